@@ -1,0 +1,98 @@
+"""Robot camera recordings as mp4 files with YAML sidecars, and back again exactly.
+
+The public surface, and nothing else::
+
+    mp4ds.pack("drive.bag", "drive")            a recording into a dataset
+    mp4ds.unpack("drive", "bag", "again.bag")   and back
+    mp4ds.validate("drive", deep=True)          every problem, or an empty list
+    mp4ds.open("drive")["/camera/image_raw"][7].data
+
+Modules are imported when first used, so that ``import mp4ds`` is cheap.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from mp4ds._version import __version__
+
+if TYPE_CHECKING:
+    from mp4ds.checks import Problem, validate
+    from mp4ds.dataset import Dataset, Frame, Stream
+    from mp4ds.dataset import open_dataset as open
+    from mp4ds.errors import (
+        ConversionError,
+        FormatError,
+        Mp4dsError,
+        OptionError,
+        SourceError,
+        SourceNotFoundError,
+        TargetError,
+        TargetExistsError,
+        VersionError,
+        VideoError,
+        WriteError,
+    )
+    from mp4ds.packing import PackOptions, PackSummary, pack
+    from mp4ds.unpacking import UnpackOptions, UnpackSummary, unpack
+
+_HOMES = {
+    "checks": ("Problem", "validate"),
+    "dataset": ("Dataset", "Frame", "Stream"),
+    "errors": (
+        "ConversionError",
+        "FormatError",
+        "Mp4dsError",
+        "OptionError",
+        "SourceError",
+        "SourceNotFoundError",
+        "TargetError",
+        "TargetExistsError",
+        "VersionError",
+        "VideoError",
+        "WriteError",
+    ),
+    "packing": ("PackOptions", "PackSummary", "pack"),
+    "unpacking": ("UnpackOptions", "UnpackSummary", "unpack"),
+}
+
+__all__ = [
+    "ConversionError",
+    "Dataset",
+    "FormatError",
+    "Frame",
+    "Mp4dsError",
+    "OptionError",
+    "PackOptions",
+    "PackSummary",
+    "Problem",
+    "SourceError",
+    "SourceNotFoundError",
+    "Stream",
+    "TargetError",
+    "TargetExistsError",
+    "UnpackOptions",
+    "UnpackSummary",
+    "VersionError",
+    "VideoError",
+    "WriteError",
+    "__version__",
+    "open",
+    "pack",
+    "unpack",
+    "validate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "open":
+        return import_module("mp4ds.dataset").open_dataset
+    for module, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f"mp4ds.{module}"), name)
+    raise AttributeError(f"module 'mp4ds' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

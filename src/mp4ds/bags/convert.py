@@ -1,0 +1,266 @@
+"""Converts channels and messages between ROS 1 and ROS 2.
+
+Payloads are converted byte by byte (rosbags' ros1_to_cdr and cdr_to_ros1): both worlds
+serialise the same values in the same order, but for the header's sequence number, which only
+ROS 1 has. Definitions become the standard ones of the target where these serialise alike.
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+import struct
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from rosbags.serde import SerdeError
+from rosbags.typesys import TypesysError
+from rosbags.typesys.msg import denormalize_msgtype, normalize_msgtype
+from rosbags.typesys.store import Typestore
+
+from mp4ds.bags.typedefs import (
+    HEADER,
+    make_store,
+    ros1_world,
+    ros2_world,
+    same_wire,
+    translate,
+    types_of,
+)
+from mp4ds.errors import ConversionError, OptionError
+from mp4ds.records import Channel, Schema
+
+if TYPE_CHECKING:
+    from rosbags.interfaces.typing import Typesdict
+
+LATCHED_QOS = """\
+- history: 1
+  depth: 1
+  reliability: 1
+  durability: 1
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  lifespan:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: 1
+  liveliness_lease_duration:
+    sec: 9223372036
+    nsec: 854775807
+  avoid_ros_namespace_conventions: false"""
+"""Keep the last one, reliable, transient local: what ROS 1 calls latching."""
+
+_ROS1 = "ros1:"  # begins the keys that keep a ROS 1 connection header in ROS 2 metadata
+_RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
+_MAX_TAIL = 8  # bytes after a message; after more, the definition is that of another type
+_REMEDY = "Exclude the topic with --exclude, or unpack to mcap, which keeps it as it is."
+_BAD_DEFINITION = (
+    TypesysError,
+    SerdeError,
+    SyntaxError,
+    RecursionError,
+    LookupError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    AssertionError,
+)
+_BAD_PAYLOAD = (SerdeError, struct.error, ValueError, LookupError, TypeError, MemoryError)
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """How a type is converted.
+
+    Attributes:
+        name: The type as rosbags spells it.
+        types: Its own definition, and those that it refers to.
+        store: The same with the header of ROS 2, which is what rosbags converts bytes by.
+        schema: Definition for the target.
+        digest: md5sum for ROS 1, type hash for ROS 2.
+    """
+
+    name: str
+    types: Typesdict
+    store: Typestore
+    schema: Schema
+    digest: str
+
+
+class Converter:
+    """Converts channels and their messages to ROS 1 or ROS 2.
+
+    Args:
+        target: ``ros1``, ``ros2``, or None to convert nothing.
+        distribution: The distribution of ROS 2 whose standard types are used.
+
+    Raises:
+        OptionError: The target or the distribution is not known.
+    """
+
+    def __init__(self, target: str | None, *, distribution: str = "humble") -> None:
+        if target not in ("ros1", "ros2", None):
+            raise OptionError(f"{target!r} cannot be converted to. Use ros1 or ros2.")
+        self._ros1, self._ros2 = ros1_world(), ros2_world(distribution)
+        self._target = {"ros1": self._ros1, "ros2": self._ros2}.get(target or "")
+        self._source = self._ros1 if self._target is self._ros2 else self._ros2
+        self._plans: dict[Schema, _Plan] = {}
+        self._omitted: Counter[str] = Counter()
+
+    @property
+    def omitted(self) -> Mapping[str, int]:
+        """What the target has no place for and was left out: a phrase -> how many."""
+        return dict(self._omitted)
+
+    def channel(self, channel: Channel) -> Channel:
+        """The channel as it is in the target; the same object if it is there already.
+
+        Raises:
+            ConversionError: It is not of ROS, or its definition is missing or damaged.
+        """
+        if self._is_done(channel):
+            return channel
+        plan = self._plan(channel)
+        if self._target is self._ros1:
+            return self._remembered(channel, plan) or self._ros1_channel(channel, plan)
+        return _ros2_channel(channel, plan)
+
+    def payload(self, channel: Channel, data: bytes | memoryview) -> bytes | memoryview:
+        """A message of a source channel as it is in the target.
+
+        Raises:
+            ConversionError: It does not parse as the channel's type.
+        """
+        if self._is_done(channel):
+            return data
+        plan = self._plan(channel)
+        try:
+            return self._convert(plan, memoryview(data))
+        except _BAD_PAYLOAD:
+            problem = f"a message does not parse as {channel.type_name}"
+            raise ConversionError(channel.topic, problem, _REMEDY) from None
+
+    def _is_done(self, channel: Channel) -> bool:
+        return self._target is None or channel.message_encoding == self._target.encoding
+
+    def _plan(self, channel: Channel) -> _Plan:
+        schema = channel.schema
+        if schema is None or channel.message_encoding != self._source.encoding:
+            raise ConversionError(
+                channel.topic,
+                f"its messages are {channel.message_encoding or 'of no known encoding'}, "
+                "which cannot be converted between ROS 1 and ROS 2",
+                _REMEDY,
+            )
+        if schema not in self._plans:
+            try:
+                self._plans[schema] = self._make_plan(schema)
+            except KeyError as error:
+                is_own = error.args[0] == normalize_msgtype(schema.name)
+                missing = schema.name if is_own else error.args[0]
+                problem = f"no definition of type {missing} is known"
+                raise ConversionError(channel.topic, problem, _REMEDY) from None
+            except _BAD_DEFINITION:
+                problem = f"the definition of type {channel.type_name} cannot be understood"
+                raise ConversionError(channel.topic, problem, _REMEDY) from None
+        return self._plans[schema]
+
+    def _make_plan(self, schema: Schema) -> _Plan:
+        target = self._target or self._source
+        types = types_of(schema, self._source)
+        name = normalize_msgtype(schema.name)
+        new_name = _RENAMED.get(name, name) if target is self._ros2 else name
+        made = make_store(translate(types, name, new_name, target), target)
+        if target is self._ros2:
+            definition, digest = made.generate_msgdef(new_name, 2)[0], made.hash_rihs01(new_name)
+        else:
+            definition, digest = made.generate_msgdef(new_name, 1)
+            new_name = denormalize_msgtype(new_name)
+        store = make_store(types, self._ros2)
+        store.get_msgdef(name)  # compiled now, to fail before any message
+        made_schema = Schema(new_name, target.schema_encoding, definition.encode())
+        return _Plan(name, types, store, made_schema, digest)
+
+    def _convert(self, plan: _Plan, raw: memoryview) -> memoryview:
+        to_ros1 = self._target is self._ros1
+        store, name = plan.store, plan.name
+        if to_ros1 and bytes(raw[:2]) == b"\0\0":
+            # rosbags converts bytes of little-endian CDR only.
+            message = store.deserialize_cdr(raw, name)
+            raw = store.serialize_cdr(message, name, little_endian=True)
+        convert = store.cdr_to_ros1 if to_ros1 else store.ros1_to_cdr
+        try:
+            converted = convert(raw, name)
+        except SerdeError:
+            # ROS itself overlooks bytes after a message, such as RealSense cameras' bags hold.
+            end = _end(plan, raw, to_ros1=to_ros1)
+            if not 0 < len(raw) - end <= _MAX_TAIL:
+                raise
+            converted = convert(raw[:end], name)
+            self._omitted["messages with bytes after their end, which were left out"] += 1
+        if not to_ros1 and HEADER in plan.types:
+            self._omitted["messages with a header's sequence number, which ROS 2 has not"] += 1
+        return converted
+
+    def _remembered(self, channel: Channel, plan: _Plan) -> Channel | None:
+        """The ROS 1 channel that this one was made of, if it tells and still fits."""
+        known = {
+            key[len(_ROS1) :]: value
+            for key, value in channel.metadata.items()
+            if key.startswith(_ROS1)
+        }
+        name, definition = known.pop("type", ""), known.pop("message_definition", None)
+        encoded = known.pop("message_definition;base64", None)
+        encoding = "" if definition is None and encoded is None else self._ros1.schema_encoding
+        try:
+            data = base64.b64decode(encoded) if encoded else (definition or "").encode()
+            schema = Schema(name, encoding, data)
+            types = types_of(schema, self._ros1)
+            if not same_wire(plan.types, plan.name, types, normalize_msgtype(name)):
+                return None
+        except _BAD_DEFINITION:
+            return None
+        return replace(channel, message_encoding="ros1", schema=schema, metadata=known)
+
+    def _ros1_channel(self, channel: Channel, plan: _Plan) -> Channel:
+        qos = channel.metadata.get("offered_qos_profiles", "")
+        metadata = {"md5sum": plan.digest}
+        if _is_latched(qos):
+            metadata["latching"] = "1"
+        elif qos:
+            self._omitted["QoS profiles of topics, which ROS 1 has not"] += 1
+        return replace(channel, message_encoding="ros1", schema=plan.schema, metadata=metadata)
+
+
+def _ros2_channel(channel: Channel, plan: _Plan) -> Channel:
+    latched = channel.metadata.get("latching", "").lower() in ("1", "true")
+    metadata = {
+        "offered_qos_profiles": LATCHED_QOS if latched else "",
+        "topic_type_hash": plan.digest,
+        **{_ROS1 + key: value for key, value in channel.metadata.items()},
+        _ROS1 + "type": channel.type_name,
+    }
+    if channel.schema and channel.schema.encoding:
+        try:
+            metadata[_ROS1 + "message_definition"] = channel.schema.data.decode()
+        except UnicodeDecodeError:
+            encoded = base64.b64encode(channel.schema.data).decode()
+            metadata[_ROS1 + "message_definition;base64"] = encoded
+    return replace(channel, message_encoding="cdr", schema=plan.schema, metadata=metadata)
+
+
+def _is_latched(qos: str) -> bool:
+    """Whether all of a topic's QoS profiles, a YAML text, say transient local."""
+    found = re.findall(r"durability[\"']?\s*:\s*[\"']?(\w+)", qos)
+    return bool(found) and set(found) <= {"1", "transient_local"}
+
+
+def _end(plan: _Plan, raw: memoryview, *, to_ros1: bool) -> int:
+    """Where the message in `raw` ends."""
+    definition = plan.store.get_msgdef(plan.name)
+    if to_ros1:
+        return 4 + definition.getsize_cdr_to_ros1(raw[4:], 0, None, 0, plan.store)[0]
+    return definition.getsize_ros1_to_cdr(raw, 0, None, 0, plan.store)[0]

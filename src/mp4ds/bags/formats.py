@@ -1,0 +1,104 @@
+"""The table of recording formats, and how a path tells which one it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from mp4ds.bags.mcap import McapReader, McapWriter
+from mp4ds.bags.multi import MultiReader
+from mp4ds.bags.protocols import BagReader, BagWriter
+from mp4ds.bags.ros1 import Ros1Reader, Ros1Writer
+from mp4ds.bags.rosbag2 import Rosbag2Reader, Rosbag2Writer
+from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
+
+_READERS: dict[str, Callable[[Path], BagReader]] = {
+    "bag": Ros1Reader,
+    "mcap": McapReader,
+    "rosbag2": Rosbag2Reader,
+}
+
+_MAGIC = {b"#ROSBAG V": "bag", b"\x89MCAP0\r\n": "mcap", b"SQLite format 3\0": "rosbag2"}
+_SUFFIXES = {".bag": "bag", ".mcap": "mcap", ".db3": "rosbag2"}
+
+
+def format_of(path: Path) -> str:
+    """The format of a recording, by its first bytes; by its name where these are damaged.
+
+    Raises:
+        SourceNotFoundError: There is nothing.
+        SourceError: It is no recording, or cannot be read.
+    """
+    if not path.exists():
+        raise SourceNotFoundError(path)
+    if path.is_dir():
+        return "rosbag2"
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(16)
+    except OSError as error:
+        raise SourceError(path, f"cannot be read: {error.strerror}") from None
+    for magic, name in _MAGIC.items():
+        if start.startswith(magic):
+            return name
+    if path.suffix in _SUFFIXES:
+        return _SUFFIXES[path.suffix]
+    raise SourceError(
+        path,
+        "is not a recording that mp4ds knows",
+        "Give a ROS 1 .bag, a rosbag2 folder or an .mcap file.",
+    )
+
+
+def open_reader(path: Path) -> BagReader:
+    """Open one recording of any format.
+
+    Raises:
+        SourceError: It cannot be read; says why and what to do.
+    """
+    return _READERS[format_of(path)](path)
+
+
+def open_sources(paths: Sequence[Path]) -> BagReader:
+    """Open recordings that belong together, such as a split bag, as one.
+
+    Raises:
+        SourceError: One of them cannot be read, or is given twice.
+    """
+    if not paths:
+        raise OptionError("No recording was given.")
+    seen: set[Path] = set()
+    for path in paths:
+        resolved = path.resolve()
+        if resolved in seen:
+            raise SourceError(path, "is given twice")
+        seen.add(resolved)
+    if len(paths) == 1:
+        return open_reader(paths[0])
+    return MultiReader([lambda path=path: open_reader(path) for path in paths])
+
+
+def open_writer(
+    path: Path, target: str, *, name: str, profile: str, library: str, storage: str
+) -> BagWriter:
+    """Open a recording for writing.
+
+    Args:
+        path: Where to write; does not exist yet.
+        target: ``bag``, ``rosbag2`` or ``mcap``.
+        name: Final name, which a rosbag2 folder gives to its files.
+        profile: MCAP profile, for ``mcap``.
+        library: MCAP library string, for ``mcap``.
+        storage: ``sqlite3`` or ``mcap``, for ``rosbag2``.
+
+    Raises:
+        OptionError: The target is unknown.
+        OSError: The disk refused.
+    """
+    if target == "bag":
+        return Ros1Writer(path)
+    if target == "rosbag2":
+        return Rosbag2Writer(path, storage=storage, name=name)
+    if target == "mcap":
+        return McapWriter(path, profile=profile, library=library)
+    raise OptionError(f"--to {target!r} is not known. Use bag, rosbag2, mcap or images.")

@@ -1,0 +1,67 @@
+"""SHA-256 of the files of a recording, while it is read."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import BinaryIO
+
+from mp4ds.errors import SourceError
+
+_BLOCK = 2**20
+
+
+class SourceHasher:
+    """SHA-256 of the source files, taken while they are read, behind the reader.
+
+    The bytes are then still in the system's cache: the disk is read once.
+
+    Args:
+        path: The recording; a folder's name is put before those of its files.
+        files: All files, in reading order.
+    """
+
+    def __init__(self, path: Path, files: Sequence[Path]) -> None:
+        self._folder = path if path.is_dir() else None
+        self._files = list(files)
+        self._position = 0
+        self._number = 0
+        self._offset = 0
+        self._hash = hashlib.sha256()
+        self.digests: list[tuple[str, int, str]] = []
+
+    def advance(self, position: int | None) -> None:
+        """Hash up to a position in all files, None for the end.
+
+        Raises:
+            SourceError: A file cannot be read.
+        """
+        while self._number < len(self._files) and (position is None or self._position < position):
+            path = self._files[self._number]
+            try:
+                with path.open("rb") as stream:
+                    stream.seek(self._offset)
+                    at_end = self._hash_file(stream, position)
+            except OSError as error:
+                raise SourceError(path, f"cannot be read: {error.strerror}") from None
+            if at_end:
+                self._finish_file(path)
+
+    def _hash_file(self, stream: BinaryIO, position: int | None) -> bool:
+        while position is None or self._position < position:
+            block = stream.read(_BLOCK)
+            if not block:
+                return True
+            self._hash.update(block)
+            self._offset += len(block)
+            self._position += len(block)
+        return False
+
+    def _finish_file(self, path: Path) -> None:
+        inside = self._folder is not None and path.parent == self._folder
+        name = f"{path.parent.name}/{path.name}" if inside else path.name
+        self.digests.append((name, self._offset, self._hash.hexdigest()))
+        self._hash = hashlib.sha256()
+        self._offset = 0
+        self._number += 1

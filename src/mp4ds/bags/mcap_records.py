@@ -1,0 +1,355 @@
+"""The records of an MCAP file, framed and checked (https://mcap.dev/spec).
+
+The mcap library parses the small records. Framing, chunks and messages are read here: the
+library's readers take short reads, overlong fields and unknown compressions for good, and
+copy every payload.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple, Protocol, TypeVar
+
+import lz4.frame
+import zstandard
+from mcap import records as mcap_records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+
+from mp4ds.errors import SourceError, SourceNotFoundError
+
+MAGIC = b"\x89MCAP0\r\n"
+MAX_RECORD_BYTES = 4 * 2**30
+FOOTER_BYTES = 9 + 20 + len(MAGIC)
+PRIVATE_OPCODE = 0x80
+CUT_SHORT_REMEDY = "The recording was cut short; recover it with `mcap recover` first."
+
+_LFS_POINTER = b"version https://git-lfs.github.com/spec/"
+_PIECE_BYTES = 16 * 2**20
+_FRAME = struct.Struct("<BQ")
+_CHUNK_HEAD = struct.Struct("<QQQII")
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+
+_RecordT = TypeVar("_RecordT", covariant=True)
+
+
+class DamageError(ValueError):
+    """What is wrong inside a record; the reader adds where."""
+
+
+class MessageHead(NamedTuple):
+    """The fields of an MCAP message; times in nanoseconds; the payload is not copied."""
+
+    channel_id: int
+    sequence: int
+    log_time: int
+    publish_time: int
+    data: memoryview
+
+
+class ByteStream(Protocol):
+    """What is read: a file, or the decompressed content of one."""
+
+    def read(self, length: int, /) -> bytes:
+        """Read so many bytes; fewer at the end only."""
+        ...
+
+    def tell(self) -> int:
+        """Bytes of the file consumed."""
+        ...
+
+    def seek(self, offset: int, /) -> int:
+        """Go on at a byte offset, where the stream has a known size."""
+        ...
+
+    def close(self) -> None:
+        """Close it."""
+        ...
+
+
+class _Parsed(Protocol[_RecordT]):
+    @staticmethod
+    def read(stream: ReadDataStream) -> _RecordT: ...
+
+
+def open_source(path: Path, shown: Path | None = None) -> BinaryIO:
+    """Open a file of a recording, refusing what is none.
+
+    Args:
+        path: The file.
+        shown: Its name in errors, where it is a decompressed copy.
+
+    Raises:
+        SourceError: It is missing, unreadable, empty, or a git-lfs pointer.
+    """
+    shown = shown or path
+    try:
+        stream = path.open("rb")
+    except FileNotFoundError:
+        raise SourceNotFoundError(shown) from None
+    except OSError as error:
+        raise SourceError(shown, f"cannot be read: {error.strerror}") from None
+    head = stream.read(len(_LFS_POINTER))
+    stream.seek(0)
+    if head and head != _LFS_POINTER:
+        return stream
+    stream.close()
+    if not head:
+        raise SourceError(shown, "is empty")
+    raise SourceError(shown, "is a git-lfs pointer, not the recording", "Run `git lfs pull`.")
+
+
+class RecordStream:
+    """One pass over the records of an MCAP file.
+
+    Args:
+        stream: A binary stream at the start of the file.
+        path: The file's name, for errors.
+        size: Bytes in the stream; None where it can neither be known nor sought in.
+
+    Attributes:
+        start: Byte offset of the record that was read last.
+    """
+
+    def __init__(self, stream: ByteStream, path: Path, size: int | None) -> None:
+        self._stream = stream
+        self.path = path
+        self.size = size
+        self._offset = 0
+        self.start = 0
+
+    def close(self) -> None:
+        """Close the stream."""
+        self._stream.close()
+
+    def tell(self) -> int:
+        """Bytes of the file consumed."""
+        return self._stream.tell()
+
+    def seek(self, offset: int) -> None:
+        """Go on at a byte offset that an index gave."""
+        if self.size is not None and offset > self.size:
+            raise DamageError(f"an index points to byte {offset}, past the end")
+        self._stream.seek(offset)
+        self._offset = offset
+
+    def read_magic(self) -> None:
+        """Read the magic bytes that begin and end a file."""
+        at_start = self._offset == 0
+        if self.read(len(MAGIC)) != MAGIC:
+            if at_start:
+                raise SourceError(self.path, "is not an MCAP file: its first bytes are others")
+            raise self.cut_short()
+
+    def read(self, length: int) -> bytes:
+        """Read exactly so many bytes."""
+        if self.size is not None and length > self.size - self._offset:
+            raise self.cut_short()
+        try:
+            if length <= _PIECE_BYTES or self.size is not None:
+                data = self._stream.read(length)
+            else:
+                data = self._read_in_pieces(length)
+        except zstandard.ZstdError as error:
+            raise SourceError(self.path, f"its zstd compression is damaged: {error}") from None
+        except OSError as error:
+            raise SourceError(self.path, f"cannot be read: {error.strerror or error}") from None
+        if len(data) != length:
+            raise self.cut_short()
+        self._offset += length
+        return data
+
+    def _read_in_pieces(self, length: int) -> bytes:
+        # A stream of unknown size may promise anything: allocate what really comes.
+        pieces = bytearray()
+        while len(pieces) < length:
+            piece = self._stream.read(min(_PIECE_BYTES, length - len(pieces)))
+            if not piece:
+                break
+            pieces += piece
+        return bytes(pieces)
+
+    def next(self) -> tuple[int, bytes]:
+        """Read one record.
+
+        Returns:
+            Its opcode and its body.
+        """
+        self.start = self._offset
+        opcode, length = _FRAME.unpack(self.read(_FRAME.size))
+        if length > MAX_RECORD_BYTES:
+            raise SourceError(
+                self.path, f"holds a record of {length} bytes at byte {self.start}: it is damaged"
+            )
+        return opcode, self.read(length)
+
+    def cut_short(self) -> SourceError:
+        """The error for a file that ends before it should."""
+        return SourceError(self.path, "ends before its footer", CUT_SHORT_REMEDY)
+
+    def damaged(self, problem: object) -> SourceError:
+        """The error for a damaged record: the one that was read last."""
+        return SourceError(self.path, f"is damaged in its record at byte {self.start}: {problem}")
+
+
+class _ExactStream(ReadDataStream):
+    def read(self, length: int) -> bytes:
+        data = super().read(length)
+        if len(data) != length:
+            raise EndOfFile
+        return data
+
+
+def parse(kind: type[_Parsed[_RecordT]], body: bytes | memoryview) -> _RecordT:
+    """Parse a small record by the mcap library, never beyond its end.
+
+    Raises:
+        DamageError: It does not hold what its kind must.
+    """
+    return _parse(kind, body)[0]
+
+
+def _parse(kind: type[_Parsed[_RecordT]], body: bytes | memoryview) -> tuple[_RecordT, int]:
+    stream = _ExactStream(io.BytesIO(body))
+    try:
+        return kind.read(stream), stream.count
+    except (EndOfFile, struct.error):
+        problem = "is shorter than its fields"
+    except UnicodeDecodeError:
+        problem = "holds text that is not UTF-8"
+    raise DamageError(f"a record of kind {kind.__name__} {problem}")
+
+
+def parse_attachment(body: bytes) -> mcap_records.Attachment:
+    """Parse an attachment and verify its checksum, if it has one."""
+    attachment: mcap_records.Attachment
+    attachment, length = _parse(mcap_records.Attachment, body)
+    (crc,) = struct.unpack_from("<I", body, length - 4)
+    if crc and crc != zlib.crc32(memoryview(body)[: length - 4]):
+        raise DamageError(f"the attachment {attachment.name!r} does not match its checksum")
+    return attachment
+
+
+def parse_message(body: bytes | memoryview) -> MessageHead:
+    """Split a message record without copying its payload."""
+    if len(body) < _MESSAGE_HEAD.size:
+        raise DamageError("a message is shorter than its fields")
+    channel_id, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(body)
+    data = memoryview(body)[_MESSAGE_HEAD.size :]
+    return MessageHead(channel_id, sequence, log_time, publish_time, data)
+
+
+def unpack_chunk(body: bytes) -> bytes | memoryview:
+    """Decompress a chunk and verify its checksum, if it has one.
+
+    Returns:
+        The records of the chunk.
+
+    Raises:
+        DamageError: The chunk is damaged or compressed in an unknown way.
+    """
+    view = memoryview(body)
+    try:
+        *_, size, crc, length = _CHUNK_HEAD.unpack_from(view)
+        compression = str(view[_CHUNK_HEAD.size :][:length], "utf-8")
+        (data_length,) = struct.unpack_from("<Q", view, _CHUNK_HEAD.size + length)
+    except (struct.error, UnicodeDecodeError):
+        raise DamageError("a chunk is shorter than its fields") from None
+    data = view[_CHUNK_HEAD.size + length + 8 :][:data_length]
+    if len(data) != data_length:
+        raise DamageError("a chunk is shorter than its fields")
+    content = _decompress(compression, data, size)
+    if len(content) != size:
+        raise DamageError(f"a chunk holds {len(content)} bytes instead of {size}")
+    if crc and crc != zlib.crc32(content):
+        raise DamageError("a chunk does not match its checksum")
+    return content
+
+
+def _decompress(compression: str, data: memoryview, size: int) -> bytes | memoryview:
+    if compression == "":
+        return data
+    if size > MAX_RECORD_BYTES:
+        raise DamageError(f"a chunk promises {size} bytes")
+    if compression == "zstd":
+        return unzstd(data, size)
+    if compression == "lz4":
+        try:
+            content: bytes = lz4.frame.decompress(data)
+        except RuntimeError as error:
+            raise DamageError(f"the lz4 compression of a chunk is damaged: {error}") from None
+        return content
+    raise DamageError(f"a chunk is compressed by {compression!r}, and only zstd and lz4 are known")
+
+
+def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
+    """Decompress one zstd frame.
+
+    Args:
+        data: The frame.
+        size: Size of the content where known, else the frame must tell it.
+
+    Raises:
+        DamageError: It is no zstd frame, damaged, or of another size.
+    """
+    try:
+        stated = zstandard.frame_content_size(data)
+        if stated < 0 and size is None:
+            return _unzstd_unsized(data)
+        if size is not None and stated not in (-1, size):
+            raise DamageError(f"zstd data holds {stated} bytes instead of {size}")
+        if stated > MAX_RECORD_BYTES:
+            raise DamageError(f"zstd data promises {stated} bytes")
+        return zstandard.ZstdDecompressor().decompress(
+            data, max_output_size=size or 0, allow_extra_data=False
+        )
+    except zstandard.ZstdError as error:
+        raise DamageError(f"zstd data is damaged: {error}") from None
+
+
+def _unzstd_unsized(data: bytes | memoryview) -> bytes:
+    decompressor = zstandard.ZstdDecompressor().decompressobj()
+    content = decompressor.decompress(data)
+    if not decompressor.eof or decompressor.unused_data:
+        raise DamageError("zstd data is cut short, or holds more than one frame")
+    return content
+
+
+def chunk_records(content: bytes | memoryview) -> Iterator[tuple[int, int, memoryview]]:
+    """Walk the records of a decompressed chunk.
+
+    Yields:
+        Offset in the chunk, opcode and body of each; the bodies are views.
+    """
+    view = memoryview(content)
+    offset = 0
+    while offset < len(view):
+        opcode, body, end = chunk_record(view, offset)
+        yield offset, opcode, body
+        offset = end
+
+
+def chunk_record(view: memoryview, offset: int) -> tuple[int, memoryview, int]:
+    """Read one record of a decompressed chunk.
+
+    Returns:
+        Its opcode, its body and the offset of the next one.
+    """
+    if offset + _FRAME.size > len(view):
+        raise DamageError("a chunk ends within a record")
+    opcode, length = _FRAME.unpack_from(view, offset)
+    offset += _FRAME.size
+    if length > len(view) - offset:
+        raise DamageError("a chunk ends within a record")
+    return opcode, view[offset : offset + length], offset + length
+
+
+def opcode_name(opcode: int) -> str:
+    """A readable name of an opcode, for summaries."""
+    known: Any = {int(item): item.name.lower() for item in Opcode}
+    return str(known.get(opcode, f"opcode 0x{opcode:02x}"))

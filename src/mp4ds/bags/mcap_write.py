@@ -1,0 +1,152 @@
+"""Writes MCAP files."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from mcap.writer import CompressionType, Writer
+
+from mp4ds._version import __version__
+from mp4ds.errors import ConversionError, OptionError
+from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
+
+CHUNK_BYTES = 2**20
+MAX_CHANNELS = 2**16 - 1
+
+_COMPRESSIONS = {
+    "zstd": CompressionType.ZSTD,
+    "lz4": CompressionType.LZ4,
+    "none": CompressionType.NONE,
+}
+
+
+class McapWriter:
+    """Writes an MCAP file with chunks, indexes and checksums. See `BagWriter`.
+
+    Memory is bounded by one chunk, or one message where that is larger.
+
+    Args:
+        path: The file, which is replaced.
+        profile: Profile of the header.
+        library: Library string of the header; this library's own where empty.
+        compression: Of the chunks: ``zstd``, ``lz4`` or ``none``.
+        chunk_size: Bytes of messages after which a chunk is closed.
+
+    Raises:
+        OptionError: The compression is unknown.
+        OSError: The disk refused.
+    """
+
+    format = "mcap"
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        profile: str,
+        library: str = "",
+        compression: str = "zstd",
+        chunk_size: int = CHUNK_BYTES,
+    ) -> None:
+        if compression not in _COMPRESSIONS:
+            raise OptionError(
+                f"compression {compression!r} is not known. Use {', '.join(_COMPRESSIONS)}."
+            )
+        self.path = path
+        self._channel_ids: dict[int, int] = {}
+        self._schema_ids: dict[Schema, int] = {}
+        self._file = path.open("wb")
+        try:
+            self._writer: Any = Writer(
+                self._file, chunk_size=chunk_size, compression=_COMPRESSIONS[compression]
+            )
+            self._writer.start(profile=profile, library=library or f"mp4ds {__version__}")
+        except BaseException:
+            self._abandon()
+            raise
+
+    @property
+    def omitted(self) -> Mapping[str, int]:
+        """Nothing: MCAP holds everything."""
+        return {}
+
+    def add_schema(self, schema: Schema) -> None:
+        """Keep a definition, whether a channel will refer to it or not."""
+        self._schema_id(schema)
+
+    def _schema_id(self, schema: Schema) -> int:
+        if schema not in self._schema_ids:
+            if len(self._schema_ids) >= MAX_CHANNELS:
+                raise ConversionError("", f"MCAP holds at most {MAX_CHANNELS} definitions")
+            self._schema_ids[schema] = self._writer.register_schema(
+                schema.name, schema.encoding, schema.data
+            )
+        return self._schema_ids[schema]
+
+    def add_channel(self, channel: Channel) -> None:
+        """Declare a channel. See `BagWriter.add_channel`."""
+        if channel.id in self._channel_ids:
+            return
+        if len(self._channel_ids) >= MAX_CHANNELS:
+            raise ConversionError(channel.topic, f"MCAP holds at most {MAX_CHANNELS} channels")
+        schema_id = self._schema_id(channel.schema) if channel.schema else 0
+        self._channel_ids[channel.id] = self._writer.register_channel(
+            channel.topic, channel.message_encoding, schema_id, dict(channel.metadata)
+        )
+
+    def write(self, message: Message) -> None:
+        """Append a message, payload verbatim."""
+        try:
+            self._writer.add_message(
+                self._channel_ids[message.channel.id],
+                message.log_time,
+                message.data,
+                message.publish_time,
+                message.sequence,
+            )
+        except struct.error:
+            raise ConversionError(
+                message.channel.topic, "has a time or sequence number that MCAP cannot hold"
+            ) from None
+
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Append an attachment."""
+        self._writer.add_attachment(
+            attachment.create_time,
+            attachment.log_time,
+            attachment.name,
+            attachment.media_type,
+            attachment.data,
+        )
+
+    def add_metadata(self, record: MetadataRecord) -> None:
+        """Append a metadata record."""
+        self._writer.add_metadata(record.name, dict(record.metadata))
+
+    def __enter__(self) -> McapWriter:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        tb: TracebackType | None,
+    ) -> None:
+        if exc_type is not None:
+            self._abandon()
+            return
+        try:
+            self._writer.finish()
+            self._file.close()
+        except BaseException:
+            self._abandon()
+            raise
+
+    def _abandon(self) -> None:
+        with suppress(OSError):
+            self._file.close()

@@ -1,0 +1,136 @@
+"""What a reader and a writer of recordings can do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.records import (
+    Attachment,
+    Channel,
+    ChannelStats,
+    Message,
+    MetadataRecord,
+    Record,
+    Schema,
+)
+
+
+class BagReader(Protocol):
+    """One recording, opened for reading. A context manager; the file is never changed.
+
+    Attributes:
+        path: What was opened, a file or a folder.
+        format: ``bag``, ``rosbag2`` or ``mcap``.
+        profile: ``ros1``, ``ros2`` or any other MCAP profile; empty for none.
+        library: The MCAP header's library string; empty for other formats.
+        files: All files that the recording consists of, in reading order.
+        channels: All channels known so far; complete once `records` is exhausted.
+        position: Bytes of `files` consumed so far, for progress and hashing.
+    """
+
+    path: Path
+    format: str
+    profile: str
+    library: str
+    files: Sequence[Path]
+
+    @property
+    def channels(self) -> Sequence[Channel]: ...
+
+    @property
+    def unused_schemas(self) -> Sequence[Schema]:
+        """Definitions that no channel refers to; complete once `records` is exhausted."""
+        ...
+
+    @property
+    def position(self) -> int: ...
+
+    def records(self) -> Iterator[Record]:
+        """Read everything once.
+
+        Messages of one channel come in log-time order, ties in source order; where a file
+        has no index (some MCAP files) they come in file order. Attachments and metadata
+        records come where the file holds them.
+
+        Raises:
+            SourceError: The file is damaged; names the file and, where known, the topic.
+        """
+        ...
+
+    def stats(self) -> Mapping[int, ChannelStats]:
+        """Counts and time spans by channel id as far as an index tells, without reading on."""
+        ...
+
+    def times(self) -> Mapping[int, NDArray[np.int64]]:
+        """Log times of every message, nanoseconds, sorted, by channel id.
+
+        Uses the index where there is one, else reads the file.
+        """
+        ...
+
+    def first(self, channel: Channel) -> Message | None:
+        """The channel's first message by log time, or None."""
+        ...
+
+    def __enter__(self) -> BagReader: ...
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        tb: TracebackType | None,
+    ) -> None: ...
+
+
+class BagWriter(Protocol):
+    """One recording, opened for writing under a temporary name by the caller.
+
+    A context manager: leaving it normally completes the file, leaving it with an exception
+    abandons it (the caller removes what is left).
+    """
+
+    format: str
+
+    def add_channel(self, channel: Channel) -> None:
+        """Declare a channel; every message's channel must have been declared.
+
+        Raises:
+            ConversionError: The format cannot hold the channel.
+        """
+        ...
+
+    def add_schema(self, schema: Schema) -> None:
+        """Keep a definition that no channel refers to; formats without such count it."""
+        ...
+
+    def write(self, message: Message) -> None:
+        """Append a message, payload verbatim."""
+        ...
+
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Append an attachment; formats without attachments count it in `omitted`."""
+        ...
+
+    def add_metadata(self, record: MetadataRecord) -> None:
+        """Append a metadata record; formats without them count it in `omitted`."""
+        ...
+
+    @property
+    def omitted(self) -> Mapping[str, int]:
+        """What the format cannot hold and was left out: a phrase -> how many."""
+        ...
+
+    def __enter__(self) -> BagWriter: ...
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        tb: TracebackType | None,
+    ) -> None: ...

@@ -1,0 +1,302 @@
+"""The metadata.yaml of rosbag2, versions 1 to 9."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PureWindowsPath
+from typing import Any
+
+import yaml
+
+from mp4ds.errors import SourceError
+
+METADATA_FILE = "metadata.yaml"
+NEWEST_VERSION = 9
+NATIVE_QOS_VERSION = 9
+"""From this version on QoS profiles are YAML; before, a string of YAML with other enums."""
+
+RECORD = "mp4ds:rosbag2"
+"""Metadata record with what a rosbag2 recording holds besides topics and messages."""
+
+TABLES_RECORD = "mp4ds:rosbag2:tables"
+"""Metadata record with the small tables of a storage file that is not open beforehand."""
+
+_TOP_KEY = "rosbag2_bagfile_information"
+_MAX_BYTES = 64 * 2**20
+_STORAGES = {"db3": "sqlite3", "mcap": "mcap"}
+_BaseLoader: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_BaseDumper: type[Any] = yaml.SafeDumper
+
+
+class _Loader(_BaseLoader):  # type: ignore[misc]
+    """Takes scalars as rosbag2 does: a topic named ``on`` or ``12:30`` stays a string."""
+
+    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 (PyYAML's class attribute)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:int", re.compile(r"-?(?:0|[1-9][0-9]*)$"), list("-0123456789")
+)
+_Loader.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile(r"(?:true|false)$"), list("tf"))
+_Loader.add_implicit_resolver("tag:yaml.org,2002:null", re.compile(r"(?:~|null|)$"), ["~", "n", ""])
+
+
+class _Dumper(_BaseDumper):  # type: ignore[misc]
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _represent_str(dumper: _Dumper, text: str) -> Any:
+    style = '"' if "\n" in text or not text else None  # as rosbag2 writes its QoS strings
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
+
+
+_Dumper.add_representer(str, _represent_str)
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic as metadata.yaml lists it.
+
+    Attributes:
+        name: Topic name.
+        type_name: Type name.
+        serialization_format: Mostly ``cdr``.
+        qos: Offered QoS profiles as YAML text, None where the version has none.
+        type_hash: Type description hash, None where the version has none.
+        count: Number of messages.
+    """
+
+    name: str
+    type_name: str
+    serialization_format: str
+    qos: str | None
+    type_hash: str | None
+    count: int
+
+
+@dataclass(frozen=True)
+class BagInfo:
+    """What mp4ds needs of a metadata.yaml.
+
+    Attributes:
+        text: The file, verbatim.
+        version: 1 to 9.
+        storage: ``sqlite3`` or ``mcap``; empty without files.
+        file_names: Names of the storage files within the folder, in reading order.
+        compression: ``file``, ``message`` or empty.
+        ros_distro: Name of the ROS distribution, empty where not told.
+        custom_data: The user's own entries.
+        topics: All topics.
+    """
+
+    text: str
+    version: int
+    storage: str
+    file_names: tuple[str, ...]
+    compression: str
+    ros_distro: str
+    custom_data: Mapping[str, str]
+    topics: tuple[Topic, ...]
+
+
+def read_bag_info(path: Path) -> BagInfo:
+    """Read a metadata.yaml.
+
+    Raises:
+        SourceError: It cannot be read or understood.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise SourceError(path, f"cannot be read: {error.strerror}") from None
+    if len(data) > _MAX_BYTES:
+        raise SourceError(path, f"is larger than {_MAX_BYTES} bytes")
+    if not data.strip():
+        raise SourceError(path, "is empty", "Make it anew with `ros2 bag reindex`.")
+    try:
+        return parse_bag_info(data.decode(), path)
+    except UnicodeDecodeError:
+        raise SourceError(path, "is not UTF-8 text") from None
+
+
+def parse_bag_info(text: str, path: Path) -> BagInfo:
+    """Parse a metadata.yaml, or the same without its top key as storage files hold it.
+
+    Args:
+        text: The YAML.
+        path: Where it stands, for errors.
+
+    Raises:
+        SourceError: It cannot be understood.
+    """
+    document = _load(text, path)
+    info = document.get(_TOP_KEY, document) if isinstance(document, dict) else None
+    if not isinstance(info, dict) or "version" not in info:
+        raise SourceError(path, f"is no metadata of rosbag2: it has no {_TOP_KEY}")
+    try:
+        version = int(info["version"])
+        if version > NEWEST_VERSION:
+            raise SourceError(
+                path,
+                f"is of rosbag2 metadata version {version}, "
+                f"and this mp4ds reads up to {NEWEST_VERSION}",
+                "Install a newer mp4ds.",
+            )
+        names = tuple(_base_name(name, path) for name in info.get("relative_file_paths") or [])
+        return BagInfo(
+            text=text,
+            version=version,
+            storage=_storage(_text(info.get("storage_identifier")), names, path),
+            file_names=names,
+            compression=_compression(info, path),
+            ros_distro=_text(info.get("ros_distro")),
+            custom_data={
+                _text(key): _text(value) for key, value in (info.get("custom_data") or {}).items()
+            },
+            topics=tuple(_topic(item) for item in info.get("topics_with_message_count") or []),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        if isinstance(error, SourceError):
+            raise
+        raise SourceError(path, f"is no metadata of rosbag2 as expected: {error!r}") from None
+
+
+def _load(text: str, path: Path) -> Any:
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise SourceError(path, f"is not valid YAML: {reason}") from None
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _base_name(name: Any, path: Path) -> str:
+    # Before version 4 the bag's folder stands before the name; nothing outside of it is read.
+    base = PureWindowsPath(_text(name)).name
+    if base in ("", ".", ".."):
+        raise SourceError(path, f"names {name!r} as a file of the recording")
+    return base
+
+
+def _storage(identifier: str, names: tuple[str, ...], path: Path) -> str:
+    if identifier in _STORAGES.values():
+        return identifier
+    suffixes = {_STORAGES.get(name.removesuffix(".zstd").rpartition(".")[2], "") for name in names}
+    if identifier == "" and len(suffixes) <= 1 and "" not in suffixes:
+        return suffixes.pop() if suffixes else ""
+    raise SourceError(
+        path, f"names the storage {identifier!r}, and only sqlite3 and mcap are known"
+    )
+
+
+def _compression(info: Mapping[str, Any], path: Path) -> str:
+    mode = _text(info.get("compression_mode")).lower()
+    if mode in ("", "none"):
+        return ""
+    scheme = _text(info.get("compression_format"))
+    if mode not in ("file", "message") or scheme != "zstd":
+        raise SourceError(
+            path,
+            f"names the compression {scheme!r} of mode {mode!r}, "
+            "and only zstd of files or messages is known",
+        )
+    return mode
+
+
+def _topic(item: Mapping[str, Any]) -> Topic:
+    topic = item["topic_metadata"]
+    qos = topic.get("offered_qos_profiles")
+    has_qos, has_hash = "offered_qos_profiles" in topic, "type_description_hash" in topic
+    return Topic(
+        name=_text(topic["name"]),
+        type_name=_text(topic["type"]),
+        serialization_format=_text(topic["serialization_format"]),
+        qos=(dump_yaml(qos) if isinstance(qos, list) and qos else _qos_text(qos))
+        if has_qos
+        else None,
+        type_hash=_text(topic["type_description_hash"]) if has_hash else None,
+        count=int(item.get("message_count") or 0),
+    )
+
+
+def _qos_text(qos: Any) -> str:
+    return "" if isinstance(qos, list) else _text(qos)
+
+
+def dump_yaml(value: Any) -> str:
+    """Write YAML as rosbag2 does, without a line break at the end."""
+    text: str = yaml.dump(
+        value,
+        Dumper=_Dumper,
+        sort_keys=False,
+        default_flow_style=False,
+        allow_unicode=True,
+        width=2**31,
+    )
+    return text.rstrip("\n")
+
+
+def dump_bag_info(info: Mapping[str, Any]) -> str:
+    """Write a metadata.yaml from the content below its top key."""
+    return dump_yaml({_TOP_KEY: info}) + "\n"
+
+
+_HISTORY = ("system_default", "keep_last", "keep_all", "unknown")
+_RELIABILITY = ("system_default", "reliable", "best_effort", "unknown", "best_available")
+_DURABILITY = ("system_default", "transient_local", "volatile", "unknown", "best_available")
+_LIVELINESS = (
+    "system_default",
+    "automatic",
+    "manual_by_node",
+    "manual_by_topic",
+    "unknown",
+    "best_available",
+)
+_POLICIES = {
+    "history": _HISTORY,
+    "reliability": _RELIABILITY,
+    "durability": _DURABILITY,
+    "liveliness": _LIVELINESS,
+}
+
+
+def parse_qos(text: str) -> list[dict[str, Any]] | None:
+    """The QoS profiles of a topic as YAML values, None where the text is no list of them."""
+    try:
+        profiles = yaml.load(text, Loader=_Loader)
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return None
+    if profiles is None:
+        return []
+    if isinstance(profiles, list) and all(isinstance(profile, dict) for profile in profiles):
+        return profiles
+    return None
+
+
+def has_numeric_qos(text: str) -> bool:
+    """Whether QoS policies are numbers, as before metadata version 9."""
+    profiles = parse_qos(text) or []
+    return any(isinstance(profile.get("reliability"), int) for profile in profiles)
+
+
+def native_qos(text: str) -> list[dict[str, Any]]:
+    """QoS profiles as metadata version 9 lists them: the policies by name."""
+    return [
+        {key: _policy(key, value) for key, value in profile.items()}
+        for profile in parse_qos(text) or []
+    ]
+
+
+def _policy(key: str, value: Any) -> Any:
+    names = _POLICIES.get(key)
+    if names is None or not isinstance(value, int) or isinstance(value, bool):
+        return value
+    return names[value] if 0 <= value < len(names) else "unknown"

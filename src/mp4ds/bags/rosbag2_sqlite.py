@@ -1,0 +1,281 @@
+"""Reads the sqlite3 storage files of rosbag2."""
+
+from __future__ import annotations
+
+import sqlite3
+from array import array
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.bags.mcap_records import DamageError, open_source
+from mp4ds.errors import SourceError
+from mp4ds.records import Channel, ChannelStats, Message, Schema
+
+QOS_KEY = "offered_qos_profiles"
+HASH_KEY = "topic_type_hash"
+
+_MAGIC = b"SQLite format 3\0"
+_TOPIC_COLUMNS = ("id", "name", "type", "serialization_format")
+_MESSAGE_COLUMNS = {"id", "topic_id", "timestamp", "data"}
+_KNOWN_TABLES = {"messages", "topics", "schema", "metadata", "message_definitions"}
+_METADATA_KEYS = {"type_description_hash": HASH_KEY}
+
+
+class SqliteReader:
+    """Reads one ``.db3`` file. Channel ids are the ids of the topic rows.
+
+    Every pass has its own connection, so that several may run.
+
+    Args:
+        path: The database.
+        shown: Its name in errors and tables, where it is a decompressed copy.
+        message_decompress: Makes the payload of a message from what the file holds; raises
+            `DamageError` for what it cannot read.
+
+    Attributes:
+        tables: Content of the small tables by ``db3:<file>:<column>``, verbatim.
+
+    Raises:
+        SourceError: The file is missing, damaged, or no database of rosbag2.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        shown: Path | None = None,
+        message_decompress: Callable[[bytes], bytes] | None = None,
+    ) -> None:
+        self.path = path
+        self._shown = shown or path
+        self._decompress = message_decompress
+        self._rows_read = 0
+        self._rows: int | None = None
+        self._start: int | None = None
+        self._definitions: list[tuple[Schema, str]] = []
+        with closing(open_source(path, self._shown)) as stream:
+            if stream.read(len(_MAGIC)) != _MAGIC:
+                raise SourceError(self._shown, "is not an sqlite3 database")
+        with self._connected() as connection:
+            self._check_columns(connection)
+            self._definitions = list(self._read_definitions(connection))
+            self._channels = {channel.id: channel for channel in self._read_topics(connection)}
+            self.tables: Mapping[str, str] = dict(self._read_tables(connection))
+
+    @contextmanager
+    def _connected(self) -> Iterator[sqlite3.Connection]:
+        """A connection for reading only, whose errors name the file."""
+        pending = any(
+            side.exists() and side.stat().st_size
+            for side in (Path(f"{self.path}{suffix}") for suffix in ("-wal", "-journal"))
+        )
+        options = "mode=ro" if pending else "mode=ro&immutable=1"
+        connection = None
+        try:
+            connection = sqlite3.connect(
+                f"{self.path.absolute().as_uri()}?{options}", uri=True, check_same_thread=False
+            )
+            connection.text_factory = bytes  # verbatim, whether it is UTF-8 or not
+            yield connection
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            remedy = (
+                "It was not closed properly: open and close it once with the sqlite3 tool."
+                if pending
+                else "If it was cut short, try the `.recover` command of the sqlite3 tool."
+            )
+            raise SourceError(self._shown, f"cannot be read as sqlite3: {error}", remedy) from None
+        finally:
+            if connection:
+                connection.close()
+
+    def _columns(self, connection: sqlite3.Connection, table: str) -> list[str]:
+        rows = connection.execute(f"PRAGMA table_info({table})")
+        return [self._text(row[1], table) for row in rows]
+
+    def _text(self, value: Any, table: str) -> str:
+        if isinstance(value, bytes):
+            try:
+                return value.decode()
+            except UnicodeDecodeError:
+                raise SourceError(
+                    self._shown, f"has text in its table {table} that is not UTF-8"
+                ) from None
+        return "" if value is None else str(value)
+
+    def _check_columns(self, connection: sqlite3.Connection) -> None:
+        topics, messages = (
+            self._columns(connection, "topics"),
+            self._columns(connection, "messages"),
+        )
+        if not {*topics}.issuperset(_TOPIC_COLUMNS) or not {*messages} >= _MESSAGE_COLUMNS:
+            raise SourceError(self._shown, "is a database, but not one of rosbag2")
+        unknown = [name for name in messages if name not in _MESSAGE_COLUMNS]
+        if unknown:
+            raise SourceError(
+                self._shown,
+                f"has a column {unknown[0]!r} with its messages that this mp4ds does not know",
+                "Install a newer mp4ds.",
+            )
+
+    def _read_definitions(self, connection: sqlite3.Connection) -> Iterator[tuple[Schema, str]]:
+        if not self._columns(connection, "message_definitions"):
+            return
+        for name, encoding, data, type_hash in connection.execute(
+            "SELECT topic_type, encoding, encoded_message_definition, type_description_hash"
+            " FROM message_definitions ORDER BY id"
+        ):
+            table = "message_definitions"
+            definition = data if isinstance(data, bytes) else self._text(data, table).encode()
+            schema = Schema(self._text(name, table), self._text(encoding, table), definition)
+            yield schema, self._text(type_hash, table)
+
+    def _read_topics(self, connection: sqlite3.Connection) -> Iterator[Channel]:
+        columns = self._columns(connection, "topics")
+        extra = [name for name in columns if name not in _TOPIC_COLUMNS]
+        for row in connection.execute("SELECT * FROM topics ORDER BY id"):
+            fields = dict(zip(columns, row, strict=True))
+            name, type_name, encoding = (
+                self._text(fields[column], "topics") for column in _TOPIC_COLUMNS[1:]
+            )
+            metadata = {
+                _METADATA_KEYS.get(column, column): self._text(fields[column], "topics")
+                for column in extra
+            }
+            schema = self._definition(type_name, metadata.get(HASH_KEY, ""))
+            yield Channel(fields["id"], name, encoding, schema, metadata)
+
+    def _definition(self, type_name: str, type_hash: str) -> Schema:
+        found = [item for item in self._definitions if item[0].name == type_name]
+        exact = [schema for schema, its_hash in found if its_hash == type_hash]
+        if exact or found:
+            return exact[0] if exact else found[0][0]
+        return Schema(type_name, "", b"")
+
+    def _read_tables(self, connection: sqlite3.Connection) -> Iterator[tuple[str, str]]:
+        prefix = f"db3:{self._shown.name}"
+        for column in self._columns(connection, "schema"):
+            row = connection.execute(f'SELECT "{column}" FROM schema').fetchone()
+            if row:
+                yield f"{prefix}:{column}", self._text(row[0], "schema")
+        if self._columns(connection, "metadata"):
+            for number, version, text in connection.execute(
+                "SELECT id, metadata_version, metadata FROM metadata ORDER BY id"
+            ):
+                yield f"{prefix}:metadata:{number}", self._text(text, "metadata")
+                yield f"{prefix}:metadata_version:{number}", self._text(version, "metadata")
+        hashes = {(c.type_name, c.metadata.get(HASH_KEY, "")) for c in self._channels.values()}
+        for number, (schema, type_hash) in enumerate(self._definitions, 1):
+            if (schema.name, type_hash) not in hashes:
+                yield f"{prefix}:definition_hash:{number}:{schema.name}", type_hash
+        names = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+        for name in sorted(self._text(row[0], "sqlite_master") for row in names):
+            if name not in _KNOWN_TABLES and not name.startswith("sqlite_"):
+                yield f"{prefix}:other_table:{name}", "left out"
+
+    @property
+    def channels(self) -> Sequence[Channel]:
+        """All topics."""
+        return list(self._channels.values())
+
+    @property
+    def unused_schemas(self) -> Sequence[Schema]:
+        """Message definitions that no topic refers to."""
+        used = {channel.schema for channel in self._channels.values()}
+        return list(dict.fromkeys(item[0] for item in self._definitions if item[0] not in used))
+
+    @property
+    def start(self) -> int | None:
+        """The earliest log time, nanoseconds; None without messages."""
+        if self._start is None:
+            with self._connected() as connection:
+                row = connection.execute("SELECT MIN(timestamp) FROM messages").fetchone()
+            self._start = row[0] if isinstance(row[0], int) else None
+        return self._start
+
+    @property
+    def fraction(self) -> float:
+        """Part of the messages that `records` has read."""
+        return min(1.0, self._rows_read / self._rows) if self._rows else 0.0
+
+    def records(self) -> Iterator[Message]:
+        """Read all messages by log time, ties as the file numbers them."""
+        with self._connected() as connection:
+            self._rows_read = 0
+            # Counted without the index, which may lack messages where it is damaged.
+            query = "SELECT COUNT(*) FROM messages NOT INDEXED"
+            (self._rows,) = connection.execute(query).fetchone()
+            # Ids first: sorting whole rows would copy the recording where no index helps.
+            for (row_id,) in connection.execute("SELECT id FROM messages ORDER BY timestamp, id"):
+                self._rows_read += 1
+                yield self._message(connection, row_id, f"message {self._rows_read}")
+            if self._rows_read != self._rows:
+                raise self._bad_index()
+
+    def _bad_index(self) -> SourceError:
+        return SourceError(
+            self._shown,
+            "is damaged: its index of times does not list its messages",
+            "Make it anew with `REINDEX` in the sqlite3 tool.",
+        )
+
+    def _message(self, connection: sqlite3.Connection, row_id: int, place: str) -> Message:
+        row = connection.execute(
+            "SELECT topic_id, timestamp, data, typeof(data) FROM messages WHERE id = ?", (row_id,)
+        ).fetchone()
+        if row is None:
+            raise self._bad_index()
+        topic_id, timestamp, data, kind = row
+        channel = self._channels.get(topic_id)
+        if channel is None:
+            raise SourceError(
+                self._shown,
+                f"{place} is of topic id {topic_id}, which its table of topics does not have",
+                "`ros2 bag convert` leaves such messages out.",
+            )
+        place = f"{place}, topic {channel.topic}"
+        if not isinstance(timestamp, int) or timestamp < 0:
+            raise SourceError(self._shown, f"{place}: the time {timestamp!r} is no time")
+        if kind != b"blob":
+            raise SourceError(self._shown, f"{place}: the payload is {kind.decode()} and no blob")
+        if self._decompress:
+            try:
+                data = self._decompress(data)
+            except DamageError as error:
+                raise SourceError(self._shown, f"{place}: {error}") from None
+        return Message(channel, timestamp, timestamp, 0, data)
+
+    def stats(self) -> Mapping[int, ChannelStats]:
+        """Counts and spans by channel id."""
+        stats = {channel_id: ChannelStats(0, 0, 0) for channel_id in self._channels}
+        with self._connected() as connection:
+            for topic_id, count, start, end in connection.execute(
+                "SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp)"
+                " FROM messages GROUP BY topic_id"
+            ):
+                if topic_id in stats and isinstance(start, int) and isinstance(end, int):
+                    stats[topic_id] = ChannelStats(count, start, end)
+        return stats
+
+    def times(self) -> Mapping[int, NDArray[np.int64]]:
+        """Log times by channel id, nanoseconds, sorted."""
+        times: dict[int, array[int]] = {}
+        with self._connected() as connection:
+            for topic_id, timestamp in connection.execute(
+                "SELECT topic_id, timestamp FROM messages WHERE typeof(timestamp) = 'integer'"
+            ):
+                times.setdefault(topic_id, array("q")).append(timestamp)
+        return {key: np.sort(np.array(values, np.int64)) for key, values in times.items()}
+
+    def first(self, channel: Channel) -> Message | None:
+        """The channel's first message by log time, or None."""
+        with self._connected() as connection:
+            row = connection.execute(
+                "SELECT id FROM messages WHERE topic_id = ? ORDER BY timestamp, id LIMIT 1",
+                (channel.id,),
+            ).fetchone()
+            return self._message(connection, row[0], "the first message") if row else None

@@ -1,0 +1,191 @@
+"""Message definitions of ROS 1 and ROS 2 as rosbags' field lists: parse, compare, choose."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.msg import normalize_msgtype
+from rosbags.typesys.store import Typestore
+
+from mp4ds.errors import OptionError
+from mp4ds.records import Schema
+
+if TYPE_CHECKING:
+    from rosbags.interfaces.typing import Fielddefs, FieldDesc, Typesdict
+
+HEADER = "std_msgs/msg/Header"
+BUILTIN = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+
+_FILLER = "structure_needs_at_least_one_member"  # what empty messages hold in ROS 2
+_BYTES = {"byte": "uint8", "char": "uint8", "octet": "uint8"}
+_RULER = "=" * 80
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """ROS 1 or ROS 2.
+
+    Attributes:
+        name: ``ROS 1`` or ``ROS 2``.
+        encoding: Message encoding of its channels.
+        schema_encoding: Encoding of the definitions that are made for it.
+        standard: The types that it ships.
+    """
+
+    name: str
+    encoding: str
+    schema_encoding: str
+    standard: Typesdict
+
+
+def ros1_world() -> World:
+    """ROS 1 with the types of Noetic."""
+    return World("ROS 1", "ros1", "ros1msg", get_typestore(Stores.ROS1_NOETIC).fielddefs)
+
+
+def ros2_world(distribution: str) -> World:
+    """ROS 2 with the types of a distribution, such as ``humble``.
+
+    Raises:
+        OptionError: The distribution is not known.
+    """
+    known = {store.value[5:]: store for store in Stores if store.value.startswith("ros2_")}
+    if distribution not in known:
+        names = ", ".join(known)
+        raise OptionError(f"ROS 2 distribution {distribution!r} is not known. Use {names}.")
+    return World("ROS 2", "cdr", "ros2msg", get_typestore(known[distribution]).fielddefs)
+
+
+def types_of(schema: Schema, world: World) -> Typesdict:
+    """The type of a schema, and all that it refers to; standard ones where it lacks them.
+
+    Raises:
+        KeyError: A type is defined nowhere.
+        TypesysError: The definition does not parse.
+    """
+    name = normalize_msgtype(schema.name)
+    found = _parse(schema, name)
+    if not fields_of(found, name) and name in world.standard:
+        found.pop(name, None)  # an empty definition that is not that of an empty message
+    # Time, duration and header are the world's own, whatever their definition is called.
+    for builtin in (*BUILTIN, HEADER):
+        found.pop(builtin, None)
+    return closure(found, name, world.standard)
+
+
+def _parse(schema: Schema, name: str) -> Typesdict:
+    text = schema.data.decode(errors="replace").replace("\r\n", "\n")
+    if not schema.encoding or not text.strip():
+        return {}
+    if schema.encoding in ("ros2idl", "omgidl") or re.match(r"=+\nIDL: ", text):
+        parts = re.split(r"(?m)^=+\n(?:IDL: .*\n)?", text)
+        parsed = (get_types_from_idl(part) for part in parts if part.strip())
+        return {key: value for types in parsed for key, value in types.items()}
+    text = re.sub(r"(?m)^={20,}[ \t]*$", _RULER, text)
+    if schema.encoding == "ros1msg":
+        text = re.sub(r"\broslib/Header\b", "std_msgs/Header", text)  # its name before 2010
+    return get_types_from_msg(text, name)
+
+
+def closure(types: Typesdict, root: str, standard: Typesdict) -> Typesdict:
+    """A type and all that it refers to, each from the first that has it.
+
+    Raises:
+        KeyError: One is in neither.
+    """
+    found: Typesdict = {}
+    todo = [root]
+    while todo:
+        name = todo.pop()
+        if name not in found:
+            found[name] = types[name] if name in types else standard[name]
+            todo += [part for _, desc in found[name][1] if (part := _shape(desc)[3])]
+    return found
+
+
+def fields_of(types: Typesdict, name: str) -> Fielddefs:
+    """A type's fields, none for a type that is not known."""
+    fields = types[name][1] if name in types else []
+    return [field for field in fields if field[0] != _FILLER]
+
+
+def same_wire(left: Typesdict, left_name: str, right: Typesdict, right_name: str) -> bool:
+    """Whether two types serialise alike, whatever their fields are called.
+
+    Headers count as alike: only that of ROS 1 has a sequence number, which conversion knows.
+    """
+    if left_name == right_name == HEADER:
+        return True
+    left_fields, right_fields = fields_of(left, left_name), fields_of(right, right_name)
+    if len(left_fields) != len(right_fields):
+        return False
+    for (_, left_desc), (_, right_desc) in zip(left_fields, right_fields, strict=True):
+        *left_shape, left_part = _shape(left_desc)
+        *right_shape, right_part = _shape(right_desc)
+        if left_shape != right_shape or bool(left_part) != bool(right_part):
+            return False
+        if left_part and not same_wire(left, left_part, right, right_part):
+            return False
+    return True
+
+
+def _shape(desc: FieldDesc) -> tuple[int, int, str, str]:
+    """Kind, length of an array, base type, name of a message type; bounds do not matter."""
+    kind, count = Nodetype.BASE, 0
+    if desc[0] == Nodetype.ARRAY or desc[0] == Nodetype.SEQUENCE:
+        kind = desc[0]
+        count = desc[1][1] if kind == Nodetype.ARRAY else 0
+        desc = desc[1][0]
+    if desc[0] == Nodetype.NAME:
+        return kind, count, "", str(desc[1])
+    base = str(desc[1][0])
+    return kind, count, _BYTES.get(base, base), ""
+
+
+def translate(types: Typesdict, root: str, new_root: str, world: World) -> Typesdict:
+    """Definitions for another world: its standard ones where they serialise alike.
+
+    Args:
+        types: The definitions, complete.
+        root: The type to translate.
+        new_root: Its name in the other world.
+        world: The other world.
+    """
+    chosen: Typesdict = {}
+    for name in types:
+        new_name = new_root if name == root else name
+        if new_name in world.standard and same_wire(types, name, world.standard, new_name):
+            chosen.update(closure({}, new_name, world.standard))
+        else:
+            constants, fields = types[name]
+            # ROS 1 cannot write bounds; ROS 1 definitions have none to lose.
+            chosen.setdefault(new_name, (constants, _without_bounds(fields)))
+    return chosen
+
+
+def _without_bounds(fields: Fielddefs) -> Fielddefs:
+    """Fields without bounds of strings and sequences, which do not show on the wire."""
+    return [(name, _unbounded(desc)) for name, desc in fields]
+
+
+def _unbounded(desc: FieldDesc) -> FieldDesc:
+    if desc[0] == Nodetype.BASE:
+        return (desc[0], (desc[1][0], 0))
+    if desc[0] == Nodetype.NAME:
+        return desc
+    part, count = desc[1]
+    if part[0] == Nodetype.BASE:
+        part = (part[0], (part[1][0], 0))
+    return (desc[0], (part, count if desc[0] == Nodetype.ARRAY else 0))
+
+
+def make_store(types: Typesdict, world: World) -> Typestore:
+    """A store of definitions with the header of a world."""
+    store = get_typestore(Stores.EMPTY)
+    own = {name: found for name, found in types.items() if name not in (*BUILTIN, HEADER)}
+    store.register({HEADER: world.standard[HEADER], **own})
+    return store

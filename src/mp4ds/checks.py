@@ -1,0 +1,310 @@
+"""``validate``: every problem of a sidecar, a dataset, or a folder of datasets.
+
+Three tiers: schema (the released JSON Schema), model (types and rules of one file), checks
+(rules over several files). Codes are listed in spec/registry.md, "Problem codes".
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from mp4ds.dataset import Dataset, Stream
+from mp4ds.errors import FormatError, Mp4dsError, SourceError, SourceNotFoundError
+from mp4ds.outputs import digest_file
+from mp4ds.records import Message
+from mp4ds.sidecar import (
+    MANIFEST_NAME,
+    MESSAGES_NAME,
+    Manifest,
+    StreamSidecar,
+    load_document,
+    schema_text,
+)
+from mp4ds.sidecar.io import model_for, model_problems
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One problem found.
+
+    Attributes:
+        code: Stable code, see spec/registry.md.
+        place: File, with key, topic or frame where known.
+        message: What is wrong.
+    """
+
+    code: str
+    place: str
+    message: str
+
+    def __str__(self) -> str:
+        return f"{self.place}: {self.message} [{self.code}]"
+
+
+def validate(
+    path: Path | str, *, deep: bool = False, progress: Callable[[str], None] | None = None
+) -> list[Problem]:
+    """Find all problems of a sidecar, a video with its sidecar, a dataset, or a folder of them.
+
+    Args:
+        path: What to validate.
+        deep: Also hash every file, decode every frame, rebuild every message, and compare.
+        progress: Called with a phrase before each costly step.
+
+    Returns:
+        All problems; empty if there is none.
+
+    Raises:
+        SourceNotFoundError: There is nothing at the path.
+        SourceError: It is nothing that can be validated.
+    """
+    path = Path(path)
+    report = progress or (lambda _: None)
+    if not path.exists():
+        raise SourceNotFoundError(path)
+    if path.name == MANIFEST_NAME:
+        path = path.parent
+    if path.is_dir():
+        return [
+            problem
+            for folder in _datasets_in(path)
+            for problem in _validate_dataset(folder, deep, report)
+        ]
+    sidecar = path.with_suffix(".yaml") if path.suffix == ".mp4" else path
+    if sidecar.suffix not in (".yaml", ".yml"):
+        raise SourceError(
+            path,
+            "is neither a dataset, a sidecar nor a video of one",
+            "Give a dataset folder, a .yaml sidecar, or an .mp4 beside its sidecar.",
+        )
+    return [*_validate_file(sidecar, "stream"), *_validate_stream(sidecar, deep, report)]
+
+
+def _datasets_in(folder: Path) -> list[Path]:
+    if (folder / MANIFEST_NAME).is_file():
+        return [folder]
+    found = sorted(manifest.parent for manifest in folder.rglob(MANIFEST_NAME))
+    if not found:
+        raise SourceError(
+            folder,
+            f"holds no dataset: there is no {MANIFEST_NAME} in it or below it",
+            "Give the folder that `mp4ds pack` made.",
+        )
+    return found
+
+
+def _validate_file(path: Path, kind: str) -> list[Problem]:
+    """Tiers schema and model of one YAML file."""
+    try:
+        document = load_document(path)
+    except FormatError as error:
+        return [Problem(error.code, error.place, error.problem)]
+    if document["kind"] != kind:
+        return [Problem("kind-unknown", str(path), f"is no {kind}")]
+    problems = [
+        Problem("schema-invalid", f"{path} at {'.'.join(map(str, error.absolute_path))}", reason)
+        for error in _schema_validator(kind).iter_errors(document)
+        for reason in [_shortened(error.message)]
+    ]
+    if problems:
+        return problems
+    try:
+        model_for(document).model_validate(document)
+    except ValidationError as error:
+        return [
+            Problem("model-invalid", f"{path} at {place}", reason)
+            for place, reason in model_problems(error)
+        ]
+    return []
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= 200 else f"{text[:100]} ... {text[-80:]}"
+
+
+@lru_cache(maxsize=None)
+def _schema_validator(kind: str) -> Any:
+    from jsonschema import Draft202012Validator
+
+    return Draft202012Validator(json.loads(schema_text(kind)))
+
+
+def _validate_dataset(folder: Path, deep: bool, report: Callable[[str], None]) -> list[Problem]:
+    problems = _validate_file(folder / MANIFEST_NAME, "dataset")
+    if problems:
+        return problems
+    manifest = Manifest.model_validate(load_document(folder / MANIFEST_NAME))
+    problems = list(_check_files(folder, manifest, deep, report))
+    for entry in manifest.streams:
+        sidecar_problems = _validate_file(folder / entry.sidecar, "stream")
+        if not sidecar_problems:
+            sidecar_problems = [
+                *_check_entry(folder, manifest, entry.sidecar),
+                *_validate_stream(folder / entry.sidecar, deep, report),
+            ]
+        problems += sidecar_problems
+    problems += _check_listed(folder, manifest)
+    if not problems:
+        problems += _check_messages(folder, manifest, deep, report)
+    return problems
+
+
+def _check_files(
+    folder: Path, manifest: Manifest, deep: bool, report: Callable[[str], None]
+) -> Iterator[Problem]:
+    """Each file of the manifest is there, has its size and, if deep, its hash."""
+    for entry in manifest.files:
+        path = folder / entry.name
+        if not path.is_file():
+            yield Problem("file-missing", str(path), "is listed in the manifest and not there")
+            continue
+        size = path.stat().st_size
+        if size != entry.size:
+            yield Problem(
+                "size-mismatch", str(path), f"has {size} bytes where the manifest says {entry.size}"
+            )
+        elif deep or path.suffix == ".yaml":
+            report(f"hashing {path.name}")
+            if digest_file(path)[1] != entry.sha256:
+                yield Problem(
+                    "hash-mismatch", str(path), "does not have the SHA-256 that the manifest says"
+                )
+
+
+def _check_listed(folder: Path, manifest: Manifest) -> Iterator[Problem]:
+    """Each file of the folder is in the manifest, and each stream's files too."""
+    listed = {entry.name for entry in manifest.files}
+    for entry in manifest.streams:
+        for name in (entry.sidecar, entry.video):
+            if name not in listed:
+                yield Problem(
+                    "manifest-inconsistent", str(folder / MANIFEST_NAME), f"does not list {name}"
+                )
+    if MESSAGES_NAME not in listed:
+        yield Problem(
+            "manifest-inconsistent", str(folder / MANIFEST_NAME), f"does not list {MESSAGES_NAME}"
+        )
+    for path in sorted(folder.iterdir()):
+        if path.name not in listed and path.suffix in (".mp4", ".yaml", ".mcap"):
+            if path.name != MANIFEST_NAME:
+                yield Problem("file-unlisted", str(path), "is not listed in the manifest")
+
+
+def _check_entry(folder: Path, manifest: Manifest, name: str) -> Iterator[Problem]:
+    """A sidecar says the same as the manifest."""
+    sidecar = StreamSidecar.model_validate(load_document(folder / name))
+    entry = next(entry for entry in manifest.streams if entry.sidecar == name)
+    for what, own, listed in (
+        ("topic", sidecar.channel.topic, entry.topic),
+        ("video", sidecar.video.file, entry.video),
+        ("frames", sidecar.frames, entry.frames),
+    ):
+        if own != listed:
+            yield Problem(
+                "manifest-inconsistent",
+                str(folder / MANIFEST_NAME),
+                f"says {what} {listed} for {name}, which says {own}",
+            )
+
+
+def _validate_stream(path: Path, deep: bool, report: Callable[[str], None]) -> list[Problem]:
+    """A valid sidecar's columns and its video."""
+    try:
+        stream = Stream(path)
+        problems = list(_check_video_file(stream, deep, report))
+        _ = stream.rebuilder  # decodes and checks the columns
+        if stream.sidecar.camera_info and stream.sidecar.camera_info.messages:
+            _ = list(stream.camera_info_messages(stream.sidecar.channel.to_record(0)))
+        with stream.open_video(sequential=True) as decoder:
+            coded = decoder.coded_frames
+            if coded != len(stream):
+                problems.append(
+                    Problem(
+                        "frame-count",
+                        str(stream.video_path),
+                        f"has {coded} frames where its sidecar says {len(stream)}",
+                    )
+                )
+                return problems
+        if deep:
+            problems += _check_frames(stream, report)
+    except FormatError as error:
+        return [Problem(error.code, error.place, error.problem)]
+    except Mp4dsError as error:
+        return [Problem("stream-invalid", str(path), str(error))]
+    return problems
+
+
+def _check_video_file(
+    stream: Stream, deep: bool, report: Callable[[str], None]
+) -> Iterator[Problem]:
+    video, path = stream.sidecar.video, stream.video_path
+    if not path.is_file():
+        return  # reported when it is opened
+    size = path.stat().st_size
+    if video.size is not None and size != video.size:
+        yield Problem(
+            "size-mismatch", str(path), f"has {size} bytes where its sidecar says {video.size}"
+        )
+    elif deep and video.sha256 is not None:
+        report(f"hashing {path.name}")
+        if digest_file(path)[1] != video.sha256:
+            yield Problem(
+                "hash-mismatch", str(path), "does not have the SHA-256 that its sidecar says"
+            )
+
+
+def _check_frames(stream: Stream, report: Callable[[str], None]) -> Iterator[Problem]:
+    """Every frame decodes and, where there is a digest, its message is the original one."""
+    report(f"decoding {stream.video_path.name}")
+    rebuilder = stream.rebuilder
+    with stream.open_video(sequential=True) as decoder:
+        for index, picture in enumerate(decoder.pictures()):
+            try:
+                rebuilder.payload(index, picture)
+            except FormatError as error:
+                yield Problem(error.code, error.place, error.problem)
+
+
+def _check_messages(
+    folder: Path, manifest: Manifest, deep: bool, report: Callable[[str], None]
+) -> list[Problem]:
+    """messages.mcap can be read, and all messages together are as many as were packed."""
+    place = str(folder / MESSAGES_NAME)
+    try:
+        with Dataset(folder) as dataset:
+            in_videos = sum(_modelled(stream) for stream in dataset.streams)
+            counted: int | None = dataset.recorded_count
+            if deep or counted is None:
+                report(f"reading {MESSAGES_NAME}")
+                counts = Counter(
+                    isinstance(record, Message) for record in dataset.recorded_records()
+                )
+                counted = counts[True]
+    except FormatError as error:
+        return [Problem(error.code, error.place, error.problem)]
+    except SourceError as error:
+        return [Problem("messages-unreadable", place, str(error))]
+    total = in_videos + counted
+    if total != manifest.messages:
+        return [
+            Problem(
+                "message-count",
+                place,
+                f"and the videos hold {total} messages where the manifest says {manifest.messages}",
+            )
+        ]
+    return []
+
+
+def _modelled(stream: Stream) -> int:
+    info = stream.sidecar.camera_info
+    return len(stream) + (info.messages if info else 0)

@@ -1,0 +1,127 @@
+"""Every error that mp4ds raises on purpose.
+
+::
+
+    Mp4dsError                         exit code 1
+    ├── SourceError (ValueError)       2  a recording that cannot be read as asked
+    │   └── SourceNotFoundError (FileNotFoundError)
+    ├── TargetError (OSError)          2  an output that may not be written there
+    │   └── TargetExistsError (FileExistsError)
+    ├── OptionError (ValueError)       2  options that contradict or are unknown
+    ├── FormatError (ValueError)       1  a dataset that breaks a rule of the format
+    │   ├── VersionError               1  written by a newer major version
+    │   └── VideoError                 1  a video that cannot be decoded as its sidecar says
+    ├── ConversionError (ValueError)   1  a message that the target cannot hold
+    └── WriteError (OSError)           1  the disk refused while writing
+
+The classes build their sentence from their fields: what, where, and what to do.
+The exit code is the one that the command line ends with.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class Mp4dsError(Exception):
+    """Base of every error raised on purpose; ``str()`` is one clear sentence."""
+
+    exit_code = 1
+
+
+class SourceError(Mp4dsError, ValueError):
+    """A recording cannot be read as asked.
+
+    Args:
+        path: The recording.
+        problem: What is wrong, without a full stop.
+        remedy: What the user can do, if anything.
+    """
+
+    exit_code = 2
+
+    def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
+        self.path = Path(path)
+        super().__init__(f"{path}: {problem}." + (f" {remedy}" if remedy else ""))
+
+
+class SourceNotFoundError(SourceError, FileNotFoundError):
+    """The recording does not exist."""
+
+    def __init__(self, path: Path | str) -> None:
+        super().__init__(path, "no such file or folder", "Check the path.")
+
+
+class TargetError(Mp4dsError, OSError):
+    """An output may not be written where it was asked for."""
+
+    exit_code = 2
+
+    def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
+        self.path = Path(path)
+        super().__init__(f"{path}: {problem}." + (f" {remedy}" if remedy else ""))
+
+
+class TargetExistsError(TargetError, FileExistsError):
+    """The output exists and ``force`` was not given."""
+
+    def __init__(self, path: Path | str) -> None:
+        super().__init__(path, "exists already", "Choose another name, or replace it with --force.")
+
+
+class OptionError(Mp4dsError, ValueError):
+    """An option is unknown, malformed, or contradicts another one."""
+
+    exit_code = 2
+
+
+class FormatError(Mp4dsError, ValueError):
+    """A dataset breaks a rule of the format.
+
+    Args:
+        code: A problem code of spec/registry.md.
+        place: File, with key or frame where known.
+        problem: What is wrong, without a full stop.
+    """
+
+    def __init__(self, code: str, place: Path | str, problem: str) -> None:
+        self.code = code
+        self.place = str(place)
+        self.problem = problem
+        super().__init__(f"{place}: {problem} [{code}].")
+
+
+class VersionError(FormatError):
+    """The dataset was written in a newer major version of the format."""
+
+    def __init__(self, place: Path | str, found: str, supported: str) -> None:
+        super().__init__(
+            "version-unsupported",
+            place,
+            f"is of format version {found!r}, and this mp4ds reads up to {supported!r}; "
+            "install a newer mp4ds",
+        )
+
+
+class VideoError(FormatError):
+    """A video cannot be decoded as its sidecar says."""
+
+
+class ConversionError(Mp4dsError, ValueError):
+    """A message that the target cannot hold."""
+
+    def __init__(self, topic: str, problem: str, remedy: str = "") -> None:
+        self.topic = topic
+        super().__init__(f"topic {topic}: {problem}." + (f" {remedy}" if remedy else ""))
+
+
+class WriteError(Mp4dsError, OSError):
+    """The disk refused while an output was written; nothing stays under its final name."""
+
+    def __init__(self, path: Path | str, cause: BaseException) -> None:
+        self.path = Path(path)
+        reason = getattr(cause, "strerror", None) or str(cause)
+        super().__init__(
+            f"{path}: could not be written: {reason}. "
+            "The source is untouched and the unfinished output was removed."
+        )

@@ -1,0 +1,129 @@
+"""Outputs appear under their final name only when whole.
+
+An output is made in a folder beside its target, on the same file system, and moved into
+place by one rename; whatever goes wrong before leaves nothing but the target as it was.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from mp4ds.errors import TargetError, TargetExistsError, WriteError
+
+
+@contextmanager
+def staged(
+    target: Path, *, force: bool, replaceable: Callable[[Path], bool]
+) -> Iterator[Path]:
+    """Make an output under a temporary name and move it into place at the end.
+
+    Args:
+        target: The final name; its parent folder must exist.
+        force: Replace an existing target.
+        replaceable: Whether an existing target is of the kind that may be replaced.
+
+    Yields:
+        A path that does not exist yet, for the caller to make a file or folder at.
+
+    Raises:
+        TargetExistsError: The target exists and ``force`` is not set.
+        TargetError: It may not be written or replaced.
+        WriteError: The disk refused.
+    """
+    check_target(target, force=force, replaceable=replaceable)
+    try:
+        folder = Path(tempfile.mkdtemp(prefix=f".{target.name[:60]}.", suffix=".part", dir=target.parent))
+    except OSError as error:
+        raise TargetError(
+            target, f"cannot be written there: {error.strerror}", "Choose another folder."
+        ) from None
+    try:
+        path = folder / target.name
+        try:
+            yield path
+            _sync(path)
+        except OSError as error:
+            raise as_write_error(error, target) from error
+        _move_into_place(path, target, folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def check_target(target: Path, *, force: bool, replaceable: Callable[[Path], bool]) -> None:
+    """Refuse a target early, before any work is done. See `staged` for the errors."""
+    if not target.parent.is_dir():
+        raise TargetError(
+            target, f"its folder {target.parent} does not exist", "Make the folder first."
+        )
+    if not os.path.lexists(target):
+        return
+    if not force:
+        raise TargetExistsError(target)
+    if not replaceable(target):
+        raise TargetError(
+            target,
+            "exists and is not something that mp4ds wrote, so --force does not replace it",
+            "Choose another name, or remove it yourself.",
+        )
+
+
+def as_write_error(error: OSError, target: Path) -> OSError:
+    """The error to report for an operating system's error while writing."""
+    if isinstance(error, (WriteError, TargetError)) or error.errno is None:
+        return error
+    if error.errno in _WRITE_ERRNOS:
+        return WriteError(target, error)
+    return error
+
+
+_BLOCK = 2**20
+_WRITE_ERRNOS = {
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EIO,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.ENAMETOOLONG,
+}
+
+
+def _sync(path: Path) -> None:
+    """Bring an output's bytes to the disk before its name is."""
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+    for file in files:
+        with file.open("rb") as stream:
+            os.fsync(stream.fileno())
+
+
+def _move_into_place(path: Path, target: Path, folder: Path) -> None:
+    old = folder / "replaced"
+    replaced = os.path.lexists(target)
+    if replaced:
+        target.rename(old)
+    try:
+        path.rename(target)
+    except OSError:
+        if replaced:
+            with suppress(OSError):
+                old.rename(target)
+        raise
+
+
+def digest_file(path: Path) -> tuple[int, str]:
+    """Size in bytes and SHA-256 of a file."""
+    digest = hashlib.sha256()
+    size = 0
+    with path.open("rb") as stream:
+        while block := stream.read(_BLOCK):
+            digest.update(block)
+            size += len(block)
+    return size, digest.hexdigest()

@@ -1,0 +1,183 @@
+"""Which topics become streams, what they are called, and how they are encoded. Pure.
+
+File names follow spec/index.md, "File names"; camera_info pairing follows the rule of
+ROS's image_transport; the visual table is that of the paper (Li, Xu, Schwertfeger, 2024).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+import xxhash
+
+from mp4ds.errors import OptionError
+from mp4ds.records import Channel
+
+IMAGE_TYPES = frozenset({"sensor_msgs/Image", "sensor_msgs/msg/Image"})
+CAMERA_INFO_TYPES = frozenset({"sensor_msgs/CameraInfo", "sensor_msgs/msg/CameraInfo"})
+
+_MAX_NAME = 100
+_RESERVED = {"dataset", "messages", "con", "prn", "aux", "nul"} | {
+    f"{port}{number}" for port in ("com", "lpt") for number in range(10)
+}
+
+VISUAL_TABLE: tuple[tuple[float, int, int], ...] = (
+    (2.0, 18, 8),
+    (5.0, 17, 8),
+    (10.0, 17, 8),
+    (20.0, 18, 8),
+    (30.0, 18, 8),
+    (60.0, 22, 6),
+)
+"""Frame rate in Hz, crf and preset of SVT-AV1 for VMAF 99.5: the paper's table."""
+
+_UNKNOWN_RATE = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Quality:
+    """What ``--quality`` asked for.
+
+    Attributes:
+        name: ``lossless``, ``visual`` or ``crf``.
+        crf: The constant rate factor, for ``crf`` only.
+    """
+
+    name: str
+    crf: int | None = None
+
+    @property
+    def lossless(self) -> bool:
+        """Whether every pixel must return as it was."""
+        return self.name == "lossless"
+
+    def __str__(self) -> str:
+        return self.name if self.crf is None else f"crf={self.crf}"
+
+
+def parse_quality(text: str) -> Quality:
+    """Parse ``lossless``, ``visual`` or ``crf=N``.
+
+    Raises:
+        OptionError: Anything else.
+    """
+    if text in ("lossless", "visual"):
+        return Quality(text)
+    match = re.fullmatch(r"crf=(\d{1,2})", text)
+    if match and int(match.group(1)) <= 63:
+        return Quality("crf", int(match.group(1)))
+    raise OptionError(
+        f"--quality {text!r} is not known. Use lossless, visual, or crf=N with N from 0 to 63."
+    )
+
+
+def visual_setting(rate: float | None) -> tuple[int, int]:
+    """The crf and preset of the table row nearest to a frame rate.
+
+    Args:
+        rate: Frames per second, or None where no index tells; then 30 is assumed.
+    """
+    wanted = rate or _UNKNOWN_RATE
+    _, crf, preset = min(VISUAL_TABLE, key=lambda row: abs(row[0] - wanted))
+    return crf, preset
+
+
+class Selection:
+    """Topics chosen by globs.
+
+    Args:
+        topics: Globs of which one must match; empty for all topics.
+        exclude: Globs of which none may match.
+    """
+
+    def __init__(self, topics: Sequence[str] = (), exclude: Sequence[str] = ()) -> None:
+        self._topics = tuple(topics)
+        self._exclude = tuple(exclude)
+
+    def __call__(self, topic: str) -> bool:
+        """Whether the topic is chosen."""
+        if self._topics and not _matches(topic, self._topics):
+            return False
+        return not _matches(topic, self._exclude)
+
+    def check(self, topics: Iterable[str]) -> None:
+        """Refuse a pattern that matches nothing: it is a typing error, or data would be missed.
+
+        Raises:
+            OptionError: Names the pattern and the topics there are.
+        """
+        known = sorted(set(topics))
+        for option, patterns in (("--topics", self._topics), ("--exclude", self._exclude)):
+            for pattern in patterns:
+                if not any(_matches(topic, (pattern,)) for topic in known):
+                    listed = ", ".join(known[:20]) + (", ..." if len(known) > 20 else "")
+                    raise OptionError(
+                        f"{option} {pattern!r} matches no topic. There are: {listed or 'none'}."
+                    )
+
+
+def _matches(topic: str, patterns: Iterable[str]) -> bool:
+    return any(
+        fnmatchcase(topic, pattern) or fnmatchcase("/" + topic.lstrip("/"), pattern)
+        for pattern in patterns
+    )
+
+
+class FileNames:
+    """Gives each stream a file name that no topic can turn into a path or take from another."""
+
+    def __init__(self) -> None:
+        self._taken: set[str] = set()
+
+    def name_for(self, topic: str) -> tuple[str, bool]:
+        """A stem for the stream's files.
+
+        Returns:
+            The stem, and whether another stream had taken the plain one.
+        """
+        stem = re.sub(r"[^A-Za-z0-9._-]+", "_", topic.strip("/")).strip("._-") or "topic"
+        if len(stem) > _MAX_NAME:
+            stem = f"{stem[: _MAX_NAME - 17]}-{xxhash.xxh64(topic.encode()).hexdigest()}"
+        if stem.casefold().split(".")[0] in _RESERVED:
+            stem = f"topic_{stem}"
+        name, number = stem, 1
+        while name.casefold() in self._taken:
+            number += 1
+            name = f"{stem}-{number}"
+        self._taken.add(name.casefold())
+        return name, name != stem
+
+
+def pair_camera_infos(channels: Sequence[Channel]) -> dict[int, int]:
+    """Pair camera_info channels with image channels.
+
+    A `CameraInfo` topic named ``camera_info`` belongs to the image topic beside it in the
+    same namespace, of several to the first by name; of several publishers on one topic, only
+    an only one is paired.
+
+    Returns:
+        Id of the camera_info channel -> id of the image channel.
+    """
+    images: dict[str, list[Channel]] = {}
+    infos: dict[str, list[Channel]] = {}
+    for channel in channels:
+        namespace, _, leaf = channel.topic.strip("/").rpartition("/")
+        if channel.type_name in IMAGE_TYPES:
+            images.setdefault(namespace, []).append(channel)
+        elif channel.type_name in CAMERA_INFO_TYPES and leaf == "camera_info":
+            infos.setdefault(namespace, []).append(channel)
+    pairs: dict[int, int] = {}
+    for namespace, found in infos.items():
+        candidates = images.get(namespace, [])
+        if len(found) == 1 and candidates:
+            pairs[found[0].id] = min(candidates, key=_image_preference).id
+    return pairs
+
+
+def _image_preference(channel: Channel) -> tuple[int, str, int]:
+    # The raw image is the one that the calibration was made for.
+    leaf = channel.topic.rstrip("/").rpartition("/")[2]
+    return (0 if leaf == "image_raw" else 1, channel.topic, channel.id)

@@ -1,0 +1,133 @@
+"""Reading and writing the YAML files, through the tiers schema and model."""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from mp4ds import yamlio
+from mp4ds.errors import FormatError, VersionError
+from mp4ds.sidecar.migrate import migrate, version_of
+from mp4ds.sidecar.models import (
+    FORMAT_VERSION,
+    Manifest,
+    StreamSidecar,
+    document_of,
+    parse_version,
+)
+
+MANIFEST_NAME = "dataset.yaml"
+
+_COMMENTS = {
+    "stream": "One camera stream, packed by mp4ds: frame n of the video is entry n of each column.",
+    "dataset": "A robot recording, packed by mp4ds: `mp4ds unpack` gives it back.",
+}
+_MODELS: dict[str, type[StreamSidecar] | type[Manifest]] = {
+    "stream": StreamSidecar,
+    "dataset": Manifest,
+}
+_ModelT = TypeVar("_ModelT", bound=BaseModel)
+
+
+def dump_document(model: StreamSidecar | Manifest) -> bytes:
+    """The YAML file of a model."""
+    return yamlio.dump(document_of(model), comment=_COMMENTS[model.kind])
+
+
+def load_document(path: Path) -> dict[str, Any]:
+    """Read a file of any version as a document of the current one.
+
+    Raises:
+        FormatError: ``file-missing``, ``yaml-invalid``, ``checksum-mismatch``,
+            ``version-unsupported``, ``migration-failed`` or ``kind-unknown``.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FormatError("file-missing", path, f"cannot be read: {error.strerror}") from None
+    document = migrate(yamlio.load(data, str(path)), str(path))
+    version = version_of(document)
+    if version is None:
+        raise FormatError(
+            "version-unsupported", path, 'has no version such as `mp4ds: "1.0"`, in quotes'
+        )
+    try:
+        found = parse_version(version)
+    except ValueError as error:
+        raise FormatError("version-unsupported", path, str(error)) from None
+    if found[0] > parse_version(FORMAT_VERSION)[0]:
+        raise VersionError(path, version, FORMAT_VERSION)
+    if document.get("kind") not in _MODELS:
+        raise FormatError("kind-unknown", path, "is neither a stream nor a dataset")
+    return document
+
+
+def load_stream(path: Path) -> StreamSidecar:
+    """Read a stream's sidecar.
+
+    Raises:
+        FormatError: Any code of `load_document`, or ``model-invalid``.
+    """
+    return _model(StreamSidecar, load_document(path), path)
+
+
+def load_manifest(path: Path) -> Manifest:
+    """Read a dataset's manifest.
+
+    Raises:
+        FormatError: Any code of `load_document`, or ``model-invalid``.
+    """
+    return _model(Manifest, load_document(path), path)
+
+
+def _model(model: type[_ModelT], document: dict[str, Any], path: Path) -> _ModelT:
+    try:
+        return model.model_validate(document)
+    except ValidationError as error:
+        problems = model_problems(error)
+        place, problem = problems[0]
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise FormatError("model-invalid", f"{path} at {place}", problem + more) from None
+
+
+def model_problems(error: ValidationError) -> list[tuple[str, str]]:
+    """Place and sentence of each problem that a model found."""
+    return [
+        (
+            ".".join(map(str, item["loc"])) or "the top",
+            item["msg"].removeprefix("Value error, "),
+        )
+        for item in error.errors(include_url=False, include_input=False)
+    ]
+
+
+def model_for(document: dict[str, Any]) -> type[StreamSidecar] | type[Manifest]:
+    """The model of a document that `load_document` returned."""
+    return _MODELS[document["kind"]]
+
+
+@lru_cache(maxsize=None)
+def schema_text(kind: str) -> str:
+    """The released JSON Schema of ``stream`` or ``dataset``, as shipped with the package."""
+    name = f"v{FORMAT_VERSION}/{kind}.schema.json"
+    shipped = files("mp4ds") / "schemas" / name
+    if shipped.is_file():
+        return shipped.read_text(encoding="utf-8")
+    # a checkout: the wheel's copy is made from this folder
+    return (Path(__file__).parents[3] / "schemas" / name).read_text(encoding="utf-8")
+
+
+def generate_schema(kind: str) -> str:
+    """The JSON Schema that the models describe now."""
+    schema = _MODELS[kind].model_json_schema(by_alias=True, mode="validation")
+    schema = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$id": f"urn:mp4ds:{FORMAT_VERSION}:{kind}",
+        **schema,
+    }
+    return json.dumps(schema, indent=2) + "\n"

@@ -1,0 +1,254 @@
+"""Dataset -> bag, rosbag2, MCAP or images."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from mp4ds.bags import BagWriter, Converter, open_writer
+from mp4ds.dataset import Dataset, Stream
+from mp4ds.errors import OptionError, WriteError
+from mp4ds.outputs import staged
+from mp4ds.plan import FileNames, Selection
+from mp4ds.records import Attachment, Message, MetadataRecord
+from mp4ds.video import ImageFile
+
+TARGETS = ("bag", "rosbag2", "mcap", "images")
+_SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
+_WORLDS: dict[str, Literal["ros1", "ros2"]] = {"bag": "ros1", "rosbag2": "ros2"}
+_OURS = "mp4ds:"  # metadata records by which a dataset remembers what a rosbag2 folder said
+
+
+@dataclass(frozen=True)
+class UnpackOptions:
+    """How to unpack.
+
+    Attributes:
+        storage: ``sqlite3`` or ``mcap``, for rosbag2; None for what the source had.
+        topics: Globs of the topics to unpack; empty for all.
+        exclude: Globs of topics to leave out.
+        image_format: ``png`` or ``jpeg``, for images.
+        force: Replace an existing target.
+    """
+
+    storage: str | None = None
+    topics: Sequence[str] = ()
+    exclude: Sequence[str] = ()
+    image_format: str = "png"
+    force: bool = False
+
+
+@dataclass(frozen=True)
+class UnpackProgress:
+    """Where an unpack stands: messages written, and how many there are (0: not known)."""
+
+    messages: int
+    messages_total: int
+
+
+@dataclass(frozen=True)
+class UnpackSummary:
+    """What an unpack did.
+
+    Attributes:
+        output: The recording or folder made.
+        messages: Messages written, by topic.
+        converted: Types converted between ROS 1 and ROS 2, by topic.
+        omitted: What the target cannot hold and was left out: a phrase -> how many.
+        left_out: Topics left out on request.
+    """
+
+    output: Path
+    messages: dict[str, int] = field(default_factory=dict)
+    converted: list[str] = field(default_factory=list)
+    omitted: dict[str, int] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
+
+
+def unpack(
+    dataset: Path | str,
+    to: str,
+    output: Path | str | None = None,
+    options: UnpackOptions | None = None,
+    *,
+    progress: Callable[[UnpackProgress], None] | None = None,
+) -> UnpackSummary:
+    """Write a dataset's recording again.
+
+    Every message of a lossless stream is compared with its digest on the way.
+
+    Args:
+        dataset: A dataset, or one video with its sidecar.
+        to: ``bag``, ``rosbag2``, ``mcap`` or ``images``.
+        output: The file or folder to make; None for the dataset's name beside it.
+        options: How.
+        progress: Called after every few messages.
+
+    Returns:
+        What was written, and what the target could not hold.
+
+    Raises:
+        FormatError: The dataset is damaged; nothing is left behind.
+        ConversionError: The target cannot hold a topic; names it.
+        TargetError: The output may not be written there.
+        WriteError: The disk refused; nothing is left behind.
+    """
+    chosen = options or UnpackOptions()
+    if to not in TARGETS:
+        raise OptionError(f"--to {to!r} is not known. Use {', '.join(TARGETS)}.")
+    if chosen.storage not in (None, "sqlite3", "mcap"):
+        raise OptionError(f"--storage {chosen.storage!r} is not known. Use sqlite3 or mcap.")
+    if chosen.image_format not in ("png", "jpeg"):
+        raise OptionError(f"--image-format {chosen.image_format!r} is not known. Use png or jpeg.")
+    with Dataset(dataset) as opened:
+        target = Path(os.path.abspath(output or default_output(opened.path, to)))  # noqa: PTH100
+        replaceable = _is_image_folder if to == "images" else _is_recording
+        with staged(target, force=chosen.force, replaceable=replaceable) as path:
+            try:
+                if to == "images":
+                    return _unpack_images(opened, path, target, chosen, progress)
+                return _unpack_recording(opened, path, target, to, chosen, progress)
+            except OSError as error:
+                if error.errno is None:
+                    raise
+                raise WriteError(target, error) from error
+
+
+def default_output(dataset: Path, to: str) -> Path:
+    """The output for a dataset when none is named: beside it, never the source's own name."""
+    stem = dataset.resolve().name if dataset.is_dir() else dataset.stem
+    return dataset.resolve().parent / f"{stem}_unpacked{_SUFFIXES[to]}"
+
+
+def _is_recording(path: Path) -> bool:
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file() or not any(path.iterdir())
+    return path.is_file()
+
+
+def _is_image_folder(path: Path) -> bool:
+    return path.is_dir() and (any(path.glob("*/stamps.csv")) or not any(path.iterdir()))
+
+
+def _unpack_recording(
+    dataset: Dataset,
+    path: Path,
+    target: Path,
+    to: str,
+    options: UnpackOptions,
+    progress: Callable[[UnpackProgress], None] | None,
+) -> UnpackSummary:
+    selected = Selection(options.topics, options.exclude)
+    selected.check(channel.topic for channel in dataset.channels)
+    # a recording returns to its own format as it was, whatever serialization it holds
+    own = dataset.manifest is not None and dataset.manifest.format == to
+    world = None if own else _WORLDS.get(to)
+    converter = Converter(world) if world else None
+    summary = UnpackSummary(target)
+    total = dataset.manifest.messages if dataset.manifest else 0
+    counts: Counter[str] = Counter()
+    library = dataset.manifest.library if dataset.manifest else ""
+    storage = options.storage or _recorded_storage(dataset)
+    with open_writer(
+        path, to, name=target.name, profile=dataset.profile, library=library, storage=storage
+    ) as writer:
+        channels = {}
+        for channel in dataset.channels:
+            if not selected(channel.topic):
+                continue
+            converted = converter.channel(channel) if converter else channel
+            channels[channel.id] = converted
+            writer.add_channel(converted)
+            counts.setdefault(channel.topic, 0)
+            if converted is not channel and channel.topic not in summary.converted:
+                summary.converted.append(channel.topic)
+        for schema in dataset.unused_schemas:
+            writer.add_schema(schema)
+        for record in dataset.records():
+            if isinstance(record, Message):
+                if record.channel.id not in channels:
+                    continue
+                channel = channels[record.channel.id]
+                if converter and channel is not record.channel:
+                    payload = converter.payload(record.channel, record.data)
+                    record = replace(record, channel=channel, data=payload)
+                writer.write(record)
+                counts[record.channel.topic] += 1
+                if progress and counts.total() % 16 == 0:
+                    progress(UnpackProgress(counts.total(), total))
+            else:
+                _write_other(writer, record, to)
+    if progress:
+        progress(UnpackProgress(counts.total(), counts.total()))
+    summary.messages.update(counts)
+    summary.omitted.update(writer.omitted)
+    summary.left_out.extend(
+        sorted({c.topic for c in dataset.channels if not selected(c.topic)})
+    )
+    return summary
+
+
+def _write_other(writer: BagWriter, record: Attachment | MetadataRecord, to: str) -> None:
+    if isinstance(record, Attachment):
+        writer.add_attachment(record)
+    elif to == "rosbag2" or not record.name.startswith(_OURS):
+        writer.add_metadata(record)
+
+
+def _recorded_storage(dataset: Dataset) -> str:
+    """The storage that a rosbag2 source had; mcap, the default of ROS 2, for all others."""
+    for record in dataset.recorded_records():
+        if isinstance(record, MetadataRecord) and record.name == f"{_OURS}rosbag2":
+            return record.metadata.get("storage", "mcap")
+        if isinstance(record, Message):
+            break  # a rosbag2 folder's own record comes before its messages
+    return "mcap"
+
+
+def _unpack_images(
+    dataset: Dataset,
+    path: Path,
+    target: Path,
+    options: UnpackOptions,
+    progress: Callable[[UnpackProgress], None] | None,
+) -> UnpackSummary:
+    selected = Selection(options.topics, options.exclude)
+    selected.check(dataset.topics)
+    summary = UnpackSummary(target)
+    path.mkdir()
+    names = FileNames()
+    streams = [stream for stream in dataset.streams if selected(stream.topic)]
+    total = sum(map(len, streams))
+    done = 0
+    for stream in streams:
+        stem, _ = names.name_for(stream.topic)
+        folder = path / stem
+        folder.mkdir()
+        for _ in _write_images(stream, folder, options.image_format):
+            done += 1
+            if progress:
+                progress(UnpackProgress(done, total))
+        summary.messages[stream.topic] = summary.messages.get(stream.topic, 0) + len(stream)
+    others = {channel.topic for channel in dataset.channels} - set(dataset.topics)
+    summary.left_out.extend(sorted(others))
+    return summary
+
+
+def _write_images(stream: Stream, folder: Path, image_format: str) -> Iterator[None]:
+    """One file per frame, and stamps.csv that tells the times of each."""
+    writer = ImageFile(stream.sidecar.image.encoding, image_format)
+    suffix = "jpg" if image_format == "jpeg" else "png"
+    digits = len(str(len(stream) - 1))
+    with (folder / "stamps.csv").open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["file", "stamp_ns", "log_time_ns", "frame_id"])
+        for frame in stream:
+            name = f"{frame.index:0{digits}d}.{suffix}"
+            (folder / name).write_bytes(writer.encode(frame.data))
+            rows.writerow([name, frame.stamp_ns, frame.log_time_ns, frame.frame_id])
+            yield

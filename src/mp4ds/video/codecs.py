@@ -1,0 +1,112 @@
+"""The table of codecs: which encoder, pixel format and options make which stream.
+
+Chosen by measurement; spec/registry.md, "Codecs", has the reasons, benchmarks/lossless.py
+the figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from mp4ds.errors import OptionError
+
+DEFAULT_GOP = 60
+
+_X264 = MappingProxyType({"bf": "0"})  # without B-frames, frames are coded in the order shown
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """How a stream is encoded.
+
+    Attributes:
+        codec: Name in the registry.
+        encoder: ffmpeg's name of the encoder.
+        pixel_format: Pixel format given to the encoder.
+        lossless: Whether every sample returns as it was.
+        options: Options of the encoder.
+    """
+
+    codec: str
+    encoder: str
+    pixel_format: str
+    lossless: bool
+    options: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class _Coding:
+    encoder: str
+    pixel_format: str
+    options: Mapping[str, str]
+    default_preset: str = ""
+
+
+CODECS = ("h264", "h265", "av1", "ffv1")
+"""The names that ``--codec`` takes."""
+
+_FFV1 = MappingProxyType({"level": "3", "slicecrc": "1", "slices": "4"})
+
+# (codec, pixel format of the picture) -> coding
+_LOSSLESS: dict[tuple[str, str], _Coding] = {
+    ("h264", "gray"): _Coding("libx264", "gray", {**_X264, "qp": "0"}, "veryfast"),
+    ("h264", "rgb24"): _Coding("libx264rgb", "rgb24", {**_X264, "qp": "0"}, "veryfast"),
+    ("h264", "bgr24"): _Coding("libx264rgb", "bgr24", {**_X264, "qp": "0"}, "veryfast"),
+    ("ffv1", "gray"): _Coding("ffv1", "gray", _FFV1),
+    ("ffv1", "gray16le"): _Coding("ffv1", "gray16le", _FFV1),
+    ("ffv1", "rgb24"): _Coding("ffv1", "bgr0", _FFV1),
+    ("ffv1", "bgr24"): _Coding("ffv1", "bgr0", _FFV1),
+}
+_LOSSY: dict[str, _Coding] = {
+    "av1": _Coding("libsvtav1", "yuv420p", {}, "6"),
+    "h264": _Coding("libx264", "yuv420p", _X264, "medium"),
+    "h265": _Coding("libx265", "yuv420p", {"x265-params": "bframes=0:open-gop=0:log-level=error"}, "medium"),
+}
+_DEFAULT_LOSSLESS = {"gray": "h264", "rgb24": "h264", "bgr24": "h264", "gray16le": "ffv1"}
+_DEFAULT_LOSSY = "av1"
+
+
+def recipe_for(
+    pixel_format: str,
+    *,
+    lossless: bool,
+    codec: str | None = None,
+    crf: int | None = None,
+    preset: str | None = None,
+) -> Recipe:
+    """The recipe for pictures of a pixel format.
+
+    Args:
+        pixel_format: Of the pictures, as a layout gives them.
+        lossless: Whether every sample must return as it was.
+        codec: A name of `CODECS`, or None for the default.
+        crf: Constant rate factor of a lossy recipe.
+        preset: The encoder's preset, or None for the default.
+
+    Raises:
+        OptionError: The codec is unknown or cannot do it; names those that can.
+    """
+    if codec is not None and codec not in CODECS:
+        raise OptionError(f"--codec {codec!r} is not known. Use one of {', '.join(CODECS)}.")
+    if lossless:
+        name = codec or _DEFAULT_LOSSLESS[pixel_format]
+        coding = _LOSSLESS.get((name, pixel_format))
+        if coding is None:
+            able = sorted({c for c, p in _LOSSLESS if p == pixel_format})
+            raise OptionError(
+                f"codec {name} has no lossless form for {pixel_format} pictures; "
+                f"use one of {', '.join(able)}"
+            )
+        options = dict(coding.options)
+    else:
+        name = codec or _DEFAULT_LOSSY
+        found = _LOSSY.get(name)
+        if found is None:
+            raise OptionError(f"codec {name} is lossless only; use one of {', '.join(_LOSSY)}")
+        coding = found
+        options = {**coding.options, "crf": str(crf)}
+    if coding.default_preset:
+        options["preset"] = preset or coding.default_preset
+    return Recipe(name, coding.encoder, coding.pixel_format, lossless, options=options)

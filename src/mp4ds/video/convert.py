@@ -1,0 +1,152 @@
+"""Pictures to video frames and back, with the colours tagged and converted as tagged.
+
+Colour is BT.709, full range (spec/registry.md, "Colour"): what is not tagged is guessed by
+every player in its own way.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import av
+import numpy as np
+from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoReformatter
+
+from mp4ds.errors import VideoError
+from mp4ds.layouts import Pixels
+
+BT709 = 1  # primaries, transfer and matrix have the same number in H.273
+FULL_RANGE = 2
+
+_INTERPOLATION = (
+    Interpolation.BICUBIC
+    | Interpolation.ACCURATE_RND
+    | Interpolation.FULL_CHR_H_INT
+    | Interpolation.FULL_CHR_H_INP
+    | Interpolation.BITEXACT
+)
+_YUV = ("yuv420p", "yuvj420p")
+
+
+class Converter:
+    """Converts frames between pixel formats, full range; not to be shared between threads.
+
+    Args:
+        matrix: Between RGB and YUV: videos have BT.709, JPEG files BT.601.
+    """
+
+    def __init__(self, matrix: Colorspace = Colorspace.ITU709) -> None:
+        self._matrix = matrix
+        self._reformatter = VideoReformatter()
+
+    def convert(self, frame: av.VideoFrame, pixel_format: str) -> av.VideoFrame:
+        """The frame in another pixel format, the colours kept."""
+        return self._reformatter.reformat(
+            frame,
+            format=pixel_format,
+            src_colorspace=self._matrix,
+            dst_colorspace=self._matrix,
+            src_color_range=ColorRange.JPEG,
+            dst_color_range=ColorRange.JPEG,
+            interpolation=_INTERPOLATION,
+            threads=1,  # a pool inherited over fork would never end
+        )
+
+
+def picture_to_frame(
+    picture: Pixels, picture_format: str, pixel_format: str, converter: Converter
+) -> av.VideoFrame:
+    """A frame for the encoder; a view of the picture where the formats agree.
+
+    Args:
+        picture: Shape (H, W) or (H, W, C), rows contiguous.
+        picture_format: Its pixel format.
+        pixel_format: The encoder's.
+        converter: The stream's own.
+    """
+    if pixel_format in _YUV and picture_format == "gray":
+        return _gray_to_yuv(picture, pixel_format)
+    if pixel_format in _YUV:
+        picture = _pad_to_even(picture, 2)
+    frame = av.VideoFrame.from_numpy_buffer(picture, format=picture_format)
+    if picture_format.startswith("bayer_"):
+        frame = converter.convert(frame, "rgb24")
+    if picture_format != pixel_format:
+        frame = converter.convert(frame, pixel_format)
+    return frame
+
+
+def _pad_to_even(picture: Pixels, multiple: int) -> Pixels:
+    """Repeat the last rows and columns, of a mosaic's whole block, for chroma planes of half size."""
+    height, width = picture.shape[:2]
+    pad = [(0, -height % multiple), (0, -width % multiple)] + [(0, 0)] * (picture.ndim - 2)
+    return np.pad(picture, pad, mode="edge") if pad[0][1] or pad[1][1] else picture
+
+
+def _gray_to_yuv(picture: Pixels, pixel_format: str) -> av.VideoFrame:
+    picture = _pad_to_even(picture, 2)
+    height, width = picture.shape
+    frame = av.VideoFrame(width, height, pixel_format)
+    luma = frame.planes[0]
+    np.frombuffer(luma, np.uint8).reshape(-1, luma.line_size)[:height, :width] = picture
+    for plane in frame.planes[1:]:
+        np.frombuffer(plane, np.uint8)[...] = 128
+    return frame
+
+
+def frame_to_picture(
+    frame: av.VideoFrame, picture_format: str, width: int, height: int, converter: Converter
+) -> Pixels:
+    """The picture in a decoded frame; a view of it where possible.
+
+    Args:
+        frame: As decoded.
+        picture_format: Of the picture wanted.
+        width: Columns of the picture; padding of the video beyond is cut off.
+        height: Rows of the picture.
+        converter: The stream's own.
+
+    Raises:
+        VideoError: The frame is smaller than the picture, or of another kind.
+    """
+    if frame.width < width or frame.height < height:
+        raise VideoError(
+            "geometry-mismatch",
+            "video",
+            f"has frames of {frame.width}x{frame.height} where {width}x{height} are due",
+        )
+    if picture_format in ("gray", "gray16le"):
+        return _plane(frame, 0, picture_format)[:height, :width]
+    if picture_format.startswith("bayer_"):
+        return _sample_mosaic(_packed(frame, "rgb24", converter), picture_format, width, height)
+    return _packed(frame, picture_format, converter)[:height, :width]
+
+
+def _plane(frame: av.VideoFrame, index: int, picture_format: str) -> Pixels:
+    expected = ("gray16le",) if picture_format == "gray16le" else ("gray", *_YUV)
+    if frame.format.name not in expected:
+        raise VideoError(
+            "codec-mismatch",
+            "video",
+            f"decodes to {frame.format.name} where {' or '.join(expected)} is due",
+        )
+    plane = frame.planes[index]
+    dtype: Any = np.dtype("<u2") if picture_format == "gray16le" else np.uint8
+    rows: Pixels = np.frombuffer(plane, dtype).reshape(-1, plane.line_size // np.dtype(dtype).itemsize)
+    return rows
+
+
+def _packed(frame: av.VideoFrame, pixel_format: str, converter: Converter) -> Pixels:
+    plane = converter.convert(frame, pixel_format).planes[0]
+    rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+    return rows[: frame.height, : 3 * frame.width].reshape(frame.height, frame.width, 3)
+
+
+def _sample_mosaic(picture: Pixels, picture_format: str, width: int, height: int) -> Pixels:
+    """The mosaic that a sensor with this pattern would have seen."""
+    mosaic = picture_format.removeprefix("bayer_")[:4]
+    pixels = np.empty((height, width), np.uint8)
+    for index, color in enumerate(mosaic):
+        row, column = divmod(index, 2)
+        pixels[row::2, column::2] = picture[row:height:2, column:width:2, "rgb".index(color)]
+    return pixels

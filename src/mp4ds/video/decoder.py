@@ -1,0 +1,171 @@
+"""Decoding a stream's pictures out of its mp4."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+from av.error import FFmpegError
+
+from mp4ds.errors import VideoError
+from mp4ds.layouts import Pixels
+from mp4ds.video.convert import Converter, frame_to_picture
+
+_CODEC_NAMES = {"h264": "h264", "h265": "hevc", "av1": "av1", "ffv1": "ffv1"}
+
+
+class VideoDecoder:
+    """One video file being read. A context manager.
+
+    What the file's header promises is compared with what its sidecar says before anything is
+    decoded, so that a forged header costs no memory.
+
+    Args:
+        path: The video.
+        codec: Name in the registry.
+        coded_size: Width and height of the coded pictures.
+        frames: Number of frames that are due.
+        picture_format: Pixel format of the pictures wanted.
+        picture_size: Width and height of the pictures wanted.
+        sequential: Decode with all cores, for reading in order.
+
+    Raises:
+        VideoError: ``video-unreadable``, ``codec-mismatch`` or ``geometry-mismatch``.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        codec: str,
+        coded_size: tuple[int, int],
+        frames: int,
+        picture_format: str,
+        picture_size: tuple[int, int],
+        sequential: bool = True,
+    ) -> None:
+        self._path = path
+        self._frames = frames
+        self._picture_format = picture_format
+        self._picture_size = picture_size
+        self._converter = Converter()
+        self._ticks: np.ndarray[tuple[int], np.dtype[np.int64]] | None = None
+        if not path.is_file():
+            raise VideoError("file-missing", path, "does not exist")
+        try:
+            self._container = av.open(str(path), "r")
+        except (FFmpegError, OSError) as error:
+            raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
+        try:
+            self._check(codec, coded_size)
+            self._stream = self._container.streams.video[0]
+            self._stream.thread_type = "AUTO" if sequential else "SLICE"
+        except BaseException:
+            self._container.close()
+            raise
+
+    def _check(self, codec: str, coded_size: tuple[int, int]) -> None:
+        if len(self._container.streams.video) != 1:
+            count = len(self._container.streams.video)
+            raise VideoError("video-unreadable", self._path, f"has {count} video tracks, not one")
+        context = self._container.streams.video[0].codec_context
+        expected = _CODEC_NAMES.get(codec)
+        found = context.codec.canonical_name
+        if expected is None or found != expected:
+            raise VideoError(
+                "codec-mismatch", self._path, f"is coded as {found} where its sidecar says {codec}"
+            )
+        if (context.width, context.height) != coded_size:
+            raise VideoError(
+                "geometry-mismatch",
+                self._path,
+                f"has {context.width}x{context.height} pixels where its sidecar says "
+                f"{coded_size[0]}x{coded_size[1]}",
+            )
+
+    @property
+    def coded_frames(self) -> int:
+        """Frames that the file's index lists."""
+        return len(self._stream.index_entries)
+
+    def pictures(self) -> Iterator[Pixels]:
+        """All pictures in order, as views that hold until the next one is asked for.
+
+        Raises:
+            VideoError: ``decode-failed`` with the frame's number, or ``frame-count`` when the
+                video ends early or goes on.
+        """
+        self._container.seek(0)
+        number = 0
+        for frame in self._decoded(0):
+            if number == self._frames:
+                raise VideoError(
+                    "frame-count", self._path, f"goes on after the {self._frames} frames due"
+                )
+            yield self._picture(frame)
+            number += 1
+        if number != self._frames:
+            raise VideoError(
+                "frame-count", self._path, f"ends after {number} of {self._frames} frames"
+            )
+
+    def picture(self, index: int) -> Pixels:
+        """One picture, by seeking to the key frame before it.
+
+        Args:
+            index: 0 <= index < frames.
+
+        Raises:
+            VideoError: It cannot be decoded.
+        """
+        tick = int(self._presentation_ticks()[index])
+        try:
+            self._container.seek(tick, stream=self._stream)
+        except (FFmpegError, OSError) as error:
+            raise VideoError("decode-failed", self._path, f"frame {index}: {error}") from None
+        for frame in self._decoded(index):
+            if frame.pts is not None and frame.pts >= tick:
+                if frame.pts > tick:
+                    break
+                return self._picture(frame)
+        raise VideoError("decode-failed", self._path, f"frame {index} was not found")
+
+    def _presentation_ticks(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+        if self._ticks is None:
+            # without B-frames the index's decoding times are the presentation times
+            ticks = [entry.timestamp for entry in self._stream.index_entries]
+            if len(ticks) != self._frames:
+                raise VideoError(
+                    "frame-count", self._path, f"has {len(ticks)} frames, {self._frames} are due"
+                )
+            self._ticks = np.sort(np.array(ticks, dtype=np.int64))
+        return self._ticks
+
+    def _decoded(self, first: int) -> Iterator[av.VideoFrame]:
+        number = first
+        try:
+            for frame in self._container.decode(self._stream):
+                yield frame
+                number += 1
+        except (FFmpegError, OSError) as error:
+            raise VideoError(
+                "decode-failed", self._path, f"frame {number} cannot be decoded: {error}"
+            ) from None
+
+    def _picture(self, frame: av.VideoFrame) -> Pixels:
+        if frame.is_corrupt:
+            raise VideoError("decode-failed", self._path, "a frame is marked as corrupt")
+        width, height = self._picture_size
+        return frame_to_picture(frame, self._picture_format, width, height, self._converter)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._container.close()
+
+    def __enter__(self) -> VideoDecoder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

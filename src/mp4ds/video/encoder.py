@@ -1,0 +1,153 @@
+"""Encoding a stream's pictures into one mp4."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from fractions import Fraction
+from pathlib import Path
+
+import av
+from av.error import FFmpegError
+
+from mp4ds.errors import Mp4dsError
+from mp4ds.layouts import Pixels
+from mp4ds.stamps import TIMESCALE
+from mp4ds.video.codecs import Recipe
+from mp4ds.video.convert import BT709, FULL_RANGE, Converter, picture_to_frame
+
+_TIME_BASE = Fraction(1, TIMESCALE)
+_LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.01, 30.0, 1000.0  # Hz
+
+
+class EncoderRefusedError(Mp4dsError):
+    """The encoder does not take pictures of this kind or size; the message says why."""
+
+
+class VideoEncoder:
+    """One mp4 file being written. A context manager; leaving it completes the file.
+
+    Args:
+        path: The file to make.
+        recipe: Codec and options.
+        picture_format: Pixel format of the pictures.
+        width: Columns of a picture.
+        height: Rows of a picture.
+        gop: Most frames from one key frame to the next.
+        threads: Threads of the encoder.
+        rate: Frames per second, if known; a hint for the encoder's look-ahead.
+
+    Raises:
+        EncoderRefusedError: The codec does not take such pictures.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        recipe: Recipe,
+        *,
+        picture_format: str,
+        width: int,
+        height: int,
+        gop: int,
+        threads: int,
+        rate: float | None,
+    ) -> None:
+        self.recipe = recipe
+        self.frames = 0
+        self._picture_format = picture_format
+        self._converter = Converter()
+        halved = recipe.pixel_format == "yuv420p"
+        self.width = width + width % 2 if halved else width
+        self.height = height + height % 2 if halved else height
+        self.options = {**recipe.options, "g": str(gop)}
+        # SVT-AV1 prints to stderr on its own; errors reach us as return codes
+        os.environ.setdefault("SVT_LOG", "1")
+        self._container = av.open(
+            str(path),
+            "w",
+            format="mp4",
+            options={
+                "video_track_timescale": str(TIMESCALE),
+                "movie_timescale": str(TIMESCALE),
+            },
+        )
+        try:
+            self._open_stream(threads, rate)
+        except (FFmpegError, ValueError) as error:
+            self._container.close()
+            raise EncoderRefusedError(
+                f"{recipe.encoder} does not take pictures of {width}x{height}: {error}"
+            ) from None
+
+    def _open_stream(self, threads: int, rate: float | None) -> None:
+        # the rate gives the last frame its duration: one of no ticks would be cut off
+        hint = min(max(rate or _USUAL_RATE, _LOWEST_RATE), _HIGHEST_RATE)
+        stream = self._container.add_stream(
+            self.recipe.encoder,
+            rate=Fraction(hint).limit_denominator(1000),
+            options=dict(self.options),
+        )
+        stream.width, stream.height = self.width, self.height
+        stream.pix_fmt = self.recipe.pixel_format
+        stream.time_base = _TIME_BASE
+        context = stream.codec_context
+        context.time_base = _TIME_BASE
+        context.thread_count = threads
+        context.colorspace = BT709
+        context.color_primaries = BT709
+        context.color_trc = BT709
+        context.color_range = FULL_RANGE
+        if self.recipe.pixel_format in ("bgr0", "rgb24", "bgr24"):
+            context.colorspace = 0  # RGB has no matrix
+        if self.recipe.encoder == "libsvtav1":
+            context.options = {**context.options, "svtav1-params": f"lp={threads}"}
+        context.open()
+        self._stream = stream
+
+    def write(self, picture: Pixels, tick: int) -> None:
+        """Encode the next picture.
+
+        Args:
+            picture: Shape (H, W) or (H, W, C); must not be changed afterwards.
+            tick: Presentation time in ticks, greater than the last.
+
+        Raises:
+            OSError: The disk refused.
+        """
+        frame = picture_to_frame(
+            picture, self._picture_format, self.recipe.pixel_format, self._converter
+        )
+        frame.pts = tick
+        frame.time_base = _TIME_BASE
+        frame.color_range = FULL_RANGE
+        for packet in self._stream.encode(frame):
+            self._container.mux(packet)
+        self.frames += 1
+
+    def close(self) -> None:
+        """Finish the file.
+
+        Raises:
+            OSError: The disk refused.
+        """
+        try:
+            for packet in self._stream.encode(None):
+                self._container.mux(packet)
+        finally:
+            self._container.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is; the caller removes it."""
+        try:
+            self._container.close()
+        except (FFmpegError, OSError):
+            return
+
+
+def tool_versions() -> Mapping[str, str]:
+    """Versions of what makes and reads the videos."""
+    return {
+        "av": av.__version__,
+        "libavcodec": ".".join(map(str, av.library_versions["libavcodec"])),
+    }

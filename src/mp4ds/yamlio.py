@@ -1,0 +1,242 @@
+"""The YAML of sidecars and manifests (spec/index.md, "The YAML subset").
+
+A file is the JSON-compatible core of YAML 1.2: maps, lists, strings, integers, floats, true,
+false and null; no anchors, tags, dates, duplicate keys or other spellings of booleans.
+Long columns stand at the end as block scalars and are sliced out before parsing, so that
+loading costs the size of the structure and not that of the columns. The last line is a
+checksum of all bytes before it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Any
+
+import xxhash
+import yaml
+
+from mp4ds.errors import FormatError
+
+MAX_BYTES = 512 * 2**20  # a sidecar of a day at 60 Hz has about 100 MB
+MAX_STRUCTURE_BYTES = 16 * 2**20
+MAX_DEPTH = 32
+
+_CHECKSUM = re.compile(rb'(?:\A|\n)checksum: "xxh64:([0-9a-f]{16})"\n\Z')
+_COLUMN = re.compile(rb"^( +)values: \|\n", re.MULTILINE)
+_PLACEHOLDER = "mp4ds column "
+
+_Parser: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_BaseDumper: type[Any] = yaml.SafeDumper
+_NUMBER = re.compile(r"[-+]?(?:0|[1-9][0-9]*)(\.[0-9]+)?([eE][-+]?[0-9]+)?")
+_WORDS = {"": None, "null": None, "~": None, "true": True, "false": False}
+
+
+class _Dumper(_BaseDumper):  # type: ignore[misc]
+    """Writes the subset: lists indented, texts of several lines as literal blocks."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+    def increase_indent(self, flow: bool = False, indentless: bool = False) -> Any:
+        return super().increase_indent(flow, False)
+
+    def analyze_scalar(self, scalar: str) -> Any:
+        analysis = super().analyze_scalar(scalar)
+        # PyYAML quotes a text with spaces before a line break; a literal block keeps them too.
+        if analysis.multiline and re.fullmatch(r"[\n\x20-\x7e]+", scalar) and scalar.strip():
+            analysis.allow_block = True
+        return analysis
+
+
+def _represent_str(dumper: _Dumper, text: str) -> Any:
+    plain_block = "\n" in text and not text.startswith((" ", "\n"))
+    style = "|" if plain_block else None
+    if not plain_block and _needs_quotes(text):
+        style = '"'
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
+
+
+def _needs_quotes(text: str) -> bool:
+    # What YAML 1.1 readers take for something else: yes, no, on, 1_000, 12:30:00, 2024-01-01 ...
+    return bool(re.match(r"[-+.0-9~]|(?i:y|n|yes|no|on|off|true|false|null)$", text)) or not text
+
+
+def _represent_float(dumper: _Dumper, value: float) -> Any:
+    text = repr(value)
+    if "e" in text and "." not in text:
+        text = text.replace("e", ".0e")
+    return dumper.represent_scalar("tag:yaml.org,2002:float", text)
+
+
+def _represent_list(dumper: _Dumper, items: list[Any]) -> Any:
+    flow = all(isinstance(item, (int, float)) for item in items)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=flow)
+
+
+_Dumper.add_representer(str, _represent_str)
+_Dumper.add_representer(float, _represent_float)
+_Dumper.add_representer(list, _represent_list)
+
+
+def dump(document: dict[str, Any], *, comment: str = "") -> bytes:
+    """Write a document of the subset, ending with its checksum line.
+
+    Args:
+        document: JSON-like values; keys keep their order.
+        comment: One line for human readers at the top.
+
+    Returns:
+        UTF-8 bytes.
+    """
+    body = yaml.dump(
+        document, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100, indent=2
+    )
+    if comment:
+        body = f"# {comment}\n{body}"
+    data = body.encode()
+    return data + b'checksum: "xxh64:%s"\n' % xxhash.xxh64(data).hexdigest().encode()
+
+
+def load(data: bytes, place: str) -> dict[str, Any]:
+    """Read a document of the subset and verify its checksum, if it has one.
+
+    Args:
+        data: The file's bytes.
+        place: The file's name, for errors.
+
+    Returns:
+        The document, without the checksum.
+
+    Raises:
+        FormatError: ``yaml-invalid`` or ``checksum-mismatch``.
+    """
+    if len(data) > MAX_BYTES:
+        raise FormatError("yaml-invalid", place, f"is larger than {MAX_BYTES} bytes")
+    match = _CHECKSUM.search(data, max(0, len(data) - 64))
+    if match:
+        body = data[: match.start() + 1] if match.start() or data[:1] == b"\n" else b""
+        if xxhash.xxh64(body).hexdigest().encode() != match.group(1):
+            raise FormatError(
+                "checksum-mismatch",
+                place,
+                "does not match the checksum in its last line: it was damaged or edited; "
+                "after an intended edit, remove that line",
+            )
+        data = body
+    structure, columns = _slice_columns(data)
+    if len(structure) > MAX_STRUCTURE_BYTES:
+        raise FormatError("yaml-invalid", place, "has too much structure outside of its columns")
+    document = _parse(structure, place)
+    if columns:
+        _restore_columns(document, columns)
+    return document
+
+
+def _parse(data: bytes, place: str) -> dict[str, Any]:
+    try:
+        document = _build(yaml.parse(data.decode(), Loader=_Parser))
+    except (yaml.YAMLError, ValueError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise FormatError(
+            "yaml-invalid", place, f"is not valid YAML of the subset: {reason}"
+        ) from None
+    if not isinstance(document, dict):
+        raise FormatError("yaml-invalid", place, "is not a map of keys and values")
+    return document
+
+
+def _build(events: Iterable[Any]) -> Any:
+    """Build values from parser events: the loop has no recursion that input could exhaust."""
+    root: list[Any] = []
+    open_nodes: list[dict[str, Any] | list[Any]] = [root]
+    keys: list[str | None] = [None]
+    for event in events:
+        if isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
+            open_nodes.pop()
+            keys.pop()
+            continue
+        if not isinstance(event, yaml.NodeEvent):
+            continue
+        line = event.start_mark.line + 1
+        if isinstance(event, yaml.AliasEvent) or event.anchor is not None:
+            raise ValueError(f"line {line}: anchors and aliases are not allowed")
+        if event.tag is not None:
+            raise ValueError(f"line {line}: tags are not allowed")
+        value = _scalar(event) if isinstance(event, yaml.ScalarEvent) else None
+        if isinstance(event, yaml.MappingStartEvent):
+            value = {}
+        elif isinstance(event, yaml.SequenceStartEvent):
+            value = []
+        _attach(open_nodes[-1], keys, value, line)
+        if isinstance(event, yaml.CollectionStartEvent):
+            open_nodes.append(value)
+            keys.append(None)
+            if len(open_nodes) > MAX_DEPTH:
+                raise ValueError(f"line {line}: is nested deeper than {MAX_DEPTH} levels")
+    if len(root) != 1:
+        raise ValueError("holds no document, or several")
+    return root[0]
+
+
+def _attach(
+    parent: dict[str, Any] | list[Any], keys: list[str | None], value: Any, line: int
+) -> None:
+    if isinstance(parent, list):
+        parent.append(value)
+        return
+    key = keys[-1]
+    if key is not None:
+        parent[key] = value
+        keys[-1] = None
+        return
+    if not isinstance(value, str):
+        raise ValueError(f"line {line}: key {value!r} is not a string")
+    if value in parent:
+        raise ValueError(f"line {line}: key {value!r} stands twice")
+    keys[-1] = value
+
+
+def _scalar(event: Any) -> Any:
+    text: str = event.value
+    if event.style not in (None, ""):
+        return text
+    if text in _WORDS:
+        return _WORDS[text]
+    number = _NUMBER.fullmatch(text)
+    if not number:
+        return text
+    return float(text) if number.group(1) or number.group(2) else int(text)
+
+
+def _slice_columns(data: bytes) -> tuple[bytes, list[str]]:
+    """Cut the literal blocks of columns out, leaving a numbered placeholder for each."""
+    pieces: list[bytes] = []
+    columns: list[str] = []
+    done = 0
+    while match := _COLUMN.search(data, done):
+        indent = b" " * (len(match.group(1)) + 2)
+        end_match = re.compile(rb"\n(?!" + indent + rb")").search(data, match.end() - 1)
+        end = end_match.end() if end_match else len(data)
+        block = data[match.end() : end]
+        if not block.isascii():
+            return data, []  # not a column as we write it: let the parser speak
+        pieces += [data[done : match.end()], indent, b"%s%d\n" % (_PLACEHOLDER.encode(), len(columns))]
+        columns.append(block[len(indent) :].replace(b"\n" + indent, b"\n").decode("ascii"))
+        done = end
+    pieces.append(data[done:])
+    return b"".join(pieces), columns
+
+
+def _restore_columns(node: Any, columns: list[str]) -> None:
+    if isinstance(node, dict):
+        values = node.get("values")
+        if isinstance(values, str) and values.startswith(_PLACEHOLDER):
+            number = values[len(_PLACEHOLDER) :].strip()
+            if number.isdigit() and int(number) < len(columns):
+                node["values"] = columns[int(number)]
+        for child in node.values():
+            _restore_columns(child, columns)
+    elif isinstance(node, list):
+        for child in node:
+            _restore_columns(child, columns)

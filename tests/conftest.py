@@ -1,0 +1,39 @@
+"""Where the tests find recordings, and what several of them share."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import mp4ds
+from sources import SOURCES, load_tool, scene
+
+DATA = Path(os.environ.get("MP4DS_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+def real(name: str) -> Path:
+    """A real recording, which is beside the project and not part of it."""
+    path = DATA / name
+    if not path.exists():
+        pytest.skip(f"the real recording {name} is not in {DATA}")
+    return path
+
+
+@pytest.fixture
+def compare() -> Callable[..., list[str]]:
+    """The independent comparison of two recordings."""
+    return load_tool("compare").compare
+
+
+@pytest.fixture(scope="session")
+def packed_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A lossless dataset of a small ROS 1 bag; not to be changed."""
+    folder = tmp_path_factory.mktemp("packed")
+    source = folder / "source"
+    source.mkdir()
+    paths = SOURCES["bag-none"](source, scene("bayer_rggb8"))
+    mp4ds.pack(paths, folder / "dataset")
+    return folder / "dataset"

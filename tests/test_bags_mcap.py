@@ -1,0 +1,570 @@
+"""MCAP files: what the library reads, we read; what we write, the library reads."""
+
+from __future__ import annotations
+
+import errno
+import struct
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zstandard
+from mcap import records as mcap_records
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap.writer import IndexType, Writer
+
+from conftest import real
+from mp4ds.bags import ordering
+from mp4ds.bags.mcap import McapReader, McapWriter
+from mp4ds.bags.mcap_records import DamageError, unzstd
+from mp4ds.bags.zstd_files import ZstdFile
+from mp4ds.errors import ConversionError, OptionError, SourceError, SourceNotFoundError
+from mp4ds.records import (
+    Attachment,
+    Channel,
+    ChannelStats,
+    Message,
+    MetadataRecord,
+    Record,
+    Schema,
+)
+
+REAL_FILES = (
+    "corrupt/sample_ok.mcap",
+    "mcap/depthai_recording_json_lz4.mcap",
+    "mcap/lichtblick_example2_json.mcap",
+    "mcap/mcap_explorer_demo_protobuf_image.mcap",
+    "mcap/pj_bad_schema.mcap",
+    "mcap/pj_empty_channel.mcap",
+    "mcap/pj_publish_vs_log_time.mcap",
+    "mcap/reductstore_demo.mcap",
+    "mcap/rerun_protobuf_vec3.mcap",
+    "mcap/rerun_simple_protobuf.mcap",
+    "mcap/roboto_tiny_dvs_ros1profile.mcap",
+    "rosbag2/amber_soccer_goal_msgzstd_v0/soccer_goal_12.mcap",
+)
+IMAGE = Schema("sensor_msgs/msg/Image", "ros2msg", b"uint32 height\n\xff")
+OTHER = Schema("pkg/msg/Other", "ros2idl", b"")
+UNUSED = Schema("pkg/msg/Unused", "ros2msg", b"int8 x")
+
+
+def messages(records: Iterable[Record]) -> list[Message]:
+    return [record for record in records if isinstance(record, Message)]
+
+
+def fields(message: Message) -> tuple[Any, ...]:
+    return (
+        *message.channel.identity,
+        message.log_time,
+        message.publish_time,
+        message.sequence,
+        bytes(message.data),
+    )
+
+
+def read(path: Path) -> tuple[McapReader, list[Record]]:
+    with McapReader(path) as reader:
+        return reader, list(reader.records())
+
+
+def by_library(path: Path) -> list[Any]:
+    with path.open("rb") as stream:
+        return list(StreamReader(stream, validate_crcs=True).records)
+
+
+def check_against_library(path: Path) -> None:
+    """Everything that the library's streaming reader finds, and the index against it."""
+    found = by_library(path)
+    reader, records = read(path)
+    expected = [
+        (r.channel_id, r.sequence, r.log_time, r.publish_time, r.data)
+        for r in found
+        if isinstance(r, mcap_records.Message)
+    ]
+    if any(isinstance(r, mcap_records.ChunkIndex) for r in found):
+        expected.sort(key=lambda item: item[2])
+    got = messages(records)
+    assert [
+        (m.channel.id, m.sequence, m.log_time, m.publish_time, bytes(m.data)) for m in got
+    ] == expected
+    check_declarations(reader, found)
+    check_others(records, found)
+    check_index(reader, got)
+    assert reader.position == path.stat().st_size
+
+
+def check_declarations(reader: McapReader, found: list[Any]) -> None:
+    schemas = {r.id: r for r in found if isinstance(r, mcap_records.Schema)}
+    channels = {r.id: r for r in found if isinstance(r, mcap_records.Channel)}
+    assert {channel.id for channel in reader.channels} == set(channels)
+    for channel in reader.channels:
+        record = channels[channel.id]
+        assert (channel.topic, channel.message_encoding) == (record.topic, record.message_encoding)
+        assert channel.metadata == record.metadata
+        schema = schemas.get(record.schema_id)
+        assert channel.schema == (
+            Schema(schema.name, schema.encoding, schema.data) if schema else None
+        )
+    header = next(r for r in found if isinstance(r, mcap_records.Header))
+    assert (reader.profile, reader.library) == (header.profile, header.library)
+
+
+def check_others(records: list[Record], found: list[Any]) -> None:
+    assert [
+        (r.name, r.media_type, r.create_time, r.log_time, r.data)
+        for r in records
+        if isinstance(r, Attachment)
+    ] == [
+        (r.name, r.media_type, r.create_time, r.log_time, r.data)
+        for r in found
+        if isinstance(r, mcap_records.Attachment)
+    ]
+    assert [(r.name, r.metadata) for r in records if isinstance(r, MetadataRecord)] == [
+        (r.name, r.metadata) for r in found if isinstance(r, mcap_records.Metadata)
+    ]
+
+
+def check_index(reader: McapReader, got: list[Message]) -> None:
+    times, stats = reader.times(), reader.stats()
+    for channel in reader.channels:
+        own = [m for m in got if m.channel is channel]
+        assert times.get(channel.id, np.empty(0)).tolist() == sorted(m.log_time for m in own)
+        if stats:
+            span = stats[channel.id]
+            assert span.count == len(own)
+            assert all(span.start <= m.log_time <= span.end for m in own)
+        first = reader.first(channel)
+        expected = min(own, key=lambda m: m.log_time, default=None)
+        assert (first and fields(first)) == (expected and fields(expected))
+
+
+@pytest.mark.parametrize("name", REAL_FILES)
+def test_real_recordings(name: str) -> None:
+    check_against_library(real(name))
+
+
+def test_conformance_files() -> None:
+    folder = real("mcap/conformance")
+    files = sorted(folder.rglob("*.mcap"))
+    assert len(files) > 100
+    for file in files:
+        check_against_library(file)
+
+
+def write_all(path: Path, records: Iterable[Record], **options: Any) -> list[Record]:
+    records = list(records)
+    with McapWriter(path, profile="ros2", **options) as writer:
+        writer.add_schema(UNUSED)
+        for record in records:
+            if isinstance(record, Message):
+                writer.add_channel(record.channel)
+                writer.write(record)
+            elif isinstance(record, Attachment):
+                writer.add_attachment(record)
+            else:
+                writer.add_metadata(record)
+        assert writer.omitted == {}
+    return records
+
+
+def scene() -> list[Record]:
+    qos = {"offered_qos_profiles": "- history: 3\n", "topic_type_hash": ""}
+    channels = (
+        Channel(0, "/image", "cdr", IMAGE, qos),
+        Channel(7, "/image", "cdr", IMAGE, qos),  # a second publisher, equal in all
+        Channel(3, "/other", "cdr", OTHER),
+        Channel(65_000, "/none", "json", None, {"": "ü"}),
+    )
+    records: list[Record] = [MetadataRecord("first", {"a": "1", "ü": ""})]
+    for number in range(200):
+        channel = channels[number % 4]
+        data = memoryview(bytes([number]) * (number * 37 % 5000))
+        records.append(Message(channel, 10**18 + number, number, 2**32 - 1 - number, data))
+        if number == 100:
+            records.append(Attachment("a.txt", "text/plain", 1, 2**64 - 1, b"\x00" * 10))
+    return [
+        *records,
+        Message(channels[0], 2**63 - 1, 2**64 - 1, 0, b""),
+        MetadataRecord("first", {}),
+    ]
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+@pytest.mark.parametrize("chunk_size", [1, 4096, 10**7])
+def test_round_trip(tmp_path: Path, compression: str, chunk_size: int) -> None:
+    path = tmp_path / "a.mcap"
+    written = write_all(path, scene(), compression=compression, chunk_size=chunk_size)
+    reader, records = read(path)
+    assert list(map(fields, messages(records))) == list(map(fields, messages(written)))
+    assert len({channel.id for channel in reader.channels}) == 4
+    assert reader.unused_schemas == [UNUSED]
+    others = [r for r in records if not isinstance(r, Message)]
+    assert others == [r for r in written if not isinstance(r, Message)]
+    assert (reader.profile, reader.library) == ("ros2", "mp4ds 0.1.0")
+    assert reader.skipped == {}
+    check_against_library(path)
+    with path.open("rb") as stream:
+        assert sum(1 for _ in make_reader(stream).iter_messages()) == 201
+
+
+def test_a_channel_may_have_no_messages(tmp_path: Path) -> None:
+    with McapWriter(tmp_path / "a.mcap", profile="", library="mine") as writer:
+        writer.add_channel(Channel(4, "/empty", "cdr", IMAGE))
+    reader, records = read(tmp_path / "a.mcap")
+    assert records == []
+    (channel,) = reader.channels
+    assert channel.identity == Channel(4, "/empty", "cdr", IMAGE).identity
+    assert reader.stats() == {channel.id: ChannelStats(0, 0, 0)}
+    assert reader.library == "mine"
+    assert reader.times() == {}
+    assert reader.first(channel) is None
+
+
+def disordered(count: int = 600) -> list[Record]:
+    channel = Channel(1, "/a", "cdr", IMAGE), Channel(2, "/b", "cdr", IMAGE)
+    order = np.random.default_rng(1).permutation(count)
+    # Near its place, and sometimes twice at the same time.
+    return [
+        Message(channel[i % 2], (i * 10 + int(order[i]) % 90) // 3, i, i, i.to_bytes(4, "little"))
+        for i in range(count)
+    ]
+
+
+def test_messages_come_in_log_time_order(tmp_path: Path) -> None:
+    written = messages(write_all(tmp_path / "a.mcap", disordered(), chunk_size=300))
+    got = messages(read(tmp_path / "a.mcap")[1])
+    assert list(map(fields, got)) == list(map(fields, sorted(written, key=lambda m: m.log_time)))
+    assert list(map(fields, got)) != list(map(fields, written))
+
+
+def test_what_is_held_back_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ordering, "HOLD_BYTES", 40)
+    written = messages(write_all(tmp_path / "a.mcap", disordered(), chunk_size=300))
+    got = messages(read(tmp_path / "a.mcap")[1])
+    assert sorted(map(fields, got)) == sorted(map(fields, written))
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+def test_without_an_index_the_file_is_read(tmp_path: Path, chunked: bool) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(
+            stream,
+            index_types=IndexType.NONE,
+            use_chunking=chunked,
+            use_statistics=False,
+            repeat_channels=False,
+            repeat_schemas=False,
+            use_summary_offsets=False,
+        )
+        writer.start()
+        channel = writer.register_channel("/a", "cdr", 0)
+        for time in (5, 3, 9, 3):
+            writer.add_message(channel, time, bytes([time]), time)
+        writer.finish()
+    reader = McapReader(path)
+    assert reader.channels == []
+    assert reader.stats() == {}
+    assert [m.log_time for m in messages(reader.records())] == [5, 3, 9, 3]
+    assert reader.times()[1].tolist() == [3, 3, 5, 9]
+    first = reader.first(reader.channels[0])
+    assert first is not None
+    assert first.log_time == 3
+    assert isinstance(first.data, bytes)
+    check_against_library(path)
+
+
+def test_an_index_that_does_not_add_up_is_not_used(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, index_types=IndexType.CHUNK)
+        writer.start()
+        channel = writer.register_channel("/a", "cdr", 0)
+        for time in (5, 3):
+            writer.add_message(channel, time, b"", time)
+        writer.finish()
+    reader = McapReader(path)
+    assert [m.log_time for m in messages(reader.records())] == [3, 5]
+    assert reader.times()[1].tolist() == [3, 5]
+    first = reader.first(reader.channels[0])
+    assert first is not None
+    assert first.log_time == 3
+    assert reader.stats() == {1: ChannelStats(2, 3, 5)}
+
+
+def test_times_past_int64_are_shortened(tmp_path: Path) -> None:
+    channel = Channel(1, "/a", "cdr", None)
+    write_all(
+        tmp_path / "a.mcap",
+        [Message(channel, 2**64 - 1, 0, 0, b""), Message(channel, 1, 0, 0, b"")],
+    )
+    reader, records = read(tmp_path / "a.mcap")
+    assert reader.times()[1].tolist() == [1, 2**63 - 1]
+    assert [m.log_time for m in messages(records)] == [1, 2**64 - 1]
+
+
+def test_several_passes_at_once(tmp_path: Path) -> None:
+    written = write_all(tmp_path / "a.mcap", scene(), chunk_size=1000)
+    with McapReader(tmp_path / "a.mcap") as reader:
+        one, two = reader.records(), reader.records()
+        next(one)
+        reader.times()
+        assert 0 < reader.position <= (tmp_path / "a.mcap").stat().st_size
+        assert len(list(two)) == len(list(one)) + 1 == len(written)
+
+
+def test_a_decompressed_stream(tmp_path: Path) -> None:
+    written = messages(write_all(tmp_path / "a.mcap", scene()))
+    packed = tmp_path / "a.mcap.zstd"
+    packed.write_bytes(zstandard.compress((tmp_path / "a.mcap").read_bytes()))
+    reader = McapReader(packed, open_stream=lambda: ZstdFile(packed))
+    assert reader.profile == "ros2"
+    got = messages(reader.records())
+    assert list(map(fields, got)) == list(map(fields, written))
+    assert reader.position == packed.stat().st_size
+    assert sum(map(len, reader.times().values())) == len(written)
+    packed.write_bytes(packed.read_bytes()[:-50])
+    with pytest.raises(SourceError, match="ends before its footer"):
+        list(McapReader(packed, open_stream=lambda: ZstdFile(packed)).records())
+
+
+def test_compressed_payloads(tmp_path: Path) -> None:
+    channel = Channel(1, "/a", "cdr", None)
+    path = tmp_path / "a.mcap"
+    write_all(path, [Message(channel, 1, 1, 0, zstandard.compress(b"payload"))])
+    reader = McapReader(path, message_decompress=unzstd)
+    (message,) = messages(reader.records())
+    first = reader.first(message.channel)
+    assert first is not None
+    assert message.data == first.data == b"payload"
+    write_all(path, [Message(channel, 1, 1, 0, b"no zstd")])
+    with pytest.raises(SourceError, match=r"message 1, topic /a: zstd data is damaged"):
+        list(McapReader(path, message_decompress=unzstd).records())
+
+
+@pytest.mark.parametrize(
+    ("data", "problem"),
+    [
+        (zstandard.compress(b"abc")[:-1], "damaged"),
+        (zstandard.compress(b"abc") + b"x", "damaged"),
+        (zstandard.ZstdCompressor().compressobj().compress(b""), "damaged"),
+        (zstandard.ZstdCompressor(write_content_size=False).compress(b"abc") + b"x", "more than"),
+        (zstandard.ZstdCompressor(write_content_size=False).compress(b"abc")[:-2], "cut short"),
+    ],
+)
+def test_damaged_payloads(data: bytes, problem: str) -> None:
+    with pytest.raises(DamageError, match=problem):
+        unzstd(data)
+
+
+def test_payloads_without_a_stated_size() -> None:
+    assert unzstd(zstandard.ZstdCompressor(write_content_size=False).compress(b"abc")) == b"abc"
+
+
+# Damage -----------------------------------------------------------------------------------
+
+
+def refuse(path: Path, problem: str) -> None:
+    def read_everything() -> None:
+        with McapReader(path) as reader:
+            list(reader.records())
+
+    with pytest.raises(SourceError, match=problem) as caught:
+        read_everything()
+    assert str(path) in str(caught.value)
+
+
+def test_what_is_no_recording(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with pytest.raises(SourceNotFoundError):
+        McapReader(path)
+    path.write_bytes(b"")
+    refuse(path, "is empty")
+    path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 3\n")
+    refuse(path, "git lfs pull")
+    path.write_bytes(b"#ROSBAG V2.0\n" + bytes(5000))
+    refuse(path, "is not an MCAP file")
+    refuse(tmp_path, "cannot be read")
+
+
+def test_a_file_cut_short_anywhere(tmp_path: Path) -> None:
+    whole = tmp_path / "a.mcap"
+    write_all(whole, scene(), chunk_size=2000, compression="none")
+    data = whole.read_bytes()
+    path = tmp_path / "cut.mcap"
+    for length in [*range(9, 200), *range(200, len(data), 9973), *range(len(data) - 60, len(data))]:
+        path.write_bytes(data[:length])
+        refuse(path, "mcap recover")
+
+
+def test_a_real_file_cut_short() -> None:
+    refuse(real("corrupt/truncated_a.mcap"), "mcap recover")
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+def test_a_changed_byte_is_noticed(tmp_path: Path, compression: str) -> None:
+    whole = tmp_path / "a.mcap"
+    channel = Channel(1, "/a", "cdr", None)
+    write_all(
+        whole, [Message(channel, i, i, 0, bytes(50)) for i in range(9)], compression=compression
+    )
+    data = bytearray(whole.read_bytes())
+    start = chunk_data_at(data)
+    path = tmp_path / "changed.mcap"
+    for position in range(start, start + 40):
+        changed = bytearray(data)
+        changed[position] ^= 0x41
+        path.write_bytes(changed)
+        refuse(path, "damaged in its record at byte")
+
+
+def chunk_data_at(data: bytearray) -> int:
+    """Where the data of the first chunk begins."""
+    offset = 8
+    while data[offset] != 6:
+        offset += 9 + struct.unpack_from("<Q", data, offset + 1)[0]
+    length = struct.unpack_from("<I", data, offset + 9 + 28)[0]
+    return int(offset + 9 + 32 + length + 8)
+
+
+def record(opcode: int, body: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(body)) + body
+
+
+def text(value: str) -> bytes:
+    return struct.pack("<I", len(value.encode())) + value.encode()
+
+
+def channel_record(number: int, topic: str) -> bytes:
+    return record(4, struct.pack("<HH", number, 0) + text(topic) + text("cdr") + text(""))
+
+
+def message_record(number: int) -> bytes:
+    return record(5, struct.pack("<HIQQ", number, 0, 1, 1) + b"payload")
+
+
+def chunk(
+    records: bytes, compression: str = "", crc: int | None = None, size: int | None = None
+) -> bytes:
+    head = struct.pack(
+        "<QQQI",
+        1,
+        1,
+        len(records) if size is None else size,
+        zlib.crc32(records) if crc is None else crc,
+    )
+    return record(6, head + text(compression) + struct.pack("<Q", len(records)) + records)
+
+
+def file_of(*records: bytes) -> bytes:
+    magic = b"\x89MCAP0\r\n"
+    end = record(15, bytes(4)) + record(2, bytes(20))
+    return magic + record(1, text("") + text("")) + b"".join(records) + end + magic
+
+
+DAMAGED: dict[str, tuple[bytes, str]] = {
+    "unknown compression": (file_of(chunk(b"", "brotli")), "'brotli'"),
+    "no channel": (file_of(message_record(3)), "message 1 is of channel 3, which is not defined"),
+    "two channels": (
+        file_of(channel_record(1, "/a"), channel_record(1, "/b")),
+        "defined twice and differently",
+    ),
+    "two schemas": (
+        file_of(*(record(3, b"\1\0" + text(name) + text("") + text("")) for name in "ab")),
+        "schema 1 is defined twice",
+    ),
+    "size": (file_of(chunk(b"", size=3)), "holds 0 bytes instead of 3"),
+    "checksum": (file_of(chunk(message_record(1), crc=3)), "checksum"),
+    "message": (file_of(record(5, b"abc")), "shorter than its fields"),
+    "channel": (file_of(record(4, b"abc")), "Channel is shorter"),
+    "not UTF-8": (file_of(record(12, b"\1\0\0\0\xff" + text(""))), "not UTF-8"),
+    "chunk": (file_of(record(6, b"abc")), "a chunk is shorter"),
+    "record in a chunk": (file_of(chunk(b"\5abc")), "ends within a record"),
+    "length in a chunk": (file_of(chunk(message_record(1)[:-1])), "ends within a record"),
+    "lz4": (file_of(chunk(b"abc", "lz4", crc=0)), "lz4"),
+    "zstd": (file_of(chunk(b"abc", "zstd", crc=0)), "zstd"),
+    "bomb": (file_of(chunk(b"abc", "zstd", size=2**60)), "promises"),
+    "header": (b"\x89MCAP0\r\n" + file_of()[8:].replace(b"\1", b"\3", 1), "header"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_damage_has_a_sentence(tmp_path: Path, name: str) -> None:
+    data, problem = DAMAGED[name]
+    path = tmp_path / "a.mcap"
+    path.write_bytes(data)
+    refuse(path, problem)
+
+
+def test_an_attachment_is_verified(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write_all(path, [Attachment("name", "", 0, 0, b"content")])
+    path.write_bytes(path.read_bytes().replace(b"content", b"Content"))
+    refuse(path, "attachment 'name' does not match its checksum")
+
+
+def test_a_huge_record_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    data = file_of()
+    path.write_bytes(data[:-37] + struct.pack("<BQ", 5, 2**40) + data[-37:])
+    refuse(path, "ends before its footer|bytes at byte")
+
+
+def test_private_records_are_counted(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(file_of(record(0x90, b"mine"), channel_record(0, "/a"), message_record(0)))
+    reader, records = read(path)
+    assert len(records) == 1
+    assert reader.skipped == {"private MCAP records (opcode 0x90)": 1}
+
+
+# Writing ----------------------------------------------------------------------------------
+
+
+def test_unknown_compression(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="zstd, lz4, none"):
+        McapWriter(tmp_path / "a.mcap", profile="", compression="gzip")
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_a_time_that_does_not_fit(tmp_path: Path) -> None:
+    def write_it() -> None:
+        write_all(tmp_path / "a.mcap", [Message(Channel(1, "/a", "cdr", None), -1, 0, 0, b"")])
+
+    with pytest.raises(ConversionError, match="topic /a"):
+        write_it()
+
+
+def test_an_abandoned_file_is_not_finished(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+
+    def write_it() -> None:
+        with McapWriter(path, profile="") as writer:
+            writer.add_channel(Channel(1, "/a", "cdr", None))
+            raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError, match="stop"):
+        write_it()
+    refuse(path, "mcap recover|is not an MCAP file|is empty")
+
+
+@pytest.mark.parametrize("count", [0, 200])
+def test_a_full_disk_is_an_operating_system_error(count: int) -> None:
+    device = Path("/dev/full")
+    if not device.exists():
+        pytest.skip("this system has no /dev/full")
+    channel = Channel(1, "/a", "cdr", None)
+
+    def write_it() -> None:
+        with McapWriter(device, profile="", compression="none") as writer:
+            writer.add_channel(channel)
+            for number in range(count):
+                writer.write(Message(channel, number, 0, 0, bytes(100_000)))
+
+    with pytest.raises(OSError, match="space") as caught:
+        write_it()
+    assert caught.value.errno == errno.ENOSPC

@@ -1,0 +1,548 @@
+"""ROS 1 bags: what rosbags reads, we read, and what it normalises stays as recorded."""
+
+from __future__ import annotations
+
+import bz2
+import os
+import struct
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import lz4.frame
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Reader
+
+from conftest import DATA, real
+from mp4ds.bags import ros1
+from mp4ds.bags.ros1 import Ros1Reader, Ros1Writer
+from mp4ds.errors import (
+    ConversionError,
+    OptionError,
+    SourceError,
+    SourceNotFoundError,
+    TargetExistsError,
+)
+from mp4ds.records import (
+    Attachment,
+    Channel,
+    ChannelStats,
+    Message,
+    MetadataRecord,
+    Schema,
+)
+from sources import START, scene, write_bag
+
+COMPRESSIONS = ("none", "bz2", "lz4")
+REAL_BAGS = (
+    "bags/bag_reader_java/Bool.bag",
+    "bags/bag_reader_java/UInt8MultiArray.bag",
+    "bags/ecto_ros_camera_info.bag",
+    "bags/embag_array.bag",
+    "bags/embag_test2_multiconn.bag",
+    "bags/example_turtle_bz2.bag",
+    "bags/example_turtle_lz4.bag",
+    "bags/example_turtle_none.bag",
+    "bags/example_unsorted_chunks.bag",
+    "bags/fiducials_aruco_marker_raspicam.bag",
+    "bags/joint_states_bz2.bag",
+    "bags/librealsense_depth_color.bag",
+    "bags/no_messages.bag",
+    "bags/only_a_cube_melodic.bag",
+    "bags/ouster_512x10_raw_packets.bag",
+    "bags/roboto_tiny_dvs.bag",
+    "bags/ros_comm_storage_test.bag",
+    "bags/ros_numpy_test.bag",
+    "bags/rosout_bz2.bag",
+    "bags/spot_compressedDepth.bag",
+    "bags/spot_cv_raw.bag",
+    "bags/youliangtan_object_pose.bag",
+    "corrupt/sample_ok.bag",
+)
+PLAIN = {"topic": b"/a", "type": b"std_msgs/String", "md5sum": b"992c", "message_definition": b""}
+
+Header = Iterable[tuple[bytes, bytes]]
+
+
+# ---------------------------------------------------------------- bags, byte by byte
+
+
+def joined(fields: Header) -> bytes:
+    pieces = [name + b"=" + value for name, value in fields]
+    body = b"".join(struct.pack("<I", len(piece)) + piece for piece in pieces)
+    return struct.pack("<I", len(body)) + body
+
+
+def record(fields: Header, data: bytes) -> bytes:
+    return joined(fields) + struct.pack("<I", len(data)) + data
+
+
+def number(value: int, form: str = "<I") -> bytes:
+    return struct.pack(form, value)
+
+
+def stamp(time: int) -> bytes:
+    return struct.pack("<II", *divmod(time, 10**9))
+
+
+def connection(conn: int, topic: bytes, header: Header) -> bytes:
+    return joined([(b"op", b"\7"), (b"topic", topic), (b"conn", number(conn))]) + joined(header)
+
+
+def bag_header(index_pos: int, connections: int, chunks: int, *more: tuple[bytes, bytes]) -> bytes:
+    counts = [(b"conn_count", number(connections)), (b"chunk_count", number(chunks))]
+    head = joined([(b"op", b"\3"), (b"index_pos", number(index_pos, "<Q")), *counts, *more])
+    padding = b" " * (4096 - len(head) - 4)
+    return b"#ROSBAG V2.0\n" + head + number(len(padding)) + padding
+
+
+def chunk_record(compression: str, content: bytes, size: int | None = None) -> bytes:
+    pack = {"bz2": bz2.compress, "lz4": lz4.frame.compress}.get(compression, bytes)
+    size = len(content) if size is None else size
+    fields = [(b"op", b"\5"), (b"compression", compression.encode()), (b"size", number(size))]
+    return record(fields, pack(content))
+
+
+def make_bag(
+    path: Path,
+    connections: Sequence[tuple[bytes, Header]],
+    chunks: Sequence[Sequence[tuple[int, int, bytes]]] = (),
+    *,
+    compression: str = "none",
+    shift: int = 0,
+    counted: int = 0,
+    size: int | None = None,
+) -> Path:
+    """A bag of connections (topic, header) and chunks of messages (connection, time, payload).
+
+    Damage: index offsets are shifted, counts in the chunk summaries are raised by `counted`, and
+    `size` is what chunks say that they unpack to.
+    """
+    body, infos = bytearray(), b""
+    for chunk in chunks:
+        position, content, entries = 4096 + 13 + len(body), b"", {}
+        for conn, time, data in chunk:
+            entries.setdefault(conn, []).append(stamp(time) + number(len(content) + shift))
+            fields = [(b"op", b"\2"), (b"conn", number(conn)), (b"time", stamp(time))]
+            content += record(fields, data)
+        body += chunk_record(compression, content, size)
+        for conn, found in entries.items():
+            counts = [(b"conn", number(conn)), (b"count", number(len(found)))]
+            body += record([(b"op", b"\4"), (b"ver", number(1)), *counts], b"".join(found))
+        times = [time for _, time, _ in chunk]
+        span = [(b"start_time", stamp(min(times))), (b"end_time", stamp(max(times)))]
+        place = [(b"ver", number(1)), (b"chunk_pos", number(position, "<Q"))]
+        counts = [(b"count", number(len(entries)))]
+        data = b"".join(number(c) + number(len(f) + counted) for c, f in entries.items())
+        infos += record([(b"op", b"\6"), *place, *span, *counts], data)
+    index = b"".join(connection(n, topic, header) for n, (topic, header) in enumerate(connections))
+    head = bag_header(4096 + 13 + len(body), len(connections), len(chunks))
+    path.write_bytes(head + body + index + infos)
+    return path
+
+
+def plain(topic: str = "/a", /, **more: bytes) -> tuple[bytes, Header]:
+    fields = {**PLAIN, "topic": topic.encode(), **more}
+    return topic.encode(), [(name.encode(), value) for name, value in fields.items()]
+
+
+def connections_in(path: Path) -> list[bytes]:
+    """Topic and header of all connections in a bag's index, sorted fields joined again."""
+    data = path.read_bytes()
+    (index,) = struct.unpack_from("<Q", data, data.index(b"index_pos=") + 10)
+    found = []
+    while index < len(data):
+        outer, after = split(data, index)
+        inner, index = split(data, after)
+        if outer[b"op"] == b"\7":
+            found.append(outer[b"topic"] + b"\0" + joined(sorted(inner.items())))
+    return found
+
+
+def split(data: bytes, start: int) -> tuple[dict[bytes, bytes], int]:
+    end = start + 4 + struct.unpack_from("<I", data, start)[0]
+    start += 4
+    fields = {}
+    while start < end:
+        (size,) = struct.unpack_from("<I", data, start)
+        name, equals, value = data[start + 4 : start + 4 + size].partition(b"=")
+        if not equals:
+            return {}, end  # chunk summaries have data here, not fields
+        fields[name] = value
+        start += 4 + size
+    return fields, end
+
+
+# ---------------------------------------------------------------- reading and writing
+
+
+Row = tuple[int, int, bytes]
+
+
+def rows(reader: Ros1Reader) -> list[Row]:
+    return [(m.channel.id, m.log_time, bytes(m.data)) for m in reader.records()]
+
+
+def by_library(path: Path) -> list[Row]:
+    with Reader(path) as reader:
+        return [(c.id, time, bytes(data)) for c, time, data in reader.messages()]
+
+
+def copy(source: Path, target: Path, compression: Any) -> None:
+    with Ros1Reader(source) as reader, Ros1Writer(target, compression) as writer:
+        for channel in reader.channels:
+            writer.add_channel(channel)
+        for message in reader.records():
+            writer.write(message)
+    assert not writer.omitted
+
+
+def identities(reader: Ros1Reader) -> list[tuple[object, ...]]:
+    return [channel.identity for channel in reader.channels]
+
+
+def refuse(path: Path, problem: str) -> None:
+    def read_everything() -> None:
+        with Ros1Reader(path) as reader:
+            for _ in reader.records():
+                pass
+
+    with pytest.raises(SourceError) as caught:
+        read_everything()
+    assert str(caught.value).startswith(f"{path}: ")
+    assert problem in str(caught.value)
+
+
+@pytest.mark.parametrize("name", REAL_BAGS)
+def test_real_bags(name: str, tmp_path: Path) -> None:
+    path = real(name)
+    with Ros1Reader(path) as reader:
+        found = rows(reader)
+        assert found == by_library(path)
+        assert reader.position == path.stat().st_size
+        assert sum(item.count for item in reader.stats().values()) == len(found)
+        own = identities(reader)
+        ids = {channel.id: number for number, channel in enumerate(reader.channels)}
+    copied = tmp_path / "copy.bag"
+    copy(path, copied, COMPRESSIONS[REAL_BAGS.index(name) % 3])
+    with Ros1Reader(copied) as reader:
+        assert identities(reader) == own
+        assert rows(reader) == [(ids[conn], time, data) for conn, time, data in found]
+    assert connections_in(copied) == connections_in(path)
+
+
+def test_all_real_bags_are_known() -> None:
+    if DATA.is_dir():
+        found = {str(p.relative_to(DATA)) for p in (DATA / "bags").glob("*.bag")}
+        assert found <= set(REAL_BAGS)
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_round_trip(tmp_path: Path, compression: str) -> None:
+    made, copied = tmp_path / "made.bag", tmp_path / "copied.bag"
+    write_bag(made, scene("bayer_rggb8", frames=40), compression)
+    copy(made, copied, compression)
+    with Ros1Reader(made) as one, Ros1Reader(copied) as other:
+        assert identities(one) == identities(other)
+        assert rows(one) == rows(other)
+        assert len(rows(one)) == len(by_library(copied)) > 200
+        assert any(not stats.count for stats in one.stats().values())  # a silent topic
+
+
+def test_a_payload_is_a_slice_of_its_chunk(tmp_path: Path) -> None:
+    path = make_bag(tmp_path / "a.bag", [plain()], [[(0, 1, b"one"), (0, 2, b"two")]])
+    with Ros1Reader(path) as reader:
+        one, two = (message.data for message in reader.records())
+    assert isinstance(one, memoryview)
+    assert isinstance(two, memoryview)
+    assert one.obj is two.obj
+    assert one.readonly
+
+
+def test_messages_come_in_log_time_order_then_file_order(tmp_path: Path) -> None:
+    chunks = [
+        [(1, 5, b"b5"), (0, 5, b"a5"), (0, 9, b"a9"), (0, 5, b"a5 again")],
+        [(0, 1, b"a1"), (1, 5, b"b5 later"), (1, 9, b"b9")],
+    ]
+    path = make_bag(tmp_path / "a.bag", [plain("/a"), plain("/b")], chunks, compression="lz4")
+    with Ros1Reader(path) as reader:
+        assert [data for _, _, data in rows(reader)] == [
+            b"a1", b"b5", b"a5", b"a5 again", b"b5 later", b"a9", b"b9",
+        ]  # fmt: skip
+        assert reader.times()[0].tolist() == [1, 5, 5, 9]
+        assert reader.times()[1].dtype == np.int64
+        assert reader.stats() == {0: ChannelStats(4, 1, 9), 1: ChannelStats(3, 5, 9)}
+        first = reader.first(reader.channels[1])
+        assert first
+        assert (bytes(first.data), first.publish_time, first.sequence) == (b"b5", 5, 0)
+
+
+def test_chunks_that_overlap_in_time_are_unpacked_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chunks = [[(0, 10 * n + c, b"%d" % n) for n in range(50)] for c in range(4)]
+    path = make_bag(tmp_path / "a.bag", [plain()], chunks, compression="bz2")
+    unpacked = []
+
+    def unpack(compression: str, size: int, data: bytes) -> bytes:
+        unpacked.append(size)
+        return real_unpack(compression, size, data)
+
+    real_unpack = ros1.unpack_chunk
+    monkeypatch.setattr(ros1, "unpack_chunk", unpack)
+    with Ros1Reader(path) as reader:
+        assert len(rows(reader)) == 200
+    assert len(unpacked) == 4
+    monkeypatch.setattr(ros1, "CACHED_BYTES", 1)
+    with Ros1Reader(path) as reader:
+        list(reader.records())
+        assert len(reader._chunks) == 2
+    assert len(unpacked) > 100
+
+
+def test_progress_is_monotone(tmp_path: Path) -> None:
+    path = tmp_path / "a.bag"
+    write_bag(path, scene("mono8", frames=40))
+    with Ros1Reader(path) as reader:
+        positions = [reader.position for _ in reader.records()]
+        assert positions == sorted(positions)
+        assert len(set(positions)) > 3
+        assert positions[-1] <= reader.position == path.stat().st_size
+
+
+def test_connection_headers_stay_as_recorded(tmp_path: Path) -> None:
+    headers = [
+        plain("/odd", latching=b"true", callerid=b"/n", vendor=b"x=y", empty=b""),
+        plain("//a/./b/", type=b"std_msgs/msg/String", latching=b"", topic=b"/inner"),
+        (b"/none", [(b"type", b"pkg/Type"), (b"md5sum", b"*")]),
+        (b"/nothing", [(b"callerid", b"/n")]),
+        plain(
+            "/raw", message_definition=b"# \xff\xfe\nstring data", callerid=b"/\xe9", type=b"\xff"
+        ),
+        (b"/raw\xff", [(b"topic", b"/raw\xff"), *plain()[1][1:]]),
+        plain("/odd", latching=b"true", callerid=b"/n", vendor=b"x=y", empty=b""),
+        plain("/name", **{"looks;base64": b"like it, is not"}),
+    ]
+    chunks = [[(n, n, b"%d" % n) for n in range(len(headers))]]
+    path = make_bag(tmp_path / "a.bag", headers, chunks)
+    with Ros1Reader(path) as reader:
+        odd, verbatim, none, nothing, raw, *_ = reader.channels
+        assert odd.metadata == {
+            "md5sum": "992c", "latching": "true", "callerid": "/n", "vendor": "x=y", "empty": "",
+        }  # fmt: skip
+        assert verbatim.topic == "//a/./b/"
+        assert verbatim.type_name == "std_msgs/msg/String"
+        assert verbatim.metadata["topic"] == "/inner"
+        assert none.schema == Schema("pkg/Type", "", b"")
+        assert nothing.schema is None
+        assert raw.schema
+        assert raw.schema.data == b"# \xff\xfe\nstring data"
+        assert raw.metadata["callerid;base64"] == "L+k="
+        own = identities(reader)
+    for channel in reader.channels:
+        str(channel.identity).encode()  # everything can be written as UTF-8
+    copied = tmp_path / "copy.bag"
+    copy(path, copied, "none")
+    assert connections_in(copied) == connections_in(path)
+    with Ros1Reader(copied) as reader:
+        assert identities(reader) == own
+        assert [data for _, _, data in rows(reader)] == [b"%d" % n for n in range(len(headers))]
+
+
+def test_the_index_may_point_to_a_connection_record(tmp_path: Path) -> None:
+    topic, header = plain()
+    path = make_bag(tmp_path / "a.bag", [(topic, header)], [[(0, 1, b"one")]])
+    data = path.read_bytes()
+    size = data.index(b"size=") + 5
+    before = connection(0, topic, header)
+    content = data.index(b"\4\0\0\0op=\2") - 4
+    (length,) = struct.unpack_from("<I", data, size)
+    longer = number(length + len(before))
+    data = data[:size] + longer + longer + before + data[content:]
+    index = struct.unpack_from("<Q", data, data.index(b"index_pos=") + 10)[0] + len(before)
+    path.write_bytes(data.replace(data[:4109], bag_header(index, 1, 1)))
+    with Ros1Reader(path) as reader:
+        assert rows(reader) == [(0, 1, b"one")]
+
+
+def test_topics_without_messages(tmp_path: Path) -> None:
+    bare = make_bag(tmp_path / "bare.bag", [plain("/a"), plain("/b")])
+    copied = tmp_path / "copy.bag"
+    copy(bare, copied, "lz4")
+    for path in (bare, copied):
+        with Ros1Reader(path) as reader:
+            assert [channel.topic for channel in reader.channels] == ["/a", "/b"]
+            assert rows(reader) == []
+            assert reader.stats() == {0: ChannelStats(0, 0, 0), 1: ChannelStats(0, 0, 0)}
+            assert reader.first(reader.channels[0]) is None
+            assert reader.position == path.stat().st_size
+    with Ros1Writer(tmp_path / "empty.bag"):
+        pass
+    with Ros1Reader(tmp_path / "empty.bag") as reader:
+        assert (list(reader.channels), rows(reader)) == ([], [])
+
+
+# ---------------------------------------------------------------- what cannot be read
+
+
+def test_what_is_no_bag(tmp_path: Path) -> None:
+    with pytest.raises(SourceNotFoundError):
+        Ros1Reader(tmp_path / "missing.bag")
+    refuse(tmp_path, "cannot be read: Is a directory")
+    path = tmp_path / "a.bag"
+    index = 4096 + 13
+    for data, problem in (
+        (b"", "is empty"),
+        (b"not a bag at all", "is not a ROS 1 bag"),
+        (b"#ROSBAG V2.0\r\n", "is not a ROS 1 bag"),
+        (b"#ROSBAG V1.2\n", "version 1.2, and only 2.0 is read. Rewrite it with `rosbag filter"),
+        (b"#ROSRECORD V1.1\n", "version 1.1"),
+        (b"version https://git-lfs.github.com/spec/v1\noid", "is a git-lfs pointer"),
+        (b"#ROSBAG V2.0\n", "is damaged"),
+        (b"#ROSBAG V2.0\n\x10\0\0\0", "is damaged"),
+        (b"#ROSBAG V2.0\n" + joined([(b"op", b"\3")]), "is damaged"),
+        (bag_header(0, 1, 1), "is not indexed: the recording was cut short. Reindex it with"),
+        (bag_header(9999, 1, 1), "is cut short: its index should begin at byte 9999"),
+        (bag_header(index, 1, 1), "is damaged"),
+        (bag_header(index, 0, 0, (b"encryptor", b"rosbag/AesCbcEncryptor")), "is encrypted"),
+    ):
+        path.write_bytes(data)
+        refuse(path, problem)
+
+
+@pytest.mark.parametrize(
+    "name", ["header_only_dummy_600chunks", "lfs_pointer", "truncated", "unindexed", "zero_bytes"]
+)
+def test_real_damage(name: str) -> None:
+    refuse(real(f"corrupt/{name}.bag"), "")
+
+
+def test_damage_has_a_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "a.bag"
+    one = [[(0, 1, b"one")]]
+    for options, problem in (
+        ({"shift": 1}, "topic /a, chunk at byte 4109: "),
+        ({"shift": 500}, "topic /a, chunk at byte 4109: a record is cut short. Copy it again"),
+        ({"counted": 1}, "the index of the chunk at byte 4109 contradicts that of the bag"),
+        ({"compression": "zstd"}, "it is compressed by 'zstd', which is not known"),
+        ({"size": 3}, "it unpacks to 49 bytes instead of 3"),
+        ({"size": 3, "compression": "bz2"}, "its bz2 data does not unpack to 3 bytes"),
+        ({"size": 2**31, "compression": "bz2"}, "it unpacks to 49 bytes instead of 2147483648"),
+    ):
+        refuse(make_bag(path, [plain()], one, **options), problem)
+    refuse(make_bag(path, [], one), "contradicts that of the bag")
+    good = make_bag(path, [plain("/a"), plain("/b")], [[(0, 1, b"one"), (1, 2, b"two")]])
+    data = good.read_bytes()
+    path.write_bytes(data.replace(b"conn=\0\0\0\0", b"conn=\1\0\0\0", 1))
+    refuse(path, "the index points to another message")
+    path.write_bytes(data.replace(b"time=\0\0\0\0\1", b"time=\0\0\0\0\3", 1))
+    refuse(path, "the index points to another message")
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_a_bag_cut_short_or_changed_anywhere(tmp_path: Path, compression: str) -> None:
+    chunks = [[(0, 5 * n + c, os.urandom(20)) for n in range(5)] for c in range(2)]
+    path = make_bag(tmp_path / "a.bag", [plain()], chunks, compression=compression)
+    data = path.read_bytes()
+    for length in [*range(100), *range(4090, len(data))]:
+        path.write_bytes(data[:length])
+        refuse(path, "")
+    for place in [*range(110), *range(4109, len(data))]:
+        path.write_bytes(data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
+        problem = damage_of(path)
+        assert "codec" not in problem
+        assert "b'" not in problem
+
+
+def damage_of(path: Path) -> str:
+    try:
+        with Ros1Reader(path) as reader:
+            assert len(rows(reader)) == 10
+    except SourceError as error:
+        return str(error)
+    return ""
+
+
+# ---------------------------------------------------------------- what a bag cannot hold
+
+STRING = Channel(7, "/a", "ros1", Schema("std_msgs/String", "ros1msg", b"string data"), {})
+
+
+def test_what_a_bag_cannot_hold_is_counted(tmp_path: Path) -> None:
+    with Ros1Writer(tmp_path / "a.bag") as writer:
+        writer.add_channel(STRING)
+        writer.add_channel(STRING)
+        writer.write(Message(STRING, START, START, 0, b"a"))
+        writer.write(Message(STRING, START, START - 1, 0, b"b"))
+        writer.write(Message(STRING, START, START, 4, memoryview(b"c")))
+        writer.add_attachment(Attachment("a", "text/plain", 0, 0, b""))
+        writer.add_metadata(MetadataRecord("a", {}))
+        writer.add_schema(Schema("a", "", b""))
+    assert writer.omitted == {
+        "publish times that differ from the log time": 1,
+        "sequence numbers of messages": 1,
+        "attachments": 1,
+        "metadata records": 1,
+        "definitions that no topic uses": 1,
+    }
+    with Ros1Reader(tmp_path / "a.bag") as reader:
+        assert len(reader.channels) == 1
+        assert rows(reader) == [(0, START, b"a"), (0, START, b"b"), (0, START, b"c")]
+
+
+@pytest.mark.parametrize("time", [0, 1, 10**9, 2**32 * 10**9 - 1])
+def test_the_times_that_a_bag_can_hold(tmp_path: Path, time: int) -> None:
+    with Ros1Writer(tmp_path / "a.bag") as writer:
+        writer.add_channel(STRING)
+        writer.write(Message(STRING, time, time, 0, b""))
+    with Ros1Reader(tmp_path / "a.bag") as reader:
+        assert rows(reader) == [(0, time, b"")]
+
+
+@pytest.mark.parametrize("time", [-1, 2**32 * 10**9])
+def test_a_time_out_of_range_is_refused(tmp_path: Path, time: int) -> None:
+    def write_it() -> None:
+        with Ros1Writer(tmp_path / "a.bag") as writer:
+            writer.add_channel(STRING)
+            writer.write(Message(STRING, time, time, 0, b""))
+
+    with pytest.raises(ConversionError, match="topic /a: has a log time of"):
+        write_it()
+    refuse(tmp_path / "a.bag", "is not indexed")  # abandoned
+
+
+def test_what_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.bag"
+    with pytest.raises(OptionError, match="none, bz2 or lz4"):
+        Ros1Writer(path, "zip")  # type: ignore[arg-type]
+    assert not path.exists()
+    with Ros1Writer(path) as writer, pytest.raises(ConversionError, match="messages are cdr"):
+        writer.add_channel(Channel(0, "/a", "cdr", STRING.schema, {}))
+    with pytest.raises(TargetExistsError):
+        Ros1Writer(path)
+
+
+def test_lz4_as_ros_reads_it(tmp_path: Path) -> None:
+    """ROS 1 refuses frames with a content size, dependent blocks, or without a checksum."""
+    path = tmp_path / "a.bag"
+    with Ros1Writer(path, "lz4") as writer:
+        writer.add_channel(STRING)
+        for n in range(100):
+            writer.write(Message(STRING, n, n, 0, bytes(40_000)))
+    data = path.read_bytes()
+    frames = data.split(b"\x04\x22\x4d\x18")[1:]
+    assert len(frames) > 2
+    assert {frame[0] for frame in frames} == {0b0110_0100}
+
+
+def test_memory_for_the_index_is_bounded(tmp_path: Path) -> None:
+    with Ros1Writer(tmp_path / "a.bag") as writer:
+        writer.add_channel(STRING)
+        for n in range(300):
+            writer.write(Message(STRING, n, n, 0, bytes(10_000)))
+        kept = [list(chunk.connections.values()) for chunk in writer._bag.chunks[:-1]]
+    assert kept
+    assert all(isinstance(items, range) for found in kept for items in found)
+    with Ros1Reader(tmp_path / "a.bag") as reader:
+        assert reader.stats() == {0: ChannelStats(300, 0, 299)}

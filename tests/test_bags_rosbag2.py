@@ -1,0 +1,857 @@
+"""rosbag2 recordings: read verbatim whatever their version and storage, written so that all can."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterable
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+import zstandard
+from mcap.reader import make_reader
+from rosbags.rosbag2 import Reader as RosbagsReader
+
+from conftest import real
+from mp4ds.bags.rosbag2 import Rosbag2Reader, Rosbag2Writer
+from mp4ds.bags.rosbag2_metadata import RECORD, TABLES_RECORD, native_qos, parse_bag_info
+from mp4ds.bags.rosbag2_sqlite import SqliteReader
+from mp4ds.bags.rosbag2_sqlite_write import SqliteWriter
+from mp4ds.errors import ConversionError, OptionError, SourceError, SourceNotFoundError
+from mp4ds.records import (
+    Attachment,
+    Channel,
+    ChannelStats,
+    Message,
+    MetadataRecord,
+    Record,
+    Schema,
+)
+
+TESTS = "rosbag2/ros2_rosbag2"
+PY = f"{TESTS}/rosbag2_py__test__resources__"
+FOLDERS = (
+    "rosbag2/geocamxyz_test_bag_sqlite3",
+    "rosbag2/ros2bag_tools_images.bag",
+    f"{TESTS}/ros2bag__test__resources/empty_bag",
+    *(f"{PY}{s}/{name}" for s in ("sqlite3", "mcap") for name in ("convert_a", "convert_b")),
+    *(f"{PY}{s}/{name}" for s in ("sqlite3", "mcap") for name in ("talker", "wbag")),
+    *(
+        f"{TESTS}/rosbag2_tests__resources/{s}/{name}"
+        for s in ("sqlite3", "mcap")
+        for name in ("bag_with_topics_and_service_events", "cdr_test", "wrong_rmw_test")
+    ),
+)
+OLD_QOS = (
+    "- history: 1\n  depth: 5\n  reliability: 2\n  durability: 1\n  deadline:\n"
+    "    sec: 9223372036\n    nsec: 854775807\n  lifespan:\n    sec: 2147483647\n"
+    "    nsec: 4294967295\n  liveliness: 1\n  liveliness_lease_duration:\n    sec: 0\n"
+    "    nsec: 0\n  avoid_ros_namespace_conventions: false"
+)
+NEW_QOS = (
+    OLD_QOS.replace("history: 1", "history: keep_last")
+    .replace("reliability: 2", "reliability: best_effort")
+    .replace("durability: 1", "durability: transient_local")
+    .replace("liveliness: 1", "liveliness: automatic")
+)
+IMAGE = Schema("sensor_msgs/msg/Image", "ros2msg", b"uint32 height\n# \xc3\xbc\n")
+OTHER = Schema("pkg/msg/Other", "ros2idl", b"module pkg {};\r\n")
+UNUSED = Schema("pkg/msg/Unused", "ros2msg", b"int8 x")
+HASH = "RIHS01_" + "0" * 64
+
+
+def messages(records: Iterable[Record]) -> list[Message]:
+    return [record for record in records if isinstance(record, Message)]
+
+
+def metadata(records: Iterable[Record], name: str) -> list[dict[str, str]]:
+    return [dict(r.metadata) for r in records if isinstance(r, MetadataRecord) and r.name == name]
+
+
+def fields(message: Message) -> tuple[Any, ...]:
+    return (*message.channel.identity, message.log_time, bytes(message.data))
+
+
+def read(path: Path, **options: Any) -> tuple[Rosbag2Reader, list[Record]]:
+    with Rosbag2Reader(path, **options) as reader:
+        records = list(reader.records())
+        assert reader.position == sum(file.stat().st_size for file in reader.files)
+        return reader, records
+
+
+def payloads_of(path: Path) -> list[tuple[str, int, bytes]]:
+    """Topic, time and payload of all messages, by the public libraries alone."""
+    if path.suffix == ".db3":
+        uri = f"{path.as_uri()}?mode=ro&immutable=1"
+        with closing(sqlite3.connect(uri, uri=True)) as connection:
+            query = (
+                "SELECT name, timestamp, data FROM messages JOIN topics ON topic_id = topics.id"
+                " ORDER BY timestamp, messages.id"
+            )
+            return [tuple(row) for row in connection.execute(query)]
+    with path.open("rb") as stream:
+        return [(c.topic, m.log_time, m.data) for _, c, m in make_reader(stream).iter_messages()]
+
+
+def check_index(reader: Rosbag2Reader, got: list[Message]) -> None:
+    times, stats = reader.times(), reader.stats()
+    for channel in reader.channels:
+        own = [m for m in got if m.channel is channel]
+        assert (times[channel.id].tolist() if own else []) == [m.log_time for m in own]
+        first = reader.first(channel)
+        assert (first and fields(first)) == (fields(own[0]) if own else None)
+        if stats:
+            assert stats[channel.id].count == len(own)
+            assert all(stats[channel.id].start <= m.log_time for m in own)
+            assert all(m.log_time <= stats[channel.id].end for m in own)
+    assert all(m.channel in reader.channels for m in got)
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_real_recordings(name: str) -> None:
+    path = real(name)
+    reader, records = read(path)
+    got = messages(records)
+    text = (path / "metadata.yaml").read_text()
+    info = yaml.safe_load(text)["rosbag2_bagfile_information"]
+    files = [path / file for file in info["relative_file_paths"]]
+    assert reader.files == [path / "metadata.yaml", *files]
+    assert (reader.format, reader.profile) == ("rosbag2", "ros2")
+    expected = [row for file in files for row in payloads_of(file)]
+    assert [(m.channel.topic, m.log_time, bytes(m.data)) for m in got] == expected
+    assert len(got) == info["message_count"] == sum(s.count for s in reader.stats().values())
+    listed = {item["topic_metadata"]["name"] for item in info["topics_with_message_count"]}
+    assert listed <= {channel.topic for channel in reader.channels}
+    (own,) = metadata(records[:1], RECORD)
+    assert own["metadata.yaml"] == text
+    assert own["storage"] == info["storage_identifier"]
+    assert own["files"].split("\n") == info["relative_file_paths"]
+    check_index(reader, got)
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_real_recordings_round_trip(name: str, storage: str, tmp_path: Path) -> None:
+    reader, records = read(real(name))
+    target = tmp_path / "out"
+    omitted = copy(reader, records, target, storage)
+    back, again = read(target)
+    same = metadata(records, RECORD)[0]["storage"] == storage
+    same_fields = fields if same else plain_fields
+    assert list(map(same_fields, messages(again))) == list(map(same_fields, messages(records)))
+    identity = Channel.identity.fget if same else plain
+    assert set(map(identity, back.channels)) == set(map(identity, reader.channels))  # type: ignore[arg-type]
+    assert set(back.unused_schemas) == set(reader.unused_schemas)
+    old, new = (
+        parse_bag_info(metadata(found, RECORD)[0]["metadata.yaml"], tmp_path)
+        for found in (records, again)
+    )
+    assert (new.version, new.ros_distro) == (old.version, old.ros_distro or new.ros_distro)
+    assert set(omitted) <= {"sequence numbers (sqlite3 storage keeps none)"}
+    if name.endswith("wrong_rmw_test"):
+        return  # rosbags reads cdr only
+    with RosbagsReader(target) as public:
+        assert public.message_count == len(messages(records))
+        if "convert_a" not in name:  # rosbags leaves out topics whose QoS is told in two ways
+            assert [(c.topic, t, bytes(d)) for c, t, d in public.messages()] == [
+                (m.channel.topic, m.log_time, bytes(m.data)) for m in messages(records)
+            ]
+
+
+def plain(channel: Channel) -> tuple[object, ...]:
+    """A channel without its QoS and hash, which storages hold in ways of their own."""
+    return replace(channel, metadata={}).identity
+
+
+def plain_fields(message: Message) -> tuple[Any, ...]:
+    return (*plain(message.channel), message.log_time, bytes(message.data))
+
+
+def copy(
+    reader: Rosbag2Reader, records: list[Record], target: Path, storage: str
+) -> dict[str, int]:
+    with Rosbag2Writer(target, storage=storage) as writer:
+        for channel in reader.channels:
+            writer.add_channel(channel)
+        for schema in reader.unused_schemas:
+            writer.add_schema(schema)
+        put(writer, records)
+    return dict(writer.omitted)
+
+
+def put(writer: Rosbag2Writer, records: Iterable[Record]) -> None:
+    for record in records:
+        if isinstance(record, Message):
+            writer.write(record)
+        elif isinstance(record, Attachment):
+            writer.add_attachment(record)
+        else:
+            writer.add_metadata(record)
+
+
+def test_payloads_compressed_within_mcap(tmp_path: Path) -> None:
+    source = real("rosbag2/amber_soccer_goal_msgzstd_v0/soccer_goal_12.mcap")
+    shutil.copyfile(source, tmp_path / source.name)
+    info = {
+        "version": 5,
+        "storage_identifier": "mcap",
+        "compression_format": "zstd",
+        "compression_mode": "MESSAGE",
+        "relative_file_paths": [source.name],
+        "message_count": 1,
+        "topics_with_message_count": [],
+    }
+    (tmp_path / "metadata.yaml").write_text(yaml.dump({"rosbag2_bagfile_information": info}))
+    reader, records = read(tmp_path)
+    ((_, _, packed),) = payloads_of(source)
+    (message,) = messages(records)
+    assert bytes(message.data) == zstandard.decompress(packed)
+    assert len(message.data) > 640 * 480 * 3
+    check_index(reader, [message])
+    # The same file alone: what stands beside it tells that its payloads are compressed.
+    (alone,) = messages(read(tmp_path / source.name)[1])
+    assert alone.data == message.data
+
+
+def test_a_database_without_metadata() -> None:
+    path = real("rosbag2/klintan_sample_2msg/sample.db3")
+    reader, records = read(path)
+    assert [(m.channel.topic, m.log_time, m.data) for m in messages(records)] == payloads_of(path)
+    assert [(c.topic, c.schema, dict(c.metadata)) for c in reader.channels] == [
+        ("/text", Schema("std_msgs/String", "", b""), {}),
+        ("/image", Schema("sensor_msgs/Image", "", b""), {}),
+    ]
+    assert metadata(records, RECORD) == [{"storage": "sqlite3", "files": "sample.db3"}]
+    check_index(reader, messages(records))
+
+
+def test_qos_comes_from_the_metadata_where_the_database_has_none() -> None:
+    reader = Rosbag2Reader(real(f"{PY}sqlite3/convert_a"))
+    assert all(c.metadata["offered_qos_profiles"].startswith("- history") for c in reader.channels)
+
+
+# Round trips ------------------------------------------------------------------------------
+
+
+def channels(qos: str = OLD_QOS) -> tuple[Channel, ...]:
+    told = {"offered_qos_profiles": qos, "topic_type_hash": HASH}
+    return (
+        Channel(0, "/image", "cdr", IMAGE, told),
+        Channel(9, "/on", "cdr", OTHER, {"offered_qos_profiles": "", "topic_type_hash": ""}),
+        Channel(5, "/image", "cdr", OTHER, told),
+        Channel(6, "/empty", "cdr", IMAGE, told),
+    )
+
+
+def scene(qos: str = OLD_QOS) -> list[Message]:
+    return [
+        Message(channels(qos)[i % 3], 10**18 + i // 2, 10**18 + i // 2, 0, bytes([i]) * (i * 50))
+        for i in range(60)
+    ]
+
+
+def write(
+    folder: Path, storage: str, records: Iterable[Record], qos: str = OLD_QOS
+) -> dict[str, int]:
+    with Rosbag2Writer(folder, storage=storage, name="run") as writer:
+        for channel in channels(qos):
+            writer.add_channel(channel)
+        writer.add_schema(UNUSED)
+        put(writer, records)
+    return dict(writer.omitted)
+
+
+def source_record(version: int, **more: Any) -> MetadataRecord:
+    info = {"version": version, "storage_identifier": "sqlite3", **more}
+    text = yaml.dump({"rosbag2_bagfile_information": info})
+    return MetadataRecord(RECORD, {"metadata.yaml": text, "storage": "sqlite3", "files": ""})
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("version", [None, *range(2, 10)])
+def test_round_trip(tmp_path: Path, storage: str, version: int | None) -> None:
+    folder = tmp_path / "made"
+    qos = NEW_QOS if version == 9 else "" if version and version < 4 else OLD_QOS
+    custom = {"custom_data": {"operator": "kim", "run": "0042"}, "ros_distro": "jazzy"}
+    given: list[Record] = [source_record(version, **custom)] if version else []
+    assert write(folder, storage, [*given, *scene(qos)], qos) == {}
+    assert sorted(file.name for file in folder.iterdir()) == [
+        "metadata.yaml",
+        f"run_0.{'db3' if storage == 'sqlite3' else 'mcap'}",
+    ]
+    reader, records = read(folder)
+    assert list(map(fields, messages(records))) == list(map(fields, scene(qos)))
+    assert {c.identity for c in reader.channels} == {c.identity for c in channels(qos)}
+    assert reader.unused_schemas == [UNUSED]
+    check_index(reader, messages(records))
+    check_layout(folder, version or 8, given != [])
+    with RosbagsReader(folder) as public:
+        assert public.message_count == 60
+        assert [c.topic for c in public.connections] == ["/image", "/on", "/image", "/empty"]
+        assert [bytes(data) for _, _, data in public.messages()] == [m.data for m in scene(qos)]
+        assert public.ros_distro == (
+            "jazzy" if version and version >= 8 else "" if (version or 8) >= 8 else None
+        )
+
+
+def check_layout(folder: Path, version: int, told: bool) -> None:
+    info = yaml.safe_load((folder / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    topic = info["topics_with_message_count"][0]["topic_metadata"]
+    assert info["version"] == version
+    assert ("compression_mode" in info) == (version >= 3)
+    assert ("offered_qos_profiles" in topic) == (version >= 4)
+    assert ("files" in info) == (version >= 5)
+    assert ("custom_data" in info) == (version >= 6)
+    assert ("type_description_hash" in topic) == (version >= 7)
+    assert ("ros_distro" in info) == (version >= 8)
+    assert info["relative_file_paths"][0].startswith("run/") == (version < 4)
+    assert (info["message_count"], info["duration"]["nanoseconds"]) == (60, 29)
+    assert info["starting_time"]["nanoseconds_since_epoch"] == 10**18
+    if version >= 6 and told:
+        assert info["custom_data"] == {"operator": "kim", "run": "0042"}
+    if version >= 9:
+        assert topic["offered_qos_profiles"] == yaml.safe_load(NEW_QOS)
+    elif version >= 4:
+        assert topic["offered_qos_profiles"] == OLD_QOS
+
+
+def test_the_version_follows_the_style_of_the_qos(tmp_path: Path) -> None:
+    for number, (qos, version) in enumerate([(OLD_QOS, 8), (NEW_QOS, 9), ("", 9), ("[]", 9)]):
+        folder = tmp_path / str(number)
+        write(folder, "mcap", scene(qos), qos)
+        check_version = yaml.safe_load((folder / "metadata.yaml").read_text())
+        assert check_version["rosbag2_bagfile_information"]["version"] == version
+
+
+def test_qos_policies_by_number_and_by_name() -> None:
+    assert native_qos(OLD_QOS) == yaml.safe_load(NEW_QOS) == native_qos(NEW_QOS)
+    assert native_qos("") == native_qos("{") == native_qos("text") == []
+    assert native_qos("- history: 99\n  depth: true") == [{"history": "unknown", "depth": True}]
+
+
+def test_mcap_storage_keeps_everything(tmp_path: Path) -> None:
+    channel = channels()[0]
+    records: list[Record] = [
+        Message(channel, 5, 3, 7, b"a"),
+        Attachment("a", "b", 1, 2, b"c"),
+        MetadataRecord("mine", {"a": "b"}),
+        Message(Channel(8, "/none", "json", None), 2**64 - 1, 1, 1, b""),
+    ]
+    with Rosbag2Writer(tmp_path / "a", storage="mcap", library="lib") as writer:
+        writer.add_channel(channel)
+        writer.add_channel(Channel(8, "/none", "json", None))
+        put(writer, records)
+    assert writer.omitted == {}
+    reader, found = read(tmp_path / "a")
+    assert reader.library == "lib"
+    assert [(m.publish_time, m.sequence) for m in messages(found)] == [(3, 7), (1, 1)]
+    assert records[1] in found
+    assert records[2] in found
+    (inside,) = metadata(found, "rosbag2")
+    assert yaml.safe_load(inside["serialized_metadata"])["message_count"] == 2
+
+
+def test_mcap_storage_keeps_the_record_of_the_source(tmp_path: Path) -> None:
+    given = MetadataRecord("rosbag2", {"serialized_metadata": "version: 9\nros_distro: jazzy\n"})
+    write(tmp_path / "a", "mcap", [given, *scene(NEW_QOS)], NEW_QOS)
+    reader, found = read(tmp_path / "a")
+    assert metadata(found, "rosbag2") == [given.metadata]
+    info = metadata(found, RECORD)[0]["metadata.yaml"]
+    assert parse_bag_info(info, tmp_path).ros_distro == "jazzy"
+    # To sqlite3 the record is no loss: what it tells stands in a table there.
+    assert copy(reader, found, tmp_path / "b", "sqlite3") == {}
+
+
+def test_what_sqlite3_cannot_hold_is_counted(tmp_path: Path) -> None:
+    told = channels()[0]
+    others = Channel(20, "/image", "cdr", Schema(IMAGE.name, "ros2msg", b"other"), told.metadata)
+    ros1 = Channel(21, "/ros1", "ros1", IMAGE, {"callerid": "/a", "md5sum": ""})
+    with Rosbag2Writer(tmp_path / "a", storage="sqlite3") as writer:
+        for channel in (told, others, ros1):
+            writer.add_channel(channel)
+            writer.add_channel(channel)
+        put(writer, [Message(told, 2, 1, 0, b""), Message(told, 3, 1, 9, b"")])
+        put(writer, [Attachment("a", "b", 1, 2, b"c"), MetadataRecord("mine", {})])
+    assert writer.omitted == {
+        "attachments (sqlite3 storage holds none)": 1,
+        "channel metadata entries (sqlite3 storage keeps QoS and hash)": 2,
+        "message definitions (sqlite3 storage keeps one for a type)": 1,
+        "metadata records (sqlite3 storage holds none)": 1,
+        "publish times (sqlite3 storage keeps one time)": 2,
+        "sequence numbers (sqlite3 storage keeps none)": 1,
+    }
+    assert [c.topic for c in Rosbag2Reader(tmp_path / "a").channels] == ["/image", "/ros1"]
+
+
+def test_what_sqlite3_cannot_hold_at_all(tmp_path: Path) -> None:
+    with Rosbag2Writer(tmp_path / "a", storage="sqlite3") as writer:
+        with pytest.raises(ConversionError, match="topic /none: has no schema"):
+            writer.add_channel(Channel(1, "/none", "json", None))
+        writer.add_channel(channels()[0])
+        with pytest.raises(ConversionError, match="log time"):
+            writer.write(Message(channels()[0], 2**63, 0, 0, b""))
+    assert messages(read(tmp_path / "a")[1]) == []
+
+
+def test_unknown_storage(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="sqlite3, mcap"):
+        Rosbag2Writer(tmp_path / "a", storage="bolt")
+    with pytest.raises(OptionError, match="compression"):
+        Rosbag2Writer(tmp_path / "a", storage="mcap", compression="gzip")
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_an_abandoned_recording_is_not_finished(tmp_path: Path, storage: str) -> None:
+    def stop() -> Iterable[Record]:
+        yield from scene()
+        raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError, match="stop"):
+        write(tmp_path / "a", storage, stop())
+    assert not (tmp_path / "a" / "metadata.yaml").exists()
+
+
+def test_a_full_disk_is_an_operating_system_error(tmp_path: Path) -> None:
+    writer = SqliteWriter(tmp_path / "a.db3")
+    writer.add_channel(channels()[0])
+    writer._connection.execute("PRAGMA max_page_count = 20")
+
+    def fill() -> None:
+        for time in range(100):
+            writer.write(Message(channels()[0], time, time, 0, bytes(4000)))
+
+    with pytest.raises(OSError, match="full") as caught:
+        fill()
+    assert caught.value.errno == errno.ENOSPC
+    writer.__exit__(OSError, caught.value, None)
+    with pytest.raises(OSError, match="unable to open"):
+        SqliteWriter(tmp_path / "missing" / "a.db3")
+
+
+# Split and compressed recordings ----------------------------------------------------------
+
+
+def edit(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    path = folder / "metadata.yaml"
+    document = yaml.safe_load(path.read_text())
+    change(document["rosbag2_bagfile_information"])
+    path.write_text(yaml.safe_dump(document, sort_keys=False))
+
+
+def split(tmp_path: Path, storage: str, parts: list[list[Message]]) -> Path:
+    """A recording of several storage files."""
+    names = []
+    for number, part in enumerate(parts):
+        folder = tmp_path / f"part{number}"
+        write(folder, storage, part)
+        (file,) = folder.glob("run_0.*")
+        names.append(f"run_{number}{file.suffix}")
+        if number:
+            shutil.move(file, tmp_path / "part0" / names[-1])
+    edit(tmp_path / "part0", lambda info: info.update(relative_file_paths=names))
+    return tmp_path / "part0"
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_split_files_are_one_recording(tmp_path: Path, storage: str) -> None:
+    parts = [scene()[:25], scene()[25:50], scene()[50:]]
+    reader, records = read(split(tmp_path, storage, parts))
+    assert list(map(fields, messages(records))) == list(map(fields, scene()))
+    assert len(reader.channels) == 4
+    check_index(reader, messages(records))
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_split_files_that_overlap(tmp_path: Path, storage: str) -> None:
+    mixed = scene()[:20] + scene()[30:40], scene()[20:30] + scene()[40:]
+    _, records = read(split(tmp_path, storage, [list(part) for part in mixed]))
+    got = messages(records)
+    assert sorted(map(fields, got), key=repr) == sorted(map(fields, scene()), key=repr)
+    assert [m.log_time for m in got] == sorted(m.log_time for m in got)
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_a_missing_file_is_named(tmp_path: Path, storage: str) -> None:
+    folder = split(tmp_path, storage, [scene()[:25], scene()[25:]])
+    (file,) = folder.glob("run_1.*")
+    file.unlink()
+    with pytest.raises(SourceError, match=rf"{file.name}, which its metadata.yaml names"):
+        Rosbag2Reader(folder)
+
+
+def compress_files(folder: Path, spelling: str = "FILE") -> None:
+    for file in folder.glob("run_*"):
+        packed = file.with_name(f"{file.name}.zstd")
+        # Two frames, as when several compressed files were joined.
+        data = file.read_bytes()
+        packed.write_bytes(zstandard.compress(data[:999]) + zstandard.compress(data[999:]))
+        file.unlink()
+
+    def change(info: dict[str, Any]) -> None:
+        info["relative_file_paths"] = [f"{name}.zstd" for name in info["relative_file_paths"]]
+        info |= {"compression_mode": spelling, "compression_format": "zstd"}
+
+    edit(folder, change)
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("spelling", ["file", "FILE"])
+def test_compressed_files(tmp_path: Path, storage: str, spelling: str) -> None:
+    folder = split(tmp_path, storage, [scene()[:25], scene()[25:]])
+    compress_files(folder, spelling)
+    work = tmp_path / "work"
+    work.mkdir()
+    with Rosbag2Reader(folder, workdir=work) as reader:
+        known = len(reader.channels)
+        assert known == (4 if storage == "sqlite3" else 0)
+        for _ in range(2):
+            records = list(reader.records())
+            assert list(map(fields, messages(records))) == list(map(fields, scene()))
+            assert reader.position == sum(file.stat().st_size for file in reader.files)
+        assert len(reader.channels) == 4
+        assert len(metadata(records, TABLES_RECORD)) == (2 if storage == "sqlite3" else 0)
+        check_index(reader, messages(records))
+    assert list(work.iterdir()) == []
+
+
+def test_a_first_file_that_was_not_read_is_removed_too(tmp_path: Path) -> None:
+    folder = split(tmp_path, "sqlite3", [scene()])
+    compress_files(folder)
+    (tmp_path / "work").mkdir()
+    with Rosbag2Reader(folder, workdir=tmp_path / "work") as reader:
+        assert len(list((tmp_path / "work").iterdir())) == 1
+        assert reader.stats() != {}
+    assert list((tmp_path / "work").iterdir()) == []
+
+
+def test_damaged_compressed_files(tmp_path: Path) -> None:
+    folder = split(tmp_path, "sqlite3", [scene()])
+    compress_files(folder)
+    (file,) = folder.glob("*.zstd")
+    data = file.read_bytes()
+    file.write_bytes(data[:-9])
+    with pytest.raises(SourceError, match="compression is cut short"):
+        Rosbag2Reader(folder)
+    file.write_bytes(data[:100] + bytes(100) + data[200:])
+    with pytest.raises(SourceError, match="compression is damaged"):
+        Rosbag2Reader(folder)
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_compressed_payloads(tmp_path: Path, storage: str) -> None:
+    packed = [
+        Message(m.channel, m.log_time, m.log_time, 0, zstandard.compress(bytes(m.data)))
+        for m in scene()
+    ]
+    folder = tmp_path / "a"
+    write(folder, storage, packed)
+    told = {"compression_mode": "message", "compression_format": "zstd"}
+    edit(folder, lambda info: info.update(told))
+    reader, records = read(folder)
+    assert list(map(fields, messages(records))) == list(map(fields, scene()))
+    check_index(reader, messages(records))
+    if storage == "sqlite3":
+        check_alone(folder / "run_0.db3")
+
+
+def check_alone(path: Path) -> None:
+    """Without its metadata.yaml a database tells itself that its payloads are compressed."""
+    (path.parent / "metadata.yaml").unlink()
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute(
+            "UPDATE metadata SET metadata = replace(replace(metadata, 'compression_mode: \"\"',"
+            " 'compression_mode: message'), 'compression_format: \"\"', 'compression_format: zstd')"
+        )
+    assert list(map(fields, messages(read(path)[1]))) == list(map(fields, scene()))
+
+
+def test_payloads_that_are_not_compressed_as_told(tmp_path: Path) -> None:
+    write(tmp_path / "a", "sqlite3", scene()[1:])
+    told = {"compression_mode": "message", "compression_format": "zstd"}
+    edit(tmp_path / "a", lambda info: info.update(told))
+    with pytest.raises(SourceError, match=r"message 1, topic /on: zstd data is damaged"):
+        read(tmp_path / "a")
+
+
+# What a metadata.yaml may say ---------------------------------------------------------------
+
+
+def test_topics_without_messages_may_stand_in_the_metadata_alone(tmp_path: Path) -> None:
+    write(tmp_path / "a", "mcap", scene())
+    topic = {
+        "name": "12:30",
+        "type": "on",
+        "serialization_format": "cdr",
+        "offered_qos_profiles": yaml.safe_load(NEW_QOS),
+    }
+
+    def change(info: dict[str, Any]) -> None:
+        info["topics_with_message_count"].append({"topic_metadata": topic, "message_count": 0})
+
+    edit(tmp_path / "a", change)
+    text = (tmp_path / "a" / "metadata.yaml").read_text()
+    (tmp_path / "a" / "metadata.yaml").write_text(
+        text.replace("'12:30'", "12:30").replace("'on'", "on")
+    )
+    reader, _ = read(tmp_path / "a")
+    assert len(reader.channels) == 5
+    assert reader.channels[-1] == Channel(
+        4, "12:30", "cdr", Schema("on", "", b""), {"offered_qos_profiles": NEW_QOS}
+    )
+    assert reader.stats()[4] == ChannelStats(0, 0, 0)
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_a_storage_without_a_name_is_told_by_its_files(tmp_path: Path, storage: str) -> None:
+    write(tmp_path / "a", storage, scene())
+    edit(tmp_path / "a", lambda info: info.update(storage_identifier=""))
+    assert len(messages(read(tmp_path / "a")[1])) == 60
+
+
+def test_a_recording_may_have_no_files(tmp_path: Path) -> None:
+    info = {"version": 4, "storage_identifier": "", "relative_file_paths": []}
+    (tmp_path / "metadata.yaml").write_text(yaml.dump({"rosbag2_bagfile_information": info}))
+    reader, records = read(tmp_path)
+    assert len(records) == 1
+    assert (reader.channels, reader.stats(), reader.times()) == ([], {}, {})
+
+
+METADATA_FAULTS: dict[str, tuple[dict[str, Any], str]] = {
+    "newer": ({"version": 10}, "metadata version 10"),
+    "storage": ({"storage_identifier": "bolt"}, "storage 'bolt'"),
+    "no storage": ({"storage_identifier": "", "relative_file_paths": ["a.xyz"]}, "storage ''"),
+    "format": ({"compression_mode": "file", "compression_format": "lz4"}, "'lz4'"),
+    "mode": ({"compression_mode": "bits", "compression_format": "zstd"}, "'bits'"),
+    "outside": ({"relative_file_paths": [".."]}, r"names '\.\.' as a file"),
+    "topics": ({"topics_with_message_count": [{"message_count": 1}]}, "not? as expected|expected"),
+    "number": ({"version": "new"}, "expected"),
+}
+
+
+@pytest.mark.parametrize("name", METADATA_FAULTS)
+def test_metadata_that_cannot_be_followed(tmp_path: Path, name: str) -> None:
+    change, problem = METADATA_FAULTS[name]
+    write(tmp_path / "a", "sqlite3", scene())
+    edit(tmp_path / "a", lambda info: info.update(change))
+    with pytest.raises(SourceError, match=problem):
+        Rosbag2Reader(tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        (b"", "is empty"),
+        (b"a: [", "is not valid YAML"),
+        (b"[" * 5000, "is not valid YAML"),
+        (b"a: &a [*a, !!python/object:os.system b]", "is not valid YAML"),
+        (b"\xff\xfe", "UTF-8"),
+        (b"other: 1", "no rosbag2_bagfile_information"),
+        (b"- 1", "no rosbag2_bagfile_information"),
+    ],
+)
+def test_a_file_that_is_no_metadata(tmp_path: Path, text: bytes, problem: str) -> None:
+    (tmp_path / "metadata.yaml").write_bytes(text)
+    with pytest.raises(SourceError, match=problem):
+        Rosbag2Reader(tmp_path)
+
+
+def test_paths_stay_inside_the_folder(tmp_path: Path) -> None:
+    write(tmp_path / "a", "sqlite3", scene())
+    for name in ("old name/run_0.db3", "../../elsewhere/run_0.db3", "C:\\bags\\run_0.db3"):
+        edit(tmp_path / "a", lambda info, name=name: info.update(relative_file_paths=[name]))  # type: ignore[misc]
+        assert len(messages(read(tmp_path / "a")[1])) == 60
+
+
+def test_what_is_no_recording(tmp_path: Path) -> None:
+    with pytest.raises(SourceNotFoundError):
+        Rosbag2Reader(tmp_path / "missing")
+    with pytest.raises(SourceError, match=r"has no metadata.yaml.*ros2 bag reindex"):
+        Rosbag2Reader(tmp_path)
+    path = tmp_path / "a.db3"
+    for data, problem in (
+        (b"", "is empty"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
+        (b"SQLite format 3\0" + bytes(5000), "cannot be read as sqlite3"),
+        (b"something else", "is not an sqlite3 database"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(SourceError, match=problem):
+            Rosbag2Reader(path)
+
+
+# What a database may hold ---------------------------------------------------------------------
+
+
+def database(path: Path, *statements: str) -> Path:
+    """A database of five messages, changed afterwards."""
+    with SqliteWriter_of(path) as connection, connection:
+        for statement in statements:
+            connection.execute(statement)
+    return path
+
+
+def SqliteWriter_of(path: Path) -> Any:
+    writer = SqliteWriter(path)
+    writer.add_channel(channels()[0])
+    for time in range(5):
+        writer.write(Message(channels()[0], time, time, 0, b"abc"))
+    writer.add_bag_info(8, "version: 8", "humble")
+    writer.__exit__(None, None, None)
+    return closing(sqlite3.connect(path))
+
+
+REBUILT = (
+    "CREATE TABLE m(id INTEGER PRIMARY KEY, topic_id, timestamp, data)",
+    "INSERT INTO m SELECT * FROM messages",
+    "DROP TABLE messages",
+    "ALTER TABLE m RENAME TO messages",
+)
+DATABASE_FAULTS = {
+    "null": (
+        [*REBUILT, "UPDATE messages SET data = NULL WHERE id = 3"],
+        "message 3, topic /image: .* null",
+    ),
+    "text": (
+        [*REBUILT, "UPDATE messages SET data = 'x' WHERE id = 3"],
+        "message 3, topic /image: .* text",
+    ),
+    "negative": (
+        ["UPDATE messages SET timestamp = -5 WHERE id = 3"],
+        "message 1, topic /image: the time -5",
+    ),
+    "no time": (
+        [*REBUILT, "UPDATE messages SET timestamp = 'x' WHERE id = 3"],
+        "message 5, topic /image: the time",
+    ),
+    "orphan": (["UPDATE messages SET topic_id = 7 WHERE id = 3"], "message 3 is of topic id 7"),
+    "column": (["ALTER TABLE messages ADD COLUMN sent INTEGER"], "a column 'sent'"),
+    "no table": (["DROP TABLE topics"], "not one of rosbag2"),
+    "no column": (["ALTER TABLE topics DROP COLUMN type"], "not one of rosbag2"),
+    "not UTF-8": (
+        ["UPDATE topics SET name = CAST(x'ff' AS TEXT)"],
+        "table topics that is not UTF-8",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DATABASE_FAULTS)
+def test_a_database_that_cannot_be_read(tmp_path: Path, name: str) -> None:
+    statements, problem = DATABASE_FAULTS[name]
+    path = database(tmp_path / "a.db3", *statements)
+    with pytest.raises(SourceError, match=problem) as caught:
+        read(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_database_cut_short(tmp_path: Path) -> None:
+    write(tmp_path / "a", "sqlite3", scene())
+    path = tmp_path / "a" / "run_0.db3"
+    data = path.read_bytes()
+    for length in (1000, len(data) // 2, len(data) - 4096):
+        path.write_bytes(data[:length])
+        with pytest.raises(SourceError, match=r"recover|not one of rosbag2"):
+            read(path)
+
+
+def test_tables_of_older_and_stranger_databases(tmp_path: Path) -> None:
+    path = database(
+        tmp_path / "a.db3",
+        "DROP TABLE message_definitions",
+        "DROP TABLE metadata",
+        "DROP INDEX timestamp_idx",
+        "ALTER TABLE topics ADD COLUMN extra TEXT DEFAULT 'kept'",
+        "CREATE TABLE notes(id)",
+    )
+    reader, records = read(path)
+    (channel,) = reader.channels
+    assert channel.schema == Schema(IMAGE.name, "", b"")
+    assert channel.metadata["extra"] == "kept"
+    assert [m.log_time for m in messages(records)] == [0, 1, 2, 3, 4]
+    assert metadata(records, RECORD) == [
+        {
+            "storage": "sqlite3",
+            "files": "a.db3",
+            "db3:a.db3:schema_version": "4",
+            "db3:a.db3:ros_distro": "humble",
+            "db3:a.db3:other_table:notes": "left out",
+        }
+    ]
+
+
+def test_definitions_by_type_and_hash(tmp_path: Path) -> None:
+    path = database(
+        tmp_path / "a.db3",
+        "INSERT INTO message_definitions SELECT 9, topic_type, encoding, 'older', 'old'"
+        " FROM message_definitions",
+        "INSERT INTO topics SELECT 2, '/old', type, serialization_format, '', 'old' FROM topics",
+        "INSERT INTO topics SELECT 3, '/new', type, serialization_format, '', 'new' FROM topics"
+        " WHERE id = 1",
+    )
+    reader = SqliteReader(path)
+    assert [c.schema.data for c in reader.channels if c.schema] == [
+        IMAGE.data,
+        b"older",
+        IMAGE.data,
+    ]
+
+
+def test_equal_topics_of_one_file_stay_apart(tmp_path: Path) -> None:
+    path = database(
+        tmp_path / "a.db3",
+        "INSERT INTO topics SELECT 2, name, type, serialization_format, offered_qos_profiles,"
+        " type_description_hash FROM topics",
+        "UPDATE messages SET topic_id = 2 WHERE id = 2",
+    )
+    reader, records = read(path)
+    assert [c.identity for c in reader.channels] == [channels()[0].identity] * 2
+    assert [m.channel.id for m in messages(records)] == [0, 1, 0, 0, 0]
+
+
+def unclosed(tmp_path: Path, mode: str) -> Path:
+    """A copy of a database while somebody writes to it."""
+    with SqliteWriter_of(tmp_path / "a.db3") as connection:
+        connection.execute(f"PRAGMA journal_mode = {mode}")
+        connection.execute("PRAGMA cache_size = 1")
+        connection.execute("UPDATE messages SET timestamp = 7")
+        for _ in range(100):
+            connection.execute("INSERT INTO messages SELECT NULL, 1, 9, zeroblob(1000)")
+        if mode == "WAL":
+            connection.commit()
+        (tmp_path / "copy").mkdir()
+        for file in tmp_path.glob("a.db3*"):
+            shutil.copyfile(file, tmp_path / "copy" / file.name)
+        connection.rollback()
+    return tmp_path / "copy" / "a.db3"
+
+
+def test_a_write_ahead_log_beside_the_database_is_read(tmp_path: Path) -> None:
+    path = unclosed(tmp_path, "WAL")
+    assert path.with_name("a.db3-wal").stat().st_size
+    assert len(messages(read(path)[1])) == 105
+
+
+def test_an_unfinished_transaction_is_refused(tmp_path: Path) -> None:
+    path = unclosed(tmp_path, "DELETE")
+    with pytest.raises(SourceError, match="not closed properly"):
+        Rosbag2Reader(path)
+
+
+def test_a_damaged_index_loses_no_message(tmp_path: Path) -> None:
+    path = tmp_path / "a.db3"
+    database(path, "PRAGMA writable_schema = ON")
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("PRAGMA writable_schema = ON")
+        # An index that was made over fewer messages than there are.
+        connection.execute("CREATE TABLE other(timestamp)")
+        connection.execute("CREATE INDEX other_idx ON other(timestamp)")
+        connection.execute(
+            "UPDATE sqlite_master SET rootpage = (SELECT rootpage FROM sqlite_master"
+            " WHERE name = 'other_idx') WHERE name = 'timestamp_idx'"
+        )
+    with pytest.raises(SourceError, match="REINDEX"):
+        read(path)

@@ -1,0 +1,595 @@
+"""The witness is tested too: it sees every single difference, and none where there is none."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sqlite3
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mcap.records as records
+import pytest
+import yaml
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+from rosbags.highlevel import AnyReader
+
+from sources import (
+    ENCODINGS,
+    IMAGE,
+    PERIOD,
+    SOURCES,
+    START,
+    TRAITS,
+    Record,
+    Scene,
+    image_cdr,
+    image_ros1,
+    load_tool,
+    odd_scene,
+    raw_scene,
+    scene,
+    typestore,
+    write_bag,
+    write_mcap,
+    write_rosbag2,
+)
+
+witness = load_tool("compare")
+digests = load_tool("compare_digest")
+DATA = Path(__file__).parents[1].parent / "shared" / "data"
+WRITERS: dict[str, Callable[..., Any]] = {
+    "bag": lambda path, what: write_bag(path.with_suffix(".bag"), what),
+    "sqlite3": write_rosbag2,
+    "mcap": lambda path, what: write_mcap(path.with_suffix(".mcap"), what),
+}
+ENDINGS = {"bag": ".bag", "sqlite3": "", "mcap": ".mcap"}
+EQUAL = [
+    ("bag-none", "bag-bz2"),
+    ("bag-none", "bag-lz4"),
+    ("bag-none", "bag-split"),
+    ("bag-lz4", "mcap-ros1-zstd"),
+    ("rosbag2-sqlite3-v9", "rosbag2-sqlite3-v4"),
+    ("rosbag2-sqlite3-v8", "rosbag2-sqlite3-v9"),
+    ("rosbag2-sqlite3-v9", "rosbag2-sqlite3-split"),
+    ("rosbag2-sqlite3-v9", "rosbag2-sqlite3-zstd-file"),
+    ("rosbag2-sqlite3-v9", "rosbag2-sqlite3-zstd-message"),
+    ("rosbag2-sqlite3-v9", "rosbag2-mcap-v9"),
+    ("rosbag2-mcap-v9", "rosbag2-mcap-split"),
+    ("rosbag2-mcap-v9", "rosbag2-mcap-zstd-file"),
+    ("rosbag2-mcap-v9", "rosbag2-mcap-zstd-message"),
+    ("mcap-ros2-none", "mcap-ros2-lz4"),
+    ("mcap-ros2-none", "mcap-ros2-zstd"),
+    ("mcap-ros2-none", "mcap-unchunked"),
+    ("mcap-ros2-none", "mcap-unindexed"),
+    ("bag-none", "rosbag2-sqlite3-v9"),
+    ("bag-none", "rosbag2-mcap-v5"),
+    ("mcap-ros1-zstd", "rosbag2-sqlite3-v6"),
+]
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], list[Path]]:
+    """Paths of a source variant, written once."""
+    folder, done = tmp_path_factory.mktemp("sources"), dict[str, list[Path]]()
+
+    def get(name: str) -> list[Path]:
+        if name not in done:
+            (folder / name).mkdir()
+            done[name] = SOURCES[name](folder / name, scene("bayer_rggb8"))
+        return done[name]
+
+    return get
+
+
+def one(differences: list[str], pattern: str) -> None:
+    """There are differences, and all of them are of the kind expected."""
+    assert differences
+    assert all(re.search(pattern, difference) for difference in differences), differences
+
+
+# ---------------------------------------------------------------- equal
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_source_is_valid_and_equals_itself(name: str, written: Any) -> None:
+    paths = written(name)
+    report = witness.examine(paths, paths)
+    assert not report.differences
+    assert sum(row.a for row in report.rows.values()) == 64
+    if name.startswith("mcap"):
+        with paths[0].open("rb") as stream:
+            assert sum(1 for _ in make_reader(stream).iter_messages()) == 64
+    else:
+        with AnyReader(paths, default_typestore=typestore("cdr")) as reader:
+            assert sum(1 for _ in reader.messages()) == 64
+
+
+@pytest.mark.parametrize(("a", "b"), EQUAL)
+def test_equal_across_compression_and_format(a: str, b: str, written: Any) -> None:
+    report = witness.examine(written(a), written(b))
+    assert report.differences == []
+    assert all(row.equal == row.a == row.b for row in report.rows.values())
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_scene_is_deterministic(encoding: str) -> None:
+    images = [m for m in scene(encoding).messages if m.msgtype == IMAGE]
+    again = [m for m in scene(encoding).messages if m.msgtype == IMAGE]
+    assert [m.payload("cdr") for m in images] == [m.payload("cdr") for m in again]
+    used = 0
+    for message in images:
+        for low, high in zip(
+            message.values["data"][::2], message.values["data"][1::2], strict=True
+        ):
+            used |= int(low) | int(high) << 8
+    assert used == 0xFFFF
+
+
+@pytest.mark.parametrize("trait", TRAITS)
+def test_trait_can_be_written(trait: str, tmp_path: Path) -> None:
+    what = odd_scene(trait)
+    write_bag(tmp_path / "a.bag", what)
+    write_mcap(tmp_path / "a.mcap", what, "ros1", attachments=False, metadata=False)
+    assert witness.compare(tmp_path / "a.bag", tmp_path / "a.mcap") == []
+    write_rosbag2(tmp_path / "sqlite3", what)
+    write_rosbag2(tmp_path / "mcap", what, "mcap")
+    assert witness.compare(tmp_path / "sqlite3", tmp_path / "mcap") == []
+
+
+def test_raw_builders_agree_with_rosbags() -> None:
+    image = next(m for m in scene("mono8").messages if m.msgtype == IMAGE)
+    values = image.values
+    common: dict[str, Any] = {
+        "width": values["width"],
+        "height": values["height"],
+        "encoding": "mono8",
+        "data": values["data"].tobytes(),
+        "stamp": values["header"]["stamp"],
+    }
+    assert image_ros1(**common, seq=values["header"]["seq"]) == image.payload("ros1")
+    assert image_cdr(**common) == image.payload("cdr")
+
+
+def test_qos_of_same_meaning_is_equal(tmp_path: Path) -> None:
+    what = scene("mono8", frames=2)
+    for name in ("a", "b"):
+        write_rosbag2(tmp_path / name, what, "mcap", 8)
+    file = tmp_path / "b" / "b_0.mcap"
+
+    def respell(record: Any) -> Any:
+        if isinstance(record, records.Channel):
+            profiles = yaml.safe_load(record.metadata["offered_qos_profiles"] or "[]")
+            for profile in profiles:
+                profile["history"] = "keep_last"
+                profile["lifespan"] = {"sec": 2147483647, "nsec": 2147483647}
+            record.metadata["offered_qos_profiles"] = json.dumps(profiles)
+        return record
+
+    rewrite(file, respell)
+    assert witness.compare(tmp_path / "a", tmp_path / "b") == []
+
+
+def test_channels_that_nothing_tells_apart_are_one(tmp_path: Path) -> None:
+    for name, channels in (("one.mcap", 1), ("two.mcap", 2)):
+        with (tmp_path / name).open("wb") as stream:
+            writer = Writer(stream)
+            writer.start("", "test")
+            ids = [writer.register_channel("/t", "json", 0) for _ in range(channels)]
+            for n in range(6):
+                writer.add_message(ids[n % channels], n, b"%d" % n, n, n)
+            writer.finish()  # type: ignore[no-untyped-call]
+    assert witness.compare(tmp_path / "one.mcap", tmp_path / "two.mcap") == []
+
+
+# ---------------------------------------------------------------- different messages
+
+
+def changed(what: Scene, index: int, **changes: Any) -> Scene:
+    messages = list(what.messages)
+    messages[index] = replace(messages[index], **changes)
+    return replace(what, messages=messages)
+
+
+def _image_index(what: Scene, n: int) -> int:
+    return [i for i, m in enumerate(what.messages) if m.msgtype == IMAGE][n]
+
+
+def _pixel(what: Scene) -> Scene:
+    index = _image_index(what, 3)
+    values = dict(what.messages[index].values)
+    values["data"] = values["data"].copy()
+    values["data"][-1] ^= 1
+    return changed(what, index, values=values)
+
+
+def _time(what: Scene) -> Scene:
+    index = _image_index(what, 3)
+    return changed(what, index, log_time=what.messages[index].log_time + 1)
+
+
+def _drop(what: Scene) -> Scene:
+    index = _image_index(what, 3)
+    return replace(what, messages=what.messages[:index] + what.messages[index + 1 :])
+
+
+def _rename(what: Scene) -> Scene:
+    messages = [replace(m, topic=m.topic.replace("/imu", "/inu")) for m in what.messages]
+    return replace(what, messages=messages)
+
+
+def _silence(what: Scene) -> Scene:
+    return replace(what, silent={})
+
+
+MESSAGE_CHANGES: dict[str, tuple[Callable[[Scene], Scene], str]] = {
+    "payload byte": (_pixel, r"^/cam/image_raw message 3: payload differs$"),
+    "log time": (_time, r"^/cam/image_raw message 3: (log|publish) time \d+ in A, \d+ in B"),
+    "dropped": (_drop, r"^/cam/image_raw(: 8 messages in A, 7 in B| message 3: .* missing in B)$"
+                       r"|sequence|more"),
+    "topic": (_rename, r"/i[mn]u"),
+    "silent topic": (_silence, r"/diagnostics.* missing in B"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+@pytest.mark.parametrize("change", MESSAGE_CHANGES)
+def test_changed_message_is_seen(change: str, kind: str, tmp_path: Path) -> None:
+    what = scene("rgb8")
+    alter, pattern = MESSAGE_CHANGES[change]
+    WRITERS[kind](tmp_path / "a", what)
+    WRITERS[kind](tmp_path / "b", alter(what))
+    paths = [tmp_path / f"{name}{ENDINGS[kind]}" for name in "ab"]
+    one(witness.compare(*paths), pattern)
+    assert witness.compare(*reversed(paths))
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+def test_payload_byte_is_seen_between_ros1_and_ros2(kind: str, tmp_path: Path) -> None:
+    what = scene("mono16", frames=4)
+    write_bag(tmp_path / "a.bag", what)
+    write_rosbag2(tmp_path / "b", _pixel(what), kind)
+    one(witness.compare(tmp_path / "a.bag", tmp_path / "b"), "^/cam/image_raw message 3: payload")
+
+
+def test_calibration_is_seen_between_ros1_and_ros2(tmp_path: Path) -> None:
+    what = scene("mono8", frames=2, frame_id="left")
+    index = next(i for i, m in enumerate(what.messages) if m.topic == "/cam/camera_info")
+    values = dict(what.messages[index].values)
+    values["d"] = [0.1, *values["d"][1:]]
+    write_bag(tmp_path / "a.bag", what)
+    write_rosbag2(tmp_path / "b", changed(what, index, values=values))
+    one(witness.compare(tmp_path / "a.bag", tmp_path / "b"), "^/cam/camera_info message 0: payload")
+
+
+def test_order_of_equal_times_is_seen(tmp_path: Path) -> None:
+    payloads = [(START, b"\1\0\0\0" + x, b"\0\1\0\0\2\0\0\0" + x + b"\0") for x in (b"a", b"b")]
+    for name, messages in (("a.bag", payloads), ("b.bag", payloads[::-1])):
+        write_bag(tmp_path / name, raw_scene("/t", "std_msgs/msg/String", messages))
+    found = witness.compare(tmp_path / "a.bag", tmp_path / "b.bag")
+    one(found, r"^/t message [01]: payload differs$")
+
+
+def test_number_of_listed_differences_is_limited(tmp_path: Path) -> None:
+    what = scene("mono8", frames=12)
+    shifted = [replace(m, log_time=m.log_time + PERIOD) for m in what.messages]
+    write_bag(tmp_path / "a.bag", what)
+    write_bag(tmp_path / "b.bag", Scene(shifted, what.silent))
+    report = witness.examine(tmp_path / "a.bag", tmp_path / "b.bag", limit=2)
+    images = [text for text in report.differences if text.startswith("/cam/image_raw")]
+    assert len(images) == 3
+    assert images[-1] == "/cam/image_raw: 10 more differences of this kind"
+
+
+# ---------------------------------------------------------------- different properties
+
+BAG_CHANGES = {
+    "callerid": (b"callerid=/first", b"callerid=/worst", r"metadata callerid '/first' in A"),
+    "latching": (b"latching=1", b"latching=0", r"^/chatter: metadata latching '1' in A, '0' in B"),
+    "md5sum": (b"md5sum=992ce", b"md5sum=993ce", r"^/(chatter|diagnostics): metadata md5sum"),
+    "definition": (b"definition=string data", b"definition=string  dat", r": definition"),
+    "type": (b"type=tf2_msgs/TFMessage", b"type=tf3_msgs/TFMessage", r"^/tf: type"),
+    "payload": (b"frame 1", b"frame 7", r"^/chatter message \d: payload differs"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change", BAG_CHANGES)
+def test_changed_bag_is_seen(change: str, tmp_path: Path) -> None:
+    old, new, pattern = BAG_CHANGES[change]
+    write_bag(tmp_path / "a.bag", scene("mono8"))
+    data = (tmp_path / "a.bag").read_bytes()
+    assert old in data
+    (tmp_path / "b.bag").write_bytes(data.replace(old, new))
+    one(witness.compare(tmp_path / "a.bag", tmp_path / "b.bag"), pattern)
+
+
+SQLITE_CHANGES = {
+    "type hash": ("UPDATE topics SET type_description_hash = 'RIHS01_00' WHERE name = '/tf'",
+                  r"^/tf: topic_type_hash"),
+    "QoS": ("UPDATE topics SET offered_qos_profiles = replace(offered_qos_profiles, 'depth: 10', "
+            "'depth: 11') WHERE name = '/imu'", r"^/imu: offered_qos_profiles"),
+    "definition": ("UPDATE message_definitions SET encoded_message_definition = 'string text' "
+                   "WHERE topic_type = 'std_msgs/msg/String'",
+                   r"^/(chatter|diagnostics): definition"),
+    "no definition": ("DELETE FROM message_definitions WHERE topic_type = 'sensor_msgs/msg/Imu'",
+                      r"^/imu: definition .* None in B"),
+    "serialization": ("UPDATE topics SET serialization_format = 'xcdr' WHERE name = '/imu'",
+                      r"^/imu: message encoding 'cdr' in A, 'xcdr' in B"),
+    "time": ("UPDATE messages SET timestamp = timestamp - 1 WHERE id = 1", r"message 0: log time"),
+    "topic": ("DELETE FROM topics WHERE name = '/diagnostics'", r"^/diagnostics: .* missing in B"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change", SQLITE_CHANGES)
+def test_changed_sqlite_is_seen(change: str, tmp_path: Path) -> None:
+    statement, pattern = SQLITE_CHANGES[change]
+    write_rosbag2(tmp_path / "a", scene("mono8", frames=3))
+    shutil.copy(tmp_path / "a" / "a_0.db3", tmp_path / "b.db3")
+    assert witness.compare(tmp_path / "a" / "a_0.db3", tmp_path / "b.db3") == []
+    with closing(sqlite3.connect(tmp_path / "b.db3")) as database, database:
+        assert database.execute(statement).rowcount == 1
+    one(witness.compare(tmp_path / "a" / "a_0.db3", tmp_path / "b.db3"), pattern)
+
+
+YAML_CHANGES = {
+    "custom data": ("operator: kim", "operator: lee", r"custom_data .*'kim'.* in A, .*'lee'"),
+    "QoS": ("depth: 100", "depth: 101", r"^metadata.yaml: topic /tf "),
+    "type hash": ("hash: RIHS01_", "hash: RIHS01_0", r"^metadata.yaml: topic "),
+    "silent topic": ("/diagnostics", "/diagnosis", r"^metadata.yaml: topic /diagnos"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change", YAML_CHANGES)
+def test_changed_metadata_yaml_is_seen(change: str, tmp_path: Path) -> None:
+    old, new, pattern = YAML_CHANGES[change]
+    write_rosbag2(tmp_path / "a", scene("mono8", frames=3), "mcap")
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    text = (tmp_path / "a" / "metadata.yaml").read_text("utf-8")
+    assert old in text
+    (tmp_path / "b" / "metadata.yaml").write_text(text.replace(old, new), "utf-8")
+    one(witness.compare(tmp_path / "a", tmp_path / "b"), pattern)
+
+
+def test_silent_topic_lost_in_another_format_is_seen(tmp_path: Path) -> None:
+    what = scene("mono8", frames=3)
+    write_rosbag2(tmp_path / "a", what, "mcap")
+    shutil.copy(tmp_path / "a" / "a_0.mcap", tmp_path / "b.mcap")
+    one(witness.compare(tmp_path / "a", tmp_path / "b.mcap"), r"^/diagnostics: .* missing in B$")
+
+
+def rewrite(path: Path, change: Callable[[Any], Any]) -> None:
+    """Write an MCAP file anew, each record changed, or left out where None is returned."""
+    with path.open("rb") as stream:
+        found = list(StreamReader(stream).records)
+    end = next(i for i, record in enumerate(found) if isinstance(record, records.DataEnd))
+    schemas: dict[int, int] = {0: 0}
+    channels: dict[int, int] = {}
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        for record in filter(None, map(change, found[:end])):
+            if isinstance(record, records.Header):
+                writer.start(record.profile, record.library)
+            elif isinstance(record, records.Schema) and record.id not in schemas:
+                told = record.name, record.encoding, record.data
+                schemas[record.id] = writer.register_schema(*told)
+            elif isinstance(record, records.Channel) and record.id not in channels:
+                schema = schemas[record.schema_id]
+                channels[record.id] = writer.register_channel(
+                    record.topic, record.message_encoding, schema, record.metadata
+                )
+            elif isinstance(record, records.Message):
+                times = record.publish_time, record.sequence
+                channel = channels[record.channel_id]
+                writer.add_message(channel, record.log_time, record.data, *times)
+            elif isinstance(record, records.Attachment):
+                text = record.name, record.media_type, record.data
+                writer.add_attachment(record.create_time, record.log_time, *text)
+            elif isinstance(record, records.Metadata):
+                writer.add_metadata(record.name, record.metadata)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+MCAP_CHANGES: dict[str, tuple[type, Callable[[Any], bool], dict[str, Any] | None, str]] = {
+    "attachment": (records.Attachment, lambda r: r.name == "map.bin", {"data": bytes(256)},
+                   "^attachment 'map.bin'"),
+    "attachment time": (records.Attachment, lambda r: r.name == "map.bin", {"create_time": 5},
+                        "^attachment 'map.bin'"),
+    "attachment lost": (records.Attachment, lambda r: r.name == "map.bin", None,
+                        "^attachment 'map.bin'.* missing in B$"),
+    "metadata": (records.Metadata, lambda r: "part" in r.metadata, {"metadata": {"part": "3"}},
+                 "^metadata record 'session'"),
+    "metadata lost": (records.Metadata, lambda r: "part" in r.metadata, None,
+                      "^metadata record 'session'.* missing in B$"),
+    "profile": (records.Header, lambda r: True, {"profile": "ros3"}, "^profile: "),
+    "publish time": (records.Message, lambda r: r.channel_id == 4 and r.sequence == 2,
+                     {"publish_time": 17}, r"message 1: publish time \d+ in A, 17 in B$"),
+    "sequence": (records.Message, lambda r: r.channel_id == 4 and r.sequence == 2,
+                 {"sequence": 17}, r"message 1: sequence 2 in A, 17 in B$"),
+    "channel metadata": (records.Channel, lambda r: r.topic == "/imu", {"metadata": {}},
+                         "^/imu: (offered_qos_profiles|topic_type_hash) .* None in B"),
+    "definition": (records.Schema, lambda r: r.name.endswith("/Imu"), {"data": b"int8 x\n"},
+                   "^/imu: definition 'ros2msg, .* in A, 'ros2msg, 7 bytes"),
+    "schema encoding": (records.Schema, lambda r: r.name.endswith("/Imu"), {"encoding": "ros2idl"},
+                        "^/imu: definition 'ros2msg, .* in A, 'ros2idl"),
+    "message encoding": (records.Channel, lambda r: r.topic == "/imu",
+                         {"message_encoding": "cdr2"}, "^/imu: message encoding"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change", MCAP_CHANGES)
+def test_changed_mcap_is_seen(change: str, tmp_path: Path) -> None:
+    kind, wanted, changes, pattern = MCAP_CHANGES[change]
+    a, b = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    write_mcap(a, scene("mono8"))
+    shutil.copy(a, b)
+    rewrite(b, lambda record: record)
+    assert witness.compare(a, b) == []
+
+    def alter(record: Any) -> Any:
+        if isinstance(record, kind) and wanted(record):
+            return replace(record, **changes) if changes is not None else None  # type: ignore[type-var]
+        return record
+
+    rewrite(b, alter)
+    one(witness.compare(a, b), pattern)
+
+
+@pytest.mark.parametrize("name", ["rosbag2", "mp4ds:source"])
+def test_bookkeeping_is_compared_between_mcap_files_alone(name: str, tmp_path: Path) -> None:
+    for folder in "ab":
+        write_rosbag2(tmp_path / folder, scene("mono8", frames=2), "mcap")
+    files = [tmp_path / folder / f"{folder}_0.mcap" for folder in "ab"]
+
+    def alter(record: Any) -> Any:
+        if isinstance(record, records.Metadata):
+            return replace(record, name=name, metadata={"changed": "yes"})
+        return record
+
+    rewrite(files[1], alter)
+    assert witness.compare(tmp_path / "a", tmp_path / "b") == []
+    one(witness.compare(*files), "^metadata record ")
+
+
+# ---------------------------------------------------------------- pixels left out
+
+
+def _two_images(encoding: str, **changes: Any) -> Iterator[Any]:
+    base = {"width": 4, "height": 2, "encoding": "mono8", "data": b"12345678"}
+    make = image_ros1 if encoding == "ros1" else image_cdr
+    channel = digests.Channel("/t", "sensor_msgs/Image", encoding, None, ())
+    digester = digests.Digester(ignore=["/t*"])
+    return (digester.digest(channel, make(**{**base, **c})) for c in ({}, changes))
+
+
+@pytest.mark.parametrize("encoding", ["ros1", "cdr"])
+def test_only_pixels_are_ignored(encoding: str) -> None:
+    a, b = _two_images(encoding, data=b"8765.321")
+    assert a == b
+    for change in (
+        {"stamp": 1},
+        {"is_bigendian": 1},
+        {"step": 3},
+        {"tail": b"x"},
+        {"frame_id": ""},
+    ):
+        a, b = _two_images(encoding, **change)
+        assert a != b, change
+    a, b = _two_images(encoding, data=b"123456")
+    assert a != b
+
+
+def test_pixels_of_big_endian_cdr_and_compressed_images() -> None:
+    a, b = _two_images("cdr", little_endian=False, data=b"8765.321")
+    assert a != b  # the byte order is part of the head
+    digester = digests.Digester(ignore=["*"])
+    channel = digests.Channel("/t", "sensor_msgs/msg/CompressedImage", "ros1", None, ())
+    head = struct.pack("<IIII", 1, 2, 3, 1) + b"c" + struct.pack("<I", 4) + b"jpeg"
+    long, short = (head + struct.pack("<I", len(x)) + x for x in (b"abcdef", b"gh"))
+    assert digester.digest(channel, long) == digester.digest(channel, short)
+    assert digester.digest(channel, long) != digester.digest(
+        channel, long.replace(b"jpeg", b"png ")
+    )
+
+
+def test_pixels_of_protobuf_are_found_by_name() -> None:
+    def entry(number: int, raw: bytes) -> bytes:
+        return bytes([number << 3 | 2, len(raw)]) + raw
+
+    told = entry(1, b"data") + bytes([3 << 3, 9])
+    message = entry(1, b"RawImage") + entry(2, entry(1, b"width") + bytes([3 << 3, 2]))
+    file = entry(2, b"foxglove") + entry(4, message + entry(2, told))
+    channel = digests.Channel(
+        "/t", "foxglove.RawImage", "protobuf", ("protobuf", entry(1, file)), ()
+    )
+    digester = digests.Digester(ignore=["/t"])
+    plain, pixels, width = (
+        digester.digest(channel, bytes([2 << 3, w]) + entry(9, data) + entry(7, b"cam"))
+        for w, data in ((4, b"abcd"), (4, b"xyz"), (5, b"abcd"))
+    )
+    assert plain == pixels != width
+
+
+def test_ignored_pixels_of_whole_recordings(tmp_path: Path) -> None:
+    what = scene("rgb8", frames=4)
+    write_bag(tmp_path / "a.bag", what)
+    write_bag(tmp_path / "b.bag", _pixel(what))
+    write_rosbag2(tmp_path / "c", _pixel(what))
+    a, b, c = tmp_path / "a.bag", tmp_path / "b.bag", tmp_path / "c"
+    assert witness.compare(a, b, ignore_pixels=["/cam/image*"]) == []
+    assert witness.compare(a, c, ignore_pixels=["/cam/image*"]) == []
+    one(witness.compare(a, b, ignore_pixels=["/other"]), "payload")
+    with pytest.raises(witness.UnreadableError, match="/imu: pixels of sensor_msgs/Imu cannot"):
+        witness.compare(a, b, ignore_pixels=["/imu"])
+
+
+# ---------------------------------------------------------------- command line
+
+
+def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    what = scene("mono8", frames=4)
+    write_bag(tmp_path / "a.bag", what)
+    write_bag(tmp_path / "b.bag", _pixel(what))
+    parts = SOURCES["bag-split"](tmp_path, what)
+    a, b, split = str(tmp_path / "a.bag"), str(tmp_path / "b.bag"), ",".join(map(str, parts))
+    assert witness.main([a, split]) == 0
+    assert capsys.readouterr().out.endswith("EQUAL\n")
+    assert witness.main([a, b]) == 1
+    assert re.search(r"/cam/image_raw +4 +4 +3 +DIFFERS \(1\)", capsys.readouterr().out)
+    assert witness.main([a, b, "--ignore-pixels", "/cam/*_raw"]) == 0
+    capsys.readouterr()
+    assert witness.main([a, b, "--json"]) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report["equal"] is False
+    assert len(report["differences"]) == 1
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-3000])
+
+
+@pytest.mark.parametrize("name", ["bag-lz4", "rosbag2-sqlite3-v9", "rosbag2-mcap-v9",
+                                  "mcap-ros2-none", "rosbag2-sqlite3-zstd-file"])  # fmt: skip
+def test_damaged_recordings_are_told(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (path,) = SOURCES[name](tmp_path, scene("mono8"))
+    file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix != ".yaml")
+    _cut(file)
+    assert witness.main([str(path), str(path)]) == 2
+    assert file.stem.split(".")[0] in capsys.readouterr().err
+    file.unlink()
+    assert witness.main([str(path), str(path)]) == 2
+
+
+def test_damaged_chunk_is_told(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "a.mcap", scene("mono8"), compression="none")
+    data = (tmp_path / "a.mcap").read_bytes()
+    (tmp_path / "a.mcap").write_bytes(data.replace(b"frame 1", b"frame 7"))
+    with pytest.raises(witness.UnreadableError, match=r"a\.mcap: CRC"):
+        witness.compare(tmp_path / "a.mcap", tmp_path / "a.mcap")
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_recordings_without_messages(kind: str, tmp_path: Path) -> None:
+    WRITERS[kind](tmp_path / "a", Scene([]))
+    WRITERS[kind](tmp_path / "b", Scene([Record("/t", "std_msgs/msg/String", START)]))
+    a, b = (tmp_path / f"{name}{ENDINGS[kind]}" for name in "ab")
+    assert witness.compare(a, a) == []
+    assert witness.compare(a, b)
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"no real recordings at {DATA}")
+def test_real_recordings() -> None:
+    bags, mcaps = DATA / "bags", DATA / "mcap"
+    assert witness.compare(bags / "example_turtle_bz2.bag", bags / "example_turtle_lz4.bag") == []
+    found = witness.compare(bags / "example_turtle_none.bag", bags / "example_turtle_lz4.bag")
+    assert "/rosout: a channel (rosgraph_msgs/Log, 1 messages) is missing in B" in found
+    converted = mcaps / "roboto_tiny_dvs_ros1profile.mcap"
+    assert witness.compare(bags / "roboto_tiny_dvs.bag", converted) == []

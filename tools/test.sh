@@ -1,0 +1,10 @@
+#!/usr/bin/env bash
+# Makes a virtual environment in .venv, installs the package with its test tools, and tests it.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+[ -x .venv/bin/python ] || "${PYTHON:-python3}" -m venv .venv
+.venv/bin/python -m pip install --quiet --editable '.[test]'
+.venv/bin/ruff check .
+.venv/bin/ruff format --check .
+.venv/bin/mypy
+exec .venv/bin/pytest -n auto "$@"
