@@ -3,7 +3,8 @@
 Videos on disk have had their noise removed by a codec, and noise is what a lossless codec spends
 its bits on. So each frame is exposed anew, as a sensor does it, *before* it is quantised:
 
-    signal    the frame's values, taken as the linear response of the sensor, in grey levels
+    signal    the frame's values with their fractions (rgb of 16 bits), taken as the linear
+              response of the sensor, in grey levels
     mosaic    one colour per pixel, rggb (mono cameras: luminance)
     variance  = read^2 + gain * signal      grey levels squared; read noise and shot noise
     pixels    = round(signal + noise), clipped to the sensor's range
@@ -67,7 +68,8 @@ class Sensor:
         variance = (self.read_electrons * gain) ** 2 + gain * signal
         noise = np.sqrt(variance) * rng.standard_normal(signal.shape, np.float32)
         dtype = np.uint8 if levels < 256 else np.uint16
-        return np.clip(np.rint(signal + noise), 0, levels).astype(dtype)
+        pixels: Pixels = np.clip(np.rint(signal + noise), 0, levels).astype(dtype)
+        return pixels
 
 
 SENSORS = {
@@ -183,15 +185,13 @@ def load(spec: ClipSpec, cache: Path | None = None) -> Pixels:
     return clip
 
 
-def _camera(
-    rgb: NDArray[np.uint8], encoding: str, sensor: Sensor, rng: np.random.Generator
-) -> Pixels:
-    """What a camera with that sensor publishes of a scene."""
+def _camera(rgb: Signal, encoding: str, sensor: Sensor, rng: np.random.Generator) -> Pixels:
+    """What a camera with that sensor publishes of a scene, given in grey levels of 8 bits."""
     if encoding == "mono8":
         return sensor.expose(rgb @ _LUMINANCE, 255, rng)
     if encoding == "mono16":
         return sensor.expose((rgb @ _LUMINANCE) * np.float32(4095 / 255), 4095, rng)
-    mosaic = sensor.expose(_sample_rggb(rgb).astype(np.float32), 255, rng)
+    mosaic = sensor.expose(_sample_rggb(rgb), 255, rng)
     if encoding == "bayer_rggb8":
         return mosaic
     if encoding == "rgb8":
@@ -202,8 +202,8 @@ def _camera(
 _RGGB = ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2))  # row, column, colour
 
 
-def _sample_rggb(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    mosaic = np.empty(rgb.shape[:2], np.uint8)
+def _sample_rggb(rgb: Signal) -> Signal:
+    mosaic = np.empty(rgb.shape[:2], np.float32)
     for row, column, color in _RGGB:
         mosaic[row::2, column::2] = rgb[row::2, column::2, color]
     return mosaic
@@ -233,12 +233,10 @@ def demosaic_bilinear(mosaic: NDArray[np.uint8]) -> NDArray[np.uint8]:
 # ---------------------------------------------------------------- scenes
 
 
-def _rgb_frames(spec: ClipSpec) -> Iterator[NDArray[np.uint8]]:
+def _rgb_frames(spec: ClipSpec) -> Iterator[Signal]:
     folder = data_folder()
     if spec.scene == DEMO or folder is None:
-        frames: Iterator[av.VideoFrame] = map(
-            lambda rgb: av.VideoFrame.from_ndarray(rgb, format="rgb24"), _demo_frames(spec.frames)
-        )
+        frames = _demo_frames(spec.frames)
     else:
         frames = _video_frames(folder / SCENES[spec.scene].pattern)
     for frame in frames:
@@ -250,27 +248,28 @@ def _video_frames(path: Path) -> Iterator[av.VideoFrame]:
         yield from container.decode(container.streams.video[0])
 
 
-def _fit(frame: av.VideoFrame, size: tuple[int, int] | None) -> NDArray[np.uint8]:
-    """The frame as rgb, scaled to cover a size and cropped to it around its middle."""
+def _fit(frame: av.VideoFrame, size: tuple[int, int] | None) -> Signal:
+    """The frame as rgb, 0 to 255, scaled to cover a size and cropped to it around its middle."""
     width, height = size or (frame.width // 2 * 2, frame.height // 2 * 2)
     scale = max(width / frame.width, height / frame.height) if size else 1.0
     scaled = frame.reformat(
         width=max(width, round(frame.width * scale)),
         height=max(height, round(frame.height * scale)),
-        format="rgb24",
+        format="rgb48le",
         interpolation="BICUBIC",
         threads=1,
     )
-    rgb = scaled.to_ndarray()
+    rgb: Signal = scaled.to_ndarray().astype(np.float32) / np.float32(257)
     top, left = (rgb.shape[0] - height) // 2, (rgb.shape[1] - width) // 2
     return rgb[top : top + height, left : left + width]
 
 
-def _demo_frames(count: int) -> Iterator[NDArray[np.uint8]]:
+def _demo_frames(count: int) -> Iterator[av.VideoFrame]:
     """The demo's rgb camera, which has a little noise of its own."""
-    from mp4ds.demo import CAMERA_HZ, demo
     from rosbags.rosbag1 import Reader
     from rosbags.typesys import Stores, get_typestore
+
+    from mp4ds.demo import CAMERA_HZ, demo
 
     store = get_typestore(Stores.ROS1_NOETIC)
     with tempfile.TemporaryDirectory() as folder:
@@ -280,7 +279,8 @@ def _demo_frames(count: int) -> Iterator[NDArray[np.uint8]]:
             images = [c for c in reader.connections if c.topic == "/right/image_raw"]
             for connection, _, data in reader.messages(images):
                 image: Any = store.deserialize_ros1(data, connection.msgtype)
-                yield image.data.reshape(image.height, image.width, 3)
+                rgb = image.data.reshape(image.height, image.width, 3)
+                yield av.VideoFrame.from_ndarray(rgb, format="rgb24")
 
 
 def read_pnm(path: Path) -> Pixels:

@@ -21,7 +21,6 @@ TOPIC = "/camera/image_raw"
 TOPICS = {TOPIC: IMAGE, "/camera/camera_info": INFO}
 START_NS = 1_712_647_128_027_473_200
 CHUNK_BYTES = 1 << 20  # the MCAP libraries' own default
-ZSTD_LEVEL = 3  # what the mcap library's writer takes
 _QOS = """\
 - history: 1
   depth: 10

@@ -252,7 +252,7 @@ def test_what_is_held_back_is_bounded(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_without_an_index_the_file_is_read(tmp_path: Path, chunked: bool) -> None:
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
-        writer = Writer(
+        writer: Any = Writer(
             stream,
             index_types=IndexType.NONE,
             use_chunking=chunked,
@@ -281,7 +281,7 @@ def test_without_an_index_the_file_is_read(tmp_path: Path, chunked: bool) -> Non
 def test_an_index_that_does_not_add_up_is_not_used(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
-        writer = Writer(stream, index_types=IndexType.CHUNK)
+        writer: Any = Writer(stream, index_types=IndexType.CHUNK)
         writer.start()
         channel = writer.register_channel("/a", "cdr", 0)
         for time in (5, 3):

@@ -432,8 +432,13 @@ def test_damage_has_a_sentence(tmp_path: Path) -> None:
     ):
         refuse(make_bag(path, [plain()], one, **options), problem)
     refuse(make_bag(path, [], one), "contradicts that of the bag")
+    two = make_bag(path, [plain()], [[(0, 1, b"one")], [(0, 2, b"two")]]).read_bytes()
+    path.write_bytes(two.replace(b"chunk_count=\2", b"chunk_count=\1"))
+    refuse(path, "its header counts fewer chunks than its index lists")
     good = make_bag(path, [plain("/a"), plain("/b")], [[(0, 1, b"one"), (1, 2, b"two")]])
     data = good.read_bytes()
+    path.write_bytes(data.replace(b"chunk_count=\1", b"chunk_count=\0"))
+    refuse(path, "")
     path.write_bytes(data.replace(b"conn=\0\0\0\0", b"conn=\1\0\0\0", 1))
     refuse(path, "the index points to another message")
     path.write_bytes(data.replace(b"time=\0\0\0\0\1", b"time=\0\0\0\0\3", 1))

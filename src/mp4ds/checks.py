@@ -17,7 +17,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from mp4ds.dataset import Dataset, Stream
-from mp4ds.errors import FormatError, Mp4dsError, SourceError, SourceNotFoundError
+from mp4ds.errors import FormatError, SourceError, SourceNotFoundError
 from mp4ds.outputs import digest_file
 from mp4ds.records import Message
 from mp4ds.sidecar import (
@@ -85,7 +85,7 @@ def validate(
             "is neither a dataset, a sidecar nor a video of one",
             "Give a dataset folder, a .yaml sidecar, or an .mp4 beside its sidecar.",
         )
-    return [*_validate_file(sidecar, "stream"), *_validate_stream(sidecar, deep, report)]
+    return _validate_file(sidecar, "stream") or _validate_stream(sidecar, deep, report)
 
 
 def _datasets_in(folder: Path) -> list[Path]:
@@ -217,12 +217,14 @@ def _check_entry(folder: Path, manifest: Manifest, name: str) -> Iterator[Proble
 
 def _validate_stream(path: Path, deep: bool, report: Callable[[str], None]) -> list[Problem]:
     """A valid sidecar's columns and its video."""
+    problems: list[Problem] = []
     try:
         stream = Stream(path)
-        problems = list(_check_video_file(stream, deep, report))
+        problems += _check_video_file(stream, deep, report)
         _ = stream.rebuilder  # decodes and checks the columns
         if stream.sidecar.camera_info and stream.sidecar.camera_info.messages:
-            _ = list(stream.camera_info_messages(stream.sidecar.channel.to_record(0)))
+            for _ in stream.camera_info_messages(stream.sidecar.channel.to_record(0)):
+                pass  # making them checks them
         with stream.open_video(sequential=True) as decoder:
             coded = decoder.coded_frames
             if coded != len(stream):
@@ -237,9 +239,7 @@ def _validate_stream(path: Path, deep: bool, report: Callable[[str], None]) -> l
         if deep:
             problems += _check_frames(stream, report)
     except FormatError as error:
-        return [Problem(error.code, error.place, error.problem)]
-    except Mp4dsError as error:
-        return [Problem("stream-invalid", str(path), str(error))]
+        problems.append(Problem(error.code, error.place, error.problem))
     return problems
 
 

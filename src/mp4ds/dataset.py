@@ -144,6 +144,8 @@ class Stream:
             frames=self.sidecar.frames,
             picture_format=self.rebuilder.picture_format,
             picture_size=self.rebuilder.picture_size,
+            matrix=video.matrix,
+            full_range=video.full_range,
             sequential=sequential,
         )
 
@@ -366,7 +368,7 @@ class Dataset:
         recorded = self._recorded_messages(group)
         due = 0
         for ordinal, message in merged:
-            while due < ordinal:
+            while due < ordinal and self.manifest:  # a pair alone has only its own messages
                 verbatim = next(recorded, None)
                 if verbatim is None:
                     raise FormatError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mp4ds._version import __version__
@@ -36,7 +36,7 @@ from mp4ds.sidecar import (
 )
 from mp4ds.streams import CameraInfoWriter, StreamKey, StreamSettings, StreamWriter, Unsuited
 from mp4ds.streams.writer import refuse_unsuited
-from mp4ds.video import tool_versions
+from mp4ds.video import check_codec, tool_versions
 from mp4ds.video.codecs import DEFAULT_GOP
 from mp4ds.wire import WireError, wire_for
 
@@ -115,11 +115,11 @@ class TopicSummary:
     verbatim: dict[str, tuple[int, int]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
-    def count_verbatim(self, reason: str) -> None:
-        """Count one more message stored verbatim."""
+    def count_verbatim(self, reason: str, number: int) -> None:
+        """Count one more message stored verbatim, the topic's message of that number."""
         if reason not in self.verbatim and len(self.verbatim) >= _MAX_REASONS:
             reason = "other reasons"
-        count, first = self.verbatim.get(reason, (0, self.messages - 1))
+        count, first = self.verbatim.get(reason, (0, number))
         self.verbatim[reason] = (count + 1, first)
 
 
@@ -172,6 +172,7 @@ def pack(
     paths = [Path(sources)] if isinstance(sources, (str, Path)) else [Path(p) for p in sources]
     target = Path(os.path.abspath(dataset))  # noqa: PTH100 - keeps links, unlike resolve()
     quality = parse_quality(chosen.quality)
+    check_codec(chosen.codec, lossless=quality.lossless)
     with (
         open_sources(paths) as reader,
         staged(target, force=chosen.force, replaceable=is_dataset) as folder,
@@ -317,7 +318,7 @@ class _Packer:
             if channel.type_name in CAMERA_INFO_TYPES and self._take_info(message):
                 return
         except Unsuited as reason:
-            topic.count_verbatim(str(reason))
+            topic.count_verbatim(str(reason), topic.messages - 1)
         self._keep(message)
 
     def _topic(self, channel: Channel) -> TopicSummary:
@@ -397,7 +398,8 @@ class _Packer:
         if state.owner is not None:
             self._add_info(state, message)
         elif len(state.pending) < _MAX_PENDING_INFOS:
-            state.pending.append(message)
+            # a copy: a view would keep the reader's whole chunk in memory
+            state.pending.append(replace(message, data=bytes(message.data)))
         else:
             self._give_up(channel.id, state)
             return False
@@ -430,7 +432,7 @@ class _Packer:
             state.writer.accept(message, ordinal)
             topic.frames += 1
         except Unsuited as reason:
-            topic.count_verbatim(str(reason))
+            topic.count_verbatim(str(reason), ordinal)
             self._keep(message)
 
     def _give_up(self, info_id: int, state: _InfoChannel) -> None:

@@ -94,6 +94,8 @@ def _decode_residuals(text: str, count: int) -> NDArray[np.int64]:
     raw = text.encode("ascii", "replace")
     if raw.translate(None, _COLUMN_BYTES):
         raise ValueError("holds something else than integers")
+    if any(bad in raw for bad in (b"- ", b"-\n", b"--")) or raw.endswith(b"-"):
+        raise ValueError("holds a sign without digits")
     if b"*" in raw:
         return _decode_runs(text, count)
     with warnings.catch_warnings():
@@ -122,6 +124,8 @@ def _decode_runs(text: str, count: int) -> NDArray[np.int64]:
         value, _, length = token.partition("*")
         values.append(int(value))
         lengths.append(int(length or 1))
+        if not lengths[-1]:
+            raise ValueError("holds a run of no values")
         total += lengths[-1]
         if total > count:
             break

@@ -146,8 +146,8 @@ def _unpack_recording(
     selected = Selection(options.topics, options.exclude)
     selected.check(channel.topic for channel in dataset.channels)
     # a recording returns to its own format as it was, whatever serialization it holds
-    own = dataset.manifest is not None and dataset.manifest.format == to
-    world = None if own else _WORLDS.get(to)
+    source = dataset.manifest.format if dataset.manifest else ""
+    world = None if source == to else _WORLDS.get(to)
     converter = Converter(world) if world else None
     summary = UnpackSummary(target)
     total = dataset.manifest.messages if dataset.manifest else 0
@@ -182,7 +182,7 @@ def _unpack_recording(
                 if progress and counts.total() % 16 == 0:
                     progress(UnpackProgress(counts.total(), total))
             else:
-                _write_other(writer, record, to)
+                _write_other(writer, record, to, source)
     if progress:
         progress(UnpackProgress(counts.total(), counts.total()))
     summary.messages.update(counts)
@@ -193,10 +193,14 @@ def _unpack_recording(
     return summary
 
 
-def _write_other(writer: BagWriter, record: Attachment | MetadataRecord, to: str) -> None:
+def _write_other(
+    writer: BagWriter, record: Attachment | MetadataRecord, to: str, source: str
+) -> None:
+    # what we noted of a rosbag2 folder is of no use to another format
+    ours = source == "rosbag2" and getattr(record, "name", "").startswith(_OURS)
     if isinstance(record, Attachment):
         writer.add_attachment(record)
-    elif to == "rosbag2" or not record.name.startswith(_OURS):
+    elif not ours or to == "rosbag2":
         writer.add_metadata(record)
 
 
@@ -204,7 +208,7 @@ def _recorded_storage(dataset: Dataset) -> str:
     """The storage that a rosbag2 source had; mcap, the default of ROS 2, for all others."""
     for record in dataset.recorded_records():
         if isinstance(record, MetadataRecord) and record.name == f"{_OURS}rosbag2":
-            return record.metadata.get("storage", "mcap")
+            return record.metadata.get("storage") or "mcap"
         if isinstance(record, Message):
             break  # a rosbag2 folder's own record comes before its messages
     return "mcap"

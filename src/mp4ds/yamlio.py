@@ -50,7 +50,8 @@ class _Dumper(_BaseDumper):  # type: ignore[misc]
 
 
 def _represent_str(dumper: _Dumper, text: str) -> Any:
-    plain_block = "\n" in text and not text.startswith((" ", "\n"))
+    plain_block = bool(re.fullmatch(r"[^\s][\n\x20-\x7e\xa0-\u2027\u2030-\ud7ff]*", text))
+    plain_block &= "\n" in text
     style = "|" if plain_block else None
     if not plain_block and _needs_quotes(text):
         style = '"'
@@ -59,7 +60,9 @@ def _represent_str(dumper: _Dumper, text: str) -> Any:
 
 def _needs_quotes(text: str) -> bool:
     # What YAML 1.1 readers take for something else: yes, no, on, 1_000, 12:30:00, 2024-01-01 ...
-    return bool(re.match(r"[-+.0-9~]|(?i:y|n|yes|no|on|off|true|false|null)$", text)) or not text
+    # and the line breaks of Unicode, which a plain or quoted scalar would fold.
+    pattern = r"[-+.0-9~]|(?i:y|n|yes|no|on|off|true|false|null)$|.*[\x85\u2028\u2029]|$"
+    return bool(re.match(pattern, text, re.DOTALL))
 
 
 def _represent_float(dumper: _Dumper, value: float) -> Any:
@@ -128,8 +131,8 @@ def load(data: bytes, place: str) -> dict[str, Any]:
     if len(structure) > MAX_STRUCTURE_BYTES:
         raise FormatError("yaml-invalid", place, "has too much structure outside of its columns")
     document = _parse(structure, place)
-    if columns:
-        _restore_columns(document, columns)
+    if columns and _restore_columns(document, columns) != len(columns):
+        document = _parse(data, place)  # what looked like a column stood inside of a text
     return document
 
 
@@ -206,7 +209,12 @@ def _scalar(event: Any) -> Any:
     number = _NUMBER.fullmatch(text)
     if not number:
         return text
-    return float(text) if number.group(1) or number.group(2) else int(text)
+    if not number.group(1) and not number.group(2):
+        return int(text)
+    value = float(text)
+    if value - value != 0:
+        raise ValueError(f"line {event.start_mark.line + 1}: {text} is no finite number")
+    return value
 
 
 def _slice_columns(data: bytes) -> tuple[bytes, list[str]]:
@@ -228,15 +236,17 @@ def _slice_columns(data: bytes) -> tuple[bytes, list[str]]:
     return b"".join(pieces), columns
 
 
-def _restore_columns(node: Any, columns: list[str]) -> None:
+def _restore_columns(node: Any, columns: list[str]) -> int:
+    """Put the columns back in place of their placeholders; returns how many there were."""
+    restored = 0
     if isinstance(node, dict):
         values = node.get("values")
         if isinstance(values, str) and values.startswith(_PLACEHOLDER):
             number = values[len(_PLACEHOLDER) :].strip()
             if number.isdigit() and int(number) < len(columns):
                 node["values"] = columns[int(number)]
-        for child in node.values():
-            _restore_columns(child, columns)
-    elif isinstance(node, list):
-        for child in node:
-            _restore_columns(child, columns)
+                restored += 1
+        return restored + sum(_restore_columns(child, columns) for child in node.values())
+    if isinstance(node, list):
+        return sum(_restore_columns(child, columns) for child in node)
+    return 0

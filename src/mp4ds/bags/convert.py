@@ -148,13 +148,12 @@ class Converter:
 
     def _plan(self, channel: Channel) -> _Plan:
         schema = channel.schema
-        if schema is None or channel.message_encoding != self._source.encoding:
-            raise ConversionError(
-                channel.topic,
-                f"its messages are {channel.message_encoding or 'of no known encoding'}, "
-                "which cannot be converted between ROS 1 and ROS 2",
-                _REMEDY,
-            )
+        if channel.message_encoding != self._source.encoding:
+            encoding = channel.message_encoding or "of no known encoding"
+            problem = f"its messages are {encoding}, which has no counterpart in ROS"
+            raise ConversionError(channel.topic, problem, _REMEDY)
+        if schema is None or not schema.name:
+            raise ConversionError(channel.topic, "the type of its messages is not known", _REMEDY)
         if schema not in self._plans:
             try:
                 self._plans[schema] = self._make_plan(schema)

@@ -23,7 +23,6 @@ from mp4ds.bags.mcap_records import (
     RecordStream,
     chunk_record,
     chunk_records,
-    opcode_name,
     open_source,
     parse,
     parse_attachment,
@@ -220,7 +219,7 @@ class McapReader:
         elif opcode == Opcode.CHANNEL:
             self._add_channel(parse(mcap_records.Channel, body))
         elif opcode >= PRIVATE_OPCODE:
-            self._skipped[f"private MCAP records ({opcode_name(opcode)})"] += 1
+            self._skipped[f"private MCAP records (opcode 0x{opcode:02x})"] += 1
 
     def _add_channel(self, record: mcap_records.Channel) -> None:
         if self._channel_records.setdefault(record.id, record) != record:

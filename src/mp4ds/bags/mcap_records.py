@@ -12,14 +12,13 @@ import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, Protocol, TypeVar
+from typing import BinaryIO, NamedTuple, Protocol, TypeVar
 
 import lz4.frame
 import zstandard
 from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
-from mcap.opcode import Opcode
 
 from mp4ds.errors import SourceError, SourceNotFoundError
 
@@ -347,9 +346,3 @@ def chunk_record(view: memoryview, offset: int) -> tuple[int, memoryview, int]:
     if length > len(view) - offset:
         raise DamageError("a chunk ends within a record")
     return opcode, view[offset : offset + length], offset + length
-
-
-def opcode_name(opcode: int) -> str:
-    """A readable name of an opcode, for summaries."""
-    known: Any = {int(item): item.name.lower() for item in Opcode}
-    return str(known.get(opcode, f"opcode 0x{opcode:02x}"))

@@ -82,7 +82,7 @@ class McapWriter:
     def _schema_id(self, schema: Schema) -> int:
         if schema not in self._schema_ids:
             if len(self._schema_ids) >= MAX_CHANNELS:
-                raise ConversionError("", f"MCAP holds at most {MAX_CHANNELS} definitions")
+                raise ConversionError(schema.name, f"MCAP holds at most {MAX_CHANNELS} schemas")
             self._schema_ids[schema] = self._writer.register_schema(
                 schema.name, schema.encoding, schema.data
             )

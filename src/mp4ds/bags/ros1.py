@@ -23,7 +23,15 @@ from rosbags.interfaces import (
     MessageDefinitionFormat,
 )
 from rosbags.rosbag1 import Reader, ReaderError
-from rosbags.rosbag1.reader import Chunk, Header, IndexData, RecordType, read_bytes, read_uint32
+from rosbags.rosbag1.reader import (
+    Chunk,
+    ChunkInfo,
+    Header,
+    IndexData,
+    RecordType,
+    read_bytes,
+    read_uint32,
+)
 
 from mp4ds.bags.ros1_records import (
     COPY_AGAIN,
@@ -197,6 +205,7 @@ class _Bag(Reader):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self.channels: dict[int, Channel] = {}
+        self._index_end = 0
         # By connection: raw index entries; number of a chunk and of its entries, alternating.
         self._index_entries: defaultdict[int, bytearray] = defaultdict(bytearray)
         self._index_runs: defaultdict[int, array[int]] = defaultdict(partial(array, "I"))
@@ -221,6 +230,23 @@ class _Bag(Reader):
             self.file.seek(header.get_uint64("index_pos"))
             for _ in range(header.get_uint32("conn_count")):
                 self.read_connection()
+            self._index_end = self.file.tell()
+        if self._goes_on():
+            raise ReaderError("its header counts fewer chunks than its index lists")
+
+    def _goes_on(self) -> bool:
+        """Whether a record follows the last one of the index that was read."""
+        self.file.seek(self._index_end)
+        try:
+            return "op" in Header.read(self.file)
+        except DAMAGE:
+            return False
+
+    def read_chunk_info(self) -> ChunkInfo:
+        """Read the summary of a chunk."""
+        info = super().read_chunk_info()
+        self._index_end = self.file.tell()
+        return info
 
     def read_connection(self) -> Connection:
         """Read a connection record, keeping its header verbatim."""

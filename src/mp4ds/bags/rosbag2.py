@@ -153,7 +153,8 @@ class Rosbag2Reader:
         return shared
 
     def _with_listed_qos(self, channel: Channel) -> Channel:
-        if self._storage == "mcap" or not self._info or channel.metadata.get(QOS_KEY):
+        """A topic of a database without a column for QoS, with what metadata.yaml tells."""
+        if self._storage == "mcap" or not self._info or QOS_KEY in channel.metadata:
             return channel
         for topic in self._info.topics:
             if topic.qos and (topic.name, topic.type_name) == (channel.topic, channel.type_name):

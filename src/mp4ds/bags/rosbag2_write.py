@@ -210,15 +210,20 @@ class Rosbag2Writer:
         return info
 
     def _as_listed(self, topic: _Topic) -> _Topic:
-        """The topic with the QoS and hash that the source's metadata.yaml alone told of it."""
-        for listed in self._source.topics if self._source else ():
-            if (listed.name, listed.type_name) == (topic.name, topic.type_name):
-                return replace(
-                    topic,
-                    qos=topic.qos or listed.qos or "",
-                    type_hash=topic.type_hash or listed.type_hash or "",
-                )
-        return topic
+        """The topic as the source's metadata.yaml listed it, which may differ from its files."""
+        found = [
+            listed
+            for listed in (self._source.topics if self._source else ())
+            if (listed.name, listed.type_name) == (topic.name, topic.type_name)
+        ]
+        if len(found) != 1:
+            return topic
+        return replace(
+            topic,
+            serialization_format=found[0].serialization_format,
+            qos=topic.qos if found[0].qos is None else found[0].qos,
+            type_hash=topic.type_hash if found[0].type_hash is None else found[0].type_hash,
+        )
 
     def _finish(self) -> None:
         info = self._info()

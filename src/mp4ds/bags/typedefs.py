@@ -82,6 +82,7 @@ def _parse(schema: Schema, name: str) -> Typesdict:
     if not schema.encoding or not text.strip():
         return {}
     if schema.encoding in ("ros2idl", "omgidl") or re.match(r"=+\nIDL: ", text):
+        text = re.sub(r"(?m)^[ \t]*#.*$", "", text)  # what it includes stands beside it
         parts = re.split(r"(?m)^=+\n(?:IDL: .*\n)?", text)
         parsed = (get_types_from_idl(part) for part in parts if part.strip())
         return {key: value for types in parsed for key, value in types.items()}

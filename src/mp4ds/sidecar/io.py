@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
@@ -47,6 +48,8 @@ def load_document(path: Path) -> dict[str, Any]:
             ``version-unsupported``, ``migration-failed`` or ``kind-unknown``.
     """
     try:
+        if path.stat().st_size > yamlio.MAX_BYTES:
+            raise FormatError("yaml-invalid", path, f"is larger than {yamlio.MAX_BYTES} bytes")
         data = path.read_bytes()
     except OSError as error:
         raise FormatError("file-missing", path, f"cannot be read: {error.strerror}") from None
@@ -60,11 +63,43 @@ def load_document(path: Path) -> dict[str, Any]:
         found = parse_version(version)
     except ValueError as error:
         raise FormatError("version-unsupported", path, str(error)) from None
-    if found[0] > parse_version(FORMAT_VERSION)[0]:
+    supported = parse_version(FORMAT_VERSION)
+    if found[0] > supported[0]:
         raise VersionError(path, version, FORMAT_VERSION)
+    if found < supported:
+        raise FormatError("version-unsupported", path, f"is of version {version!r}, which never was")
     if document.get("kind") not in _MODELS:
         raise FormatError("kind-unknown", path, "is neither a stream nor a dataset")
+    return document if found == supported else _without_news(document, path)
+
+
+def _without_news(document: dict[str, Any], path: Path) -> dict[str, Any]:
+    """A document of a newer minor version without the keys that this one does not know."""
+    dropped: list[str] = []
+    while True:
+        try:
+            model_for(document).model_validate(document)
+        except ValidationError as error:
+            unknown = [item["loc"] for item in error.errors() if item["type"] == "extra_forbidden"]
+        else:
+            unknown = []
+        if not unknown:
+            break
+        for place in unknown:
+            _remove(document, place)
+            dropped.append(".".join(map(str, place)))
+    warnings.warn(
+        f"{path} is of format version {document['mp4ds']}, newer than {FORMAT_VERSION}; "
+        f"ignored: {', '.join(dropped) or 'nothing'}",
+        stacklevel=2,
+    )
     return document
+
+
+def _remove(document: Any, place: tuple[int | str, ...]) -> None:
+    for key in place[:-1]:
+        document = document[key]
+    document.pop(place[-1], None)
 
 
 def load_stream(path: Path) -> StreamSidecar:

@@ -78,6 +78,13 @@ def _from_0(old: Document, place: str) -> Document:
             "pixel_format": "yuv420p",
             "width": width,
             "height": height,
+            # that tool left the conversion to ffmpeg, which then takes BT.601, limited
+            "color": {
+                "primaries": "bt709",
+                "transfer": "bt709",
+                "matrix": "smpte170m",
+                "range": "limited",
+            },
         },
         "camera_info": {
             "channel": _channel_0(str(info_topic), "sensor_msgs/CameraInfo"),

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from mp4ds.layouts import LAYOUTS, MAX_SIDE, why_not
+from mp4ds.layouts import ENCODINGS, LAYOUTS, MAX_SIDE, why_not
 from mp4ds.records import Channel, Schema
 from mp4ds.stamps import INT64_MAX, INT64_MIN, decode_column
 from mp4ds.wire.formats import WIRES
@@ -25,6 +25,7 @@ MAX_FRAMES = 10**8
 MAX_CAMERA_INFOS = 10**7
 
 Int64 = Annotated[int, Field(ge=INT64_MIN, le=INT64_MAX)]
+Time = Annotated[int, Field(ge=INT64_MIN, le=2**64 - 1)]
 Uint32 = Annotated[int, Field(ge=0, le=2**32 - 1)]
 Side = Annotated[int, Field(ge=1, le=MAX_SIDE)]
 Count = Annotated[int, Field(ge=0, le=MAX_FRAMES)]
@@ -161,6 +162,16 @@ class Video(_Model):
     options: dict[str, str] = Field(default_factory=dict, description="The encoder's options.")
     size: Size | None = Field(None, description="Bytes.")
     sha256: Sha256 | None = Field(None, description="Of the file.")
+
+    @property
+    def matrix(self) -> str:
+        """Matrix coefficients of the video's colours."""
+        return self.color.matrix if self.color else "bt709"
+
+    @property
+    def full_range(self) -> bool:
+        """Whether the video's samples use their full range."""
+        return self.color is None or self.color.range == "full"
 
     @model_validator(mode="after")
     def _known(self) -> Video:
@@ -299,6 +310,14 @@ class StreamSidecar(_Model):
                 raise ValueError(f"wire {wire!r} is not one of {', '.join(WIRES)}")
         if self.profile == "lossless" and self.digests is None:
             raise ValueError("a lossless stream has digests")
+        encoding = ENCODINGS[self.image.encoding]
+        if self.video.layout not in (encoding.exact, encoding.lossy):
+            raise ValueError(f"layout {self.video.layout} does not carry {encoding.name} images")
+        width, height = LAYOUTS[self.video.layout].picture_size(
+            self.image.width, self.image.height
+        )
+        if self.video.width < width or self.video.height < height:
+            raise ValueError(f"the video is smaller than its pictures of {width}x{height}")
         return self
 
 
@@ -339,8 +358,8 @@ class Verbatim(_Model):
 class TimeRange(_Model):
     """Log times of the first and the last message, ns, both included."""
 
-    start: Int64
-    end: Int64
+    start: Time
+    end: Time
 
 
 class Manifest(_Model):
@@ -373,7 +392,7 @@ def decode_base64(text: str) -> bytes:
     try:
         return base64.b64decode(text, validate=True)
     except binascii.Error as error:
-        raise ValueError(f"is not base64: {error}") from None
+        raise ValueError(f"{text[:20]!r} is not base64: {error}") from None
 
 
 def parse_version(text: str) -> tuple[int, int]:

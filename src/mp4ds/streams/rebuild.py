@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import FormatError
 from mp4ds.layouts import ENCODINGS, LAYOUTS, Pixels, pixel_view
 from mp4ds.records import Channel, Message
-from mp4ds.sidecar import CameraInfo, Columns, StreamSidecar
+from mp4ds.sidecar import Calibration, CameraInfo, Columns, StreamSidecar
 from mp4ds.sidecar.models import decode_base64
 from mp4ds.streams.camera_info import fields_of
 from mp4ds.streams.writer import picture_format
@@ -66,6 +66,34 @@ def decode_columns(columns: Columns, count: int, variants: int, place: str) -> D
     return decoded
 
 
+def check_stamps(columns: DecodedColumns, wire: str, place: str) -> None:
+    """Refuse stamps and sequence numbers that the serialization has no bits for.
+
+    Raises:
+        FormatError: ``column-invalid``, naming the column.
+    """
+    low, high = (0, 2**32) if wire == "ros1" else (-(2**31), 2**31)
+    seconds = columns.stamp // 10**9
+    if seconds.min() < low or seconds.max() >= high:
+        raise FormatError(
+            "column-invalid",
+            f"{place} at columns.stamp",
+            f"has seconds outside of {low} to {high}",
+        )
+    seq = columns.seq
+    if seq is not None and (seq.min() < 0 or seq.max() >= 2**32):
+        raise FormatError(
+            "column-invalid", f"{place} at columns.seq", "has values beyond 32 bits"
+        )
+
+
+def _template(text: str, place: str) -> bytes:
+    try:
+        return decode_base64(text)
+    except ValueError as error:
+        raise FormatError("header-mismatch", place, str(error)) from None
+
+
 class ImageRebuilder:
     """Makes the image messages of a stream.
 
@@ -89,7 +117,7 @@ class ImageRebuilder:
         self._digests = self._decode_digests()
         self._heads = [self._head(number) for number in range(len(sidecar.headers))]
         self._tails = [bytes.fromhex(header.tail) for header in sidecar.headers]
-        self._check_stamps()
+        check_stamps(self.columns, sidecar.wire, place)
 
     @property
     def picture_format(self) -> str:
@@ -178,7 +206,7 @@ class ImageRebuilder:
         )
         if header.template is None:
             return plain
-        template = decode_base64(header.template)
+        template = _template(header.template, f"{self._place} at headers.{number}.template")
         if len(template) != len(plain):
             raise FormatError(
                 "header-mismatch",
@@ -186,22 +214,6 @@ class ImageRebuilder:
                 f"has {len(template)} bytes where its fields take {len(plain)}",
             )
         return template
-
-    def _check_stamps(self) -> None:
-        signed = self._sidecar.wire != "ros1"
-        low, high = (-(2**31), 2**31) if signed else (0, 2**32)
-        seconds = self.columns.stamp // 10**9
-        if seconds.min() < low or seconds.max() >= high:
-            raise FormatError(
-                "column-invalid",
-                f"{self._place} at columns.stamp",
-                f"has seconds outside of {low} to {high}",
-            )
-        seq = self.columns.seq
-        if seq is not None and (seq.min() < 0 or seq.max() >= 2**32):
-            raise FormatError(
-                "column-invalid", f"{self._place} at columns.seq", "has values beyond 32 bits"
-            )
 
 
 class CameraInfoRebuilder:
@@ -226,12 +238,24 @@ class CameraInfoRebuilder:
             len(camera_info.calibrations),
             f"{place} at camera_info",
         )
+        check_stamps(self.columns, camera_info.wire, f"{place} at camera_info")
         self._blanks = [
-            decode_base64(calibration.template)
-            if calibration.template is not None
-            else self._wire.camera_info(0, 0, calibration.frame_id, fields_of(calibration))
-            for calibration in camera_info.calibrations
+            self._blank(calibration, f"{place} at camera_info.calibrations.{number}")
+            for number, calibration in enumerate(camera_info.calibrations)
         ]
+
+    def _blank(self, calibration: Calibration, place: str) -> bytes:
+        plain = self._wire.camera_info(0, 0, calibration.frame_id, fields_of(calibration))
+        if calibration.template is None:
+            return plain
+        template = _template(calibration.template, f"{place}.template")
+        if len(template) < len(plain):
+            raise FormatError(
+                "header-mismatch",
+                f"{place}.template",
+                f"has {len(template)} bytes where its fields take {len(plain)}",
+            )
+        return template
 
     def messages(self, channel: Channel) -> Iterator[tuple[int, Message]]:
         """Ordinal and message of each."""

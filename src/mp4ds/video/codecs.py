@@ -44,9 +44,6 @@ class _Coding:
     default_preset: str = ""
 
 
-CODECS = ("h264", "h265", "av1", "ffv1")
-"""The names that ``--codec`` takes."""
-
 _FFV1 = MappingProxyType({"level": "3", "slicecrc": "1", "slices": "4"})
 
 # (codec, pixel format of the picture) -> coding
@@ -68,6 +65,20 @@ _DEFAULT_LOSSLESS = {"gray": "h264", "rgb24": "h264", "bgr24": "h264", "gray16le
 _DEFAULT_LOSSY = "av1"
 
 
+def check_codec(codec: str | None, *, lossless: bool) -> None:
+    """Refuse a codec that could make no stream at all of a profile.
+
+    Raises:
+        OptionError: Names those that can.
+    """
+    able = {name for name, _ in _LOSSLESS} if lossless else set(_LOSSY)
+    if codec is not None and codec not in able:
+        kind = "lossless" if lossless else "lossy"
+        raise OptionError(
+            f"--codec {codec!r} is not one for {kind} packing. Use {', '.join(sorted(able))}."
+        )
+
+
 def recipe_for(
     pixel_format: str,
     *,
@@ -81,15 +92,13 @@ def recipe_for(
     Args:
         pixel_format: Of the pictures, as a layout gives them.
         lossless: Whether every sample must return as it was.
-        codec: A name of `CODECS`, or None for the default.
+        codec: ``h264``, ``h265``, ``av1``, ``ffv1``, or None for the default.
         crf: Constant rate factor of a lossy recipe.
         preset: The encoder's preset, or None for the default.
 
     Raises:
         OptionError: The codec is unknown or cannot do it; names those that can.
     """
-    if codec is not None and codec not in CODECS:
-        raise OptionError(f"--codec {codec!r} is not known. Use one of {', '.join(CODECS)}.")
     if lossless:
         name = codec or _DEFAULT_LOSSLESS[pixel_format]
         coding = _LOSSLESS.get((name, pixel_format))

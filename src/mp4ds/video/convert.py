@@ -26,17 +26,20 @@ _INTERPOLATION = (
     | Interpolation.BITEXACT
 )
 _YUV = ("yuv420p", "yuvj420p")
+_MATRICES = {"bt709": Colorspace.ITU709, "smpte170m": Colorspace.ITU601}
 
 
 class Converter:
-    """Converts frames between pixel formats, full range; not to be shared between threads.
+    """Converts frames between pixel formats, to full range; not to be shared between threads.
 
     Args:
-        matrix: Between RGB and YUV: videos have BT.709, JPEG files BT.601.
+        matrix: Between RGB and YUV, by ffmpeg's name: ours is bt709, JPEG files have smpte170m.
+        source_full_range: Whether the frames to convert use the full range.
     """
 
-    def __init__(self, matrix: Colorspace = Colorspace.ITU709) -> None:
-        self._matrix = matrix
+    def __init__(self, matrix: str = "bt709", *, source_full_range: bool = True) -> None:
+        self._matrix = _MATRICES.get(matrix, Colorspace.ITU709)
+        self._source_range = ColorRange.JPEG if source_full_range else ColorRange.MPEG
         self._reformatter = VideoReformatter()
 
     def convert(self, frame: av.VideoFrame, pixel_format: str) -> av.VideoFrame:
@@ -46,7 +49,7 @@ class Converter:
             format=pixel_format,
             src_colorspace=self._matrix,
             dst_colorspace=self._matrix,
-            src_color_range=ColorRange.JPEG,
+            src_color_range=self._source_range,
             dst_color_range=ColorRange.JPEG,
             interpolation=_INTERPOLATION,
             threads=1,  # a pool inherited over fork would never end

@@ -29,6 +29,8 @@ class VideoDecoder:
         frames: Number of frames that are due.
         picture_format: Pixel format of the pictures wanted.
         picture_size: Width and height of the pictures wanted.
+        matrix: Matrix coefficients of the video's colours.
+        full_range: Whether its samples use their full range.
         sequential: Decode with all cores, for reading in order.
 
     Raises:
@@ -44,13 +46,15 @@ class VideoDecoder:
         frames: int,
         picture_format: str,
         picture_size: tuple[int, int],
+        matrix: str = "bt709",
+        full_range: bool = True,
         sequential: bool = True,
     ) -> None:
         self._path = path
         self._frames = frames
         self._picture_format = picture_format
         self._picture_size = picture_size
-        self._converter = Converter()
+        self._converter = Converter(matrix, source_full_range=full_range)
         self._ticks: np.ndarray[tuple[int], np.dtype[np.int64]] | None = None
         if not path.is_file():
             raise VideoError("file-missing", path, "does not exist")

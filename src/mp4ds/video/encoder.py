@@ -10,7 +10,7 @@ from pathlib import Path
 import av
 from av.error import FFmpegError
 
-from mp4ds.errors import Mp4dsError
+from mp4ds.errors import Mp4dsError, OptionError
 from mp4ds.layouts import Pixels
 from mp4ds.stamps import TIMESCALE
 from mp4ds.video.codecs import Recipe
@@ -22,6 +22,27 @@ _LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.01, 30.0, 1000.0  # Hz
 
 class EncoderRefusedError(Mp4dsError):
     """The encoder does not take pictures of this kind or size; the message says why."""
+
+
+def check_preset(recipe: Recipe) -> None:
+    """Refuse a preset that the encoder does not know for pictures of any size.
+
+    Raises:
+        OptionError: Names preset and encoder.
+    """
+    context = av.CodecContext.create(recipe.encoder, "w")
+    context.width = context.height = 256
+    context.pix_fmt = recipe.pixel_format
+    context.time_base = _TIME_BASE
+    context.options = dict(recipe.options)
+    try:
+        context.open()
+    except (FFmpegError, ValueError):
+        preset = recipe.options.get("preset")
+        raise OptionError(
+            f"--preset {preset!r} is not one that {recipe.encoder} takes. "
+            "x264 and x265 take ultrafast to veryslow, SVT-AV1 takes 0 to 13."
+        ) from None
 
 
 class VideoEncoder:
@@ -62,7 +83,7 @@ class VideoEncoder:
         self.height = height + height % 2 if halved else height
         self.options = {**recipe.options, "g": str(gop)}
         # SVT-AV1 prints to stderr on its own; errors reach us as return codes
-        os.environ.setdefault("SVT_LOG", "1")
+        os.environ.setdefault("SVT_LOG", "0")
         self._container = av.open(
             str(path),
             "w",

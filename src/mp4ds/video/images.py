@@ -6,7 +6,6 @@ from fractions import Fraction
 
 import av
 import numpy as np
-from av.video.reformatter import Colorspace
 
 from mp4ds.layouts import ENCODINGS, Pixels
 from mp4ds.video.convert import Converter
@@ -33,7 +32,7 @@ class ImageFile:
         self._jpeg = image_format == "jpeg"
         if self._jpeg and known.bytes_per_sample == 2:
             raise ValueError(f"JPEG cannot hold {encoding} images; use png")
-        self._converter = Converter(Colorspace.ITU601)
+        self._converter = Converter("smpte170m")
         if known.bytes_per_sample == 2:
             self._source, self._pixel_format = "gray16le", "gray16be"
         elif known.channels == 3:

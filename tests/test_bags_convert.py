@@ -1,0 +1,418 @@
+"""ROS 1 <-> ROS 2: the same values on both sides, and back to the same channel."""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.convert.converter import default_message
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.msg import normalize_msgtype
+
+from conftest import real
+from mp4ds.bags.convert import LATCHED_QOS, Converter
+from mp4ds.bags.definitions import ros1_channel
+from mp4ds.bags.ros1 import Ros1Reader
+from mp4ds.errors import ConversionError, OptionError
+from mp4ds.records import Channel, Schema
+from sources import INFO, image_cdr, image_ros1, scene, typestore
+
+HEADER = "std_msgs/msg/Header"
+NO_SEQ = "messages with a header's sequence number, which ROS 2 has not"
+TAILS = "messages with bytes after their end, which were left out"
+REAL_BAGS = (
+    "bag_reader_java/Int64MultiArray",
+    "ecto_ros_camera_info",
+    "embag_array",
+    "example_turtle_none",
+    "fiducials_aruco_marker_raspicam",
+    "joint_states_bz2",
+    "librealsense_depth_color",
+    "only_a_cube_melodic",
+    "ouster_512x10_raw_packets",
+    "roboto_tiny_dvs",
+    "ros_numpy_test",
+    "rosout_bz2",
+    "spot_cv_raw",
+    "youliangtan_object_pose",
+)
+
+
+def store_of(channel: Channel) -> Any:
+    """A store of a channel's own definition, with the header of its world."""
+    assert channel.schema
+    world = Stores.ROS1_NOETIC if channel.message_encoding == "ros1" else Stores.ROS2_HUMBLE
+    text = channel.schema.data.decode().replace("roslib/Header", "std_msgs/Header")
+    types = get_types_from_msg(text, normalize_msgtype(channel.schema.name))
+    store = get_typestore(Stores.EMPTY)
+    store.register({**types, HEADER: get_typestore(world).fielddefs[HEADER]})
+    return store
+
+
+def read(channel: Channel, store: Any, data: bytes | memoryview) -> Any:
+    decode = store.deserialize_ros1 if channel.message_encoding == "ros1" else store.deserialize_cdr
+    return values(decode(data, normalize_msgtype(channel.type_name)))
+
+
+def values(item: Any) -> Any:
+    """The values of a message in order, without names and without header.seq."""
+    if dataclasses.is_dataclass(item):
+        skip = {"__msgtype__", "structure_needs_at_least_one_member"}
+        skip |= {"seq"} if item.__msgtype__ == HEADER else set()
+        names = [field.name for field in dataclasses.fields(item) if field.name not in skip]
+        return [values(getattr(item, name)) for name in names]
+    if isinstance(item, np.ndarray):
+        return item.tobytes()
+    if isinstance(item, list):
+        return [values(part) for part in item]
+    return struct.pack("<d", item) if isinstance(item, float) else item
+
+
+@pytest.mark.parametrize("name", REAL_BAGS)
+def test_real_bags_to_ros2_and_back(name: str) -> None:
+    to_ros2, to_ros1 = Converter("ros2"), Converter("ros1")
+    known: dict[int, tuple[Channel, Any, Any]] = {}
+    with Ros1Reader(real(f"bags/{name}.bag")) as reader:
+        for channel in reader.channels:
+            made = to_ros2.channel(channel)
+            known[channel.id] = made, store_of(channel), store_of(made)
+            assert to_ros1.channel(made) == channel
+            unremembered = to_ros1.channel(replace(made, metadata={}))
+            assert unremembered.metadata == {"md5sum": channel.metadata["md5sum"]}
+        for record in reader.records():
+            channel = record.channel
+            made, store1, store2 = known[channel.id]
+            there = to_ros2.payload(channel, record.data)
+            back = to_ros1.payload(made, there)
+            before = read(channel, store1, record.data)
+            assert read(made, store2, there) == before
+            assert read(channel, store1, back) == before
+            assert len(back) == len(record.data)
+
+
+def test_a_scene_becomes_what_ros2_writes() -> None:
+    """Payloads are those that rosbags writes for ROS 2, byte for byte."""
+    converter = Converter("ros2")
+    checked = set()
+    for n, message in enumerate(scene("rgb8").messages):
+        package, _, name = message.msgtype.split("/")
+        channel = ros1_channel(n, message.topic, f"{package}/{name}", "/node")
+        made = converter.channel(channel)
+        assert made.type_name == message.msgtype
+        assert made.topic == message.topic
+        assert made.metadata["topic_type_hash"] == typestore("cdr").hash_rihs01(message.msgtype)
+        assert converter.payload(channel, message.payload("ros1")) == message.payload("cdr")
+        checked.add(message.msgtype)
+    assert len(checked) > 4
+    assert converter.omitted[NO_SEQ] > 10
+
+
+def test_camera_info_has_the_field_names_of_the_target() -> None:
+    channel = ros1_channel(0, "/info", "sensor_msgs/CameraInfo", "/node")
+    made = Converter("ros2").channel(channel)
+    assert made.schema
+    assert b"\nfloat64[9] k\n" in made.schema.data
+    assert b"\nfloat64[9] K\n" not in made.schema.data
+    back = Converter("ros1").channel(replace(made, metadata={}))
+    assert back.schema
+    assert b"\nfloat64[9] K\n" in back.schema.data
+    assert back.metadata["md5sum"] == "c9a58c1b0b154e0e6da7578cb991d214"
+    assert back.type_name == "sensor_msgs/CameraInfo"
+    # The same where it stands inside another type.
+    definition = (
+        b"sensor_msgs/CameraInfo[] infos\n" + b"=" * 80 + b"\nMSG: sensor_msgs/CameraInfo\n"
+    )
+    assert channel.schema
+    own = Schema("my_msgs/Infos", "ros1msg", definition + channel.schema.data)
+    inside = Converter("ros2").channel(replace(channel, schema=own)).schema
+    assert inside
+    assert b"\nfloat64[9] k\n" in inside.data
+
+
+def test_published_hashes() -> None:
+    """What ROS 2 and ROS 1 themselves call their types."""
+    image = ros1_channel(0, "/a", "sensor_msgs/Image", "/node")
+    made = Converter("ros2", distribution="jazzy").channel(image)
+    assert made.metadata["topic_type_hash"] == (
+        "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47"
+    )
+    frames = Channel(0, "/tf", "cdr", Schema("tf2_msgs/msg/TFMessage", "", b""), {})
+    tf = Converter("ros1").channel(frames)
+    assert tf.type_name == "tf2_msgs/TFMessage"
+    assert tf.metadata["md5sum"] == "94810edda583a504dfda3829e70d7eec"
+
+
+def test_the_ros1_identity_is_kept() -> None:
+    metadata = {"callerid": "/n", "latching": "1", "md5sum": "0" * 32, "vendor": "x", "topic": "t"}
+    for data in (b"string data # what\n", b"string data # \xff\n"):
+        channel = Channel(
+            3, "chatter", "ros1", Schema("std_msgs/String", "ros1msg", data), metadata
+        )
+        made = Converter("ros2").channel(channel)
+        assert (made.id, made.topic, made.message_encoding) == (3, "chatter", "cdr")
+        assert made.schema == Schema("std_msgs/msg/String", "ros2msg", b"string data\n")
+        assert made.metadata["ros1:callerid"] == "/n"
+        assert made.metadata["ros1:type"] == "std_msgs/String"
+        assert made.metadata["offered_qos_profiles"] == LATCHED_QOS
+        assert Converter("ros1").channel(made) == channel
+    bare = Channel(3, "/a", "ros1", Schema("std_msgs/String", "", b""), {"latching": "0"})
+    made = Converter("ros2").channel(bare)
+    assert made.metadata["offered_qos_profiles"] == ""
+    assert Converter("ros1").channel(made) == bare
+
+
+def test_an_identity_that_does_not_fit_is_not_believed() -> None:
+    identity = {"ros1:type": "std_msgs/Int8", "ros1:message_definition": "int8 data", "ros1:a": "b"}
+    for more in ({}, {"ros1:message_definition;base64": "%"}, {"ros1:type": "1/2/3"}):
+        schema = Schema("std_msgs/msg/String", "ros2msg", b"string data")
+        made = Converter("ros1").channel(Channel(0, "/a", "cdr", schema, {**identity, **more}))
+        assert made.type_name == "std_msgs/String"
+        assert made.metadata == {"md5sum": "992ce8a1687cec8c8bd883ec73ca41d1"}
+
+
+@pytest.mark.parametrize(
+    ("qos", "latching"),
+    [
+        (LATCHED_QOS, "1"),
+        ("- durability: transient_local\n- {durability: 'transient_local'}", "1"),
+        ("- durability: 1\n- durability: 2", None),
+        ("- durability: volatile", None),
+        ("", None),
+        ("- history: 1", None),
+    ],
+)
+def test_latching_is_transient_local(qos: str, latching: str | None) -> None:
+    schema = Schema("std_msgs/msg/String", "ros2msg", b"string data")
+    converter = Converter("ros1")
+    made = converter.channel(Channel(0, "/a", "cdr", schema, {"offered_qos_profiles": qos}))
+    assert made.metadata.get("latching") == latching
+    assert bool(converter.omitted) == bool(qos and not latching)
+
+
+@pytest.mark.parametrize("latching", ["1", "true", "True"])
+def test_transient_local_is_latching(latching: str) -> None:
+    channel = ros1_channel(0, "/a", "std_msgs/String", "/node")
+    made = Converter("ros2").channel(replace(channel, metadata={"latching": latching}))
+    assert made.metadata["offered_qos_profiles"] == LATCHED_QOS
+
+
+def test_tf_message_is_renamed() -> None:
+    with Ros1Reader(real("bags/example_turtle_bz2.bag")) as reader:
+        (channel,) = (c for c in reader.channels if c.topic == "/tf")
+        assert channel.type_name == "tf/tfMessage"
+        made = Converter("ros2").channel(channel)
+    assert made.type_name == "tf2_msgs/msg/TFMessage"
+    assert made.metadata["topic_type_hash"] == typestore("cdr").hash_rihs01(
+        "tf2_msgs/msg/TFMessage"
+    )
+
+
+def test_types_that_differ_keep_their_own_definition() -> None:
+    marker = ros1_channel(0, "/a", "visualization_msgs/Marker", "/node")
+    made = Converter("ros2").channel(marker).schema
+    assert made
+    assert b"uv_coordinates" not in made.data  # ROS 2 has more fields
+    assert b"mesh_use_embedded_materials" in made.data
+    schema = Schema("visualization_msgs/msg/Marker", "", b"")
+    back = Converter("ros1").channel(Channel(0, "/a", "cdr", schema, {})).schema
+    assert back
+    assert b"uv_coordinates" in back.data
+
+
+@pytest.mark.parametrize("target", ["ros1", "ros2", None])
+def test_what_is_there_already_stays(target: str | None) -> None:
+    converter = Converter(target)
+    for encoding in (
+        ("ros1", "cdr") if target is None else ("ros1",) if target == "ros1" else ("cdr",)
+    ):
+        channel = Channel(0, "/a", encoding, None, {})
+        data = memoryview(b"anything")
+        assert converter.channel(channel) is channel
+        assert converter.payload(channel, data) is data
+    assert not converter.omitted
+
+
+def test_definitions_as_they_are_found() -> None:
+    """Line ends, rulers, bounds, defaults, old headers, and types defined elsewhere."""
+    old_header = (
+        b"Header h\r\n=====================\r\nMSG: roslib/Header\r\n"
+        b"uint32 seq\r\ntime stamp\r\nstring frame_id\r\n"
+    )
+    idl = (
+        b"%b\nIDL: my/msg/A\n"
+        b'#include "my/msg/B.idl"\nmodule my { module msg { struct A { my::msg::B b; '
+        b"sequence<double, 4> d; octet o; string<7> s; }; }; };\n"
+        b"%b\nIDL: my/msg/B\nmodule my { module msg { struct B { long x; }; }; };\n"
+    ) % (b"=" * 80, b"=" * 80)
+    bounds = b"string<=5 name 'x'\nint32[<=3] a\nint8 b 4\nint8 C=3"
+    times = b"std_msgs/Header header\nbuiltin_interfaces/Time t"
+    cases = (
+        (Schema("my/A", "ros1msg", old_header), "ros2"),
+        (Schema("my/A", "ros1msg", b"roslib/Header h\nduration d\nchar c\nbyte b"), "ros2"),
+        (Schema("my/A", "ros1msg", b"sensor_msgs/Image image"), "ros2"),
+        (Schema("std_msgs/Empty", "ros1msg", b""), "ros2"),
+        (Schema("sensor_msgs/Image", "ros1msg", b"\n"), "ros2"),
+        (Schema("my/msg/A", "ros2msg", bounds), "ros1"),
+        (Schema("my/msg/A", "ros2msg", times), "ros1"),
+        (Schema("my/msg/A", "ros2idl", idl), "ros1"),
+    )
+    for schema, target in cases:
+        encoding = "ros1" if target == "ros2" else "cdr"
+        made = Converter(target).channel(Channel(0, "/a", encoding, schema, {}))
+        assert made.schema
+        assert b"<=" not in made.schema.data
+        assert b"roslib" not in made.schema.data
+        store_of(made).get_msgdef(normalize_msgtype(made.type_name))
+        back = Converter("ros1" if target == "ros2" else "ros2").channel(made)
+        assert back.schema
+        assert normalize_msgtype(back.type_name) == normalize_msgtype(schema.name)
+
+
+def test_a_missing_definition_is_the_standard_one() -> None:
+    with_text = Converter("ros1").channel(standard("ros2"))
+    without = replace(standard("ros2"), schema=Schema(INFO, "", b""))
+    assert Converter("ros1").channel(without) == with_text
+    assert normalize_msgtype(with_text.type_name) == INFO
+
+
+def standard(world: str) -> Channel:
+    channel = ros1_channel(0, "/info", "sensor_msgs/CameraInfo", "/node")
+    return replace(Converter(world).channel(channel), metadata={})
+
+
+def test_bounds_do_not_change_payloads() -> None:
+    schema = Schema("my/msg/A", "ros2msg", b"uint8 a\nstring<=5 name\nfloat64[<=3] b\nfloat32[2] c")
+    channel = Channel(0, "/a", "cdr", schema, {})
+    store = store_of(channel)
+    message = store.types["my/msg/A"](7, "abc", np.array([1.0, 2.0]), np.array([3, 4], np.float32))
+    data = store.serialize_cdr(message, "my/msg/A", little_endian=True)
+    to_ros1 = Converter("ros1")
+    there = to_ros1.payload(channel, data)
+    made = to_ros1.channel(channel)
+    assert there == b"\7\3\0\0\0abc" + struct.pack("<Idd2f", 2, 1, 2, 3, 4)
+    assert Converter("ros2").payload(made, there) == data
+
+
+def test_big_endian_cdr() -> None:
+    plain: dict[str, Any] = {"width": 3, "height": 2, "encoding": "mono8", "data": b"abcdef"}
+    channel = Channel(0, "/a", "cdr", Schema("sensor_msgs/msg/Image", "", b""), {})
+    made = Converter("ros1").payload(channel, image_cdr(**plain, little_endian=False))
+    assert made == image_ros1(**plain)
+
+
+@pytest.mark.parametrize("options", [{"padding": b"\x61"}, {"options": b"\0\3"}, {"tail": b"\0\0"}])
+def test_what_cdr_may_hold_besides(options: dict[str, Any]) -> None:
+    plain: dict[str, Any] = {"width": 3, "height": 2, "encoding": "mono8", "data": b"abcdef"}
+    channel = Channel(0, "/a", "cdr", Schema("sensor_msgs/msg/Image", "", b""), {})
+    converter = Converter("ros1")
+    assert converter.payload(channel, image_cdr(**plain, **options)) == image_ros1(**plain)
+    assert not converter.omitted  # padding up to a multiple of four is no content
+
+
+def test_bytes_after_a_message_are_counted() -> None:
+    plain: dict[str, Any] = {"width": 3, "height": 2, "encoding": "mono8", "data": b"abcdef"}
+    ros1 = ros1_channel(0, "/a", "sensor_msgs/Image", "/node")
+    to_ros2, to_ros1 = Converter("ros2"), Converter("ros1")
+    assert to_ros2.payload(ros1, image_ros1(**plain, tail=b"four")) == image_cdr(**plain)
+    assert to_ros2.omitted == {TAILS: 1, NO_SEQ: 1}
+    made = to_ros2.channel(ros1)
+    assert to_ros1.payload(made, image_cdr(**plain, tail=b"four")) == image_ros1(**plain)
+    assert to_ros1.omitted == {TAILS: 1}
+    with pytest.raises(ConversionError):
+        to_ros2.payload(ros1, image_ros1(**plain, tail=b"more than eight"))
+
+
+def test_large_payloads_are_not_deserialised() -> None:
+    """Bytes in, bytes out: values that Python would change stay."""
+    pixels = bytes(range(256)) * 64
+    channel = ros1_channel(0, "/a", "sensor_msgs/Image", "/node")
+    converter = Converter("ros2")
+    data = image_ros1(width=128, height=128, encoding="mono8", data=pixels, stamp=(2**32 - 1, 7))
+    made = converter.payload(channel, memoryview(data))
+    assert isinstance(made, memoryview)
+    assert Converter("ros1").payload(converter.channel(channel), made) == data
+    nan = struct.pack("<I", 0x7FA00001)  # a signalling NaN
+    float32 = ros1_channel(0, "/a", "std_msgs/Float32", "/node")
+    assert bytes(converter.payload(float32, nan))[4:] == nan
+
+
+@pytest.mark.parametrize(
+    ("encoding", "schema", "target", "problem"),
+    [
+        ("protobuf", Schema("foxglove.RawImage", "protobuf", b""), "ros1", "messages are protobuf"),
+        ("json", None, "ros2", "messages are json"),
+        ("", None, "ros2", "of no known encoding"),
+        ("ros1", None, "ros2", "the type of its messages is not known"),
+        ("ros1", Schema("my/Type", "", b""), "ros2", "no definition of type my/Type is known"),
+        ("ros1", Schema("my/Type", "ros1msg", b"Other x"), "ros2", "type my/msg/Other is known"),
+        ("ros1", Schema("my/Type", "ros1msg", b"int8 x\n?!"), "ros2", "cannot be understood"),
+        ("ros1", Schema("", "ros1msg", b"int8 x"), "ros2", "type of its messages is not known"),
+        ("ros1", Schema("my/1 Type", "ros1msg", b"int8 x"), "ros2", "cannot be understood"),
+        ("ros1", Schema("my/Type", "ros1msg", b"Type x"), "ros2", "cannot be understood"),
+        ("cdr", Schema("my/msg/Type", "ros2msg", b"wstring x"), "ros1", "no definition of type"),
+        ("cdr", Schema("my/srv/Type", "ros2msg", b"int8 x\n---\n"), "ros1", "cannot be understood"),
+        ("cdr", Schema("my/msg/Type", "ros2idl", b"module {"), "ros1", "cannot be understood"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_converted(
+    encoding: str, schema: Schema | None, target: str, problem: str
+) -> None:
+    with pytest.raises(ConversionError) as caught:
+        Converter(target).channel(Channel(0, "/a", encoding, schema, {}))
+    assert str(caught.value).startswith("topic /a: ")
+    assert problem in str(caught.value)
+    assert "Exclude the topic with --exclude, or unpack to mcap" in str(caught.value)
+
+
+@pytest.mark.parametrize("target", ["ros1", "ros2"])
+def test_payloads_that_do_not_parse(target: str) -> None:
+    ros1 = ros1_channel(0, "/a", "sensor_msgs/Image", "/node")
+    plain: dict[str, Any] = {"width": 3, "height": 2, "encoding": "mono8", "data": b"abcdef"}
+    if target == "ros2":
+        channel, data = ros1, image_ros1(**plain)
+    else:
+        channel, data = Converter("ros2").channel(ros1), image_cdr(**plain)
+    converter = Converter(target)
+    huge = data.replace(b"\6\0\0\0abcdef", b"\xff\xff\xff\xffabcdef")
+    for damaged in [huge, b"\xff" * 80, *(data[:length] for length in range(len(data)))]:
+        with pytest.raises(ConversionError, match="a message does not parse as sensor_msgs/"):
+            converter.payload(channel, damaged)
+    assert not converter.omitted
+
+
+def test_compressed_payloads_do_not_parse() -> None:
+    """Real CDR that is compressed message by message, without the file saying so."""
+    path = real("rosbag2/amber_soccer_goal_msgzstd_v0/soccer_goal_12.mcap")
+    with path.open("rb") as stream:
+        schema, channel, message = next(make_reader(stream).iter_messages())
+    assert schema
+    own = Schema(schema.name, schema.encoding, schema.data)
+    with pytest.raises(ConversionError, match="does not parse"):
+        Converter("ros1").payload(Channel(0, channel.topic, "cdr", own, {}), message.data)
+
+
+def test_every_standard_type_converts() -> None:
+    """All of Noetic's types, with default values, against rosbags' own serialisation."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    converter = Converter("ros2")
+    for number, name in enumerate(store.types):
+        package, _, short = name.split("/")
+        if package == "builtin_interfaces" or name == HEADER:
+            continue
+        message = store.serialize_ros1(default_message(store, name), name)
+        channel = ros1_channel(number, "/a", f"{package}/{short}", "/node")
+        made = converter.channel(channel)
+        there = converter.payload(channel, message)
+        assert read(made, store_of(made), there) == read(channel, store, message)
+
+
+def test_unknown_targets() -> None:
+    with pytest.raises(OptionError, match="Use ros1 or ros2"):
+        Converter("ros3")
+    with pytest.raises(OptionError, match="foxy, galactic, humble"):
+        Converter("ros2", distribution="noetic")
