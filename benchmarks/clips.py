@@ -128,17 +128,22 @@ def data_folder() -> Path | None:
     return folder if (folder / "video").is_dir() else None
 
 
-def specs(
-    family: str, frames: int, size: tuple[int, int] | None, noises: tuple[str, ...] = tuple(SENSORS)
-) -> list[ClipSpec]:
-    """All clips of a family that can be made here; tells on stderr what is missing."""
-    folder = data_folder()
-    if folder is None:
+def check_data() -> None:
+    """Tell on stderr that the real scenes are missing, if they are."""
+    if data_folder() is None:
         print(
             "The folder ../shared/data beside the project, or in $MP4DS_DATA, is not there: the "
             "scene of `mp4ds demo` is used. Figures differ from those of RESULTS.md.",
             file=sys.stderr,
         )
+
+
+def specs(
+    family: str, frames: int, size: tuple[int, int] | None, noises: tuple[str, ...] = tuple(SENSORS)
+) -> list[ClipSpec]:
+    """All clips of a family that can be made here."""
+    folder = data_folder()
+    if folder is None:
         scenes = {} if family == "16UC1" else {DEMO: _Scene("")}
     else:
         scenes = {name: scene for name, scene in SCENES.items() if any(folder.glob(scene.pattern))}
@@ -176,6 +181,7 @@ def load(spec: ClipSpec, cache: Path | None = None) -> Pixels:
     """
     if cache is None:
         return np.stack(list(make(spec)))
+    cache.mkdir(parents=True, exist_ok=True)
     path = cache / f"{spec.name}.npy"
     if not path.exists():
         part = path.with_suffix(".part.npy")

@@ -44,7 +44,8 @@ def pack(
     """Pack losslessly, after importing.
 
     Returns:
-        ``cpu`` seconds; ``codec`` that was used; bytes of ``dataset`` and ``video``.
+        ``cpu`` seconds; ``codec`` that was used, None where the one asked for was refused;
+        ``peak`` of memory; bytes of ``dataset`` and ``video``.
     """
     import mp4ds
     from mp4ds.sidecar import load_stream
@@ -52,7 +53,10 @@ def pack(
     run, options = mp4ds.pack, mp4ds.PackOptions(codec=codec, jobs=jobs)
     cpu = Cpu()
     with cpu.measured():
-        summary = run(source, target, options)
+        try:
+            summary = run(source, target, options)
+        except mp4ds.OptionError:
+            return {"codec": None}  # it has no lossless form at all
     return {
         "cpu": cpu.seconds,
         "peak": _peak_bytes(),

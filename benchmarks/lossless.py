@@ -30,6 +30,7 @@ from measure import job, parse_size, print_machine, print_table
 from recordings import CHUNK_BYTES, write_mcap
 
 HERTZ = 30.0
+CODECS = ("h264", "h265", "av1", "ffv1")
 HEADER = (
     "clip",
     "noise",
@@ -75,6 +76,7 @@ def main() -> None:
     parser.add_argument("--noise", action="append", choices=list(clips.SENSORS))
     parser.add_argument("--cache", type=Path, help="folder that keeps the clips")
     options = parser.parse_args()
+    clips.check_data()
     print_machine()
     print_noise()
     print(f"- MCAP: chunks of {CHUNK_BYTES} bytes, zstd at the mcap library's level")
@@ -84,10 +86,12 @@ def main() -> None:
         specs = clips.specs(family, options.frames, options.size, noises)
         specs = [spec for spec in specs if not options.scene or spec.scene in options.scene]
         results: list[list[Result]] = []
+        if not specs:
+            print(f"\n{family}: there is no clip of it here.")
+            continue
         print(f"\n### {family}")
         print_table(HEADER, rows(specs, options.cache, results))
-        if results:
-            summary.append(summary_row(family, results))
+        summary.append(summary_row(family, results))
     print("\n### Default codec, geometric mean over the clips (least to most)")
     print_table(
         ("family", "clips", "raw / packed", "smaller than PNG", "smaller than zstd MCAP"), summary
@@ -140,7 +144,7 @@ def measure(
     write_mcap(source, clip, len(clip), spec.encoding, compression="zstd", hertz=HERTZ)
     yield Result("zstd MCAP", source.stat().st_size)
     used = set()
-    for codec in (None, *_codecs()):
+    for codec in (None, *CODECS):
         if codec in used:
             continue
         dataset = folder / f"dataset-{codec}"
@@ -160,24 +164,18 @@ def measure(
         )
 
 
-def _codecs() -> tuple[str, ...]:
-    from mp4ds.video import CODECS
-
-    return tuple(CODECS)
-
-
 def png_files(clip: clips.Pixels) -> Result:
     """Each frame as a PNG file with Pillow's default settings."""
-    size, start = 0, time.process_time()
-    for pixels in clip:
-        file = io.BytesIO()
-        Image.fromarray(pixels).save(file, "PNG")
-        size += file.tell()
-    encode = len(clip) / (time.process_time() - start)
+    files = [io.BytesIO() for _ in clip]
     start = time.process_time()
-    file.seek(0)
-    Image.open(file).load()
-    return Result("PNG", size, encode, 1 / (time.process_time() - start))
+    for pixels, file in zip(clip, files, strict=True):
+        Image.fromarray(pixels).save(file, "PNG")
+    encoded = time.process_time()
+    for file in files:
+        Image.open(file).load()
+    decoded = time.process_time()
+    size = sum(len(file.getbuffer()) for file in files)
+    return Result("PNG", size, len(clip) / (encoded - start), len(clip) / (decoded - encoded))
 
 
 def summary_row(family: str, results: list[list[Result]]) -> tuple[object, ...]:

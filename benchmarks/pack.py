@@ -47,6 +47,7 @@ def main() -> None:
     parser.add_argument("--memory", action="store_true", help="measure memory instead")
     parser.add_argument("--minutes", type=float, nargs=2, default=(1.0, 4.0), help="for --memory")
     options = parser.parse_args()
+    clips.check_data()
     print_machine()
     with tempfile.TemporaryDirectory(prefix="mp4ds-benchmark-") as folder:
         if options.memory:

@@ -246,7 +246,7 @@ def test_definitions_as_they_are_found() -> None:
     idl = (
         b"%b\nIDL: my/msg/A\n"
         b'#include "my/msg/B.idl"\nmodule my { module msg { struct A { my::msg::B b; '
-        b"sequence<double, 4> d; octet o; string<7> s; }; }; };\n"
+        b"sequence<double, 4> d; uint8 o; string<7> s; }; }; };\n"
         b"%b\nIDL: my/msg/B\nmodule my { module msg { struct B { long x; }; }; };\n"
     ) % (b"=" * 80, b"=" * 80)
     bounds = b"string<=5 name 'x'\nint32[<=3] a\nint8 b 4\nint8 C=3"
@@ -256,6 +256,7 @@ def test_definitions_as_they_are_found() -> None:
         (Schema("my/A", "ros1msg", b"roslib/Header h\nduration d\nchar c\nbyte b"), "ros2"),
         (Schema("my/A", "ros1msg", b"sensor_msgs/Image image"), "ros2"),
         (Schema("std_msgs/Empty", "ros1msg", b""), "ros2"),
+        (Schema("my/Empty", "ros1msg", b"# nothing\n"), "ros2"),
         (Schema("sensor_msgs/Image", "ros1msg", b"\n"), "ros2"),
         (Schema("my/msg/A", "ros2msg", bounds), "ros1"),
         (Schema("my/msg/A", "ros2msg", times), "ros1"),
@@ -325,6 +326,15 @@ def test_bytes_after_a_message_are_counted() -> None:
     assert to_ros1.omitted == {TAILS: 1}
     with pytest.raises(ConversionError):
         to_ros2.payload(ros1, image_ros1(**plain, tail=b"more than eight"))
+
+
+def test_an_empty_definition_of_a_type_that_is_not_empty() -> None:
+    """The payload tells, however short it is."""
+    channel = Channel(0, "/a", "ros1", Schema("my/Type", "ros1msg", b""), {})
+    converter = Converter("ros2")
+    assert bytes(converter.payload(channel, b"")) == b"\0\1\0\0\0"
+    with pytest.raises(ConversionError, match="does not parse as my/Type"):
+        converter.payload(channel, b"four")
 
 
 def test_large_payloads_are_not_deserialised() -> None:

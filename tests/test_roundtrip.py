@@ -91,7 +91,8 @@ def test_every_source_and_encoding(
 
 @pytest.mark.parametrize("target", [*TARGETS][:4])
 @pytest.mark.parametrize(
-    "source", ["bag-none", "rosbag2-sqlite3-v4", "rosbag2-mcap-v9", "mcap-ros1-zstd", "mcap-ros2-lz4"]
+    "source",
+    ["bag-none", "rosbag2-sqlite3-v4", "rosbag2-mcap-v9", "mcap-ros1-zstd", "mcap-ros2-lz4"],
 )
 def test_every_target(source: str, target: str, tmp_path: Path, compare: Compare) -> None:
     (tmp_path / "source").mkdir()
@@ -111,8 +112,14 @@ def test_odd_messages_return(trait: str, source: str, tmp_path: Path, compare: C
 
 REAL = sorted(
     str(path.relative_to(DATA))
-    for pattern in ("bags/**/*.bag", "mcap/*.mcap", "corrupt/sample_ok.*", "rosbag2/**/*.db3",
-                    "rosbag2/**/*.mcap", "mcap/conformance/**/*.mcap")
+    for pattern in (
+        "bags/**/*.bag",
+        "mcap/*.mcap",
+        "corrupt/sample_ok.*",
+        "rosbag2/**/*.db3",
+        "rosbag2/**/*.mcap",
+        "mcap/conformance/**/*.mcap",
+    )
     for path in DATA.glob(pattern)
 )
 REAL_FOLDERS = sorted(

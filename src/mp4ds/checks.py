@@ -10,7 +10,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -130,7 +130,7 @@ def _shortened(text: str) -> str:
     return text if len(text) <= 200 else f"{text[:100]} ... {text[-80:]}"
 
 
-@lru_cache(maxsize=None)
+@cache
 def _schema_validator(kind: str) -> Any:
     from jsonschema import Draft202012Validator
 
@@ -192,10 +192,10 @@ def _check_listed(folder: Path, manifest: Manifest) -> Iterator[Problem]:
         yield Problem(
             "manifest-inconsistent", str(folder / MANIFEST_NAME), f"does not list {MESSAGES_NAME}"
         )
+    listed.add(MANIFEST_NAME)
     for path in sorted(folder.iterdir()):
         if path.name not in listed and path.suffix in (".mp4", ".yaml", ".mcap"):
-            if path.name != MANIFEST_NAME:
-                yield Problem("file-unlisted", str(path), "is not listed in the manifest")
+            yield Problem("file-unlisted", str(path), "is not listed in the manifest")
 
 
 def _check_entry(folder: Path, manifest: Manifest, name: str) -> Iterator[Problem]:

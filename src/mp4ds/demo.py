@@ -136,7 +136,7 @@ def _image(camera: _Camera, seq: int, stamp: int) -> bytes:
 
 
 def _view(camera: _Camera, time: float) -> NDArray[np.float32]:
-    """What a camera sees: a floor, a wall, and discs that come nearer. Shape (H, W, 3), 0 to 255."""
+    """What a camera sees: a floor, a wall, discs that come nearer. Shape (H, W, 3), 0 to 255."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
     shade = 90 + 60 * (y / HEIGHT) + 12 * np.sin(x / 9 + time) * (y > HEIGHT / 2)
     picture: NDArray[np.float32] = np.stack([shade, shade * 0.95, shade * 0.85], axis=-1)

@@ -61,7 +61,7 @@ class Workers:
                 continue
             try:
                 job()
-            except BaseException as error:  # noqa: BLE001 - handed to the calling thread
+            except BaseException as error:
                 self._error = self._error or error
                 self._stopped.set()
 

@@ -150,7 +150,9 @@ def _content(reader: BagReader, channel: Channel) -> str:
 
 def intrinsics_text(width: int, height: int, model: str, k: Any) -> str:
     """One line for a calibration."""
-    return f"{width}x{height} {model or '-'} fx={k[0]:.1f} fy={k[4]:.1f} cx={k[2]:.1f} cy={k[5]:.1f}"
+    return (
+        f"{width}x{height} {model or '-'} fx={k[0]:.1f} fy={k[4]:.1f} cx={k[2]:.1f} cy={k[5]:.1f}"
+    )
 
 
 def _dataset_info(dataset: Dataset) -> Info:

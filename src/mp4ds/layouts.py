@@ -163,7 +163,12 @@ def layout_for(encoding: Encoding, *, lossless: bool) -> Layout:
 
 
 def pixel_view(
-    data: memoryview | bytearray, encoding: Encoding, *, width: int, height: int, step: int,
+    data: memoryview | bytearray,
+    encoding: Encoding,
+    *,
+    width: int,
+    height: int,
+    step: int,
     is_bigendian: bool,
 ) -> Pixels:
     """The pixels of an image message, without a copy.
@@ -180,15 +185,14 @@ def pixel_view(
         Array of shape (height, width) or (height, width, channels), uint8 or uint16 in the
         message's byte order; writable where the data is.
     """
-    dtype = np.dtype(np.uint8)
-    if encoding.bytes_per_sample == 2:
-        dtype = np.dtype(">u2" if is_bigendian else "<u2")
+    code = "u1" if encoding.bytes_per_sample == 1 else ">u2" if is_bigendian else "<u2"
     shape: tuple[int, ...] = (height, width)
     strides: tuple[int, ...] = (step, encoding.pixel_bytes)
     if encoding.channels > 1:
         shape += (encoding.channels,)
         strides += (encoding.bytes_per_sample,)
-    return np.ndarray(shape, dtype, buffer=data, strides=strides)
+    pixels: Pixels = np.ndarray(shape, code, buffer=data, strides=strides)
+    return pixels
 
 
 def padding_is_zero(data: memoryview, *, row_bytes: int, step: int, height: int) -> bool:
@@ -199,9 +203,7 @@ def padding_is_zero(data: memoryview, *, row_bytes: int, step: int, height: int)
     return not rows[:, row_bytes:].any()
 
 
-def why_not(
-    encoding_name: str, *, width: int, height: int, step: int, size: int
-) -> str | None:
+def why_not(encoding_name: str, *, width: int, height: int, step: int, size: int) -> str | None:
     """Why no layout carries an image of this geometry, or None if one does."""
     encoding = ENCODINGS.get(encoding_name)
     if encoding is None:

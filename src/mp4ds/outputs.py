@@ -19,9 +19,7 @@ from mp4ds.errors import TargetError, TargetExistsError, WriteError
 
 
 @contextmanager
-def staged(
-    target: Path, *, force: bool, replaceable: Callable[[Path], bool]
-) -> Iterator[Path]:
+def staged(target: Path, *, force: bool, replaceable: Callable[[Path], bool]) -> Iterator[Path]:
     """Make an output under a temporary name and move it into place at the end.
 
     Args:
@@ -39,7 +37,9 @@ def staged(
     """
     check_target(target, force=force, replaceable=replaceable)
     try:
-        folder = Path(tempfile.mkdtemp(prefix=f".{target.name[:60]}.", suffix=".part", dir=target.parent))
+        folder = Path(
+            tempfile.mkdtemp(prefix=f".{target.name[:60]}.", suffix=".part", dir=target.parent)
+        )
     except OSError as error:
         raise TargetError(
             target, f"cannot be written there: {error.strerror}", "Choose another folder."

@@ -182,4 +182,6 @@ class Int64Column:
 
     def to_numpy(self) -> NDArray[np.int64]:
         """A view of the values; do not append while it is in use."""
-        return np.frombuffer(self._values, dtype=np.int64) if self._values else np.empty(0, np.int64)
+        return (
+            np.frombuffer(self._values, dtype=np.int64) if self._values else np.empty(0, np.int64)
+        )

@@ -187,9 +187,7 @@ def _unpack_recording(
         progress(UnpackProgress(counts.total(), counts.total()))
     summary.messages.update(counts)
     summary.omitted.update(writer.omitted)
-    summary.left_out.extend(
-        sorted({c.topic for c in dataset.channels if not selected(c.topic)})
-    )
+    summary.left_out.extend(sorted({c.topic for c in dataset.channels if not selected(c.topic)}))
     return summary
 
 

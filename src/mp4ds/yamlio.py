@@ -161,18 +161,18 @@ def _build(events: Iterable[Any]) -> Any:
             continue
         if not isinstance(event, yaml.NodeEvent):
             continue
-        line = event.start_mark.line + 1
+        line = _line(event)
         if isinstance(event, yaml.AliasEvent) or event.anchor is not None:
             raise ValueError(f"line {line}: anchors and aliases are not allowed")
-        if event.tag is not None:
+        if getattr(event, "tag", None) is not None:
             raise ValueError(f"line {line}: tags are not allowed")
-        value = _scalar(event) if isinstance(event, yaml.ScalarEvent) else None
+        value: Any = _scalar(event) if isinstance(event, yaml.ScalarEvent) else None
         if isinstance(event, yaml.MappingStartEvent):
             value = {}
         elif isinstance(event, yaml.SequenceStartEvent):
             value = []
         _attach(open_nodes[-1], keys, value, line)
-        if isinstance(event, yaml.CollectionStartEvent):
+        if isinstance(value, (dict, list)):
             open_nodes.append(value)
             keys.append(None)
             if len(open_nodes) > MAX_DEPTH:
@@ -180,6 +180,10 @@ def _build(events: Iterable[Any]) -> Any:
     if len(root) != 1:
         raise ValueError("holds no document, or several")
     return root[0]
+
+
+def _line(event: Any) -> int:
+    return int(event.start_mark.line) + 1
 
 
 def _attach(
@@ -213,7 +217,7 @@ def _scalar(event: Any) -> Any:
         return int(text)
     value = float(text)
     if value - value != 0:
-        raise ValueError(f"line {event.start_mark.line + 1}: {text} is no finite number")
+        raise ValueError(f"line {_line(event)}: {text} is no finite number")
     return value
 
 
@@ -229,7 +233,11 @@ def _slice_columns(data: bytes) -> tuple[bytes, list[str]]:
         block = data[match.end() : end]
         if not block.isascii():
             return data, []  # not a column as we write it: let the parser speak
-        pieces += [data[done : match.end()], indent, b"%s%d\n" % (_PLACEHOLDER.encode(), len(columns))]
+        pieces += [
+            data[done : match.end()],
+            indent,
+            b"%s%d\n" % (_PLACEHOLDER.encode(), len(columns)),
+        ]
         columns.append(block[len(indent) :].replace(b"\n" + indent, b"\n").decode("ascii"))
         done = end
     pieces.append(data[done:])

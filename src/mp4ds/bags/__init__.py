@@ -11,4 +11,13 @@ from mp4ds.bags.formats import open_reader, open_sources, open_writer
 from mp4ds.bags.hashing import SourceHasher
 from mp4ds.bags.protocols import BagReader, BagWriter
 
-__all__ = ["BagReader", "BagWriter", "Converter", "SourceHasher", "open_reader", "open_sources", "open_writer", "ros1_channel"]
+__all__ = [
+    "BagReader",
+    "BagWriter",
+    "Converter",
+    "SourceHasher",
+    "open_reader",
+    "open_sources",
+    "open_writer",
+    "ros1_channel",
+]

@@ -22,6 +22,7 @@ from rosbags.typesys.store import Typestore
 
 from mp4ds.bags.typedefs import (
     HEADER,
+    fields_of,
     make_store,
     ros1_world,
     ros2_world,
@@ -68,7 +69,15 @@ _BAD_DEFINITION = (
     AttributeError,
     AssertionError,
 )
-_BAD_PAYLOAD = (SerdeError, struct.error, ValueError, LookupError, TypeError, MemoryError)
+_BAD_PAYLOAD = (
+    SerdeError,
+    AssertionError,
+    struct.error,
+    ValueError,
+    LookupError,
+    TypeError,
+    MemoryError,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,10 +202,10 @@ class Converter:
         convert = store.cdr_to_ros1 if to_ros1 else store.ros1_to_cdr
         try:
             converted = convert(raw, name)
-        except SerdeError:
+        except (SerdeError, AssertionError):
             # ROS itself overlooks bytes after a message, such as RealSense cameras' bags hold.
             end = _end(plan, raw, to_ros1=to_ros1)
-            if not 0 < len(raw) - end <= _MAX_TAIL:
+            if not (0 < len(raw) - end <= _MAX_TAIL and fields_of(plan.types, name)):
                 raise
             converted = convert(raw[:end], name)
             self._omitted["messages with bytes after their end, which were left out"] += 1

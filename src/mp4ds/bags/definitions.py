@@ -34,8 +34,6 @@ def ros1_channel(channel_id: int, topic: str, type_name: str, callerid: str) -> 
 def _store() -> Typestore:
     store = get_typestore(Stores.ROS1_NOETIC)
     store.register(
-        get_types_from_msg(
-            "geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"
-        )
+        get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
     )
     return store

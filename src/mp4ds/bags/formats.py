@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from mp4ds.bags.mcap import McapReader, McapWriter
@@ -75,7 +76,7 @@ def open_sources(paths: Sequence[Path]) -> BagReader:
         seen.add(resolved)
     if len(paths) == 1:
         return open_reader(paths[0])
-    return MultiReader([lambda path=path: open_reader(path) for path in paths])
+    return MultiReader([partial(open_reader, path) for path in paths])
 
 
 def open_writer(

@@ -31,6 +31,7 @@ from mp4ds.bags.mcap_records import (
 )
 from mp4ds.bags.mcap_write import McapWriter
 from mp4ds.bags.ordering import HoldBack
+from mp4ds.bags.protocols import Format
 from mp4ds.records import (
     Attachment,
     Channel,
@@ -58,12 +59,13 @@ class McapReader:
             not seekable, whose ``tell()`` counts bytes of the file.
         message_decompress: Makes the payload of a message from what the file holds; raises
             `DamageError` for what it cannot read.
+        in_file_order: Give messages as they stand in the file, whatever their log times.
 
     Raises:
         SourceError: The file is missing, no MCAP file, or cut short.
     """
 
-    format = "mcap"
+    format: Format = "mcap"
 
     def __init__(
         self,
@@ -71,11 +73,13 @@ class McapReader:
         *,
         open_stream: Callable[[], ByteStream] | None = None,
         message_decompress: Callable[[memoryview], bytes] | None = None,
+        in_file_order: bool = False,
     ) -> None:
         self.path = path
         self.files: Sequence[Path] = [path]
         self._open_stream = open_stream
         self._decompress = message_decompress
+        self._in_file_order = in_file_order
         self._schemas: dict[int, mcap_records.Schema] = {}
         self._channel_records: dict[int, mcap_records.Channel] = {}
         self._channels: dict[int, Channel] = {}
@@ -161,7 +165,8 @@ class McapReader:
             stream.close()
 
     def _read(self, stream: RecordStream) -> Iterator[Record]:
-        held = HoldBack() if self._summary and self._summary.is_indexed else None
+        in_time_order = self._summary and self._summary.is_indexed and not self._in_file_order
+        held = HoldBack() if in_time_order else None
         self._skipped.clear()
         number = 0
         while True:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -36,6 +37,7 @@ class MultiReader:
         self._openers = openers
         self._channels: dict[tuple[object, ...], Channel] = {}
         self._schemas: list[Schema] = []
+        self._skipped: Counter[str] = Counter()
         self._done = 0
         self._active: list[BagReader] = []
         self._stats: dict[int, ChannelStats] = {}
@@ -59,7 +61,7 @@ class MultiReader:
                 spans.append((start, end, number))
         self._groups = _overlapping(sorted(spans))
         order = [number for group in self._groups for number in group]
-        self.files = [file for number in order for file in files[number]]
+        self.files: Sequence[Path] = [file for number in order for file in files[number]]
 
     def _shared(self, channel: Channel) -> Channel:
         key = channel.identity
@@ -86,6 +88,11 @@ class MultiReader:
     def unused_schemas(self) -> Sequence[Schema]:
         """See `BagReader.unused_schemas`."""
         return self._schemas
+
+    @property
+    def skipped(self) -> Mapping[str, int]:
+        """See `BagReader.skipped`."""
+        return self._skipped
 
     @property
     def position(self) -> int:
@@ -119,6 +126,7 @@ class MultiReader:
                 yield record
         for channel in part.channels:
             self._shared(channel)
+        self._skipped.update(part.skipped)
         for schema in part.unused_schemas:
             if schema not in self._schemas:
                 self._schemas.append(schema)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,28 +20,33 @@ from mp4ds.records import (
     Schema,
 )
 
+Format = Literal["bag", "rosbag2", "mcap"]
+
 
 class BagReader(Protocol):
     """One recording, opened for reading. A context manager; the file is never changed.
 
     Attributes:
         path: What was opened, a file or a folder.
-        format: ``bag``, ``rosbag2`` or ``mcap``.
         profile: ``ros1``, ``ros2`` or any other MCAP profile; empty for none.
         library: The MCAP header's library string; empty for other formats.
         files: All files that the recording consists of, in reading order.
-        channels: All channels known so far; complete once `records` is exhausted.
-        position: Bytes of `files` consumed so far, for progress and hashing.
     """
 
     path: Path
-    format: str
     profile: str
     library: str
     files: Sequence[Path]
 
     @property
-    def channels(self) -> Sequence[Channel]: ...
+    def format(self) -> Format:
+        """``bag``, ``rosbag2`` or ``mcap``."""
+        ...
+
+    @property
+    def channels(self) -> Sequence[Channel]:
+        """All channels known so far; complete once `records` is exhausted."""
+        ...
 
     @property
     def unused_schemas(self) -> Sequence[Schema]:
@@ -49,7 +54,14 @@ class BagReader(Protocol):
         ...
 
     @property
-    def position(self) -> int: ...
+    def skipped(self) -> Mapping[str, int]:
+        """What the source holds and no dataset can: a phrase -> how many; to be told."""
+        ...
+
+    @property
+    def position(self) -> int:
+        """Bytes of `files` consumed so far, for progress and hashing."""
+        ...
 
     def records(self) -> Iterator[Record]:
         """Read everything once.

@@ -11,7 +11,7 @@ from collections import OrderedDict, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
@@ -33,6 +33,7 @@ from rosbags.rosbag1.reader import (
     read_uint32,
 )
 
+from mp4ds.bags.protocols import Format
 from mp4ds.bags.ros1_records import (
     COPY_AGAIN,
     DAMAGE,
@@ -79,10 +80,11 @@ class Ros1Reader:
         SourceError: The file is missing, no bag, not indexed, encrypted, or damaged.
     """
 
-    format = "bag"
+    format: Format = "bag"
     profile = "ros1"
     library = ""
     unused_schemas: Sequence[Schema] = ()
+    skipped: Mapping[str, int] = MappingProxyType({})
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mp4ds.bags.mcap import McapReader
 from mp4ds.bags.mcap_records import MAGIC, open_source, unzstd
 from mp4ds.bags.ordering import HoldBack
+from mp4ds.bags.protocols import Format
 from mp4ds.bags.rosbag2_metadata import (
     METADATA_FILE,
     RECORD,
@@ -54,7 +55,7 @@ class Rosbag2Reader:
         SourceError: The recording is incomplete, damaged, or of an unknown kind.
     """
 
-    format = "rosbag2"
+    format: Format = "rosbag2"
     profile = "ros2"
 
     def __init__(self, path: Path, *, workdir: Path | None = None) -> None:

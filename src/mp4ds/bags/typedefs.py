@@ -70,7 +70,7 @@ def types_of(schema: Schema, world: World) -> Typesdict:
     name = normalize_msgtype(schema.name)
     found = _parse(schema, name)
     if not fields_of(found, name) and name in world.standard:
-        found.pop(name, None)  # an empty definition that is not that of an empty message
+        found.pop(name, None)  # the definition is empty, but perhaps not the type
     # Time, duration and header are the world's own, whatever their definition is called.
     for builtin in (*BUILTIN, HEADER):
         found.pop(builtin, None)
@@ -79,7 +79,7 @@ def types_of(schema: Schema, world: World) -> Typesdict:
 
 def _parse(schema: Schema, name: str) -> Typesdict:
     text = schema.data.decode(errors="replace").replace("\r\n", "\n")
-    if not schema.encoding or not text.strip():
+    if not schema.encoding:
         return {}
     if schema.encoding in ("ros2idl", "omgidl") or re.match(r"=+\nIDL: ", text):
         text = re.sub(r"(?m)^[ \t]*#.*$", "", text)  # what it includes stands beside it

@@ -10,6 +10,14 @@ from mp4ds.sidecar.io import (
     load_stream,
     schema_text,
 )
+from mp4ds.sidecar.manifest import (
+    FileEntry,
+    Manifest,
+    Source,
+    StreamEntry,
+    TimeRange,
+    Verbatim,
+)
 from mp4ds.sidecar.models import (
     FORMAT_VERSION,
     MESSAGES_NAME,
@@ -20,17 +28,11 @@ from mp4ds.sidecar.models import (
     Column,
     Columns,
     Digests,
-    FileEntry,
     Header,
     Image,
-    Manifest,
     Roi,
     SchemaModel,
-    Source,
-    StreamEntry,
     StreamSidecar,
-    TimeRange,
-    Verbatim,
     Video,
 )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from functools import lru_cache
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,10 +13,10 @@ from pydantic import BaseModel, ValidationError
 
 from mp4ds import yamlio
 from mp4ds.errors import FormatError, VersionError
+from mp4ds.sidecar.manifest import Manifest
 from mp4ds.sidecar.migrate import migrate, version_of
 from mp4ds.sidecar.models import (
     FORMAT_VERSION,
-    Manifest,
     StreamSidecar,
     document_of,
     parse_version,
@@ -67,7 +67,9 @@ def load_document(path: Path) -> dict[str, Any]:
     if found[0] > supported[0]:
         raise VersionError(path, version, FORMAT_VERSION)
     if found < supported:
-        raise FormatError("version-unsupported", path, f"is of version {version!r}, which never was")
+        raise FormatError(
+            "version-unsupported", path, f"is of version {version!r}, which never was"
+        )
     if document.get("kind") not in _MODELS:
         raise FormatError("kind-unknown", path, "is neither a stream nor a dataset")
     return document if found == supported else _without_news(document, path)
@@ -146,7 +148,7 @@ def model_for(document: dict[str, Any]) -> type[StreamSidecar] | type[Manifest]:
     return _MODELS[document["kind"]]
 
 
-@lru_cache(maxsize=None)
+@cache
 def schema_text(kind: str) -> str:
     """The released JSON Schema of ``stream`` or ``dataset``, as shipped with the package."""
     name = f"v{FORMAT_VERSION}/{kind}.schema.json"

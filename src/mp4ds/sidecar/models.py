@@ -1,5 +1,7 @@
 """The one source of truth for the format: schemas/ and the tables of spec/ are made from it.
 
+The manifest's part is in manifest.py.
+
 Every model is strict, frozen and closed: an unknown key is an error, a string is no number.
 """
 
@@ -39,11 +41,13 @@ Version = Annotated[str, Field(pattern=r"^(0|[1-9][0-9]*)\.(0|[1-9][0-9]*)$")]
 Profile = Annotated[str, Field(pattern=r"^(lossless|visual|crf=[0-9]{1,2})$")]
 
 
-class _Model(BaseModel):
+class Model(BaseModel):
+    """Base of all models: nothing is converted, added or changed."""
+
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
-class SchemaModel(_Model):
+class SchemaModel(Model):
     """A message definition, verbatim."""
 
     name: str = Field(description="Type name as the source spells it.")
@@ -73,7 +77,7 @@ class SchemaModel(_Model):
         return Schema(self.name, self.encoding, data)
 
 
-class ChannelModel(_Model):
+class ChannelModel(Model):
     """The channel that the messages were recorded on."""
 
     topic: str = Field(description="Topic name as the source spells it.")
@@ -100,7 +104,7 @@ class ChannelModel(_Model):
         return Channel(channel_id, self.topic, self.message_encoding, schema, self.metadata)
 
 
-class Image(_Model):
+class Image(Model):
     """What all images of the stream have in common."""
 
     encoding: str = Field(description="ROS image encoding.")
@@ -125,7 +129,7 @@ class Image(_Model):
         return self
 
 
-class Header(_Model):
+class Header(Model):
     """The part of a message around its pixels that does not change from frame to frame."""
 
     frame_id: str = Field(description="Coordinate frame.")
@@ -139,7 +143,7 @@ class Header(_Model):
     )
 
 
-class Color(_Model):
+class Color(Model):
     """How the video's samples are to be understood; the names are ffmpeg's."""
 
     primaries: str = Field(description="Colour primaries.")
@@ -148,7 +152,7 @@ class Color(_Model):
     range: Literal["full", "limited"] = Field(description="Range of the samples.")
 
 
-class Video(_Model):
+class Video(Model):
     """The video file and how it was made."""
 
     file: FileName
@@ -180,7 +184,7 @@ class Video(_Model):
         return self
 
 
-class Column(_Model):
+class Column(Model):
     """A column of 64-bit integers: ``value[i] = value[i-1] + step + residual[i-1]``."""
 
     start: Int64 = Field(description="The first value.")
@@ -198,7 +202,7 @@ class Column(_Model):
         return decode_column(self.start, self.step, self.values, count)
 
 
-class Columns(_Model):
+class Columns(Model):
     """One value per message, in the order of the video's frames."""
 
     log_time: Column = Field(description="When each message was recorded, ns.")
@@ -218,7 +222,7 @@ class Columns(_Model):
         return [name for name in type(self).model_fields if getattr(self, name) is not None]
 
 
-class Digests(_Model):
+class Digests(Model):
     """A digest of each original message payload, in frame order."""
 
     algorithm: Literal["xxh64"] = Field(description="XXH64 with seed 0.")
@@ -239,7 +243,7 @@ class Digests(_Model):
         return np.frombuffer(raw, dtype=">u8").astype(np.uint64)
 
 
-class Roi(_Model):
+class Roi(Model):
     """Region of interest of a CameraInfo."""
 
     x_offset: Uint32
@@ -253,7 +257,7 @@ Matrix9 = Annotated[list[float], Field(min_length=9, max_length=9)]
 Matrix12 = Annotated[list[float], Field(min_length=12, max_length=12)]
 
 
-class Calibration(_Model):
+class Calibration(Model):
     """The intrinsics of a camera: a CameraInfo without its stamp."""
 
     frame_id: str = Field(description="Coordinate frame.")
@@ -274,7 +278,7 @@ class Calibration(_Model):
     )
 
 
-class CameraInfo(_Model):
+class CameraInfo(Model):
     """The CameraInfo messages that belong to the stream."""
 
     channel: ChannelModel
@@ -284,7 +288,7 @@ class CameraInfo(_Model):
     columns: Columns | None = Field(None, description="Absent when there are no messages.")
 
 
-class StreamSidecar(_Model):
+class StreamSidecar(Model):
     """One stream: a video and everything that turns its frames back into messages."""
 
     mp4ds: Version = Field(description="Version of the format.")
@@ -313,74 +317,10 @@ class StreamSidecar(_Model):
         encoding = ENCODINGS[self.image.encoding]
         if self.video.layout not in (encoding.exact, encoding.lossy):
             raise ValueError(f"layout {self.video.layout} does not carry {encoding.name} images")
-        width, height = LAYOUTS[self.video.layout].picture_size(
-            self.image.width, self.image.height
-        )
+        width, height = LAYOUTS[self.video.layout].picture_size(self.image.width, self.image.height)
         if self.video.width < width or self.video.height < height:
             raise ValueError(f"the video is smaller than its pictures of {width}x{height}")
         return self
-
-
-class Source(_Model):
-    """A recording file that was packed."""
-
-    name: str = Field(description="File name, for a rosbag2 folder with the folder's name.")
-    size: Size = Field(description="Bytes.")
-    sha256: Sha256
-
-
-class StreamEntry(_Model):
-    """A stream of the dataset."""
-
-    topic: str
-    sidecar: FileName
-    video: FileName
-    frames: Count
-
-
-class FileEntry(_Model):
-    """A file of the dataset."""
-
-    name: FileName
-    size: Size = Field(description="Bytes.")
-    sha256: Sha256
-
-
-class Verbatim(_Model):
-    """Camera messages that are in messages.mcap as they were, and why."""
-
-    topic: str
-    messages: Size
-    first: Size = Field(description="Number of the first of them among the topic's messages.")
-    reason: str
-
-
-class TimeRange(_Model):
-    """Log times of the first and the last message, ns, both included."""
-
-    start: Time
-    end: Time
-
-
-class Manifest(_Model):
-    """A dataset: its sources, its files, and what is in them."""
-
-    mp4ds: Version = Field(description="Version of the format.")
-    kind: Literal["dataset"]
-    profile: Profile = Field(description="What was asked for.")
-    format: Literal["bag", "rosbag2", "mcap"] = Field(description="Format of the recording.")
-    recording_profile: str = Field(description="MCAP profile of the recording: ros1, ros2 ...")
-    library: str = Field("", description="The recording's own library string.")
-    sources: list[Source]
-    messages: Size = Field(description="Messages of the recording that were packed.")
-    topics_left_out: list[str] = Field(
-        default_factory=list, description="Topics that were left out on request."
-    )
-    time_range: TimeRange | None = Field(None, description="Absent without messages.")
-    streams: list[StreamEntry]
-    verbatim: list[Verbatim] = Field(default_factory=list)
-    files: list[FileEntry]
-    tools: dict[str, str] = Field(default_factory=dict, description="Versions that packed it.")
 
 
 def decode_base64(text: str) -> bytes:

@@ -82,9 +82,7 @@ def check_stamps(columns: DecodedColumns, wire: str, place: str) -> None:
         )
     seq = columns.seq
     if seq is not None and (seq.min() < 0 or seq.max() >= 2**32):
-        raise FormatError(
-            "column-invalid", f"{place} at columns.seq", "has values beyond 32 bits"
-        )
+        raise FormatError("column-invalid", f"{place} at columns.seq", "has values beyond 32 bits")
 
 
 def _template(text: str, place: str) -> bytes:
@@ -111,9 +109,7 @@ class ImageRebuilder:
         self._wire = WIRES[sidecar.wire]
         self._encoding = ENCODINGS[sidecar.image.encoding]
         self._layout = LAYOUTS[sidecar.video.layout]
-        self.columns = decode_columns(
-            sidecar.columns, sidecar.frames, len(sidecar.headers), place
-        )
+        self.columns = decode_columns(sidecar.columns, sidecar.frames, len(sidecar.headers), place)
         self._digests = self._decode_digests()
         self._heads = [self._head(number) for number in range(len(sidecar.headers))]
         self._tails = [bytes.fromhex(header.tail) for header in sidecar.headers]

@@ -7,4 +7,12 @@ from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.encoder import VideoEncoder, tool_versions
 from mp4ds.video.images import ImageFile
 
-__all__ = ["ImageFile", "Recipe", "VideoDecoder", "VideoEncoder", "check_codec", "recipe_for", "tool_versions"]
+__all__ = [
+    "ImageFile",
+    "Recipe",
+    "VideoDecoder",
+    "VideoEncoder",
+    "check_codec",
+    "recipe_for",
+    "tool_versions",
+]

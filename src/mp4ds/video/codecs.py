@@ -59,7 +59,9 @@ _LOSSLESS: dict[tuple[str, str], _Coding] = {
 _LOSSY: dict[str, _Coding] = {
     "av1": _Coding("libsvtav1", "yuv420p", {}, "6"),
     "h264": _Coding("libx264", "yuv420p", _X264, "medium"),
-    "h265": _Coding("libx265", "yuv420p", {"x265-params": "bframes=0:open-gop=0:log-level=error"}, "medium"),
+    "h265": _Coding(
+        "libx265", "yuv420p", {"x265-params": "bframes=0:open-gop=0:log-level=error"}, "medium"
+    ),
 }
 _DEFAULT_LOSSLESS = {"gray": "h264", "rgb24": "h264", "bgr24": "h264", "gray16le": "ffv1"}
 _DEFAULT_LOSSY = "av1"

@@ -6,11 +6,12 @@ every player in its own way.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import av
 import numpy as np
 from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoReformatter
+from numpy.typing import NDArray
 
 from mp4ds.errors import VideoError
 from mp4ds.layouts import Pixels
@@ -70,7 +71,7 @@ def picture_to_frame(
     if pixel_format in _YUV and picture_format == "gray":
         return _gray_to_yuv(picture, pixel_format)
     if pixel_format in _YUV:
-        picture = _pad_to_even(picture, 2)
+        picture = _pad_to_even(picture)
     frame = av.VideoFrame.from_numpy_buffer(picture, format=picture_format)
     if picture_format.startswith("bayer_"):
         frame = converter.convert(frame, "rgb24")
@@ -79,21 +80,23 @@ def picture_to_frame(
     return frame
 
 
-def _pad_to_even(picture: Pixels, multiple: int) -> Pixels:
-    """Repeat the last rows and columns, of a mosaic's whole block, for chroma planes of half size."""
+def _pad_to_even(picture: Pixels) -> Pixels:
+    """Repeat the last row and column where they are odd, for chroma planes of half size."""
     height, width = picture.shape[:2]
-    pad = [(0, -height % multiple), (0, -width % multiple)] + [(0, 0)] * (picture.ndim - 2)
-    return np.pad(picture, pad, mode="edge") if pad[0][1] or pad[1][1] else picture
+    pad = [(0, height % 2), (0, width % 2)] + [(0, 0)] * (picture.ndim - 2)
+    if not pad[0][1] and not pad[1][1]:
+        return picture
+    padded: Any = np.pad(picture, pad, mode="edge")  # whose type forgets the dtype
+    return cast("Pixels", padded)
 
 
 def _gray_to_yuv(picture: Pixels, pixel_format: str) -> av.VideoFrame:
-    picture = _pad_to_even(picture, 2)
+    picture = _pad_to_even(picture)
     height, width = picture.shape
     frame = av.VideoFrame(width, height, pixel_format)
-    luma = frame.planes[0]
-    np.frombuffer(luma, np.uint8).reshape(-1, luma.line_size)[:height, :width] = picture
-    for plane in frame.planes[1:]:
-        np.frombuffer(plane, np.uint8)[...] = 128
+    _rows(frame, 0)[:height, :width] = picture
+    for index in (1, 2):
+        _rows(frame, index)[...] = 128
     return frame
 
 
@@ -119,13 +122,19 @@ def frame_to_picture(
             f"has frames of {frame.width}x{frame.height} where {width}x{height} are due",
         )
     if picture_format in ("gray", "gray16le"):
-        return _plane(frame, 0, picture_format)[:height, :width]
+        return _plane(frame, picture_format)[:height, :width]
     if picture_format.startswith("bayer_"):
         return _sample_mosaic(_packed(frame, "rgb24", converter), picture_format, width, height)
     return _packed(frame, picture_format, converter)[:height, :width]
 
 
-def _plane(frame: av.VideoFrame, index: int, picture_format: str) -> Pixels:
+def _rows(frame: av.VideoFrame, index: int) -> NDArray[np.uint8]:
+    """A plane as a view of shape (rows, bytes of a row), padding included."""
+    plane: Any = frame.planes[index]  # a buffer, which its type does not tell
+    return np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+
+
+def _plane(frame: av.VideoFrame, picture_format: str) -> Pixels:
     expected = ("gray16le",) if picture_format == "gray16le" else ("gray", *_YUV)
     if frame.format.name not in expected:
         raise VideoError(
@@ -133,15 +142,12 @@ def _plane(frame: av.VideoFrame, index: int, picture_format: str) -> Pixels:
             "video",
             f"decodes to {frame.format.name} where {' or '.join(expected)} is due",
         )
-    plane = frame.planes[index]
-    dtype: Any = np.dtype("<u2") if picture_format == "gray16le" else np.uint8
-    rows: Pixels = np.frombuffer(plane, dtype).reshape(-1, plane.line_size // np.dtype(dtype).itemsize)
-    return rows
+    rows = _rows(frame, 0)
+    return rows.view("<u2") if picture_format == "gray16le" else rows
 
 
 def _packed(frame: av.VideoFrame, pixel_format: str, converter: Converter) -> Pixels:
-    plane = converter.convert(frame, pixel_format).planes[0]
-    rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+    rows = _rows(converter.convert(frame, pixel_format), 0)
     return rows[: frame.height, : 3 * frame.width].reshape(frame.height, frame.width, 3)
 
 

@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 from av.error import FFmpegError
@@ -30,7 +31,7 @@ def check_preset(recipe: Recipe) -> None:
     Raises:
         OptionError: Names preset and encoder.
     """
-    context = av.CodecContext.create(recipe.encoder, "w")
+    context: Any = av.CodecContext.create(recipe.encoder, "w")
     context.width = context.height = 256
     context.pix_fmt = recipe.pixel_format
     context.time_base = _TIME_BASE
@@ -104,7 +105,7 @@ class VideoEncoder:
     def _open_stream(self, threads: int, rate: float | None) -> None:
         # the rate gives the last frame its duration: one of no ticks would be cut off
         hint = min(max(rate or _USUAL_RATE, _LOWEST_RATE), _HIGHEST_RATE)
-        stream = self._container.add_stream(
+        stream: Any = self._container.add_stream(
             self.recipe.encoder,
             rate=Fraction(hint).limit_denominator(1000),
             options=dict(self.options),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from typing import Any
 
 import av
 import numpy as np
@@ -47,13 +48,14 @@ class ImageFile:
 
     def encode(self, pixels: Pixels) -> bytes:
         """The file's bytes for an image of shape (H, W) or (H, W, C)."""
-        frame = av.VideoFrame.from_numpy_buffer(np.ascontiguousarray(pixels), format=self._source)
+        contiguous: Any = np.ascontiguousarray(pixels)
+        frame = av.VideoFrame.from_numpy_buffer(contiguous, format=self._source)
         if self._source.startswith("bayer_"):
             frame = self._converter.convert(frame, "rgb24")
         if frame.format.name != self._pixel_format:
             frame = self._converter.convert(frame, self._pixel_format)
         frame.pts = 0
-        context = av.CodecContext.create("mjpeg" if self._jpeg else "png", "w")
+        context: Any = av.CodecContext.create("mjpeg" if self._jpeg else "png", "w")
         context.width, context.height = frame.width, frame.height
         context.pix_fmt = self._pixel_format
         context.time_base = Fraction(1, 25)

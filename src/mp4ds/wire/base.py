@@ -80,7 +80,10 @@ class CameraInfoFields:
 class Wire(Protocol):
     """One serialization of camera messages."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """The name that sidecars use."""
+        ...
 
     def split_image(self, data: memoryview) -> ImageParts:
         """Take an image message apart.

@@ -46,9 +46,7 @@ class Reader:
         """Read bytes as a view."""
         end = self.offset + size
         if end > len(self._data):
-            raise WireError(
-                f"it ends at byte {len(self._data)} where a field needs {end}"
-            )
+            raise WireError(f"it ends at byte {len(self._data)} where a field needs {end}")
         view = self._data[self.offset : end]
         self.offset = end
         return view

@@ -72,7 +72,9 @@ class RosWire:
         if not self.ros2:
             struct.pack_into("<I", head, offset, seq or 0)
             offset += 4
-        struct.pack_into(f"{self.order}{'i' if self.ros2 else 'I'}I", head, offset, *divmod(stamp, NS))
+        struct.pack_into(
+            f"{self.order}{'i' if self.ros2 else 'I'}I", head, offset, *divmod(stamp, NS)
+        )
         return bytes(head)
 
     def split_camera_info(self, data: memoryview) -> tuple[int, int | None, str, CameraInfoFields]:

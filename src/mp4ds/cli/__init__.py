@@ -1,0 +1,239 @@
+"""The command line: the only place that prints or exits.
+
+Exit codes: 0 the whole job was done; 1 it failed or problems were found; 2 the input or the
+options are wrong; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, NoReturn, Optional
+
+import typer
+
+from mp4ds._version import __version__
+from mp4ds.cli.output import (
+    pack_progress,
+    print_info,
+    print_json,
+    print_pack,
+    print_unpack,
+    print_validation,
+    status_line,
+    unpack_progress,
+)
+from mp4ds.errors import Mp4dsError
+
+app = typer.Typer(
+    name="mp4ds",
+    help="Robot camera recordings as ordinary mp4 files, and back again exactly.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+JsonFlag = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+TopicsOption = Annotated[
+    Optional[list[str]],  # noqa: UP045 - read at run time by typer
+    typer.Option("--topics", "-t", metavar="GLOB", help="Only topics that match; may be repeated."),
+]
+ExcludeOption = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--exclude", "-x", metavar="GLOB", help="Leave out topics that match."),
+]
+ForceFlag = Annotated[bool, typer.Option("--force", "-f", help="Replace an existing output.")]
+
+
+@app.callback(invoke_without_command=True)
+def _top(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    if version:
+        print(f"mp4ds {__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def pack(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SOURCE...", help="A .bag, a rosbag2 folder or an .mcap; or several parts."
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DATASET", help="The folder to make.")
+    ],
+    topics: TopicsOption = None,
+    exclude: ExcludeOption = None,
+    quality: Annotated[
+        str, typer.Option("--quality", "-q", help="lossless, visual, or crf=N.")
+    ] = "lossless",
+    codec: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--codec", help="h264, h265, av1 or ffv1; the best by default."),
+    ] = None,
+    preset: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--preset", help="The encoder's preset, such as 6 or veryfast."),
+    ] = None,
+    gop: Annotated[
+        int, typer.Option("--gop", min=1, max=100_000, help="Most frames between key frames.")
+    ] = 60,
+    jobs: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option("--jobs", "-j", min=1, max=256, help="Cores to use; all by default."),
+    ] = None,
+    force: ForceFlag = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Pack a recording into a dataset of mp4 files.
+
+    Lossless by default: `mp4ds unpack` gives every message back as it was.
+    """
+    from mp4ds.packing import PackOptions
+    from mp4ds.packing import pack as run
+
+    options = PackOptions(
+        topics=topics or (),
+        exclude=exclude or (),
+        quality=quality,
+        codec=codec,
+        preset=preset,
+        gop=gop,
+        jobs=jobs,
+        force=force,
+    )
+    with _errors(as_json), pack_progress(as_json) as progress:
+        summary = run(sources, output, options, progress=progress)
+    if as_json:
+        print_json(summary)
+    else:
+        print_pack(summary)
+
+
+@app.command()
+def unpack(
+    dataset: Annotated[Path, typer.Argument(help="A dataset, or a sidecar beside its video.")],
+    to: Annotated[str, typer.Option("--to", help="bag, rosbag2, mcap or images.")],
+    output: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--output", "-o", metavar="OUT", help="What to make."),
+    ] = None,
+    storage: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--storage", help="sqlite3 or mcap, for rosbag2; as recorded by default."),
+    ] = None,
+    image_format: Annotated[
+        str, typer.Option("--image-format", help="png (exact) or jpeg, for images.")
+    ] = "png",
+    topics: TopicsOption = None,
+    exclude: ExcludeOption = None,
+    force: ForceFlag = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Write a dataset's recording again: as a bag, rosbag2, MCAP, or images.
+
+    Messages are converted between ROS 1 and ROS 2 where the target asks for it.
+    """
+    from mp4ds.unpacking import UnpackOptions
+    from mp4ds.unpacking import unpack as run
+
+    options = UnpackOptions(
+        storage=storage,
+        topics=topics or (),
+        exclude=exclude or (),
+        image_format=image_format,
+        force=force,
+    )
+    with _errors(as_json), unpack_progress(as_json) as progress:
+        summary = run(dataset, to, output, options, progress=progress)
+    if as_json:
+        print_json(summary)
+        return
+    print_unpack(summary, "images" if to == "images" else "messages")
+
+
+@app.command()
+def validate(
+    path: Annotated[Path, typer.Argument(help="A sidecar, a dataset, or a folder of datasets.")],
+    deep: Annotated[
+        bool, typer.Option("--deep", help="Also decode every frame and compare every message.")
+    ] = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """List every problem of a dataset; exit code 1 if there is one."""
+    from mp4ds.checks import validate as run
+
+    with _errors(as_json), status_line(as_json) as report:
+        problems = run(path, deep=deep, progress=report)
+    if as_json:
+        print_json({"path": path, "deep": deep, "problems": problems})
+    else:
+        print_validation(path, problems, deep=deep)
+    raise typer.Exit(1 if problems else 0)
+
+
+@app.command()
+def info(
+    path: Annotated[Path, typer.Argument(help="A bag, rosbag2 folder, MCAP, dataset or sidecar.")],
+    as_json: JsonFlag = False,
+) -> None:
+    """Show what is in a recording or a dataset."""
+    from mp4ds.info import info as run
+
+    with _errors(as_json):
+        result = run(path)
+    if as_json:
+        print_json(result)
+    else:
+        print_info(result)
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Argument(help="The .bag file to make.")] = Path("demo.bag"),
+    seconds: Annotated[float, typer.Option("--seconds", min=0.1, max=3600.0)] = 3.0,
+    force: ForceFlag = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Make a small recording: two cameras (Bayer and rgb), calibrations, imu and tf."""
+    from mp4ds.demo import demo as run
+
+    with _errors(as_json):
+        messages = run(output, seconds=seconds, force=force)
+    if as_json:
+        print_json({"output": output, "messages": messages})
+    else:
+        print(f"{output}: {messages} messages")
+
+
+def main() -> NoReturn:
+    """Run the command line and exit."""
+    app()
+    sys.exit(0)
+
+
+@contextmanager
+def _errors(as_json: bool) -> Iterator[None]:
+    """Turn errors raised on purpose into one sentence and an exit code."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        _fail("interrupted; the unfinished output was removed", 130, as_json)
+    except Mp4dsError as error:
+        _fail(str(error), error.exit_code, as_json)
+    except MemoryError:
+        _fail("out of memory; try fewer --jobs", 1, as_json)
+
+
+def _fail(message: str, code: int, as_json: bool) -> NoReturn:
+    if as_json:
+        print_json({"error": message, "exit_code": code})
+    print(f"mp4ds: {message}", file=sys.stderr)
+    raise typer.Exit(code)

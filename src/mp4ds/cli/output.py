@@ -1,0 +1,272 @@
+"""What the command line shows: progress on stderr, results on stdout."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, is_dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from mp4ds.checks import Problem
+    from mp4ds.info import Info, TopicInfo
+    from mp4ds.packing import PackProgress, PackSummary, TopicSummary
+    from mp4ds.unpacking import UnpackProgress, UnpackSummary
+
+
+def _jsonable(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        return asdict(value)
+    return str(value)
+
+
+def print_json(value: Any) -> None:
+    """Print a result for scripts."""
+    print(json.dumps(value, default=_jsonable, indent=2))
+
+
+def _console() -> Console:
+    from rich.console import Console
+
+    return Console(stderr=True)
+
+
+@contextmanager
+def pack_progress(as_json: bool) -> Iterator[Callable[[PackProgress], None] | None]:
+    """A bar on a terminal: bytes read, rate, size so far, time left."""
+    console = _console()
+    if as_json or not console.is_terminal:
+        yield None
+        return
+    from rich.progress import (
+        BarColumn,
+        DownloadColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+        TransferSpeedColumn,
+    )
+
+    with Progress(
+        TextColumn("packing"),
+        BarColumn(),
+        DownloadColumn(binary_units=False),
+        TransferSpeedColumn(),
+        TextColumn("-> {task.fields[written]}, {task.fields[frames]} frames"),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+    ) as bar:
+        task = bar.add_task("pack", total=None, written="0 B", frames=0)
+
+        def report(state: PackProgress) -> None:
+            bar.update(
+                task,
+                completed=state.bytes_read,
+                total=state.bytes_total,
+                written=_size(state.bytes_written),
+                frames=state.frames,
+            )
+
+        yield report
+
+
+@contextmanager
+def unpack_progress(as_json: bool) -> Iterator[Callable[[UnpackProgress], None] | None]:
+    """A bar on a terminal: messages written, time left."""
+    console = _console()
+    if as_json or not console.is_terminal:
+        yield None
+        return
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    with Progress(
+        TextColumn("unpacking"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("messages"),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+    ) as bar:
+        task = bar.add_task("unpack", total=None)
+
+        def report(state: UnpackProgress) -> None:
+            bar.update(task, completed=state.messages, total=state.messages_total or None)
+
+        yield report
+
+
+@contextmanager
+def status_line(as_json: bool) -> Iterator[Callable[[str], None] | None]:
+    """On a terminal, a line that tells what is being done."""
+    console = _console()
+    if as_json or not console.is_terminal:
+        yield None
+        return
+    with console.status("validating") as status:
+        yield status.update
+
+
+def _size(count: float) -> str:
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.2f} TB"
+
+
+def _print_table(columns: list[tuple[str, str]], rows: list[list[str]]) -> None:
+    """Print a table; a column is right-aligned, or folds where the screen is too narrow."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(markup=False, highlight=False)
+    if not console.is_terminal:
+        console = Console(markup=False, highlight=False, width=_PIPE_WIDTH)
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name, kind in columns:
+        if kind == "right":
+            table.add_column(name, justify="right", no_wrap=True)
+        else:
+            table.add_column(name, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
+
+
+def print_pack(summary: PackSummary) -> None:
+    """Print what became of each topic."""
+    _print_table(_PACK_COLUMNS, [_pack_row(topic) for topic in summary.topics])
+    for topic in summary.topics:
+        for reason, (count, first) in topic.verbatim.items():
+            print(
+                f"{topic.topic}: {count} of {topic.messages} messages stored verbatim in "
+                f"messages.mcap: {reason} (first: message {first})"
+            )
+        for note in topic.notes:
+            print(f"{topic.topic}: {note}")
+    for what, count in summary.skipped.items():
+        print(f"not packed, as no dataset can hold it: {count} {what}")
+    if summary.left_out:
+        print(f"left out: {', '.join(summary.left_out)}")
+    if not any(topic.files for topic in summary.topics):
+        print("no topic became a video: all messages are in messages.mcap as they were")
+    ratio = summary.source_bytes / summary.dataset_bytes
+    print(
+        f"{summary.dataset}: {_size(summary.source_bytes)} -> {_size(summary.dataset_bytes)} "
+        f"({ratio:.2f} times smaller), of which messages.mcap {_size(summary.messages_bytes)}"
+    )
+
+
+def _pack_row(topic: TopicSummary) -> list[str]:
+    stored = ", ".join(topic.files)
+    if not stored:
+        modelled = topic.messages and topic.frames == topic.messages
+        stored = "sidecar" if modelled else "messages.mcap"
+    ratio = topic.raw_bytes / topic.packed_bytes if topic.packed_bytes else None
+    return [
+        topic.topic,
+        topic.type_name,
+        str(topic.messages),
+        str(topic.frames) if topic.files else "",
+        _size(topic.raw_bytes),
+        _size(topic.packed_bytes) if topic.packed_bytes else "",
+        _number(ratio, 2),
+        stored,
+    ]
+
+
+def print_unpack(summary: UnpackSummary, noun: str) -> None:
+    """Print what was written, and what the target could not hold."""
+    total = sum(summary.messages.values())
+    print(f"{summary.output}: {total} {noun} of {len(summary.messages)} topics")
+    if summary.converted:
+        print(f"converted between ROS 1 and ROS 2: {', '.join(summary.converted)}")
+    for what, count in summary.omitted.items():
+        print(f"not held by this format: {count} {what}")
+    if summary.left_out:
+        print(f"left out: {', '.join(summary.left_out)}")
+
+
+def print_validation(path: Path, problems: list[Problem], *, deep: bool) -> None:
+    """Print all problems, and how deep was looked for them."""
+    for problem in problems:
+        print(problem)
+    count = len(problems)
+    found = f"{count} problem{'s' * (count > 1)}" if count else "no problem"
+    depth = (
+        "every frame was decoded, every message with a digest compared"
+        if deep
+        else "frames were not decoded (--deep does)"
+    )
+    print(f"{path}: {found}; {depth}")
+
+
+def print_info(result: Info) -> None:
+    """Print what is in a recording or dataset."""
+    print(f"{result.path}: {result.kind}, profile {result.profile or '-'}, {_size(result.bytes)}")
+    if result.start is not None and result.end is not None:
+        start = datetime.fromtimestamp(result.start / 1e9, timezone.utc)
+        print(
+            f"{start:%Y-%m-%d %H:%M:%S} UTC, {(result.end - result.start) / 1e9:.2f} s, "
+            f"{sum(topic.messages for topic in result.topics)} messages"
+        )
+    _print_table(_INFO_COLUMNS, [_info_row(topic) for topic in result.topics])
+    for note in result.notes:
+        print(note)
+
+
+def _info_row(topic: TopicInfo) -> list[str]:
+    return [
+        topic.topic,
+        topic.type_name,
+        str(topic.messages),
+        _number(topic.rate_hz, 2),
+        _number(topic.jitter_ms, 2),
+        str(topic.gaps) if topic.gaps else "",
+        _number(topic.longest_gap_s, 3),
+        _size(topic.bytes) if topic.bytes is not None else "",
+        topic.content,
+        topic.stored,
+    ]
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+_PIPE_WIDTH = 160
+_PACK_COLUMNS = [
+    ("topic", "fold"),
+    ("type", "fold"),
+    ("messages", "right"),
+    ("frames", "right"),
+    ("raw", "right"),
+    ("packed", "right"),
+    ("ratio", "right"),
+    ("stored in", "fold"),
+]
+_INFO_COLUMNS = [
+    ("topic", "fold"),
+    ("type", "fold"),
+    ("messages", "right"),
+    ("Hz", "right"),
+    ("jitter ms", "right"),
+    ("gaps", "right"),
+    ("longest s", "right"),
+    ("size", "right"),
+    ("content", "fold"),
+    ("stored", "fold"),
+]

@@ -1,0 +1,169 @@
+"""Reads what a stranger sent, in a process that may not take much memory or time.
+
+A `Jail` keeps one process in which mp4ds is imported; it forks for every reading, so that each
+has limits of its own and costs milliseconds.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+MEMORY = 2 * 2**30
+"""Bytes of address space that a reading may take."""
+
+SECONDS = 20
+"""Seconds of computing after which a reading is ended."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one reading.
+
+    Attributes:
+        codes: Problem codes, sorted, each once.
+        problems: The problems as text.
+        error: Name of the class of the error, empty if there was none.
+        ours: Whether the error is one that mp4ds raises on purpose.
+        text: The error's sentence; for a foreign error its traceback.
+        frames: Frames that were read.
+        messages: Messages that were read.
+        warned: Warnings that were given.
+        seconds: How long it took.
+        peak: Most bytes of memory that the process had.
+    """
+
+    codes: list[str]
+    problems: list[str]
+    error: str
+    ours: bool
+    text: str
+    frames: int
+    messages: int
+    warned: list[str]
+    seconds: float
+    peak: int
+
+
+class Jail:
+    """A process that reads for us. A context manager."""
+
+    def __enter__(self) -> Jail:
+        self._process = subprocess.Popen(
+            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                pipe.close()
+        self._process.wait(timeout=10)
+
+    def validate(self, path: Path, *, deep: bool = True) -> Outcome:
+        """All problems of a sidecar or dataset."""
+        return self._ask("validate", path, deep)
+
+    def read(self, path: Path) -> Outcome:
+        """Open a sidecar or dataset, read a frame, all frames, and all messages."""
+        return self._ask("read", path, False)
+
+    def _ask(self, task: str, path: Path, deep: bool) -> Outcome:
+        stdin, stdout = self._process.stdin, self._process.stdout
+        if stdin is None or stdout is None:
+            raise RuntimeError("the jail is not open")
+        stdin.write(json.dumps([task, str(path), deep]) + "\n")
+        stdin.flush()
+        return Outcome(**json.loads(stdout.readline()))
+
+
+def _read(path: str, _deep: bool, found: dict[str, Any]) -> None:
+    import mp4ds
+
+    with mp4ds.open(path) as dataset:
+        for stream in dataset.streams:
+            _ = stream[-1]
+            for _ in stream:
+                found["frames"] += 1
+        for _ in dataset.records():
+            found["messages"] += 1
+
+
+def _validate(path: str, deep: bool, found: dict[str, Any]) -> None:
+    import mp4ds
+
+    problems = mp4ds.validate(path, deep=deep)
+    found["codes"] = sorted({problem.code for problem in problems})
+    found["problems"] = [str(problem) for problem in problems]
+
+
+_TASKS: dict[str, Callable[[str, bool, dict[str, Any]], None]] = {
+    "read": _read,
+    "validate": _validate,
+}
+
+
+def _run(task: str, path: str, deep: bool) -> dict[str, Any]:
+    from mp4ds import Mp4dsError
+
+    found: dict[str, Any] = {"codes": [], "problems": [], "error": "", "ours": False, "text": ""}
+    found |= {"frames": 0, "messages": 0}
+    start = time.monotonic()
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        try:
+            _TASKS[task](path, deep, found)
+        except BaseException as error:
+            found["error"], found["ours"] = type(error).__name__, isinstance(error, Mp4dsError)
+            found["text"] = str(error) if found["ours"] else traceback.format_exc()
+    found["seconds"] = time.monotonic() - start
+    found["warned"] = [str(item.message) for item in warned]
+    return found
+
+
+def _in_child(request: list[Any]) -> dict[str, Any]:
+    receiver, sender = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(receiver)
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+        signal.alarm(2 * SECONDS)
+        with os.fdopen(sender, "w") as pipe:
+            json.dump(_run(*request), pipe)
+        os._exit(0)
+    os.close(sender)
+    with os.fdopen(receiver) as pipe:
+        answer = pipe.read()
+    _, status, usage = os.wait4(child, 0)
+    if answer:
+        found: dict[str, Any] = json.loads(answer)
+    else:
+        found = {"codes": [], "problems": [], "error": "Killed", "ours": False, "frames": 0}
+        found |= {"text": f"ended with status {status}", "messages": 0, "warned": []}
+        found["seconds"] = usage.ru_utime + usage.ru_stime
+    found["peak"] = usage.ru_maxrss * 1024
+    return found
+
+
+def _serve() -> None:
+    import mp4ds.checks
+    import mp4ds.dataset  # noqa: F401 - imported once, for all children
+
+    for line in sys.stdin:
+        print(json.dumps(_in_child(json.loads(line))), flush=True)  # noqa: T201
+
+
+if __name__ == "__main__":
+    _serve()
