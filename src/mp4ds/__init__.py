@@ -13,11 +13,13 @@ Modules are imported when first used, so that ``import mp4ds`` is cheap.
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
 from mp4ds._version import __version__
 
+TYPE_CHECKING = False  # without typing, whose import costs more than all of this
 if TYPE_CHECKING:
+    from typing import Any
+
     from mp4ds.checks import Problem, validate
     from mp4ds.dataset import Dataset, Frame, Stream
     from mp4ds.dataset import open_dataset as open

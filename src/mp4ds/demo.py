@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags import open_writer, ros1_channel
+from mp4ds.bags import open_writer
+from mp4ds.bags.definitions import ros1_channel
 from mp4ds.errors import OptionError
 from mp4ds.outputs import staged
 from mp4ds.records import Channel, Message

@@ -21,7 +21,8 @@ MAX_GAP_NS = 1_000 * 10**9
 
 NS_PER_TICK = 10**9 // TIMESCALE
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
-_PER_LINE = 16
+_PER_LINE = 32
+_MINUS, _ZERO = ord("-"), ord("0")
 _TOKENS = re.compile(r"\s*-?[0-9]+(?:\*[0-9]+)?(?:\s+-?[0-9]+(?:\*[0-9]+)?)*\s*")
 _COLUMN_BYTES = b"0123456789-* \n"
 
@@ -35,7 +36,7 @@ def encode_column(values: Sequence[int] | NDArray[np.int64]) -> dict[str, int | 
         values: At least one 64-bit integer.
 
     Returns:
-        ``start``, ``step`` and ``values``: residuals as text, 16 a line, where ``r*n``
+        ``start``, ``step`` and ``values``: residuals as text, 32 a line, where ``r*n``
         stands for n times r.
     """
     column = np.asarray(values, dtype=np.int64)
@@ -94,7 +95,8 @@ def _decode_residuals(text: str, count: int) -> NDArray[np.int64]:
     raw = text.encode("ascii", "replace")
     if raw.translate(None, _COLUMN_BYTES):
         raise ValueError("holds something else than integers")
-    if any(bad in raw for bad in (b"- ", b"-\n", b"--")) or raw.endswith(b"-"):
+    codes = np.frombuffer(raw + b" ", np.uint8)
+    if ((codes[:-1] == _MINUS) & (codes[1:] < _ZERO)).any():
         raise ValueError("holds a sign without digits")
     if b"*" in raw:
         return _decode_runs(text, count)

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import csv
 import os
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
-from mp4ds.bags import BagWriter, Converter, open_writer
+from mp4ds.bags import BagWriter, open_writer
+from mp4ds.bags.convert import Converter
 from mp4ds.dataset import Dataset, Stream
 from mp4ds.errors import OptionError, WriteError
 from mp4ds.outputs import staged
 from mp4ds.plan import FileNames, Selection
-from mp4ds.records import Attachment, Message, MetadataRecord
+from mp4ds.records import Attachment, Channel, Message, MetadataRecord
 from mp4ds.video import ImageFile
 
 TARGETS = ("bag", "rosbag2", "mcap", "images")
 _SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
-_WORLDS: dict[str, Literal["ros1", "ros2"]] = {"bag": "ros1", "rosbag2": "ros2"}
+_WORLDS = {"bag": "ros1", "rosbag2": "ros2"}
 _OURS = "mp4ds:"  # metadata records by which a dataset remembers what a rosbag2 folder said
 
 
@@ -128,7 +127,7 @@ def default_output(dataset: Path, to: str) -> Path:
 def _is_recording(path: Path) -> bool:
     if path.is_dir():
         return (path / "metadata.yaml").is_file() or not any(path.iterdir())
-    return path.is_file()
+    return path.is_file() and path.suffix in (".bag", ".mcap")
 
 
 def _is_image_folder(path: Path) -> bool:
@@ -147,58 +146,69 @@ def _unpack_recording(
     selected.check(channel.topic for channel in dataset.channels)
     # a recording returns to its own format as it was, whatever serialization it holds
     source = dataset.manifest.format if dataset.manifest else ""
-    world = None if source == to else _WORLDS.get(to)
-    converter = Converter(world) if world else None
+    converter = Converter(None if source == to else _WORLDS.get(to))
     summary = UnpackSummary(target)
     total = dataset.manifest.messages if dataset.manifest else 0
-    counts: Counter[str] = Counter()
-    library = dataset.manifest.library if dataset.manifest else ""
-    storage = options.storage or _recorded_storage(dataset)
     with open_writer(
-        path, to, name=target.name, profile=dataset.profile, library=library, storage=storage
+        path,
+        to,
+        name=target.name,
+        profile=dataset.profile,
+        library=dataset.manifest.library if dataset.manifest else "",
+        storage=(options.storage or _recorded_storage(dataset)) if to == "rosbag2" else "",
     ) as writer:
-        channels = {}
-        for channel in dataset.channels:
-            if not selected(channel.topic):
-                continue
-            converted = converter.channel(channel) if converter else channel
-            channels[channel.id] = converted
-            writer.add_channel(converted)
-            counts.setdefault(channel.topic, 0)
-            if converted is not channel and channel.topic not in summary.converted:
-                summary.converted.append(channel.topic)
-        for schema in dataset.unused_schemas:
-            writer.add_schema(schema)
+        channels = _declare(dataset, writer, converter, selected, summary)
+        done = 0
         for record in dataset.records():
-            if isinstance(record, Message):
-                if record.channel.id not in channels:
-                    continue
-                channel = channels[record.channel.id]
-                if converter and channel is not record.channel:
-                    payload = converter.payload(record.channel, record.data)
-                    record = replace(record, channel=channel, data=payload)
-                writer.write(record)
-                counts[record.channel.topic] += 1
-                if progress and counts.total() % 16 == 0:
-                    progress(UnpackProgress(counts.total(), total))
-            else:
+            if not isinstance(record, Message):
                 _write_other(writer, record, to, source)
-    if progress:
-        progress(UnpackProgress(counts.total(), counts.total()))
-    summary.messages.update(counts)
-    summary.omitted.update(writer.omitted)
-    summary.left_out.extend(sorted({c.topic for c in dataset.channels if not selected(c.topic)}))
+            elif record.channel.id in channels:
+                payload = converter.payload(record.channel, record.data)
+                channel = channels[record.channel.id]
+                writer.write(replace(record, channel=channel, data=payload))
+                summary.messages[channel.topic] += 1
+                done += 1
+                if progress and done % 16 == 0:
+                    progress(UnpackProgress(done, total))
+    for part in (writer, converter):
+        summary.omitted.update(part.omitted)
     return summary
+
+
+def _declare(
+    dataset: Dataset,
+    writer: BagWriter,
+    converter: Converter,
+    selected: Selection,
+    summary: UnpackSummary,
+) -> dict[int, Channel]:
+    """Declare the chosen channels; returns them, as the target has them, by the dataset's id."""
+    channels: dict[int, Channel] = {}
+    for channel in dataset.channels:
+        if not selected(channel.topic):
+            if channel.topic not in summary.left_out:
+                summary.left_out.append(channel.topic)
+            continue
+        channels[channel.id] = converter.channel(channel)
+        writer.add_channel(channels[channel.id])
+        summary.messages.setdefault(channel.topic, 0)
+        changed = channels[channel.id].message_encoding != channel.message_encoding
+        if changed and channel.topic not in summary.converted:
+            summary.converted.append(channel.topic)
+    for schema in dataset.unused_schemas:
+        writer.add_schema(schema)
+    return channels
 
 
 def _write_other(
     writer: BagWriter, record: Attachment | MetadataRecord, to: str, source: str
 ) -> None:
-    # what we noted of a rosbag2 folder is of no use to another format
-    ours = source == "rosbag2" and getattr(record, "name", "").startswith(_OURS)
     if isinstance(record, Attachment):
         writer.add_attachment(record)
-    elif not ours or to == "rosbag2":
+        return
+    # what we noted of a rosbag2 folder is of no use to another format
+    ours = source == "rosbag2" and record.name.startswith(_OURS)
+    if not ours or to == "rosbag2":
         writer.add_metadata(record)
 
 

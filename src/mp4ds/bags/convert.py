@@ -131,7 +131,7 @@ class Converter:
             ConversionError: It is not of ROS, or its definition is missing or damaged.
         """
         if self._is_done(channel):
-            return channel
+            return self._completed(channel) if self._target is self._ros1 else channel
         plan = self._plan(channel)
         if self._target is self._ros1:
             return self._remembered(channel, plan) or self._ros1_channel(channel, plan)
@@ -151,6 +151,24 @@ class Converter:
         except _BAD_PAYLOAD:
             problem = f"a message does not parse as {channel.type_name}"
             raise ConversionError(channel.topic, problem, _REMEDY) from None
+
+    def _completed(self, channel: Channel) -> Channel:
+        """A ROS 1 channel with the md5sum without which ROS 1 opens no bag.
+
+        Only where the source tells none (an MCAP file may not); a known standard type then
+        gets its definition too, if it has none.
+        """
+        schema = channel.schema
+        if schema is None or not schema.name or "md5sum" in channel.metadata:
+            return channel
+        try:
+            store = make_store(types_of(schema, self._ros1), self._ros1)
+            definition, digest = store.generate_msgdef(normalize_msgtype(schema.name), 1)
+        except _BAD_DEFINITION:
+            return channel
+        if not schema.data:
+            schema = Schema(schema.name, self._ros1.schema_encoding, definition.encode())
+        return replace(channel, schema=schema, metadata={"md5sum": digest, **channel.metadata})
 
     def _is_done(self, channel: Channel) -> bool:
         return self._target is None or channel.message_encoding == self._target.encoding

@@ -6,17 +6,35 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from mp4ds.bags.mcap import McapReader, McapWriter
 from mp4ds.bags.multi import MultiReader
 from mp4ds.bags.protocols import BagReader, BagWriter
-from mp4ds.bags.ros1 import Ros1Reader, Ros1Writer
-from mp4ds.bags.rosbag2 import Rosbag2Reader, Rosbag2Writer
 from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
 
+# each imports its library when it is needed: a recording is of one format
+
+
+def _read_bag(path: Path) -> BagReader:
+    from mp4ds.bags.ros1 import Ros1Reader
+
+    return Ros1Reader(path)
+
+
+def _read_mcap(path: Path) -> BagReader:
+    from mp4ds.bags.mcap import McapReader
+
+    return McapReader(path)
+
+
+def _read_rosbag2(path: Path) -> BagReader:
+    from mp4ds.bags.rosbag2 import Rosbag2Reader
+
+    return Rosbag2Reader(path)
+
+
 _READERS: dict[str, Callable[[Path], BagReader]] = {
-    "bag": Ros1Reader,
-    "mcap": McapReader,
-    "rosbag2": Rosbag2Reader,
+    "bag": _read_bag,
+    "mcap": _read_mcap,
+    "rosbag2": _read_rosbag2,
 }
 
 _MAGIC = {b"#ROSBAG V": "bag", b"\x89MCAP0\r\n": "mcap", b"SQLite format 3\0": "rosbag2"}
@@ -97,9 +115,15 @@ def open_writer(
         OSError: The disk refused.
     """
     if target == "bag":
+        from mp4ds.bags.ros1_write import Ros1Writer
+
         return Ros1Writer(path)
     if target == "rosbag2":
+        from mp4ds.bags.rosbag2_write import Rosbag2Writer
+
         return Rosbag2Writer(path, storage=storage, name=name)
     if target == "mcap":
+        from mp4ds.bags.mcap_write import McapWriter
+
         return McapWriter(path, profile=profile, library=library)
     raise OptionError(f"--to {target!r} is not known. Use bag, rosbag2, mcap or images.")

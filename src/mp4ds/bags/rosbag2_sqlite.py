@@ -75,6 +75,8 @@ class SqliteReader:
             for side in (Path(f"{self.path}{suffix}") for suffix in ("-wal", "-journal"))
         )
         options = "mode=ro" if pending else "mode=ro&immutable=1"
+        index = Path(f"{self.path}-shm")  # sqlite makes one to read a -wal, and leaves it
+        had_index = index.exists()
         connection = None
         try:
             connection = sqlite3.connect(
@@ -92,6 +94,8 @@ class SqliteReader:
         finally:
             if connection:
                 connection.close()
+            if not had_index:
+                index.unlink(missing_ok=True)
 
     def _columns(self, connection: sqlite3.Connection, table: str) -> list[str]:
         rows = connection.execute(f"PRAGMA table_info({table})")

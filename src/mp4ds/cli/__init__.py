@@ -6,6 +6,7 @@ options are wrong; 130 interrupted.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -215,6 +216,8 @@ def demo(
 
 def main() -> NoReturn:
     """Run the command line and exit."""
+    # numpy is yet to be imported: no matrix is multiplied here, and idle threads cost time
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     app()
     sys.exit(0)
 

@@ -35,7 +35,7 @@ from mp4ds.wire import ImageParts, Wire
 from mp4ds.wire.formats import WIRES
 
 _MAX_TAIL = 64
-_DIGESTS_PER_LINE = 6
+_DIGESTS_PER_LINE = 12
 
 
 @dataclass(frozen=True, slots=True)

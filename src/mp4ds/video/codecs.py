@@ -45,16 +45,18 @@ class _Coding:
 
 
 _FFV1 = MappingProxyType({"level": "3", "slicecrc": "1", "slices": "4"})
+_FFV1_8BIT = MappingProxyType({**_FFV1, "coder": "range_tab", "context": "1"})
 
 # (codec, pixel format of the picture) -> coding
 _LOSSLESS: dict[tuple[str, str], _Coding] = {
     ("h264", "gray"): _Coding("libx264", "gray", {**_X264, "qp": "0"}, "veryfast"),
     ("h264", "rgb24"): _Coding("libx264rgb", "rgb24", {**_X264, "qp": "0"}, "veryfast"),
     ("h264", "bgr24"): _Coding("libx264rgb", "bgr24", {**_X264, "qp": "0"}, "veryfast"),
-    ("ffv1", "gray"): _Coding("ffv1", "gray", _FFV1),
+    ("av1", "gray"): _Coding("libsvtav1", "yuv420p", {"svtav1-params": "lossless=1"}, "12"),
+    ("ffv1", "gray"): _Coding("ffv1", "gray", _FFV1_8BIT),
     ("ffv1", "gray16le"): _Coding("ffv1", "gray16le", _FFV1),
-    ("ffv1", "rgb24"): _Coding("ffv1", "bgr0", _FFV1),
-    ("ffv1", "bgr24"): _Coding("ffv1", "bgr0", _FFV1),
+    ("ffv1", "rgb24"): _Coding("ffv1", "bgr0", _FFV1_8BIT),
+    ("ffv1", "bgr24"): _Coding("ffv1", "bgr0", _FFV1_8BIT),
 }
 _LOSSY: dict[str, _Coding] = {
     "av1": _Coding("libsvtav1", "yuv420p", {}, "6"),

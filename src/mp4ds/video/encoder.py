@@ -123,7 +123,8 @@ class VideoEncoder:
         if self.recipe.pixel_format in ("bgr0", "rgb24", "bgr24"):
             context.colorspace = 0  # RGB has no matrix
         if self.recipe.encoder == "libsvtav1":
-            context.options = {**context.options, "svtav1-params": f"lp={threads}"}
+            params = ":".join(filter(None, (self.options.get("svtav1-params"), f"lp={threads}")))
+            context.options = {**context.options, "svtav1-params": params}
         context.open()
         self._stream = stream
 

@@ -1,0 +1,1000 @@
+"""Files from strangers: refused with a code, in bounded time and memory, and without a trace.
+
+Every reading is done in a `Jail`. The cases change a good sidecar and manifest; most write them
+with a fitting checksum, as whoever means harm would.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import io
+import os
+import random
+import shutil
+import socket
+import warnings
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import pytest
+
+import mp4ds
+from jail import Jail, Outcome
+from mp4ds import Mp4dsError, VersionError, yamlio
+
+Document = dict[str, Any]
+Change = Callable[[Document], None]
+
+STEM = "cam_image_raw"
+WIDTH, HEIGHT, FRAMES = 64, 48, 8
+MAX_SECONDS = 2.0
+MAX_MEMORY = 700 * 2**20
+BAD_DOCUMENT = {"schema-invalid", "model-invalid"}
+COLUMNS = ("log_time", "stamp", "seq")
+NAMES = {
+    "parent": "../x.mp4",
+    "absolute": "/etc/passwd",
+    "subfolder": "a/b.mp4",
+    "windows": "C:\\x",
+    "backslash": "..\\x.mp4",
+    "empty": "",
+    "dot": ".",
+    "dots": "..",
+    "line-feed": "x.mp4\n",
+    "nul": "x.mp4\0",
+    "fullwidth-dots": "\uff0e\uff0e/x.mp4",
+    "one-dot-leader": "\u2024\u2024",
+    "zero-width": "x\u200b.mp4",
+    "right-to-left": "x\u202e4pm.",
+    "option": "-x.mp4",
+    "pattern": "%00d.mp4",
+    "protocol": "http:x.mp4",
+    "long": "x" * 129,
+}
+
+
+@pytest.fixture(scope="module")
+def jail() -> Iterator[Jail]:
+    with Jail() as opened:
+        yield opened
+
+
+@pytest.fixture
+def pair(packed_bag: Path, tmp_path: Path) -> Path:
+    """A video with its sidecar, without the rest of their dataset."""
+    for suffix in (".mp4", ".yaml"):
+        shutil.copy(packed_bag / f"{STEM}{suffix}", tmp_path)
+    return tmp_path / f"{STEM}.yaml"
+
+
+@pytest.fixture
+def dataset(packed_bag: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(packed_bag, tmp_path / "dataset"))
+
+
+def load(path: Path) -> Document:
+    return yamlio.load(path.read_bytes(), str(path))
+
+
+def changed(path: Path, change: Change) -> None:
+    """Change a file, so that its checksum fits again."""
+    document = load(path)
+    change(document)
+    path.write_bytes(yamlio.dump(document))
+
+
+def edited(path: Path, old: bytes, new: bytes) -> None:
+    """Change a file as text, without its checksum."""
+    text = path.read_bytes()
+    text = text[: text.rindex(b"checksum:")]
+    assert old in text
+    path.write_bytes(text.replace(old, new, 1))
+
+
+def agreed(folder: Path) -> None:
+    """Let the manifest say what the files are now."""
+
+    def change(manifest: Document) -> None:
+        for entry in manifest["files"]:
+            data = (folder / entry["name"]).read_bytes()
+            entry["size"], entry["sha256"] = len(data), hashlib.sha256(data).hexdigest()
+
+    changed(folder / "dataset.yaml", change)
+
+
+def put(*place: str | int, value: Any) -> Change:
+    """A change of one value."""
+
+    def change(document: Document) -> None:
+        node: Any = document
+        for key in place[:-1]:
+            node = node[key]
+        node[place[-1]] = copy.deepcopy(value)
+
+    return change
+
+
+def drop(*place: str | int) -> Change:
+    def change(document: Document) -> None:
+        node: Any = document
+        for key in place[:-1]:
+            node = node[key]
+        del node[place[-1]]
+
+    return change
+
+
+def both(*changes: Change) -> Change:
+    def change(document: Document) -> None:
+        for one in changes:
+            one(document)
+
+    return change
+
+
+def column(start: int, step: int, values: str) -> Document:
+    return {"start": start, "step": step, "values": values}
+
+
+def claiming(count: int) -> Change:
+    """A sidecar of a few bytes that claims to have many frames, each with its values."""
+    runs = column(0, 0, f"0*{count - 1}")
+    return both(
+        put("frames", value=count), *(put("columns", name, value=runs) for name in COLUMNS)
+    )
+
+
+# the video may be another one; there is no digest that would tell
+UNSEALED = both(drop("video", "size"), drop("video", "sha256"))
+LOSSY = both(UNSEALED, drop("digests"), put("profile", value="visual"))
+
+
+def bounded(outcome: Outcome) -> None:
+    assert outcome.error in ("", *MP4DS_ERRORS), outcome.text
+    assert outcome.seconds < MAX_SECONDS
+    assert outcome.peak < MAX_MEMORY
+
+
+MP4DS_ERRORS = [name for name in mp4ds.__all__ if name.endswith("Error")]
+
+
+def refused(jail: Jail, path: Path, *codes: str, by_reading: bool = True) -> str:
+    """Both ways of reading refuse, one with a problem of these codes, one with an error.
+
+    Args:
+        jail: Where to read.
+        path: What to read.
+        codes: Codes of which one must be found, and all others may not.
+        by_reading: Whether opening or reading must fail, too.
+
+    Returns:
+        All problems as text.
+    """
+    validated = jail.validate(path)
+    bounded(validated)
+    assert not validated.error, validated.text
+    assert validated.codes, "no problem was found"
+    assert set(validated.codes) <= set(codes), validated.problems
+    read = jail.read(path)
+    bounded(read)
+    if by_reading:
+        assert read.ours, read.text or "it could be read"
+        assert any(f"[{code}]" in read.text for code in codes), read.text
+    return "\n".join(validated.problems)
+
+
+def accepted(jail: Jail, path: Path) -> None:
+    for outcome in (jail.validate(path), jail.read(path)):
+        bounded(outcome)
+        assert not outcome.error, outcome.text
+        assert outcome.problems == []
+
+
+def test_the_good_ones_are_accepted(pair: Path, dataset: Path, jail: Jail) -> None:
+    accepted(jail, pair)
+    accepted(jail, dataset)
+    assert jail.read(pair).frames == FRAMES
+
+
+# ---------------------------------------------------------------- names of files
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_video_outside_of_the_folder_is_refused(name: str, pair: Path, jail: Jail) -> None:
+    changed(pair, put("video", "file", value=NAMES[name]))
+    refused(jail, pair, *BAD_DOCUMENT)
+
+
+@pytest.mark.parametrize("name", ["parent", "absolute", "empty", "dot", "line-feed", "fullwidth-dots"])
+@pytest.mark.parametrize("key", ["sidecar", "video", "files"])
+def test_a_manifest_names_plain_files_only(key: str, name: str, dataset: Path, jail: Jail) -> None:
+    place = ("files", 0, "name") if key == "files" else ("streams", 0, key)
+    changed(dataset / "dataset.yaml", put(*place, value=NAMES[name]))
+    refused(jail, dataset, *BAD_DOCUMENT)
+
+
+def test_no_file_outside_is_touched(dataset: Path, tmp_path: Path, jail: Jail) -> None:
+    outside = shutil.copy(dataset / f"{STEM}.mp4", tmp_path / "x.mp4")
+    os.utime(outside, (1, 1))
+    changed(dataset / f"{STEM}.yaml", put("video", "file", value="../x.mp4"))
+    agreed(dataset)
+    refused(jail, dataset, *BAD_DOCUMENT)
+    assert Path(outside).stat().st_atime == 1
+
+
+@pytest.mark.parametrize("name", ["dataset.yaml", f"{STEM}.yaml", "messages.mcap"])
+def test_a_video_that_is_another_file_of_the_dataset(
+    name: str, dataset: Path, jail: Jail
+) -> None:
+    changed(dataset / f"{STEM}.yaml", both(LOSSY, put("video", "file", value=name)))
+    agreed(dataset)
+    refused(jail, dataset, "video-unreadable", "manifest-inconsistent")
+
+
+@pytest.mark.parametrize("name", ["dataset.yaml", "messages.mcap", "none.yaml"])
+def test_a_sidecar_that_is_another_file(name: str, dataset: Path, jail: Jail) -> None:
+    changed(dataset / "dataset.yaml", put("streams", 0, "sidecar", value=name))
+    refused(
+        jail,
+        dataset,
+        *("kind-unknown", "yaml-invalid", "file-missing", "manifest-inconsistent", "model-invalid"),
+    )
+
+
+# ---------------------------------------------------------------- links and special files
+
+
+@pytest.mark.parametrize("inside", [True, False], ids=["inside", "outside"])
+@pytest.mark.parametrize("suffix", [".mp4", ".yaml"])
+def test_links_are_followed(
+    suffix: str, inside: bool, dataset: Path, tmp_path: Path, jail: Jail
+) -> None:
+    # git-annex, DVC and the caches of data hubs hold every file as a link to a store
+    path = dataset / f"{STEM}{suffix}"
+    path.rename((dataset if inside else tmp_path) / "blob")
+    path.symlink_to("blob" if inside else "../blob")
+    accepted(jail, dataset)
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".yaml"])
+def test_links_in_a_circle(suffix: str, pair: Path, jail: Jail) -> None:
+    path = pair.with_suffix(suffix)
+    path.unlink()
+    path.symlink_to(path.name)
+    if suffix == ".yaml":
+        for outcome in (jail.validate(pair), jail.read(pair)):
+            bounded(outcome)
+            assert outcome.ours or outcome.codes == ["file-missing"], outcome.text
+    else:
+        refused(jail, pair, "file-missing")
+
+
+@pytest.mark.parametrize("kind", ["zero", "fifo", "folder"])
+@pytest.mark.parametrize("name", [f"{STEM}.yaml", f"{STEM}.mp4", "messages.mcap", "dataset.yaml"])
+def test_what_is_no_regular_file(name: str, kind: str, dataset: Path, jail: Jail) -> None:
+    path = dataset / name
+    path.unlink()
+    if kind == "zero":
+        path.symlink_to("/dev/zero")
+    elif kind == "fifo":
+        os.mkfifo(path)
+    else:
+        path.mkdir()
+    for outcome in (jail.validate(dataset), jail.read(dataset)):
+        bounded(outcome)
+        assert outcome.ours or outcome.codes, outcome.text
+
+
+# ---------------------------------------------------------------- YAML
+
+TEXTS: dict[str, bytes] = {
+    "empty": b"",
+    "nul": b"\0",
+    "no-map": b"- 1\n",
+    "scalar": b"hello\n",
+    "not-utf8": b"a: \xe4\n",
+    "utf16": "a: 1\n".encode("utf-16"),
+    "laughs": b'a: &a ["lol"]\n'
+    + b"".join(
+        b"%c: &%c [%s]\n" % (98 + i, 98 + i, b",".join([b"*%c" % (97 + i)] * 9)) for i in range(9)
+    ),
+    "alias-of-itself": b"a: &a [*a]\n",
+    "anchor-alone": b"a: &a 1\n",
+    "brackets": b"a: " + b"[" * 100_000,
+    "closed-brackets": b"a: " + b"[" * 100_000 + b"]" * 100_000,
+    "braces": b"{a: " * 100_000,
+    "dashes": b"- " * 100_000,
+    "questions": b"? " * 100_000,
+    "indents": b"\n".join(b" " * n + b"a:" for n in range(1500)),
+    "two-documents": b"a: 1\n---\na: 2\n",
+    "python-object": b'a: !!python/object/apply:os.system ["touch pwned"]\n',
+    "own-tag": b"a: !x 1\n",
+    "core-tag": b'a: !!int "8"\n',
+    "key-twice": b"a: 1\na: 2\n",
+    "key-twice-below": b"a: {b: 1, b: 1}\n",
+    "key-number": b"5: 1\n",
+    "key-null": b"~: 1\n",
+    "key-list": b"[1]: 1\n",
+    "key-map": b"? {a: 1}\n: 1\n",
+    "lone-surrogate": b'a: "\\ud800"\n',
+    "infinite": b"a: 1e999\n",
+    "digits": b"a: 1" + b"0" * 5000 + b"\n",
+    "many-digits": b"a: 1" + b"0" * 10_000_000 + b"\n",
+    "structure": b"a: [" + b"x" * (17 * 2**20) + b"]\n",
+}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+@pytest.mark.parametrize("to", ["sidecar", "manifest"])
+def test_yaml_beyond_the_subset(to: str, name: str, dataset: Path, jail: Jail) -> None:
+    path = dataset / (f"{STEM}.yaml" if to == "sidecar" else "dataset.yaml")
+    head = b'mp4ds: "1.0"\nkind: stream\n' if TEXTS[name].startswith(b"a:") else b""
+    path.write_bytes(head + TEXTS[name])
+    refused(jail, path if to == "sidecar" else dataset, "yaml-invalid")
+    assert not list(dataset.glob("pwned"))
+
+
+VALUES: dict[str, bytes] = {
+    "date": b"2024-01-01",
+    "time": b"12:30:00",
+    "hexadecimal": b"0x8",
+    "octal": b"010",
+    "underscore": b"1_000",
+    "yes": b"yes",
+    "True": b"True",
+    "true": b"true",
+    "nan": b".nan",
+    "inf": b".inf",
+    "quoted": b'"8"',
+    "float": b"8.0",
+    "huge": b"1" + b"0" * 4000,
+    "null": b"null",
+    "list": b"[8]",
+    "map": b"{a: 8}",
+    "merge": b"8\n<<: {a: 1}",
+    "unknown-key": b"8\nfancy: 1",
+}
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_what_is_no_integer(name: str, pair: Path, jail: Jail) -> None:
+    edited(pair, b"frames: 8", b"frames: " + VALUES[name])
+    refused(jail, pair, *BAD_DOCUMENT)
+
+
+@pytest.mark.parametrize("value", [b".nan", b".inf", b"-.inf", b"nan", b'"0.0"', b"true", b"[]"])
+def test_a_calibration_has_finite_numbers(value: bytes, pair: Path, jail: Jail) -> None:
+    edited(pair, b"0.0,", value + b",")
+    refused(jail, pair, *BAD_DOCUMENT)
+
+
+def test_a_sidecar_larger_than_any(pair: Path, jail: Jail) -> None:
+    os.truncate(pair, 8 * 2**30)  # takes no room on the disk
+    refused(jail, pair, "yaml-invalid")
+
+
+def test_a_text_that_looks_like_a_column_cut_out(pair: Path, jail: Jail) -> None:
+    changed(pair, put("columns", "stamp", "values", value="mp4ds column 0"))
+    refused(jail, pair, "column-invalid")
+
+
+def test_many_unknown_keys(pair: Path, jail: Jail) -> None:
+    edited(pair, b"frames: 8", b"frames: 8" + b"".join(b"\nk%d: 1" % n for n in range(20_000)))
+    text = refused(jail, pair, *BAD_DOCUMENT)
+    assert len(text) < 10_000
+
+
+def test_many_headers(pair: Path, jail: Jail) -> None:
+    # a writer stores messages verbatim before it comes to 257 different headers
+    changed(pair, put("headers", value=[{"frame_id": "cam"}] * 20_000))
+    refused(jail, pair, *BAD_DOCUMENT)
+
+
+# ---------------------------------------------------------------- versions
+
+
+@pytest.mark.parametrize("version", ["2.0", "2.7", "10.0", "99999999999.0"])
+def test_a_newer_major_version_is_refused(version: str, pair: Path, jail: Jail) -> None:
+    changed(pair, put("mp4ds", value=version))
+    text = refused(jail, pair, "version-unsupported")
+    assert version in text
+    assert "1.0" in text
+    with pytest.raises(VersionError, match=version):
+        mp4ds.open(pair)
+
+
+@pytest.mark.parametrize(
+    "version",
+    [b"1", b"1.0", b'"1"', b'"1.0.0"', b'"01.0"', b'"0.9"', b'"1.0 "', b'"-1.0"', b'"1.\xd9\xa1"',
+     b"null", b"[1]", b"{}", b"true", b'"' + b"9" * 5000 + b'.0"'],
+)  # fmt: skip
+def test_what_is_no_version(version: bytes, pair: Path, jail: Jail) -> None:
+    edited(pair, b'mp4ds: "1.0"', b"mp4ds: " + version)
+    refused(jail, pair, "version-unsupported")
+
+
+def test_no_version(pair: Path, jail: Jail) -> None:
+    changed(pair, drop("mp4ds"))
+    refused(jail, pair, "version-unsupported")
+
+
+def newer(document: Document) -> None:
+    document["mp4ds"] = "1.7"
+    document["fancy"] = {"a": [1, {"b": None}]}
+    document["video"]["sparkle"] = 7
+    document["headers"][0]["glitter"] = "x"
+    document["camera_info"]["calibrations"][0]["channel"] = {}
+    document["channel"]["schema"]["language"] = "en"
+
+
+def test_a_newer_minor_version_is_read_with_a_warning(pair: Path, jail: Jail) -> None:
+    before = load(pair)
+    changed(pair, newer)
+    with pytest.warns(UserWarning, match=r"1\.7.*video\.sparkle") as caught:
+        stream = mp4ds.open(pair).streams[0]
+    assert len(caught) == 1
+    assert len(list(stream)) == before["frames"]
+    outcome = jail.validate(pair)
+    bounded(outcome)
+    assert not outcome.error, outcome.text
+    assert outcome.problems == []
+    assert outcome.warned
+
+
+def test_a_newer_minor_version_may_not_break_the_rest(pair: Path, jail: Jail) -> None:
+    changed(pair, both(newer, put("frames", value=-1)))
+    refused(jail, pair, *BAD_DOCUMENT)
+
+
+def test_a_newer_minor_version_with_many_keys(pair: Path, jail: Jail) -> None:
+    keys = b"".join(b"\nk%d: 1" % n for n in range(20_000))
+    edited(pair, b'mp4ds: "1.0"', b'mp4ds: "1.7"' + keys)
+    outcome = jail.validate(pair)
+    bounded(outcome)
+    assert not outcome.error, outcome.text
+    assert sum(map(len, outcome.warned)) < 10_000
+
+
+def test_unknown_keys_of_this_version_are_refused(pair: Path, jail: Jail) -> None:
+    changed(pair, both(newer, put("mp4ds", value="1.0")))
+    refused(jail, pair, *BAD_DOCUMENT)
+
+
+@pytest.mark.parametrize("kind", [b"dataset", b"torrent", b"5", b"null", b"[]", b"{}", b"true"])
+def test_another_kind(kind: bytes, pair: Path, jail: Jail) -> None:
+    edited(pair, b"kind: stream", b"kind: " + kind)
+    refused(jail, pair, "kind-unknown", "model-invalid")
+
+
+VERSION_0 = """\
+bagname: x.bag
+topic_name: [/info, /image]
+camera_info: {frameid: c, height: 48, width: 64, distortion_model: plumb_bob, D: [0.1],
+  K: [1, 0, 0, 0, 1, 0, 0, 0, 1], R: [1, 0, 0, 0, 1, 0, 0, 0, 1],
+  P: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]}
+img_timestamp: [1.5, 2.5]
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("[1.5, 2.5]", '["1/0"]'),
+        ("[1.5, 2.5]", '["1e99999999"]'),
+        ("[1.5, 2.5]", "[1e308]"),
+        ("[1.5, 2.5]", "[.nan]"),
+        ("[1.5, 2.5]", "[]"),
+        ("[1.5, 2.5]", "[[1]]"),
+        ("[1.5, 2.5]", "[null]"),
+        ("[1.5, 2.5]", "5"),
+        ("[1.5, 2.5]", "{a: 1}"),
+        ("[/info, /image]", "/image"),
+        ("[/info, /image]", "[/a, /b, /c]"),
+        ("width: 64", "width: 1e999999999"),
+        ("width: 64", "width: 1e308"),
+        ("width: 64", "width: -1"),
+        ("width: 64", "width: {}"),
+        ("D: [0.1]", "D: [nan]"),
+        ("D: [0.1]", "D: [[1]]"),
+        ("D: [0.1]", "D: 5"),
+        ("bagname: x.bag", "extra: 1"),
+    ],
+)
+def test_a_hostile_version_0(old: str, new: str, pair: Path, jail: Jail) -> None:
+    assert old in VERSION_0
+    pair.write_text(VERSION_0.replace(old, new))
+    refused(jail, pair, "migration-failed", "yaml-invalid", *BAD_DOCUMENT)
+
+
+# ---------------------------------------------------------------- numbers that ask for memory
+
+GEOMETRY: dict[str, tuple[Change, set[str]]] = {
+    "billion-by-billion": (
+        both(*(put("image", key, value=10**9) for key in ("width", "height", "step"))),
+        BAD_DOCUMENT,
+    ),
+    "step": (put("image", "step", value=2**32 - 1), BAD_DOCUMENT),
+    "step-beyond": (put("image", "step", value=2**32), BAD_DOCUMENT),
+    "height": (put("image", "height", value=16384), BAD_DOCUMENT),
+    "largest": (
+        both(*(put("image", key, value=16384) for key in ("width", "height", "step"))),
+        BAD_DOCUMENT,
+    ),
+    "largest-video": (
+        both(
+            *(put("image", key, value=16384) for key in ("width", "height", "step")),
+            *(put("video", key, value=16384) for key in ("width", "height")),
+        ),
+        {"geometry-mismatch"},
+    ),
+    "zero": (put("image", "width", value=0), BAD_DOCUMENT),
+    "negative": (put("image", "height", value=-48), BAD_DOCUMENT),
+    "step-short": (put("image", "step", value=63), BAD_DOCUMENT),
+    "smaller-video": (put("video", "width", value=63), BAD_DOCUMENT),
+    "other-video": (put("video", "width", value=128), {"geometry-mismatch"}),
+    "frames-1e8": (claiming(10**8), {"frame-count"}),
+    "frames-beyond": (claiming(10**8 + 1), BAD_DOCUMENT),
+    "frames-2**62": (claiming(2**62), BAD_DOCUMENT),
+    "frames-none": (put("frames", value=0), BAD_DOCUMENT),
+    "frames-negative": (put("frames", value=-8), BAD_DOCUMENT),
+    "tail": (put("headers", 0, "tail", value="00" * 65), BAD_DOCUMENT),
+    "tail-huge": (put("headers", 0, "tail", value="00" * 2**20), BAD_DOCUMENT),
+    "tail-odd": (put("headers", 0, "tail", value="000"), BAD_DOCUMENT),
+    "no-headers": (put("headers", value=[]), BAD_DOCUMENT),
+    "infos-beyond": (put("camera_info", "messages", value=10**7 + 1), BAD_DOCUMENT),
+}
+
+
+@pytest.mark.parametrize("name", GEOMETRY)
+def test_sizes_that_ask_for_memory(name: str, pair: Path, jail: Jail) -> None:
+    change, codes = GEOMETRY[name]
+    changed(pair, change)
+    refused(jail, pair, *codes)
+
+
+def test_as_many_frames_as_a_hollow_video_has_bytes(pair: Path, jail: Jail) -> None:
+    os.truncate(pair.with_suffix(".mp4"), 10**8)  # takes no room on the disk
+    changed(pair, both(LOSSY, claiming(10**8)))
+    refused(jail, pair, "frame-count")
+
+
+def test_ten_million_camera_infos_in_a_few_bytes(pair: Path, jail: Jail) -> None:
+    runs = column(0, 0, f"0*{10**7 - 1}")
+    changed(
+        pair,
+        both(
+            put("camera_info", "messages", value=10**7),
+            *(put("camera_info", "columns", name, value=runs) for name in COLUMNS),
+        ),
+    )
+    bounded(jail.validate(pair))
+
+
+# ---------------------------------------------------------------- columns
+
+WHOLE = f"0*{FRAMES - 1}"
+RESIDUALS: dict[str, str] = {
+    "short": f"0*{FRAMES - 2}",
+    "long": f"0*{FRAMES}",
+    "few": "0 0 0",
+    "none": "",
+    "letters": "x",
+    "float": "1.5 " * (FRAMES - 1),
+    "exponent": "1e3 " * (FRAMES - 1),
+    "hexadecimal": "0x1 " * (FRAMES - 1),
+    "sign-alone": "- " * (FRAMES - 1),
+    "signs": "--1 " * (FRAMES - 1),
+    "sign-inside": "1-1 " * (FRAMES - 1),
+    "comma": "0,0,0,0,0,0,0",
+    "nul": "0\0" * (FRAMES - 1),
+    "arabic-digits": "\u0661 " * (FRAMES - 1),
+    "beyond-64-bits": "9" * 30 + " 0" * (FRAMES - 2),
+    "saturated": f"{2**63} " + "0 " * (FRAMES - 2),
+    "run-beyond": "0*" + "9" * 30,
+    "run-of-digits": "0*" + "9" * 5000,
+    "run-value-beyond": "9" * 5000 + "*7",
+    "run-negative": "0*-1",
+    "run-of-none": f"0*0 {WHOLE}",
+    "many-runs-of-none": "0*0 " * 100_000 + WHOLE,
+    "run-empty": "*7",
+    "run-of-run": "0*1*7",
+    "two-stars": "0**7",
+    "unlimited-spaces": "0 " + " " * 2**20 + "x",
+}
+
+
+@pytest.mark.parametrize("name", RESIDUALS)
+def test_columns_that_do_not_decode(name: str, pair: Path, jail: Jail) -> None:
+    changed(pair, put("columns", "stamp", "values", value=RESIDUALS[name]))
+    text = refused(jail, pair, "column-invalid", "yaml-invalid")
+    assert "columns.stamp" in text or "yaml-invalid" in text
+
+
+COLUMN_CHANGES: dict[str, tuple[Change, set[str]]] = {
+    "start-beyond": (put("columns", "stamp", "start", value=2**63), BAD_DOCUMENT),
+    "step-beyond": (put("columns", "stamp", "step", value=-(2**63) - 1), BAD_DOCUMENT),
+    "start-float": (put("columns", "stamp", "start", value=1.0), BAD_DOCUMENT),
+    "start-true": (put("columns", "stamp", "start", value=True), BAD_DOCUMENT),
+    "stamp-negative": (put("columns", "stamp", "start", value=-1), {"column-invalid"}),
+    "stamp-beyond": (put("columns", "stamp", "start", value=2**62), {"column-invalid"}),
+    "seq-negative": (put("columns", "seq", "start", value=-1), {"column-invalid"}),
+    "seq-beyond": (put("columns", "seq", "start", value=2**32), {"column-invalid"}),
+    "variant-beyond": (put("columns", "variant", value=column(1, 0, WHOLE)), {"column-invalid"}),
+    "variant-negative": (
+        put("columns", "variant", value=column(-1, 0, WHOLE)),
+        {"column-invalid"},
+    ),
+    "ordinal-repeated": (put("columns", "ordinal", value=column(0, 0, WHOLE)), {"column-invalid"}),
+    "ordinal-falling": (put("columns", "ordinal", value=column(9, -1, WHOLE)), {"column-invalid"}),
+    "ordinal-negative": (put("columns", "ordinal", value=column(-1, 1, WHOLE)), {"column-invalid"}),
+    "ordinal-wrapped": (
+        put("columns", "ordinal", value=column(0, 2**62, WHOLE)),
+        {"column-invalid"},
+    ),
+    "digests-short": (put("digests", "values", value="00" * 8 * (FRAMES - 1)), {"column-invalid"}),
+    "digests-odd": (put("digests", "values", value="0" * 15), {"column-invalid"}),
+    "digests-junk": (put("digests", "values", value="zz" * 8 * FRAMES), {"column-invalid"}),
+    "digests-wrong": (put("digests", "values", value="00" * 8 * FRAMES), {"digest-mismatch"}),
+    "digests-none": (drop("digests"), BAD_DOCUMENT),
+    "digests-other": (put("digests", "algorithm", value="md5"), BAD_DOCUMENT),
+    "no-stamp": (drop("columns", "stamp"), BAD_DOCUMENT),
+    "template-no-base64": (put("headers", 0, "template", value="A"), {"header-mismatch"}),
+    "template-other-letters": (put("headers", 0, "template", value="!!!!"), BAD_DOCUMENT),
+    "template-short": (put("headers", 0, "template", value="AAAA"), {"header-mismatch"}),
+    "template-empty": (put("headers", 0, "template", value=""), {"header-mismatch"}),
+    "template-long": (put("headers", 0, "template", value="AAAA" * 2**18), {"header-mismatch"}),
+    "info-template-no-base64": (
+        put("camera_info", "calibrations", 0, "template", value="A"),
+        {"header-mismatch"},
+    ),
+    "info-template-short": (
+        put("camera_info", "calibrations", 0, "template", value="AAAA"),
+        {"header-mismatch"},
+    ),
+    "info-no-columns": (drop("camera_info", "columns"), {"column-invalid", *BAD_DOCUMENT}),
+    "info-no-calibrations": (
+        put("camera_info", "calibrations", value=[]),
+        {"column-invalid", *BAD_DOCUMENT},
+    ),
+    "info-stamp-negative": (
+        put("camera_info", "columns", "stamp", "start", value=-1),
+        {"column-invalid"},
+    ),
+    "info-seq-beyond": (
+        put("camera_info", "columns", "seq", "start", value=2**32),
+        {"column-invalid"},
+    ),
+    "info-matrix": (put("camera_info", "calibrations", 0, "k", value=[0.0] * 8), BAD_DOCUMENT),
+    "wire-unknown": (put("wire", value="x"), BAD_DOCUMENT),
+    "wire-other": (put("wire", value="cdr-le"), {"digest-mismatch", "model-invalid"}),
+    "schema-no-base64": (
+        put("channel", "schema", value={"name": "a", "encoding": "b", "base64": "A"}),
+        {"model-invalid", "header-mismatch", "stream-invalid"},
+    ),
+    "schema-both": (put("channel", "schema", "base64", value="AAAA"), BAD_DOCUMENT),
+    "layout-unknown": (put("video", "layout", value="x"), BAD_DOCUMENT),
+    "layout-of-another-encoding": (put("video", "layout", value="rgb24"), BAD_DOCUMENT),
+    "encoding-unknown": (put("image", "encoding", value="rgb9"), BAD_DOCUMENT),
+    "encoding-of-another-layout": (put("image", "encoding", value="mono16"), BAD_DOCUMENT),
+    "codec-other": (put("video", "codec", value="av1"), {"codec-mismatch"}),
+    "codec-unknown": (put("video", "codec", value="x"), {"codec-mismatch", *BAD_DOCUMENT}),
+    "pixel-format-unknown": (
+        put("video", "pixel_format", value="x"),
+        {"codec-mismatch", *BAD_DOCUMENT},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", COLUMN_CHANGES)
+def test_a_sidecar_that_contradicts_itself_or_its_video(
+    name: str, pair: Path, jail: Jail
+) -> None:
+    change, codes = COLUMN_CHANGES[name]
+    changed(pair, change)
+    refused(jail, pair, *codes)
+
+
+@pytest.mark.parametrize(("start", "step"), [(3, 1), (0, 2), (2**62, 1)])
+def test_places_of_messages_that_are_nowhere(
+    start: int, step: int, dataset: Path, jail: Jail
+) -> None:
+    changed(
+        dataset / f"{STEM}.yaml", put("columns", "ordinal", value=column(start, step, WHOLE))
+    )
+    agreed(dataset)
+    refused(jail, dataset, "messages-missing")
+
+
+# ---------------------------------------------------------------- videos
+
+
+def video(
+    path: Path,
+    codec: str = "libx264",
+    pixel_format: str = "gray",
+    *,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    frames: int = FRAMES,
+    container: str = "mp4",
+) -> None:
+    """A black video."""
+    options = {"qp": "0", "preset": "ultrafast"} if codec.startswith("libx264") else {}
+    with av.open(str(path), "w", format=container) as output:
+        stream = output.add_stream(codec, rate=30, options=options)
+        stream.width, stream.height = size
+        stream.pix_fmt = pixel_format
+        for number in range(frames):
+            output.mux(stream.encode(black(size, pixel_format, number)))
+        output.mux(stream.encode(None))
+
+
+def black(size: tuple[int, int], pixel_format: str, number: int) -> av.VideoFrame:
+    frame = av.VideoFrame(*size, pixel_format)
+    for plane in frame.planes:
+        plane.update(bytes(plane.buffer_size))
+    frame.pts = number
+    return frame
+
+
+def h264(size: tuple[int, int], frames: int) -> bytes:
+    """A bare H.264 stream of key frames, each with the size in front."""
+    context = av.CodecContext.create("libx264", "w")
+    context.width, context.height = size
+    context.pix_fmt, context.time_base = "gray", Fraction(1, 30)
+    parameters = "repeat-headers=1:keyint=1"
+    context.options = {"qp": "0", "preset": "ultrafast", "x264-params": parameters}
+    packets = [p for n in range(frames) for p in context.encode(black(size, "gray", n))]
+    return b"".join(bytes(packet) for packet in [*packets, *context.encode(None)])
+
+
+def video_that_changes(path: Path, *parts: bytes) -> None:
+    """A video of bare streams, one after the other."""
+    with (
+        av.open(io.BytesIO(b"".join(parts)), format="h264") as source,
+        av.open(str(path), "w", format="mp4") as output,
+    ):
+        stream = output.add_stream_from_template(source.streams.video[0])
+        packets = [packet for packet in source.demux() if packet.size]
+        for number, packet in enumerate(packets):
+            packet.stream, packet.time_base = stream, Fraction(1, 30)
+            packet.pts = packet.dts = number
+            output.mux(packet)
+
+
+OTHER_VIDEOS: dict[str, tuple[Callable[[Path], None], set[str]]] = {
+    "mpeg4": (lambda path: video(path, "mpeg4", "yuv420p"), {"codec-mismatch"}),
+    "ffv1": (lambda path: video(path, "ffv1"), {"codec-mismatch"}),
+    "yuv444p": (lambda path: video(path, pixel_format="yuv444p"), {"codec-mismatch"}),
+    "rgb24": (lambda path: video(path, "libx264rgb", "rgb24"), {"codec-mismatch"}),
+    "fewer-frames": (lambda path: video(path, frames=FRAMES - 1), {"frame-count"}),
+    "more-frames": (lambda path: video(path, frames=FRAMES + 1), {"frame-count"}),
+    "larger": (lambda path: video(path, size=(128, 96)), {"geometry-mismatch"}),
+    "very-large": (lambda path: video(path, size=(8192, 8192), frames=1), {"geometry-mismatch"}),
+    "very-wide": (lambda path: video(path, size=(16384, 16)), {"geometry-mismatch"}),
+    "matroska": (lambda path: video(path, container="matroska"), {"video-unreadable"}),
+    "avi": (lambda path: video(path, container="avi"), {"video-unreadable"}),
+    "png": (lambda path: video(path, "png", "gray", container="image2"), {"video-unreadable"}),
+    "empty": (lambda path: path.write_bytes(b"") and None, {"frame-count", "video-unreadable"}),
+    "text": (lambda path: path.write_text("hello\n" * 99) and None, {"video-unreadable"}),
+    "half": (lambda path: os.truncate(path, path.stat().st_size // 2), {"video-unreadable"}),
+    "missing": (lambda path: path.unlink(), {"file-missing"}),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_VIDEOS)
+def test_another_video(name: str, pair: Path, jail: Jail) -> None:
+    make, codes = OTHER_VIDEOS[name]
+    path = pair.with_suffix(".mp4")
+    if name not in ("half", "missing"):
+        path.unlink()
+    make(path)
+    changed(pair, LOSSY)
+    refused(jail, pair, *codes)
+
+
+@pytest.mark.parametrize("size", [(32, 48), (128, 48), (64, 96), (8192, 8192)])
+def test_a_video_that_changes_its_size_half_way(
+    size: tuple[int, int], pair: Path, jail: Jail
+) -> None:
+    start = h264((WIDTH, HEIGHT), FRAMES // 2)
+    video_that_changes(pair.with_suffix(".mp4"), start, h264(size, FRAMES // 2))
+    changed(pair, LOSSY)
+    refused(jail, pair, "geometry-mismatch", "decode-failed")
+
+
+def test_a_file_header_of_another_size(pair: Path, jail: Jail) -> None:
+    # what counts is the size in the coded stream: no other is allocated
+    path = pair.with_suffix(".mp4")
+    data = bytearray(path.read_bytes())
+    entry = data.index(b"avc1", data.index(b"stsd"))
+    data[entry + 28 : entry + 32] = (16384).to_bytes(2, "big") * 2
+    path.write_bytes(data)
+    changed(pair, UNSEALED)
+    for outcome in (jail.validate(pair), jail.read(pair)):
+        bounded(outcome)
+        assert not outcome.error or outcome.ours
+
+
+@pytest.mark.parametrize("name", [b"Lavf", b"VideoHandler"])
+def test_a_video_with_a_text_that_is_not_utf8(name: bytes, pair: Path, jail: Jail) -> None:
+    path = pair.with_suffix(".mp4")
+    data = bytearray(path.read_bytes())
+    data[data.index(name)] |= 0x80
+    path.write_bytes(data)
+    changed(pair, UNSEALED)
+    for outcome in (jail.validate(pair), jail.read(pair)):
+        bounded(outcome)
+        assert not outcome.error or outcome.ours
+
+
+def test_a_playlist_of_other_files(pair: Path, jail: Jail) -> None:
+    path = pair.with_suffix(".mp4")
+    path.rename(pair.with_name("other.mp4"))
+    path.write_text("ffconcat version 1.0\nfile other.mp4\n")
+    changed(pair, LOSSY)
+    refused(jail, pair, "video-unreadable")
+
+
+@pytest.mark.parametrize("form", ["hls", "sdp", "concat", "dash"])
+def test_nothing_is_fetched_from_a_network(form: str, pair: Path, jail: Jail) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(0.05)
+        url = f"http://127.0.0.1:{server.getsockname()[1]}/x.mp4"
+        text = {
+            "hls": f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{url}\n#EXT-X-ENDLIST\n",
+            "sdp": "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\n"
+            "m=video 5004 RTP/AVP 96\na=rtpmap:96 H264/90000\n",
+            "concat": f"ffconcat version 1.0\nfile {url}\n",
+            "dash": '<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011">'
+            f"<Period><AdaptationSet><BaseURL>{url}</BaseURL></AdaptationSet></Period></MPD>",
+        }[form]
+        pair.with_suffix(".mp4").write_text(text)
+        changed(pair, LOSSY)
+        refused(jail, pair, "video-unreadable")
+        with pytest.raises(TimeoutError):
+            server.accept()
+
+
+@pytest.mark.parametrize("folder", ["a:b", "run-12:00:00", "http:", "pipe:0", "100%d", "-x", "é è"])
+def test_a_folder_whose_name_looks_like_something_else(
+    folder: str, packed_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(packed_bag, tmp_path / folder)
+    monkeypatch.chdir(tmp_path)
+    assert mp4ds.validate(folder, deep=True) == []
+    with mp4ds.open(folder) as dataset:
+        assert len(list(dataset.streams[0])) == FRAMES
+
+
+# ---------------------------------------------------------------- manifests
+
+MANIFESTS: dict[str, tuple[Change, set[str]]] = {
+    "kind": (put("kind", value="stream"), {"kind-unknown", "model-invalid"}),
+    "format": (put("format", value="zip"), BAD_DOCUMENT),
+    "messages-beyond": (put("messages", value=2**63), BAD_DOCUMENT),
+    "messages-negative": (put("messages", value=-1), BAD_DOCUMENT),
+    "size-beyond": (put("files", 0, "size", value=2**63), BAD_DOCUMENT),
+    "sha256-short": (put("files", 0, "sha256", value="00"), BAD_DOCUMENT),
+    "sha256-upper": (put("files", 0, "sha256", value="A" * 64), BAD_DOCUMENT),
+    "frames-beyond": (put("streams", 0, "frames", value=10**9), BAD_DOCUMENT),
+    "no-files": (drop("files"), BAD_DOCUMENT),
+    "newer-major": (put("mp4ds", value="3.1"), {"version-unsupported"}),
+}
+
+
+@pytest.mark.parametrize("name", MANIFESTS)
+def test_a_hostile_manifest(name: str, dataset: Path, jail: Jail) -> None:
+    change, codes = MANIFESTS[name]
+    changed(dataset / "dataset.yaml", change)
+    refused(jail, dataset, *codes)
+
+
+def test_a_stream_that_is_listed_twice(dataset: Path, jail: Jail) -> None:
+    def twice(manifest: Document) -> None:
+        manifest["streams"] *= 2
+
+    changed(dataset / "dataset.yaml", twice)
+    refused(jail, dataset, "message-count", "manifest-inconsistent", "model-invalid")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"x" * 4096, b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n"],
+    ids=["empty", "junk", "git-lfs"],
+)
+def test_messages_that_are_no_mcap(content: bytes, dataset: Path, jail: Jail) -> None:
+    (dataset / "messages.mcap").write_bytes(content)
+    agreed(dataset)
+    outcome = jail.validate(dataset)
+    bounded(outcome)
+    assert outcome.codes == ["messages-unreadable"]
+    outcome = jail.read(dataset)
+    bounded(outcome)
+    assert outcome.ours, outcome.text
+
+
+# ---------------------------------------------------------------- anything else
+
+ODD_VALUES: list[Any] = [
+    None, True, False, -1, 0, 1, 255, 2**31, 2**32, 2**63 - 1, -(2**63), 2**64, 0.5, -0.0, 1e308,
+    "", "x", "0", "\0", "\ud7ff", "A", "AAAA", "0*7", "ros1", "cdr-be", "mono16", [], [0], [[]], {},
+    {"a": 1},
+]  # fmt: skip
+
+
+def _leaves(node: Any, place: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    if place:
+        yield place
+    children = node.items() if isinstance(node, dict) else enumerate(node)
+    for key, child in children if isinstance(node, (dict, list)) else ():
+        yield from _leaves(child, (*place, key))
+
+
+def _mutated(document: Document, rng: random.Random) -> tuple[Document, str]:
+    place = rng.choice(list(_leaves(document)))
+    result = copy.deepcopy(document)
+    if rng.random() < 0.2:
+        drop(*place)(result)
+        return result, f"without {place}"
+    value = rng.choice(ODD_VALUES)
+    put(*place, value=value)(result)
+    return result, f"{place} = {value!r}"
+
+
+def _use(path: Path) -> list[str]:
+    """Validate and read; returns what was raised that is not meant for users."""
+    foreign = []
+    for task in (_validate_all, _read_all):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                task(path)
+        except Mp4dsError:
+            continue
+        except Exception as error:  # noqa: BLE001 - this is what is looked for
+            foreign.append(f"{task.__name__}: {error!r}")
+    return foreign
+
+
+def _validate_all(path: Path) -> None:
+    mp4ds.validate(path, deep=True)
+
+
+def _read_all(path: Path) -> None:
+    with mp4ds.open(path) as dataset:
+        for _ in dataset.records():
+            pass
+        for stream in dataset.streams:
+            _ = stream[-1].intrinsics
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", [f"{STEM}.yaml", "dataset.yaml"])
+def test_no_change_of_a_value_raises_anything_foreign(
+    name: str, seed: int, dataset: Path
+) -> None:
+    path, rng = dataset / name, random.Random(seed)
+    document, found = load(path), []
+    for _ in range(60):
+        mutant, what = _mutated(document, rng)
+        path.write_bytes(yamlio.dump(mutant))
+        found += [f"{what}: {text}" for text in _use(dataset)]
+    assert found == []
+
+
+@pytest.mark.parametrize("name", [f"{STEM}.yaml", "dataset.yaml"])
+def test_no_change_of_a_letter_raises_anything_foreign(name: str, dataset: Path) -> None:
+    path, rng = dataset / name, random.Random(7)
+    good, found = path.read_bytes(), []
+    good = good[: good.rindex(b"checksum:")]
+    for _ in range(150):
+        text = bytearray(good)
+        for _ in range(rng.randint(1, 3)):
+            text[rng.randrange(len(text))] = rng.choice(b"\n :-[]{}&*!|>'\"%@,#0x\x80\xff")
+        path.write_bytes(text)
+        found += [f"{bytes(text)!r}: {raised}" for raised in _use(dataset)]
+    assert found == []

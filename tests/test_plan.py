@@ -1,0 +1,219 @@
+"""Which topics become streams, what they are called, and how they are encoded."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import pytest
+import xxhash
+from hypothesis import example, given
+from hypothesis import strategies as st
+from pydantic import TypeAdapter
+
+from mp4ds.errors import OptionError
+from mp4ds.plan import (
+    VISUAL_TABLE,
+    FileNames,
+    Quality,
+    Selection,
+    pair_camera_infos,
+    parse_quality,
+    visual_setting,
+)
+from mp4ds.records import Channel, Schema
+from mp4ds.sidecar.models import FileName
+
+# ---------------------------------------------------------------- quality
+
+
+@pytest.mark.parametrize(
+    ("text", "quality", "lossless"),
+    [
+        ("lossless", Quality("lossless"), True),
+        ("visual", Quality("visual"), False),
+        *((f"crf={n}", Quality("crf", n), False) for n in (0, 7, 22, 63)),
+    ],
+)
+def test_qualities(text: str, quality: Quality, lossless: bool) -> None:
+    assert parse_quality(text) == quality
+    assert quality.lossless is lossless
+    assert str(quality) == text
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "Lossless", "lossless ", "crf", "crf=", "crf=64", "crf=-1", "crf=1.5", "crf=100", "22",
+     "crf=\u0662", "crf=22\n", "vmaf=99.5", "best"],
+)  # fmt: skip
+def test_other_qualities_are_refused(text: str) -> None:
+    with pytest.raises(OptionError, match="Use lossless, visual, or crf=N"):
+        parse_quality(text)
+
+
+@pytest.mark.parametrize(
+    ("rate", "setting"),
+    [
+        (None, (18, 8)), (0.1, (18, 8)), (2, (18, 8)), (3.5, (18, 8)), (3.6, (17, 8)),
+        (10, (17, 8)), (14.9, (17, 8)), (15.1, (18, 8)), (30, (18, 8)), (45, (18, 8)),
+        (45.1, (22, 6)), (60, (22, 6)), (1000, (22, 6)),
+    ],
+)  # fmt: skip
+def test_the_papers_table(rate: float | None, setting: tuple[int, int]) -> None:
+    assert visual_setting(rate) == setting
+
+
+def test_the_table_is_ordered_by_rate() -> None:
+    rates = [row[0] for row in VISUAL_TABLE]
+    assert rates == sorted(rates)
+
+
+# ---------------------------------------------------------------- selection
+
+
+@pytest.mark.parametrize(
+    ("topics", "exclude", "chosen"),
+    [
+        ([], [], ["/a/image", "/a/info", "/b", "c"]),
+        (["/a/*"], [], ["/a/image", "/a/info"]),
+        (["/a/*"], ["*info"], ["/a/image"]),
+        ([], ["/a/*"], ["/b", "c"]),
+        (["/c"], [], ["c"]),
+        (["c"], [], ["c"]),
+        (["/b", "c"], [], ["/b", "c"]),
+        (["/[ab]*"], [], ["/a/image", "/a/info", "/b"]),
+        (["/A/*"], [], []),
+        (["*"], ["*"], []),
+    ],
+)
+def test_selections(topics: Sequence[str], exclude: Sequence[str], chosen: list[str]) -> None:
+    selected = Selection(topics, exclude)
+    assert [t for t in ("/a/image", "/a/info", "/b", "c") if selected(t)] == chosen
+
+
+def test_a_pattern_that_matches_nothing_is_an_error() -> None:
+    topics = ["/b", "/a"]
+    Selection(["/a"], ["/b"]).check(topics)
+    Selection().check([])
+    with pytest.raises(OptionError, match=r"--topics '/x' matches no topic. There are: /a, /b\."):
+        Selection(["/a", "/x"]).check(topics)
+    with pytest.raises(OptionError, match="--exclude '/x' matches no topic"):
+        Selection([], ["/x"]).check(topics)
+    with pytest.raises(OptionError, match="There are: none"):
+        Selection(["*"]).check([])
+    with pytest.raises(OptionError, match=r", \.\.\."):
+        Selection(["/x"]).check(f"/{i}" for i in range(30))
+
+
+# ---------------------------------------------------------------- file names
+
+DEVICES = {"con", "prn", "aux", "nul", *(f"{p}{n}" for p in ("com", "lpt") for n in range(10))}
+Topics = (
+    st.text(max_size=30)
+    | st.lists(
+        st.sampled_from(["a", "A", "-2", "-3", "_", ".", "/", "con", "aux.x", "dataset", "..",
+                         "messages", "topic", "image_raw", "\u00e4", " ", "\\", ":", "x" * 60]),
+        max_size=6,
+    ).map("".join)
+    | st.text("aB", min_size=95, max_size=250)
+)  # fmt: skip
+
+
+def stem_by_the_spec(topic: str, taken: set[str]) -> str:
+    """spec/index.md, "File names", in its own order."""
+    stem = re.sub(r"[^A-Za-z0-9._-]+", "_", topic.strip("/")).strip("._-")
+    stem = stem or "topic"
+    if len(stem) > 100:
+        stem = stem[:83] + "-" + xxhash.xxh64(topic.encode("utf-8")).hexdigest()
+    if stem.split(".")[0].lower() in DEVICES | {"dataset", "messages"}:
+        stem = "topic_" + stem
+    name = stem
+    for number in range(2, 10**6):
+        if name.lower() not in taken:
+            break
+        name = f"{stem}-{number}"
+    taken.add(name.lower())
+    return name
+
+
+@given(st.lists(Topics, max_size=12))
+@example(["a", "A", "a-2", "a", "A-2", "/a/"])
+@example(["a-2", "a", "a"])
+@example(["con", "topic_con", "CON", "con.x", "/com1", "lpt0.image", "com10"])
+@example(["dataset", "messages", "Messages.MCAP", "dataset.yaml"])
+@example(["../../etc/passwd", "..", ".", "/", "", "\0", "C:\\x", "~/x", "-rf"])
+@example(["x" * 101, "x" * 101 + "y", "X" * 101])
+def test_names_are_plain_and_never_collide(topics: list[str]) -> None:
+    names, taken = FileNames(), set[str]()
+    pattern = TypeAdapter(FileName)
+    files: set[str] = {"dataset.yaml", "messages.mcap"}
+    for topic in topics:
+        stem, renamed = names.name_for(topic)
+        assert stem == stem_by_the_spec(topic, taken)
+        assert renamed == (stem.lower() != stem_by_the_spec(topic, set()).lower())
+        assert stem.lower().split(".")[0] not in DEVICES
+        for file in (f"{stem}.mp4", f"{stem}.yaml"):
+            pattern.validate_python(file)
+            assert file.casefold() not in files
+            files.add(file.casefold())
+
+
+def test_ordinary_names() -> None:
+    names = FileNames()
+    assert names.name_for("/left/image_raw") == ("left_image_raw", False)
+    assert names.name_for("/left/image_raw") == ("left_image_raw-2", True)
+    assert names.name_for("left//image_raw/") == ("left_image_raw-3", True)
+    assert names.name_for("/cam/Bild \u00e4") == ("cam_Bild", False)
+
+
+# ---------------------------------------------------------------- pairing
+
+
+def channels(*topics: str) -> list[Channel]:
+    """Channels by topic; those with ``info`` in the last part are calibrations."""
+    return [
+        Channel(
+            number,
+            topic,
+            "ros1",
+            Schema("sensor_msgs/CameraInfo" if "info" in topic.split("/")[-1]
+                   else "sensor_msgs/Image", "", b""),
+        )
+        for number, topic in enumerate(topics)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("topics", "pairs"),
+    [
+        (["/cam/image_raw", "/cam/camera_info"], {1: 0}),
+        (["/cam/camera_info", "/cam/image_raw"], {0: 1}),
+        (["/cam/image_color", "/cam/image_raw", "/cam/camera_info"], {2: 1}),
+        (["/cam/image_mono", "/cam/image_color", "/cam/camera_info"], {2: 1}),
+        (["/l/image_raw", "/r/image_raw", "/r/camera_info", "/l/camera_info"], {2: 1, 3: 0}),
+        (["/cam/image_raw", "/other/camera_info"], {}),
+        (["/cam/image_raw", "/cam/left_info"], {}),
+        (["/cam/deep/image_raw", "/cam/camera_info"], {}),
+        (["/camera_info", "/image_raw"], {0: 1}),
+        (["image_raw", "/camera_info"], {1: 0}),
+        (["cam/image_raw", "/cam/camera_info"], {1: 0}),
+        (["/cam/image_raw", "/cam/camera_info", "/cam/camera_info"], {}),  # several publishers
+        (["/cam/image_raw", "/cam/image_raw", "/cam/camera_info"], {2: 0}),
+        (["/cam/camera_info"], {}),
+        ([], {}),
+    ],
+)
+def test_calibrations_belong_to_the_image_beside_them(
+    topics: list[str], pairs: dict[int, int]
+) -> None:
+    assert pair_camera_infos(channels(*topics)) == pairs
+
+
+def test_only_the_types_count() -> None:
+    image, info = channels("/cam/image_raw", "/cam/camera_info")
+    words = Channel(2, "/cam/image_raw", "ros1", Schema("std_msgs/String", "", b""))
+    ros2 = Channel(3, "/cam/image_raw", "cdr", Schema("sensor_msgs/msg/Image", "", b""))
+    assert pair_camera_infos([words, info]) == {}
+    assert pair_camera_infos([Channel(4, "/cam/image_raw", "json", None), info]) == {}
+    assert pair_camera_infos([ros2, info]) == {1: 3}
+    assert pair_camera_infos([image, Channel(1, "/cam/camera_info", "ros1", None)]) == {}

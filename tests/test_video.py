@@ -1,0 +1,486 @@
+"""Pictures through the codecs: exact where promised, near where not, and found by number."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+import random
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from PIL import Image
+
+from mp4ds.errors import OptionError, VideoError
+from mp4ds.layouts import ENCODINGS
+from mp4ds.video import (
+    ImageFile,
+    Recipe,
+    VideoDecoder,
+    VideoEncoder,
+    check_codec,
+    recipe_for,
+    tool_versions,
+)
+from mp4ds.video.encoder import EncoderRefusedError, check_preset
+from sources import BAYER, picture
+
+Pixels = NDArray[Any]
+
+CODECS = ["h264", "h265", "av1", "ffv1"]
+FORMATS = ["gray", "rgb24", "bgr24", "gray16le"]
+SIZES = [(1, 1), (2, 2), (3, 5), (7, 4), (16, 16), (33, 31), (1, 63), (63, 1), (64, 48)]
+
+
+def exists(codec: str, picture_format: str, lossless: bool) -> bool:
+    try:
+        recipe_for(picture_format, lossless=lossless, codec=codec, crf=20)
+    except OptionError:
+        return False
+    return True
+
+
+LOSSLESS = [pair for pair in itertools.product(CODECS, FORMATS) if exists(*pair, lossless=True)]
+LOSSY = [codec for codec in CODECS if exists(codec, "rgb24", lossless=False)]
+
+
+def ffprobe(path: Path, *options: str) -> Any:
+    if not shutil.which("ffprobe"):
+        pytest.skip("there is no ffprobe")
+    command = ["ffprobe", "-v", "error", "-of", "json", *options, str(path)]
+    return json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+
+
+def noise(picture_format: str, width: int, height: int, frames: int) -> list[Pixels]:
+    dtype = np.dtype("<u2" if picture_format == "gray16le" else np.uint8)
+    shape = (height, width, 3) if picture_format in ("rgb24", "bgr24") else (height, width)
+    rng = np.random.default_rng([width, height])
+    top = np.iinfo(dtype).max
+    pictures = [rng.integers(0, top, shape, dtype, endpoint=True) for _ in range(frames - 2)]
+    return [np.zeros(shape, dtype), np.full(shape, top, dtype), *pictures]
+
+
+def scene_pictures(encoding: str, width: int, height: int, frames: int) -> list[Pixels]:
+    return [
+        np.ascontiguousarray(picture(encoding, frame=n, width=width, height=height, rng=None))
+        for n in range(frames)
+    ]
+
+
+def encode(
+    path: Path,
+    recipe: Recipe,
+    pictures: Sequence[Pixels],
+    picture_format: str,
+    *,
+    ticks: Sequence[int] | None = None,
+    gop: int = 60,
+    threads: int = 1,
+) -> dict[str, Any]:
+    """Make a video; returns what its decoder is to be told."""
+    height, width = pictures[0].shape[:2]
+    encoder = VideoEncoder(
+        path, recipe, picture_format=picture_format, width=width, height=height,
+        gop=gop, threads=threads, rate=30.0,
+    )  # fmt: skip
+    for number, pixels in enumerate(pictures):
+        encoder.write(pixels, ticks[number] if ticks else number * 33_333)
+    encoder.close()
+    assert encoder.frames == len(pictures)
+    return {
+        "codec": recipe.codec,
+        "coded_size": (encoder.width, encoder.height),
+        "frames": len(pictures),
+        "picture_format": picture_format,
+        "picture_size": (width, height),
+    }
+
+
+def decode(path: Path, told: dict[str, Any]) -> list[Pixels]:
+    with VideoDecoder(path, **told) as decoder:
+        assert decoder.coded_frames == told["frames"]
+        return [pixels.copy() for pixels in decoder.pictures()]
+
+
+def psnr(a: Pixels, b: Pixels) -> float:
+    error = np.mean((a.astype(float) - b.astype(float)) ** 2)
+    return float("inf") if error == 0 else float(10 * np.log10(255**2 / error))
+
+
+# ---------------------------------------------------------------- lossless
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+@pytest.mark.parametrize(("codec", "picture_format"), LOSSLESS)
+def test_lossless_is_exact(
+    codec: str, picture_format: str, width: int, height: int, tmp_path: Path
+) -> None:
+    recipe = recipe_for(picture_format, lossless=True, codec=codec)
+    assert recipe.lossless
+    pictures = noise(picture_format, width, height, 6)
+    path = tmp_path / "video.mp4"
+    try:
+        told = encode(path, recipe, pictures, picture_format, gop=4)
+    except EncoderRefusedError as error:
+        # the smallest pictures are refused by some, and then stored verbatim
+        assert min(width, height) < 4  # noqa: PT017
+        assert f"{width}x{height}" in str(error)  # noqa: PT017
+        return
+    decoded = decode(path, told)
+    assert all(map(np.array_equal, decoded, pictures))
+    assert decoded[0].dtype.itemsize == pictures[0].dtype.itemsize
+    with VideoDecoder(path, **told, sequential=False) as decoder:
+        assert np.array_equal(decoder.picture(5), pictures[5])
+
+
+@pytest.mark.parametrize("picture_format", FORMATS)
+def test_the_default_takes_every_size_from_two_on(picture_format: str, tmp_path: Path) -> None:
+    recipe = recipe_for(picture_format, lossless=True)
+    for width, height in [(2, 2), (2, 301), (301, 2), (5, 3)]:
+        pictures = noise(picture_format, width, height, 3)
+        told = encode(tmp_path / "video.mp4", recipe, pictures, picture_format)
+        assert all(map(np.array_equal, decode(tmp_path / "video.mp4", told), pictures))
+
+
+@pytest.mark.parametrize(("codec", "picture_format"), LOSSLESS)
+@pytest.mark.parametrize("threads", [1, 3])
+def test_lossless_of_a_scene_with_threads(
+    codec: str, picture_format: str, threads: int, tmp_path: Path
+) -> None:
+    encoding = {"gray": "mono8", "gray16le": "mono16", "rgb24": "rgb8", "bgr24": "bgr8"}
+    pictures = scene_pictures(encoding[picture_format], 96, 66, 10)
+    recipe = recipe_for(picture_format, lossless=True, codec=codec)
+    told = encode(tmp_path / "v.mp4", recipe, pictures, picture_format, threads=threads)
+    assert all(map(np.array_equal, decode(tmp_path / "v.mp4", told), pictures))
+
+
+# ---------------------------------------------------------------- colour
+
+TAGS = ("color_range", "color_space", "color_transfer", "color_primaries")
+
+
+@pytest.mark.parametrize("codec", LOSSY)
+@pytest.mark.parametrize("picture_format", ["rgb24", "bgr24", "gray", "bayer_rggb8"])
+def test_lossy_files_are_tagged_as_bt709_full_range(
+    codec: str, picture_format: str, tmp_path: Path
+) -> None:
+    encoding = {"rgb24": "rgb8", "bgr24": "bgr8", "gray": "mono8"}
+    pictures = scene_pictures(encoding.get(picture_format, "bayer_rggb8"), 64, 48, 3)
+    recipe = recipe_for("rgb24", lossless=False, codec=codec, crf=20)
+    encode(tmp_path / "v.mp4", recipe, pictures, picture_format)
+    found = ffprobe(tmp_path / "v.mp4", "-show_streams")["streams"]
+    assert len(found) == 1
+    assert [found[0].get(tag) for tag in TAGS] == ["pc", "bt709", "bt709", "bt709"]
+    assert found[0]["pix_fmt"] in ("yuv420p", "yuvj420p")
+
+
+@pytest.mark.parametrize(("codec", "picture_format"), LOSSLESS)
+def test_lossless_files_are_tagged_too(codec: str, picture_format: str, tmp_path: Path) -> None:
+    recipe = recipe_for(picture_format, lossless=True, codec=codec)
+    encode(tmp_path / "v.mp4", recipe, noise(picture_format, 16, 16, 3), picture_format)
+    found = ffprobe(tmp_path / "v.mp4", "-show_streams")["streams"][0]
+    matrix = "gbr" if picture_format in ("rgb24", "bgr24") else "bt709"
+    assert [found.get(tag) for tag in TAGS] == ["pc", matrix, "bt709", "bt709"]
+
+
+@pytest.mark.parametrize("codec", LOSSY)
+@pytest.mark.parametrize("picture_format", ["rgb24", "bgr24"])
+def test_flat_colours_keep_their_value(codec: str, picture_format: str, tmp_path: Path) -> None:
+    """A wrong matrix or range moves them by 10 to 40 levels."""
+    colours = [(0, 0, 0), (255, 255, 255), (255, 0, 0), (0, 255, 0), (0, 0, 255),
+               (250, 240, 10), (17, 130, 200), (128, 128, 128)]  # fmt: skip
+    pictures = [np.full((48, 64, 3), colour, np.uint8) for colour in colours]
+    recipe = recipe_for(picture_format, lossless=False, codec=codec, crf=10)
+    told = encode(tmp_path / "v.mp4", recipe, pictures, picture_format, gop=1)
+    for colour, pixels in zip(colours, decode(tmp_path / "v.mp4", told), strict=True):
+        assert np.abs(pixels.astype(int) - colour).max() <= 3
+
+
+@pytest.mark.parametrize("codec", LOSSY)
+@pytest.mark.parametrize(("width", "height"), [(96, 66), (97, 65), (64, 64)])
+def test_a_coloured_scene_stays_near(
+    codec: str, width: int, height: int, tmp_path: Path
+) -> None:
+    y, x = np.mgrid[:height, :width]
+    pictures = [
+        np.stack([x * 2 + n, y * 3, 255 - x - y - n], axis=-1).clip(0, 255).astype(np.uint8)
+        for n in range(6)
+    ]
+    recipe = recipe_for("rgb24", lossless=False, codec=codec, crf=12)
+    told = encode(tmp_path / "v.mp4", recipe, pictures, "rgb24")
+    for original, pixels in zip(pictures, decode(tmp_path / "v.mp4", told), strict=True):
+        assert pixels.shape == original.shape
+        assert psnr(original, pixels) > 38
+        bias = (pixels.astype(float) - original).mean(axis=(0, 1))
+        assert np.abs(bias).max() < 1.5
+
+
+@pytest.mark.parametrize("codec", LOSSY)
+@pytest.mark.parametrize(("width", "height"), [(64, 48), (65, 47)])
+def test_grey_is_the_luma_itself(codec: str, width: int, height: int, tmp_path: Path) -> None:
+    pictures = scene_pictures("mono8", width, height, 6)
+    recipe = recipe_for("gray", lossless=False, codec=codec, crf=12)
+    told = encode(tmp_path / "v.mp4", recipe, pictures, "gray")
+    decoded = decode(tmp_path / "v.mp4", told)
+    assert min(map(psnr, pictures, decoded)) > 38
+    with av.open(str(tmp_path / "v.mp4")) as container:
+        lumas = [np.asarray(plane_rows(frame)) for frame in container.decode(video=0)]
+    assert all(np.array_equal(a, b[:height, :width]) for a, b in zip(decoded, lumas, strict=True))
+
+
+def plane_rows(frame: av.VideoFrame) -> Pixels:
+    plane = frame.planes[0]
+    return np.frombuffer(bytes(plane), np.uint8).reshape(-1, plane.line_size)
+
+
+@pytest.mark.parametrize("codec", LOSSY)
+@pytest.mark.parametrize("encoding", BAYER)
+@pytest.mark.parametrize(("width", "height"), [(128, 96), (127, 95)])
+def test_a_demosaiced_video_gives_the_mosaic_back(
+    codec: str, encoding: str, width: int, height: int, tmp_path: Path
+) -> None:
+    """And shows the colours of the scene, not those of another pattern."""
+    y, x = np.mgrid[:height, :width].astype(float)
+    colour = np.stack([40 + x, 200 - y, 90 + 40 * np.sin(x / 20 + y / 25)], axis=-1)
+    colour = colour.clip(0, 255).astype(np.uint8)
+    mosaic = np.empty((height, width), np.uint8)
+    for place, letter in enumerate(encoding[6:10]):
+        rows, columns = slice(place // 2, None, 2), slice(place % 2, None, 2)
+        mosaic[rows, columns] = colour[rows, columns, "rgb".index(letter)]
+    recipe = recipe_for("rgb24", lossless=False, codec=codec, crf=12)
+    told = encode(tmp_path / "v.mp4", recipe, [mosaic] * 3, encoding)
+    for pixels in decode(tmp_path / "v.mp4", told):
+        assert pixels.shape == mosaic.shape
+        assert psnr(mosaic, pixels) > 35
+    shown = decode(tmp_path / "v.mp4", {**told, "picture_format": "rgb24"})[1]
+    inner = (slice(4, -4), slice(4, -4))
+    assert psnr(colour[inner], shown[inner]) > 33
+
+
+# ---------------------------------------------------------------- random access
+
+
+@pytest.mark.parametrize("gop", [1, 3, 60])
+@pytest.mark.parametrize("codec", [*(f"{c} lossless" for c in ("h264", "ffv1", "av1")), *LOSSY])
+def test_any_frame_is_found(codec: str, gop: int, tmp_path: Path) -> None:
+    """By its number, at whatever times the frames are shown."""
+    name, _, lossless = codec.partition(" ")
+    recipe = recipe_for("gray", lossless=bool(lossless), codec=name, crf=30)
+    rng = random.Random(gop)
+    gaps = [1, 2, 40_000, 33_333, 1_000_000_000, 999, 1] * 4
+    rng.shuffle(gaps)
+    ticks = [0, *itertools.accumulate(gaps)]
+    pictures = scene_pictures("mono8", 64, 48, len(ticks))
+    told = encode(tmp_path / "v.mp4", recipe, pictures, "gray", ticks=ticks, gop=gop)
+    decoded = decode(tmp_path / "v.mp4", told)
+    numbers = [*range(len(ticks)), *reversed(range(len(ticks)))]
+    numbers += rng.choices(range(len(ticks)), k=30)
+    with VideoDecoder(tmp_path / "v.mp4", **told, sequential=False) as decoder:
+        for number in numbers:
+            assert np.array_equal(decoder.picture(number), decoded[number]), number
+        mixed = [pixels.copy() for pixels in decoder.pictures()]
+        assert all(map(np.array_equal, mixed, decoded))
+        assert np.array_equal(decoder.picture(5), decoded[5])
+
+
+@pytest.mark.parametrize("codec", [*LOSSY, "h264 lossless", "ffv1 lossless"])
+def test_times_in_the_file_are_the_ticks(codec: str, tmp_path: Path) -> None:
+    """Strictly increasing from 0, in the order of coding, the last with a duration."""
+    name, _, lossless = codec.partition(" ")
+    recipe = recipe_for("gray", lossless=bool(lossless), codec=name, crf=30)
+    ticks = [0, 1, 2, 33_335, 1_000_033_335, 1_000_033_336]
+    encode(tmp_path / "v.mp4", recipe, scene_pictures("mono8", 64, 48, 6), "gray", ticks=ticks)
+    with av.open(str(tmp_path / "v.mp4")) as container:
+        stream = container.streams.video[0]
+        assert stream.time_base is not None
+        assert stream.time_base.denominator == 1_000_000
+        packets = [packet for packet in container.demux(stream) if packet.size]
+    assert [packet.pts for packet in packets] == ticks
+    assert [packet.dts for packet in packets] == ticks
+    assert all(packet.duration for packet in packets)
+    assert packets[0].is_keyframe
+
+
+@pytest.mark.parametrize("rate", [None, 0.0, 1e-9, 0.3, 29.97, 1e9])
+def test_any_rate_and_a_single_frame(rate: float | None, tmp_path: Path) -> None:
+    pixels = scene_pictures("mono8", 64, 48, 1)[0]
+    for lossless, codec in ((True, "h264"), (True, "ffv1"), (False, "av1"), (False, "h265")):
+        recipe = recipe_for("gray", lossless=lossless, codec=codec, crf=20)
+        encoder = VideoEncoder(
+            tmp_path / "v.mp4", recipe, picture_format="gray", width=64, height=48,
+            gop=60, threads=1, rate=rate,
+        )  # fmt: skip
+        encoder.write(pixels, 0)
+        encoder.close()
+        told = {"codec": codec, "coded_size": (64, 48), "frames": 1, "picture_format": "gray"}
+        assert len(decode(tmp_path / "v.mp4", {**told, "picture_size": (64, 48)})) == 1
+
+
+# ---------------------------------------------------------------- what is refused
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], list[Pixels]]:
+    path = tmp_path_factory.mktemp("video") / "plain.mp4"
+    pictures = scene_pictures("mono8", 32, 24, 8)
+    recipe = recipe_for("gray", lossless=True)
+    return path, encode(path, recipe, pictures, "gray", gop=4), pictures
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ({"codec": "av1"}, "codec-mismatch"),
+        ({"codec": "h265"}, "codec-mismatch"),
+        ({"codec": "who knows"}, "codec-mismatch"),
+        ({"coded_size": (32, 23)}, "geometry-mismatch"),
+        ({"coded_size": (24, 32)}, "geometry-mismatch"),
+        ({"frames": 7}, "frame-count"),
+        ({"frames": 9}, "frame-count"),
+        ({"picture_size": (33, 24)}, "geometry-mismatch"),
+        ({"picture_format": "gray16le"}, "codec-mismatch"),
+    ],
+)
+def test_a_video_that_is_not_what_its_sidecar_says(
+    change: dict[str, Any], code: str, plain: tuple[Path, dict[str, Any], list[Pixels]]
+) -> None:
+    path, told, _ = plain
+    with pytest.raises(VideoError) as caught, VideoDecoder(path, **{**told, **change}) as decoder:
+        list(decoder.pictures())
+    assert caught.value.code == code
+    with pytest.raises(VideoError), VideoDecoder(path, **{**told, **change}) as decoder:
+        decoder.picture(0)
+    assert caught.value.place.startswith(str(path))
+
+
+def test_files_that_are_no_videos(tmp_path: Path, plain: Any) -> None:
+    path, told, _ = plain
+    with pytest.raises(VideoError) as caught:
+        VideoDecoder(tmp_path / "none.mp4", **told)
+    assert caught.value.code == "file-missing"
+    junk = tmp_path / "junk.mp4"
+    for data in (b"", b"junk" * 100, path.read_bytes()[:40]):
+        junk.write_bytes(data)
+        with pytest.raises(VideoError) as caught:
+            VideoDecoder(junk, **told)
+        assert caught.value.code == "video-unreadable"
+
+
+def test_two_video_tracks_are_one_too_many(tmp_path: Path, plain: Any) -> None:
+    with av.open(str(tmp_path / "two.mp4"), "w") as container:
+        streams = [container.add_stream("libx264", rate=30) for _ in range(2)]
+        for stream in streams:
+            stream.width, stream.height, stream.pix_fmt = 32, 24, "gray"
+        for stream in streams:
+            frame = av.VideoFrame.from_ndarray(np.zeros((24, 32), np.uint8), format="gray")
+            container.mux([*stream.encode(frame), *stream.encode(None)])
+    with pytest.raises(VideoError, match="2 video tracks"):
+        VideoDecoder(tmp_path / "two.mp4", **plain[1])
+
+
+def read_all(path: Path, told: dict[str, Any]) -> list[Pixels] | VideoError:
+    try:
+        with VideoDecoder(path, **told) as decoder:
+            pictures = [pixels.copy() for pixels in decoder.pictures()]
+            for number in range(told["frames"]):
+                decoder.picture(number)
+            return pictures
+    except VideoError as error:
+        return error
+
+
+@given(data=st.data())
+@settings(max_examples=60, deadline=None)
+def test_a_damaged_video_is_a_clear_error_at_worst(
+    data: st.DataObject, plain: Any, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """That its samples are the right ones is for the digests to say."""
+    path, told, _ = plain
+    raw = bytearray(path.read_bytes())
+    if data.draw(st.booleans()):
+        del raw[data.draw(st.integers(0, len(raw) - 1)) :]
+    else:
+        for _ in range(data.draw(st.integers(1, 8))):
+            raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
+    damaged = tmp_path_factory.getbasetemp() / "damaged.mp4"
+    damaged.write_bytes(raw)
+    found = read_all(damaged, told)
+    if isinstance(found, VideoError):
+        assert "\n" not in str(found)
+        assert str(damaged) in str(found)
+    else:
+        assert len(found) == told["frames"]
+
+
+def test_presets_and_codecs() -> None:
+    check_preset(recipe_for("gray", lossless=True, preset="ultrafast"))
+    check_preset(recipe_for("rgb24", lossless=False, crf=20, preset="12"))
+    for codec in ("h264", "h265", "av1"):
+        with pytest.raises(OptionError, match="'warp'"):
+            check_preset(recipe_for("rgb24", lossless=False, codec=codec, crf=20, preset="warp"))
+    for codec, lossless in (("vp9", True), ("vp9", False), ("", True), ("ffv1", False)):
+        with pytest.raises(OptionError, match="Use "):
+            check_codec(codec, lossless=lossless)
+    for codec in CODECS:
+        able = any(exists(codec, picture_format, lossless=True) for picture_format in FORMATS)
+        if able:
+            check_codec(codec, lossless=True)
+    check_codec(None, lossless=True)
+
+
+@pytest.mark.parametrize("picture_format", FORMATS)
+def test_an_unable_codec_names_those_that_can(picture_format: str) -> None:
+    able = [codec for codec in CODECS if exists(codec, picture_format, lossless=True)]
+    for codec in set(CODECS) - set(able):
+        with pytest.raises(OptionError) as caught:
+            recipe_for(picture_format, lossless=True, codec=codec)
+        assert all(name in str(caught.value) for name in (codec, *able))
+
+
+def test_tool_versions() -> None:
+    assert tool_versions()["av"] == av.__version__
+
+
+# ---------------------------------------------------------------- single images
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (33, 21), (64, 48)])
+def test_a_png_keeps_every_sample(encoding: str, width: int, height: int) -> None:
+    pixels = scene_pictures(encoding, width, height, 1)[0]
+    image = Image.open(io.BytesIO(ImageFile(encoding, "png").encode(pixels)))
+    found = np.asarray(image).astype(pixels.dtype)
+    assert image.format == "PNG"
+    assert np.array_equal(found[..., ::-1] if encoding == "bgr8" else found, pixels)
+
+
+@pytest.mark.parametrize("encoding", [e for e in ENCODINGS if "16" not in e])
+def test_a_jpeg_is_for_looking_at(encoding: str) -> None:
+    pixels = scene_pictures(encoding, 64, 48, 1)[0]
+    image = Image.open(io.BytesIO(ImageFile(encoding, "jpeg").encode(pixels)))
+    assert image.format == "JPEG"
+    assert image.size == (64, 48)
+    shown = np.asarray(image.convert("RGB"))
+    if encoding == "mono8":
+        expected = np.repeat(pixels[..., None], 3, axis=2)
+    else:
+        expected = scene_pictures("rgb8", 64, 48, 1)[0]
+    inner = (slice(4, -4), slice(4, -4))
+    assert np.abs(shown[inner].astype(float) - expected[inner]).mean() < (
+        6 if encoding in BAYER else 3
+    )
+
+
+@pytest.mark.parametrize("encoding", ["mono16", "16UC1"])
+def test_a_jpeg_cannot_hold_16_bits(encoding: str) -> None:
+    with pytest.raises(ValueError, match="use png"):
+        ImageFile(encoding, "jpeg")
