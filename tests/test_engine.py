@@ -14,13 +14,13 @@ from mp4ds.engine import Workers
 COUNTS = [0, 1, 2, 5]
 
 
-class Broken(Exception):
+class BrokenError(Exception):
     """A job's own error."""
 
 
 def fail(message: str = "broken") -> Callable[[], None]:
     def job() -> None:
-        raise Broken(message)
+        raise BrokenError(message)
 
     return job
 
@@ -64,7 +64,7 @@ def test_without_threads_a_job_runs_at_once() -> None:
     with Workers(0) as workers:
         workers.submit(0, lambda: seen.append(threading.get_ident()))
         assert seen == [threading.get_ident()]
-        with pytest.raises(Broken):
+        with pytest.raises(BrokenError):
             workers.submit(0, fail())
 
 
@@ -99,7 +99,7 @@ def test_memory_is_bounded(count: int) -> None:
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_the_first_error_reaches_the_caller(count: int) -> None:
     before, ran = threads(), []
-    with pytest.raises(Broken, match="first"), Workers(count) as workers:
+    with pytest.raises(BrokenError, match="first"), Workers(count) as workers:  # noqa: PT012
         workers.submit(0, fail("first"))
         for number in range(1000):
             time.sleep(0.001)
@@ -110,7 +110,7 @@ def test_the_first_error_reaches_the_caller(count: int) -> None:
 
 
 def test_an_error_of_the_last_job_is_raised_at_the_end() -> None:
-    with pytest.raises(Broken), Workers(2) as workers:
+    with pytest.raises(BrokenError), Workers(2) as workers:
         workers.submit(1, fail())
 
 
@@ -131,12 +131,12 @@ def test_an_error_of_the_caller_drops_what_has_not_begun() -> None:
         go.wait(20)
         ran.append("first")
 
-    with pytest.raises(Broken, match="the caller's"), Workers(1) as workers:
+    with pytest.raises(BrokenError, match="the caller's"), Workers(1) as workers:  # noqa: PT012
         workers.submit(0, first)
         workers.submit(0, lambda: ran.append("second"))
         started.wait(20)
         threading.Timer(0.2, go.set).start()
-        raise Broken("the caller's")
+        raise BrokenError("the caller's")
     assert ran == ["first"]
     assert threads() <= before + 1  # the timer
 
@@ -149,9 +149,9 @@ def test_the_callers_error_is_not_replaced_by_a_jobs(wait: float) -> None:
     def late() -> None:
         started.set()
         time.sleep(wait)
-        raise Broken("the job's")
+        raise BrokenError("the job's")
 
-    with pytest.raises(Broken, match="the caller's"), Workers(1) as workers:
+    with pytest.raises(BrokenError, match="the caller's"), Workers(1) as workers:  # noqa: PT012
         workers.submit(0, late)
         started.wait(20)
-        raise Broken("the caller's")
+        raise BrokenError("the caller's")

@@ -751,6 +751,10 @@ def h264(size: tuple[int, int], frames: int) -> bytes:
     return b"".join(bytes(packet) for packet in [*packets, *context.encode(None)])
 
 
+def put_bytes(path: Path, data: bytes) -> None:
+    path.write_bytes(data)
+
+
 def video_that_changes(path: Path, *parts: bytes) -> None:
     """A video of bare streams, one after the other."""
     with (
@@ -777,9 +781,10 @@ OTHER_VIDEOS: dict[str, tuple[Callable[[Path], None], set[str]]] = {
     "very-wide": (lambda path: video(path, size=(16384, 16)), {"geometry-mismatch"}),
     "matroska": (lambda path: video(path, container="matroska"), {"video-unreadable"}),
     "avi": (lambda path: video(path, container="avi"), {"video-unreadable"}),
-    "png": (lambda path: video(path, "png", "gray", container="image2"), {"video-unreadable"}),
-    "empty": (lambda path: path.write_bytes(b"") and None, {"frame-count", "video-unreadable"}),
-    "text": (lambda path: path.write_text("hello\n" * 99) and None, {"video-unreadable"}),
+    "nut": (lambda path: video(path, "ffv1", container="nut"), {"video-unreadable"}),
+    "h264": (lambda path: put_bytes(path, h264((WIDTH, HEIGHT), FRAMES)), {"video-unreadable"}),
+    "empty": (lambda path: put_bytes(path, b""), {"frame-count", "video-unreadable"}),
+    "text": (lambda path: put_bytes(path, b"hello\n" * 99), {"video-unreadable"}),
     "half": (lambda path: os.truncate(path, path.stat().st_size // 2), {"video-unreadable"}),
     "missing": (lambda path: path.unlink(), {"file-missing"}),
 }
@@ -929,8 +934,10 @@ ODD_VALUES: list[Any] = [
 def _leaves(node: Any, place: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
     if place:
         yield place
-    children = node.items() if isinstance(node, dict) else enumerate(node)
-    for key, child in children if isinstance(node, (dict, list)) else ():
+    children: Any = node.items() if isinstance(node, dict) else ()
+    if isinstance(node, list):
+        children = enumerate(node)
+    for key, child in children:
         yield from _leaves(child, (*place, key))
 
 

@@ -61,7 +61,7 @@ def test_what_goes_wrong_leaves_nothing(
 ) -> None:
     if old:
         make(target, old, "old")
-    with (
+    with (  # noqa: PT012 - the body is what is tested
         pytest.raises(type(error)) as caught,
         staged(target, force=bool(old), replaceable=anything) as path,
     ):
@@ -119,9 +119,7 @@ def test_the_folder_must_exist(target: Path) -> None:
         check_target(target / "deep", force=False, replaceable=anything)
 
 
-def test_a_folder_that_may_not_be_written(
-    target: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_that_may_not_be_written(target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> str:
         raise PermissionError(errno.EACCES, "Permission denied")
 
@@ -142,7 +140,7 @@ def test_any_name_that_the_disk_takes(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.EROFS])
 def test_a_disk_that_refuses(code: int, target: Path) -> None:
-    with (
+    with (  # noqa: PT012 - the body is what is tested
         pytest.raises(WriteError, match="the unfinished output was removed") as caught,
         staged(target, force=False, replaceable=nothing) as path,
     ):
@@ -154,7 +152,11 @@ def test_a_disk_that_refuses(code: int, target: Path) -> None:
 
 
 def test_other_errors_keep_their_class(target: Path) -> None:
-    for error in (FileNotFoundError(errno.ENOENT, "x"), WriteError(target, OSError("x")), OSError()):
+    for error in (
+        FileNotFoundError(errno.ENOENT, "x"),
+        WriteError(target, OSError("x")),
+        OSError(),
+    ):
         assert as_write_error(error, target) is error
     assert isinstance(as_write_error(OSError(errno.ENOSPC, "full"), target), WriteError)
 
@@ -184,7 +186,7 @@ def test_a_move_that_fails_brings_the_old_back(
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
 def test_what_appeared_meanwhile_is_not_replaced(kind: str, target: Path) -> None:
-    with (
+    with (  # noqa: PT012 - the body is what is tested
         pytest.raises(TargetExistsError),
         staged(target, force=False, replaceable=nothing) as path,
     ):

@@ -253,7 +253,8 @@ def test_any_channel_returns_through_the_file(
 
 SIDES = [0, -1, 16385, 2**70, 1.0, "8", True, None]
 BAD_NAMES = ["", ".", "..", "../x.mp4", "/etc/passwd", "a/b.mp4", "a\\b.mp4", "C:x", ".hidden",
-             "a\0b", "a\n", "a b", "\u00e4.mp4", "-x.mp4", "_x", "x" * 129, 5, None, ["a"]]  # fmt: skip
+             "a\0b", "a\n", "a b", "\u00e4.mp4", "-x.mp4", "_x", "x" * 129, 5,
+             None, ["a"]]  # fmt: skip
 REFUSED: dict[str, list[tuple[str, Any]]] = {
     "stream": [
         *(("frames", value) for value in (0, -1, 10**8 + 1, 2**80, 1.0, "3", True, None, ...)),
@@ -362,6 +363,8 @@ ONLY_MODEL = {
     ("channel.schema.base64", "AAAA"),
     ("digests", ...),
 }
+
+
 @pytest.mark.parametrize(("kind", "place", "value"), CASES)
 def test_the_released_schema_refuses_it_too(kind: str, place: str, value: Any) -> None:
     # JSON Schema takes 1.0 for an integer, and null where the model has it for "absent"
@@ -484,7 +487,7 @@ def test_base64_that_is_none(text: str) -> None:
 def test_bad_digests(values: str, count: int) -> None:
     model = StreamSidecar.model_validate(edited(stream(), "digests.values", values))
     assert model.digests is not None
-    with pytest.raises(ValueError, match="digest|hexadecimal"):
+    with pytest.raises(ValueError, match=r"digest|hexadecimal"):
         model.digests.decode(count)
 
 

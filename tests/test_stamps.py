@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 
 import numpy as np
@@ -90,7 +91,7 @@ def test_what_others_write_is_read(values: list[int], data: st.DataObject) -> No
     """Another step, other runs, other line breaks: the writer is free."""
     step = data.draw(Int64)
     tokens = []
-    for before, after in zip(values, values[1:]):  # noqa: B905 - one shorter
+    for before, after in itertools.pairwise(values):
         residual = (after - before - step + 2**63) % 2**64 - 2**63
         tokens.append(f"{residual}*1" if data.draw(st.booleans()) else str(residual))
     if tokens:

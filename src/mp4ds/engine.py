@@ -9,6 +9,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from types import TracebackType
 
 _DEPTH = 2
@@ -95,5 +96,5 @@ class Workers:
             self.join()
             return
         self._stopped.set()
-        self._error = None
-        self.join()
+        with suppress(BaseException):  # the error that led here is the one to report
+            self.join()

@@ -49,9 +49,9 @@ def staged(target: Path, *, force: bool, replaceable: Callable[[Path], bool]) ->
         try:
             yield path
             _sync(path)
+            _move_into_place(path, target, folder, force=force)
         except OSError as error:
             raise as_write_error(error, target) from error
-        _move_into_place(path, target, folder)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -104,9 +104,11 @@ def _sync(path: Path) -> None:
             os.fsync(stream.fileno())
 
 
-def _move_into_place(path: Path, target: Path, folder: Path) -> None:
+def _move_into_place(path: Path, target: Path, folder: Path, *, force: bool) -> None:
     old = folder / "replaced"
     replaced = os.path.lexists(target)
+    if replaced and not force:
+        raise TargetExistsError(target)  # it appeared meanwhile
     if replaced:
         target.rename(old)
     try:

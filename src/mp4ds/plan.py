@@ -66,7 +66,7 @@ def parse_quality(text: str) -> Quality:
     """
     if text in ("lossless", "visual"):
         return Quality(text)
-    match = re.fullmatch(r"crf=(\d{1,2})", text)
+    match = re.fullmatch(r"crf=([0-9]{1,2})", text)
     if match and int(match.group(1)) <= 63:
         return Quality("crf", int(match.group(1)))
     raise OptionError(

@@ -24,7 +24,7 @@ MAX_DEPTH = 32
 
 _CHECKSUM = re.compile(rb'(?:\A|\n)checksum: "xxh64:([0-9a-f]{16})"\n\Z')
 _COLUMN = re.compile(rb"^( +)values: \|\n", re.MULTILINE)
-_PLACEHOLDER = "mp4ds column "
+_COLUMN_LINE = re.compile(r"^ *values: [|]", re.MULTILINE)
 
 _Parser: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _BaseDumper: type[Any] = yaml.SafeDumper
@@ -51,7 +51,8 @@ class _Dumper(_BaseDumper):  # type: ignore[misc]
 
 def _represent_str(dumper: _Dumper, text: str) -> Any:
     plain_block = bool(re.fullmatch(r"[^\s][\n\x20-\x7e\xa0-\u2027\u2030-\ud7ff]*", text))
-    plain_block &= "\n" in text
+    # a text that ends open, or shows the first line of a column, is quoted: readers may slice
+    plain_block &= "\n" in text and not text.endswith("\n\n") and not _COLUMN_LINE.search(text)
     style = "|" if plain_block else None
     if not plain_block and _needs_quotes(text):
         style = '"'
@@ -127,11 +128,14 @@ def load(data: bytes, place: str) -> dict[str, Any]:
                 "after an intended edit, remove that line",
             )
         data = body
-    structure, columns = _slice_columns(data)
+    mark = "mp4ds column "
+    while mark.encode() in data:
+        mark = f"_{mark}"
+    structure, columns = _slice_columns(data, mark)
     if len(structure) > MAX_STRUCTURE_BYTES:
         raise FormatError("yaml-invalid", place, "has too much structure outside of its columns")
     document = _parse(structure, place)
-    if columns and _restore_columns(document, columns) != len(columns):
+    if columns and _restore_columns(document, columns, mark) != len(columns):
         document = _parse(data, place)  # what looked like a column stood inside of a text
     return document
 
@@ -221,7 +225,7 @@ def _scalar(event: Any) -> Any:
     return value
 
 
-def _slice_columns(data: bytes) -> tuple[bytes, list[str]]:
+def _slice_columns(data: bytes, mark: str) -> tuple[bytes, list[str]]:
     """Cut the literal blocks of columns out, leaving a numbered placeholder for each."""
     pieces: list[bytes] = []
     columns: list[str] = []
@@ -231,12 +235,16 @@ def _slice_columns(data: bytes) -> tuple[bytes, list[str]]:
         end_match = re.compile(rb"\n(?!" + indent + rb")").search(data, match.end() - 1)
         end = end_match.end() if end_match else len(data)
         block = data[match.end() : end]
-        if not block.isascii():
+        if (
+            not block.isascii()
+            or not block.startswith(indent)
+            or block[len(indent) :][:1].isspace()
+        ):
             return data, []  # not a column as we write it: let the parser speak
         pieces += [
             data[done : match.end()],
             indent,
-            b"%s%d\n" % (_PLACEHOLDER.encode(), len(columns)),
+            b"%s%d\n" % (mark.encode(), len(columns)),
         ]
         columns.append(block[len(indent) :].replace(b"\n" + indent, b"\n").decode("ascii"))
         done = end
@@ -244,17 +252,17 @@ def _slice_columns(data: bytes) -> tuple[bytes, list[str]]:
     return b"".join(pieces), columns
 
 
-def _restore_columns(node: Any, columns: list[str]) -> int:
+def _restore_columns(node: Any, columns: list[str], mark: str) -> int:
     """Put the columns back in place of their placeholders; returns how many there were."""
     restored = 0
     if isinstance(node, dict):
         values = node.get("values")
-        if isinstance(values, str) and values.startswith(_PLACEHOLDER):
-            number = values[len(_PLACEHOLDER) :].strip()
+        if isinstance(values, str) and values.startswith(mark):
+            number = values[len(mark) :].strip()
             if number.isdigit() and int(number) < len(columns):
                 node["values"] = columns[int(number)]
                 restored += 1
-        return restored + sum(_restore_columns(child, columns) for child in node.values())
+        return restored + sum(_restore_columns(child, columns, mark) for child in node.values())
     if isinstance(node, list):
-        return sum(_restore_columns(child, columns) for child in node)
+        return sum(_restore_columns(child, columns, mark) for child in node)
     return 0

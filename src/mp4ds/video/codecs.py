@@ -52,7 +52,6 @@ _LOSSLESS: dict[tuple[str, str], _Coding] = {
     ("h264", "gray"): _Coding("libx264", "gray", {**_X264, "qp": "0"}, "veryfast"),
     ("h264", "rgb24"): _Coding("libx264rgb", "rgb24", {**_X264, "qp": "0"}, "veryfast"),
     ("h264", "bgr24"): _Coding("libx264rgb", "bgr24", {**_X264, "qp": "0"}, "veryfast"),
-    ("av1", "gray"): _Coding("libsvtav1", "yuv420p", {"svtav1-params": "lossless=1"}, "12"),
     ("ffv1", "gray"): _Coding("ffv1", "gray", _FFV1_8BIT),
     ("ffv1", "gray16le"): _Coding("ffv1", "gray16le", _FFV1),
     ("ffv1", "rgb24"): _Coding("ffv1", "bgr0", _FFV1_8BIT),

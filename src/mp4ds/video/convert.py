@@ -101,7 +101,12 @@ def _gray_to_yuv(picture: Pixels, pixel_format: str) -> av.VideoFrame:
 
 
 def frame_to_picture(
-    frame: av.VideoFrame, picture_format: str, width: int, height: int, converter: Converter
+    frame: av.VideoFrame,
+    picture_format: str,
+    width: int,
+    height: int,
+    converter: Converter,
+    place: str,
 ) -> Pixels:
     """The picture in a decoded frame; a view of it where possible.
 
@@ -111,6 +116,7 @@ def frame_to_picture(
         width: Columns of the picture; padding of the video beyond is cut off.
         height: Rows of the picture.
         converter: The stream's own.
+        place: The video, for errors.
 
     Raises:
         VideoError: The frame is smaller than the picture, or of another kind.
@@ -118,11 +124,11 @@ def frame_to_picture(
     if frame.width < width or frame.height < height:
         raise VideoError(
             "geometry-mismatch",
-            "video",
+            place,
             f"has frames of {frame.width}x{frame.height} where {width}x{height} are due",
         )
     if picture_format in ("gray", "gray16le"):
-        return _plane(frame, picture_format)[:height, :width]
+        return _plane(frame, picture_format, place)[:height, :width]
     if picture_format.startswith("bayer_"):
         return _sample_mosaic(_packed(frame, "rgb24", converter), picture_format, width, height)
     return _packed(frame, picture_format, converter)[:height, :width]
@@ -134,12 +140,12 @@ def _rows(frame: av.VideoFrame, index: int) -> NDArray[np.uint8]:
     return np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
 
 
-def _plane(frame: av.VideoFrame, picture_format: str) -> Pixels:
+def _plane(frame: av.VideoFrame, picture_format: str, place: str) -> Pixels:
     expected = ("gray16le",) if picture_format == "gray16le" else ("gray", *_YUV)
     if frame.format.name not in expected:
         raise VideoError(
             "codec-mismatch",
-            "video",
+            place,
             f"decodes to {frame.format.name} where {' or '.join(expected)} is due",
         )
     rows = _rows(frame, 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -59,7 +60,7 @@ class VideoDecoder:
         if not path.is_file():
             raise VideoError("file-missing", path, "does not exist")
         try:
-            self._container = av.open(str(path), "r")
+            self._container = av.open(str(path), "r", metadata_errors="ignore")
         except (FFmpegError, OSError) as error:
             raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
         try:
@@ -74,7 +75,9 @@ class VideoDecoder:
         if len(self._container.streams.video) != 1:
             count = len(self._container.streams.video)
             raise VideoError("video-unreadable", self._path, f"has {count} video tracks, not one")
-        context = self._container.streams.video[0].codec_context
+        context: Any = self._container.streams.video[0].codec_context
+        if context is None or context.codec is None:
+            raise VideoError("video-unreadable", self._path, "has a video track of no known codec")
         expected = _CODEC_NAMES.get(codec)
         found = context.codec.canonical_name
         if expected is None or found != expected:
@@ -101,7 +104,7 @@ class VideoDecoder:
             VideoError: ``decode-failed`` with the frame's number, or ``frame-count`` when the
                 video ends early or goes on.
         """
-        self._container.seek(0)
+        self._seek(0, 0)
         number = 0
         for frame in self._decoded(0):
             if number == self._frames:
@@ -125,16 +128,21 @@ class VideoDecoder:
             VideoError: It cannot be decoded.
         """
         tick = int(self._presentation_ticks()[index])
-        try:
-            self._container.seek(tick, stream=self._stream)
-        except (FFmpegError, OSError) as error:
-            raise VideoError("decode-failed", self._path, f"frame {index}: {error}") from None
+        self._seek(tick, index)
         for frame in self._decoded(index):
             if frame.pts is not None and frame.pts >= tick:
                 if frame.pts > tick:
                     break
                 return self._picture(frame)
         raise VideoError("decode-failed", self._path, f"frame {index} was not found")
+
+    def _seek(self, tick: int, index: int) -> None:
+        try:
+            self._container.seek(tick, stream=self._stream)
+        except (FFmpegError, OSError) as error:
+            raise VideoError(
+                "decode-failed", self._path, f"frame {index} cannot be sought: {error}"
+            ) from None
 
     def _presentation_ticks(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
         if self._ticks is None:
@@ -162,7 +170,9 @@ class VideoDecoder:
         if frame.is_corrupt:
             raise VideoError("decode-failed", self._path, "a frame is marked as corrupt")
         width, height = self._picture_size
-        return frame_to_picture(frame, self._picture_format, width, height, self._converter)
+        return frame_to_picture(
+            frame, self._picture_format, width, height, self._converter, str(self._path)
+        )
 
     def close(self) -> None:
         """Close the file."""

@@ -18,7 +18,7 @@ from mp4ds.video.codecs import Recipe
 from mp4ds.video.convert import BT709, FULL_RANGE, Converter, picture_to_frame
 
 _TIME_BASE = Fraction(1, TIMESCALE)
-_LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.01, 30.0, 1000.0  # Hz
+_LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.1, 30.0, 240.0  # Hz, what every encoder takes
 
 
 class EncoderRefusedError(Mp4dsError):
@@ -34,7 +34,7 @@ def check_preset(recipe: Recipe) -> None:
     context: Any = av.CodecContext.create(recipe.encoder, "w")
     context.width = context.height = 256
     context.pix_fmt = recipe.pixel_format
-    context.time_base = _TIME_BASE
+    context.time_base, context.framerate = _TIME_BASE, Fraction(_USUAL_RATE)
     context.options = dict(recipe.options)
     try:
         context.open()
@@ -123,8 +123,7 @@ class VideoEncoder:
         if self.recipe.pixel_format in ("bgr0", "rgb24", "bgr24"):
             context.colorspace = 0  # RGB has no matrix
         if self.recipe.encoder == "libsvtav1":
-            params = ":".join(filter(None, (self.options.get("svtav1-params"), f"lp={threads}")))
-            context.options = {**context.options, "svtav1-params": params}
+            context.options = {**context.options, "svtav1-params": f"lp={threads}"}
         context.open()
         self._stream = stream
 

@@ -1,0 +1,490 @@
+"""A dataset is whole or visibly not: whatever is damaged is found, and never unpacked as if whole."""
+
+from __future__ import annotations
+
+import hashlib
+import random
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mp4ds
+from mp4ds import FormatError, Mp4dsError, SourceError, yamlio
+from scenes import Scene
+from sources import SOURCES, load_tool, scene
+
+STEM = "cam_image_raw"
+FILES = (f"{STEM}.mp4", f"{STEM}.yaml", "dataset.yaml", "messages.mcap")
+TARGETS = {"bag-none": "bag", "mcap-ros2-zstd": "mcap", "rosbag2-sqlite3-v9": "rosbag2"}
+POSITIONS = 25
+DAMAGED_YAML = {
+    "checksum-mismatch",
+    "yaml-invalid",
+    "schema-invalid",
+    "model-invalid",
+    "version-unsupported",
+    "kind-unknown",
+}
+
+CHANGED_FILE = {"size-mismatch", "hash-mismatch"}
+
+compare = load_tool("compare").compare
+Document = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[list[Path], Path]]:
+    """Recordings and their lossless datasets, made once; not to be changed."""
+    made: dict[str, tuple[list[Path], Path]] = {}
+
+    def make(source: str) -> tuple[list[Path], Path]:
+        if source not in made:
+            folder = tmp_path_factory.mktemp(source)
+            (folder / "source").mkdir()
+            paths = SOURCES[source](folder / "source", scene("bayer_rggb8"))
+            mp4ds.pack(paths, folder / "dataset")
+            made[source] = paths, folder / "dataset"
+        return made[source]
+
+    return make
+
+
+@pytest.fixture
+def dataset(packed: Callable[[str], tuple[list[Path], Path]], tmp_path: Path) -> Path:
+    """A dataset of a bag, to be damaged."""
+    return Path(shutil.copytree(packed("bag-none")[1], tmp_path / "dataset"))
+
+
+@pytest.fixture
+def two_cameras(tmp_path: Path) -> Path:
+    """A dataset of two streams, to be damaged."""
+    left = scene("mono8", with_info=False).messages
+    right = scene("rgb8", with_info=False, frames=6).messages
+    messages = [replace(m, topic=f"/left{m.topic}") for m in left]
+    messages += [replace(m, topic=f"/right{m.topic}") for m in right]
+    messages.sort(key=lambda message: message.log_time)
+    paths = SOURCES["bag-none"](tmp_path, Scene(messages))
+    mp4ds.pack(paths, tmp_path / "dataset")
+    return tmp_path / "dataset"
+
+
+def codes(path: Path, *, deep: bool = True) -> list[str]:
+    return sorted({problem.code for problem in mp4ds.validate(path, deep=deep)})
+
+
+def places(path: Path, code: str) -> str:
+    """Where the problems of a code are, as text."""
+    return "\n".join(p.place for p in mp4ds.validate(path, deep=True) if p.code == code)
+
+
+def digest(path: Path) -> Document:
+    data = path.read_bytes()
+    return {"name": path.name, "size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+
+
+def changed(path: Path, change: Callable[[Document], None]) -> None:
+    """Change a file, so that its checksum fits again."""
+    document = yamlio.load(path.read_bytes(), str(path))
+    change(document)
+    path.write_bytes(yamlio.dump(document))
+
+
+def agreed(folder: Path) -> None:
+    """Let the manifest say what the files are now, so that only the contradiction is left."""
+
+    def change(manifest: Document) -> None:
+        manifest["files"] = [digest(folder / entry["name"]) for entry in manifest["files"]]
+
+    changed(folder / "dataset.yaml", change)
+
+
+def unpacked(folder: Path, to: str, output: Path) -> str:
+    """Unpack; returns the error's text, which may only be one that mp4ds raises on purpose."""
+    before = sorted(output.parent.iterdir())
+    try:
+        mp4ds.unpack(folder, to, output)
+    except Mp4dsError as error:
+        assert sorted(output.parent.iterdir()) == before
+        return str(error)
+    return ""
+
+
+def refused(folder: Path, to: str = "mcap") -> str:
+    """The error of unpacking, which must fail."""
+    text = unpacked(folder, to, folder.parent / "again")
+    assert text, "it was unpacked"
+    return text
+
+
+# ---------------------------------------------------------------- single bits
+
+
+def flips(data: bytes, seed: str) -> Iterator[tuple[int, bytes]]:
+    """The file with one bit changed, at chosen places, the first and the last among them."""
+    rng = random.Random(seed)
+    chosen = {0, 1, len(data) - 2, len(data) - 1}
+    chosen |= {rng.randrange(len(data)) for _ in range(POSITIONS)}
+    for position in sorted(chosen):
+        damaged = bytearray(data)
+        damaged[position] ^= 1 << rng.randrange(8)
+        yield position, bytes(damaged)
+
+
+def found_in(folder: Path, name: str) -> str:
+    """What is wrong with the answer of validate to a damaged file; empty if nothing is."""
+    try:
+        found = set(codes(folder))
+    except Mp4dsError as error:
+        return f"validate raised {error!r}"
+    if not found:
+        return "validate found no problem"
+    if name == "dataset.yaml":
+        return "" if found & DAMAGED_YAML else f"validate found {found}"
+    if "hash-mismatch" not in found:
+        return f"validate found {found} and no hash-mismatch"
+    if name.endswith(".yaml") and not found & DAMAGED_YAML:
+        return f"validate found only {found}"
+    return ""
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("source", TARGETS)
+def test_a_flipped_bit_is_found(
+    source: str,
+    name: str,
+    packed: Callable[[str], tuple[list[Path], Path]],
+    tmp_path: Path,
+) -> None:
+    recording, good = packed(source)
+    folder = shutil.copytree(good, tmp_path / "dataset")
+    (tmp_path / "out").mkdir()
+    output = tmp_path / "out" / "again"
+    wrong = []
+    for position, data in flips((good / name).read_bytes(), f"{source} {name}"):
+        (folder / name).write_bytes(data)
+        if problem := found_in(folder, name):
+            wrong.append(f"byte {position}: {problem}")
+        if not unpacked(folder, TARGETS[source], output):
+            wrong += [f"byte {position}: unpacked: {text}" for text in compare(recording, output)]
+            shutil.rmtree(output) if output.is_dir() else output.unlink()
+    assert wrong == []
+
+
+@pytest.mark.parametrize("what", [b"name: cam", b"operator", b"offered_qos_profiles"])
+def test_flipped_bits_of_metadata_are_found(
+    what: bytes, packed: Callable[[str], tuple[list[Path], Path]], tmp_path: Path
+) -> None:
+    # MCAP has no checksum of its own for metadata and schema records
+    recording, good = packed("rosbag2-sqlite3-v9")
+    data = (good / "messages.mcap").read_bytes()
+    start = data.find(what)
+    if start < 0:
+        pytest.skip(f"{what.decode()} is not in messages.mcap as plain text")
+    folder = shutil.copytree(good, tmp_path / "dataset")
+    wrong = []
+    for position in range(start, start + len(what)):
+        damaged = bytearray(data)
+        damaged[position] ^= 1
+        (folder / "messages.mcap").write_bytes(damaged)
+        output = tmp_path / f"again{position}"
+        if not unpacked(folder, "rosbag2", output):
+            wrong += compare(recording, output)
+    assert wrong == []
+
+
+@pytest.mark.parametrize("text", [b"Lavf", b"VideoHandler", b"moov", b"mdat", b"ftyp", b"stsz"])
+def test_flipped_bits_of_the_container_are_found(text: bytes, dataset: Path) -> None:
+    path = dataset / f"{STEM}.mp4"
+    data = bytearray(path.read_bytes())
+    data[data.index(text)] ^= 0x80
+    path.write_bytes(data)
+    assert "hash-mismatch" in codes(dataset)
+    unpacked(dataset, "bag", dataset.parent / "again.bag")
+
+
+@pytest.mark.parametrize("name", FILES[:2])
+def test_a_flipped_bit_of_a_pair_alone_is_found(name: str, dataset: Path) -> None:
+    pair = dataset.parent / "pair"
+    pair.mkdir()
+    for part in FILES[:2]:
+        shutil.copy(dataset / part, pair)
+    wrong = []
+    for position, data in flips((dataset / name).read_bytes(), name):
+        (pair / name).write_bytes(data)
+        found = set(codes(pair / FILES[1]))
+        if not found & (DAMAGED_YAML if name.endswith(".yaml") else {"hash-mismatch"}):
+            wrong.append(f"byte {position}: {found}")
+    assert wrong == []
+
+
+def test_shallow_validation_finds_a_flipped_bit_of_the_sidecar(dataset: Path) -> None:
+    path = dataset / f"{STEM}.yaml"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    assert codes(dataset, deep=False) == ["checksum-mismatch", "hash-mismatch"]
+
+
+# ---------------------------------------------------------------- whole files
+
+
+@pytest.mark.parametrize("name", [FILES[0], FILES[1], FILES[3]])
+def test_a_file_that_is_missing(name: str, dataset: Path) -> None:
+    (dataset / name).unlink()
+    assert "file-missing" in codes(dataset)
+    assert "file-missing" in codes(dataset, deep=False)
+    assert name in places(dataset, "file-missing")
+    assert name in refused(dataset)
+
+
+def test_a_manifest_that_is_missing(dataset: Path) -> None:
+    (dataset / "dataset.yaml").unlink()
+    with pytest.raises(SourceError, match="dataset"):
+        mp4ds.validate(dataset)
+    assert "dataset" in refused(dataset)
+
+
+@pytest.mark.parametrize("name", ["extra.mp4", "extra.yaml", "extra.mcap"])
+def test_a_file_that_is_not_listed(name: str, dataset: Path) -> None:
+    shutil.copy(dataset / f"{STEM}{Path(name).suffix}" if "mcap" not in name else
+                dataset / "messages.mcap", dataset / name)  # fmt: skip
+    assert codes(dataset) == ["file-unlisted"]
+    assert name in places(dataset, "file-unlisted")
+
+
+def test_other_files_are_nobodys_business(dataset: Path) -> None:
+    (dataset / "notes.txt").write_text("windy")
+    (dataset / ".DS_Store").write_bytes(b"\0")
+    (dataset / "thumbnails").mkdir()
+    assert codes(dataset) == []
+
+
+def swap(folder: Path, suffix: str) -> None:
+    left, right = (folder / f"{side}_cam_image_raw{suffix}" for side in ("left", "right"))
+    first, second = left.read_bytes(), right.read_bytes()
+    left.write_bytes(second)
+    right.write_bytes(first)
+
+
+def test_two_sidecars_that_were_swapped(two_cameras: Path) -> None:
+    swap(two_cameras, ".yaml")
+    found = codes(two_cameras)
+    assert CHANGED_FILE & set(found)
+    assert "manifest-inconsistent" in found
+
+
+def test_two_videos_that_were_swapped(two_cameras: Path) -> None:
+    swap(two_cameras, ".mp4")
+    found = codes(two_cameras)
+    assert CHANGED_FILE & set(found)
+    assert {"codec-mismatch", "geometry-mismatch", "frame-count"} & set(found)
+    refused(two_cameras)
+
+
+def test_swapped_sidecars_whose_manifest_was_made_to_agree(two_cameras: Path) -> None:
+    swap(two_cameras, ".yaml")
+    agreed(two_cameras)
+    assert codes(two_cameras) == ["manifest-inconsistent"]
+
+
+@pytest.mark.parametrize("length", [0, 1, 40, 0.3, 0.9, -1])
+def test_a_video_that_was_cut_short(length: float, dataset: Path) -> None:
+    path = dataset / f"{STEM}.mp4"
+    data = path.read_bytes()
+    end = int(length * len(data)) if 0 < length < 1 else int(length) % len(data)
+    path.write_bytes(data[:end])
+    for deep in (False, True):
+        assert "size-mismatch" in codes(dataset, deep=deep)
+        assert "size-mismatch" in codes(dataset / f"{STEM}.yaml", deep=deep)
+    if end < len(data) - 1:
+        refused(dataset)
+
+
+@pytest.mark.parametrize("length", [0, 1, 40, 0.3, 0.9, -1])
+def test_messages_that_were_cut_short(length: float, dataset: Path) -> None:
+    path = dataset / "messages.mcap"
+    data = path.read_bytes()
+    end = int(length * len(data)) if 0 < length < 1 else int(length) % len(data)
+    path.write_bytes(data[:end])
+    assert codes(dataset) == ["size-mismatch"]
+    assert "messages.mcap" in refused(dataset)
+
+
+def test_messages_of_another_dataset(
+    dataset: Path, packed: Callable[[str], tuple[list[Path], Path]], tmp_path: Path
+) -> None:
+    (tmp_path / "other").mkdir()
+    other = SOURCES["bag-none"](tmp_path / "other", scene("mono8", frames=4))
+    mp4ds.pack(other, tmp_path / "other" / "dataset")
+    shutil.copy(tmp_path / "other" / "dataset" / "messages.mcap", dataset)
+    assert CHANGED_FILE & set(codes(dataset))
+    agreed(dataset)
+    assert codes(dataset) == ["message-count"]
+    refused(dataset)
+
+
+# ---------------------------------------------------------------- contradictions
+
+
+@pytest.mark.parametrize("frames", [7, 9])
+def test_a_number_of_frames_that_was_edited(frames: int, dataset: Path) -> None:
+    path = dataset / f"{STEM}.yaml"
+    changed(path, lambda document: document.update(frames=frames))
+    found = codes(dataset)
+    assert {"column-invalid", "manifest-inconsistent"} <= set(found)
+    assert CHANGED_FILE & set(found)
+    assert "checksum-mismatch" not in found
+    assert codes(path) == ["column-invalid"]
+    refused(dataset)
+
+
+def shortened(document: Document) -> None:
+    """A sidecar that forgets its last frame, and is consistent in itself."""
+    document["frames"] -= 1
+    document["columns"] = {
+        name: shortened_column(column) for name, column in document["columns"].items()
+    }
+    document["digests"]["values"] = " ".join(document["digests"]["values"].split()[:-1])
+
+
+def shortened_column(column: Document) -> Document:
+    residuals = []
+    for token in column["values"].split():
+        value, _, count = token.partition("*")
+        residuals += [value] * int(count or 1)
+    return {**column, "values": " ".join(residuals[:-1])}
+
+
+def test_a_frame_that_was_forgotten_everywhere(dataset: Path) -> None:
+    def manifest(document: Document) -> None:
+        document["streams"][0]["frames"] -= 1
+        document["messages"] -= 1
+
+    changed(dataset / f"{STEM}.yaml", shortened)
+    changed(dataset / "dataset.yaml", manifest)
+    agreed(dataset)
+    assert codes(dataset, deep=False) == ["frame-count"]
+    assert codes(dataset) == ["frame-count"]
+    assert "frame-count" in refused(dataset)
+
+
+def test_a_digest_that_was_changed_names_the_message(dataset: Path) -> None:
+    def change(document: Document) -> None:
+        digests = document["digests"]["values"].split()
+        digests[5] = "0" * 16
+        document["digests"]["values"] = " ".join(digests)
+
+    changed(dataset / f"{STEM}.yaml", change)
+    agreed(dataset)
+    assert codes(dataset, deep=False) == []
+    problems = mp4ds.validate(dataset, deep=True)
+    assert [problem.code for problem in problems] == ["digest-mismatch"]
+    assert "message 5 of topic /cam/image_raw" in str(problems[0])
+    assert "message 5 of topic /cam/image_raw" in refused(dataset)
+
+
+def test_a_stamp_that_was_changed(dataset: Path) -> None:
+    def change(document: Document) -> None:
+        document["columns"]["stamp"]["start"] += 1
+
+    changed(dataset / f"{STEM}.yaml", change)
+    agreed(dataset)
+    problems = mp4ds.validate(dataset, deep=True)
+    assert [problem.code for problem in problems] == ["digest-mismatch"] * 8
+
+
+def test_a_video_of_the_same_size_and_length(dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    other = SOURCES["bag-none"](tmp_path / "other", scene("bayer_rggb8", seed=9))
+    mp4ds.pack(other, tmp_path / "other" / "dataset")
+    shutil.copy(tmp_path / "other" / "dataset" / f"{STEM}.mp4", dataset)
+
+    def change(document: Document) -> None:
+        found = digest(dataset / f"{STEM}.mp4")
+        document["video"].update(size=found["size"], sha256=found["sha256"])
+
+    changed(dataset / f"{STEM}.yaml", change)
+    agreed(dataset)
+    assert codes(dataset) == ["digest-mismatch"]
+    assert "digest-mismatch" in refused(dataset)
+
+
+def test_a_stream_that_was_taken_out_of_the_manifest(two_cameras: Path) -> None:
+    gone: list[str] = []
+
+    def change(manifest: Document) -> None:
+        entry = manifest["streams"].pop()
+        gone.extend((entry["sidecar"], entry["video"]))
+        manifest["files"] = [e for e in manifest["files"] if e["name"] not in gone]
+
+    changed(two_cameras / "dataset.yaml", change)
+    assert "file-unlisted" in codes(two_cameras)
+    for name in gone:
+        (two_cameras / name).unlink()
+    assert codes(two_cameras) == ["message-count"]
+    refused(two_cameras)
+
+
+def test_a_number_of_messages_that_was_changed(dataset: Path) -> None:
+    changed(dataset / "dataset.yaml", lambda manifest: manifest.update(messages=63))
+    assert codes(dataset) == ["message-count"]
+    refused(dataset)
+
+
+def test_a_file_that_the_manifest_does_not_list(dataset: Path) -> None:
+    changed(dataset / "dataset.yaml", lambda manifest: manifest["files"].pop())
+    assert {"manifest-inconsistent", "file-unlisted"} & set(codes(dataset))
+
+
+# ---------------------------------------------------------------- several faults
+
+
+def test_all_of_three_faults_are_listed(two_cameras: Path) -> None:
+    video = two_cameras / "left_cam_image_raw.mp4"
+    video.write_bytes(video.read_bytes()[:-100])
+    changed(two_cameras / "right_cam_image_raw.yaml", lambda d: d["digests"].update(values="00"))
+    (two_cameras / "messages.mcap").unlink()
+    found = {(p.code, Path(p.place.split(" at ")[0]).name) for p in mp4ds.validate(two_cameras)}
+    assert found >= {
+        ("size-mismatch", "left_cam_image_raw.mp4"),
+        ("column-invalid", "right_cam_image_raw.yaml"),
+        ("file-missing", "messages.mcap"),
+    }
+
+
+def test_all_faults_of_a_folder_of_datasets_are_listed(dataset: Path) -> None:
+    folder = dataset.parent / "drives"
+    for name in ("a", "b", "c"):
+        shutil.copytree(dataset, folder / "nested" / name)
+    (folder / "nested" / "a" / f"{STEM}.mp4").unlink()
+    (folder / "nested" / "c" / "dataset.yaml").write_bytes(b"kind: dataset\n")
+    problems = mp4ds.validate(folder)
+    assert {problem.code for problem in problems} == {"file-missing", "version-unsupported"}
+    assert not [problem for problem in problems if "/b/" in problem.place]
+
+
+def test_every_frame_that_is_wrong_is_listed(dataset: Path) -> None:
+    def change(document: Document) -> None:
+        digests = document["digests"]["values"].split()
+        document["digests"]["values"] = " ".join(
+            value if n % 3 else "0" * 16 for n, value in enumerate(digests)
+        )
+
+    changed(dataset / f"{STEM}.yaml", change)
+    problems = mp4ds.validate(dataset / f"{STEM}.yaml", deep=True)
+    assert [problem.code for problem in problems] == ["digest-mismatch"] * 3
+
+
+def test_reading_a_damaged_dataset_raises_what_validate_says(dataset: Path) -> None:
+    path = dataset / f"{STEM}.yaml"
+    data = bytearray(path.read_bytes())
+    data[200] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(FormatError) as caught:
+        mp4ds.open(dataset)
+    assert caught.value.code == "checksum-mismatch"
+    assert str(path) in str(caught.value)
