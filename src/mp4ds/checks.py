@@ -282,6 +282,9 @@ def _check_messages(
     try:
         with Dataset(folder) as dataset:
             in_videos = sum(_modelled(stream) for stream in dataset.streams)
+            gaps = [Problem("messages-missing", topic, what) for topic, what in dataset.gaps()]
+            if gaps:
+                return gaps
             counted: int | None = dataset.recorded_count
             if deep or counted is None:
                 report(f"reading {MESSAGES_NAME}")

@@ -21,6 +21,7 @@ from mp4ds.sidecar import (
     load_manifest,
 )
 from mp4ds.streams import Frame, Stream
+from mp4ds.streams.rebuild import DecodedColumns
 
 __all__ = ["Dataset", "Frame", "Stream", "open_dataset"]
 
@@ -124,19 +125,18 @@ class Dataset:
         groups: dict[tuple[object, ...], _ChannelGroup] = {}
         first_id = 1 + max((channel.id for channel in self._recorded), default=0)
         for stream in self.streams:
-            sources = [(stream.sidecar.channel, stream.messages, stream.log_times)]
-            info = stream.sidecar.camera_info
-            if info and info.messages:
-                times = stream.camera_info_log_times
-                sources.append((info.channel, stream.camera_info_messages, times))
-            for model, messages, times in sources:
+            images = _Part(stream.messages, stream.rebuilder.columns)
+            sources = [(stream.sidecar.channel, images)]
+            info, columns = stream.sidecar.camera_info, stream.camera_info_columns
+            if info and columns:
+                sources.append((info.channel, _Part(stream.camera_info_messages, columns)))
+            for model, part in sources:
                 key = model.to_record(0).identity
                 if key not in groups:
                     channel = model.to_record(first_id + len(groups))
                     recorded = [c for c in self._recorded if c.identity == key]
-                    groups[key] = _ChannelGroup(channel, [], [], {c.id for c in recorded})
-                groups[key].parts.append(messages)
-                groups[key].times.append(times)
+                    groups[key] = _ChannelGroup(channel, [], {c.id for c in recorded})
+                groups[key].parts.append(part)
         return list(groups.values())
 
     @cached_property
@@ -161,8 +161,29 @@ class Dataset:
                 found = {key: [times] for key, times in reader.times().items()}
         for group in self._groups:
             recorded = [found.pop(key)[0] for key in group.recorded_ids if key in found]
-            found[group.channel.id] = [*recorded, *group.times]
+            found[group.channel.id] = [
+                *recorded,
+                *(part.columns.log_time for part in group.parts),
+            ]
         return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items() if arrays}
+
+    def gaps(self) -> Iterator[tuple[str, str]]:
+        """Topics of which the columns say that messages are missing, and what is missing.
+
+        The places that a channel's columns leave free are those of its messages in
+        messages.mcap, so these must be as many.
+        """
+        if self._messages_path is None:
+            return
+        with McapReader(self._messages_path) as reader:
+            recorded = {key: item.count for key, item in reader.stats().items()}
+        for group in self._groups:
+            places = np.concatenate([part.columns.ordinal for part in group.parts])
+            total = len(places) + sum(recorded.get(key, 0) for key in group.recorded_ids)
+            if len(np.unique(places)) < len(places):
+                yield group.channel.topic, "two messages have the same place"
+            elif places.max() >= total:
+                yield group.channel.topic, f"has {total} messages and one of number {places.max()}"
 
     def _verbatim_records(self) -> Iterator[Record]:
         wanted = {channel.id for channel in self._verbatim_channels}
@@ -172,7 +193,9 @@ class Dataset:
 
     def _group_messages(self, group: _ChannelGroup) -> Iterator[Message]:
         """One channel's messages from all its places, in the channel's order."""
-        merged = heapq.merge(*(part(group.channel) for part in group.parts), key=lambda m: m[0])
+        merged = heapq.merge(
+            *(part.messages(group.channel) for part in group.parts), key=lambda pair: pair[0]
+        )
         recorded = self._recorded_messages(group)
         due = 0
         for ordinal, message in merged:
@@ -209,16 +232,20 @@ class Dataset:
         self.close()
 
 
-_MessageSource = Callable[[Channel], Iterator[tuple[int, Message]]]
+@dataclass(frozen=True)
+class _Part:
+    """Messages of a channel that are in one video: what makes them, and their columns."""
+
+    messages: Callable[[Channel], Iterator[tuple[int, Message]]]
+    columns: DecodedColumns
 
 
-@dataclass
+@dataclass(frozen=True)
 class _ChannelGroup:
     """A channel with messages in videos, and its channels in messages.mcap if any."""
 
     channel: Channel
-    parts: list[_MessageSource]
-    times: list[NDArray[np.int64]]
+    parts: list[_Part]
     recorded_ids: set[int]
 
 

@@ -32,6 +32,7 @@ _MODELS: dict[str, type[StreamSidecar] | type[Manifest]] = {
     "stream": StreamSidecar,
     "dataset": Manifest,
 }
+_NEWS_LISTED = 5
 _ModelT = TypeVar("_ModelT", bound=BaseModel)
 
 
@@ -48,6 +49,8 @@ def load_document(path: Path) -> dict[str, Any]:
             ``version-unsupported``, ``migration-failed`` or ``kind-unknown``.
     """
     try:
+        if not path.is_file() and path.exists():
+            raise FormatError("file-missing", path, "is no regular file")
         if path.stat().st_size > yamlio.MAX_BYTES:
             raise FormatError("yaml-invalid", path, f"is larger than {yamlio.MAX_BYTES} bytes")
         data = path.read_bytes()
@@ -70,7 +73,7 @@ def load_document(path: Path) -> dict[str, Any]:
         raise FormatError(
             "version-unsupported", path, f"is of version {version!r}, which never was"
         )
-    if document.get("kind") not in _MODELS:
+    if document.get("kind") not in list(_MODELS):
         raise FormatError("kind-unknown", path, "is neither a stream nor a dataset")
     return document if found == supported else _without_news(document, path)
 
@@ -92,7 +95,8 @@ def _without_news(document: dict[str, Any], path: Path) -> dict[str, Any]:
             dropped.append(".".join(map(str, place)))
     warnings.warn(
         f"{path} is of format version {document['mp4ds']}, newer than {FORMAT_VERSION}; "
-        f"ignored: {', '.join(dropped) or 'nothing'}",
+        f"ignored: {', '.join(dropped[:_NEWS_LISTED]) or 'nothing'}"
+        + (f" and {len(dropped) - _NEWS_LISTED} more" if len(dropped) > _NEWS_LISTED else ""),
         stacklevel=2,
     )
     return document

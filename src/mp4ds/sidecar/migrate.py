@@ -52,7 +52,7 @@ def _from_0(old: Document, place: str) -> Document:
     info_topic, image_topic = old["topic_name"]
     info = old["camera_info"]
     # round half even of the exact product: the nearest nanosecond to the stored float
-    times = [round(seconds * 10**9) for seconds in map(Fraction, old["img_timestamp"])]
+    times = [round(Fraction(float(seconds)) * 10**9) for seconds in old["img_timestamp"]]
     column = encode_column(times)
     width, height = int(info["width"]), int(info["height"])
     return {
@@ -115,8 +115,15 @@ def _calibration_0(info: Document) -> Document:
         "height": int(info["height"]),
         "width": int(info["width"]),
         "distortion_model": str(info["distortion_model"]),
-        **{key.lower(): [float(value) for value in info[key]] for key in "DKRP"},
+        **{key.lower(): [_finite(value) for value in info[key]] for key in "DKRP"},
     }
+
+
+def _finite(value: Any) -> float:
+    number = float(value)
+    if number - number != 0:
+        raise ValueError(f"{value} is no finite number")
+    return number
 
 
 MIGRATIONS: dict[str, Callable[[Document, str], Document]] = {"0": _from_0}

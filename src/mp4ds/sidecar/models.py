@@ -23,8 +23,10 @@ from mp4ds.wire.formats import WIRES
 
 FORMAT_VERSION = "1.0"
 MESSAGES_NAME = "messages.mcap"
-MAX_FRAMES = 10**8
+MAX_FRAMES = 2 * 10**7  # 92 hours at 60 Hz; bounds what a sidecar can make a reader allocate
 MAX_CAMERA_INFOS = 10**7
+MAX_VARIANTS = 256
+"""Headers or calibrations of a stream: a topic with more is not modelled any further."""
 
 Int64 = Annotated[int, Field(ge=INT64_MIN, le=INT64_MAX)]
 Time = Annotated[int, Field(ge=INT64_MIN, le=2**64 - 1)]
@@ -284,7 +286,7 @@ class CameraInfo(Model):
     channel: ChannelModel
     wire: str = Field(description="Serialization (registry, Wires).")
     messages: Annotated[int, Field(ge=0, le=MAX_CAMERA_INFOS)]
-    calibrations: list[Calibration]
+    calibrations: Annotated[list[Calibration], Field(max_length=MAX_VARIANTS)]
     columns: Columns | None = Field(None, description="Absent when there are no messages.")
 
 
@@ -301,7 +303,7 @@ class StreamSidecar(Model):
     channel: ChannelModel
     wire: str = Field(description="Serialization (registry, Wires).")
     image: Image
-    headers: Annotated[list[Header], Field(min_length=1)]
+    headers: Annotated[list[Header], Field(min_length=1, max_length=MAX_VARIANTS)]
     video: Video
     camera_info: CameraInfo | None = None
     columns: Columns

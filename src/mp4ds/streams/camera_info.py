@@ -6,6 +6,7 @@ import base64
 
 from mp4ds.records import Channel, Message
 from mp4ds.sidecar import Calibration, CameraInfo, ChannelModel, Roi
+from mp4ds.sidecar.models import MAX_CAMERA_INFOS
 from mp4ds.streams.columns import ColumnsWriter, Unsuited, Variants
 from mp4ds.wire import CameraInfoFields, Wire, WireError, wire_for
 
@@ -30,6 +31,8 @@ class CameraInfoWriter:
             Unsuited: It cannot be modelled exactly; nothing was changed.
         """
         self._columns.check(message)
+        if len(self._columns) == MAX_CAMERA_INFOS:
+            raise Unsuited(f"more than {MAX_CAMERA_INFOS} messages")
         data = memoryview(message.data)
         try:
             wire = wire_for(message.channel.message_encoding, data)

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from mp4ds.records import Message
 from mp4ds.sidecar import Column, Columns
+from mp4ds.sidecar.models import MAX_VARIANTS
 from mp4ds.stamps import INT64_MAX, INT64_MIN, Int64Column, encode_column
-
-MAX_VARIANTS = 256
-"""A topic whose messages differ in more ways than this is not modelled any further."""
 
 _VariantT = TypeVar("_VariantT")
 

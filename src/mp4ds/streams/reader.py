@@ -15,7 +15,12 @@ from mp4ds.errors import FormatError
 from mp4ds.layouts import Pixels
 from mp4ds.records import Channel, Message
 from mp4ds.sidecar import Calibration, StreamSidecar, load_stream
-from mp4ds.streams.rebuild import CameraInfoRebuilder, ImageRebuilder, message_at
+from mp4ds.streams.rebuild import (
+    CameraInfoRebuilder,
+    DecodedColumns,
+    ImageRebuilder,
+    message_at,
+)
 from mp4ds.video import VideoDecoder
 
 
@@ -191,9 +196,9 @@ class Stream:
                 yield ordinal, message_at(rebuilder.columns, index, channel, payload)
 
     @property
-    def camera_info_log_times(self) -> NDArray[np.int64]:
-        """Log times of the CameraInfo messages, nanoseconds."""
-        return self._info.columns.log_time if self._info else np.empty(0, np.int64)
+    def camera_info_columns(self) -> DecodedColumns | None:
+        """The columns of the CameraInfo messages, if there are any."""
+        return self._info.columns if self._info else None
 
     def camera_info_messages(self, channel: Channel) -> Iterator[tuple[int, Message]]:
         """The CameraInfo messages, each with its place among the channel's messages."""

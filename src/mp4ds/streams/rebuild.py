@@ -45,7 +45,7 @@ def decode_columns(columns: Columns, count: int, variants: int, place: str) -> D
             arrays[name] = getattr(columns, name).decode(count)
         except ValueError as error:
             raise FormatError("column-invalid", f"{place} at columns.{name}", str(error)) from None
-    zeros = np.zeros(count, np.int64)
+    zeros = np.broadcast_to(np.int64(0), (count,))
     decoded = DecodedColumns(
         log_time=arrays["log_time"],
         publish_time=arrays.get("publish_time", arrays["log_time"]),

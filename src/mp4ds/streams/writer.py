@@ -26,7 +26,7 @@ from mp4ds.sidecar import (
     Video,
     dump_document,
 )
-from mp4ds.sidecar.models import FORMAT_VERSION
+from mp4ds.sidecar.models import FORMAT_VERSION, MAX_FRAMES
 from mp4ds.stamps import PresentationClock
 from mp4ds.streams.columns import ColumnsWriter, Unsuited, Variants
 from mp4ds.video import Recipe, VideoEncoder, recipe_for
@@ -201,6 +201,8 @@ class StreamWriter:
             Unsuited: The stream cannot carry it exactly; nothing was changed.
         """
         self._columns.check(message)
+        if self.frames == MAX_FRAMES:
+            raise Unsuited(f"more than {MAX_FRAMES} messages")
         row_bytes = parts.width * self._encoding.pixel_bytes
         if not padding_is_zero(
             parts.pixels, row_bytes=row_bytes, step=parts.step, height=parts.height

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import av
 import numpy as np
-from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoReformatter
+from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from numpy.typing import NDArray
 
 from mp4ds.errors import VideoError
@@ -19,13 +19,10 @@ from mp4ds.layouts import Pixels
 BT709 = 1  # primaries, transfer and matrix have the same number in H.273
 FULL_RANGE = 2
 
-_INTERPOLATION = (
-    Interpolation.BICUBIC
-    | Interpolation.ACCURATE_RND
-    | Interpolation.FULL_CHR_H_INT
-    | Interpolation.FULL_CHR_H_INP
-    | Interpolation.BITEXACT
-)
+# libswscale's flags: bicubic, full chroma in and out, accurate rounding, the same everywhere.
+# As numbers, since older PyAV has no names for them.
+_BICUBIC, _FULL_CHROMA, _ACCURATE, _BITEXACT = 0x4, 0x2000 | 0x4000, 0x40000, 0x80000
+_INTERPOLATION = _BICUBIC | _FULL_CHROMA | _ACCURATE | _BITEXACT
 _YUV = ("yuv420p", "yuvj420p")
 _MATRICES = {"bt709": Colorspace.ITU709, "smpte170m": Colorspace.ITU601}
 

@@ -1,0 +1,1036 @@
+"""Bad input and hard times: one clear sentence, the right exit code, and nothing left behind.
+
+Exit codes: 0 done; 1 the job failed or problems were found; 2 wrong input or options; 130
+interrupted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+import re
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mp4ds
+from conftest import real
+from mp4ds.cli import app
+from scenes import ENCODINGS, IMAGE, START, Record, Scene, image_cdr, image_ros1, picture
+from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2
+
+Compare = Callable[..., list[str]]
+ROOT = Path(mp4ds.__file__).parents[1]
+NEEDS_ROOT = "a file system can only be mounted by root"
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a command did."""
+
+    code: int
+    out: str
+    err: str
+
+
+def call(*arguments: object) -> Result:
+    """A command in this process: its exit code and what it wrote."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            app([str(argument) for argument in arguments])
+            code: Any = 0
+        except SystemExit as exit_:
+            code = exit_.code or 0
+    return Result(code, out.getvalue(), err.getvalue())
+
+
+def start(*arguments: object, **options: Any) -> subprocess.Popen[str]:
+    """A command as a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "mp4ds", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT), **options.pop("env", {})},
+        **options,
+    )
+
+
+def run(*arguments: object, **options: Any) -> Result:
+    """A command as a process of its own: its exit code and what it wrote."""
+    with start(*arguments, **options) as process:
+        out, err = process.communicate(timeout=60)
+    return Result(process.returncode, out, err)
+
+
+def tree(folder: Path) -> dict[str, str]:
+    """Everything below a folder, hidden files too: relative path -> SHA-256, link or ``/``."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_symlink():
+            content = f"-> {path.readlink()}"
+        elif path.is_dir():
+            content = "/"
+        elif path.is_file():
+            content = hashlib.sha256(path.read_bytes()).hexdigest()
+        else:
+            content = "special"
+        found[str(path.relative_to(folder))] = content
+    return found
+
+
+@contextlib.contextmanager
+def unchanged(folder: Path) -> Iterator[None]:
+    """Whatever is done, source, target and all beside them stay as they are."""
+    before = tree(folder)
+    yield
+    assert tree(folder) == before
+
+
+def refused(result: Result, code: int, *words: str) -> None:
+    """One sentence on stderr, with these words, and nothing on stdout."""
+    assert "Traceback" not in result.err
+    assert result.code == code, result.err
+    assert re.fullmatch(r"mp4ds: [^\n]+\n", result.err), result.err
+    for word in words:
+        assert word in result.err
+    assert result.out == ""
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a bag of two cameras and its dataset; not to be changed."""
+    folder = tmp_path_factory.mktemp("demo")
+    assert call("demo", folder / "drive.bag", "--seconds", 1).code == 0
+    assert call("pack", folder / "drive.bag", "-o", folder / "drive").code == 0
+    return folder
+
+
+@pytest.fixture
+def small_bag(tmp_path: Path) -> Path:
+    write_bag(tmp_path / "drive.bag", scene("mono8", frames=4))
+    return tmp_path / "drive.bag"
+
+
+@pytest.fixture
+def small_dataset(packed_bag: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(packed_bag, tmp_path / "dataset"))
+
+
+# ---------------------------------------------------------------- sources that cannot be read
+
+LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0123\nsize 123456789\n"
+SUFFIXES = ("bag", "mcap", "db3")
+
+
+def written(name: str, data: bytes) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        (folder / name).write_bytes(data)
+        return folder / name
+
+    return make
+
+
+def of_kind(kind: str, folder: Path) -> Path:
+    """A good file of a kind, with images, calibrations and other messages."""
+    path = folder / f"drive.{kind}"
+    if kind == "bag":
+        write_bag(path, scene("mono8"))
+    elif kind == "mcap":
+        write_mcap(path, scene("mono8"))
+    else:
+        write_rosbag2(folder / "whole", scene("mono8"))
+        shutil.move(str(next((folder / "whole").glob("*.db3"))), path)
+        shutil.rmtree(folder / "whole")
+    return path
+
+
+def cut(kind: str, keep: float) -> Callable[[Path], Path]:
+    """A file that ends early: after a part of its bytes, or so many before its end."""
+
+    def make(folder: Path) -> Path:
+        path = of_kind(kind, folder)
+        size = path.stat().st_size
+        os.truncate(path, int(size * keep) if keep > 0 else size + int(keep))
+        return path
+
+    return make
+
+
+def unindexed(folder: Path) -> Path:
+    path = of_kind("bag", folder)
+    data = bytearray(path.read_bytes())
+    place = data.index(b"index_pos=") + len(b"index_pos=")
+    data[place : place + 8] = bytes(8)
+    path.write_bytes(data)
+    return path
+
+
+def damaged(kind: str, compression: str) -> Callable[[Path], Path]:
+    """A file whose index is whole and whose messages are not."""
+
+    def make(folder: Path) -> Path:
+        path = folder / f"drive.{kind}"
+        write = write_bag if kind == "bag" else write_mcap
+        write(path, scene("mono8"), compression=compression)
+        data = bytearray(path.read_bytes())
+        middle = len(data) // 2
+        data[middle : middle + 64] = bytes(byte ^ 0x55 for byte in data[middle : middle + 64])
+        path.write_bytes(data)
+        return path
+
+    return make
+
+
+def folder_of(change: Callable[[Path], object], **options: Any) -> Callable[[Path], Path]:
+    """A rosbag2 folder that was changed."""
+
+    def make(folder: Path) -> Path:
+        write_rosbag2(folder / "drive", scene("mono8"), **options)
+        change(folder / "drive")
+        return folder / "drive"
+
+    return make
+
+
+def database(folder: Path) -> Path:
+    with contextlib.closing(sqlite3.connect(folder / "other.db3")) as connection:
+        connection.execute("CREATE TABLE messages (id INTEGER, text TEXT)")
+        connection.commit()
+    return folder / "other.db3"
+
+
+def empty_folder(folder: Path) -> Path:
+    (folder / "drive").mkdir()
+    return folder / "drive"
+
+
+BAD_SOURCES: dict[str, tuple[Callable[[Path], Path], str]] = {
+    "missing": (lambda folder: folder / "none.bag", "no such file"),
+    "name-too-long": (lambda folder: folder / ("x" * 300 + ".bag"), "xxx.bag"),
+    "below-a-file": (lambda folder: written("a.bag", b"")(folder) / "b.bag", "b.bag"),
+    **{f"text.{s}": (written(f"drive.{s}", b"hello\n" * 9), "is not a") for s in SUFFIXES},
+    **{
+        f"random.{s}": (written(f"drive.{s}", hashlib.sha512(s.encode()).digest() * 99), "is not a")
+        for s in SUFFIXES
+    },
+    **{f"empty.{s}": (written(f"drive.{s}", b""), "is empty") for s in SUFFIXES},
+    **{f"git-lfs.{s}": (written(f"drive.{s}", LFS_POINTER), "git lfs pull") for s in SUFFIXES},
+    "text": (written("notes.txt", b"hello\n"), "is not a recording"),
+    "no-suffix": (written("notes", b""), "is not a recording"),
+    "bag-1.2": (written("drive.bag", b"#ROSBAG V1.2\n" + bytes(99)), "1.2"),
+    **{f"half.{s}": (cut(s, 0.5), "drive." + s) for s in SUFFIXES},
+    **{f"start.{s}": (cut(s, 0.01), "drive." + s) for s in SUFFIXES},
+    "index-cut.bag": (cut("bag", -300), "drive.bag"),
+    "footer-cut.mcap": (cut("mcap", -20), "ends before its footer"),
+    "unindexed.bag": (unindexed, "rosbag reindex"),
+    "damaged-bz2.bag": (damaged("bag", "bz2"), "is damaged"),
+    "damaged-lz4.bag": (damaged("bag", "lz4"), "is damaged"),
+    "damaged-zstd.mcap": (damaged("mcap", "zstd"), "is damaged"),
+    "other-database": (database, "not one of rosbag2"),
+    "empty-folder": (empty_folder, "has no metadata.yaml"),
+    "no-metadata": (
+        folder_of(lambda folder: (folder / "metadata.yaml").unlink()),
+        "ros2 bag reindex",
+    ),
+    "split-missing": (
+        folder_of(lambda folder: sorted(folder.glob("*.db3"))[1].unlink(), files=3),
+        "is missing",
+    ),
+    "split-missing.mcap": (
+        folder_of(
+            lambda folder: sorted(folder.glob("*.mcap"))[1].unlink(), files=3, storage="mcap"
+        ),
+        "is missing",
+    ),
+    "metadata-empty": (
+        folder_of(lambda folder: (folder / "metadata.yaml").write_bytes(b"")),
+        "is empty",
+    ),
+    "metadata-junk": (
+        folder_of(lambda folder: (folder / "metadata.yaml").write_bytes(b"\xff: [")),
+        "metadata.yaml",
+    ),
+    "metadata-outside": (
+        folder_of(
+            lambda folder: (folder / "metadata.yaml").write_text(
+                (folder / "metadata.yaml").read_text().replace("drive_0.db3", "../../etc/passwd")
+            )
+        ),
+        "passwd",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD_SOURCES)
+def test_a_source_that_cannot_be_read(name: str, tmp_path: Path) -> None:
+    make, word = BAD_SOURCES[name]
+    path = make(tmp_path)
+    with unchanged(tmp_path):
+        refused(call("pack", path, "-o", tmp_path / "dataset"), 2, word)
+
+
+@pytest.mark.parametrize("name", [n for n in BAD_SOURCES if not n.startswith("damaged")])
+def test_info_on_a_source_that_cannot_be_read(name: str, tmp_path: Path) -> None:
+    make, word = BAD_SOURCES[name]
+    path = make(tmp_path)
+    with unchanged(tmp_path):
+        refused(call("info", path), 2, word)
+
+
+@pytest.mark.parametrize("name", ["missing", "half.mcap", "split-missing"])
+def test_the_real_command_says_the_same(name: str, tmp_path: Path) -> None:
+    make, word = BAD_SOURCES[name]
+    path = make(tmp_path)
+    with unchanged(tmp_path):
+        refused(run("pack", path, "-o", tmp_path / "dataset"), 2, word)
+
+
+@pytest.mark.parametrize(
+    ("name", "word"),
+    [
+        ("truncated.bag", "rosbag reindex"),
+        ("unindexed.bag", "rosbag reindex"),
+        ("truncated_a.mcap", "ends before its footer"),
+        ("zero_bytes.bag", "is empty"),
+        ("lfs_pointer.bag", "git lfs pull"),
+        ("header_only_dummy_600chunks.bag", "header_only_dummy_600chunks.bag"),
+    ],
+)
+def test_real_recordings_that_cannot_be_read(name: str, word: str, tmp_path: Path) -> None:
+    path = real(f"corrupt/{name}")
+    before = path.read_bytes()
+    for arguments in (("pack", path, "-o", tmp_path / "dataset"), ("info", path)):
+        refused(call(*arguments), 2, word)
+    assert path.read_bytes() == before
+    assert tree(tmp_path) == {}
+
+
+def test_one_bad_part_of_several(small_bag: Path, tmp_path: Path) -> None:
+    (tmp_path / "second").mkdir()
+    second = cut("bag", 0.5)(tmp_path / "second")
+    with unchanged(tmp_path):
+        refused(call("pack", small_bag, second, "-o", tmp_path / "dataset"), 2, str(second))
+
+
+def test_a_source_that_is_given_twice(small_bag: Path, tmp_path: Path) -> None:
+    (tmp_path / "link.bag").symlink_to(small_bag.name)
+    for other in (small_bag, tmp_path / "." / "drive.bag", tmp_path / "link.bag"):
+        with unchanged(tmp_path):
+            result = call("pack", small_bag, other, "-o", tmp_path / "dataset")
+            refused(result, 2, "is given twice")
+
+
+def test_a_dataset_that_is_packed_again(small_dataset: Path, tmp_path: Path) -> None:
+    with unchanged(tmp_path):
+        refused(call("pack", small_dataset, "-o", tmp_path / "again"), 2, str(small_dataset))
+
+
+def test_a_pipe_is_no_recording(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "drive.bag")
+    process = start("info", tmp_path / "drive.bag")
+    try:
+        out, err = process.communicate(timeout=8)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+        pytest.fail("it waits for a writer")
+    refused(Result(process.returncode, out, err), 2, "drive.bag")
+
+
+# ---------------------------------------------------------------- sources that are unusual
+
+
+def round_trip(source: Path, to: str, tmp_path: Path, compare: Compare) -> Result:
+    """Pack, validate, unpack and compare; returns what pack said."""
+    before = tree(source) if source.is_dir() else source.read_bytes()
+    packed = call("pack", source, "-o", tmp_path / "dataset")
+    assert packed.code == 0, packed.err
+    assert packed.err == ""
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    output = tmp_path / f"again{ {'bag': '.bag', 'mcap': '.mcap'}.get(to, '') }"
+    unpacked = call("unpack", tmp_path / "dataset", "--to", to, "-o", output)
+    assert unpacked.code == 0, unpacked.err
+    assert compare([source], output) == []
+    assert (tree(source) if source.is_dir() else source.read_bytes()) == before
+    return packed
+
+
+def only(source: Scene, *topics: str) -> Scene:
+    return Scene([message for message in source.messages if message.topic in topics])
+
+
+EMPTY = Scene([], {"/cam/image_raw": IMAGE, "/chatter": "std_msgs/msg/String"})
+NO_IMAGES = only(scene("mono8"), "/imu", "/tf", "/cam/camera_info")
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap", "rosbag2"])
+@pytest.mark.parametrize("content", ["no-messages", "no-channels", "no-images"])
+def test_nothing_for_a_video(content: str, kind: str, tmp_path: Path, compare: Compare) -> None:
+    made = {"no-messages": EMPTY, "no-channels": Scene([]), "no-images": NO_IMAGES}[content]
+    name = {"bag": "bag-none", "mcap": "mcap-ros2-zstd", "rosbag2": "rosbag2-sqlite3-v9"}[kind]
+    source = SOURCES[name](tmp_path, made)[0]
+    packed = round_trip(source, kind, tmp_path, compare)
+    assert "no topic became a video" in packed.out
+    assert not list(tmp_path.glob("dataset/*.mp4"))
+
+
+def test_a_real_bag_without_messages(tmp_path: Path, compare: Compare) -> None:
+    packed = round_trip(real("bags/no_messages.bag"), "bag", tmp_path, compare)
+    assert "no topic became a video" in packed.out
+
+
+def with_short_images() -> Scene:
+    """Eight images, of which numbers 3 and 6 have less data than their headers say."""
+    messages = []
+    for n in range(8):
+        pixels = picture("mono8", frame=n, width=32, height=24, rng=None).tobytes()
+        data = pixels[:-5] if n in (3, 6) else pixels
+        fields: dict[str, Any] = {"width": 32, "height": 24, "encoding": "mono8", "step": 32}
+        stamp = START + n * 10**8
+        ros1 = image_ros1(**fields, data=data, stamp=stamp, seq=n)
+        cdr = image_cdr(**fields, data=data, stamp=stamp)
+        messages.append(Record("/odd/image", IMAGE, stamp, ros1=ros1, cdr=cdr))
+    return Scene(messages)
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_an_image_with_less_data_than_its_header_says(
+    kind: str, tmp_path: Path, compare: Compare
+) -> None:
+    name = {"bag": "bag-none", "mcap": "mcap-ros2-zstd"}[kind]
+    source = SOURCES[name](tmp_path, with_short_images())[0]
+    packed = round_trip(source, kind, tmp_path, compare)
+    said = [line for line in packed.out.splitlines() if "verbatim" in line]
+    assert len(said) == 1
+    assert said[0].startswith("/odd/image: 2 of 8 messages stored verbatim in messages.mcap: ")
+    assert "763 bytes of pixels where step x height says 768" in said[0]
+    assert "first: message 3" in said[0]
+    shutil.rmtree(tmp_path / "dataset")
+    packed = call("pack", source, "-o", tmp_path / "dataset", "--json")
+    topic = json.loads(packed.out)["topics"][0]
+    assert (topic["topic"], topic["messages"], topic["frames"]) == ("/odd/image", 8, 6)
+    assert list(topic["verbatim"].values()) == [[2, 3]]
+
+
+def cameras(*topics: str) -> Scene:
+    messages = []
+    for number, topic in enumerate(topics):
+        made = scene(ENCODINGS[number % 3], frames=3, with_info=False, seed=number)
+        messages += [replace(m, topic=topic) for m in only(made, "/cam/image_raw").messages]
+    return Scene(sorted(messages, key=lambda message: message.log_time))
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_topics_that_map_to_one_file_name(kind: str, tmp_path: Path, compare: Compare) -> None:
+    topics = ("/a/b", "/a_b", "/A/b", "/a.b/", "/a_b-2")
+    name = {"bag": "bag-none", "mcap": "mcap-ros2-zstd"}[kind]
+    source = SOURCES[name](tmp_path, cameras(*topics))[0]
+    packed = round_trip(source, kind, tmp_path, compare)
+    with mp4ds.open(tmp_path / "dataset") as dataset:
+        files = {stream.topic: stream.sidecar.video.file for stream in dataset.streams}
+    assert sorted(files) == sorted(topics)
+    assert len({name.casefold() for name in files.values()}) == len(topics)
+    for topic, file in files.items():
+        if re.search(r"-\d\.mp4$", file) and topic != "/a_b-2":
+            assert f"{topic}: stored as {file}" in packed.out
+    assert packed.out.count("stored as") >= 2
+
+
+@pytest.mark.parametrize(
+    "topics",
+    [("/../x", "/..", "..", "/."), ("", "/"), ("/dataset", "/messages", "/con"), ("/ä", "/相机"),
+     ("/a\nb", "/\x1b[31mred", "/[bold]", "/a[/b]"), ("/" + "x" * 300, "/" + "x" * 299 + "y")],
+)  # fmt: skip
+def test_topics_with_odd_names(topics: tuple[str, ...], tmp_path: Path, compare: Compare) -> None:
+    write_mcap(tmp_path / "drive.mcap", cameras(*topics))
+    packed = round_trip(tmp_path / "drive.mcap", "mcap", tmp_path, compare)
+    names = {path.name for path in (tmp_path / "dataset").iterdir()}
+    assert all(re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}", name) for name in names)
+    assert len(names) == 2 + 2 * len(topics)
+    assert "\x1b" not in packed.out
+    assert call("info", tmp_path / "dataset").code == 0
+
+
+def test_a_terminal_that_cannot_show_a_topic(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "drive.mcap", cameras("/ä", "/相机"))
+    environment = {"PYTHONIOENCODING": "ascii"}
+    packed = run("pack", tmp_path / "drive.mcap", "-o", tmp_path / "dataset", env=environment)
+    assert "Traceback" not in packed.err
+    assert packed.code == 0
+    assert "topic.mp4" in packed.out
+
+
+# ---------------------------------------------------------------- targets that may not be written
+
+
+@pytest.mark.parametrize("command", ["pack", "unpack", "demo"])
+@pytest.mark.parametrize("place", ["below-a-file", "no-parent", "exists", "dangling-link"])
+def test_a_target_that_may_not_be_written(
+    place: str, command: str, small_bag: Path, small_dataset: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "there").write_text("mine")
+    (tmp_path / "link").symlink_to("nowhere")
+    name = {"below-a-file": "there/x", "no-parent": "none/x", "exists": "there"}.get(place, "link")
+    target = tmp_path / name
+    if command == "demo":
+        target = target.with_suffix(".bag")
+        if place == "exists":
+            target.write_text("mine")
+        elif place == "dangling-link":
+            target.symlink_to("nowhere")
+    arguments = {
+        "pack": ("pack", small_bag, "-o", target),
+        "unpack": ("unpack", small_dataset, "--to", "mcap", "-o", target),
+        "demo": ("demo", target, "--seconds", 0.1),
+    }[command]
+    with unchanged(tmp_path):
+        result = call(*arguments)
+        refused(result, 2, str(target))
+        if place in ("exists", "dangling-link"):
+            assert "--force" in result.err
+
+
+@contextlib.contextmanager
+def mounted(folder: Path, *options: str) -> Iterator[Path]:
+    """A file system of its own in memory."""
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", ",".join(options), "tmpfs", str(folder)]
+    try:
+        made = subprocess.run(command, capture_output=True, check=False)
+    except OSError:
+        pytest.skip(NEEDS_ROOT)
+    if made.returncode:
+        pytest.skip(NEEDS_ROOT)
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_folder_that_is_read_only(demo: Path, tmp_path: Path) -> None:
+    with mounted(tmp_path / "disk", "size=512k,ro") as disk:
+        for arguments in (
+            ("pack", demo / "drive.bag", "-o", disk / "x"),
+            ("unpack", demo / "drive", "--to", "mcap", "-o", disk / "x.mcap"),
+            ("demo", disk / "x.bag"),
+        ):
+            refused(call(*arguments), 2, str(disk / "x"), "Read-only file system")
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere"
+)
+def test_a_folder_without_permission(small_bag: Path, small_dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "locked").mkdir(mode=0o555)
+    target = tmp_path / "locked" / "x"
+    with unchanged(tmp_path):
+        refused(call("pack", small_bag, "-o", target), 2, str(target), "Permission denied")
+        result = call("unpack", small_dataset, "--to", "mcap", "-o", target)
+        refused(result, 2, str(target), "Permission denied")
+    small_bag.chmod(0)
+    refused(call("pack", small_bag, "-o", tmp_path / "x"), 2, "Permission denied")
+
+
+def test_a_name_that_is_too_long(small_bag: Path, tmp_path: Path) -> None:
+    with unchanged(tmp_path):
+        result = call("pack", small_bag, "-o", tmp_path / ("x" * 300))
+        assert result.code in (1, 2)
+        refused(result, result.code, "File name too long")
+
+
+def test_pack_replaces_a_dataset_with_force_only(
+    small_bag: Path, small_dataset: Path, tmp_path: Path
+) -> None:
+    with unchanged(tmp_path):
+        refused(call("pack", small_bag, "-o", small_dataset), 2, "exists already", "--force")
+    assert call("pack", small_bag, "-o", small_dataset, "--force").code == 0
+    assert mp4ds.validate(small_dataset, deep=True) == []
+    with mp4ds.open(small_dataset) as dataset:
+        assert len(dataset.streams[0]) == 4
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["dataset", "drive.bag"]
+
+
+def test_pack_replaces_an_empty_folder_with_force_only(small_bag: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with unchanged(tmp_path):
+        refused(call("pack", small_bag, "-o", tmp_path / "empty"), 2, "exists already")
+    assert call("pack", small_bag, "-o", tmp_path / "empty", "--force").code == 0
+    assert mp4ds.validate(tmp_path / "empty") == []
+
+
+@pytest.mark.parametrize("what", ["folder", "file", "rosbag2", "link"])
+def test_pack_never_replaces_what_it_did_not_make(
+    what: str, small_bag: Path, tmp_path: Path
+) -> None:
+    target = tmp_path / "target"
+    if what == "folder":
+        target.mkdir()
+        (target / "thesis.tex").write_text("ten years of work")
+    elif what == "file":
+        target.write_text("ten years of work")
+    elif what == "rosbag2":
+        write_rosbag2(target, scene("mono8", frames=2))
+    else:
+        (tmp_path / "elsewhere").write_text("ten years of work")
+        target.symlink_to("elsewhere")
+    with unchanged(tmp_path):
+        result = call("pack", small_bag, "-o", target, "--force")
+        refused(result, 2, str(target), "--force does not replace it")
+
+
+@pytest.mark.parametrize("to", ["bag", "mcap", "rosbag2", "images"])
+def test_unpack_replaces_its_own_output_with_force_only(
+    to: str, small_dataset: Path, tmp_path: Path
+) -> None:
+    target = tmp_path / f"again{ {'bag': '.bag', 'mcap': '.mcap'}.get(to, '') }"
+    arguments = ("unpack", small_dataset, "--to", to, "-o", target)
+    assert call(*arguments).code == 0
+    first = tree(target) if target.is_dir() else target.stat().st_ino
+    with unchanged(tmp_path):
+        refused(call(*arguments), 2, "exists already", "--force")
+    assert call(*arguments, "--force").code == 0
+    assert target.is_dir() or target.stat().st_ino != first
+    if to == "images":
+        assert tree(target) == first
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize("to", ["bag", "mcap", "rosbag2", "images"])
+@pytest.mark.parametrize("what", ["folder", "dataset"])
+def test_unpack_never_replaces_a_folder_it_did_not_make(
+    what: str, to: str, small_dataset: Path, tmp_path: Path
+) -> None:
+    target = tmp_path / "target"
+    if what == "folder":
+        target.mkdir()
+        (target / "thesis.tex").write_text("ten years of work")
+    else:
+        shutil.copytree(small_dataset, target)
+    with unchanged(tmp_path):
+        result = call("unpack", small_dataset, "--to", to, "-o", target, "--force")
+        refused(result, 2, str(target), "--force does not replace it")
+
+
+def test_what_is_replaced_stays_until_the_new_one_is_whole(
+    small_dataset: Path, tmp_path: Path
+) -> None:
+    bad = damaged("bag", "bz2")(tmp_path)
+    with unchanged(tmp_path):
+        refused(call("pack", bad, "-o", small_dataset, "--force"), 2, "is damaged")
+    assert call("unpack", small_dataset, "--to", "bag", "-o", tmp_path / "again.bag").code == 0
+    video = small_dataset / "cam_image_raw.mp4"
+    os.truncate(video, video.stat().st_size - 2000)
+    with unchanged(tmp_path):
+        target = tmp_path / "again.bag"
+        refused(call("unpack", small_dataset, "--to", "bag", "-o", target, "--force"), 1)
+
+
+# ---------------------------------------------------------------- a target that is the source
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("kind", ["bag", "rosbag2"])
+def test_packing_onto_the_source(kind: str, force: bool, tmp_path: Path) -> None:
+    name = {"bag": "bag-none", "rosbag2": "rosbag2-sqlite3-v9"}[kind]
+    source = SOURCES[name](tmp_path, scene("mono8", frames=3))[0]
+    with unchanged(tmp_path):
+        refused(call("pack", source, "-o", source, *["--force"] * force), 2, str(source))
+
+
+def test_packing_into_the_source(tmp_path: Path) -> None:
+    source = SOURCES["rosbag2-sqlite3-v9"](tmp_path, scene("mono8", frames=3))[0]
+    with unchanged(tmp_path):
+        refused(call("pack", source, "-o", source / "dataset"), 2, str(source))
+
+
+def test_packing_a_part_of_a_dataset_onto_it(small_dataset: Path, tmp_path: Path) -> None:
+    source = small_dataset / "messages.mcap"
+    with unchanged(tmp_path):
+        refused(call("pack", source, "-o", small_dataset, "--force"), 2, str(small_dataset))
+
+
+def test_packing_onto_a_dataset_that_holds_the_source(
+    small_bag: Path, small_dataset: Path, tmp_path: Path
+) -> None:
+    source = small_dataset / "drive.bag"
+    shutil.move(str(small_bag), source)
+    with unchanged(tmp_path):
+        refused(call("pack", source, "-o", small_dataset, "--force"), 2, str(small_dataset))
+
+
+@pytest.mark.parametrize("name", ["messages.mcap", "cam_image_raw.mp4", "dataset.yaml", "new.mcap"])
+@pytest.mark.parametrize("to", ["bag", "mcap"])
+def test_unpacking_into_the_dataset(
+    to: str, name: str, small_dataset: Path, tmp_path: Path
+) -> None:
+    target = small_dataset / name
+    with unchanged(tmp_path):
+        result = call("unpack", small_dataset, "--to", to, "-o", target, "--force")
+        refused(result, 2, str(small_dataset))
+
+
+def test_unpacking_onto_a_folder_that_holds_the_dataset(
+    small_dataset: Path, tmp_path: Path
+) -> None:
+    recording = tmp_path / "drive"
+    write_rosbag2(recording, scene("mono8", frames=2))
+    inside = recording / "dataset"
+    shutil.move(str(small_dataset), inside)
+    with unchanged(tmp_path):
+        result = call("unpack", inside, "--to", "rosbag2", "-o", recording, "--force")
+        refused(result, 2, str(recording))
+
+
+@pytest.mark.parametrize("name", ["cam_image_raw.mp4", "cam_image_raw.yaml"])
+def test_unpacking_a_pair_onto_itself(name: str, small_dataset: Path, tmp_path: Path) -> None:
+    sidecar = small_dataset / "cam_image_raw.yaml"
+    with unchanged(tmp_path):
+        result = call("unpack", sidecar, "--to", "mcap", "-o", small_dataset / name, "--force")
+        refused(result, 2, name)
+
+
+# ---------------------------------------------------------------- a disk that is full
+
+UNPACK_TARGETS = {
+    "bag": ("--to", "bag", "-o", "x.bag"),
+    "mcap": ("--to", "mcap", "-o", "x.mcap"),
+    "rosbag2-sqlite3": ("--to", "rosbag2", "--storage", "sqlite3", "-o", "x"),
+    "rosbag2-mcap": ("--to", "rosbag2", "--storage", "mcap", "-o", "x"),
+    "images": ("--to", "images", "-o", "x"),
+}
+
+
+@pytest.mark.parametrize("job", ["pack", "pack-lossy", "demo", *UNPACK_TARGETS])
+def test_a_disk_that_is_full_half_way(job: str, demo: Path, tmp_path: Path) -> None:
+    with mounted(tmp_path / "disk", "size=512k") as disk, unchanged(demo):
+        if job == "demo":
+            result = call("demo", disk / "x.bag", "--seconds", 1)
+        elif job == "pack":
+            result = call("pack", demo / "drive.bag", "-o", disk / "x")
+        elif job == "pack-lossy":
+            lossy = ("--quality", "crf=1", "--codec", "h264", "--preset", "ultrafast")
+            result = call("pack", demo / "drive.bag", "-o", disk / "x", *lossy)
+        else:
+            *options, name = UNPACK_TARGETS[job]
+            result = call("unpack", demo / "drive", *options, disk / name)
+        refused(result, 1, str(disk / "x"), "No space left")
+        assert tree(disk) == {}
+
+
+def test_the_real_command_on_a_full_disk(demo: Path, tmp_path: Path) -> None:
+    with mounted(tmp_path / "disk", "size=512k") as disk:
+        result = run("pack", demo / "drive.bag", "-o", disk / "x")
+        refused(result, 1, str(disk / "x"), "No space left")
+        assert tree(disk) == {}
+
+
+def test_a_full_disk_leaves_what_was_there(demo: Path, small_dataset: Path, tmp_path: Path) -> None:
+    with mounted(tmp_path / "disk", "size=512k") as disk:
+        shutil.copytree(small_dataset, disk / "x")
+        with unchanged(disk):
+            result = call("pack", demo / "drive.bag", "-o", disk / "x", "--force")
+            refused(result, 1, "No space left")
+
+
+@pytest.mark.parametrize("job", ["pack", "images"])
+def test_a_disk_without_room_for_another_file(job: str, demo: Path, tmp_path: Path) -> None:
+    with mounted(tmp_path / "disk", "size=64m,nr_inodes=6") as disk:
+        if job == "pack":
+            result = call("pack", demo / "drive.bag", "-o", disk / "x")
+        else:
+            result = call("unpack", demo / "drive", "--to", "images", "-o", disk / "x")
+        refused(result, 1, str(disk / "x"), "No space left")
+        assert tree(disk) == {}
+
+
+# ---------------------------------------------------------------- an interruption
+
+
+@pytest.fixture(scope="module")
+def long_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag that takes several seconds to pack; not to be changed."""
+    path = tmp_path_factory.mktemp("long") / "drive.bag"
+    assert call("demo", path, "--seconds", 2).code == 0
+    return path
+
+
+def interrupted(folder: Path, *arguments: object) -> Result:
+    """A command that gets SIGINT as soon as it has begun to write."""
+    process = start(*arguments)
+    end = time.monotonic() + 30
+    while not list(folder.glob(".*.part/*")):
+        if process.poll() is not None or time.monotonic() > end:
+            process.kill()
+            pytest.fail(f"it did not begin: {process.communicate()}")
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    return Result(process.returncode, out, err)
+
+
+SLOW = ("--quality", "crf=20", "--preset", "2")
+
+
+def test_interrupting_a_pack(long_demo: Path, tmp_path: Path) -> None:
+    with unchanged(tmp_path), unchanged(long_demo.parent):
+        result = interrupted(tmp_path, "pack", long_demo, "-o", tmp_path / "x", *SLOW)
+        refused(result, 130, "interrupted")
+
+
+def test_interrupting_a_pack_leaves_what_was_there(
+    long_demo: Path, small_dataset: Path, tmp_path: Path
+) -> None:
+    with unchanged(tmp_path):
+        target = small_dataset
+        result = interrupted(tmp_path, "pack", long_demo, "-o", target, *SLOW, "--force", "--json")
+        assert result.code == 130
+        assert "Traceback" not in result.err
+        assert parsed(result)["exit_code"] == 130
+
+
+def test_interrupting_an_unpack(long_demo: Path, tmp_path: Path) -> None:
+    fast = ("--quality", "crf=40", "--codec", "h264", "--preset", "ultrafast")
+    assert call("pack", long_demo, "-o", tmp_path / "dataset", *fast).code == 0
+    with unchanged(tmp_path):
+        target = tmp_path / "images"
+        arguments = ("unpack", tmp_path / "dataset", "--to", "images", "-o", target)
+        refused(interrupted(tmp_path, *arguments), 130, "interrupted")
+
+
+# ---------------------------------------------------------------- options
+
+BAD_OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
+    **{
+        f"quality {value}": (("pack", "BAG", "-o", "OUT", "--quality", value), "lossless, visual")
+        for value in ("best", "crf=64", "crf=-1", "crf=", "crf=1.5", "CRF=20", "crf=\u0661", "")
+    },
+    "codec": (("pack", "BAG", "-o", "OUT", "--codec", "theora"), "h264"),
+    "codec-lossless": (("pack", "BAG", "-o", "OUT", "--codec", "av1"), "av1"),
+    "codec-lossy": (("pack", "BAG", "-o", "OUT", "-q", "crf=20", "--codec", "ffv1"), "ffv1"),
+    "topics": (("pack", "BAG", "-o", "OUT", "--topics", "/none/*"), "/cam/image_raw"),
+    "second-topics": (("pack", "BAG", "-o", "OUT", "-t", "/imu", "-t", "/none"), "'/none'"),
+    "exclude": (("pack", "BAG", "-o", "OUT", "--exclude", "/none/*"), "/cam/image_raw"),
+    "to": (("unpack", "DATASET", "--to", "zip", "-o", "OUT"), "bag, rosbag2, mcap"),
+    "to-empty": (("unpack", "DATASET", "--to", "", "-o", "OUT"), "bag, rosbag2, mcap"),
+    "storage": (
+        ("unpack", "DATASET", "--to", "rosbag2", "--storage", "zip", "-o", "OUT"),
+        "sqlite3 or mcap",
+    ),
+    "image-format": (
+        ("unpack", "DATASET", "--to", "images", "--image-format", "gif", "-o", "OUT"),
+        "png or jpeg",
+    ),
+    "unpack-topics": (("unpack", "DATASET", "--to", "bag", "-o", "OUT", "-t", "/no"), "/imu"),
+    "unpack-exclude": (("unpack", "DATASET", "--to", "bag", "-o", "OUT", "-x", "/no"), "/imu"),
+    "images-topics": (
+        ("unpack", "DATASET", "--to", "images", "-o", "OUT", "-t", "/imu"),
+        "/cam/image_raw",
+    ),
+    "demo": (("demo", "OUT"), ".bag"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_OPTIONS)
+def test_an_option_that_is_wrong(
+    name: str, small_bag: Path, small_dataset: Path, tmp_path: Path
+) -> None:
+    arguments, word = BAD_OPTIONS[name]
+    paths = {"BAG": small_bag, "DATASET": small_dataset, "OUT": tmp_path / "out"}
+    with unchanged(tmp_path):
+        refused(call(*(paths.get(argument, argument) for argument in arguments)), 2, word)
+
+
+@pytest.mark.parametrize("codec", ["h264", "av1"])
+def test_a_preset_that_is_wrong(codec: str, small_bag: Path, tmp_path: Path) -> None:
+    # as a process: encoders write to stderr on their own
+    with unchanged(tmp_path):
+        options = ("--quality", "crf=20", "--codec", codec, "--preset", "quick")
+        refused(run("pack", small_bag, "-o", tmp_path / "x", *options), 2, "'quick'")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("pack",),
+        ("pack", "BAG"),
+        ("pack", "BAG", "-o", "OUT", "--gop", "0"),
+        ("pack", "BAG", "-o", "OUT", "--gop", "many"),
+        ("pack", "BAG", "-o", "OUT", "--jobs", "0"),
+        ("pack", "BAG", "-o", "OUT", "--fast"),
+        ("unpack", "DATASET"),
+        ("demo", "OUT.bag", "--seconds", "0"),
+        ("demo", "OUT.bag", "--seconds", "nan"),
+        ("sell", "BAG"),
+    ],
+    ids=" ".join,
+)
+def test_a_command_line_that_cannot_be_understood(
+    arguments: tuple[str, ...], small_bag: Path, small_dataset: Path, tmp_path: Path
+) -> None:
+    paths = {"BAG": small_bag, "DATASET": small_dataset, "OUT": tmp_path / "out"}
+    paths["OUT.bag"] = tmp_path / "out.bag"
+    with unchanged(tmp_path):
+        result = call(*(paths.get(argument, argument) for argument in arguments))
+        assert result.code == 2
+        assert "Traceback" not in result.err
+        assert "Error" in result.err
+
+
+# ---------------------------------------------------------------- datasets that are none
+
+NO_DATASETS: dict[str, Callable[[Path], Path]] = {
+    "missing": lambda folder: folder / "none",
+    "name-too-long": lambda folder: folder / ("x" * 300),
+    "text": written("notes.txt", b"hello\n"),
+    "empty-folder": empty_folder,
+    "bag": lambda folder: of_kind("bag", folder),
+    "mcap": lambda folder: of_kind("mcap", folder),
+    "rosbag2": folder_of(lambda folder: None),
+}
+
+
+@pytest.mark.parametrize("command", ["unpack", "validate"])
+@pytest.mark.parametrize("name", NO_DATASETS)
+def test_what_is_no_dataset(name: str, command: str, tmp_path: Path) -> None:
+    path = NO_DATASETS[name](tmp_path)
+    options = ("--to", "mcap", "-o", tmp_path / "out.mcap") if command == "unpack" else ()
+    with unchanged(tmp_path):
+        refused(call(command, path, *options), 2, str(path))
+
+
+def test_other_yaml_is_a_problem_of_a_sidecar(tmp_path: Path) -> None:
+    path = written("notes.yaml", b"shopping: [milk]\n")(tmp_path)
+    with unchanged(tmp_path):
+        refused(call("unpack", path, "--to", "mcap", "-o", tmp_path / "out"), 1, str(path))
+        result = call("validate", path)
+    assert (result.code, result.err) == (1, "")
+    assert "version-unsupported" in result.out
+
+
+@pytest.mark.parametrize("to", ["bag", "rosbag2"])
+def test_messages_that_a_target_cannot_hold(to: str, tmp_path: Path) -> None:
+    source = SOURCES["mcap-none-profile"](tmp_path, scene("mono8"))[0]
+    assert call("pack", source, "-o", tmp_path / "dataset").code == 0
+    with unchanged(tmp_path):
+        result = call("unpack", tmp_path / "dataset", "--to", to, "-o", tmp_path / "out")
+        refused(result, 1, "topic /", "json", "--exclude", "mcap")
+
+
+def test_a_damaged_dataset_names_what_and_where(small_dataset: Path, tmp_path: Path) -> None:
+    sidecar = small_dataset / "cam_image_raw.yaml"
+    data = bytearray(sidecar.read_bytes())
+    data[300] ^= 1
+    sidecar.write_bytes(data)
+    with unchanged(tmp_path):
+        result = call("unpack", small_dataset, "--to", "bag", "-o", tmp_path / "out.bag")
+        refused(result, 1, str(sidecar), "[checksum-mismatch]")
+        refused(call("info", small_dataset), 1, str(sidecar), "[checksum-mismatch]")
+
+
+# ---------------------------------------------------------------- --json
+
+
+def parsed(result: Result) -> Any:
+    """Standard output as strict JSON."""
+
+    def refuse(word: str) -> None:
+        raise ValueError(f"{word} is no JSON")
+
+    return json.loads(result.out, parse_constant=refuse)
+
+
+@pytest.mark.parametrize("command", ["pack", "unpack", "images", "validate", "info", "demo"])
+def test_json_of_success(
+    command: str, small_bag: Path, small_dataset: Path, tmp_path: Path
+) -> None:
+    arguments: dict[str, tuple[object, ...]] = {
+        "pack": ("pack", small_bag, "-o", tmp_path / "x"),
+        "unpack": ("unpack", small_dataset, "--to", "bag", "-o", tmp_path / "x.bag"),
+        "images": ("unpack", small_dataset, "--to", "images", "-o", tmp_path / "x"),
+        "validate": ("validate", small_dataset, "--deep"),
+        "info": ("info", small_bag),
+        "demo": ("demo", tmp_path / "x.bag", "--seconds", 0.1),
+    }
+    result = call(*arguments[command], "--json")
+    assert (result.code, result.err) == (0, "")
+    keys = {
+        "pack": "topics",
+        "unpack": "messages",
+        "images": "messages",
+        "validate": "problems",
+        "info": "topics",
+        "demo": "messages",
+    }
+    assert keys[command] in parsed(result)
+
+
+@pytest.mark.parametrize("what", ["DATASET", "SIDECAR"])
+def test_json_of_info_on_a_dataset(what: str, small_dataset: Path) -> None:
+    path = small_dataset if what == "DATASET" else small_dataset / "cam_image_raw.yaml"
+    result = call("info", path, "--json")
+    assert (result.code, result.err) == (0, "")
+    topics = {topic["topic"]: topic for topic in parsed(result)["topics"]}
+    assert topics["/cam/image_raw"]["messages"] == 8
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (("pack", "none.bag", "-o", "OUT"), 2),
+        (("pack", "BAG", "-o", "DATASET"), 2),
+        (("pack", "BAG", "-o", "OUT", "--quality", "best"), 2),
+        (("unpack", "none", "--to", "bag"), 2),
+        (("unpack", "DATASET", "--to", "zip"), 2),
+        (("validate", "none"), 2),
+        (("info", "none.bag"), 2),
+        (("demo", "OUT"), 2),
+    ],
+)
+def test_json_of_failure(
+    arguments: tuple[str, ...], code: int, small_bag: Path, small_dataset: Path, tmp_path: Path
+) -> None:
+    paths = {"BAG": small_bag, "DATASET": small_dataset, "OUT": tmp_path / "out"}
+    with unchanged(tmp_path):
+        result = call(*(paths.get(argument, argument) for argument in arguments), "--json")
+    found = parsed(result)
+    assert (result.code, found["exit_code"]) == (code, code)
+    assert result.err == f"mp4ds: {found['error']}\n"
+
+
+def test_json_of_problems(small_dataset: Path) -> None:
+    (small_dataset / "messages.mcap").unlink()
+    result = call("validate", small_dataset, "--json")
+    assert (result.code, result.err) == (1, "")
+    problems = parsed(result)["problems"]
+    assert [problem["code"] for problem in problems] == ["file-missing"]
+    assert set(problems[0]) >= {"code", "place", "message"}
+
+
+def test_json_of_the_real_command(small_bag: Path, tmp_path: Path) -> None:
+    packed = run("pack", small_bag, "-o", tmp_path / "x", "--json")
+    assert (packed.code, packed.err) == (0, "")
+    assert parsed(packed)["dataset"] == str(tmp_path / "x")
+
+
+def test_a_newer_minor_version_is_told_in_one_line(small_dataset: Path) -> None:
+    path = small_dataset / "cam_image_raw.yaml"
+    text = path.read_bytes()
+    text = text[: text.rindex(b"checksum:")].replace(b'mp4ds: "1.0"', b'mp4ds: "1.7"\nfancy: 1')
+    path.write_bytes(text)
+    result = run("info", path)
+    assert result.code == 0, result.err
+    assert re.fullmatch(r"mp4ds: [^\n]*1\.7[^\n]*\n", result.err), result.err

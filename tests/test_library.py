@@ -1,0 +1,487 @@
+"""``mp4ds.open``: frames by number, their times and calibrations, and pairs on their own."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+import mp4ds
+from mp4ds.packing import PackOptions
+from mp4ds.unpacking import UnpackOptions
+from sources import (
+    ENCODINGS,
+    IMAGE,
+    INFO,
+    PERIOD,
+    SOURCES,
+    START,
+    Record,
+    Scene,
+    image_cdr,
+    image_ros1,
+    odd_scene,
+    scene,
+    write_bag,
+    write_mcap,
+)
+
+TOPIC = "/cam/image_raw"
+
+
+def images(source: Scene, topic: str = TOPIC) -> list[Any]:
+    return [message for message in source.messages if message.topic == topic]
+
+
+def expected_pixels(values: Any) -> np.ndarray[Any, Any]:
+    """What numpy sees in an image message, in native byte order."""
+    encoding, height, width = values["encoding"], values["height"], values["width"]
+    rows = np.asarray(values["data"], np.uint8).reshape(height, values["step"])
+    if encoding in ("mono16", "16UC1"):
+        dtype = np.dtype(">u2" if values["is_bigendian"] else "<u2")
+        pixels = np.ascontiguousarray(rows[:, : 2 * width]).view(dtype)
+        return pixels.astype(np.uint16)
+    if encoding in ("rgb8", "bgr8"):
+        return rows[:, : 3 * width].reshape(height, width, 3)
+    return rows[:, :width]
+
+
+def packed(folder: Path, source: Scene, variant: str = "bag-none", **options: Any) -> Path:
+    """A dataset of the scene."""
+    (folder / "source").mkdir(parents=True)
+    paths = SOURCES[variant](folder / "source", source)
+    mp4ds.pack(paths, folder / "dataset", PackOptions(**options))
+    return folder / "dataset"
+
+
+@pytest.fixture(scope="module")
+def colour(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene]:
+    """A dataset of rgb8 images, not to be changed, and what was recorded."""
+    source = scene("rgb8", frames=12)
+    return packed(tmp_path_factory.mktemp("colour"), source, gop=5), source
+
+
+# ---------------------------------------------------------------- frames
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize(
+    ("variant", "shape"),
+    [
+        ("bag-none", {}),
+        ("mcap-ros2-zstd", {"width": 63, "height": 47}),
+        ("rosbag2-sqlite3-v9", {"pad": 8, "big_endian": True}),
+    ],
+)
+def test_frames_are_the_pixels_that_were_recorded(
+    encoding: str, variant: str, shape: dict[str, Any], tmp_path: Path
+) -> None:
+    source = scene(encoding, frames=5, **shape)
+    with mp4ds.open(packed(tmp_path, source, variant)) as dataset:
+        stream = dataset[TOPIC]
+        assert len(stream) == 5
+        for found in (list(stream), [stream[i] for i in range(5)], stream[:]):
+            for number, (frame, message) in enumerate(zip(found, images(source), strict=True)):
+                values = message.values
+                expected = expected_pixels(values)
+                assert np.array_equal(frame.data, expected)
+                assert frame.data.dtype == expected.dtype
+                assert frame.data.dtype.isnative
+                assert frame.data.shape == expected.shape
+                assert frame.data.flags.writeable
+                assert frame.index == number
+                assert frame.stamp_ns == values["header"]["stamp"]
+                assert frame.log_time_ns == message.log_time
+                assert frame.frame_id == "cam"
+                assert frame.encoding == encoding
+                assert frame.intrinsics is not None
+                assert frame.intrinsics.k[0] == pytest.approx(0.9 * values["width"])
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_frames_of_a_lossy_dataset_are_near(encoding: str, tmp_path: Path) -> None:
+    source = scene(encoding, frames=4, noisy=False, width=96, height=64)
+    with mp4ds.open(packed(tmp_path, source, quality="crf=10")) as dataset:
+        for frame, message in zip(dataset[TOPIC], images(source), strict=True):
+            expected = expected_pixels(message.values).astype(float)
+            assert frame.data.shape == expected.shape
+            if "16" in encoding:  # depth is never blurred
+                assert np.array_equal(frame.data, expected)
+            error = np.abs(frame.data - expected).mean()
+            assert error < (12 if "bayer" in encoding else 6)  # hard edges, smeared colours
+
+
+def test_numbers_and_slices(colour: tuple[Path, Scene]) -> None:
+    with mp4ds.open(colour[0]) as dataset:
+        stream = dataset[TOPIC]
+        every = list(stream)
+        assert [frame.index for frame in every] == list(range(12))
+        for number in (*range(12), *range(-12, 0)):
+            frame = stream[number]
+            assert frame.index == number % 12
+            assert np.array_equal(frame.data, every[number].data)
+        for part in (slice(2, 7), slice(None, None, 3), slice(8, 2, -2), slice(-3, None),
+                     slice(5, 5), slice(0, 100), slice(None, None, -1)):  # fmt: skip
+            assert [frame.index for frame in stream[part]] == list(range(12))[part]
+        assert stream[np.int64(3)].index == 3  # type: ignore[call-overload]
+
+
+@pytest.mark.parametrize("number", [12, -13, 10**9, -(10**9), 2**70])
+def test_numbers_out_of_range(number: int, colour: tuple[Path, Scene]) -> None:
+    with mp4ds.open(colour[0]) as dataset:
+        with pytest.raises(IndexError, match=f"12 frames, and no frame {number}"):
+            dataset[TOPIC][number]
+        assert dataset[TOPIC][11].index == 11
+
+
+def test_what_is_no_number(colour: tuple[Path, Scene]) -> None:
+    with mp4ds.open(colour[0]) as dataset, pytest.raises(TypeError):
+        dataset[TOPIC]["3"]  # type: ignore[call-overload]
+
+
+def test_frames_do_not_change_when_others_are_read(colour: tuple[Path, Scene]) -> None:
+    """Their pixels are their own, whatever is read besides."""
+    with mp4ds.open(colour[0]) as dataset:
+        stream = dataset[TOPIC]
+        expected = [expected_pixels(message.values) for message in images(colour[1])]
+        rng = random.Random(0)
+        kept = []
+        for frame in stream:
+            kept += [frame, stream[rng.randrange(12)]]
+            next(iter(stream)).data[...] += 1  # one's own copy
+        for frame in kept:
+            assert np.array_equal(frame.data, expected[frame.index])
+
+
+def test_two_readers_at_once(colour: tuple[Path, Scene]) -> None:
+    with mp4ds.open(colour[0]) as one, mp4ds.open(colour[0]) as two:
+        for a, b in zip(one[TOPIC], reversed(two[TOPIC][:]), strict=True):
+            assert np.array_equal(a.data, one[TOPIC][a.index].data)
+            assert np.array_equal(b.data, one[TOPIC][b.index].data)
+
+
+def test_columns(colour: tuple[Path, Scene]) -> None:
+    with mp4ds.open(colour[0]) as dataset:
+        stream = dataset[TOPIC]
+        recorded = images(colour[1])
+        assert stream.stamps.dtype == np.int64
+        assert stream.stamps.tolist() == [m.values["header"]["stamp"] for m in recorded]
+        assert stream.log_times.tolist() == [m.log_time for m in recorded]
+        assert stream.topic == TOPIC
+        assert stream.video_path == colour[0] / "cam_image_raw.mp4"
+
+
+# ---------------------------------------------------------------- opening
+
+
+@pytest.mark.parametrize(
+    "place",
+    [".", "dataset.yaml", "cam_image_raw.mp4", "cam_image_raw.yaml"],
+)
+@pytest.mark.parametrize("kind", [str, Path])
+def test_all_that_can_be_opened(
+    place: str, kind: Callable[[Path], Any], colour: tuple[Path, Scene]
+) -> None:
+    with mp4ds.open(kind(colour[0] / place)) as dataset:
+        assert isinstance(dataset, mp4ds.Dataset)
+        assert dataset.topics == [TOPIC]
+        assert [type(stream) for stream in dataset.streams] == [mp4ds.Stream]
+        assert isinstance(dataset[TOPIC][0], mp4ds.Frame)
+        assert dataset["cam_image_raw"] is dataset[TOPIC]
+
+
+def test_relative_paths(colour: tuple[Path, Scene], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(colour[0])
+    for place in (".", "cam_image_raw.mp4", "dataset.yaml"):
+        with mp4ds.open(place) as dataset:
+            assert len(dataset[TOPIC][:2]) == 2
+
+
+@pytest.mark.parametrize("topic", ["/imu", "/cam", "", "cam/image_raw", "/cam/camera_info"])
+def test_a_wrong_topic_lists_the_right_ones(topic: str, colour: tuple[Path, Scene]) -> None:
+    with mp4ds.open(colour[0]) as dataset, pytest.raises(KeyError, match="there are: /cam/image_r"):
+        dataset[topic]
+
+
+def test_a_dataset_without_streams(tmp_path: Path) -> None:
+    dataset = packed(tmp_path, scene("mono8"), exclude=["/cam/*"])
+    with mp4ds.open(dataset) as opened:
+        assert opened.topics == []
+        with pytest.raises(KeyError, match="there are: none"):
+            opened[TOPIC]
+
+
+def test_what_cannot_be_opened(tmp_path: Path, colour: tuple[Path, Scene]) -> None:
+    with pytest.raises(mp4ds.SourceNotFoundError) as missing:
+        mp4ds.open(tmp_path / "none")
+    assert isinstance(missing.value, FileNotFoundError)
+    with pytest.raises(mp4ds.FormatError) as empty:
+        mp4ds.open(tmp_path)
+    assert empty.value.code == "file-missing"
+    shutil.copy(colour[0] / "cam_image_raw.mp4", tmp_path / "alone.mp4")
+    with pytest.raises(mp4ds.FormatError) as alone:
+        mp4ds.open(tmp_path / "alone.mp4")
+    assert alone.value.code == "file-missing"
+    assert "alone.yaml" in str(alone.value)
+    (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(range(256)))
+    with pytest.raises(mp4ds.Mp4dsError):
+        mp4ds.open(tmp_path / "drive.bag")
+
+
+@pytest.mark.parametrize("name", ["cam_image_raw.mp4", "cam_image_raw.yaml", "messages.mcap"])
+def test_a_file_that_is_gone(name: str, tmp_path: Path, colour: tuple[Path, Scene]) -> None:
+    shutil.copytree(colour[0], tmp_path / "dataset")
+    (tmp_path / "dataset" / name).unlink()
+    with pytest.raises(mp4ds.FormatError) as caught, mp4ds.open(tmp_path / "dataset") as dataset:
+        assert list(dataset.records())
+    assert caught.value.code == "file-missing"
+    assert name in str(caught.value)
+
+
+# ---------------------------------------------------------------- closing
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_closing_closes_all_files(colour: tuple[Path, Scene]) -> None:
+    def open_files() -> list[str]:
+        folder = "/proc/self/fd"
+        links = (os.path.realpath(f"{folder}/{name}") for name in os.listdir(folder))  # noqa: PTH208
+        return [link for link in links if link.startswith(str(colour[0]))]
+
+    assert open_files() == []
+    dataset = mp4ds.open(colour[0])
+    stream = dataset[TOPIC]
+    assert stream[3].index == 3
+    assert open_files() == [str(stream.video_path)]
+    iterator = iter(stream)
+    next(iterator)
+    iterator.close()  # type: ignore[attr-defined]
+    assert len(open_files()) == 1
+    dataset.close()
+    assert open_files() == []
+    dataset.close()
+    with mp4ds.open(colour[0]) as again:
+        again[TOPIC][0]
+    assert open_files() == []
+
+
+def test_closed_streams_still_know_their_times(colour: tuple[Path, Scene]) -> None:
+    with mp4ds.open(colour[0]) as dataset:
+        stream = dataset[TOPIC]
+        first = stream[0]
+    assert len(stream.stamps) == 12
+    assert np.array_equal(stream[0].data, first.data)  # opens its video once more
+    stream.close()
+
+
+# ---------------------------------------------------------------- calibrations
+
+
+def recalibrated(first_new: int, *, frames: int = 8) -> Scene:
+    """A camera whose calibration changes with its message of that number, twice."""
+    source = scene("mono8", frames=frames)
+    number = 0
+    for place, message in enumerate(source.messages):
+        if message.msgtype != INFO:
+            continue
+        if first_new <= number < frames - 2:
+            new = {"k": [70.0, 0, 30, 0, 70, 20, 0, 0, 1], "distortion_model": "equidistant"}
+            source.messages[place] = replace(message, values={**message.values, **new})
+        number += 1
+    return source
+
+
+@pytest.mark.parametrize("first_new", [0, 3, 5])
+@pytest.mark.parametrize("variant", ["bag-none", "mcap-ros2-lz4"])
+def test_the_calibration_that_held(first_new: int, variant: str, tmp_path: Path) -> None:
+    source = recalibrated(first_new)
+    infos = images(source, "/cam/camera_info")
+    with mp4ds.open(packed(tmp_path, source, variant)) as dataset:
+        stream = dataset[TOPIC]
+        models = [info.values["distortion_model"] for info in infos]
+        assert [c.distortion_model for c in stream.calibrations] == list(dict.fromkeys(models))
+        for number, message in enumerate(images(source)):
+            earlier = [info for info in infos if info.log_time <= message.log_time] or infos[:1]
+            calibration = stream.intrinsics_at(number)
+            assert calibration is not None
+            assert calibration.distortion_model == earlier[-1].values["distortion_model"]
+            assert calibration.k == [float(value) for value in earlier[-1].values["k"]]
+            assert stream[number].intrinsics is calibration
+
+
+def test_a_camera_without_calibration(tmp_path: Path) -> None:
+    with mp4ds.open(packed(tmp_path, scene("mono8", with_info=False))) as dataset:
+        stream = dataset[TOPIC]
+        assert list(stream.calibrations) == []
+        assert stream.intrinsics_at(0) is None
+        assert stream[0].intrinsics is None
+
+
+# ---------------------------------------------------------------- several geometries
+
+
+@pytest.mark.parametrize("variant", ["bag-none", "mcap-ros2-none"])
+def test_a_topic_that_changes_its_size(variant: str, tmp_path: Path) -> None:
+    with mp4ds.open(packed(tmp_path, odd_scene("size-change"), variant)) as dataset:
+        assert dataset.topics == ["/odd/image"]
+        assert len(dataset.streams) == 2
+        with pytest.raises(mp4ds.OptionError, match="odd_image, odd_image-2"):
+            dataset["/odd/image"]
+        large, small = dataset["odd_image"], dataset["odd_image-2"]
+        assert [len(large), len(small)] == [4, 4]
+        assert large[0].data.shape == (24, 32)
+        assert small[0].data.shape == (12, 32)
+        assert large.topic == small.topic == "/odd/image"
+        assert max(large.stamps) < min(small.stamps)
+
+
+def test_a_topic_that_changes_its_encoding(tmp_path: Path) -> None:
+    with mp4ds.open(packed(tmp_path, odd_scene("encoding-change"))) as dataset:
+        found = {stream.sidecar.image.encoding: stream for stream in dataset.streams}
+        assert {name: len(stream) for name, stream in found.items()} == {
+            "mono8": 6,
+            "bayer_rggb8": 2,
+        }
+        assert found["bayer_rggb8"].stamps.tolist() == [START + n * PERIOD for n in (2, 5)]
+
+
+def test_frame_ids_that_change(tmp_path: Path) -> None:
+    with mp4ds.open(packed(tmp_path, odd_scene("frame-id-change"))) as dataset:
+        names = [frame.frame_id for frame in dataset["/odd/image"]]
+        assert names == ["/cam/optical \u00e4", ""] * 4
+        assert dataset["/odd/image"][3].frame_id == ""
+
+
+@pytest.mark.parametrize("trait", ["stamp-zero", "stamp-repeated", "stamp-backward", "log-equal"])
+def test_frames_are_found_by_number_whatever_the_times(trait: str, tmp_path: Path) -> None:
+    with mp4ds.open(packed(tmp_path, odd_scene(trait))) as dataset:
+        stream = dataset["/odd/image"]
+        every = list(stream)
+        for number in (5, 0, 7, 3):
+            assert np.array_equal(stream[number].data, every[number].data)
+        assert len({frame.data.tobytes() for frame in every}) == 8
+
+
+# ---------------------------------------------------------------- pairs on their own
+
+
+def payloads(path: Path, topics: set[str]) -> list[tuple[str, int, bytes]]:
+    """What a recording holds on some topics, read by rosbags."""
+    with AnyReader([path]) as reader:
+        connections = [c for c in reader.connections if c.topic in topics]
+        return sorted(
+            (connection.topic, time, bytes(raw))
+            for connection, time, raw in reader.messages(connections)
+        )
+
+
+@pytest.mark.parametrize("encoding", ["bayer_gbrg8", "rgb8", "mono16"])
+def test_a_pair_alone(encoding: str, tmp_path: Path) -> None:
+    source = scene(encoding)
+    dataset = packed(tmp_path, source)
+    alone = tmp_path / "a mail"
+    alone.mkdir()
+    for suffix in ("mp4", "yaml"):
+        shutil.copy(dataset / f"cam_image_raw.{suffix}", alone)
+    video, sidecar = alone / "cam_image_raw.mp4", alone / "cam_image_raw.yaml"
+    for path in (video, sidecar, str(video)):
+        assert mp4ds.validate(path, deep=True) == []
+    with mp4ds.open(video) as pair:
+        assert pair.manifest is None
+        assert pair.topics == [TOPIC]
+        assert pair.profile == "ros1"
+        for frame, message in zip(pair[TOPIC], images(source), strict=True):
+            assert np.array_equal(frame.data, expected_pixels(message.values))
+    summary = mp4ds.unpack(sidecar, "bag", tmp_path / "again.bag")
+    assert summary.messages == {TOPIC: 8, "/cam/camera_info": 8}
+    topics = {TOPIC, "/cam/camera_info"}
+    again = payloads(tmp_path / "again.bag", topics)
+    assert len(again) == 16
+    assert again == payloads(tmp_path / "source" / "drive.bag", topics)
+    assert mp4ds.unpack(video, "images").output == alone / "cam_image_raw_unpacked_images"
+
+
+def test_a_pair_of_a_topic_with_other_places(tmp_path: Path) -> None:
+    """A pair alone has only its own messages, and that is no error."""
+    dataset = packed(tmp_path, odd_scene("encoding-change"))
+    pair = tmp_path / "pair"
+    pair.mkdir()
+    for suffix in ("mp4", "yaml"):
+        shutil.copy(dataset / f"odd_image-2.{suffix}", pair)
+    assert mp4ds.validate(pair / "odd_image-2.yaml", deep=True) == []
+    summary = mp4ds.unpack(pair / "odd_image-2.mp4", "bag", tmp_path / "again.bag")
+    assert summary.messages == {"/odd/image": 2}
+    everything = payloads(tmp_path / "source" / "drive.bag", {"/odd/image"})
+    assert set(payloads(tmp_path / "again.bag", {"/odd/image"})) < set(everything)
+
+
+def test_a_pair_without_its_video(tmp_path: Path, colour: tuple[Path, Scene]) -> None:
+    shutil.copy(colour[0] / "cam_image_raw.yaml", tmp_path)
+    problems = mp4ds.validate(tmp_path / "cam_image_raw.yaml")
+    assert [problem.code for problem in problems] == ["file-missing"]
+    with mp4ds.open(tmp_path / "cam_image_raw.yaml") as pair:
+        assert pair[TOPIC].sidecar.frames == 12
+        with pytest.raises(mp4ds.FormatError, match="cam_image_raw.mp4"):
+            pair[TOPIC][0]
+
+
+def test_several_topics_and_a_choice_of_them(tmp_path: Path) -> None:
+    def image(n: int, topic: str) -> Any:
+        stamp = START + n * PERIOD
+        fields: dict[str, Any] = {"width": 4, "height": 2, "encoding": "mono8"}
+        fields |= {"data": bytes([n] * 8), "stamp": stamp}
+        return (topic, stamp, image_ros1(**fields), image_cdr(**fields))
+
+    rows = [image(n, topic) for n in range(5) for topic in ("/a/image", "/b/image", "/A/image")]
+    source = Scene([Record(t, IMAGE, time, ros1=r, cdr=c) for t, time, r, c in rows])
+    dataset = packed(tmp_path, source)
+    with mp4ds.open(dataset) as opened:
+        assert opened.topics == ["/a/image", "/b/image", "/A/image"]
+        assert [stream.path.stem for stream in opened.streams] == [
+            "a_image",
+            "b_image",
+            "A_image-2",
+        ]
+        for stream in opened.streams:
+            assert [int(frame.data[0, 0]) for frame in stream] == [0, 1, 2, 3, 4]
+    mp4ds.unpack(dataset, "mcap", tmp_path / "b.mcap", UnpackOptions(topics=["/[bA]/*"]))
+    found = payloads_of_mcap(tmp_path / "b.mcap")
+    assert found == {"/b/image": 5, "/A/image": 5}
+
+
+def payloads_of_mcap(path: Path) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    with path.open("rb") as stream:
+        for _, channel, _ in make_reader(stream).iter_messages():
+            counts[channel.topic] = counts.get(channel.topic, 0) + 1
+    return counts
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_strings_and_paths_for_everything(kind: Callable[[Path], Any], tmp_path: Path) -> None:
+    write_bag(tmp_path / "drive.bag", scene("mono8"))
+    summary = mp4ds.pack(kind(tmp_path / "drive.bag"), kind(tmp_path / "set"))
+    assert summary.dataset == tmp_path / "set"
+    assert mp4ds.validate(kind(tmp_path / "set")) == []
+    assert mp4ds.unpack(kind(tmp_path / "set"), "bag").output == tmp_path / "set_unpacked.bag"
+    write_mcap(tmp_path / "one.mcap", scene("mono8"))
+    mp4ds.pack([kind(tmp_path / "one.mcap")], kind(tmp_path / "other"))
+    assert mp4ds.validate(kind(tmp_path)) == []
+
+
+def test_relative_outputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_bag(Path("drive.bag"), scene("mono8", frames=2))
+    assert mp4ds.pack("drive.bag", "set").dataset == tmp_path / "set"
+    assert mp4ds.unpack("set", "bag").output == tmp_path / "set_unpacked.bag"
+    assert mp4ds.unpack("set/cam_image_raw.mp4", "mcap", "one.mcap").output == tmp_path / "one.mcap"

@@ -1,0 +1,259 @@
+"""The public surface: its names, their documentation and types, and what importing costs."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mp4ds
+from mp4ds import errors
+
+ROOT = Path(__file__).parents[1]
+NAMES = [
+    "ConversionError",
+    "Dataset",
+    "FormatError",
+    "Frame",
+    "Mp4dsError",
+    "OptionError",
+    "PackOptions",
+    "PackSummary",
+    "Problem",
+    "SourceError",
+    "SourceNotFoundError",
+    "Stream",
+    "TargetError",
+    "TargetExistsError",
+    "UnpackOptions",
+    "UnpackSummary",
+    "VersionError",
+    "VideoError",
+    "WriteError",
+    "__version__",
+    "open",
+    "pack",
+    "unpack",
+    "validate",
+]
+
+
+def python(code: str) -> str:
+    """Standard output of a new interpreter."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(mp4ds.__file__).parents[1])}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+# ---------------------------------------------------------------- names
+
+
+def test_these_are_the_names() -> None:
+    """A change here is a change of what users rely on."""
+    assert sorted(mp4ds.__all__) == NAMES
+    assert dir(mp4ds) == mp4ds.__all__
+    for name in NAMES:
+        assert getattr(mp4ds, name) is not None
+
+
+def test_other_names_are_attribute_errors() -> None:
+    with pytest.raises(AttributeError, match="'opne'"):
+        mp4ds.opne  # noqa: B018
+    assert not hasattr(mp4ds, "__wrapped__")
+
+
+def test_a_star_import_takes_exactly_these() -> None:
+    code = "ns = {}; exec('from mp4ds import *', ns); print(sorted(set(ns) - {'__builtins__'}))"
+    assert eval(python(code)) == NAMES  # noqa: S307
+
+
+def test_every_error_is_public() -> None:
+    tree = {
+        name
+        for name, value in vars(errors).items()
+        if isinstance(value, type) and issubclass(value, Exception)
+    }
+    assert tree <= set(NAMES)
+    for name in tree:
+        assert issubclass(getattr(mp4ds, name), mp4ds.Mp4dsError)
+        assert name in str(errors.__doc__)  # the tree is drawn there
+
+
+@pytest.mark.parametrize(
+    ("name", "builtin", "code"),
+    [
+        ("SourceError", ValueError, 2),
+        ("SourceNotFoundError", FileNotFoundError, 2),
+        ("TargetError", OSError, 2),
+        ("TargetExistsError", FileExistsError, 2),
+        ("OptionError", ValueError, 2),
+        ("FormatError", ValueError, 1),
+        ("VersionError", ValueError, 1),
+        ("VideoError", ValueError, 1),
+        ("ConversionError", ValueError, 1),
+        ("WriteError", OSError, 1),
+        ("Mp4dsError", Exception, 1),
+    ],
+)
+def test_errors_are_also_builtin_ones(name: str, builtin: type, code: int) -> None:
+    error = getattr(mp4ds, name)
+    assert issubclass(error, builtin)
+    assert error.exit_code == code
+    assert re.search(rf"{name}\b.* {code}\b", str(errors.__doc__)) or name in (
+        "SourceNotFoundError",
+        "TargetExistsError",
+    )
+
+
+def test_the_errors_sentences() -> None:
+    path = Path("drive")
+    for error, sentence in [
+        (mp4ds.SourceError(path, "is odd", "Fix it."), "drive: is odd. Fix it."),
+        (mp4ds.SourceError(path, "is odd"), "drive: is odd."),
+        (mp4ds.SourceNotFoundError("drive"), "drive: no such file or folder. Check the path."),
+        (mp4ds.FormatError("some-code", path, "is odd"), "drive: is odd [some-code]."),
+        (mp4ds.ConversionError("/t", "is odd"), "topic /t: is odd."),
+    ]:
+        assert str(error) == sentence
+    for error in (
+        mp4ds.TargetExistsError(path),
+        mp4ds.VersionError(path, "2.0", "1.0"),
+        mp4ds.WriteError(path, OSError(28, "No space left on device")),
+    ):
+        assert str(error).startswith("drive: ")
+        assert str(error).endswith(".")
+
+
+# ---------------------------------------------------------------- documentation
+
+
+def members(value: Any) -> list[tuple[str, Any]]:
+    """What a class defines itself for its users."""
+    return [
+        (name, member)
+        for name, member in vars(value).items()
+        if not name.startswith("_")
+        and (callable(member) or isinstance(member, property) or hasattr(member, "func"))
+    ]
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "__version__"])
+def test_all_is_documented(name: str) -> None:
+    value = getattr(mp4ds, name)
+    text = inspect.getdoc(value)
+    assert text
+    assert text.splitlines()[0].rstrip("`").endswith("."), "a summary is a sentence"
+    if isinstance(value, type):
+        for member_name, member in members(value):
+            assert inspect.getdoc(member), f"{name}.{member_name}"
+    if dataclasses.is_dataclass(value):
+        documented = set(re.findall(r"^ {4}(\w+): ", text, re.MULTILINE))
+        assert {field.name for field in dataclasses.fields(value)} == documented
+    elif callable(value) and not isinstance(value, type):
+        for parameter in inspect.signature(value).parameters.values():
+            known = f"{parameter.name}: " in text or name == "open"  # which refers to Dataset
+            assert known, f"{name}({parameter.name})"
+
+
+@pytest.mark.parametrize("name", ["open", "pack", "unpack", "validate"])
+def test_the_functions_are_annotated(name: str) -> None:
+    function = getattr(mp4ds, name)
+    signature = inspect.signature(function)
+    assert signature.return_annotation is not inspect.Signature.empty
+    for parameter in signature.parameters.values():
+        assert parameter.annotation is not inspect.Parameter.empty
+        if parameter.name in ("deep", "progress"):
+            assert parameter.kind is inspect.Parameter.KEYWORD_ONLY
+
+
+def test_options_are_frozen_and_compare() -> None:
+    for options in (mp4ds.PackOptions(), mp4ds.UnpackOptions()):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            options.force = True  # type: ignore[misc]
+        assert options == type(options)()
+
+
+# ---------------------------------------------------------------- importing
+
+HEAVY = ["numpy", "av", "pydantic", "yaml", "rosbags", "mcap", "jsonschema", "typer", "rich"]
+
+
+def test_importing_is_cheap() -> None:
+    loaded = python("import mp4ds, sys; print(*sys.modules)").split()
+    assert [name for name in HEAVY if name in loaded] == []
+
+
+@pytest.mark.parametrize(
+    ("code", "absent"),
+    [
+        ("mp4ds.FormatError", ["numpy", "av", "pydantic"]),
+        ("mp4ds.__version__", ["numpy", "av", "pydantic"]),
+        ("import mp4ds.cli", ["numpy", "av", "pydantic", "rosbags", "mcap"]),
+        ("mp4ds.open", ["typer", "rich", "jsonschema"]),
+        ("mp4ds.pack", ["typer", "rich", "jsonschema"]),
+    ],
+)
+def test_what_is_used_is_imported(code: str, absent: list[str]) -> None:
+    loaded = python(f"import mp4ds, sys; {code}; print(*sys.modules)").split()
+    assert [name for name in absent if name in loaded] == []
+
+
+def test_importing_changes_nothing() -> None:
+    """No logging set up, no signals, no warnings filters, no environment."""
+    code = (
+        "import os, signal, warnings, logging, locale\n"
+        "def state():\n"
+        "    return (dict(os.environ), signal.getsignal(signal.SIGINT), list(warnings.filters),\n"
+        "            logging.root.handlers[:], locale.setlocale(locale.LC_ALL))\n"
+        "before = state()\n"
+        "import mp4ds\n"
+        "print(before == state())"
+    )
+    assert python(code).strip() == "True"
+
+
+def test_the_version_is_that_of_the_build() -> None:
+    text = (ROOT / "src" / "mp4ds" / "_version.py").read_text()
+    assert f'"{mp4ds.__version__}"' in text
+    assert re.fullmatch(r"\d+\.\d+\.\d+(\.\w+|[a-z]+\d+)?", mp4ds.__version__)
+
+
+# ---------------------------------------------------------------- types
+
+
+def test_the_package_says_that_it_is_typed() -> None:
+    assert Path(mp4ds.__file__).with_name("py.typed").is_file()
+
+
+def test_a_typed_program_passes_mypy(tmp_path: Path) -> None:
+    pytest.importorskip("mypy")
+    usage = ROOT / "tests" / "typed_usage.py"
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "mypy", "--strict", "--config-file", os.devnull),
+            *("--follow-imports", "silent", "--cache-dir", str(tmp_path), str(usage)),
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+        env={**os.environ, "MYPYPATH": str(ROOT / "src")},
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_typed_program_uses_every_name() -> None:
+    text = (ROOT / "tests" / "typed_usage.py").read_text()
+    used = set(re.findall(r"\bmp4ds\.(\w+)", text))
+    errors_of_a_kind = {name for name in NAMES if name.endswith("Error")}
+    assert used <= set(NAMES)
+    assert set(NAMES) - used <= errors_of_a_kind
