@@ -144,7 +144,7 @@ def _in_child(request: list[Any]) -> dict[str, Any]:
         os.close(receiver)
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
-        signal.alarm(SECONDS + 2)  # for one that waits and does not compute
+        signal.alarm(5 * SECONDS)  # for one that waits and does not compute
         with os.fdopen(sender, "w") as pipe:
             json.dump(_run(*request), pipe)
         os._exit(0)

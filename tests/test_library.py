@@ -431,7 +431,7 @@ def test_a_pair_without_its_video(tmp_path: Path, colour: tuple[Path, Scene]) ->
     assert [problem.code for problem in problems] == ["file-missing"]
     with mp4ds.open(tmp_path / "cam_image_raw.yaml") as pair:
         assert pair[TOPIC].sidecar.frames == 12
-        with pytest.raises(mp4ds.FormatError, match="cam_image_raw.mp4"):
+        with pytest.raises(mp4ds.FormatError, match=r"cam_image_raw\.mp4"):
             pair[TOPIC][0]
 
 

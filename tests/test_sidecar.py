@@ -29,7 +29,13 @@ from mp4ds.sidecar import (
     load_stream,
     schema_text,
 )
-from mp4ds.sidecar.models import decode_base64, document_of, parse_version
+from mp4ds.sidecar.models import (
+    MAX_CAMERA_INFOS,
+    MAX_FRAMES,
+    decode_base64,
+    document_of,
+    parse_version,
+)
 
 Document = dict[str, Any]
 
@@ -257,7 +263,7 @@ BAD_NAMES = ["", ".", "..", "../x.mp4", "/etc/passwd", "a/b.mp4", "a\\b.mp4", "C
              None, ["a"]]  # fmt: skip
 REFUSED: dict[str, list[tuple[str, Any]]] = {
     "stream": [
-        *(("frames", value) for value in (0, -1, 10**8 + 1, 2**80, 1.0, "3", True, None, ...)),
+        *(("frames", value) for value in (0, -1, MAX_FRAMES + 1, 2**80, 1.0, "3", True, None, ...)),
         *(("kind", value) for value in ("dataset", "Stream", None, ...)),
         *(("profile", value) for value in ("best", "crf=100", "crf=", "", None, 1, ...)),
         *(("stamps", value) for value in ("exact", "", None)),
@@ -289,7 +295,7 @@ REFUSED: dict[str, list[tuple[str, Any]]] = {
         *(("columns.stamp.values", value) for value in (5, [0, -12], None, ...)),
         *((f"columns.{name}", ...) for name in ("log_time", "stamp")),
         *(("columns.stamp", value) for value in ([1, 2, 3], 5, None)),
-        *(("camera_info.messages", value) for value in (-1, 10**7 + 1, 1.0, None, ...)),
+        *(("camera_info.messages", value) for value in (-1, MAX_CAMERA_INFOS + 1, 1.0, None, ...)),
         *((f"camera_info.calibrations.0.{m}", value)
           for m in ("k", "r", "p")
           for value in ([], [0.0] * 8, [0.0] * 13, ["0"] * 9, None, ...)),
@@ -314,7 +320,7 @@ REFUSED: dict[str, list[tuple[str, Any]]] = {
         *(("streams.0.video", value) for value in BAD_NAMES),
         *(("files.0.name", value) for value in BAD_NAMES),
         *(("files.0.sha256", value) for value in ("", "b" * 63, None, ...)),
-        *(("streams.0.frames", value) for value in (-1, 10**8 + 1, True, ...)),
+        *(("streams.0.frames", value) for value in (-1, MAX_FRAMES + 1, True, ...)),
         *(("time_range.start", value) for value in (-(2**63) - 1, 0.0, None, ...)),
         *(("time_range.end", value) for value in (2**64, "0", ...)),
         *(("topics_left_out", value) for value in ([1], "x", None)),

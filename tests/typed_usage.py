@@ -12,11 +12,15 @@ from numpy.typing import NDArray
 import mp4ds
 
 
+def use(*values: object) -> None:
+    """Take any values."""
+
+
 def pack(source: Path, dataset: str) -> dict[str, tuple[int, int]]:
     """Messages and frames of each topic."""
     options = mp4ds.PackOptions(topics=["/cam*"], quality="crf=22", codec="av1", jobs=2)
     summary: mp4ds.PackSummary = mp4ds.pack(source, dataset, options)
-    mp4ds.pack([source, str(source)], Path(dataset), progress=lambda state: print(state.frames))
+    mp4ds.pack([source, str(source)], Path(dataset), progress=lambda state: use(state.frames))
     return {topic.topic: (topic.messages, topic.frames) for topic in summary.topics}
 
 
@@ -26,13 +30,13 @@ def unpack(dataset: str | Path) -> Path:
     summary: mp4ds.UnpackSummary = mp4ds.unpack(dataset, "rosbag2", "drive", options)
     counts: dict[str, int] = summary.messages
     omitted: dict[str, int] = summary.omitted
-    print(sum(counts.values()), omitted, summary.converted, summary.left_out)
+    use(sum(counts.values()), omitted, summary.converted, summary.left_out)
     return summary.output
 
 
 def problems(dataset: Path) -> list[str]:
     """Codes of all problems."""
-    found: list[mp4ds.Problem] = mp4ds.validate(dataset, deep=True, progress=print)
+    found: list[mp4ds.Problem] = mp4ds.validate(dataset, deep=True, progress=use)
     return [problem.code for problem in found if problem.place and problem.message]
 
 
@@ -44,10 +48,10 @@ def brightness(path: str) -> list[tuple[int, float]]:
         some: list[mp4ds.Frame] = stream[2:7:2]
         stamps: NDArray[np.int64] = stream.stamps
         data: NDArray[Any] = last.data
-        print(len(stream), stamps[0], data.shape, [frame.index for frame in some])
+        use(len(stream), stamps[0], data.shape, [frame.index for frame in some])
         if last.intrinsics is not None:
             k: Sequence[float] = last.intrinsics.k
-            print(k[0], last.frame_id.upper(), last.encoding.upper())
+            use(k[0], last.frame_id.upper(), last.encoding.upper())
         return [(frame.stamp_ns, float(frame.data.mean())) for frame in stream]
 
 
@@ -56,14 +60,14 @@ def guarded(path: str) -> int:
     try:
         dataset: mp4ds.Dataset = mp4ds.open(path)
         topics: list[str] = dataset.topics
-        print(topics)
+        use(topics)
     except mp4ds.SourceNotFoundError as error:
         missing: Path = error.path
-        print(missing)
+        use(missing)
         return error.exit_code
     except mp4ds.VideoError as error:
         code: str = error.code
-        print(code, error.place, error.problem)
+        use(code, error.place, error.problem)
         return error.exit_code
     except mp4ds.Mp4dsError as error:
         return error.exit_code

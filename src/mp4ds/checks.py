@@ -222,9 +222,7 @@ def _validate_stream(path: Path, deep: bool, report: Callable[[str], None]) -> l
         stream = Stream(path)
         problems += _check_video_file(stream, deep, report)
         _ = stream.rebuilder  # decodes and checks the columns
-        if stream.sidecar.camera_info and stream.sidecar.camera_info.messages:
-            for _ in stream.camera_info_messages(stream.sidecar.channel.to_record(0)):
-                pass  # making them checks them
+        _ = stream.camera_info_columns
         with stream.open_video(sequential=True) as decoder:
             coded = decoder.coded_frames
             if coded != len(stream):

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.mcap import McapReader
-from mp4ds.errors import FormatError, OptionError, SourceNotFoundError
+from mp4ds.errors import FormatError, OptionError, SourceError, SourceNotFoundError
+from mp4ds.outputs import digest_file
 from mp4ds.records import Channel, Message, Record, Schema
 from mp4ds.sidecar import (
     MANIFEST_NAME,
@@ -36,6 +37,7 @@ class Dataset:
 
     Raises:
         SourceNotFoundError: There is nothing.
+        SourceError: What is there is no dataset.
         FormatError: A file breaks a rule of the format.
     """
 
@@ -46,6 +48,13 @@ class Dataset:
         if self.path.name == MANIFEST_NAME:
             self.path = self.path.parent
         self.manifest: Manifest | None = None
+        holds_one = (self.path / MANIFEST_NAME).exists()
+        if not holds_one and self.path.suffix not in (".yaml", ".yml", ".mp4"):
+            raise SourceError(
+                self.path,
+                "is no dataset",
+                "Give a folder that `mp4ds pack` made, or a sidecar beside its video.",
+            )
         if self.path.is_dir():
             self.manifest = load_manifest(self.path / MANIFEST_NAME)
             sidecars = [self.path / entry.sidecar for entry in self.manifest.streams]
@@ -104,6 +113,24 @@ class Dataset:
             return 0
         with McapReader(self._messages_path) as reader:
             return sum(item.count for item in reader.stats().values())
+
+    def verify_messages(self) -> None:
+        """Compare messages.mcap with its SHA-256: not all that it holds has a checksum of its own.
+
+        Raises:
+            FormatError: ``file-missing`` or ``hash-mismatch``.
+        """
+        if self._messages_path is None or self.manifest is None:
+            return
+        if not self._messages_path.is_file():
+            raise FormatError("file-missing", self._messages_path, "does not exist")
+        entry = next((item for item in self.manifest.files if item.name == MESSAGES_NAME), None)
+        if entry is None or digest_file(self._messages_path)[1] != entry.sha256:
+            raise FormatError(
+                "hash-mismatch",
+                self._messages_path,
+                "does not have the SHA-256 that the manifest says",
+            )
 
     def recorded_records(self) -> Iterator[Record]:
         """Everything in messages.mcap, in file order."""

@@ -11,7 +11,7 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -19,13 +19,16 @@ from mp4ds.errors import TargetError, TargetExistsError, WriteError
 
 
 @contextmanager
-def staged(target: Path, *, force: bool, replaceable: Callable[[Path], bool]) -> Iterator[Path]:
+def staged(
+    target: Path, *, force: bool, replaceable: Callable[[Path], bool], sources: Sequence[Path] = ()
+) -> Iterator[Path]:
     """Make an output under a temporary name and move it into place at the end.
 
     Args:
         target: The final name; its parent folder must exist.
         force: Replace an existing target.
         replaceable: Whether an existing target is of the kind that may be replaced.
+        sources: What the output is made from: neither may stand in the other.
 
     Yields:
         A path that does not exist yet, for the caller to make a file or folder at.
@@ -35,6 +38,7 @@ def staged(target: Path, *, force: bool, replaceable: Callable[[Path], bool]) ->
         TargetError: It may not be written or replaced.
         WriteError: The disk refused.
     """
+    _refuse_overlap(target, sources)
     check_target(target, force=force, replaceable=replaceable)
     try:
         folder = Path(
@@ -59,9 +63,7 @@ def staged(target: Path, *, force: bool, replaceable: Callable[[Path], bool]) ->
 def check_target(target: Path, *, force: bool, replaceable: Callable[[Path], bool]) -> None:
     """Refuse a target early, before any work is done. See `staged` for the errors."""
     if not target.parent.is_dir():
-        raise TargetError(
-            target, f"its folder {target.parent} does not exist", "Make the folder first."
-        )
+        raise TargetError(target, f"{target.parent} is no folder", "Make the folder first.")
     if not os.path.lexists(target):
         return
     if not force:
@@ -72,6 +74,16 @@ def check_target(target: Path, *, force: bool, replaceable: Callable[[Path], boo
             "exists and is not something that mp4ds wrote, so --force does not replace it",
             "Choose another name, or remove it yourself.",
         )
+
+
+def _refuse_overlap(target: Path, sources: Sequence[Path]) -> None:
+    """Keep a source from being written into, or replaced together with what is around it."""
+    place = target.resolve()
+    for source in (path.resolve() for path in sources):
+        if place == source or source in place.parents or place in source.parents:
+            raise TargetError(
+                target, f"overlaps with the source {source}", "Choose a place beside the source."
+            )
 
 
 def as_write_error(error: OSError, target: Path) -> OSError:

@@ -11,7 +11,7 @@ from pathlib import Path
 from mp4ds.bags import BagWriter, open_writer
 from mp4ds.bags.convert import Converter
 from mp4ds.dataset import Dataset, Stream
-from mp4ds.errors import OptionError, WriteError
+from mp4ds.errors import FormatError, OptionError, WriteError
 from mp4ds.outputs import staged
 from mp4ds.plan import FileNames, Selection
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord
@@ -102,12 +102,18 @@ def unpack(
         raise OptionError(f"--to {to!r} is not known. Use {', '.join(TARGETS)}.")
     if chosen.storage not in (None, "sqlite3", "mcap"):
         raise OptionError(f"--storage {chosen.storage!r} is not known. Use sqlite3 or mcap.")
+    if chosen.storage and to != "rosbag2":
+        raise OptionError(f"--storage goes with --to rosbag2, not with --to {to}.")
     if chosen.image_format not in ("png", "jpeg"):
         raise OptionError(f"--image-format {chosen.image_format!r} is not known. Use png or jpeg.")
     with Dataset(dataset) as opened:
         target = Path(os.path.abspath(output or default_output(opened.path, to)))  # noqa: PTH100
         replaceable = _is_image_folder if to == "images" else _is_recording
-        with staged(target, force=chosen.force, replaceable=replaceable) as path:
+        if to != "images":
+            opened.verify_messages()
+        with staged(
+            target, force=chosen.force, replaceable=replaceable, sources=[opened.path]
+        ) as path:
             try:
                 if to == "images":
                     return _unpack_images(opened, path, target, chosen, progress)
@@ -158,11 +164,13 @@ def _unpack_recording(
         storage=(options.storage or _recorded_storage(dataset)) if to == "rosbag2" else "",
     ) as writer:
         channels = _declare(dataset, writer, converter, selected, summary)
-        done = 0
+        done = found = 0
         for record in dataset.records():
             if not isinstance(record, Message):
                 _write_other(writer, record, to, source)
-            elif record.channel.id in channels:
+                continue
+            found += 1
+            if record.channel.id in channels:
                 payload = converter.payload(record.channel, record.data)
                 channel = channels[record.channel.id]
                 writer.write(replace(record, channel=channel, data=payload))
@@ -170,6 +178,12 @@ def _unpack_recording(
                 done += 1
                 if progress and done % 16 == 0:
                     progress(UnpackProgress(done, total))
+        if dataset.manifest and found != total:
+            raise FormatError(
+                "message-count",
+                dataset.path,
+                f"holds {found} messages where its manifest says {total}",
+            )
     for part in (writer, converter):
         summary.omitted.update(part.omitted)
     return summary

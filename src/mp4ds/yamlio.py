@@ -21,6 +21,8 @@ from mp4ds.errors import FormatError
 MAX_BYTES = 512 * 2**20  # a sidecar of a day at 60 Hz has about 100 MB
 MAX_STRUCTURE_BYTES = 16 * 2**20
 MAX_DEPTH = 32
+MAX_EVENTS = 10**6
+_MAX_DIGITS = 400
 
 _CHECKSUM = re.compile(rb'(?:\A|\n)checksum: "xxh64:([0-9a-f]{16})"\n\Z')
 _COLUMN = re.compile(rb"^( +)values: \|\n", re.MULTILINE)
@@ -158,7 +160,9 @@ def _build(events: Iterable[Any]) -> Any:
     root: list[Any] = []
     open_nodes: list[dict[str, Any] | list[Any]] = [root]
     keys: list[str | None] = [None]
-    for event in events:
+    for number, event in enumerate(events):
+        if number > MAX_EVENTS:
+            raise ValueError(f"has more than {MAX_EVENTS} values")
         if isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
             open_nodes.pop()
             keys.pop()
@@ -217,6 +221,8 @@ def _scalar(event: Any) -> Any:
     number = _NUMBER.fullmatch(text)
     if not number:
         return text
+    if len(text) > _MAX_DIGITS:
+        raise ValueError(f"line {_line(event)}: a number of {len(text)} digits")
     if not number.group(1) and not number.group(2):
         return int(text)
     value = float(text)

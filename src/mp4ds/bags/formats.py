@@ -48,13 +48,17 @@ def format_of(path: Path) -> str:
         SourceNotFoundError: There is nothing.
         SourceError: It is no recording, or cannot be read.
     """
-    if not path.exists():
-        raise SourceNotFoundError(path)
-    if path.is_dir():
-        return "rosbag2"
     try:
+        if not path.exists():
+            raise SourceNotFoundError(path)
+        if path.is_dir():
+            return "rosbag2"
+        if not path.is_file():
+            raise SourceError(path, "is neither a file nor a folder")
         with path.open("rb") as stream:
             start = stream.read(16)
+    except SourceError:
+        raise
     except OSError as error:
         raise SourceError(path, f"cannot be read: {error.strerror}") from None
     for magic, name in _MAGIC.items():

@@ -6,10 +6,14 @@ options are wrong; 130 interrupted.
 
 from __future__ import annotations
 
+import errno
 import os
+import signal
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, NoReturn, Optional
 
@@ -23,10 +27,13 @@ from mp4ds.cli.output import (
     print_pack,
     print_unpack,
     print_validation,
+    shown,
     status_line,
     unpack_progress,
 )
 from mp4ds.errors import Mp4dsError
+
+_BAD_PATH = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EACCES, errno.EINVAL)
 
 app = typer.Typer(
     name="mp4ds",
@@ -211,13 +218,23 @@ def demo(
     if as_json:
         print_json({"output": output, "messages": messages})
     else:
-        print(f"{output}: {messages} messages")
+        print(f"{shown(output)}: {messages} messages")
+
+
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    print(f"mp4ds: {shown(message)}", file=sys.stderr)
 
 
 def main() -> NoReturn:
     """Run the command line and exit."""
     # numpy is yet to be imported: no matrix is multiplied here, and idle threads cost time
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    warnings.showwarning = _show_warning
+    # a batch system's way to interrupt: leave as tidily as after Ctrl-C
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a terminal may lack a topic's letters
     app()
     sys.exit(0)
 
@@ -228,9 +245,13 @@ def _errors(as_json: bool) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        _fail("interrupted; the unfinished output was removed", 130, as_json)
+        _fail("interrupted; nothing unfinished was left behind", 130, as_json)
     except Mp4dsError as error:
         _fail(str(error), error.exit_code, as_json)
+    except OSError as error:
+        # a path that the system itself refuses, wherever it was met
+        code = 2 if error.errno in _BAD_PATH else 1
+        _fail(f"{error.filename or 'a file'}: {error.strerror or error}", code, as_json)
     except MemoryError:
         _fail("out of memory; try fewer --jobs", 1, as_json)
 
@@ -238,5 +259,5 @@ def _errors(as_json: bool) -> Iterator[None]:
 def _fail(message: str, code: int, as_json: bool) -> NoReturn:
     if as_json:
         print_json({"error": message, "exit_code": code})
-    print(f"mp4ds: {message}", file=sys.stderr)
+    print(f"mp4ds: {shown(message)}", file=sys.stderr)
     raise typer.Exit(code)

@@ -119,6 +119,19 @@ def status_line(as_json: bool) -> Iterator[Callable[[str], None] | None]:
         yield status.update
 
 
+def shown(value: object) -> str:
+    """A text without what would steer a terminal: a topic or file may be named so."""
+    text = str(value)
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def say(value: object) -> None:
+    """Print one line."""
+    print(shown(value))
+
+
 def _size(count: float) -> str:
     for unit in ("B", "kB", "MB", "GB"):
         if count < 1000:
@@ -142,7 +155,7 @@ def _print_table(columns: list[tuple[str, str]], rows: list[list[str]]) -> None:
         else:
             table.add_column(name, overflow="fold")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(shown, row))
     console.print(table)
 
 
@@ -151,20 +164,20 @@ def print_pack(summary: PackSummary) -> None:
     _print_table(_PACK_COLUMNS, [_pack_row(topic) for topic in summary.topics])
     for topic in summary.topics:
         for reason, (count, first) in topic.verbatim.items():
-            print(
+            say(
                 f"{topic.topic}: {count} of {topic.messages} messages stored verbatim in "
                 f"messages.mcap: {reason} (first: message {first})"
             )
         for note in topic.notes:
-            print(f"{topic.topic}: {note}")
+            say(f"{topic.topic}: {note}")
     for what, count in summary.skipped.items():
-        print(f"not packed, as no dataset can hold it: {count} {what}")
+        say(f"not packed, as no dataset can hold it: {count} {what}")
     if summary.left_out:
-        print(f"left out: {', '.join(summary.left_out)}")
+        say(f"left out: {', '.join(summary.left_out)}")
     if not any(topic.files for topic in summary.topics):
-        print("no topic became a video: all messages are in messages.mcap as they were")
+        say("no topic became a video: all messages are in messages.mcap as they were")
     ratio = summary.source_bytes / summary.dataset_bytes
-    print(
+    say(
         f"{summary.dataset}: {_size(summary.source_bytes)} -> {_size(summary.dataset_bytes)} "
         f"({ratio:.2f} times smaller), of which messages.mcap {_size(summary.messages_bytes)}"
     )
@@ -191,19 +204,19 @@ def _pack_row(topic: TopicSummary) -> list[str]:
 def print_unpack(summary: UnpackSummary, noun: str) -> None:
     """Print what was written, and what the target could not hold."""
     total = sum(summary.messages.values())
-    print(f"{summary.output}: {total} {noun} of {len(summary.messages)} topics")
+    say(f"{summary.output}: {total} {noun} of {len(summary.messages)} topics")
     if summary.converted:
-        print(f"converted between ROS 1 and ROS 2: {', '.join(summary.converted)}")
+        say(f"converted between ROS 1 and ROS 2: {', '.join(summary.converted)}")
     for what, count in summary.omitted.items():
-        print(f"not held by this format: {count} {what}")
+        say(f"not held by this format: {count} {what}")
     if summary.left_out:
-        print(f"left out: {', '.join(summary.left_out)}")
+        say(f"left out: {', '.join(summary.left_out)}")
 
 
 def print_validation(path: Path, problems: list[Problem], *, deep: bool) -> None:
     """Print all problems, and how deep was looked for them."""
     for problem in problems:
-        print(problem)
+        say(problem)
     count = len(problems)
     found = f"{count} problem{'s' * (count > 1)}" if count else "no problem"
     depth = (
@@ -211,21 +224,21 @@ def print_validation(path: Path, problems: list[Problem], *, deep: bool) -> None
         if deep
         else "frames were not decoded (--deep does)"
     )
-    print(f"{path}: {found}; {depth}")
+    say(f"{path}: {found}; {depth}")
 
 
 def print_info(result: Info) -> None:
     """Print what is in a recording or dataset."""
-    print(f"{result.path}: {result.kind}, profile {result.profile or '-'}, {_size(result.bytes)}")
+    say(f"{result.path}: {result.kind}, profile {result.profile or '-'}, {_size(result.bytes)}")
     if result.start is not None and result.end is not None:
         start = datetime.fromtimestamp(result.start / 1e9, timezone.utc)
-        print(
+        say(
             f"{start:%Y-%m-%d %H:%M:%S} UTC, {(result.end - result.start) / 1e9:.2f} s, "
             f"{sum(topic.messages for topic in result.topics)} messages"
         )
     _print_table(_INFO_COLUMNS, [_info_row(topic) for topic in result.topics])
     for note in result.notes:
-        print(note)
+        say(note)
 
 
 def _info_row(topic: TopicInfo) -> list[str]:

@@ -46,10 +46,10 @@ def pack(
     paths = [Path(sources)] if isinstance(sources, (str, Path)) else [Path(p) for p in sources]
     target = Path(os.path.abspath(dataset))  # noqa: PTH100 - keeps links, unlike resolve()
     quality = parse_quality(chosen.quality)
-    check_codec(chosen.codec, lossless=quality.lossless)
+    check_codec(chosen.codec, chosen.preset, lossless=quality.lossless)
     with (
         open_sources(paths) as reader,
-        staged(target, force=chosen.force, replaceable=is_dataset) as folder,
+        staged(target, force=chosen.force, replaceable=is_dataset, sources=paths) as folder,
     ):
         folder.mkdir()
         try:

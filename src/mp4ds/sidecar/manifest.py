@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from mp4ds.sidecar.models import Count, FileName, Model, Profile, Sha256, Size, Time, Version
 
@@ -69,3 +70,15 @@ class Manifest(Model):
     verbatim: list[Verbatim] = Field(default_factory=list)
     files: list[FileEntry]
     tools: dict[str, str] = Field(default_factory=dict, description="Versions that packed it.")
+
+    @model_validator(mode="after")
+    def _once(self) -> Manifest:
+        for what, names in (
+            ("file", [entry.name for entry in self.files]),
+            ("sidecar", [entry.sidecar for entry in self.streams]),
+            ("video", [entry.video for entry in self.streams]),
+        ):
+            twice = [name for name, count in Counter(names).items() if count > 1]
+            if twice:
+                raise ValueError(f"{what} {twice[0]} is listed twice")
+        return self

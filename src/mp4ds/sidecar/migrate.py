@@ -49,19 +49,21 @@ def _from_0(old: Document, place: str) -> Document:
     unknown = set(old) - _VERSION_0_KEYS
     if unknown:
         raise ValueError(f"unknown keys {sorted(unknown)}")
-    info_topic, image_topic = old["topic_name"]
+    if not isinstance(old["topic_name"], list):
+        raise ValueError("topic_name is no list")
+    info_topic, image_topic = map(_text, old["topic_name"])
     info = old["camera_info"]
     # round half even of the exact product: the nearest nanosecond to the stored float
-    times = [round(Fraction(float(seconds)) * 10**9) for seconds in old["img_timestamp"]]
+    times = [round(Fraction(_number(seconds)) * 10**9) for seconds in old["img_timestamp"]]
     column = encode_column(times)
-    width, height = int(info["width"]), int(info["height"])
+    width, height = _integer(info["width"]), _integer(info["height"])
     return {
         "mp4ds": "1.0",
         "kind": "stream",
         "profile": "crf=22",
         "stamps": "record-float",
         "frames": len(times),
-        "channel": _channel_0(str(image_topic), "sensor_msgs/Image"),
+        "channel": _channel_0(image_topic, "sensor_msgs/Image"),
         "wire": "ros1",
         "image": {
             "encoding": "bgr8",
@@ -87,7 +89,7 @@ def _from_0(old: Document, place: str) -> Document:
             },
         },
         "camera_info": {
-            "channel": _channel_0(str(info_topic), "sensor_msgs/CameraInfo"),
+            "channel": _channel_0(info_topic, "sensor_msgs/CameraInfo"),
             "wire": "ros1",
             "messages": 0,
             "calibrations": [_calibration_0(info)],
@@ -112,18 +114,31 @@ def _channel_0(topic: str, type_name: str) -> Document:
 def _calibration_0(info: Document) -> Document:
     return {
         "frame_id": str(info["frameid"]),
-        "height": int(info["height"]),
-        "width": int(info["width"]),
+        "height": _integer(info["height"]),
+        "width": _integer(info["width"]),
         "distortion_model": str(info["distortion_model"]),
-        **{key.lower(): [_finite(value) for value in info[key]] for key in "DKRP"},
+        **{key.lower(): [_number(value) for value in info[key]] for key in "DKRP"},
     }
 
 
-def _finite(value: Any) -> float:
-    number = float(value)
-    if number - number != 0:
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"{value!r} is no number")
+    if value - value != 0:
         raise ValueError(f"{value} is no finite number")
-    return number
+    return float(value)
+
+
+def _integer(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f"{value!r} is no whole number")
+    return value
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError(f"{value!r} is no text")
+    return value
 
 
 MIGRATIONS: dict[str, Callable[[Document, str], Document]] = {"0": _from_0}

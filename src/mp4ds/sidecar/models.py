@@ -28,6 +28,9 @@ MAX_CAMERA_INFOS = 10**7
 MAX_VARIANTS = 256
 """Headers or calibrations of a stream: a topic with more is not modelled any further."""
 
+CODECS = ("h264", "h265", "av1", "ffv1")
+PIXEL_FORMATS = ("gray", "gray16le", "rgb24", "bgr24", "bgr0", "yuv420p")
+
 Int64 = Annotated[int, Field(ge=INT64_MIN, le=INT64_MAX)]
 Time = Annotated[int, Field(ge=INT64_MIN, le=2**64 - 1)]
 Uint32 = Annotated[int, Field(ge=0, le=2**32 - 1)]
@@ -61,6 +64,8 @@ class SchemaModel(Model):
     def _one_form(self) -> SchemaModel:
         if (self.text is None) == (self.base64 is None):
             raise ValueError("a schema has either text or base64")
+        if self.base64 is not None:
+            decode_base64(self.base64)
         return self
 
     @classmethod
@@ -183,6 +188,11 @@ class Video(Model):
     def _known(self) -> Video:
         if self.layout not in LAYOUTS:
             raise ValueError(f"layout {self.layout!r} is not one of {', '.join(LAYOUTS)}")
+        if self.codec not in CODECS:
+            raise ValueError(f"codec {self.codec!r} is not one of {', '.join(CODECS)}")
+        if self.pixel_format not in PIXEL_FORMATS:
+            known = ", ".join(PIXEL_FORMATS)
+            raise ValueError(f"pixel format {self.pixel_format!r} is not one of {known}")
         return self
 
 

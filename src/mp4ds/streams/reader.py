@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mp4ds.errors import FormatError
 from mp4ds.layouts import Pixels
+from mp4ds.outputs import digest_file
 from mp4ds.records import Channel, Message
 from mp4ds.sidecar import Calibration, StreamSidecar, load_stream
 from mp4ds.streams.rebuild import (
@@ -189,11 +190,23 @@ class Stream:
             FormatError: A frame does not decode, or a message does not match its digest.
         """
         rebuilder = self.rebuilder
+        self._verify_lossy_video()
         with self.open_video(sequential=True) as decoder:
             for index, picture in enumerate(decoder.pictures()):
                 payload = rebuilder.payload(index, picture)
                 ordinal = int(rebuilder.columns.ordinal[index])
                 yield ordinal, message_at(rebuilder.columns, index, channel, payload)
+
+    def _verify_lossy_video(self) -> None:
+        """Compare the video's SHA-256 where no digest of each message would tell damage."""
+        video = self.sidecar.video
+        if self.sidecar.digests is None and video.sha256 is not None:
+            if digest_file(self.video_path)[1] != video.sha256:
+                raise FormatError(
+                    "hash-mismatch",
+                    self.video_path,
+                    "does not have the SHA-256 that its sidecar says",
+                )
 
     @property
     def camera_info_columns(self) -> DecodedColumns | None:

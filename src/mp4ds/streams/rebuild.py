@@ -61,7 +61,7 @@ def decode_columns(columns: Columns, count: int, variants: int, place: str) -> D
             f"{place} at columns.variant",
             f"refers to number {int(decoded.variant.max())} of {variants}",
         )
-    if decoded.ordinal[0] < 0 or (np.diff(decoded.ordinal) <= 0).any():
+    if decoded.ordinal[0] < 0 or (decoded.ordinal[1:] <= decoded.ordinal[:-1]).any():
         raise FormatError("column-invalid", f"{place} at columns.ordinal", "does not increase")
     return decoded
 

@@ -30,7 +30,7 @@ from mp4ds.sidecar.models import FORMAT_VERSION, MAX_FRAMES
 from mp4ds.stamps import PresentationClock
 from mp4ds.streams.columns import ColumnsWriter, Unsuited, Variants
 from mp4ds.video import Recipe, VideoEncoder, recipe_for
-from mp4ds.video.encoder import EncoderRefusedError, check_preset
+from mp4ds.video.encoder import EncoderRefusedError
 from mp4ds.wire import ImageParts, Wire
 from mp4ds.wire.formats import WIRES
 
@@ -168,7 +168,6 @@ class StreamWriter:
             )
         except EncoderRefusedError as error:
             self.video_path.unlink(missing_ok=True)
-            check_preset(self._recipe)
             raise Unsuited(str(error)) from None
 
     @property

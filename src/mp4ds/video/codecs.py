@@ -6,7 +6,7 @@ the figures.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -68,8 +68,20 @@ _DEFAULT_LOSSLESS = {"gray": "h264", "rgb24": "h264", "bgr24": "h264", "gray16le
 _DEFAULT_LOSSY = "av1"
 
 
-def check_codec(codec: str | None, *, lossless: bool) -> None:
-    """Refuse a codec that could make no stream at all of a profile.
+_X26X_PRESETS = (
+    *("ultrafast", "superfast", "veryfast", "faster", "fast"),
+    *("medium", "slow", "slower", "veryslow"),
+)
+_PRESETS: dict[str, Sequence[str]] = {
+    "h264": _X26X_PRESETS,
+    "h265": _X26X_PRESETS,
+    "av1": [str(number) for number in range(14)],
+    "ffv1": (),
+}
+
+
+def check_codec(codec: str | None, preset: str | None, *, lossless: bool) -> None:
+    """Refuse a codec that could make no stream of a profile, or a preset that it does not have.
 
     Raises:
         OptionError: Names those that can.
@@ -79,6 +91,13 @@ def check_codec(codec: str | None, *, lossless: bool) -> None:
         kind = "lossless" if lossless else "lossy"
         raise OptionError(
             f"--codec {codec!r} is not one for {kind} packing. Use {', '.join(sorted(able))}."
+        )
+    name = codec or (_DEFAULT_LOSSLESS["gray"] if lossless else _DEFAULT_LOSSY)
+    if preset is not None and preset not in _PRESETS[name]:
+        known = ", ".join(_PRESETS[name])
+        raise OptionError(
+            f"--preset {preset!r} is not one of {name}. "
+            + (f"Use one of {known}." if known else "It has no presets.")
         )
 
 

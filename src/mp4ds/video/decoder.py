@@ -53,6 +53,7 @@ class VideoDecoder:
     ) -> None:
         self._path = path
         self._frames = frames
+        self._coded_size = coded_size
         self._picture_format = picture_format
         self._picture_size = picture_size
         self._converter = Converter(matrix, source_full_range=full_range)
@@ -60,7 +61,8 @@ class VideoDecoder:
         if not path.is_file():
             raise VideoError("file-missing", path, "does not exist")
         try:
-            self._container = av.open(str(path), "r", metadata_errors="ignore")
+            # absolute: ffmpeg takes a relative name with a colon for an address
+            self._container = av.open(str(path.absolute()), "r", metadata_errors="ignore")
         except (FFmpegError, OSError) as error:
             raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
         try:
@@ -72,6 +74,9 @@ class VideoDecoder:
             raise
 
     def _check(self, codec: str, coded_size: tuple[int, int]) -> None:
+        if "mp4" not in self._container.format.name.split(","):
+            name = self._container.format.name
+            raise VideoError("video-unreadable", self._path, f"is a {name} file, not an mp4")
         if len(self._container.streams.video) != 1:
             count = len(self._container.streams.video)
             raise VideoError("video-unreadable", self._path, f"has {count} video tracks, not one")
@@ -169,6 +174,13 @@ class VideoDecoder:
     def _picture(self, frame: av.VideoFrame) -> Pixels:
         if frame.is_corrupt:
             raise VideoError("decode-failed", self._path, "a frame is marked as corrupt")
+        if (frame.width, frame.height) != self._coded_size:
+            raise VideoError(
+                "geometry-mismatch",
+                self._path,
+                f"has a frame of {frame.width}x{frame.height} pixels among others of "
+                f"{self._coded_size[0]}x{self._coded_size[1]}",
+            )
         width, height = self._picture_size
         return frame_to_picture(
             frame, self._picture_format, width, height, self._converter, str(self._path)

@@ -11,7 +11,7 @@ from typing import Any
 import av
 from av.error import FFmpegError
 
-from mp4ds.errors import Mp4dsError, OptionError
+from mp4ds.errors import Mp4dsError
 from mp4ds.layouts import Pixels
 from mp4ds.stamps import TIMESCALE
 from mp4ds.video.codecs import Recipe
@@ -23,27 +23,6 @@ _LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.1, 30.0, 240.0  # Hz, what every en
 
 class EncoderRefusedError(Mp4dsError):
     """The encoder does not take pictures of this kind or size; the message says why."""
-
-
-def check_preset(recipe: Recipe) -> None:
-    """Refuse a preset that the encoder does not know for pictures of any size.
-
-    Raises:
-        OptionError: Names preset and encoder.
-    """
-    context: Any = av.CodecContext.create(recipe.encoder, "w")
-    context.width = context.height = 256
-    context.pix_fmt = recipe.pixel_format
-    context.time_base, context.framerate = _TIME_BASE, Fraction(_USUAL_RATE)
-    context.options = dict(recipe.options)
-    try:
-        context.open()
-    except (FFmpegError, ValueError):
-        preset = recipe.options.get("preset")
-        raise OptionError(
-            f"--preset {preset!r} is not one that {recipe.encoder} takes. "
-            "x264 and x265 take ultrafast to veryslow, SVT-AV1 takes 0 to 13."
-        ) from None
 
 
 class VideoEncoder:
@@ -86,7 +65,7 @@ class VideoEncoder:
         # SVT-AV1 prints to stderr on its own; errors reach us as return codes
         os.environ.setdefault("SVT_LOG", "0")
         self._container = av.open(
-            str(path),
+            str(path.absolute()),  # ffmpeg takes a relative name with a colon for an address
             "w",
             format="mp4",
             options={

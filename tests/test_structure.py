@@ -1,0 +1,329 @@
+"""The house: which module may import which, what is generated, and what the spec promises."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mp4ds.layouts import ENCODINGS, LAYOUTS
+from mp4ds.plan import VISUAL_TABLE
+from mp4ds.sidecar import (
+    FORMAT_VERSION,
+    Manifest,
+    StreamSidecar,
+    dump_document,
+    load_manifest,
+    load_stream,
+)
+from mp4ds.sidecar.io import generate_schema
+from mp4ds.sidecar.models import document_of
+from mp4ds.wire.formats import WIRES
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src" / "mp4ds"
+MODULES = sorted(SOURCE.rglob("*.py"))
+SPEC = ROOT / "spec"
+KINDS = ("stream", "dataset")
+
+MAX_LINES = 400
+LONGER: dict[str, str] = {}
+"""Modules that may be longer -> why."""
+
+
+def run(*command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+
+
+# ---------------------------------------------------------------- modules
+
+
+def test_imports_keep_to_the_floors() -> None:
+    pytest.importorskip("importlinter")
+    code = "from importlinter.cli import lint_imports_command; lint_imports_command()"
+    done = run(sys.executable, "-c", code, "--no-cache")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.search(r"\b[1-9]\d* kept, 0 broken", done.stdout)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(SOURCE)))
+def test_modules_are_short(path: Path) -> None:
+    lines = len(path.read_text().splitlines())
+    name = str(path.relative_to(SOURCE))
+    assert lines <= MAX_LINES or name in LONGER, f"{name} has {lines} lines"
+    assert lines > MAX_LINES or name not in LONGER, f"{name} is no longer long: strike it"
+
+
+def imports_of(path: Path) -> Iterator[str]:
+    """Top-level names of the packages that a module imports, anywhere in it."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.split(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.module.split(".")[0]
+
+
+# Each package is known to one room only.
+HOMES = {
+    "rosbags": ("bags",),
+    "mcap": ("bags",),
+    "zstandard": ("bags",),
+    "lz4": ("bags",),
+    "sqlite3": ("bags",),
+    "av": ("video",),
+    "typer": ("cli",),
+    "rich": ("cli",),
+    "yaml": ("yamlio.py", "bags"),
+    "pydantic": ("sidecar", "checks.py"),
+    "jsonschema": ("checks.py",),
+}
+
+
+@pytest.mark.parametrize("package", HOMES)
+def test_each_library_has_its_room(package: str) -> None:
+    found = {
+        str(path.relative_to(SOURCE)).split("/")[0]
+        for path in MODULES
+        if package in imports_of(path)
+    }
+    assert found <= set(HOMES[package])
+    assert found, f"nobody imports {package}: strike it, and from pyproject.toml"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(SOURCE)))
+def test_habits(path: Path) -> None:
+    """No print outside of the command line, no assert on state, a docstring for each module."""
+    tree = ast.parse(path.read_text())
+    name = str(path.relative_to(SOURCE))
+    assert ast.get_docstring(tree), name
+    for node in ast.walk(tree):
+        assert not isinstance(node, ast.Assert), f"{name}:{node.lineno}"
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            assert node.func.id != "print" or name.startswith("cli"), f"{name}:{node.lineno}"
+    assert not re.search(r"\b(TODO|FIXME|XXX)\b", path.read_text()), name
+
+
+def test_the_picture_of_the_code_names_every_module() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    for path in SOURCE.iterdir():
+        if path.is_dir() and (path / "__init__.py").is_file():
+            assert f"{path.name}/" in text, path.name
+        elif path.suffix == ".py":
+            assert path.name in text, path.name
+
+
+# ---------------------------------------------------------------- problem codes
+
+CODE = re.compile(r"[a-z0-9]+(-[a-z0-9]+)+")
+CODED = {"FormatError", "VideoError", "Problem"}
+
+
+def emitted_codes() -> dict[str, list[str]]:
+    """Code -> places where it is the first argument of an error or a problem."""
+    found: dict[str, list[str]] = {}
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not (isinstance(node, ast.Call) and node.args):
+                continue
+            name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            is_super = isinstance(node.func, ast.Attribute) and name == "__init__"
+            first = node.args[0]
+            if name not in CODED and not (is_super and path.name == "errors.py"):
+                continue
+            if isinstance(first, ast.Constant) and isinstance(first.value, str):
+                if CODE.fullmatch(first.value):
+                    found.setdefault(first.value, []).append(f"{path.name}:{node.lineno}")
+            elif name in CODED and ast.unparse(first) != "error.code":
+                # a code that is passed on must be one that is found elsewhere
+                pytest.fail(f"{path.name}:{node.lineno}: the code is {ast.unparse(first)}")
+    return found
+
+
+def section(text: str, title: str) -> str:
+    return text.split(f"\n## {title}\n", 1)[1].split("\n## ", 1)[0]
+
+
+def registry(title: str) -> str:
+    return section((SPEC / "registry.md").read_text(), title)
+
+
+def first_cells(text: str) -> list[str]:
+    """Names in backticks in the first cell of each row of a section's tables."""
+    rows = re.findall(r"^\| ((?:`[^`]+` ?)+)\|", text, re.MULTILINE)
+    return [name for row in rows for name in re.findall(r"`([^`]+)`", row)]
+
+
+def test_the_registry_lists_exactly_the_codes_of_the_code() -> None:
+    codes = emitted_codes()
+    listed = first_cells(registry("Problem codes"))
+    assert len(listed) == len(set(listed))
+    assert {code: places for code, places in codes.items() if code not in listed} == {}
+    assert sorted(set(listed) - set(codes)) == []
+
+
+def test_the_spec_uses_no_other_codes() -> None:
+    listed = set(first_cells(registry("Problem codes")))
+    text = (SPEC / "index.md").read_text()
+    used = set(re.findall(r"\(`([a-z]+(?:-[a-z]+)+)`\)", text))
+    assert used
+    assert used <= listed
+
+
+# ---------------------------------------------------------------- other registries
+
+
+def test_the_registry_lists_exactly_the_encodings() -> None:
+    text = registry("Encodings")
+    assert first_cells(text) == list(ENCODINGS)
+    for row in re.findall(r"^\| `.*", text, re.MULTILINE):
+        cells = [cell.strip() for cell in row.strip("|").split("|")]
+        for name in re.findall(r"`([^`]+)`", cells[0]):
+            encoding = ENCODINGS[name]
+            assert cells[1:3] == [str(encoding.channels), str(8 * encoding.bytes_per_sample)]
+            assert cells[3] == f"`{encoding.exact}`"
+            assert cells[4].startswith(f"`{encoding.lossy}`" if encoding.lossy else "none")
+
+
+def test_the_registry_lists_exactly_the_layouts_and_wires() -> None:
+    assert first_cells(registry("Layouts")) == list(LAYOUTS)
+    assert first_cells(registry("Wires")) == list(WIRES)
+
+
+def test_the_registry_has_the_table_of_the_paper() -> None:
+    rows = re.findall(r"^\| (\d+) \| (\d+) \| (\d+) \|$", registry("Profiles"), re.MULTILINE)
+    assert [(float(rate), int(crf), int(preset)) for rate, crf, preset in rows] == list(
+        VISUAL_TABLE
+    )
+
+
+# ---------------------------------------------------------------- generated and released
+
+
+def test_what_is_generated_is_up_to_date() -> None:
+    done = run(sys.executable, "tools/generate.py", "--check")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_released_schema_is_there(kind: str) -> None:
+    path = ROOT / "schemas" / f"v{FORMAT_VERSION}" / f"{kind}.schema.json"
+    schema = json.loads(path.read_text())
+    assert schema["$id"] == f"urn:mp4ds:{FORMAT_VERSION}:{kind}"
+    assert schema["additionalProperties"] is False
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_schema_of_an_unreleased_version_is_the_draft(kind: str) -> None:
+    """From the release on it is frozen; the draft goes on under the next version."""
+    draft = json.loads((ROOT / "schemas" / "draft" / f"{kind}.schema.json").read_text())
+    assert draft == json.loads(generate_schema(kind))
+    if draft["$id"] == f"urn:mp4ds:{FORMAT_VERSION}:{kind}":
+        path = ROOT / "schemas" / f"v{FORMAT_VERSION}" / f"{kind}.schema.json"
+        assert json.loads(path.read_text()) == draft
+
+
+def test_every_field_is_in_a_table_of_the_spec() -> None:
+    text = (SPEC / "index.md").read_text()
+    tables = set(re.findall(r"<!-- fields: (\w+) -->", text))
+    models = {name for kind in KINDS for name in json.loads(generate_schema(kind)).get("$defs", {})}
+    assert tables == models | set(KINDS)
+
+
+# ---------------------------------------------------------------- examples of the spec
+
+
+def example(kind: str) -> str:
+    text = (SPEC / "index.md").read_text()
+    found = re.findall(rf"<!-- example: {kind} -->\n```yaml\n(.*?)```", text, re.DOTALL)
+    assert len(found) == 1
+    return str(found[0])
+
+
+@pytest.fixture
+def examples(tmp_path: Path) -> tuple[StreamSidecar, Manifest]:
+    for kind in KINDS:
+        (tmp_path / f"{kind}.yaml").write_text(example(kind))
+    return load_stream(tmp_path / "stream.yaml"), load_manifest(tmp_path / "dataset.yaml")
+
+
+def test_the_examples_load_and_say_the_same(examples: tuple[StreamSidecar, Manifest]) -> None:
+    stream, manifest = examples
+    assert stream.mp4ds == manifest.mp4ds == FORMAT_VERSION
+    entry = manifest.streams[0]
+    assert (entry.topic, entry.video) == (stream.channel.topic, stream.video.file)
+    assert entry.frames == stream.frames
+    listed = {file.name: (file.size, file.sha256) for file in manifest.files}
+    assert listed[stream.video.file] == (stream.video.size, stream.video.sha256)
+    assert set(listed) == {entry.video, entry.sidecar, "messages.mcap"}
+
+
+def test_the_columns_of_the_example_decode(examples: tuple[StreamSidecar, Manifest]) -> None:
+    stream, manifest = examples
+    assert manifest.time_range is not None
+    parts: list[tuple[Any, int]] = [(stream.columns, stream.frames)]
+    assert stream.camera_info is not None
+    parts.append((stream.camera_info.columns, stream.camera_info.messages))
+    for columns, count in parts:
+        for name in columns.names():
+            assert len(getattr(columns, name).decode(count)) == count
+        times = columns.log_time.decode(count)
+        assert manifest.time_range.start <= times[0] < times[-1] <= manifest.time_range.end
+    assert stream.digests is not None
+    assert len(stream.digests.decode(stream.frames)) == stream.frames
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_examples_are_what_we_write(kind: str, tmp_path: Path) -> None:
+    """Key by key, in our order and style: but for the checksum, which they leave out."""
+    path = tmp_path / "example.yaml"
+    path.write_text(example(kind))
+    model = load_stream(path) if kind == "stream" else load_manifest(path)
+    written = dump_document(model).decode()
+    assert written.rsplit("checksum: ", 1)[0] == example(kind)
+    assert document_of(model)["kind"] == kind
+
+
+# ---------------------------------------------------------------- tools and examples
+
+
+@pytest.mark.parametrize("folder", ["tools", "examples", "benchmarks"])
+def test_scripts_parse_and_say_what_they_do(folder: str) -> None:
+    paths = sorted((ROOT / folder).glob("*.py"))
+    assert paths
+    for path in paths:
+        assert ast.get_docstring(ast.parse(path.read_text())), path
+        assert importlib.util.spec_from_file_location(path.stem, path)
+
+
+def links(path: Path) -> Iterator[tuple[str, str]]:
+    text = re.sub(r"```.*?```", "", path.read_text(), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if "://" not in target and not target.startswith("mailto:"):
+            file, _, anchor = target.partition("#")
+            yield file, anchor
+
+
+def anchors(path: Path) -> set[str]:
+    titles = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize(
+    "path",
+    [*sorted(ROOT.glob("*.md")), *sorted(SPEC.glob("*.md"))],
+    ids=lambda path: str(path.relative_to(ROOT)),
+)
+def test_links_lead_somewhere(path: Path) -> None:
+    for file, anchor in links(path):
+        target = (path.parent / file).resolve() if file else path
+        assert target.exists(), f"{path.name} -> {file}"
+        if anchor and target.suffix == ".md":
+            assert anchor in anchors(target), f"{path.name} -> {file}#{anchor}"
