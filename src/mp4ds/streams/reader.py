@@ -200,13 +200,14 @@ class Stream:
     def _verify_lossy_video(self) -> None:
         """Compare the video's SHA-256 where no digest of each message would tell damage."""
         video = self.sidecar.video
-        if self.sidecar.digests is None and video.sha256 is not None:
-            if digest_file(self.video_path)[1] != video.sha256:
-                raise FormatError(
-                    "hash-mismatch",
-                    self.video_path,
-                    "does not have the SHA-256 that its sidecar says",
-                )
+        if self.sidecar.digests is not None or video.sha256 is None:
+            return
+        if digest_file(self.video_path)[1] != video.sha256:
+            raise FormatError(
+                "hash-mismatch",
+                self.video_path,
+                "does not have the SHA-256 that its sidecar says",
+            )
 
     @property
     def camera_info_columns(self) -> DecodedColumns | None:
