@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from mp4ds.errors import OptionError
@@ -19,6 +19,8 @@ from mp4ds.layouts import (
     pixel_view,
     why_not,
 )
+
+steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 SIZES = [(w, h) for w in (1, 2, 3, 4, 7, 8) for h in (1, 2, 3, 5, 6)]
 
@@ -118,6 +120,7 @@ def test_a_view_of_bytes_is_read_only_and_not_a_copy() -> None:
     assert np.shares_memory(view, np.frombuffer(data, np.uint8))
 
 
+@steady
 @given(st.integers(1, 6), st.integers(0, 4), st.integers(1, 5), st.data())
 @example(3, 0, 2, None)
 def test_padding(row_bytes: int, pad: int, height: int, data: st.DataObject | None) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import pytest
 import xxhash
-from hypothesis import example, given
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
@@ -23,6 +23,8 @@ from mp4ds.plan import (
 )
 from mp4ds.records import Channel, Schema
 from mp4ds.sidecar.models import FileName
+
+steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 # ---------------------------------------------------------------- quality
 
@@ -136,6 +138,7 @@ def stem_by_the_spec(topic: str, taken: set[str]) -> str:
     return name
 
 
+@steady
 @given(st.lists(Topics, max_size=12))
 @example(["a", "A", "a-2", "a", "A-2", "/a/"])
 @example(["a-2", "a", "a"])

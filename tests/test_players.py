@@ -8,7 +8,9 @@ import shutil
 import signal
 import subprocess
 import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -60,11 +62,12 @@ H264: dict[str, Any] = {"quality": "crf=20", "codec": "h264"}
 CASES: dict[str, Case] = {
     "mono8": Case("mono8", {}, "h264", GREY_H264, None),
     "bayer": Case("bayer_grbg8", {}, "h264", GREY_H264, None),
-    "rgb8": Case("rgb8", {}, "h264", ("gbrp",), "gbr", browser=False),
-    "bgr8": Case("bgr8", {}, "h264", ("gbrp",), "gbr", browser=False),
+    "rgb8": Case("rgb8", {"codec": "h264"}, "h264", ("gbrp",), "gbr", browser=False),
+    "bgr8": Case("bgr8", {"codec": "h264"}, "h264", ("gbrp",), "gbr", browser=False),
     "mono16": Case("mono16", {}, "ffv1", ("gray16le",), browser=False),
     "mono8 ffv1": Case("mono8", {"codec": "ffv1"}, "ffv1", ("gray",), browser=False),
     "rgb8 ffv1": Case("rgb8", {"codec": "ffv1"}, "ffv1", ("bgr0",), "gbr", browser=False),
+    "bgr8 ffv1": Case("bgr8", {"codec": "ffv1"}, "ffv1", ("bgr0",), "gbr", browser=False),
     "mono8 visual": Case("mono8", VISUAL, "av1", YUV),
     "rgb8 visual": Case("rgb8", VISUAL, "av1", YUV),
     "bgr8 visual": Case("bgr8", VISUAL, "av1", YUV),
@@ -295,7 +298,9 @@ async function test(name, times) {
 (async () => {
   for (const [name, times] of Object.entries(await (await fetch("/jobs")).json())) {
     let result;
-    try { result = await test(name, times); } catch (error) { result = {error: String(error)}; }
+    const late = new Promise((_, reject) => setTimeout(reject, 20000, new Error("takes too long")));
+    try { result = await Promise.race([test(name, times), late]); }
+    catch (error) { result = {error: String(error)}; }
     const body = JSON.stringify(result);
     await fetch("/result/" + encodeURIComponent(name), {method: "POST", body});
   }
@@ -399,13 +404,18 @@ def played(
             start_new_session=True,  # a group of its own, to be ended as a whole
         )
         try:
-            server.done.wait(90)
+            end = time.monotonic() + 90
+            while not server.done.wait(0.1) and time.monotonic() < end and browser.poll() is None:
+                pass
         finally:
-            os.killpg(browser.pid, signal.SIGKILL)
+            with suppress(ProcessLookupError):
+                os.killpg(browser.pid, signal.SIGKILL)
             browser.wait()
             log.close()
             server.shutdown()
             thread.join()
+        if not server.results:
+            pytest.fail(f"the browser played nothing: {(profile / 'log.txt').read_text()[-2000:]}")
         yield server.results
     shutil.rmtree(profile, ignore_errors=True)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
@@ -36,6 +36,8 @@ from mp4ds.sidecar.models import (
     document_of,
     parse_version,
 )
+
+steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 Document = dict[str, Any]
 
@@ -225,6 +227,7 @@ def test_optional_keys_may_be_absent(kind: str, tmp_path: Path) -> None:
         assert document_of(load(write(tmp_path, document), kind)) == document
 
 
+@steady
 @given(st.binary(max_size=60), st.text(max_size=10), st.text(max_size=10))
 def test_any_definition_returns(data: bytes, name: str, encoding: str) -> None:
     schema = Schema(name, encoding, data)
@@ -237,6 +240,7 @@ def test_any_definition_returns(data: bytes, name: str, encoding: str) -> None:
 Texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=30)
 
 
+@steady
 @given(
     Texts,
     st.sampled_from(["ros1", "cdr"]) | Texts,
@@ -383,6 +387,7 @@ def test_the_released_schema_refuses_it_too(kind: str, place: str, value: Any) -
     assert not Draft202012Validator(json.loads(schema_text(kind))).is_valid(document)
 
 
+@steady
 @given(st.data())
 def test_random_damage_is_refused_in_one_sentence(data: st.DataObject) -> None:
     kind = data.draw(st.sampled_from(list(WHOLE)))

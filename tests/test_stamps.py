@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from mp4ds.stamps import (
@@ -20,6 +20,8 @@ from mp4ds.stamps import (
     decode_column,
     encode_column,
 )
+
+steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 Int64 = st.integers(INT64_MIN, INT64_MAX)
 # Any integers; those of a clock; those of a counter; few different ones in runs.
@@ -58,6 +60,7 @@ def decode_by_the_spec(start: int, step: int, text: str) -> list[int]:
 # ---------------------------------------------------------------- columns
 
 
+@steady
 @given(Columns)
 @example([INT64_MIN, INT64_MAX, INT64_MIN])
 @example([0, INT64_MIN, 0, INT64_MIN, 5])
@@ -74,6 +77,7 @@ def test_any_column_returns(values: list[int]) -> None:
     assert decode_by_the_spec(start, step, text) == values
 
 
+@steady
 @given(Columns)
 def test_the_text_keeps_to_the_grammar(values: list[int]) -> None:
     text = str(encode_column(values)["values"])
@@ -86,6 +90,7 @@ def test_the_text_keeps_to_the_grammar(values: list[int]) -> None:
         assert "*" in text  # plain parsers clip at these two without saying so
 
 
+@steady
 @given(Columns, st.data())
 def test_what_others_write_is_read(values: list[int], data: st.DataObject) -> None:
     """Another step, other runs, other line breaks: the writer is free."""
@@ -141,6 +146,7 @@ def test_bad_columns_are_refused_with_a_reason(text: str, count: int) -> None:
     assert len(str(caught.value)) < 200
 
 
+@steady
 @given(st.text(" \n-*0123456789", max_size=12), st.integers(1, 5))
 def test_random_text_is_read_by_the_grammar_or_refused(text: str, count: int) -> None:
     try:
@@ -190,6 +196,7 @@ def ticks_by_the_spec(stamps: list[int], log_times: list[int]) -> list[int]:
     return found
 
 
+@steady
 @given(st.lists(st.tuples(Int64, Int64) | st.tuples(Gaps, Gaps), min_size=1, max_size=40))
 @example([(0, 0)] * 5)
 @example([(5, 5), (4, 4), (3, 3)])
@@ -205,6 +212,7 @@ def test_ticks_increase_whatever_the_clocks_do(times: list[tuple[int, int]]) -> 
     assert found == ticks_by_the_spec(stamps, log_times)
 
 
+@steady
 @given(st.lists(st.tuples(Gaps, Gaps), min_size=1, max_size=40))
 def test_sums_of_gaps(gaps: list[tuple[int, int]]) -> None:
     stamps = np.cumsum([s for s, _ in gaps]).tolist()
@@ -214,6 +222,7 @@ def test_sums_of_gaps(gaps: list[tuple[int, int]]) -> None:
     assert found == ticks_by_the_spec(stamps, log_times)
 
 
+@steady
 @given(st.lists(st.integers(1000, MAX_GAP_NS), min_size=1, max_size=50), Int64)
 def test_an_ordinary_clock_is_shown_as_it_is(gaps: list[int], first: int) -> None:
     """To the microsecond, without rounding errors that add up."""

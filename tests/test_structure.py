@@ -26,6 +26,7 @@ from mp4ds.sidecar import (
 )
 from mp4ds.sidecar.io import generate_schema
 from mp4ds.sidecar.models import document_of
+from mp4ds.video import recipe_for
 from mp4ds.wire.formats import WIRES
 
 ROOT = Path(__file__).parents[1]
@@ -202,6 +203,39 @@ def test_the_registry_has_the_table_of_the_paper() -> None:
     assert [(float(rate), int(crf), int(preset)) for rate, crf, preset in rows] == list(
         VISUAL_TABLE
     )
+
+
+def codec_rows() -> list[tuple[list[str], bool, str, bool, dict[str, str]]]:
+    """Picture formats, lossless, codec, default, and options of each row of Codecs."""
+    found = []
+    for row in re.findall(r"^\| .*", registry("Codecs"), re.MULTILINE):
+        cells = [cell.strip() for cell in row.strip("|").split("|")]
+        if len(cells) < 6 or cells[1] not in ("lossless", "lossy"):
+            continue
+        formats = re.findall(r"`([^`]+)`", cells[0]) or ["gray", "rgb24", "bgr24"]
+        (codec,) = re.findall(r"`([^`]+)`", cells[2])
+        options = dict(
+            (*option.partition("=")[::2],) for option in re.findall(r"`([^`]+)`", cells[5])
+        )
+        found.append((formats, cells[1] == "lossless", codec, cells[2].endswith("*"), options))
+    return found
+
+
+def test_the_registry_has_the_codecs_and_their_defaults() -> None:
+    rows = codec_rows()
+    assert len(rows) >= 8
+    for formats, lossless, codec, default, options in rows:
+        for picture_format in formats:
+            recipe = recipe_for(picture_format, lossless=lossless, codec=codec, crf=20)
+            for key, value in options.items():
+                assert value in recipe.options[key], f"{picture_format} {codec}: {key}"
+            missing = set(recipe.options) - set(options) - {"x264-params", "x265-params"}
+            assert missing == set(), f"{picture_format} {codec}"
+            if default:
+                assert recipe_for(picture_format, lossless=lossless, crf=20) == recipe
+    for picture_format in ("gray", "rgb24", "bgr24", "gray16le"):
+        defaults = [row for row in rows if row[1] and row[3] and picture_format in row[0]]
+        assert len(defaults) == 1, picture_format
 
 
 # ---------------------------------------------------------------- generated and released

@@ -17,7 +17,7 @@ import av
 import numpy as np
 import pytest
 import yaml
-from hypothesis import example, given
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
@@ -27,6 +27,8 @@ import mp4ds
 from mp4ds.info import info
 from mp4ds.sidecar.migrate import migrate
 from mp4ds.stamps import decode_column
+
+steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 FIXTURE = Path(__file__).parent / "fixtures" / "v0"
 SHA256 = {
@@ -225,6 +227,7 @@ def test_it_unpacks_to_the_others(to: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- times
 
 
+@steady
 @given(st.lists(st.floats(0, 2**32 - 1), min_size=1, max_size=30))
 @example(STAMPS)
 @example([0.0, 5e-10, 1.5e-9, 2.5e-9, 0.1, 1e-300, 4294967294.9999995])

@@ -7,13 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from mp4ds.wire import CameraInfoFields, ImageParts, Wire, WireError, wire_for
 from mp4ds.wire.base import join_stamp
 from mp4ds.wire.formats import WIRES
 from sources import IMAGE, INFO, build, image_cdr, image_ros1, typestore
+
+steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 NAMES = ["ros1", "cdr-le", "cdr-be"]
 ENCODING = {"ros1": "ros1", "cdr-le": "cdr", "cdr-be": "cdr"}
@@ -80,8 +82,8 @@ def info_values(draw: st.DrawFn) -> dict[str, Any]:
 # ---------------------------------------------------------------- images
 
 
+@steady
 @given(headers(), st.data(), st.binary(max_size=8))
-@settings(deadline=None)
 def test_an_image_of_rosbags_splits_and_returns(
     head: tuple[str, dict[str, Any], int], data: st.DataObject, tail: bytes
 ) -> None:
@@ -126,6 +128,7 @@ def test_every_cut_is_refused(name: str) -> None:
         assert str(caught.value)
 
 
+@steady
 @given(st.sampled_from(NAMES), st.binary(max_size=120))
 @example("ros1", b"\xff" * 60)
 @example("cdr-le", b"\xff" * 60)
@@ -221,8 +224,8 @@ def test_strings_that_are_none(name: str) -> None:
 # ---------------------------------------------------------------- CameraInfo
 
 
+@steady
 @given(headers(), st.data(), st.binary(max_size=3))
-@settings(deadline=None)
 def test_a_camera_info_of_rosbags_splits_and_returns(
     head: tuple[str, dict[str, Any], int], data: st.DataObject, tail: bytes
 ) -> None:

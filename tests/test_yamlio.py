@@ -8,11 +8,13 @@ from typing import Any
 import pytest
 import xxhash
 import yaml
-from hypothesis import example, given
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from mp4ds import yamlio
 from mp4ds.errors import FormatError
+
+steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 # What some YAML reader takes for something else, and what breaks careless writers and slicers.
 NASTY = [
@@ -70,6 +72,7 @@ def load(text: str) -> Any:
 # ---------------------------------------------------------------- round trip
 
 
+@steady
 @given(Documents)
 def test_any_document_returns(document: dict[str, Any]) -> None:
     assert same(load_back(document), document)
@@ -92,6 +95,7 @@ def test_nasty_strings_return_everywhere(text: str, place: str) -> None:
     assert same(load_back(document), document)
 
 
+@steady
 @given(Documents)
 def test_other_readers_read_the_same(document: dict[str, Any]) -> None:
     """PyYAML is a reader of YAML 1.1, which takes more words for something else."""
@@ -102,6 +106,7 @@ def test_other_readers_read_the_same(document: dict[str, Any]) -> None:
     assert same(read, document)
 
 
+@steady
 @given(Documents)
 def test_the_last_line_is_the_checksum_of_all_before(document: dict[str, Any]) -> None:
     body, last = yamlio.dump(document).removesuffix(b"\n").rsplit(b"\n", 1)
@@ -109,6 +114,7 @@ def test_the_last_line_is_the_checksum_of_all_before(document: dict[str, Any]) -
     assert last == f'checksum: "xxh64:{digest}"'.encode()
 
 
+@steady
 @given(
     st.lists(st.lists(st.integers(-(2**63), 2**63), min_size=1, max_size=40), max_size=4),
     st.sampled_from(NASTY),
@@ -291,6 +297,7 @@ def test_columns_written_otherwise(text: str) -> None:
 # ---------------------------------------------------------------- checksum
 
 
+@steady
 @given(st.data())
 def test_no_change_of_a_byte_goes_unnoticed(data: st.DataObject) -> None:
     document = {"a": {"values": "1 2 3\n4 5 6\n"}, "b": ["x", 1.5], "c": "one\ntwo\n"}

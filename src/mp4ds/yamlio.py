@@ -222,7 +222,7 @@ def _scalar(event: Any) -> Any:
     if not number:
         return text
     if len(text) > _MAX_DIGITS:
-        raise ValueError(f"line {_line(event)}: a number of {len(text)} digits")
+        raise ValueError(f"line {_line(event)}: an integer of {len(text)} digits")
     if not number.group(1) and not number.group(2):
         return int(text)
     value = float(text)

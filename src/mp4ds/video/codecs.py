@@ -64,7 +64,7 @@ _LOSSY: dict[str, _Coding] = {
         "libx265", "yuv420p", {"x265-params": "bframes=0:open-gop=0:log-level=error"}, "medium"
     ),
 }
-_DEFAULT_LOSSLESS = {"gray": "h264", "rgb24": "h264", "bgr24": "h264", "gray16le": "ffv1"}
+_DEFAULT_LOSSLESS = {"gray": "h264", "rgb24": "ffv1", "bgr24": "ffv1", "gray16le": "ffv1"}
 _DEFAULT_LOSSY = "av1"
 
 

@@ -1,0 +1,103 @@
+"""The examples and the README's commands run, on what a new user has."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import mp4ds
+from mp4ds.demo import demo
+from sources import SOURCES, scene
+
+ROOT = Path(__file__).parents[1]
+
+
+def run(*command: str, cwd: Path) -> str:
+    bin_folder = str(Path(sys.executable).parent)
+    done = subprocess.run(
+        command,
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        env={**os.environ, "PATH": f"{bin_folder}:{os.environ['PATH']}"},
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def demo_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo")
+    demo(folder / "demo.bag", seconds=0.5)
+    mp4ds.pack(folder / "demo.bag", folder / "demo")
+    return folder / "demo"
+
+
+def test_frames(demo_dataset: Path) -> None:
+    out = run(sys.executable, str(ROOT / "examples/frames.py"), str(demo_dataset), cwd=ROOT)
+    assert out.count("bayer_rggb8 (360, 480)") == 3
+    assert out.count("rgb8 (360, 480, 3)") == 3
+    assert out.count("fx 300.0") == 6
+
+
+def test_other_topics(tmp_path: Path) -> None:
+    (tmp_path / "source").mkdir()
+    mp4ds.pack(SOURCES["mcap-ros2-zstd"](tmp_path / "source", scene("mono8")), tmp_path / "drive")
+    out = run(
+        sys.executable, str(ROOT / "examples/other_topics.py"), str(tmp_path / "drive"), cwd=ROOT
+    )
+    assert "/imu (sensor_msgs/msg/Imu)" in out
+    assert "/cam/image_raw" not in out
+
+
+def test_quickstart(tmp_path: Path) -> None:
+    """The README's first command, but for the installation, which CI does in a fresh clone."""
+    script = (ROOT / "examples/quickstart.sh").read_text()
+    lines = [line for line in script.splitlines() if line.startswith(("mp4ds", "python tools"))]
+    assert len(lines) == 5
+    shutil.copytree(ROOT / "tools", tmp_path / "tools")
+    (tmp_path / "quickstart").mkdir()
+    out = run("bash", "-euc", "work=quickstart\n" + "\n".join(lines), cwd=tmp_path)
+    assert "no problem" in out
+    assert out.rstrip().endswith("EQUAL")
+
+
+def test_readme_commands(demo_dataset: Path, tmp_path: Path) -> None:
+    """Each mp4ds line of the README's shell blocks, on the demo under the README's names."""
+    readme = (ROOT / "README.md").read_text()
+    lines = [
+        line.split("#")[0].strip()
+        for block in re.findall(r"```sh\n(.*?)```", readme, re.DOTALL)
+        for line in block.splitlines()
+        if line.startswith("mp4ds ")
+    ]
+    assert len(lines) >= 5
+    (tmp_path / "source").mkdir()
+    source = SOURCES["rosbag2-mcap-v9"](tmp_path / "source", scene("mono8"))[0]
+    shutil.copytree(source, tmp_path / "rosbag2_drive")
+    shutil.copy(demo_dataset.parent / "demo.bag", tmp_path / "drive_0.bag")
+    (mcap,) = SOURCES["mcap-ros2-none"](tmp_path / "source", scene("rgb8"))
+    shutil.copy(mcap, tmp_path / "drive.mcap")
+    for line in lines:
+        run("bash", "-c", line, cwd=tmp_path)
+
+
+def test_readme_python(demo_dataset: Path, tmp_path: Path) -> None:
+    readme = (ROOT / "README.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    shutil.copy(demo_dataset.parent / "demo.bag", tmp_path / "drive.bag")
+    run(sys.executable, "-c", code, cwd=tmp_path)
+
+
+@pytest.mark.parametrize("command", ["pack", "unpack", "validate", "info", "demo"])
+def test_every_command_is_in_the_readme_and_helps(command: str) -> None:
+    assert f"`mp4ds {command}" in (ROOT / "README.md").read_text()
+    assert "Usage" in run(sys.executable, "-m", "mp4ds", command, "--help", cwd=ROOT)
