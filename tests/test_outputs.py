@@ -112,11 +112,36 @@ def test_force_replaces_a_link_and_not_what_it_points_to(target: Path) -> None:
 
 
 def test_the_folder_must_exist(target: Path) -> None:
-    with pytest.raises(TargetError, match="does not exist"):
+    with pytest.raises(TargetError, match="is no folder"):
         check_target(target / "deep", force=False, replaceable=anything)
     make(target, "file")
-    with pytest.raises(TargetError):
+    with pytest.raises(TargetError, match="is no folder"):
         check_target(target / "deep", force=False, replaceable=anything)
+
+
+@pytest.mark.parametrize("source", ["out", "out/deep", "out/deep/part", ".", "link", "link/deep"])
+@pytest.mark.parametrize("force", [False, True])
+def test_an_output_never_overlaps_with_its_source(
+    source: str, force: bool, target: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make(target, "folder", "old")
+    (target.parent / "link").symlink_to("out")
+    monkeypatch.chdir(target.parent)
+    with (
+        pytest.raises(TargetError, match="overlaps with the source"),
+        staged(target, force=force, replaceable=anything, sources=[Path(source)]),
+    ):
+        pytest.fail("nothing may be made there")
+    assert read(target) == "old"
+    assert only(target.parent, "out", "link")
+
+
+def test_an_output_may_stand_beside_its_source(target: Path) -> None:
+    make(target.parent / "out.bag", "file", "old")
+    sources = [target.parent / "out.bag"]
+    with staged(target, force=False, replaceable=nothing, sources=sources) as path:
+        make(path, "folder")
+    assert only(target.parent, "out", "out.bag")
 
 
 def test_a_folder_that_may_not_be_written(target: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -83,7 +83,7 @@ def test_the_text_keeps_to_the_grammar(values: list[int]) -> None:
     text = str(encode_column(values)["values"])
     assert VALUES.fullmatch(text)
     assert text == "" if len(values) == 1 else text.endswith("\n")
-    assert max(len(line.split()) for line in text.splitlines() or [""]) <= 16
+    assert max(len(line.split()) for line in text.splitlines() or [""]) <= 32
     integers = [int(token.split("*")[0]) for token in text.split()]
     assert all(INT64_MIN <= value <= INT64_MAX for value in integers)
     if {INT64_MIN, INT64_MAX} & set(integers):

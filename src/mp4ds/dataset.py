@@ -30,7 +30,8 @@ __all__ = ["Dataset", "Frame", "Stream", "open_dataset"]
 class Dataset:
     """A folder that `mp4ds pack` made, or one video with its sidecar.
 
-    ``dataset["/topic"]`` is a topic's stream, ``dataset.streams`` are all of them.
+    ``dataset["/topic"]`` is a topic's stream, ``"/topic" in dataset`` tells whether there is
+    one, and iteration gives all streams.
 
     Args:
         path: The folder, a manifest, a sidecar, or a video beside its sidecar.
@@ -79,6 +80,15 @@ class Dataset:
                 f"choose one of {stems}"
             )
         return found[0]
+
+    def __contains__(self, topic: object) -> bool:
+        return any(topic in (stream.topic, stream.path.stem) for stream in self.streams)
+
+    def __iter__(self) -> Iterator[Stream]:
+        return iter(self.streams)
+
+    def __len__(self) -> int:
+        return len(self.streams)
 
     @property
     def profile(self) -> str:

@@ -22,7 +22,7 @@ MAX_BYTES = 512 * 2**20  # a sidecar of a day at 60 Hz has about 100 MB
 MAX_STRUCTURE_BYTES = 16 * 2**20
 MAX_DEPTH = 32
 MAX_EVENTS = 10**6
-_MAX_DIGITS = 400
+_MAX_DIGITS = 4300  # where Python stops converting
 
 _CHECKSUM = re.compile(rb'(?:\A|\n)checksum: "xxh64:([0-9a-f]{16})"\n\Z')
 _COLUMN = re.compile(rb"^( +)values: \|\n", re.MULTILINE)

@@ -44,6 +44,8 @@ class _Coding:
     default_preset: str = ""
 
 
+# the converter sites chroma in the middle; untagged, decoders take it for left
+_CENTRED = "chromaloc=1"
 _FFV1 = MappingProxyType({"level": "3", "slicecrc": "1", "slices": "4"})
 _FFV1_8BIT = MappingProxyType({**_FFV1, "coder": "range_tab", "context": "1"})
 
@@ -59,9 +61,12 @@ _LOSSLESS: dict[tuple[str, str], _Coding] = {
 }
 _LOSSY: dict[str, _Coding] = {
     "av1": _Coding("libsvtav1", "yuv420p", {}, "6"),
-    "h264": _Coding("libx264", "yuv420p", _X264, "medium"),
+    "h264": _Coding("libx264", "yuv420p", {**_X264, "x264-params": _CENTRED}, "medium"),
     "h265": _Coding(
-        "libx265", "yuv420p", {"x265-params": "bframes=0:open-gop=0:log-level=error"}, "medium"
+        "libx265",
+        "yuv420p",
+        {"x265-params": f"bframes=0:open-gop=0:{_CENTRED}:log-level=error"},
+        "medium",
     ),
 }
 _DEFAULT_LOSSLESS = {"gray": "h264", "rgb24": "ffv1", "bgr24": "ffv1", "gray16le": "ffv1"}

@@ -75,10 +75,10 @@ class VideoEncoder:
         )
         try:
             self._open_stream(threads, rate)
-        except (FFmpegError, ValueError) as error:
+        except (FFmpegError, ValueError):
             self._container.close()
             raise EncoderRefusedError(
-                f"{recipe.encoder} does not take pictures of {width}x{height}: {error}"
+                f"{recipe.encoder} does not take pictures of {width}x{height}"
             ) from None
 
     def _open_stream(self, threads: int, rate: float | None) -> None:
