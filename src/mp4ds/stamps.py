@@ -86,7 +86,8 @@ def decode_column(start: int, step: int, text: str, count: int) -> NDArray[np.in
     column = np.empty(count, dtype=np.int64)
     column[0] = start
     with np.errstate(over="ignore"):
-        np.cumsum(residuals + np.int64(step), out=column[1:])
+        residuals += np.int64(step)  # in place: a fresh array costs more than the sum
+        np.cumsum(residuals, out=column[1:])
         column[1:] += np.int64(start)
     return column
 
@@ -95,8 +96,10 @@ def _decode_residuals(text: str, count: int) -> NDArray[np.int64]:
     raw = text.encode("ascii", "replace")
     if raw.translate(None, _COLUMN_BYTES):
         raise ValueError("holds something else than integers")
-    codes = np.frombuffer(raw + b" ", np.uint8)
-    if ((codes[:-1] == _MINUS) & (codes[1:] < _ZERO)).any():
+    codes = np.frombuffer(raw, np.uint8)
+    signs = codes[:-1] == _MINUS
+    signs &= codes[1:] < _ZERO
+    if raw.endswith(b"-") or signs.any():
         raise ValueError("holds a sign without digits")
     if b"*" in raw:
         return _decode_runs(text, count)

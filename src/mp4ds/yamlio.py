@@ -26,6 +26,7 @@ _MAX_DIGITS = 4300  # where Python stops converting
 
 _CHECKSUM = re.compile(rb'(?:\A|\n)checksum: "xxh64:([0-9a-f]{16})"\n\Z')
 _COLUMN = re.compile(rb"^( +)values: \|\n", re.MULTILINE)
+_MARK = "mp4ds column "
 _COLUMN_LINE = re.compile(r"^ *values: [|]", re.MULTILINE)
 
 _Parser: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -119,26 +120,24 @@ def load(data: bytes, place: str) -> dict[str, Any]:
     """
     if len(data) > MAX_BYTES:
         raise FormatError("yaml-invalid", place, f"is larger than {MAX_BYTES} bytes")
-    match = _CHECKSUM.search(data, max(0, len(data) - 64))
+    end = len(data)  # of the document; nothing large is copied on the way to its columns
+    match = _CHECKSUM.search(data, max(0, end - 64))
     if match:
-        body = data[: match.start() + 1] if match.start() or data[:1] == b"\n" else b""
-        if xxhash.xxh64(body).hexdigest().encode() != match.group(1):
+        end = match.start() + 1 if match.start() or data[:1] == b"\n" else 0
+        if xxhash.xxh64(memoryview(data)[:end]).hexdigest().encode() != match.group(1):
             raise FormatError(
                 "checksum-mismatch",
                 place,
                 "does not match the checksum in its last line: it was damaged or edited; "
                 "after an intended edit, remove that line",
             )
-        data = body
-    mark = "mp4ds column "
-    while mark.encode() in data:
-        mark = f"_{mark}"
-    structure, columns = _slice_columns(data, mark)
+    structure, columns = _slice_columns(data, end)
     if len(structure) > MAX_STRUCTURE_BYTES:
         raise FormatError("yaml-invalid", place, "has too much structure outside of its columns")
     document = _parse(structure, place)
-    if columns and _restore_columns(document, columns, mark) != len(columns):
-        document = _parse(data, place)  # what looked like a column stood inside of a text
+    marks = structure.count(_MARK.encode())
+    if columns and not marks == _restore_columns(document, columns) == len(columns):
+        document = _parse(data[:end], place)  # what looked like a column stood inside of a text
     return document
 
 
@@ -231,44 +230,46 @@ def _scalar(event: Any) -> Any:
     return value
 
 
-def _slice_columns(data: bytes, mark: str) -> tuple[bytes, list[str]]:
-    """Cut the literal blocks of columns out, leaving a numbered placeholder for each."""
+def _slice_columns(data: bytes, end: int) -> tuple[bytes, list[str]]:
+    """Cut the literal blocks of columns out, leaving a numbered placeholder for each.
+
+    Returns:
+        The document's structure, and the columns without their indentation; where a block is
+        not as we write it, the whole document and no columns, for the parser to judge.
+    """
     pieces: list[bytes] = []
     columns: list[str] = []
     done = 0
-    while match := _COLUMN.search(data, done):
+    while match := _COLUMN.search(data, done, end):
+        start = match.end()
         indent = b" " * (len(match.group(1)) + 2)
-        end_match = re.compile(rb"\n(?!" + indent + rb")").search(data, match.end() - 1)
-        end = end_match.end() if end_match else len(data)
-        block = data[match.end() : end]
-        if (
-            not block.isascii()
-            or not block.startswith(indent)
-            or block[len(indent) :][:1].isspace()
-        ):
-            return data, []  # not a column as we write it: let the parser speak
-        pieces += [
-            data[done : match.end()],
-            indent,
-            b"%s%d\n" % (mark.encode(), len(columns)),
-        ]
-        columns.append(block[len(indent) :].replace(b"\n" + indent, b"\n").decode("ascii"))
-        done = end
-    pieces.append(data[done:])
+        last = re.compile(rb"\n(?!" + indent + rb")").search(data, start - 1, end)
+        stop = last.end() if last else end
+        first = start + len(indent)
+        if not data.startswith(indent, start) or data[first : first + 1].isspace():
+            return data[:end], []
+        try:
+            text = str(memoryview(data)[first:stop], "ascii")
+        except UnicodeDecodeError:
+            return data[:end], []
+        pieces += [data[done:start], indent, f"{_MARK}{len(columns)}\n".encode()]
+        columns.append(text.replace(f"\n{indent.decode()}", "\n"))
+        done = stop
+    pieces.append(data[done:end])
     return b"".join(pieces), columns
 
 
-def _restore_columns(node: Any, columns: list[str], mark: str) -> int:
+def _restore_columns(node: Any, columns: list[str]) -> int:
     """Put the columns back in place of their placeholders; returns how many there were."""
     restored = 0
     if isinstance(node, dict):
         values = node.get("values")
-        if isinstance(values, str) and values.startswith(mark):
-            number = values[len(mark) :].strip()
+        if isinstance(values, str) and values.startswith(_MARK):
+            number = values[len(_MARK) :].strip()
             if number.isdigit() and int(number) < len(columns):
                 node["values"] = columns[int(number)]
                 restored += 1
-        return restored + sum(_restore_columns(child, columns, mark) for child in node.values())
+        return restored + sum(_restore_columns(child, columns) for child in node.values())
     if isinstance(node, list):
-        return sum(_restore_columns(child, columns, mark) for child in node)
+        return sum(_restore_columns(child, columns) for child in node)
     return 0
