@@ -116,8 +116,9 @@ def _add_topics(
             item.content = f"{len(own)} publishers"
         result.topics.append(item)
         if len(merged):
-            result.start = min(filter(None, (result.start, int(merged[0]))), default=0)
-            result.end = max(result.end or 0, int(merged[-1]))
+            first, last = int(merged[0]), int(merged[-1])
+            result.start = first if result.start is None else min(result.start, first)
+            result.end = last if result.end is None else max(result.end, last)
 
 
 def _timing(item: TopicInfo, times: NDArray[np.int64]) -> TopicInfo:

@@ -45,6 +45,8 @@ class Packer:
         progress: Called several times a second, if given.
     """
 
+    _verbatim: BagWriter  # messages.mcap, open while `run` reads
+
     def __init__(
         self,
         reader: BagReader,
@@ -118,8 +120,6 @@ class Packer:
             left_out=list(self._left_out),
             skipped=dict(self._reader.skipped),
         )
-
-    _verbatim: BagWriter
 
     def _read(self, hasher: SourceHasher) -> None:
         with Workers(self._jobs if self._jobs > 1 else 0) as workers:
