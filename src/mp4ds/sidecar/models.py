@@ -342,9 +342,12 @@ def decode_base64(text: str) -> bytes:
         ValueError: It is not base64.
     """
     try:
-        return base64.b64decode(text, validate=True)
+        data = base64.b64decode(text, validate=True)
     except binascii.Error as error:
         raise ValueError(f"{text[:20]!r} is not base64: {error}") from None
+    if base64.b64encode(data).decode() != text:
+        raise ValueError(f"{text[:20]!r} is not base64: it does not encode what it decodes to")
+    return data
 
 
 def parse_version(text: str) -> tuple[int, int]:
