@@ -489,3 +489,24 @@ def test_reading_a_damaged_dataset_raises_what_validate_says(dataset: Path) -> N
         mp4ds.open(dataset)
     assert caught.value.code == "checksum-mismatch"
     assert str(path) in str(caught.value)
+
+
+def test_images_are_not_written_of_a_damaged_video(packed_bag: Path, tmp_path: Path) -> None:
+    """Frames have no digest of their own: the video's has to tell."""
+    shutil.copytree(packed_bag, tmp_path / "dataset")
+    (video,) = (tmp_path / "dataset").glob("*.mp4")
+    data = bytearray(video.read_bytes())
+    data[len(data) // 2] ^= 1
+    video.write_bytes(data)
+    with pytest.raises(mp4ds.FormatError, match="hash-mismatch"):
+        mp4ds.unpack(tmp_path / "dataset", "images", tmp_path / "images")
+    assert not (tmp_path / "images").exists()
+
+
+def test_jpeg_of_sixteen_bits_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "source").mkdir()
+    sources = SOURCES["mcap-ros2-none"](tmp_path / "source", scene("mono16"))
+    mp4ds.pack(sources, tmp_path / "dataset")
+    options = mp4ds.UnpackOptions(image_format="jpeg")
+    with pytest.raises(mp4ds.OptionError, match="mono16"):
+        mp4ds.unpack(tmp_path / "dataset", "images", tmp_path / "images", options)

@@ -108,8 +108,6 @@ class Dataset:
         if self._messages_path is None:
             return []
         with McapReader(self._messages_path) as reader:
-            for _ in reader.records():
-                pass
             return list(reader.unused_schemas)
 
     @property

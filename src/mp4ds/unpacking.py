@@ -252,6 +252,7 @@ def _unpack_images(
     total = sum(map(len, streams))
     done = 0
     for stream in streams:
+        stream.verify_video()
         stem, _ = names.name_for(stream.topic)
         folder = path / stem
         folder.mkdir()
@@ -260,7 +261,7 @@ def _unpack_images(
             if progress:
                 progress(UnpackProgress(done, total))
         summary.messages[stream.topic] = summary.messages.get(stream.topic, 0) + len(stream)
-    others = {channel.topic for channel in dataset.channels} - set(dataset.topics)
+    others = {channel.topic for channel in dataset.channels} - set(summary.messages)
     summary.left_out.extend(sorted(others))
     return summary
 

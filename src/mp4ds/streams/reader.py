@@ -190,19 +190,24 @@ class Stream:
             FormatError: A frame does not decode, or a message does not match its digest.
         """
         rebuilder = self.rebuilder
-        self._verify_lossy_video()
+        if self.sidecar.digests is None:
+            self.verify_video()
         with self.open_video(sequential=True) as decoder:
             for index, picture in enumerate(decoder.pictures()):
                 payload = rebuilder.payload(index, picture)
                 ordinal = int(rebuilder.columns.ordinal[index])
                 yield ordinal, message_at(rebuilder.columns, index, channel, payload)
 
-    def _verify_lossy_video(self) -> None:
-        """Compare the video's SHA-256 where no digest of each message would tell damage."""
+    def verify_video(self) -> None:
+        """Compare the video with its SHA-256, for where no digest of a message tells damage.
+
+        Raises:
+            FormatError: ``file-missing`` or ``hash-mismatch``.
+        """
         video = self.sidecar.video
-        if self.sidecar.digests is not None or video.sha256 is None:
-            return
-        if digest_file(self.video_path)[1] != video.sha256:
+        if not self.video_path.is_file():
+            raise FormatError("file-missing", self.video_path, "does not exist")
+        if video.sha256 is not None and digest_file(self.video_path)[1] != video.sha256:
             raise FormatError(
                 "hash-mismatch",
                 self.video_path,

@@ -8,6 +8,7 @@ from typing import Any
 import av
 import numpy as np
 
+from mp4ds.errors import OptionError
 from mp4ds.layouts import ENCODINGS, Pixels
 from mp4ds.video.convert import Converter
 
@@ -25,14 +26,14 @@ class ImageFile:
         image_format: ``png`` or ``jpeg``.
 
     Raises:
-        ValueError: JPEG cannot hold the encoding.
+        OptionError: JPEG cannot hold the encoding.
     """
 
     def __init__(self, encoding: str, image_format: str) -> None:
         known = ENCODINGS[encoding]
         self._jpeg = image_format == "jpeg"
         if self._jpeg and known.bytes_per_sample == 2:
-            raise ValueError(f"JPEG cannot hold {encoding} images; use png")
+            raise OptionError(f"JPEG cannot hold {encoding} images; use png")
         self._converter = Converter("smpte170m")
         if known.bytes_per_sample == 2:
             self._source, self._pixel_format = "gray16le", "gray16be"
