@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import mp4ds
+from mp4ds.packing import PackOptions
 from sources import SOURCES, load_tool, scene
 
 DATA = Path(os.environ.get("MP4DS_DATA", Path(__file__).parents[2] / "shared" / "data"))
@@ -35,5 +36,5 @@ def packed_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = folder / "source"
     source.mkdir()
     paths = SOURCES["bag-none"](source, scene("bayer_rggb8"))
-    mp4ds.pack(paths, folder / "dataset")
+    mp4ds.pack(paths, folder / "dataset", PackOptions(codec="h264"))
     return folder / "dataset"

@@ -6,22 +6,20 @@ Nothing here uses mp4ds, so that its tests have an independent source.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from definitions import IMAGE, INFO, TF, definitions
+from pictures import ENCODINGS, YUV, picture
+
 START = 1_700_000_000_000_000_000
 PERIOD = 33_333_333
-IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
-TF = "tf2_msgs/msg/TFMessage"
-BAYER = [f"bayer_{order}8" for order in ("rggb", "bggr", "gbrg", "grbg")]
-ENCODINGS = ["mono8", "rgb8", "bgr8", *BAYER, "mono16", "16UC1"]
 
 
 # ---------------------------------------------------------------- scenes
@@ -75,10 +73,11 @@ class Scene:
 
 @cache
 def typestore(encoding: str) -> Any:
-    """The standard types of ROS 1 (``ros1``) or ROS 2 (``cdr``)."""
+    """The standard types of ROS 1 (``ros1``) or ROS 2 (``cdr``), and those of `definitions`."""
     store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
-    if TF not in store.types:
-        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
+    for msgtype, text in definitions(encoding).items():
+        if msgtype not in store.types:
+            store.register(get_types_from_msg(text, msgtype))
     return store
 
 
@@ -100,47 +99,11 @@ def build(encoding: str, msgtype: str, values: Mapping[str, Any]) -> Any:
                 fields[name] = [build(encoding, inner_detail, item) for item in given or ()]
             else:
                 size = count if kind == Nodetype.ARRAY else 0
+                if isinstance(given, bytes):
+                    given = np.frombuffer(given, np.uint8)
                 given = np.zeros(size) if given is None else np.asarray(given)
                 fields[name] = given.astype(inner_detail[0])
     return store.types[msgtype](**fields)
-
-
-def picture(
-    encoding: str, *, frame: int, width: int, height: int, rng: np.random.Generator | None
-) -> NDArray[Any]:
-    """A moving pattern with edges and slopes; 16-bit encodings use all of their bits.
-
-    Returns:
-        ``(height, width)`` or ``(height, width, 3)``, uint8 or uint16.
-    """
-    y, x = np.mgrid[:height, :width].astype(float)
-    colours = [
-        128 + 100 * np.sin((x + 2 * frame) / 9),
-        128 + 100 * np.sin((y - frame) / 7),
-        255 * ((x + y + 3 * frame) % 40) / 40,
-    ]
-    colour: NDArray[np.float64] = np.stack(colours, axis=-1)
-    left = (5 * frame) % max(1, width - width // 4)
-    colour[height // 3 : height // 2, left : left + width // 4] = (250, 30, 90)
-    if rng is not None:
-        colour += rng.normal(0, 3, colour.shape)
-    rgb: NDArray[np.uint8] = np.clip(colour, 0, 255).astype(np.uint8)
-    if encoding in ("rgb8", "bgr8"):
-        return rgb if encoding == "rgb8" else rgb[..., ::-1]
-    if encoding.startswith("bayer_"):
-        order = ["rgb".index(letter) for letter in encoding[6:10]]
-        mosaic = np.empty((height, width), np.uint8)
-        for place, channel in enumerate(order):
-            rows, columns = slice(place // 2, None, 2), slice(place % 2, None, 2)
-            mosaic[rows, columns] = rgb[rows, columns, channel]
-        return mosaic
-    grey: NDArray[np.float64] = np.clip(colour.mean(axis=-1), 0, 255)
-    if encoding == "mono8":
-        return grey.astype(np.uint8)
-    deep: NDArray[np.uint16] = (grey / 255 * 65535).astype(np.uint16)
-    if encoding == "16UC1":
-        deep[(x + frame) % 17 == 0] = 0  # holes, as depth cameras leave them
-    return deep
 
 
 def scene(
@@ -155,44 +118,63 @@ def scene(
     with_info: bool = True,
     big_endian: bool = False,
     pad: int = 0,
+    content: str = "full",
 ) -> Scene:
     """A camera with its calibration amid other topics; the same arguments give the same bytes.
 
-    Topics are ``/cam/image_raw``, ``/cam/camera_info``, ``/imu``, ``/tf`` and ``/chatter``, the
-    last of three publishers. Two messages have the same log time, and two of ``/imu`` stand out
-    of order in the file.
+    Topics are ``/cam/image_raw``, ``/cam/camera_info``, and those of `together`.
 
     Args:
         encoding: One of `ENCODINGS`.
         frames: Number of images.
-        width: Image width, pixels.
-        height: Image height, pixels.
+        width: Image width, pixels; the next even number for YUV.
+        height: Image height, pixels; the next even number for YUV.
         seed: Of the noise and the jitter of the times.
         frame_id: Of image and calibration.
         noisy: Add sensor noise.
         with_info: Publish a calibration with each image.
-        big_endian: Set ``is_bigendian``, and swap the bytes of 16-bit pixels.
+        big_endian: Set ``is_bigendian``, and swap the bytes of samples that have several.
         pad: Zero bytes after each row.
+        content: One of `CONTENTS`.
     """
     rng = np.random.default_rng([seed, ENCODINGS.index(encoding)])
-    messages = []
+    if encoding in YUV:
+        width, height = width + width % 2, height + height % 2
+    made = partial(picture, encoding, width=width, height=height, content=content)
+    groups = []
     for n in range(frames):
-        stamp = START + n * PERIOD + int(rng.integers(-200_000, 200_000))
-        log = stamp + 4_000_000 + int(rng.integers(0, 500_000))
-        pixels = picture(encoding, frame=n, width=width, height=height, rng=rng if noisy else None)
-        if big_endian and pixels.dtype == np.uint16:
-            pixels = pixels.byteswap()
-        rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(height, -1)
+        stamp, log = instant(n, rng)
+        pixels = made(frame=n, rng=rng if noisy else None)
+        pixels = pixels.byteswap() if big_endian else pixels
+        rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
         rows = np.pad(rows, ((0, 0), (0, pad)))
         head = {"seq": n + 7, "stamp": stamp, "frame_id": frame_id}
         size = {"header": head, "height": height, "width": width}
         image = size | {"encoding": encoding, "is_bigendian": int(big_endian)}
         image |= {"step": rows.shape[1], "data": rows.ravel()}
-        messages.append(Record("/cam/image_raw", IMAGE, log, image))
+        group = [Record("/cam/image_raw", IMAGE, log, image)]
         if with_info:
-            info = size | _calibration(width, height)
-            messages.append(Record("/cam/camera_info", INFO, log + 90_000, info))
-        messages += _others(n, log)
+            info = size | calibration(width, height)
+            group.append(Record("/cam/camera_info", INFO, log + 90_000, info))
+        groups.append(group)
+    return together(groups)
+
+
+def instant(n: int, rng: np.random.Generator) -> tuple[int, int]:
+    """Header stamp and log time of a camera's n-th image, nanoseconds, with jitter."""
+    stamp = START + n * PERIOD + int(rng.integers(-200_000, 200_000))
+    return stamp, stamp + 4_000_000 + int(rng.integers(0, 500_000))
+
+
+def together(groups: Iterable[Sequence[Record]]) -> Scene:
+    """What a camera publishes for each image, amid the messages of other topics.
+
+    These are ``/imu``, ``/tf`` and ``/chatter``, the last of three publishers. Two messages have
+    the same log time, and two of ``/imu`` stand out of order in the file.
+    """
+    messages: list[Record] = []
+    for n, group in enumerate(groups):
+        messages += [*group, *_others(n, group[0].log_time)]
     messages.sort(key=lambda message: message.log_time)
     imu = [i for i, message in enumerate(messages) if message.topic == "/imu"]
     if len(imu) > 3:
@@ -200,7 +182,8 @@ def scene(
     return Scene(messages, {"/diagnostics": "std_msgs/msg/String"})
 
 
-def _calibration(width: int, height: int) -> dict[str, Any]:
+def calibration(width: int, height: int) -> dict[str, Any]:
+    """Fields of a calibration that have the same names in ROS and Foxglove."""
     fx, cx, cy = 0.9 * width, width / 2 - 0.5, height / 2 - 0.5
     return {
         "distortion_model": "plumb_bob",

@@ -1,7 +1,7 @@
 """Small recordings of every source format, written with the public libraries alone.
 
-`SOURCES` names a writer for every variant of every format, `ENCODINGS` every image encoding and
-`TRAITS` the oddities of real recordings::
+`SOURCES` names a writer for every variant of every format, `ENCODINGS` every image encoding
+(`COMMON` a few of them, for tests that multiply), and `TRAITS` the oddities of real recordings::
 
     paths = SOURCES["rosbag2-mcap-v9"](folder, scene("bayer_rggb8"))
     paths = SOURCES["bag-lz4"](folder, odd_scene("row-padding-garbage"))
@@ -25,11 +25,9 @@ import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag1 import Writer as BagWriter
 
+from definitions import IMAGE, INFO, PICTURES
+from pictures import BAYER, COMMON, CONTENTS, ENCODINGS, picture
 from scenes import (
-    BAYER,
-    ENCODINGS,
-    IMAGE,
-    INFO,
     PERIOD,
     START,
     TRAITS,
@@ -39,7 +37,6 @@ from scenes import (
     image_cdr,
     image_ros1,
     odd_scene,
-    picture,
     raw_scene,
     scene,
     typestore,
@@ -48,6 +45,8 @@ from source_rosbag2 import qos_text, write_rosbag2
 
 __all__ = [
     "BAYER",
+    "COMMON",
+    "CONTENTS",
     "ENCODINGS",
     "IMAGE",
     "INFO",
@@ -151,8 +150,8 @@ def write_mcap(
     Args:
         path: The file to write.
         scene: What to write.
-        profile: ``ros1``, ``ros2``, or empty: images as CDR, all else as JSON, the third
-            publisher's messages without a schema.
+        profile: ``ros1``, ``ros2``, or empty: images of any kind as CDR, all else as JSON,
+            the third publisher's messages without a schema.
         compression: ``none``, ``lz4`` or ``zstd``.
         chunked: Group messages into compressed chunks.
         indexed: Write the indexes.
@@ -197,7 +196,7 @@ def write_mcap(
 def _encoding(message: Record, profile: str) -> str:
     if profile:
         return "ros1" if profile == "ros1" else "cdr"
-    return "cdr" if message.msgtype == IMAGE else "json"
+    return "cdr" if message.msgtype in PICTURES else "json"
 
 
 def _register(writer: Writer, message: Record, profile: str) -> int:

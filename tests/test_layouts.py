@@ -2,55 +2,178 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from mp4ds.errors import OptionError
 from mp4ds.layouts import (
+    CHROMA_SHIFTS,
     ENCODINGS,
     LAYOUTS,
     MAX_ROW_PADDING,
     MAX_SIDE,
-    Encoding,
+    MAX_TABLE,
+    NO_PARAMETERS,
+    SCALES,
+    Layout,
+    Parameters,
+    bind,
+    fit,
     layout_for,
     padding_is_zero,
     pixel_view,
     why_not,
 )
+from pixel_kinds import KINDS, PAIRS, as_message, bits_of, bound, rounded, suited, values
 
 steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 SIZES = [(w, h) for w in (1, 2, 3, 4, 7, 8) for h in (1, 2, 3, 5, 6)]
+WITH_PARAMETERS = [pair for pair in PAIRS if LAYOUTS[pair[1]].parameters]
+GENERAL = [(e.name, e.general) for e in ENCODINGS.values()]
+CHANNELS = {"rgb24": 3, "bgr24": 3, "rgba": 4, "bgra": 4}
 
 
-def random_pixels(encoding: Encoding, width: int, height: int) -> np.ndarray:
-    dtype = np.uint8 if encoding.bytes_per_sample == 1 else np.uint16
-    shape = (height, width) if encoding.channels == 1 else (height, width, encoding.channels)
-    rng = np.random.default_rng([width, height])
-    return rng.integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
+def through(layout: Layout, pixels: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+    """The pixels, into a picture and back; checks that the picture is what the layout says."""
+    encoding = layout.encoding
+    picture = layout.to_picture(pixels)
+    width, height = pixels.shape[1], int(len(pixels) / encoding.rows)
+    columns, rows = layout.picture_size(width, height)
+    across, down = CHROMA_SHIFTS.get(layout.pixel_format, (0, 0))
+    if layout.pixel_format in CHANNELS:
+        shapes = [(rows, columns, CHANNELS[layout.pixel_format])]
+    elif layout.pixel_format.startswith(("gray", "bayer")):
+        shapes = [(rows, columns)]
+    else:
+        planes = 4 if layout.pixel_format.startswith("gbra") else 3
+        chroma = (-(-rows >> down), -(-columns >> across))
+        shapes = [(rows, columns), *[chroma] * (planes - 1)]
+    assert [plane.shape for plane in picture] == shapes
+    sample = np.dtype(np.uint16 if layout.pixel_format.endswith("le") else np.uint8)
+    assert {plane.dtype for plane in picture} == {sample}
+    if out is None:
+        out = np.empty(pixels.shape, encoding.dtype)
+    # as a decoder gives them: its own memory, read-only, of no more bits than the format has
+    depth = re.search(r"gray(9|1\d)le|gbra?p(1\d)le", layout.pixel_format)
+    bits = int(depth[1] or depth[2]) if depth else 8
+    copies = tuple(plane & sample.type(2**bits - 1) for plane in picture)
+    for plane in copies:
+        plane.flags.writeable = False
+    layout.to_pixels(copies, out)
+    return out
 
 
-@pytest.mark.parametrize("name", ENCODINGS)
-@pytest.mark.parametrize(("width", "height"), SIZES)
-def test_every_layout_gives_the_pixels_back(name: str, width: int, height: int) -> None:
+# ---------------------------------------------------------------- exact layouts
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("name", "layout"), GENERAL)
+def test_the_general_layout_gives_all_pixels_back(name: str, layout: str, kind: str) -> None:
     encoding = ENCODINGS[name]
-    pixels = random_pixels(encoding, width, height)
-    for layout_name in {encoding.exact, encoding.lossy} - {None}:
-        layout = LAYOUTS[str(layout_name)]
-        picture = layout.to_picture(pixels)
-        assert picture.shape[1::-1] == layout.picture_size(width, height)
-        out = np.empty_like(pixels)
-        layout.to_pixels(picture, out)
-        assert np.array_equal(out, pixels)
+    general = bind(layout, encoding)
+    assert general == layout_for(encoding, lossless=True)
+    for width, height in {rounded(encoding, *size) for size in SIZES}:
+        pixels = values(encoding, kind, width, height)
+        for big in (False, True):
+            for pad in (0, 1, 6):
+                view = as_message(pixels, encoding, pad=pad, is_bigendian=big)
+                assert general.refuses(view) is None
+                assert bits_of(through(general, view)) == bits_of(pixels)
+                target = np.ndarray(
+                    view.shape, view.dtype, bytearray(len(view) * view.strides[0]),
+                    strides=view.strides,
+                )  # fmt: skip
+                assert bits_of(through(general, view, target)) == bits_of(pixels)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("name", "layout"), WITH_PARAMETERS)
+def test_a_fitted_layout_gives_the_samples_back(name: str, layout: str, seed: int) -> None:
+    encoding = ENCODINGS[name]
+    for width, height in SIZES:
+        pixels = suited(layout, encoding, width, height, seed)
+        fitted = fit(layout, encoding, [pixels])
+        if fitted is None:
+            assert width * height < 600, "not even of many samples"
+            continue
+        assert bind(layout, encoding, fitted.parameters) is not fitted
+        for big in (False, True):
+            view = as_message(pixels, encoding, pad=3, is_bigendian=big)
+            assert fitted.refuses(view) is None
+            assert bits_of(through(fitted, view)) == bits_of(pixels)
+            out = np.empty(pixels.shape, pixels.dtype.newbyteorder(">" if big else "<"))
+            assert bits_of(through(fitted, view, out)) == bits_of(pixels)
+
+
+def refused_or_returned(layout: Layout, pixels: np.ndarray) -> bool:
+    """Exactly one of both; the picture of folded bits has room for some that are refused."""
+    refused = layout.refuses(pixels) is not None
+    returned = bits_of(through(layout, pixels)) == bits_of(pixels)
+    return refused != returned or (refused and layout.name.endswith("fold"))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("name", "layout"), WITH_PARAMETERS)
+def test_what_is_not_refused_comes_back(name: str, layout: str, kind: str) -> None:
+    """And what does not come back is refused: for every kind of pixels, some changed."""
+    encoding = ENCODINGS[name]
+    for seed in range(4):
+        fitted = bound(layout, encoding, 16, 12, seed)
+        pixels = suited(layout, encoding, 16, 12, seed)
+        assert fitted.refuses(pixels) is None
+        other = values(encoding, kind, 16, 12, seed)
+        for y, x in ((0, 0), (11, 15), (5, 7)):
+            changed = pixels.copy()
+            changed[y, x] = other[y, x]
+            assert refused_or_returned(fitted, changed)
+        assert refused_or_returned(fitted, other)
+
+
+@steady
+@given(st.data())
+def test_any_pixels_come_back_or_are_refused(data: st.DataObject) -> None:
+    name, layout = data.draw(st.sampled_from(PAIRS))
+    encoding = ENCODINGS[name]
+    width, height = rounded(encoding, data.draw(st.integers(1, 9)), data.draw(st.integers(1, 9)))
+    shape = encoding.shape(width, height)
+    patterns = hnp.arrays(f"u{encoding.bytes_per_sample}", shape)
+    samples = [data.draw(patterns).view(encoding.dtype) for _ in range(2)]
+    fitted = fit(layout, encoding, samples[:1])
+    if fitted is None:
+        return
+    assert fitted.refuses(samples[0]) is None
+    for pixels in samples:
+        if fitted.refuses(pixels) is None:
+            assert bits_of(through(fitted, pixels)) == bits_of(pixels)
+
+
+@pytest.mark.parametrize("dtype", ["u2", "i2"])
+def test_every_word_comes_back(dtype: str) -> None:
+    pixels = np.arange(65536, dtype=np.uint16).reshape(256, 256).view(dtype)
+    encoding = ENCODINGS["16UC1" if dtype == "u2" else "16SC1"]
+    folds = [Parameters(bits=16, shift=0, low=low) for low in (6, 7, 8)]
+    for name, parameters in [("gray16", NO_PARAMETERS), *(("fold", p) for p in folds)]:
+        layout = bind(name, encoding, parameters)
+        assert layout.refuses(pixels) is None
+        assert bits_of(through(layout, pixels)) == bits_of(pixels)
+
+
+# ---------------------------------------------------------------- what the spec says of each
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
 def test_tiles_are_where_the_spec_says(width: int, height: int) -> None:
     """spec/index.md, Layouts, mosaic8."""
     pixels = np.arange(width * height, dtype=np.uint16).reshape(height, width)
-    picture = LAYOUTS["mosaic8"].to_picture(pixels)
+    (picture,) = bind("mosaic16", ENCODINGS["bayer_rggb16"]).to_picture(pixels)
     h, w = -(-height // 2), -(-width // 2)
     assert picture.shape == (2 * h, 2 * w)
     for y in range(height):
@@ -61,29 +184,460 @@ def test_tiles_are_where_the_spec_says(width: int, height: int) -> None:
 
 def test_tiles_hold_one_colour_each() -> None:
     mosaic = np.array([[10, 20] * 3, [30, 40] * 3] * 2, np.uint8)
-    picture = LAYOUTS["mosaic8"].to_picture(mosaic)
+    (picture,) = bind("mosaic8", ENCODINGS["bayer_rggb8"]).to_picture(mosaic)
     quarters = (picture[:2, :3], picture[:2, 3:], picture[2:, :3], picture[2:, 3:])
     assert [np.unique(quarter).tolist() for quarter in quarters] == [[10], [20], [30], [40]]
 
 
+def test_signed_samples_keep_their_order() -> None:
+    pixels = np.arange(-128, 128, dtype=np.int8).reshape(16, 16)
+    (picture,) = bind("gray8", ENCODINGS["8SC1"]).to_picture(pixels)
+    assert picture.ravel().tolist() == list(range(256))
+
+
+@pytest.mark.parametrize("word", [0x0000, 0x00FF, 0x0100, 0x01FF, 0x02FE, 0xFF00, 0xFFFF])
+def test_low_bytes_are_folded(word: int) -> None:
+    """A step of one never moves the low byte by more than one."""
+    fold = bind("fold", ENCODINGS["mono16"], Parameters(bits=16, shift=0, low=8))
+    (picture,) = fold.to_picture(np.array([[word]], np.uint16))
+    high, low = divmod(word, 256)
+    assert picture.tolist() == [[high], [255 - low if high % 2 else low]]
+
+
+@pytest.mark.parametrize(
+    ("bits", "shift", "low", "pixel_format"),
+    [(12, 0, 3, "gray10le"), (12, 4, 4, "gray"), (14, 2, 5, "gray10le"), (10, 0, 2, "gray")],
+)
+def test_low_bits_are_folded(bits: int, shift: int, low: int, pixel_format: str) -> None:
+    values = np.arange(2**bits, dtype=np.uint16).reshape(-1, 64)
+    layout = bind("fold", ENCODINGS["mono16"], Parameters(bits=bits, shift=shift, low=low))
+    assert layout.pixel_format == pixel_format
+    (picture,) = layout.to_picture(values << shift)
+    high, folded = np.split(picture.astype(int), 2)
+    assert np.array_equal(high, values >> low)
+    flat = folded.ravel()
+    steps = np.abs(np.diff(flat))
+    assert steps.max() == 1
+    assert np.array_equal(
+        np.flatnonzero(steps == 0) % 2**low, [2**low - 1] * (2 ** (bits - low) - 1)
+    )
+    assert bits_of(through(layout, values << shift)) == bits_of(values << shift)
+
+
+def test_a_mosaic_is_tiled_before_it_is_folded() -> None:
+    mosaic = np.array([[0x001, 0x012], [0x023, 0x034]], np.uint16)
+    parameters = Parameters(bits=12, shift=0, low=4)
+    (picture,) = bind("mosaic_fold", ENCODINGS["bayer_rggb16"], parameters).to_picture(
+        np.tile(mosaic, (1, 2))
+    )
+    assert picture.tolist() == [[0, 0, 1, 1], [2, 2, 3, 3], [1, 1, 13, 13], [3, 3, 11, 11]]
+
+
+@pytest.mark.parametrize("encoding", ["rgba8", "bgra8", "8UC4"])
+def test_an_alpha_that_is_the_same_is_left_out(encoding: str) -> None:
+    known = ENCODINGS[encoding]
+    pixels = values(known, "random", 5, 4)
+    assert fit("opaque", known, [pixels]) is None
+    pixels[..., 3] = 200
+    layout = fit("opaque", known, [pixels, pixels])
+    assert layout is not None
+    assert layout.pixel_format == ("rgb24" if encoding == "rgba8" else "bgr24")
+    (picture,) = layout.to_picture(pixels)
+    assert np.array_equal(picture, pixels[..., :3])
+    assert bits_of(through(layout, pixels)) == bits_of(pixels)
+    pixels[2, 3, 3] = 201
+    assert "an alpha that is not the stream's, 200" in str(layout.refuses(pixels))
+
+
+def test_bytes_lie_in_two_rows_the_highest_first() -> None:
+    four = np.array([[0x01020304]], np.int32)
+    (picture,) = bind("bytes", ENCODINGS["32SC1"]).to_picture(four)
+    assert picture.tolist() == [[0x81, 2], [3, 4]]
+    eight = np.array([[[0x0102030405060708, 0x1112131415161718]]], np.uint64).view("f8")
+    (picture,) = bind("bytes", ENCODINGS["64FC2"]).to_picture(eight)
+    rows = [[1, 2, 3, 4], [5, 6, 7, 8], [17, 18, 19, 20], [21, 22, 23, 24]]
+    assert picture.tolist() == rows
+
+
+def test_channels_are_stacked() -> None:
+    pixels = np.arange(12, dtype=np.uint8).reshape(2, 3, 2)
+    (picture,) = bind("stack8", ENCODINGS["8UC2"]).to_picture(pixels)
+    assert picture.tolist() == [[0, 2, 4], [6, 8, 10], [1, 3, 5], [7, 9, 11]]
+
+
+@pytest.mark.parametrize(
+    ("encoding", "order"),
+    [
+        *(("rgb16", "rgb"), ("bgr16", "bgr"), ("rgba16", "rgba"), ("bgra16", "bgra")),
+        *(("16UC3", "bgr"), ("16UC4", "bgra")),
+    ],
+)
+def test_planes_of_colours_are_green_blue_red_alpha(encoding: str, order: str) -> None:
+    known = ENCODINGS[encoding]
+    pixel = np.array([[[ord(letter) for letter in order]]], np.uint16)
+    planes = bind(known.general, known).to_picture(pixel)
+    assert "".join(chr(plane.item()) for plane in planes) == "gbra"[: len(order)]
+
+
+YUV = {
+    "yuv422": [[[20, 1], [30, 2], [21, 3], [31, 4]], [[22, 5], [32, 6], [23, 7], [33, 8]]],
+    "yuyv": [[[1, 20], [2, 30], [3, 21], [4, 31]], [[5, 22], [6, 32], [7, 23], [8, 33]]],
+    "nv12": [[1, 2, 3, 4], [5, 6, 7, 8], [20, 30, 21, 31]],
+    "nv21": [[1, 2, 3, 4], [5, 6, 7, 8], [30, 20, 31, 21]],
+    "nv24": [[1, 2, 3, 4], [5, 6, 7, 8], [20, 30, 21, 31], [22, 32, 23, 33],
+             [24, 34, 25, 35], [26, 36, 27, 37]],
+}  # fmt: skip
+PLANES = {
+    "yuv422": ([[20, 21], [22, 23]], [[30, 31], [32, 33]]),
+    "nv12": ([[20, 21]], [[30, 31]]),
+    "nv24": ([[20, 21, 22, 23], [24, 25, 26, 27]], [[30, 31, 32, 33], [34, 35, 36, 37]]),
+}
+
+
+@pytest.mark.parametrize(
+    ("encoding", "same", "planes"),
+    [
+        ("yuv422", "yuv422", "yuv422"),
+        ("uyvy", "yuv422", "yuv422"),
+        ("yuyv", "yuyv", "yuv422"),
+        ("yuv422_yuy2", "yuyv", "yuv422"),
+        ("nv12", "nv12", "nv12"),
+        ("nv21", "nv21", "nv12"),
+        ("nv24", "nv24", "nv24"),
+    ],
+)
+@pytest.mark.parametrize("pad", [0, 5])
+def test_yuv_becomes_planes(encoding: str, same: str, planes: str, pad: int) -> None:
+    """By the FourCC codes UYVY, YUY2, NV12, NV21 and NV24."""
+    known = ENCODINGS[encoding]
+    pixels = as_message(np.array(YUV[same], np.uint8), known, pad=pad)
+    y, u, v = bind(known.general, known).to_picture(pixels)
+    assert y.tolist() == [[1, 2, 3, 4], [5, 6, 7, 8]]
+    assert (u.tolist(), v.tolist()) == PLANES[planes]
+
+
+@pytest.mark.parametrize("encoding", ["yuv422", "uyvy", "yuyv", "yuv422_yuy2", "nv24"])
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_halved_chroma_stays_near(encoding: str, width: int, height: int) -> None:
+    known = ENCODINGS[encoding]
+    width, height = rounded(known, width, height)
+    layout = layout_for(known, lossless=False)
+    assert (layout.name, layout.is_exact) == ("halved420", False)
+    y, x = np.mgrid[:height, :width]
+    planes = [(n * 40 + 8 * y + 4 * (x // 2)).astype(np.uint8) for n in (1, 2, 3)]
+    if known.channels == 2:
+        planes[1:] = [plane[:, ::2] for plane in planes[1:]]
+    exact = bind(known.general, known)
+    pixels = np.empty(known.shape(width, height), np.uint8)
+    exact.to_pixels(tuple(planes), pixels)
+    found = exact.to_picture(through(layout, pixels))
+    assert np.array_equal(found[0], planes[0])
+    for original, chroma in zip(planes[1:], found[1:], strict=True):
+        assert np.abs(chroma.astype(int) - original).max() <= 4
+        flat = np.full_like(original, 77)
+        exact.to_pixels((planes[0], flat, flat), pixels)
+        assert np.array_equal(through(layout, pixels), pixels)
+
+
 def test_layouts_of_encodings() -> None:
-    assert {name: (e.exact, e.lossy) for name, e in ENCODINGS.items()} == {
-        "mono8": ("gray8", "gray8"),
-        "rgb8": ("rgb24", "rgb24"),
-        "bgr8": ("bgr24", "bgr24"),
-        **{f"bayer_{m}8": ("mosaic8", "demosaic8") for m in ("rggb", "bggr", "gbrg", "grbg")},
-        "mono16": ("gray16", None),
-        "16UC1": ("gray16", None),
+    assert len(ENCODINGS) == 53
+    assert {name: e.lossy for name, e in ENCODINGS.items() if e.lossy} == {
+        "mono8": "gray8",
+        "8UC1": "gray8",
+        "rgb8": "rgb24",
+        "bgr8": "bgr24",
+        "8UC3": "bgr24",
+        **{f"bayer_{m}8": "demosaic8" for m in ("rggb", "bggr", "gbrg", "grbg")},
+        **dict.fromkeys(("yuv422", "uyvy", "yuyv", "yuv422_yuy2", "nv24"), "halved420"),
+        **dict.fromkeys(("nv12", "nv21"), "planar420"),
     }
     for name, encoding in ENCODINGS.items():
-        assert layout_for(encoding, lossless=True).name == encoding.exact
+        assert encoding.general in encoding.exact
+        assert LAYOUTS[encoding.general].parameters == frozenset()
+        assert all(LAYOUTS[layout].is_exact for layout in encoding.exact)
+        assert layout_for(encoding, lossless=True).name == encoding.general
         if encoding.lossy:
             assert layout_for(encoding, lossless=False).name == encoding.lossy
         else:
             with pytest.raises(OptionError, match=name):
                 layout_for(encoding, lossless=False)
         if encoding.mosaic:
-            assert name == f"bayer_{encoding.mosaic}8"
+            assert name == f"bayer_{encoding.mosaic}{8 * encoding.bytes_per_sample}"
+    used = {layout for e in ENCODINGS.values() for layout in (*e.exact, e.lossy)}
+    assert used - {None} == set(LAYOUTS)
+
+
+# ---------------------------------------------------------------- parameters
+
+
+def parameters_of(layout: str, encoding: str, *samples: Any) -> Parameters | None:
+    known = ENCODINGS[encoding]
+    arrays = [np.asarray(sample, known.dtype) for sample in samples]
+    fitted = fit(layout, known, arrays)
+    return fitted.parameters if fitted else None
+
+
+@pytest.mark.parametrize(
+    ("encoding", "samples", "expected"),
+    [
+        ("mono16", [[0, 4095]], (12, 0)),
+        ("mono16", [[1, 6]], (12, 0)),
+        ("mono16", [[1, 900]], (12, 0)),
+        ("mono16", [[1, 1023]], (10, 0)),  # one is white
+        ("mono16", [[1, 255]], (8, 0)),
+        ("mono16", [[4, 1020]], (8, 2)),
+        ("mono16", [[4, 900]], (10, 2)),
+        ("mono16", [[0, 4096 + 1]], None),
+        ("mono16", [[0, 0]], None),
+        ("mono16", [[0x8010, 0x0020]], (12, 4)),
+        ("mono16", [[0x0030, 0x0010]], (12, 4)),  # left-aligned, and dark
+        ("mono16", [[0x0040, 0x8000]], (10, 6)),
+        ("mono16", [[0x0020, 0x8000]], (12, 4)),
+        ("mono16", [[0xFF00, 0x0100]], (8, 8)),
+        ("mono16", [[0x8000, 0x8000]], (8, 8)),
+        ("mono16", [[4, 0x8000]], (14, 2)),
+        ("mono16", [[2, 0x8000]], None),
+        ("16SC1", [[-2048, 2047]], (12, 0)),
+        ("16SC1", [[-2049, 5]], None),
+        ("16SC1", [[-32768, 16]], (12, 4)),
+    ],
+)
+def test_bits_that_are_fitted(
+    encoding: str, samples: Any, expected: tuple[int, int] | None
+) -> None:
+    found = parameters_of("gray_bits", encoding, samples)
+    assert (found and (found.bits, found.shift)) == expected
+
+
+@pytest.mark.parametrize(("encoding", "bits", "shift", "bad"), [
+    ("mono16", 12, 0, 4096),
+    ("mono16", 10, 6, 0x8020),
+    ("16SC1", 12, 0, 2048),
+    ("16SC1", 12, 0, -2049),
+    ("16SC1", 12, 4, 8),
+])  # fmt: skip
+def test_bits_that_are_refused(encoding: str, bits: int, shift: int, bad: int) -> None:
+    known = ENCODINGS[encoding]
+    layout = bind("gray_bits", known, Parameters(bits=bits, shift=shift))
+    pixels = np.zeros((4, 4), known.dtype)
+    assert layout.refuses(pixels) is None
+    pixels[2, 3] = bad
+    assert f"does not fit into {bits} bits" in str(layout.refuses(pixels))
+
+
+def test_a_table_is_of_what_occurs() -> None:
+    first, second = [[9, 900, 7], [9, 40000, 7]], [[7, 9, 9], [9, 9, 9]]
+    assert parameters_of("table", "mono16", first, second) == Parameters(table=(7, 9, 900, 40000))
+    assert parameters_of("table", "mono16", [list(range(100))]) is None  # dense
+    for count in (256, 257, MAX_TABLE, MAX_TABLE + 1):
+        thin = [[3 * n for n in range(count)]]
+        found = parameters_of("table", "mono16", thin)
+        assert (found is None) == (count > MAX_TABLE)
+        if found:
+            layout = bind("table", ENCODINGS["mono16"], found)
+            assert layout.pixel_format == "gray"
+            assert layout.picture_size(count, 1) == (count, 1 if count == 256 else 2)
+    assert parameters_of("table", "32FC1", [np.arange(MAX_TABLE + 1)]) is None
+
+
+def test_a_table_that_goes_on_growing_is_none() -> None:
+    """Since later images would be refused."""
+    frames = [[[5, 900, 7000]], [[5, 7000, 900]], [[900, 900, 5]], [[5, 900, 7000]]]
+    assert parameters_of("table", "mono16", *frames) == Parameters(table=(5, 900, 7000))
+    assert parameters_of("table", "mono16", *frames[:3], [[5, 901, 7000]]) is None
+    assert parameters_of("table", "mono16", frames[0], [[1, 901, 7000]], *frames[:2]) is not None
+
+
+def test_a_table_refuses_what_it_does_not_have() -> None:
+    floats = ENCODINGS["32FC1"]
+    pixels = np.array([[1.5, np.nan], [-0.0, 2.5]], np.float32)
+    layout = fit("table", floats, [pixels])
+    assert layout is not None
+    assert layout.pixel_format == "gray"
+    for value in (0.0, 1.0, 3.0, -np.nan, np.inf):
+        changed = pixels.copy()
+        changed[0, 0] = value
+        assert "in the stream's table" in str(layout.refuses(changed))
+
+
+def test_a_palette_stands_below_the_numbers() -> None:
+    encoding = ENCODINGS["16SC1"]
+    layout = bind("palette", encoding, Parameters(entries=256))
+    pixels = np.array([[-3, 1000, -3], [7, 7, 1000]], np.int16)
+    (picture,) = layout.to_picture(pixels)
+    assert picture.shape == (2 + 171, 3) == layout.picture_size(3, 2)[::-1]
+    assert picture[:2].tolist() == [[0, 2, 0], [1, 1, 2]]
+    listed = picture[2:].ravel()
+    assert listed[:4].tolist() == [0x7F, 0x80, 0x83, 0x83]
+    assert listed[256:260].tolist() == [0xFD, 0x07, 0xE8, 0xE8]
+    assert listed[512:].tolist() == [0]
+
+
+@pytest.mark.parametrize("encoding", ["mono16", "16SC1", "32FC1"])
+@pytest.mark.parametrize("count", [2, 100, 257, 2000])
+def test_images_of_few_values_have_palettes(encoding: str, count: int) -> None:
+    known = ENCODINGS[encoding]
+    rng = np.random.default_rng(count)
+    images = []
+    for _ in range(4):  # each has other values
+        few = rng.integers(0, 2**32, count, np.uint64).astype(f"u{known.bytes_per_sample}")
+        images.append(rng.choice(few, (70, 50)).view(known.dtype))
+    layout = fit("palette", known, images[:1])
+    assert layout is not None
+    assert layout.pixel_format == "gray"
+    for pixels in images:
+        assert layout.refuses(pixels) is None
+        assert bits_of(through(layout, pixels)) == bits_of(pixels)
+    many = values(known, "random", 100, 90)
+    assert "more than the" in str(layout.refuses(many))
+    assert fit("palette", known, [many]) is None
+    (picture,) = layout.to_picture(images[0])
+    layout.to_pixels((picture | 0xF0,), np.empty_like(images[0]))  # damaged: no error
+
+
+@pytest.mark.parametrize("encoding", ["mono16", "32FC1"])
+def test_numbers_beyond_a_table_are_no_error(encoding: str) -> None:
+    """A damaged video must not do more than give other pixels."""
+    known = ENCODINGS[encoding]
+    layout = bind("table", known, Parameters(table=(5, 9)))
+    out = np.zeros((1, 3), known.dtype)
+    layout.to_pixels((np.array([[0, 1, 255]], np.uint8),), out)
+    assert out.view(f"u{out.itemsize}").tolist() == [[5, 9, 9]]
+
+
+@pytest.mark.parametrize("name", ["gray_bits", "fold", "metres16", "metres_fold"])
+def test_any_picture_gives_some_pixels(name: str) -> None:
+    encoding = ENCODINGS["32FC1" if name.startswith("metres") else "16SC1"]
+    layout = bound(name, encoding)
+    sample = np.uint8 if layout.pixel_format == "gray" else np.uint16
+    width, height = layout.picture_size(5, 4)
+    picture = np.full((height, width), np.iinfo(sample).max, sample)
+    layout.to_pixels((picture,), np.empty((4, 5), encoding.dtype))
+
+
+COUNTS = np.arange(1, 65536, dtype=np.float32).reshape(255, 257)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("hole", [0x00000000, 0x7FC00000, 0xFFC00000, 0x7F800000])
+@pytest.mark.parametrize("name", ["metres16", "metres_fold"])
+def test_all_millimetres_come_back(name: str, hole: int, scale: str) -> None:
+    pixels = COUNTS * np.float32(0.001) if scale == "product" else COUNTS / np.float32(1000)
+    pixels[::7, ::5] = np.array(hole, np.uint32).view(np.float32)
+    layout = fit(name, ENCODINGS["32FC1"], [pixels])
+    assert layout is not None
+    assert layout.parameters == Parameters(hole=hole, scale=scale)
+    assert layout.refuses(pixels) is None
+    assert bits_of(through(layout, pixels)) == bits_of(pixels)
+
+
+def test_the_usual_ways_to_metres_are_two() -> None:
+    """In double precision and rounded, both are the quotient."""
+    counts = COUNTS.astype(np.float64)
+    quotient = bits_of(COUNTS / np.float32(1000))
+    assert bits_of((counts / 1000).astype(np.float32)) == quotient
+    assert bits_of((counts * 0.001).astype(np.float32)) == quotient
+    assert bits_of(COUNTS * np.float32(0.001)) != quotient
+
+
+@pytest.mark.parametrize(
+    "value", [0.0005, 1.00025, -1.0, 65.536, 1e30, np.inf, -np.inf, np.nan, -0.0, 1e-40]
+)
+def test_other_floats_are_refused(value: float) -> None:
+    floats = ENCODINGS["32FC1"]
+    layout = bind("metres16", floats, Parameters(hole=0, scale="quotient"))
+    pixels = np.array([[1.0, 0.0], [2.5, 65.535]], np.float32)
+    assert layout.refuses(pixels) is None
+    pixels[0, 1] = value
+    assert "neither whole millimetres" in str(layout.refuses(pixels))
+    assert fit("metres16", floats, [pixels, np.zeros_like(pixels)]) is None
+
+
+def test_two_marks_of_a_hole_are_one_too_many() -> None:
+    pixels = np.array([[1.0, 0.0], [np.nan, 2.0]], np.float32)
+    assert fit("metres16", ENCODINGS["32FC1"], [pixels]) is None
+
+
+@pytest.mark.parametrize(
+    ("encoding", "layout", "parameters", "words"),
+    [
+        ("mono8", "gray16", {}, "does not carry mono8"),
+        ("mono8", "nonsense", {}, "does not carry mono8"),
+        ("rgb8", "bgr24", {}, "does not carry rgb8"),
+        ("mono16", "gray16", {"bits": 12, "shift": 0}, "needs the parameters none"),
+        ("mono16", "gray_bits", {}, "needs the parameters bits, shift"),
+        ("mono16", "gray_bits", {"bits": 12}, "was given bits"),
+        ("mono16", "gray_bits", {"bits": 11, "shift": 0}, "11 bits above 0"),
+        ("mono16", "gray_bits", {"bits": 16, "shift": 0}, "16 bits above 0"),
+        ("mono16", "gray_bits", {"bits": 12, "shift": 5}, "12 bits above 5"),
+        ("mono16", "gray_bits", {"bits": 12, "shift": -1}, "12 bits above -1"),
+        ("mono16", "gray_bits", {"bits": 12, "shift": True}, "12 bits above True"),
+        ("mono16", "gray_bits", {"bits": 12, "shift": 1.0}, "12 bits above 1.0"),
+        ("mono16", "gray_bits", {"bits": 12.0, "shift": 0}, "12.0 bits"),
+        ("mono16", "gray_bits", {"bits": 12, "shift": 0, "low": 3}, "was given bits, low, shift"),
+        ("mono16", "fold", {"bits": 12, "shift": 0}, "needs the parameters bits, low, shift"),
+        ("mono16", "fold", {"bits": 12, "shift": 0, "low": 0}, "no layout has 0 low bits"),
+        ("mono16", "fold", {"bits": 12, "shift": 0, "low": 1}, "no layout has 1 low bits of 12"),
+        ("mono16", "fold", {"bits": 12, "shift": 0, "low": 9}, "no layout has 9 low bits of 12"),
+        ("mono16", "fold", {"bits": 12, "shift": 0, "low": -3}, "no layout has -3 low bits"),
+        ("mono16", "fold", {"bits": 12, "shift": 0, "low": 3.0}, "no layout has 3.0 low bits"),
+        ("mono16", "fold", {"bits": 8, "shift": 0, "low": 8}, "no layout has 8 low bits of 8"),
+        ("mono16", "fold", {"bits": 16, "shift": 0, "low": 5}, "no layout has 5 low bits of 16"),
+        ("mono16", "fold", {"bits": 16, "shift": 1, "low": 8}, "16 bits above 1"),
+        ("mono16", "palette", {}, "needs the parameters entries"),
+        ("mono16", "palette", {"entries": 0}, "a list of 0 values"),
+        ("mono16", "palette", {"entries": 300}, "no power of two"),
+        ("mono16", "palette", {"entries": 128}, "less than 256"),
+        ("mono16", "palette", {"entries": 8192}, "up to 4096"),
+        ("mono16", "palette", {"entries": 512.0}, "a list of 512.0 values"),
+        ("32FC2", "palette", {"entries": 512}, "does not carry 32FC2"),
+        ("rgba8", "opaque", {}, "needs the parameters alpha"),
+        ("rgba8", "opaque", {"alpha": 256}, "an alpha of 256"),
+        ("rgba8", "opaque", {"alpha": -1}, "an alpha of -1"),
+        ("8SC4", "opaque", {"alpha": 1}, "does not carry 8SC4"),
+        ("mono16", "table", {"table": []}, "table of 0 values"),
+        (
+            "mono16",
+            "table",
+            {"table": list(range(MAX_TABLE + 1))},
+            f"table of {MAX_TABLE + 1} values",
+        ),
+        ("mono16", "table", {"table": [1, 65536]}, "beyond 0 to 65535"),
+        ("mono16", "table", {"table": [-1, 5]}, "beyond 0 to 65535"),
+        ("mono16", "table", {"table": [1, 2.0]}, "beyond 0 to 65535"),
+        ("mono16", "table", {"table": [1, 2, 2]}, "does not increase"),
+        ("32FC1", "table", {"table": [2, 1]}, "does not increase"),
+        ("32FC1", "table", {"table": [2**32]}, "beyond 0 to 4294967295"),
+        ("32FC1", "metres16", {"hole": 2**32, "scale": "product"}, "no pattern of 32 bits"),
+        ("32FC1", "metres16", {"hole": -1, "scale": "product"}, "no pattern of 32 bits"),
+        ("32FC1", "metres16", {"hole": 0, "scale": "sum"}, "scale 'sum'"),
+        ("32FC1", "metres16", {"hole": 0}, "needs the parameters hole, scale"),
+        ("32FC2", "metres16", {"hole": 0, "scale": "product"}, "does not carry 32FC2"),
+    ],
+)
+def test_layouts_that_cannot_be(
+    encoding: str, layout: str, parameters: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        bind(layout, ENCODINGS[encoding], Parameters.from_values(parameters))
+
+
+@pytest.mark.parametrize(("name", "layout"), PAIRS)
+def test_parameters_are_plain_values(name: str, layout: str) -> None:
+    parameters = bound(layout, ENCODINGS[name]).parameters
+    plain = parameters.to_values()
+    assert Parameters.from_values(plain) == parameters
+    assert set(plain) == LAYOUTS[layout].parameters
+    assert all(isinstance(value, (int, str, list)) for value in plain.values())
+    assert (parameters == NO_PARAMETERS) == (not plain)
+    if plain:
+        with pytest.raises(ValueError, match="needs the parameters"):
+            bind(layout, ENCODINGS[name], replace(parameters, **{next(iter(plain)): None}))
+
+
+def test_unknown_parameters() -> None:
+    with pytest.raises(ValueError, match="'colour'"):
+        Parameters.from_values({"bits": 12, "colour": 3})
 
 
 # ---------------------------------------------------------------- views
@@ -94,20 +648,24 @@ def test_layouts_of_encodings() -> None:
 @pytest.mark.parametrize("big", [False, True])
 def test_a_view_is_the_message_itself(name: str, pad: int, big: bool) -> None:
     encoding = ENCODINGS[name]
-    width, height = 5, 3
+    width, height = rounded(encoding, 5, 3)
     step = width * encoding.pixel_bytes + pad
-    data = bytearray(np.random.default_rng(0).integers(0, 256, step * height, np.uint8).tobytes())
+    count = encoding.size(step, height)
+    data = bytearray(np.random.default_rng(0).integers(0, 256, count, np.uint8).tobytes())
     view = pixel_view(data, encoding, width=width, height=height, step=step, is_bigendian=big)
-    order = "big" if big else "little"
-    for y, x, c in np.ndindex(height, width, encoding.channels):
-        size = encoding.bytes_per_sample
+    order, size = "big" if big else "little", encoding.bytes_per_sample
+    assert view.shape == encoding.shape(width, height)
+    assert len(view) * step == count
+    for y, x, c in np.ndindex(len(view), width, encoding.channels):
         at = y * step + x * encoding.pixel_bytes + c * size
         sample = view[y, x] if encoding.channels == 1 else view[y, x, c]
-        assert sample == int.from_bytes(data[at : at + size], order)
+        assert sample.astype(encoding.dtype).tobytes() == int.from_bytes(
+            data[at : at + size], order
+        ).to_bytes(size, "little")
     before = bytes(data)
     view[...] = 0
     assert view.flags.writeable
-    for y in range(height):  # the padding is not touched
+    for y in range(len(view)):  # the padding is not touched
         start = y * step + width * encoding.pixel_bytes
         assert data[start : start + pad] == before[start : start + pad]
         assert not any(data[y * step : start])
@@ -120,57 +678,92 @@ def test_a_view_of_bytes_is_read_only_and_not_a_copy() -> None:
     assert np.shares_memory(view, np.frombuffer(data, np.uint8))
 
 
+@pytest.mark.parametrize("name", ["mono8", "mono16", "rgb8", "bgra8", "16UC1", "nv12"])
+def test_plain_pictures_are_no_copies(name: str) -> None:
+    encoding = ENCODINGS[name]
+    pixels = as_message(values(encoding, "random", 6, 4), encoding, pad=4)
+    for plane in layout_for(encoding, lossless=True).to_picture(pixels)[:1]:
+        assert np.shares_memory(plane, pixels)
+
+
 @steady
-@given(st.integers(1, 6), st.integers(0, 4), st.integers(1, 5), st.data())
-@example(3, 0, 2, None)
-def test_padding(row_bytes: int, pad: int, height: int, data: st.DataObject | None) -> None:
-    step = row_bytes + pad
-    rows = np.full((height, step), 7, np.uint8)
+@given(st.sampled_from(["mono8", "rgb8", "nv12", "nv24"]), st.integers(0, 4), st.data())
+@example("mono8", 0, None)
+def test_padding(name: str, pad: int, data: st.DataObject | None) -> None:
+    encoding = ENCODINGS[name]
+    width, height = rounded(encoding, 4, 2)
+    row_bytes = width * encoding.pixel_bytes
+    rows = np.full((encoding.shape(width, height)[0], row_bytes + pad), 7, np.uint8)
     rows[:, row_bytes:] = 0
-    assert padding_is_zero(
-        memoryview(rows.tobytes()), row_bytes=row_bytes, step=step, height=height
-    )
+    size = {"width": width, "height": height, "step": row_bytes + pad}
+    assert padding_is_zero(memoryview(rows.tobytes()), encoding, **size)
     if pad and data:
-        y, x = data.draw(st.integers(0, height - 1)), data.draw(st.integers(row_bytes, step - 1))
+        y = data.draw(st.integers(0, len(rows) - 1))
+        x = data.draw(st.integers(row_bytes, rows.shape[1] - 1))
         rows[y, x] = data.draw(st.integers(1, 255))
-        assert not padding_is_zero(
-            memoryview(rows.tobytes()), row_bytes=row_bytes, step=step, height=height
-        )
+        assert not padding_is_zero(memoryview(rows.tobytes()), encoding, **size)
 
 
 # ---------------------------------------------------------------- what has no layout
 
 
 @pytest.mark.parametrize("name", ENCODINGS)
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (640, 480), (MAX_SIDE, MAX_SIDE)])
+@pytest.mark.parametrize(("width", "height"), [(2, 2), (640, 480), (1920, 1080)])
 @pytest.mark.parametrize("pad", [0, 5, MAX_ROW_PADDING])
 def test_ordinary_images_have_one(name: str, width: int, height: int, pad: int) -> None:
-    step = width * ENCODINGS[name].pixel_bytes + pad
-    assert why_not(name, width=width, height=height, step=step, size=step * height) is None
+    encoding = ENCODINGS[name]
+    step = width * encoding.pixel_bytes + pad
+    size = encoding.size(step, height)
+    assert why_not(name, width=width, height=height, step=step, size=size) is None
+
+
+@pytest.mark.parametrize("name", ENCODINGS)
+def test_the_largest_image_is_the_one_of_the_largest_picture(name: str) -> None:
+    encoding = ENCODINGS[name]
+    layout = layout_for(encoding, lossless=True)
+    across, down = (side // 64 for side in layout.picture_size(64, 64))
+    for width, height, fits in (
+        (MAX_SIDE // across, MAX_SIDE // down, True),
+        (MAX_SIDE // across + 2, 2, False),
+        (2, MAX_SIDE // down + 2, False),
+    ):
+        step = width * encoding.pixel_bytes
+        size = encoding.size(step, height)
+        reason = why_not(name, width=width, height=height, step=step, size=size)
+        assert (reason is None) == fits
+        assert fits or "beyond 16384" in str(reason)
 
 
 @pytest.mark.parametrize(
     ("encoding", "width", "height", "step", "size", "words"),
     [
-        ("rgba8", 4, 4, 16, 64, "no layout for encoding 'rgba8'"),
-        ("", 4, 4, 4, 16, "no layout for encoding ''"),
-        ("MONO8", 4, 4, 4, 16, "no layout"),
-        ("mono8 ", 4, 4, 4, 16, "no layout"),
+        *((name, 4, 4, 16, 64, f"no layout for encoding {name!r}") for name in (
+            "", "MONO8", "mono8 ", "rgb32", "8UC5", "8UC0", "8UC", "32UC1", "CV_8UC1",
+            "bayer_rgbg8", "yuv420", "jpeg",
+        )),
         ("mono8", 0, 4, 0, 0, "0x4 pixels"),
         ("mono8", 4, 0, 4, 0, "4x0 pixels"),
         ("mono8", 4, 4, 3, 12, "shorter than a row"),
         ("rgb8", 4, 4, 11, 44, "shorter than a row"),
         ("mono16", 4, 4, 7, 28, "shorter than a row"),
+        ("64FC4", 4, 4, 127, 508, "shorter than a row"),
         ("mono8", 4, 4, 0, 0, "shorter than a row"),
         ("mono8", 4, 4, 4, 15, "15 bytes of pixels where step x height says 16"),
         ("mono8", 4, 4, 4, 17, "17 bytes"),
         ("mono8", 4, 4, 4, 0, "0 bytes"),
+        ("nv12", 4, 4, 4, 16, "step x height x 3/2 says 24"),
+        ("nv24", 4, 4, 4, 24, "step x height x 3 says 48"),
+        *((name, 3, 4, 6, 36, f"where {name} needs even sides") for name in (
+            "yuv422", "uyvy", "yuyv", "yuv422_yuy2", "nv12", "nv21",
+        )),
+        *((name, 4, 3, 4, 18, "even sides") for name in ("nv12", "nv21")),
         ("mono8", MAX_SIDE + 1, 1, MAX_SIDE + 1, MAX_SIDE + 1, "beyond 16384"),
         ("mono8", 1, MAX_SIDE + 1, 1, MAX_SIDE + 1, "beyond 16384"),
+        ("64FC1", 5000, 1, 40000, 40000, "whose picture of 20000x2 is beyond 16384"),
         ("mono8", 4, 1, 5 + MAX_ROW_PADDING, 5 + MAX_ROW_PADDING, "4096 bytes of padding"),
         ("mono8", 2**32 - 1, 2**32 - 1, 2**32 - 1, 16, "bytes of pixels"),
     ],
-)
+)  # fmt: skip
 def test_others_have_none_and_say_why(
     encoding: str, width: int, height: int, step: int, size: int, words: str
 ) -> None:

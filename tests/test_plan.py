@@ -17,12 +17,10 @@ from mp4ds.plan import (
     FileNames,
     Quality,
     Selection,
-    pair_camera_infos,
     parse_quality,
     visual_setting,
 )
-from mp4ds.records import Channel, Schema
-from mp4ds.sidecar.models import FileName
+from mp4ds.sidecar.fields import FileName
 
 steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
@@ -167,56 +165,3 @@ def test_ordinary_names() -> None:
     assert names.name_for("/left/image_raw") == ("left_image_raw-2", True)
     assert names.name_for("left//image_raw/") == ("left_image_raw-3", True)
     assert names.name_for("/cam/Bild \u00e4") == ("cam_Bild", False)
-
-
-# ---------------------------------------------------------------- pairing
-
-
-def channels(*topics: str) -> list[Channel]:
-    """Channels by topic; those with ``info`` in the last part are calibrations."""
-    return [
-        Channel(
-            number,
-            topic,
-            "ros1",
-            Schema("sensor_msgs/CameraInfo" if "info" in topic.split("/")[-1]
-                   else "sensor_msgs/Image", "", b""),
-        )
-        for number, topic in enumerate(topics)
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("topics", "pairs"),
-    [
-        (["/cam/image_raw", "/cam/camera_info"], {1: 0}),
-        (["/cam/camera_info", "/cam/image_raw"], {0: 1}),
-        (["/cam/image_color", "/cam/image_raw", "/cam/camera_info"], {2: 1}),
-        (["/cam/image_mono", "/cam/image_color", "/cam/camera_info"], {2: 1}),
-        (["/l/image_raw", "/r/image_raw", "/r/camera_info", "/l/camera_info"], {2: 1, 3: 0}),
-        (["/cam/image_raw", "/other/camera_info"], {}),
-        (["/cam/image_raw", "/cam/left_info"], {}),
-        (["/cam/deep/image_raw", "/cam/camera_info"], {}),
-        (["/camera_info", "/image_raw"], {0: 1}),
-        (["image_raw", "/camera_info"], {1: 0}),
-        (["cam/image_raw", "/cam/camera_info"], {1: 0}),
-        (["/cam/image_raw", "/cam/camera_info", "/cam/camera_info"], {}),  # several publishers
-        (["/cam/image_raw", "/cam/image_raw", "/cam/camera_info"], {2: 0}),
-        (["/cam/camera_info"], {}),
-        ([], {}),
-    ],
-)
-def test_calibrations_belong_to_the_image_beside_them(
-    topics: list[str], pairs: dict[int, int]
-) -> None:
-    assert pair_camera_infos(channels(*topics)) == pairs
-
-
-def test_only_the_types_count() -> None:
-    image, info = channels("/cam/image_raw", "/cam/camera_info")
-    words = Channel(2, "/cam/image_raw", "ros1", Schema("std_msgs/String", "", b""))
-    ros2 = Channel(3, "/cam/image_raw", "cdr", Schema("sensor_msgs/msg/Image", "", b""))
-    assert pair_camera_infos([words, info]) == {}
-    assert pair_camera_infos([Channel(4, "/cam/image_raw", "json", None), info]) == {}
-    assert pair_camera_infos([ros2, info]) == {1: 3}
-    assert pair_camera_infos([image, Channel(1, "/cam/camera_info", "ros1", None)]) == {}

@@ -12,38 +12,21 @@ from pathlib import Path
 import pytest
 
 import mp4ds
+from coded_scenes import CODED
 from conftest import DATA, real
-from mp4ds.packing import PackOptions
-from mp4ds.unpacking import UnpackOptions
-from sources import ENCODINGS, SOURCES, TRAITS, odd_scene, scene
-
-Compare = Callable[..., list[str]]
-
-TARGETS = {
-    "bag": ("bag", None),
-    "rosbag2-sqlite3": ("rosbag2", "sqlite3"),
-    "rosbag2-mcap": ("rosbag2", "mcap"),
-    "mcap": ("mcap", None),
-    "rosbag2": ("rosbag2", None),
-}
-OWN_TARGET = {"bag": "bag", "rosbag2": "rosbag2-mcap", "mcap": "mcap"}
-
-
-def own_target(source: str) -> str:
-    kind = source.split("-")[0]
-    return "rosbag2-sqlite3" if source.startswith("rosbag2-sqlite3") else OWN_TARGET[kind]
-
-
-def round_trip(
-    sources: list[Path], folder: Path, target: str, exclude: list[str] | None = None
-) -> Path:
-    """Pack, validate, unpack; returns what came out."""
-    mp4ds.pack(sources, folder / "dataset", PackOptions(exclude=exclude or ()))
-    assert mp4ds.validate(folder / "dataset", deep=True) == []
-    to, storage = TARGETS[target]
-    output = folder / f"again{ {'bag': '.bag', 'mcap': '.mcap'}.get(to, '') }"
-    mp4ds.unpack(folder / "dataset", to, output, UnpackOptions(storage=storage))
-    return output
+from definitions import PICTURES
+from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
+from round_trips import (
+    TARGETS,
+    Compare,
+    journey,
+    output_of,
+    own_target,
+    round_trip,
+    unpacked,
+)
+from scenes import Scene
+from sources import COMMON, SOURCES, TRAITS, odd_scene, scene
 
 
 def has_streams(folder: Path) -> bool:
@@ -62,7 +45,7 @@ def test_every_source_returns_to_its_own_format(
     assert compare(sources, output) == []
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("encoding", COMMON)
 @pytest.mark.parametrize("source", ["bag-lz4", "rosbag2-sqlite3-v9", "mcap-ros2-zstd"])
 def test_every_encoding_is_a_video_and_returns(
     source: str, encoding: str, tmp_path: Path, compare: Compare
@@ -78,7 +61,7 @@ def test_every_encoding_is_a_video_and_returns(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("encoding", COMMON)
 @pytest.mark.parametrize("source", SOURCES)
 def test_every_source_and_encoding(
     source: str, encoding: str, tmp_path: Path, compare: Compare
@@ -99,6 +82,89 @@ def test_every_target(source: str, target: str, tmp_path: Path, compare: Compare
     sources = SOURCES[source](tmp_path / "source", scene("rgb8"))
     output = round_trip(sources, tmp_path, target)
     assert compare(sources, output) == []
+
+
+# ---------------------------------------------------------------- from any middleware to any
+
+ROS_SOURCES = [
+    *("bag-none", "rosbag2-sqlite3-v9", "rosbag2-mcap-v9", "mcap-ros1-zstd", "mcap-ros2-zstd"),
+]
+CAMERAS: dict[str, Callable[[], Scene]] = {
+    "raw": lambda: scene("bgr8", pad=2),
+    "yuv": lambda: scene("nv12"),
+    **{
+        name: CODED[name]
+        for name in ("jpeg-rgb", "png-gray-cv2", "depth-32FC1-rvl", "video-h265", "ffmpeg-libx264")
+    },
+}
+CROSSED = [
+    pytest.param(camera, source, target, marks=[pytest.mark.slow] if (n + k + m) % 3 else [])
+    for n, camera in enumerate(CAMERAS)
+    for k, source in enumerate(ROS_SOURCES)
+    for m, target in enumerate([*TARGETS][:4])
+]
+
+
+@pytest.mark.parametrize(("camera", "source", "target"), CROSSED)
+def test_from_any_ros_to_any_other(
+    camera: str, source: str, target: str, tmp_path: Path, compare: Compare
+) -> None:
+    recorded = CAMERAS[camera]()
+    done = journey(tmp_path, SOURCES[source], recorded, target)
+    assert compare(done.sources, done.output) == []
+    cameras = {m.topic for m in recorded.messages if m.msgtype in PICTURES}
+    assert {done.frames(topic) for topic in cameras} <= {(8, 8), (10, 10)}
+
+
+FOXGLOVE_CAMERAS = ["raw-bgr8", "jpeg-rgb", "video-h264"]
+
+
+@pytest.mark.parametrize("camera", FOXGLOVE_CAMERAS)
+@pytest.mark.parametrize("target", [*TARGETS][:4])
+def test_foxglove_messages_of_ros_go_to_any_other(
+    camera: str, target: str, tmp_path: Path, compare: Compare
+) -> None:
+    write = FOXGLOVE_SOURCES["mcap-foxglove-ros2"]
+    done = journey(tmp_path, write, FOXGLOVE[camera](), target)
+    assert compare(done.sources, done.output) == []
+    assert done.frames("/camera/image") == (10, 10)
+
+
+@pytest.mark.parametrize("camera", [*FOXGLOVE_CAMERAS, "webp"])
+@pytest.mark.parametrize("target", [*TARGETS][:3])
+@pytest.mark.parametrize("source", ["mcap-protobuf", "mcap-json", "mcap-flatbuffer"])
+def test_what_no_ros_can_hold_is_refused(
+    source: str, target: str, camera: str, tmp_path: Path, compare: Compare
+) -> None:
+    done = journey(tmp_path, FOXGLOVE_SOURCES[source], FOXGLOVE[camera](), "mcap")
+    assert compare(done.sources, done.output) == []
+    done.output.unlink()
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(mp4ds.ConversionError) as caught:
+        unpacked(tmp_path, target)
+    assert caught.value.topic in FOXGLOVE_TOPICS
+    for word in (f"topic {caught.value.topic}:", source.split("-")[1], "--exclude", "mcap"):
+        assert word in str(caught.value)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+FOXGLOVE_TOPICS = {"/camera/image", "/camera/calibration", "/tf", "/pose", "/log"}
+
+
+@pytest.mark.parametrize("target", [*TARGETS][:3])
+def test_what_ros_can_hold_of_the_rest(target: str, tmp_path: Path, compare: Compare) -> None:
+    """The remedy that the refusal names."""
+    (tmp_path / "source").mkdir()
+    recorded = scene("rgb8")
+    sources = SOURCES["mcap-none-profile"](tmp_path / "source", recorded)
+    mp4ds.pack(sources, tmp_path / "dataset")
+    to, storage = TARGETS[target]
+    others = sorted({message.topic for message in recorded.messages} - {"/cam/image_raw"})
+    options = mp4ds.UnpackOptions(storage=storage, exclude=[*others, "/diagnostics"])
+    output = output_of(tmp_path, target)
+    summary = mp4ds.unpack(tmp_path / "dataset", to, output, options)
+    assert summary.messages == {"/cam/image_raw": 8}
+    assert all("/cam/image_raw" not in line for line in compare(sources, output))
 
 
 @pytest.mark.parametrize("trait", TRAITS)

@@ -1,4 +1,4 @@
-"""The house: which module may import which, what is generated, and what the spec promises."""
+"""The house: which module may import which, what is generated, and the examples of the spec."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from typing import Any
 
 import pytest
 
-from mp4ds.layouts import ENCODINGS, LAYOUTS
-from mp4ds.plan import VISUAL_TABLE
 from mp4ds.sidecar import (
     FORMAT_VERSION,
     Manifest,
@@ -24,10 +22,8 @@ from mp4ds.sidecar import (
     load_manifest,
     load_stream,
 )
+from mp4ds.sidecar.fields import document_of
 from mp4ds.sidecar.io import generate_schema
-from mp4ds.sidecar.models import document_of
-from mp4ds.video import recipe_for
-from mp4ds.wire.formats import WIRES
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "mp4ds"
@@ -76,7 +72,7 @@ def imports_of(path: Path) -> Iterator[str]:
 HOMES = {
     "rosbags": ("bags",),
     "mcap": ("bags",),
-    "zstandard": ("bags",),
+    "zstandard": ("bags", "streams"),  # streams compare a video with what zstd makes of it
     "lz4": ("bags",),
     "sqlite3": ("bags",),
     "av": ("video",),
@@ -119,123 +115,6 @@ def test_the_picture_of_the_code_names_every_module() -> None:
             assert f"{path.name}/" in text, path.name
         elif path.suffix == ".py":
             assert path.name in text, path.name
-
-
-# ---------------------------------------------------------------- problem codes
-
-CODE = re.compile(r"[a-z0-9]+(-[a-z0-9]+)+")
-CODED = {"FormatError", "VideoError", "Problem"}
-
-
-def emitted_codes() -> dict[str, list[str]]:
-    """Code -> places where it is the first argument of an error or a problem."""
-    found: dict[str, list[str]] = {}
-    for path in MODULES:
-        for node in ast.walk(ast.parse(path.read_text())):
-            if not (isinstance(node, ast.Call) and node.args):
-                continue
-            name = getattr(node.func, "id", getattr(node.func, "attr", ""))
-            is_super = isinstance(node.func, ast.Attribute) and name == "__init__"
-            first = node.args[0]
-            if name not in CODED and not (is_super and path.name == "errors.py"):
-                continue
-            if isinstance(first, ast.Constant) and isinstance(first.value, str):
-                if CODE.fullmatch(first.value):
-                    found.setdefault(first.value, []).append(f"{path.name}:{node.lineno}")
-            elif name in CODED and ast.unparse(first) != "error.code":
-                # a code that is passed on must be one that is found elsewhere
-                pytest.fail(f"{path.name}:{node.lineno}: the code is {ast.unparse(first)}")
-    return found
-
-
-def section(text: str, title: str) -> str:
-    return text.split(f"\n## {title}\n", 1)[1].split("\n## ", 1)[0]
-
-
-def registry(title: str) -> str:
-    return section((SPEC / "registry.md").read_text(), title)
-
-
-def first_cells(text: str) -> list[str]:
-    """Names in backticks in the first cell of each row of a section's tables."""
-    rows = re.findall(r"^\| ((?:`[^`]+` ?)+)\|", text, re.MULTILINE)
-    return [name for row in rows for name in re.findall(r"`([^`]+)`", row)]
-
-
-def test_the_registry_lists_exactly_the_codes_of_the_code() -> None:
-    codes = emitted_codes()
-    listed = first_cells(registry("Problem codes"))
-    assert len(listed) == len(set(listed))
-    assert {code: places for code, places in codes.items() if code not in listed} == {}
-    assert sorted(set(listed) - set(codes)) == []
-
-
-def test_the_spec_uses_no_other_codes() -> None:
-    listed = set(first_cells(registry("Problem codes")))
-    text = (SPEC / "index.md").read_text()
-    used = set(re.findall(r"\(`([a-z]+(?:-[a-z]+)+)`\)", text))
-    assert used
-    assert used <= listed
-
-
-# ---------------------------------------------------------------- other registries
-
-
-def test_the_registry_lists_exactly_the_encodings() -> None:
-    text = registry("Encodings")
-    assert first_cells(text) == list(ENCODINGS)
-    for row in re.findall(r"^\| `.*", text, re.MULTILINE):
-        cells = [cell.strip() for cell in row.strip("|").split("|")]
-        for name in re.findall(r"`([^`]+)`", cells[0]):
-            encoding = ENCODINGS[name]
-            assert cells[1:3] == [str(encoding.channels), str(8 * encoding.bytes_per_sample)]
-            assert cells[3] == f"`{encoding.exact}`"
-            assert cells[4].startswith(f"`{encoding.lossy}`" if encoding.lossy else "none")
-
-
-def test_the_registry_lists_exactly_the_layouts_and_wires() -> None:
-    assert first_cells(registry("Layouts")) == list(LAYOUTS)
-    assert first_cells(registry("Wires")) == list(WIRES)
-
-
-def test_the_registry_has_the_table_of_the_paper() -> None:
-    rows = re.findall(r"^\| (\d+) \| (\d+) \| (\d+) \|$", registry("Profiles"), re.MULTILINE)
-    assert [(float(rate), int(crf), int(preset)) for rate, crf, preset in rows] == list(
-        VISUAL_TABLE
-    )
-
-
-def codec_rows() -> list[tuple[list[str], bool, str, bool, dict[str, str]]]:
-    """Picture formats, lossless, codec, default, and options of each row of Codecs."""
-    found = []
-    for row in re.findall(r"^\| .*", registry("Codecs"), re.MULTILINE):
-        cells = [cell.strip() for cell in row.strip("|").split("|")]
-        if len(cells) < 6 or cells[1] not in ("lossless", "lossy"):
-            continue
-        formats = re.findall(r"`([^`]+)`", cells[0]) or ["gray", "rgb24", "bgr24"]
-        (codec,) = re.findall(r"`([^`]+)`", cells[2])
-        options = dict(
-            (*option.partition("=")[::2],) for option in re.findall(r"`([^`]+)`", cells[5])
-        )
-        found.append((formats, cells[1] == "lossless", codec, cells[2].endswith("*"), options))
-    return found
-
-
-def test_the_registry_has_the_codecs_and_their_defaults() -> None:
-    rows = codec_rows()
-    assert len(rows) >= 8
-    for formats, lossless, codec, default, options in rows:
-        for picture_format in formats:
-            recipe = recipe_for(picture_format, lossless=lossless, codec=codec, crf=20)
-            for key, value in options.items():
-                assert value in recipe.options[key], f"{picture_format} {codec}: {key}"
-            missing = set(recipe.options) - set(options) - {"x264-params", "x265-params"}
-            assert missing == set(), f"{picture_format} {codec}"
-            if default:
-                assert recipe_for(picture_format, lossless=lossless, crf=20) == recipe
-    for picture_format in ("gray", "rgb24", "bgr24", "gray16le"):
-        defaults = [row for row in rows if row[1] and row[3] and picture_format in row[0]]
-        assert len(defaults) == 1, picture_format
 
 
 # ---------------------------------------------------------------- generated and released

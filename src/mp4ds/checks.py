@@ -263,13 +263,11 @@ def _check_video_file(
 def _check_frames(stream: Stream, report: Callable[[str], None]) -> Iterator[Problem]:
     """Every frame decodes and, where there is a digest, its message is the original one."""
     report(f"decoding {stream.video_path.name}")
-    rebuilder = stream.rebuilder
-    with stream.open_video(sequential=True) as decoder:
-        for index, picture in enumerate(decoder.pictures()):
-            try:
-                rebuilder.payload(index, picture)
-            except FormatError as error:
-                yield Problem(error.code, error.place, error.problem)
+    for make in stream.makers():
+        try:
+            make()
+        except FormatError as error:
+            yield Problem(error.code, error.place, error.problem)
 
 
 def _check_messages(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +24,25 @@ from mp4ds.sidecar import (
 from mp4ds.streams import Frame, Stream
 from mp4ds.streams.rebuild import DecodedColumns
 
-__all__ = ["Dataset", "Frame", "Stream", "open_dataset"]
+__all__ = ["Dataset", "Frame", "ImageChannel", "Stream", "open_dataset"]
+
+MessageSource = Callable[[Channel], Iterator[tuple[int, Message]]]
+"""Gives messages of a channel, each with its place among the channel's messages."""
+
+
+@dataclass(frozen=True)
+class ImageChannel:
+    """A channel with images in videos.
+
+    Attributes:
+        channel: As in `Dataset.channels`.
+        streams: Its streams; each holds some of its messages.
+        recorded: Number of its messages that are in messages.mcap.
+    """
+
+    channel: Channel
+    streams: list[Stream]
+    recorded: int
 
 
 class Dataset:
@@ -35,6 +53,7 @@ class Dataset:
 
     Args:
         path: The folder, a manifest, a sidecar, or a video beside its sidecar.
+        jpeg_quality: Of the JPEG files that messages of transcoded streams get, 1 to 100.
 
     Raises:
         SourceNotFoundError: There is nothing.
@@ -42,7 +61,7 @@ class Dataset:
         FormatError: A file breaks a rule of the format.
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, *, jpeg_quality: int = 95) -> None:
         self.path = Path(path)
         if not self.path.exists():
             raise SourceNotFoundError(self.path)
@@ -61,7 +80,9 @@ class Dataset:
             sidecars = [self.path / entry.sidecar for entry in self.manifest.streams]
         else:
             sidecars = [self.path.with_suffix(".yaml") if self.path.suffix == ".mp4" else self.path]
-        self.streams: list[Stream] = [Stream(sidecar) for sidecar in sidecars]
+        self.streams: list[Stream] = [
+            Stream(sidecar, jpeg_quality=jpeg_quality) for sidecar in sidecars
+        ]
 
     @property
     def topics(self) -> list[str]:
@@ -117,10 +138,14 @@ class Dataset:
     @property
     def recorded_count(self) -> int | None:
         """Messages in messages.mcap as far as its index tells."""
+        return sum(self._recorded_counts().values())
+
+    def _recorded_counts(self) -> dict[int, int]:
+        """Messages in messages.mcap by channel id."""
         if self._messages_path is None:
-            return 0
+            return {}
         with McapReader(self._messages_path) as reader:
-            return sum(item.count for item in reader.stats().values())
+            return {key: item.count for key, item in reader.stats().items()}
 
     def verify_messages(self) -> None:
         """Compare messages.mcap with its SHA-256: not all that it holds has a checksum of its own.
@@ -160,7 +185,7 @@ class Dataset:
         groups: dict[tuple[object, ...], _ChannelGroup] = {}
         first_id = 1 + max((channel.id for channel in self._recorded), default=0)
         for stream in self.streams:
-            images = _Part(stream.messages, stream.rebuilder.columns)
+            images = _Part(stream.messages, stream.rebuilder.columns, stream)
             sources = [(stream.sidecar.channel, images)]
             info, columns = stream.sidecar.camera_info, stream.camera_info_columns
             if info and columns:
@@ -179,14 +204,29 @@ class Dataset:
         split = {channel_id for group in self._groups for channel_id in group.recorded_ids}
         return [channel for channel in self._recorded if channel.id not in split]
 
-    def records(self) -> Iterator[Record]:
+    def image_channels(self) -> list[ImageChannel]:
+        """The channels that have images in videos."""
+        recorded = self._recorded_counts()
+        found = []
+        for group in self._groups:
+            streams = [part.stream for part in group.parts if part.stream is not None]
+            if streams:
+                count = sum(recorded.get(key, 0) for key in group.recorded_ids)
+                found.append(ImageChannel(group.channel, streams, count))
+        return found
+
+    def records(self, sources: Mapping[Path, MessageSource] | None = None) -> Iterator[Record]:
         """Everything that was recorded, merged by log time; each channel in its own order.
+
+        Args:
+            sources: What gives the messages of a stream, by the path of its sidecar; those of
+                the others are as recorded.
 
         Raises:
             FormatError: A frame does not decode, or a message does not match its digest.
         """
-        parts = [self._verbatim_records(), *(self._group_messages(g) for g in self._groups)]
-        return heapq.merge(*parts, key=_time_of)
+        groups = (self._group_messages(group, sources or {}) for group in self._groups)
+        return heapq.merge(self._verbatim_records(), *groups, key=_time_of)
 
     def times(self) -> dict[int, NDArray[np.int64]]:
         """Sorted log times of every message, nanoseconds, by channel id; decodes no frame."""
@@ -210,8 +250,7 @@ class Dataset:
         """
         if self._messages_path is None:
             return
-        with McapReader(self._messages_path) as reader:
-            recorded = {key: item.count for key, item in reader.stats().items()}
+        recorded = self._recorded_counts()
         for group in self._groups:
             places = np.concatenate([part.columns.ordinal for part in group.parts])
             total = len(places) + sum(recorded.get(key, 0) for key in group.recorded_ids)
@@ -226,11 +265,15 @@ class Dataset:
             if not isinstance(record, Message) or record.channel.id in wanted:
                 yield record
 
-    def _group_messages(self, group: _ChannelGroup) -> Iterator[Message]:
+    def _group_messages(
+        self, group: _ChannelGroup, sources: Mapping[Path, MessageSource]
+    ) -> Iterator[Message]:
         """One channel's messages from all its places, in the channel's order."""
-        merged = heapq.merge(
-            *(part.messages(group.channel) for part in group.parts), key=lambda pair: pair[0]
-        )
+        parts = [
+            sources.get(part.stream.path, part.messages) if part.stream else part.messages
+            for part in group.parts
+        ]
+        merged = heapq.merge(*(part(group.channel) for part in parts), key=lambda pair: pair[0])
         recorded = self._recorded_messages(group)
         due = 0
         for ordinal, message in merged:
@@ -269,10 +312,15 @@ class Dataset:
 
 @dataclass(frozen=True)
 class _Part:
-    """Messages of a channel that are in one video: what makes them, and their columns."""
+    """Messages of a channel that belong to one video: what makes them, and their columns.
 
-    messages: Callable[[Channel], Iterator[tuple[int, Message]]]
+    Attributes:
+        stream: Whose images they are; None for calibrations.
+    """
+
+    messages: MessageSource
     columns: DecodedColumns
+    stream: Stream | None = None
 
 
 @dataclass(frozen=True)

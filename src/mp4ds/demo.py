@@ -21,8 +21,7 @@ from mp4ds.bags.definitions import ros1_channel
 from mp4ds.errors import OptionError
 from mp4ds.outputs import staged
 from mp4ds.records import Channel, Message
-from mp4ds.wire import CameraInfoFields, ImageParts
-from mp4ds.wire.formats import WIRES
+from mp4ds.wire import CalibrationFields, Fields, ImageFields, Slots, form_of
 
 START_NS = 1_712_647_128_027_473_200
 WIDTH, HEIGHT = 480, 360
@@ -31,7 +30,8 @@ IMU_HZ = 100
 TF_HZ = 20
 _NOISE = 2.0  # standard deviation, grey levels: a camera indoors
 _DISCS = 12
-_EMPTY = memoryview(b"")
+_IMAGE_TYPE = "sensor_msgs/Image"
+_INFO_TYPE = "sensor_msgs/CameraInfo"
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,8 @@ def _channels() -> dict[str, Channel]:
         "/tf": ("tf2_msgs/TFMessage", "/odometry"),
     }
     for camera in _CAMERAS:
-        topics[f"/{camera.name}/image_raw"] = ("sensor_msgs/Image", f"/{camera.name}_driver")
-        topics[f"/{camera.name}/camera_info"] = ("sensor_msgs/CameraInfo", f"/{camera.name}_driver")
+        topics[f"/{camera.name}/image_raw"] = (_IMAGE_TYPE, f"/{camera.name}_driver")
+        topics[f"/{camera.name}/camera_info"] = (_INFO_TYPE, f"/{camera.name}_driver")
     return {
         topic: ros1_channel(number, topic, type_name, callerid)
         for number, (topic, (type_name, callerid)) in enumerate(topics.items())
@@ -119,21 +119,22 @@ def _image(camera: _Camera, seq: int, stamp: int) -> bytes:
         for row, column, color in ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2)):  # rggb
             mosaic[row::2, column::2] = pixels[row::2, column::2, color]
         pixels = mosaic
-    parts = ImageParts(
-        stamp=stamp,
-        seq=seq,
-        frame_id=f"{camera.name}_optical",
-        height=HEIGHT,
-        width=WIDTH,
+    fields = ImageFields(
         encoding=camera.encoding,
-        is_bigendian=0,
+        width=WIDTH,
+        height=HEIGHT,
         step=WIDTH * camera.channels,
-        size=pixels.nbytes,
-        head=_EMPTY,
-        pixels=_EMPTY,
-        tail=_EMPTY,
+        is_bigendian=0,
     )
-    return WIRES["ros1"].image_head(parts) + pixels.tobytes()
+    return _ros1(_IMAGE_TYPE, f"{camera.name}_optical", fields, Slots(stamp, seq), pixels.tobytes())
+
+
+def _ros1(type_name: str, frame_id: str, fields: Fields, slots: Slots, body: bytes = b"") -> bytes:
+    """A message in the serialization of ROS 1."""
+    form = form_of("ros1", type_name, b"")
+    blank = form.plain(frame_id, fields) or b""
+    head, tail = form.template(blank).around(slots, len(body))
+    return head + body + tail
 
 
 def _view(camera: _Camera, time: float) -> NDArray[np.float32]:
@@ -160,7 +161,7 @@ def _view(camera: _Camera, time: float) -> NDArray[np.float32]:
 
 def _camera_info(camera: _Camera, seq: int, stamp: int) -> bytes:
     fx, cx, cy = 300.0, WIDTH / 2, HEIGHT / 2
-    fields = CameraInfoFields(
+    fields = CalibrationFields(
         height=HEIGHT,
         width=WIDTH,
         distortion_model="plumb_bob",
@@ -168,12 +169,8 @@ def _camera_info(camera: _Camera, seq: int, stamp: int) -> bytes:
         k=(fx, 0.0, cx, 0.0, fx, cy, 0.0, 0.0, 1.0),
         r=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
         p=(fx, 0.0, cx, -fx * camera.offset, 0.0, fx, cy, 0.0, 0.0, 0.0, 1.0, 0.0),
-        binning_x=0,
-        binning_y=0,
-        roi=(0, 0, 0, 0),
-        roi_do_rectify=0,
     )
-    return WIRES["ros1"].camera_info(stamp, seq, f"{camera.name}_optical", fields)
+    return _ros1(_INFO_TYPE, f"{camera.name}_optical", fields, Slots(stamp, seq))
 
 
 def _header(seq: int, stamp: int, frame_id: str) -> bytes:

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from mp4ds.bags import BagReader, open_reader
 from mp4ds.dataset import Dataset, Stream
-from mp4ds.plan import CAMERA_INFO_TYPES, IMAGE_TYPES
 from mp4ds.records import Channel
 from mp4ds.sidecar import MANIFEST_NAME
-from mp4ds.wire import WireError, wire_for
+from mp4ds.streams import Forms, Unsuited
+from mp4ds.wire import CodedFields, ImageFields, kind_of
 
 
 @dataclass
@@ -96,7 +96,7 @@ def _recording_info(reader: BagReader) -> Info:
     by_topic = {item.topic: item for item in result.topics}
     for channel in reader.channels:
         item = by_topic[channel.topic]
-        if not item.content and channel.type_name in IMAGE_TYPES | CAMERA_INFO_TYPES:
+        if not item.content and kind_of(channel):
             item.content = _content(reader, channel)
     return result
 
@@ -137,15 +137,14 @@ def _content(reader: BagReader, channel: Channel) -> str:
     message = reader.first(channel)
     if message is None:
         return ""
-    data = memoryview(message.data)
     try:
-        wire = wire_for(channel.message_encoding, data)
-        if channel.type_name in IMAGE_TYPES:
-            parts = wire.split_image(data)
-            return f"{parts.encoding} {parts.width}x{parts.height}"
-        fields = wire.split_camera_info(data)[3]
-    except WireError as error:
-        return f"unreadable: {error}"
+        fields = Forms(channel).split(message)[1].fields
+    except Unsuited as reason:
+        return f"unreadable: {reason}"
+    if isinstance(fields, ImageFields):
+        return f"{fields.encoding} {fields.width}x{fields.height}"
+    if isinstance(fields, CodedFields):
+        return fields.format
     return intrinsics_text(fields.width, fields.height, fields.distortion_model, fields.k)
 
 

@@ -1,7 +1,7 @@
-"""Which topics become streams, what they are called, and how they are encoded. Pure.
+"""Which topics are packed, what their streams are called, and how they are encoded. Pure.
 
-File names follow spec/index.md, "File names"; camera_info pairing follows the rule of
-ROS's image_transport; the visual table is that of the paper (Li, Xu, Schwertfeger, 2024).
+File names follow spec/index.md, "File names"; the visual table is that of the paper
+(Li, Xu, Schwertfeger, 2024).
 """
 
 from __future__ import annotations
@@ -14,10 +14,6 @@ from fnmatch import fnmatchcase
 import xxhash
 
 from mp4ds.errors import OptionError
-from mp4ds.records import Channel
-
-IMAGE_TYPES = frozenset({"sensor_msgs/Image", "sensor_msgs/msg/Image"})
-CAMERA_INFO_TYPES = frozenset({"sensor_msgs/CameraInfo", "sensor_msgs/msg/CameraInfo"})
 
 _MAX_NAME = 100
 _RESERVED = {"dataset", "messages", "con", "prn", "aux", "nul"} | {
@@ -149,35 +145,3 @@ class FileNames:
             name = f"{stem}-{number}"
         self._taken.add(name.casefold())
         return name, name != stem
-
-
-def pair_camera_infos(channels: Sequence[Channel]) -> dict[int, int]:
-    """Pair camera_info channels with image channels.
-
-    A `CameraInfo` topic named ``camera_info`` belongs to the image topic beside it in the
-    same namespace, of several to the first by name; of several publishers on one topic, only
-    an only one is paired.
-
-    Returns:
-        Id of the camera_info channel -> id of the image channel.
-    """
-    images: dict[str, list[Channel]] = {}
-    infos: dict[str, list[Channel]] = {}
-    for channel in channels:
-        namespace, _, leaf = channel.topic.strip("/").rpartition("/")
-        if channel.type_name in IMAGE_TYPES:
-            images.setdefault(namespace, []).append(channel)
-        elif channel.type_name in CAMERA_INFO_TYPES and leaf == "camera_info":
-            infos.setdefault(namespace, []).append(channel)
-    pairs: dict[int, int] = {}
-    for namespace, found in infos.items():
-        candidates = images.get(namespace, [])
-        if len(found) == 1 and candidates:
-            pairs[found[0].id] = min(candidates, key=_image_preference).id
-    return pairs
-
-
-def _image_preference(channel: Channel) -> tuple[int, str, int]:
-    # The raw image is the one that the calibration was made for.
-    leaf = channel.topic.rstrip("/").rpartition("/")[2]
-    return (0 if leaf == "image_raw" else 1, channel.topic, channel.id)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from mp4ds.errors import FormatError, OptionError, WriteError
 from mp4ds.outputs import staged
 from mp4ds.plan import FileNames, Selection
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord
+from mp4ds.republish import KINDS, Republished, Republisher, files_of, holds_files
 from mp4ds.video import ImageFile
 
 TARGETS = ("bag", "rosbag2", "mcap", "images")
@@ -32,6 +34,9 @@ class UnpackOptions:
         topics: Globs of the topics to unpack; empty for all.
         exclude: Globs of topics to leave out.
         image_format: ``png`` or ``jpeg``, for images.
+        images: How camera messages are given: one of `mp4ds.republish.KINDS`, or None for as
+            they were recorded.
+        jpeg_quality: Of JPEG files that are made, 1 to 100.
         force: Replace an existing target.
     """
 
@@ -39,6 +44,8 @@ class UnpackOptions:
     topics: Sequence[str] = ()
     exclude: Sequence[str] = ()
     image_format: str = "png"
+    images: str | None = None
+    jpeg_quality: int = 95
     force: bool = False
 
 
@@ -60,6 +67,9 @@ class UnpackSummary:
         converted: Types converted between ROS 1 and ROS 2, by topic.
         omitted: What the target cannot hold and was left out: a phrase -> how many.
         left_out: Topics left out on request.
+        republished: What became of the topics whose images are given in another form.
+        as_recorded: Where another form was asked for, the camera topics of which messages stay
+            as recorded: reason -> how many.
     """
 
     output: Path
@@ -67,6 +77,8 @@ class UnpackSummary:
     converted: list[str] = field(default_factory=list)
     omitted: dict[str, int] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
+    republished: dict[str, Republished] = field(default_factory=dict)
+    as_recorded: dict[str, dict[str, int]] = field(default_factory=dict)
 
 
 def unpack(
@@ -98,15 +110,8 @@ def unpack(
         WriteError: The disk refused; nothing is left behind.
     """
     chosen = options or UnpackOptions()
-    if to not in TARGETS:
-        raise OptionError(f"--to {to!r} is not known. Use {', '.join(TARGETS)}.")
-    if chosen.storage not in (None, "sqlite3", "mcap"):
-        raise OptionError(f"--storage {chosen.storage!r} is not known. Use sqlite3 or mcap.")
-    if chosen.storage and to != "rosbag2":
-        raise OptionError(f"--storage goes with --to rosbag2, not with --to {to}.")
-    if chosen.image_format not in ("png", "jpeg"):
-        raise OptionError(f"--image-format {chosen.image_format!r} is not known. Use png or jpeg.")
-    with Dataset(dataset) as opened:
+    _check(to, chosen)
+    with Dataset(dataset, jpeg_quality=chosen.jpeg_quality) as opened:
         target = Path(os.path.abspath(output or default_output(opened.path, to)))  # noqa: PTH100
         replaceable = _is_image_folder if to == "images" else _is_recording
         if to != "images":
@@ -122,6 +127,28 @@ def unpack(
                 if error.errno is None:
                     raise
                 raise WriteError(target, error) from error
+
+
+def _check(to: str, options: UnpackOptions) -> None:
+    """Refuse options that are unknown or contradict each other.
+
+    Raises:
+        OptionError: Says which, and what there is.
+    """
+    if to not in TARGETS:
+        raise OptionError(f"--to {to!r} is not known. Use {', '.join(TARGETS)}.")
+    if options.storage not in (None, "sqlite3", "mcap"):
+        raise OptionError(f"--storage {options.storage!r} is not known. Use sqlite3 or mcap.")
+    if options.storage and to != "rosbag2":
+        raise OptionError(f"--storage goes with --to rosbag2, not with --to {to}.")
+    if options.image_format not in ("png", "jpeg"):
+        raise OptionError(f"--image-format {options.image_format!r} is not known. Use png or jpeg.")
+    if options.images not in (None, *KINDS):
+        raise OptionError(f"--images {options.images!r} is not known. Use {', '.join(KINDS)}.")
+    if options.images and to == "images":
+        raise OptionError("--images goes with a recording; with --to images, use --image-format.")
+    if not 1 <= options.jpeg_quality <= 100:
+        raise OptionError(f"--jpeg-quality {options.jpeg_quality} is not from 1 to 100.")
 
 
 def default_output(dataset: Path, to: str) -> Path:
@@ -153,6 +180,7 @@ def _unpack_recording(
     # a recording returns to its own format as it was, whatever serialization it holds
     source = dataset.manifest.format if dataset.manifest else ""
     converter = Converter(None if source == to else _WORLDS.get(to))
+    republisher = _republisher(dataset, to, options, selected)
     summary = UnpackSummary(target)
     total = dataset.manifest.messages if dataset.manifest else 0
     with open_writer(
@@ -163,18 +191,15 @@ def _unpack_recording(
         library=dataset.manifest.library if dataset.manifest else "",
         storage=(options.storage or _recorded_storage(dataset)) if to == "rosbag2" else "",
     ) as writer:
-        channels = _declare(dataset, writer, converter, selected, summary)
+        topics = _Topics(writer, converter, selected, summary)
+        topics.declare(dataset, republisher)
         done = found = 0
-        for record in dataset.records():
+        for record in dataset.records(republisher.sources if republisher else None):
             if not isinstance(record, Message):
                 _write_other(writer, record, to, source)
                 continue
             found += 1
-            if record.channel.id in channels:
-                payload = converter.payload(record.channel, record.data)
-                channel = channels[record.channel.id]
-                writer.write(replace(record, channel=channel, data=payload))
-                summary.messages[channel.topic] += 1
+            if topics.write(record):
                 done += 1
                 if progress and done % 16 == 0:
                     progress(UnpackProgress(done, total))
@@ -184,34 +209,86 @@ def _unpack_recording(
                 dataset.path,
                 f"holds {found} messages where its manifest says {total}",
             )
-    for part in (writer, converter):
-        summary.omitted.update(part.omitted)
+    omitted = Counter(writer.omitted) + Counter(converter.omitted)
+    if republisher:
+        omitted += Counter(republisher.omitted)
+        summary.republished.update(republisher.republished)
+        summary.as_recorded.update(republisher.as_recorded)
+    summary.omitted.update(omitted)
     return summary
 
 
-def _declare(
-    dataset: Dataset,
-    writer: BagWriter,
-    converter: Converter,
-    selected: Selection,
-    summary: UnpackSummary,
-) -> dict[int, Channel]:
-    """Declare the chosen channels; returns them, as the target has them, by the dataset's id."""
-    channels: dict[int, Channel] = {}
-    for channel in dataset.channels:
-        if not selected(channel.topic):
-            if channel.topic not in summary.left_out:
-                summary.left_out.append(channel.topic)
-            continue
-        channels[channel.id] = converter.channel(channel)
-        writer.add_channel(channels[channel.id])
-        summary.messages.setdefault(channel.topic, 0)
-        changed = channels[channel.id].message_encoding != channel.message_encoding
-        if changed and channel.topic not in summary.converted:
-            summary.converted.append(channel.topic)
-    for schema in dataset.unused_schemas:
-        writer.add_schema(schema)
-    return channels
+def _republisher(
+    dataset: Dataset, to: str, options: UnpackOptions, selected: Selection
+) -> Republisher | None:
+    if options.images is None:
+        return None
+    world = _WORLDS.get(to) or ("ros1" if dataset.profile == "ros1" else "ros2")
+    return Republisher(
+        dataset,
+        options.images,
+        encoding="ros1" if world == "ros1" else "cdr",
+        selected=selected,
+        jpeg_quality=options.jpeg_quality,
+    )
+
+
+class _Topics:
+    """The channels of a recording that is written, by their ids in the dataset."""
+
+    def __init__(
+        self,
+        writer: BagWriter,
+        converter: Converter,
+        selected: Selection,
+        summary: UnpackSummary,
+    ) -> None:
+        self._writer = writer
+        self._converter = converter
+        self._selected = selected
+        self._summary = summary
+        self._channels: dict[int, Channel] = {}
+        self._republished: set[int] = set()
+
+    def declare(self, dataset: Dataset, republisher: Republisher | None) -> None:
+        """Declare the chosen channels, and the definitions that none refers to."""
+        for channel in dataset.channels:
+            topic = channel.topic
+            if self._selected(topic):
+                if republisher is None or not republisher.empties(channel):
+                    self._add(channel)
+            elif topic not in self._summary.left_out:
+                self._summary.left_out.append(topic)
+        for channel in republisher.channels if republisher else ():
+            self._republished.add(channel.id)
+            self._channels[channel.id] = channel
+            self._writer.add_channel(channel)
+            self._summary.messages.setdefault(channel.topic, 0)
+        for schema in dataset.unused_schemas:
+            self._writer.add_schema(schema)
+
+    def _add(self, channel: Channel) -> None:
+        converted = self._converter.channel(channel)
+        self._channels[channel.id] = converted
+        self._writer.add_channel(converted)
+        self._summary.messages.setdefault(channel.topic, 0)
+        changed = converted.message_encoding != channel.message_encoding
+        if changed and channel.topic not in self._summary.converted:
+            self._summary.converted.append(channel.topic)
+
+    def write(self, message: Message) -> bool:
+        """Write a message of a chosen channel; returns whether it is of one."""
+        source = message.channel
+        if source.id not in self._channels:
+            if not self._selected(source.topic):
+                return False
+            self._add(source)  # it was to have no message any more, and has one after all
+        channel, payload = self._channels[source.id], message.data
+        if source.id not in self._republished:
+            payload = self._converter.payload(source, payload)
+        self._writer.write(replace(message, channel=channel, data=payload))
+        self._summary.messages[channel.topic] += 1
+        return True
 
 
 def _write_other(
@@ -256,7 +333,7 @@ def _unpack_images(
         stem, _ = names.name_for(stream.topic)
         folder = path / stem
         folder.mkdir()
-        for _ in _write_images(stream, folder, options.image_format):
+        for _ in _write_images(stream, folder, options):
             done += 1
             if progress:
                 progress(UnpackProgress(done, total))
@@ -266,16 +343,26 @@ def _unpack_images(
     return summary
 
 
-def _write_images(stream: Stream, folder: Path, image_format: str) -> Iterator[None]:
+def _write_images(stream: Stream, folder: Path, options: UnpackOptions) -> Iterator[None]:
     """One file per frame, and stamps.csv that tells the times of each."""
-    writer = ImageFile(stream.sidecar.image.encoding, image_format)
-    suffix = "jpg" if image_format == "jpeg" else "png"
+    columns, headers = stream.rebuilder.columns, stream.sidecar.headers
+    suffix = "jpg" if options.image_format == "jpeg" else "png"
     digits = len(str(len(stream) - 1))
     with (folder / "stamps.csv").open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["file", "stamp_ns", "log_time_ns", "frame_id"])
-        for frame in stream:
-            name = f"{frame.index:0{digits}d}.{suffix}"
-            (folder / name).write_bytes(writer.encode(frame.data))
-            rows.writerow([name, frame.stamp_ns, frame.log_time_ns, frame.frame_id])
+        for index, data in enumerate(_files(stream, options)):
+            name = f"{index:0{digits}d}.{suffix}"
+            (folder / name).write_bytes(data)
+            frame_id = headers[int(columns.variant[index])].frame_id
+            rows.writerow([name, int(columns.stamp[index]), int(columns.log_time[index]), frame_id])
             yield
+
+
+def _files(stream: Stream, options: UnpackOptions) -> Iterator[bytes | memoryview]:
+    """The recorded files where they are of the format, else files of the frames."""
+    if holds_files(stream.sidecar, options.image_format):
+        return files_of(stream)
+    quality = options.jpeg_quality
+    writer = ImageFile(stream.sidecar.image.encoding, options.image_format, quality=quality)
+    return (writer.encode(frame.data) for frame in stream)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import zstandard
 from mcap.writer import CompressionType, Writer
 
 from mp4ds._version import __version__
@@ -150,3 +151,12 @@ class McapWriter:
     def _abandon(self) -> None:
         with suppress(OSError):
             self._file.close()
+
+
+def compressed_size(payloads: Iterable[bytes | memoryview]) -> int:
+    """About how many bytes messages take in the chunks of an MCAP file.
+
+    Args:
+        payloads: Of the messages, each as large as a chunk or nearly so.
+    """
+    return sum(len(zstandard.compress(bytes(payload))) for payload in payloads)

@@ -90,6 +90,20 @@ def pack(
         Optional[str],  # noqa: UP045
         typer.Option("--preset", help="The encoder's preset, such as 6 or veryfast."),
     ] = None,
+    transcode: Annotated[
+        bool,
+        typer.Option(
+            "--transcode", help="Encode JPEG topics anew by --quality, instead of copying them."
+        ),
+    ] = False,
+    camera_info: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            "--camera-info",
+            metavar="IMAGE=INFO",
+            help="Topics that belong together, where names and stamps do not tell.",
+        ),
+    ] = None,
     gop: Annotated[
         int, typer.Option("--gop", min=1, max=100_000, help="Most frames between key frames.")
     ] = 60,
@@ -113,6 +127,8 @@ def pack(
         quality=quality,
         codec=codec,
         preset=preset,
+        transcode=transcode,
+        camera_info=camera_info or (),
         gop=gop,
         jobs=jobs,
         force=force,
@@ -140,6 +156,17 @@ def unpack(
     image_format: Annotated[
         str, typer.Option("--image-format", help="png (exact) or jpeg, for images.")
     ] = "png",
+    images: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            "--images",
+            metavar="KIND",
+            help="Give all cameras as raw, jpeg, png or compressed-video; as recorded by default.",
+        ),
+    ] = None,
+    jpeg_quality: Annotated[
+        int, typer.Option("--jpeg-quality", min=1, max=100, help="Of JPEG files that are made.")
+    ] = 95,
     topics: TopicsOption = None,
     exclude: ExcludeOption = None,
     force: ForceFlag = False,
@@ -157,6 +184,8 @@ def unpack(
         topics=topics or (),
         exclude=exclude or (),
         image_format=image_format,
+        images=images,
+        jpeg_quality=jpeg_quality,
         force=force,
     )
     with _errors(as_json), unpack_progress(as_json) as progress:
@@ -190,9 +219,18 @@ def validate(
 @app.command()
 def info(
     path: Annotated[Path, typer.Argument(help="A bag, rosbag2 folder, MCAP, dataset or sidecar.")],
+    intrinsics: Annotated[
+        bool,
+        typer.Option(
+            "--intrinsics", help="Show the cameras' calibrations, to be pasted into Python."
+        ),
+    ] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Show what is in a recording or a dataset."""
+    if intrinsics:
+        _print_intrinsics(path, as_json)
+        return
     from mp4ds.info import info as run
 
     with _errors(as_json):
@@ -201,6 +239,18 @@ def info(
         print_json(result)
     else:
         print_info(result)
+
+
+def _print_intrinsics(path: Path, as_json: bool) -> None:
+    from mp4ds.cli.calibrations import print_intrinsics
+    from mp4ds.intrinsics import intrinsics as run
+
+    with _errors(as_json), status_line(as_json, "reading"):
+        result = run(path)
+    if as_json:
+        print_json(result)
+    else:
+        print_intrinsics(result)
 
 
 @app.command()

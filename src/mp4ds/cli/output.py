@@ -109,13 +109,13 @@ def unpack_progress(as_json: bool) -> Iterator[Callable[[UnpackProgress], None] 
 
 
 @contextmanager
-def status_line(as_json: bool) -> Iterator[Callable[[str], None] | None]:
+def status_line(as_json: bool, text: str = "validating") -> Iterator[Callable[[str], None] | None]:
     """On a terminal, a line that tells what is being done."""
     console = _console()
     if as_json or not console.is_terminal:
         yield None
         return
-    with console.status("validating") as status:
+    with console.status(text) as status:
         yield status.update
 
 
@@ -205,6 +205,12 @@ def print_unpack(summary: UnpackSummary, noun: str) -> None:
     """Print what was written, and what the target could not hold."""
     total = sum(summary.messages.values())
     say(f"{summary.output}: {total} {noun} of {len(summary.messages)} topics")
+    for topic, now in summary.republished.items():
+        taken = f" ({now.instead_of} is taken)" if now.instead_of else ""
+        say(f"{topic}: given as {now.topic}, {now.type_name}{taken}")
+    for topic, reasons in summary.as_recorded.items():
+        for reason, count in reasons.items():
+            say(f"{topic}: {count} messages as recorded: {reason}")
     if summary.converted:
         say(f"converted between ROS 1 and ROS 2: {', '.join(summary.converted)}")
     for what, count in summary.omitted.items():
@@ -220,7 +226,7 @@ def print_validation(path: Path, problems: list[Problem], *, deep: bool) -> None
     count = len(problems)
     found = f"{count} problem{'s' * (count > 1)}" if count else "no problem"
     depth = (
-        "every frame was decoded, every message with a digest compared"
+        "every video was read to its end, every message with a digest compared"
         if deep
         else "frames were not decoded (--deep does)"
     )

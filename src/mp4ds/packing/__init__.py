@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mp4ds.bags import open_sources
-from mp4ds.errors import SourceError, WriteError
+from mp4ds.errors import OptionError, SourceError, WriteError
 from mp4ds.outputs import staged
 from mp4ds.packing.packer import Packer
 from mp4ds.packing.report import PackOptions, PackProgress, PackSummary, TopicSummary
@@ -46,6 +46,11 @@ def pack(
     paths = [Path(sources)] if isinstance(sources, (str, Path)) else [Path(p) for p in sources]
     target = Path(os.path.abspath(dataset))  # noqa: PTH100 - keeps links, unlike resolve()
     quality = parse_quality(chosen.quality)
+    if chosen.transcode and quality.lossless:
+        raise OptionError(
+            "--transcode goes with a lossy --quality, such as visual: without loss, a JPEG file "
+            "is smaller than any video of its pixels."
+        )
     check_codec(chosen.codec, chosen.preset, lossless=quality.lossless)
     with (
         open_sources(paths) as reader,

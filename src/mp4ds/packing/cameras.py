@@ -2,54 +2,86 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from mp4ds.bags import BagReader
 from mp4ds.engine import Workers
+from mp4ds.packing.calibrations import Calibrations
 from mp4ds.packing.report import TopicSummary
-from mp4ds.plan import FileNames, Selection, pair_camera_infos
+from mp4ds.plan import FileNames
 from mp4ds.records import Channel, Message
 from mp4ds.sidecar import StreamSidecar
-from mp4ds.streams import CameraInfoWriter, StreamKey, StreamSettings, StreamWriter, Unsuited
-from mp4ds.streams.writer import refuse_unsuited
-from mp4ds.wire import WireError, wire_for
+from mp4ds.streams import (
+    Looker,
+    Seen,
+    StreamKey,
+    StreamSettings,
+    StreamWriter,
+    TrackPlan,
+    Unsuited,
+    needs_trial,
+    plan_tracks,
+)
 
 MAX_STREAMS_PER_CHANNEL = 16
 """A topic that changes its geometry more often than this is not split any further."""
 
-_MAX_PENDING_INFOS = 1000
+_SAMPLES = 6
+"""Images of a stream that are held back until they have shown how it is best encoded."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Item:
+    """A message of a camera channel.
+
+    Attributes:
+        ordinal: Its place among the channel's messages.
+        number: Its place among the topic's messages.
+        seen: What it holds.
+    """
+
+    message: Message
+    ordinal: int
+    number: int
+    seen: Seen
 
 
 @dataclass
-class _ImageChannel:
-    """An image channel being packed."""
+class _Route:
+    """Where the messages of one key go: into the first of the streams that takes them.
 
-    count: int = 0
-    streams: dict[StreamKey, StreamWriter] = field(default_factory=dict)
-    refused: dict[StreamKey, str] = field(default_factory=dict)
+    Attributes:
+        plans: How streams for them may be made, the best first; empty to store them verbatim.
+        streams: Those that were made, in the order of the plans.
+        refusal: Why there is no stream for what none of these takes.
+    """
+
+    plans: list[TrackPlan]
+    streams: list[StreamWriter] = field(default_factory=list)
+    refusal: str = ""
 
 
 @dataclass
-class _InfoChannel:
-    """A camera_info channel whose image channel has a stream, or may get one."""
+class _CameraChannel:
+    """A camera channel being packed."""
 
-    image_id: int
-    writer: CameraInfoWriter
-    owner: StreamWriter | None
+    looker: Looker
     count: int = 0
-    pending: list[Message] = field(default_factory=list)
+    routes: dict[StreamKey, _Route] = field(default_factory=dict)
+    held: list[_Item] = field(default_factory=list)
 
 
 class Cameras:
-    """Routes image and CameraInfo messages into streams.
+    """Routes the images of all camera channels into streams.
 
     Args:
         reader: The recording.
         folder: Where the streams' files are made.
-        selected: The topics chosen.
         settings: How to encode.
+        calibrations: Takes notice of new streams.
         topic_of: The summary of a channel's topic.
         keep: Stores what no stream can carry exactly.
     """
@@ -58,147 +90,139 @@ class Cameras:
         self,
         reader: BagReader,
         folder: Path,
-        selected: Selection,
         settings: StreamSettings,
+        calibrations: Calibrations,
         *,
         topic_of: Callable[[Channel], TopicSummary],
         keep: Callable[[Message], None],
     ) -> None:
         self._reader = reader
         self._folder = folder
-        self._selected = selected
         self._settings = settings
+        self._calibrations = calibrations
         self._topic_of = topic_of
         self._keep = keep
         self._names = FileNames()
-        self._images: dict[tuple[object, ...], _ImageChannel] = {}
-        self._infos: dict[int, _InfoChannel | None] = {}
+        self._channels: dict[tuple[object, ...], _CameraChannel] = {}
         self._streams: list[StreamWriter] = []
         self.frames = 0
 
-    def take_image(self, message: Message, workers: Workers) -> None:
-        """Encode an image, or keep it with the reason why no stream takes it."""
-        topic = self._topic_of(message.channel)
-        state = self._images.setdefault(message.channel.identity, _ImageChannel())
-        ordinal = state.count
+    def take(self, message: Message, workers: Workers) -> None:
+        """Encode an image, hold it back, or keep it with the reason why no stream takes it."""
+        channel = message.channel
+        if channel.identity not in self._channels:
+            self._channels[channel.identity] = _CameraChannel(
+                Looker(channel, transcode=self._settings.transcode)
+            )
+        state = self._channels[channel.identity]
+        ordinal, number = state.count, self._topic_of(channel).messages - 1
         state.count += 1
         try:
-            stream, job = self._accept_image(message, state, ordinal)
+            seen = state.looker.look(message)
         except Unsuited as reason:
-            topic.count_verbatim(str(reason), topic.messages - 1)
-            self._keep(message)
+            self._settle(state, workers)
+            self._keep_verbatim(message, number, str(reason))
             return
-        if stream.frames == 1:
-            self._adopt_infos(message.channel, stream)
-        topic.frames += 1
-        self.frames += 1
-        workers.submit(self._streams.index(stream), job)
+        self._calibrations.saw(channel, seen)
+        item = _Item(message, ordinal, number, seen)
+        if seen.key in state.routes and not state.held:
+            self._write(state, item, workers)
+            return
+        state.held.append(item)
+        held = Counter(other.seen.key for other in state.held)
+        enough = held[seen.key] == _SAMPLES or len(state.held) == 2 * _SAMPLES
+        if enough or not needs_trial(seen, self._settings):
+            self._settle(state, workers)
 
-    def _accept_image(
-        self, message: Message, state: _ImageChannel, ordinal: int
-    ) -> tuple[StreamWriter, Callable[[], None]]:
-        data = memoryview(message.data)
-        try:
-            wire = wire_for(message.channel.message_encoding, data)
-            parts = wire.split_image(data)
-        except WireError as error:
-            raise Unsuited(f"it does not parse as an image: {error}") from None
-        refuse_unsuited(parts)
-        key = StreamKey.of(wire, parts)
-        stream = state.streams.get(key) or self._new_stream(message.channel, key, state)
-        return stream, stream.accept(message, parts, ordinal)
+    def settle(self, workers: Workers) -> None:
+        """Write everything that is held back: the recording is at its end."""
+        for state in self._channels.values():
+            self._settle(state, workers)
 
-    def _new_stream(self, channel: Channel, key: StreamKey, state: _ImageChannel) -> StreamWriter:
-        if key in state.refused:
-            raise Unsuited(state.refused[key])
-        if len(state.streams) == MAX_STREAMS_PER_CHANNEL:
-            raise Unsuited(f"more than {MAX_STREAMS_PER_CHANNEL} sizes or encodings on one topic")
-        stem, renamed = self._names.name_for(channel.topic)
-        stats = self._reader.stats().get(channel.id)
+    def _settle(self, state: _CameraChannel, workers: Workers) -> None:
+        """Decide how the held images are encoded, and write them in their order."""
+        held, state.held = state.held, []
+        for key in dict.fromkeys(item.seen.key for item in held):
+            if key not in state.routes:
+                samples = [item.seen for item in held if item.seen.key == key]
+                state.routes[key] = self._plan(samples, held[0].message.channel)
+        for item in held:
+            self._write(state, item, workers)
+
+    def _plan(self, samples: list[Seen], channel: Channel) -> _Route:
         try:
-            stream = StreamWriter(
-                stem,
-                self._folder,
-                channel=channel,
-                key=key,
-                settings=self._settings,
-                rate=stats.rate if stats else None,
-            )
+            return _Route(plan_tracks(samples, self._settings, self._rate(channel)))
         except Unsuited as reason:
-            state.refused[key] = str(reason)
-            raise
-        state.streams[key] = stream
+            return _Route([], refusal=str(reason))
+
+    def _rate(self, channel: Channel) -> float | None:
+        stats = self._reader.stats().get(channel.id)
+        return stats.rate if stats else None
+
+    def _write(self, state: _CameraChannel, item: _Item, workers: Workers) -> None:
+        route = state.routes[item.seen.key]
+        reason = route.refusal
+        for stream in self._candidates(state, route, item):
+            try:
+                job = stream.accept(item.message, item.seen, item.ordinal)
+            except Unsuited as refusal:
+                reason = str(refusal)
+                continue
+            topic = self._topic_of(item.message.channel)
+            topic.frames += 1
+            self.frames += 1
+            if stream.frames == 1:
+                self._calibrations.adopt(stream)
+            workers.submit(self._streams.index(stream), job)
+            return
+        state.looker.leave_out(item.seen)
+        self._keep_verbatim(item.message, item.number, route.refusal or reason)
+
+    def _candidates(
+        self, state: _CameraChannel, route: _Route, item: _Item
+    ) -> Iterator[StreamWriter]:
+        """The streams that may take a message; the next one is made when the others refuse."""
+        yield from route.streams
+        while len(route.streams) < len(route.plans) and not route.refusal:
+            made = sum(len(other.streams) for other in state.routes.values())
+            if made == MAX_STREAMS_PER_CHANNEL:
+                route.refusal = (
+                    f"more than {MAX_STREAMS_PER_CHANNEL} sizes or encodings on one topic"
+                )
+                return
+            try:
+                stream = self._new_stream(item, route.plans[len(route.streams)])
+            except Unsuited as reason:
+                route.refusal = str(reason)
+                return
+            route.streams.append(stream)
+            yield stream
+
+    def _new_stream(self, item: _Item, plan: TrackPlan) -> StreamWriter:
+        channel = item.message.channel
+        stem, renamed = self._names.name_for(channel.topic)
+        stream = StreamWriter(
+            stem,
+            self._folder,
+            channel=channel,
+            seen=item.seen,
+            plan=plan,
+            settings=self._settings,
+            rate=self._rate(channel),
+        )
         self._streams.append(stream)
         topic = self._topic_of(channel)
-        if stream.note:
-            topic.notes.append(stream.note)
+        if plan.note:
+            topic.notes.append(plan.note)
         if renamed:
             topic.notes.append(f"stored as {stem}.mp4: the plain name was taken")
         return stream
 
-    def take_info(self, message: Message) -> None:
-        """Take a CameraInfo into its stream, or keep it if it belongs to none."""
-        channel = message.channel
-        if channel.id not in self._infos:
-            self._infos[channel.id] = self._new_info(channel)
-        state = self._infos[channel.id]
-        if state is None:
-            self._keep(message)
-        elif state.owner is not None:
-            self._add_info(state, message)
-        elif len(state.pending) < _MAX_PENDING_INFOS:
-            # a copy: a view would keep the reader's whole chunk in memory
-            state.pending.append(replace(message, data=bytes(message.data)))
-        else:
-            self._give_up(channel.id, state)
-            self._keep(message)
+    def _keep_verbatim(self, message: Message, number: int, reason: str) -> None:
+        self._topic_of(message.channel).count_verbatim(reason, number)
+        self._keep(message)
 
-    def _new_info(self, channel: Channel) -> _InfoChannel | None:
-        chosen = {c.id: c for c in self._reader.channels if self._selected(c.topic)}
-        image_id = pair_camera_infos(list(chosen.values())).get(channel.id)
-        if image_id is None:
-            return None
-        images = self._images.get(chosen[image_id].identity)
-        streams = [s for s in images.streams.values() if s.frames] if images else []
-        return _InfoChannel(image_id, CameraInfoWriter(channel), streams[0] if streams else None)
-
-    def _adopt_infos(self, channel: Channel, stream: StreamWriter) -> None:
-        """Let a channel's first stream have the CameraInfo messages that waited for it."""
-        for state in self._infos.values():
-            if state is None or state.owner is not None or state.image_id != channel.id:
-                continue
-            state.owner = stream
-            pending, state.pending = state.pending, []
-            for message in pending:
-                self._add_info(state, message)
-
-    def _add_info(self, state: _InfoChannel, message: Message) -> None:
-        topic = self._topic_of(message.channel)
-        ordinal = state.count
-        state.count += 1
-        try:
-            state.writer.accept(message, ordinal)
-            topic.frames += 1
-        except Unsuited as reason:
-            topic.count_verbatim(str(reason), ordinal)
-            self._keep(message)
-
-    def _give_up(self, info_id: int, state: _InfoChannel) -> None:
-        for message in state.pending:
-            self._keep(message)
-        self._infos[info_id] = None
-
-    def finish_infos(self) -> None:
-        """Hand each stream its calibrations, and keep what waited for a stream in vain."""
-        for info_id, state in list(self._infos.items()):
-            if state is None:
-                continue
-            if state.owner is None:
-                self._give_up(info_id, state)
-            else:
-                state.owner.camera_info = state.writer.to_model()
-
-    def finish_streams(
+    def finish(
         self, digest: Callable[[Path], tuple[int, str]]
     ) -> list[tuple[StreamWriter, StreamSidecar]]:
         """Complete all videos and write their sidecars; all jobs must have run.
@@ -222,14 +246,8 @@ class Cameras:
         return finished
 
     def in_videos(self) -> set[tuple[object, ...]]:
-        """Identities of the channels that a sidecar describes; call after `finish_infos`."""
-        images = {stream.channel.identity for stream in self._streams if stream.frames}
-        infos = {
-            state.writer.channel.identity
-            for state in self._infos.values()
-            if state is not None and state.owner is not None and state.owner.camera_info
-        }
-        return images | infos
+        """Identities of the channels that have streams."""
+        return {stream.channel.identity for stream in self._streams if stream.frames}
 
     def abandon(self) -> None:
         """Close all videos as they are; the caller removes them."""

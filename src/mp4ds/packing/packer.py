@@ -9,11 +9,13 @@ from pathlib import Path
 
 from mp4ds._version import __version__
 from mp4ds.bags import BagReader, BagWriter, SourceHasher, open_writer
+from mp4ds.coded import zlib_build
 from mp4ds.engine import Workers
 from mp4ds.outputs import digest_file
+from mp4ds.packing.calibrations import Calibrations
 from mp4ds.packing.cameras import Cameras
 from mp4ds.packing.report import PackOptions, PackProgress, PackSummary, TopicSummary
-from mp4ds.plan import CAMERA_INFO_TYPES, IMAGE_TYPES, Quality, Selection
+from mp4ds.plan import Quality, Selection
 from mp4ds.records import Attachment, Channel, Message, Record
 from mp4ds.sidecar import (
     FORMAT_VERSION,
@@ -22,6 +24,7 @@ from mp4ds.sidecar import (
     FileEntry,
     Manifest,
     Source,
+    StaticTransform,
     StreamEntry,
     StreamSidecar,
     TimeRange,
@@ -30,6 +33,8 @@ from mp4ds.sidecar import (
 )
 from mp4ds.streams import StreamSettings, StreamWriter
 from mp4ds.video import tool_versions
+from mp4ds.wire import is_calibration, is_camera
+from mp4ds.wire.transforms import TransformCollector
 
 _REPORT_SECONDS = 0.1
 
@@ -65,21 +70,29 @@ class Packer:
         self._left_out: dict[str, None] = {}
         self._declared: set[int] = set()
         self._span: tuple[int, int] | None = None
+        self._transforms = TransformCollector()
         self._total = sum(path.stat().st_size for path in reader.files)
         cores = options.jobs or os.cpu_count() or 1
-        cameras = sum(channel.type_name in IMAGE_TYPES for channel in reader.channels) or 1
+        cameras = sum(map(is_camera, reader.channels)) or 1
         self._jobs = min(cores, cameras)
+        self._calibrations = Calibrations(
+            [channel for channel in reader.channels if self._selected(channel.topic)],
+            options.camera_info,
+            topic_of=self._topic,
+            keep=self._keep,
+        )
         self._cameras = Cameras(
             reader,
             folder,
-            self._selected,
             StreamSettings(
                 quality=quality,
                 codec=options.codec,
                 preset=options.preset,
                 gop=options.gop,
                 threads=max(1, -(-cores // self._jobs)),
+                transcode=options.transcode,
             ),
+            self._calibrations,
             topic_of=self._topic,
             keep=self._keep,
         )
@@ -103,7 +116,7 @@ class Packer:
                 storage="",
             ) as self._verbatim:
                 self._read(hasher)
-            streams = self._cameras.finish_streams(digest_file)
+            streams = self._cameras.finish(digest_file)
         except BaseException:
             self._cameras.abandon()
             raise
@@ -127,9 +140,10 @@ class Packer:
                 self._take(record, workers)
                 hasher.advance(self._reader.position)
                 self._report()
-        self._cameras.finish_infos()
+            self._cameras.settle(workers)
+        self._calibrations.finish()
         # channels without any message are part of the recording too
-        in_videos = self._cameras.in_videos()
+        in_videos = self._cameras.in_videos() | self._calibrations.in_sidecars()
         for channel in self._reader.channels:
             if not self._selected(channel.topic):
                 self._left_out[channel.topic] = None
@@ -155,10 +169,11 @@ class Packer:
         topic.raw_bytes += len(record.data)
         start, end = self._span or (record.log_time, record.log_time)
         self._span = (min(start, record.log_time), max(end, record.log_time))
-        if channel.type_name in IMAGE_TYPES:
-            self._cameras.take_image(record, workers)
-        elif channel.type_name in CAMERA_INFO_TYPES:
-            self._cameras.take_info(record)
+        self._transforms.add(channel, record.data)
+        if is_camera(channel):
+            self._cameras.take(record, workers)
+        elif is_calibration(channel):
+            self._calibrations.take(record)
         else:
             self._keep(record)
 
@@ -207,6 +222,10 @@ class Packer:
                 )
                 for stream, sidecar in streams
             ],
+            transforms=[
+                StaticTransform.from_record(transform)
+                for transform in self._transforms.between(_frame_ids(streams))
+            ],
             verbatim=[
                 Verbatim(topic=topic.topic, messages=count, first=first, reason=reason)
                 for topic in self._topics.values()
@@ -216,7 +235,7 @@ class Packer:
                 FileEntry(name=name, size=size, sha256=sha256)
                 for name, (size, sha256) in sorted(digests.items())
             ],
-            tools={"mp4ds": __version__, **tool_versions()},
+            tools={"mp4ds": __version__, **tool_versions(), "zlib": zlib_build()},
         )
 
     def _report(self, *, done: bool = False) -> None:
@@ -232,6 +251,16 @@ class Packer:
                 frames=self._cameras.frames,
             )
         )
+
+
+def _frame_ids(streams: list[tuple[StreamWriter, StreamSidecar]]) -> set[str]:
+    """Coordinate frames of all images and calibrations."""
+    found: set[str] = set()
+    for _, sidecar in streams:
+        found.update(header.frame_id for header in sidecar.headers)
+        if sidecar.camera_info:
+            found.update(item.frame_id for item in sidecar.camera_info.calibrations)
+    return found
 
 
 def _folder_size(folder: Path) -> int:

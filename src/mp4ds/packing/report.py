@@ -21,6 +21,8 @@ class PackOptions:
         quality: ``lossless``, ``visual`` or ``crf=N``.
         codec: ``h264``, ``h265``, ``av1`` or ``ffv1``; None chooses by measurement.
         preset: The encoder's preset; None chooses.
+        transcode: Encode JPEG topics anew, by `quality`, instead of copying their files.
+        camera_info: Pairs ``IMAGE=INFO`` of topics that belong together, beyond what names tell.
         gop: Most frames from one key frame to the next.
         jobs: Streams encoded side by side; None for one per core.
         force: Replace an existing dataset.
@@ -31,6 +33,8 @@ class PackOptions:
     quality: str = "lossless"
     codec: str | None = None
     preset: str | None = None
+    transcode: bool = False
+    camera_info: Sequence[str] = ()
     gop: int = DEFAULT_GOP
     jobs: int | None = None
     force: bool = False

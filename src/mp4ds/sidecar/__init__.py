@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from mp4ds.sidecar.columns import Column, Columns, Digests
+from mp4ds.sidecar.fields import FORMAT_VERSION, MESSAGES_NAME
 from mp4ds.sidecar.io import (
     MANIFEST_NAME,
     dump_document,
@@ -14,22 +16,20 @@ from mp4ds.sidecar.manifest import (
     FileEntry,
     Manifest,
     Source,
+    StaticTransform,
     StreamEntry,
     TimeRange,
     Verbatim,
 )
 from mp4ds.sidecar.models import (
-    FORMAT_VERSION,
-    MESSAGES_NAME,
     Calibration,
     CameraInfo,
     ChannelModel,
     Color,
-    Column,
-    Columns,
-    Digests,
     Header,
     Image,
+    LayoutParameters,
+    PngFile,
     Roi,
     SchemaModel,
     StreamSidecar,
@@ -50,10 +50,13 @@ __all__ = [
     "FileEntry",
     "Header",
     "Image",
+    "LayoutParameters",
     "Manifest",
+    "PngFile",
     "Roi",
     "SchemaModel",
     "Source",
+    "StaticTransform",
     "StreamEntry",
     "StreamSidecar",
     "TimeRange",

@@ -13,14 +13,10 @@ from pydantic import BaseModel, ValidationError
 
 from mp4ds import yamlio
 from mp4ds.errors import FormatError, VersionError
+from mp4ds.sidecar.fields import FORMAT_VERSION, document_of, parse_version
 from mp4ds.sidecar.manifest import Manifest
 from mp4ds.sidecar.migrate import migrate, version_of
-from mp4ds.sidecar.models import (
-    FORMAT_VERSION,
-    StreamSidecar,
-    document_of,
-    parse_version,
-)
+from mp4ds.sidecar.models import StreamSidecar
 
 MANIFEST_NAME = "dataset.yaml"
 

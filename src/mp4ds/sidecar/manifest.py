@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, FiniteFloat, model_validator
 
-from mp4ds.sidecar.models import Count, FileName, Model, Profile, Sha256, Size, Time, Version
+from mp4ds.sidecar.fields import Count, FileName, Model, Profile, Sha256, Size, Time, Version
+from mp4ds.wire.transforms import MAX_TRANSFORMS, Transform
 
 
 class Source(Model):
@@ -44,6 +45,32 @@ class Verbatim(Model):
     reason: str
 
 
+class StaticTransform(Model):
+    """Pose of a coordinate frame in another, which holds for the whole recording.
+
+    A point p of the child frame is rotation * p + translation in the parent frame.
+    """
+
+    parent: str = Field(description="Frame in which the child is placed, as recorded.")
+    child: str = Field(description="Frame that is placed, as recorded.")
+    translation: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] = Field(
+        description="x, y, z of the child's origin, metres."
+    )
+    rotation: Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)] = Field(
+        description="x, y, z, w of a unit quaternion."
+    )
+
+    @classmethod
+    def from_record(cls, transform: Transform) -> StaticTransform:
+        """The model of a transform."""
+        return cls(
+            parent=transform.parent,
+            child=transform.child,
+            translation=list(transform.translation),
+            rotation=list(transform.rotation),
+        )
+
+
 class TimeRange(Model):
     """Log times of the first and the last message, ns, both included."""
 
@@ -67,6 +94,10 @@ class Manifest(Model):
     )
     time_range: TimeRange | None = Field(None, description="Absent without messages.")
     streams: list[StreamEntry]
+    transforms: Annotated[list[StaticTransform], Field(max_length=MAX_TRANSFORMS)] = Field(
+        default_factory=list,
+        description="Static transforms that connect the cameras: a copy of what /tf_static says.",
+    )
     verbatim: list[Verbatim] = Field(default_factory=list)
     files: list[FileEntry]
     tools: dict[str, str] = Field(default_factory=dict, description="Versions that packed it.")

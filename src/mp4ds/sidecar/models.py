@@ -2,54 +2,63 @@
 
 The manifest's part is in manifest.py.
 
-Every model is strict, frozen and closed: an unknown key is an error, a string is no number.
+Their base and the types of their fields are in fields.py.
 """
 
 from __future__ import annotations
 
 import base64
-import binascii
-import re
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from mp4ds.layouts import ENCODINGS, LAYOUTS, MAX_SIDE, why_not
+from mp4ds.coded import PACKET_CODECS, PNG_ENCODINGS
+from mp4ds.layouts import (
+    ENCODINGS,
+    LAYOUTS,
+    MAX_SIDE,
+    MAX_TABLE,
+    Layout,
+    Parameters,
+    bind,
+    why_not,
+)
 from mp4ds.records import Channel, Schema
-from mp4ds.stamps import INT64_MAX, INT64_MIN, decode_column
-from mp4ds.wire.formats import WIRES
+from mp4ds.sidecar.columns import Columns, Digests
+from mp4ds.sidecar.fields import (
+    MAX_CAMERA_INFOS,
+    MAX_FRAMES,
+    MAX_VARIANTS,
+    Base64,
+    Body,
+    FileName,
+    Model,
+    Profile,
+    Sha256,
+    Side,
+    Size,
+    Uint32,
+    Uint64,
+    Version,
+    decode_base64,
+)
+from mp4ds.wire import WIRES
 
-FORMAT_VERSION = "1.0"
-MESSAGES_NAME = "messages.mcap"
-MAX_FRAMES = 2 * 10**7  # 92 hours at 60 Hz; bounds what a sidecar can make a reader allocate
-MAX_CAMERA_INFOS = 10**7
-MAX_VARIANTS = 256
-"""Headers or calibrations of a stream: a topic with more is not modelled any further."""
-
-CODECS = ("h264", "h265", "av1", "ffv1")
-PIXEL_FORMATS = ("gray", "gray16le", "rgb24", "bgr24", "bgr0", "yuv420p")
-
-Int64 = Annotated[int, Field(ge=INT64_MIN, le=INT64_MAX)]
-Time = Annotated[int, Field(ge=INT64_MIN, le=2**64 - 1)]
-Uint32 = Annotated[int, Field(ge=0, le=2**32 - 1)]
-Side = Annotated[int, Field(ge=1, le=MAX_SIDE)]
-Count = Annotated[int, Field(ge=0, le=MAX_FRAMES)]
-Size = Annotated[int, Field(ge=0, le=INT64_MAX)]
-Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-FileName = Annotated[
-    str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,127}$", description="A plain file name.")
-]
-Base64 = Annotated[str, Field(pattern=r"^[A-Za-z0-9+/]*={0,2}$")]
-Version = Annotated[str, Field(pattern=r"^(0|[1-9][0-9]*)\.(0|[1-9][0-9]*)$")]
-Profile = Annotated[str, Field(pattern=r"^(lossless|visual|crf=[0-9]{1,2})$")]
-
-
-class Model(BaseModel):
-    """Base of all models: nothing is converted, added or changed."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+_GREY_OR_COLOUR = frozenset({"mono8", "rgb8"})
+_BODY_ENCODINGS = {
+    "packet": _GREY_OR_COLOUR,
+    "jpeg": _GREY_OR_COLOUR,
+    "rvl": frozenset({"16UC1"}),
+    "png": frozenset(PNG_ENCODINGS.values()),
+}
+CODECS = ("h264", "h265", "av1", "vp9", "ffv1", "mjpeg")
+PIXEL_FORMATS = (
+    *("gray", "gray10le", "gray12le", "gray14le", "gray16le"),
+    *("rgb24", "bgr24", "bgr0", "bgra"),
+    *("gbrp10le", "gbrp12le", "gbrp14le", "gbrp16le"),
+    *("gbrap10le", "gbrap12le", "gbrap14le", "gbrap16le"),
+    *("yuv420p", "yuv422p", "yuv444p"),
+)
 
 
 class SchemaModel(Model):
@@ -88,7 +97,7 @@ class ChannelModel(Model):
     """The channel that the messages were recorded on."""
 
     topic: str = Field(description="Topic name as the source spells it.")
-    message_encoding: str = Field(description="ros1 or cdr.")
+    message_encoding: str = Field(description="ros1, cdr, protobuf, json or flatbuffer.")
     schema_: SchemaModel | None = Field(None, alias="schema", description="Message definition.")
     metadata: dict[str, str] = Field(
         default_factory=dict, description="Connection header, QoS, type hash; verbatim."
@@ -119,35 +128,61 @@ class Image(Model):
     height: Side = Field(description="Rows, pixels.")
     step: Uint32 = Field(description="Bytes per row; what exceeds the pixels is zero.")
     is_bigendian: Annotated[int, Field(ge=0, le=255)] = Field(
-        description="The byte as it stands; for 16-bit samples not 0 means big-endian."
+        description="The byte as it stands; for samples of several bytes not 0 means big-endian."
     )
 
     @model_validator(mode="after")
     def _fits(self) -> Image:
+        encoding = ENCODINGS.get(self.encoding)
         reason = why_not(
             self.encoding,
             width=self.width,
             height=self.height,
             step=self.step,
-            size=self.step * self.height,
+            size=encoding.size(self.step, self.height) if encoding else 0,
         )
         if reason:
             raise ValueError(reason)
         return self
 
 
+class PngFile(Model):
+    """How a PNG file is made of its pixels."""
+
+    filters: str = Field(description="Rule of the row filters (registry, PNG files).")
+    level: Annotated[int, Field(ge=1, le=9)] = Field(description="Level of deflate.")
+    strategy: Annotated[int, Field(ge=0, le=4)] = Field(description="Strategy of deflate.")
+    memory_level: Annotated[int, Field(ge=1, le=9)] = Field(description="Its memory level.")
+    window_bits: Annotated[int, Field(ge=9, le=15)] = Field(description="Its window.")
+    zlib_header: Annotated[str, Field(pattern=r"^[0-9a-f]{4}$")] = Field(
+        description="The two bytes before the deflated data, hexadecimal."
+    )
+    chunk_bytes: Annotated[int, Field(ge=0, le=2**31)] = Field(
+        description="Image data in each IDAT chunk but the last; 0: one chunk."
+    )
+    deflate: Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")] = Field(
+        description="Fingerprint of the deflate that makes these bytes (registry, PNG files)."
+    )
+    before: Base64 = Field("", description="Chunks between the header and the image data.")
+    after: Base64 = Field("", description="What follows the image data.")
+
+
 class Header(Model):
-    """The part of a message around its pixels that does not change from frame to frame."""
+    """The part of a message around its body that does not change from frame to frame."""
 
     frame_id: str = Field(description="Coordinate frame.")
+    format: str | None = Field(None, description="Of a coded image, to the letter.")
     template: Base64 | None = Field(
         None,
-        description="All bytes before the pixels, stamp and seq zero, where they are not those "
-        "of a plain serialization (padding that is not zero).",
+        description="The blank message, where it is not that of a plain serialization.",
     )
-    tail: Annotated[str, Field(pattern=r"^([0-9a-f]{2})*$", max_length=128)] = Field(
-        "", description="All bytes after the pixels, hexadecimal."
+    framing: Annotated[str, Field(pattern=r"^[0-9a-z +]*$", max_length=4096)] = Field(
+        "", description="Of packets: the start codes or delimiter that an mp4 does not keep."
     )
+    prefix: Annotated[str, Field(pattern=r"^([0-9a-f]{2})*$", max_length=64)] = Field(
+        "", description="Bytes of the body before the coded picture, hexadecimal."
+    )
+    png: PngFile | None = Field(None, description="How the file in the body is made.")
 
 
 class Color(Model):
@@ -159,13 +194,43 @@ class Color(Model):
     range: Literal["full", "limited"] = Field(description="Range of the samples.")
 
 
+class LayoutParameters(Model):
+    """What a layout needs to know of a stream."""
+
+    bits: Annotated[int, Field(ge=1, le=16)] | None = Field(
+        None, description="Bits of a value that are kept."
+    )
+    shift: Annotated[int, Field(ge=0, le=15)] | None = Field(
+        None, description="Zero bits below them in each sample of the image."
+    )
+    low: Annotated[int, Field(ge=1, le=8)] | None = Field(
+        None, description="How many of the bits are low ones, folded and stored apart."
+    )
+    table: Annotated[list[Uint64], Field(max_length=MAX_TABLE)] | None = Field(
+        None, description="The bit patterns that occur, in increasing order."
+    )
+    entries: Annotated[int, Field(ge=1, le=MAX_TABLE)] | None = Field(
+        None, description="Length of the list of values in each picture."
+    )
+    hole: Uint32 | None = Field(
+        None, description="Bit pattern of the float that stands for no measurement."
+    )
+    scale: str | None = Field(None, description="product or quotient: of metres.")
+    alpha: Annotated[int, Field(ge=0, le=255)] | None = Field(
+        None, description="Alpha of every pixel."
+    )
+
+
 class Video(Model):
     """The video file and how it was made."""
 
     file: FileName
     layout: str = Field(description="How pixels became the picture (registry, Layouts).")
+    parameters: LayoutParameters | None = Field(None, description="Of the layout, if it has any.")
     codec: str = Field(description="Codec (registry, Codecs).")
-    pixel_format: str = Field(description="Pixel format of the coded video.")
+    pixel_format: str | None = Field(
+        None, description="Pixel format of the coded video; absent for packets as they came."
+    )
     width: Annotated[int, Field(ge=1, le=MAX_SIDE + 1)] = Field(description="Picture width.")
     height: Annotated[int, Field(ge=1, le=MAX_SIDE + 1)] = Field(description="Picture height.")
     color: Color | None = Field(None, description="Absent where the samples are not colours.")
@@ -175,9 +240,11 @@ class Video(Model):
     sha256: Sha256 | None = Field(None, description="Of the file.")
 
     @property
-    def matrix(self) -> str:
-        """Matrix coefficients of the video's colours."""
-        return self.color.matrix if self.color else "bt709"
+    def matrix(self) -> str | None:
+        """Matrix coefficients of the video's colours; None where the video itself tells them."""
+        if self.color is None:
+            return None if self.pixel_format is None else "bt709"
+        return self.color.matrix
 
     @property
     def full_range(self) -> bool:
@@ -190,69 +257,10 @@ class Video(Model):
             raise ValueError(f"layout {self.layout!r} is not one of {', '.join(LAYOUTS)}")
         if self.codec not in CODECS:
             raise ValueError(f"codec {self.codec!r} is not one of {', '.join(CODECS)}")
-        if self.pixel_format not in PIXEL_FORMATS:
+        if self.pixel_format not in (*PIXEL_FORMATS, None):
             known = ", ".join(PIXEL_FORMATS)
             raise ValueError(f"pixel format {self.pixel_format!r} is not one of {known}")
         return self
-
-
-class Column(Model):
-    """A column of 64-bit integers: ``value[i] = value[i-1] + step + residual[i-1]``."""
-
-    start: Int64 = Field(description="The first value.")
-    step: Int64 = Field(description="The common difference.")
-    values: str = Field(
-        description="Residuals of the differences, separated by white space; r*n is n times r."
-    )
-
-    def decode(self, count: int) -> NDArray[np.int64]:
-        """The values, shape (count,).
-
-        Raises:
-            ValueError: The column does not have that length; says why.
-        """
-        return decode_column(self.start, self.step, self.values, count)
-
-
-class Columns(Model):
-    """One value per message, in the order of the video's frames."""
-
-    log_time: Column = Field(description="When each message was recorded, ns.")
-    publish_time: Column | None = Field(None, description="ns; absent: the log times.")
-    sequence: Column | None = Field(None, description="MCAP sequence; absent: all 0.")
-    stamp: Column = Field(description="Header stamps, ns.")
-    seq: Column | None = Field(None, description="ROS 1 header sequence numbers.")
-    variant: Column | None = Field(
-        None, description="Number of the header or calibration of each; absent: all 0."
-    )
-    ordinal: Column | None = Field(
-        None, description="Place of each among the channel's messages; absent: 0, 1, 2 ..."
-    )
-
-    def names(self) -> list[str]:
-        """Names of the columns that are there."""
-        return [name for name in type(self).model_fields if getattr(self, name) is not None]
-
-
-class Digests(Model):
-    """A digest of each original message payload, in frame order."""
-
-    algorithm: Literal["xxh64"] = Field(description="XXH64 with seed 0.")
-    values: str = Field(description="16 hexadecimal digits each, separated by white space.")
-
-    def decode(self, count: int) -> NDArray[np.uint64]:
-        """The digests, shape (count,).
-
-        Raises:
-            ValueError: There are not that many; says so.
-        """
-        try:
-            raw = bytes.fromhex(self.values)
-        except ValueError:
-            raise ValueError("holds something else than hexadecimal digits") from None
-        if len(raw) != 8 * count:
-            raise ValueError(f"holds {len(raw) / 8:g} digests where {count} are due")
-        return np.frombuffer(raw, dtype=">u8").astype(np.uint64)
 
 
 class Roi(Model):
@@ -285,8 +293,7 @@ class Calibration(Model):
     roi: Roi | None = Field(None, description="Absent: all zero.")
     template: Base64 | None = Field(
         None,
-        description="The message with stamp and seq zero, where it is not that of a plain "
-        "serialization.",
+        description="The blank message, where it is not that of a plain serialization.",
     )
 
 
@@ -312,6 +319,9 @@ class StreamSidecar(Model):
     frames: Annotated[int, Field(ge=1, le=MAX_FRAMES)] = Field(description="Frames of the video.")
     channel: ChannelModel
     wire: str = Field(description="Serialization (registry, Wires).")
+    body: Body = Field(
+        "pixels", description="What a message's body is to the video (registry, Bodies)."
+    )
     image: Image
     headers: Annotated[list[Header], Field(min_length=1, max_length=MAX_VARIANTS)]
     video: Video
@@ -326,42 +336,35 @@ class StreamSidecar(Model):
                 raise ValueError(f"wire {wire!r} is not one of {', '.join(WIRES)}")
         if self.profile == "lossless" and self.digests is None:
             raise ValueError("a lossless stream has digests")
-        encoding = ENCODINGS[self.image.encoding]
-        if self.video.layout not in (encoding.exact, encoding.lossy):
-            raise ValueError(f"layout {self.video.layout} does not carry {encoding.name} images")
-        width, height = LAYOUTS[self.video.layout].picture_size(self.image.width, self.image.height)
+        width, height = self.layout.picture_size(self.image.width, self.image.height)
         if self.video.width < width or self.video.height < height:
             raise ValueError(f"the video is smaller than its pictures of {width}x{height}")
+        self._check_body()
         return self
 
+    def _check_body(self) -> None:
+        body, encoding = self.body, self.image.encoding
+        allowed = _BODY_ENCODINGS.get(body)
+        if allowed is not None and encoding not in allowed:
+            raise ValueError(f"a stream with the body {body} has no {encoding} images")
+        if (self.video.pixel_format is None) != (body == "packet"):
+            raise ValueError("video.pixel_format is absent for the body packet, and only there")
+        if body == "packet" and self.video.codec not in PACKET_CODECS:
+            raise ValueError(f"no packets of codec {self.video.codec} are carried")
+        if body == "jpeg" and self.profile == "lossless":
+            raise ValueError("a stream with the body jpeg is not lossless")
+        for number, header in enumerate(self.headers):
+            if (header.png is not None) != (body == "png"):
+                raise ValueError(f"headers.{number}.png is there for the body png, and only there")
 
-def decode_base64(text: str) -> bytes:
-    """Decode base64.
+    @property
+    def layout(self) -> Layout:
+        """The layout of the video's pictures.
 
-    Raises:
-        ValueError: It is not base64.
-    """
-    try:
-        data = base64.b64decode(text, validate=True)
-    except binascii.Error as error:
-        raise ValueError(f"{text[:20]!r} is not base64: {error}") from None
-    if base64.b64encode(data).decode() != text:
-        raise ValueError(f"{text[:20]!r} is not base64: it does not encode what it decodes to")
-    return data
-
-
-def parse_version(text: str) -> tuple[int, int]:
-    """Major and minor.
-
-    Raises:
-        ValueError: Not of the form MAJOR.MINOR.
-    """
-    match = re.fullmatch(r"(0|[1-9]\d*)\.(0|[1-9]\d*)", text)
-    if not match:
-        raise ValueError(f"version {text!r} is not of the form MAJOR.MINOR")
-    return int(match.group(1)), int(match.group(2))
-
-
-def document_of(model: BaseModel) -> dict[str, Any]:
-    """JSON-like values of a model, without the keys that have their default."""
-    return model.model_dump(mode="json", by_alias=True, exclude_defaults=True)
+        Raises:
+            ValueError: It does not suit the images, or its parameters.
+        """
+        given = self.video.parameters
+        values = given.model_dump(exclude_none=True) if given else {}
+        encoding = ENCODINGS[self.image.encoding]
+        return bind(self.video.layout, encoding, Parameters.from_values(values))

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import base64
-
 from mp4ds.records import Channel, Message
 from mp4ds.sidecar import Calibration, CameraInfo, ChannelModel, Roi
-from mp4ds.sidecar.models import MAX_CAMERA_INFOS
-from mp4ds.streams.columns import ColumnsWriter, Unsuited, Variants
-from mp4ds.wire import CameraInfoFields, Wire, WireError, wire_for
+from mp4ds.sidecar.fields import MAX_CAMERA_INFOS
+from mp4ds.streams.columns import ColumnsWriter, Unsuited
+from mp4ds.streams.headers import Forms, Heads
+from mp4ds.wire import CalibrationFields
 
 
 class CameraInfoWriter:
-    """The CameraInfo messages of one channel."""
+    """The calibration messages of one channel."""
 
     def __init__(self, channel: Channel) -> None:
         self.channel = channel
-        self._wire: Wire | None = None
+        self._forms = Forms(channel)
         self._columns = ColumnsWriter()
-        self._calibrations: Variants[Calibration] = Variants()
+        self._heads: Heads[Calibration] | None = None
 
     def accept(self, message: Message, ordinal: int) -> None:
         """Take a message.
@@ -30,45 +29,38 @@ class CameraInfoWriter:
         Raises:
             Unsuited: It cannot be modelled exactly; nothing was changed.
         """
-        self._columns.check(message)
+        form, parts = self._forms.split(message)
+        self._columns.check(message, parts)
         if len(self._columns) == MAX_CAMERA_INFOS:
             raise Unsuited(f"more than {MAX_CAMERA_INFOS} messages")
-        data = memoryview(message.data)
-        try:
-            wire = wire_for(message.channel.message_encoding, data)
-            stamp, seq, frame_id, fields = wire.split_camera_info(data)
-        except WireError as error:
-            raise Unsuited(f"it does not parse: {error}") from None
-        if self._wire is not None and wire is not self._wire:
+        fields = parts.fields
+        if not isinstance(fields, CalibrationFields):
+            raise Unsuited("it is no calibration")
+        heads = self._heads or Heads[Calibration](form)
+        if heads.form.wire != form.wire:
             raise Unsuited("its byte order differs from the first one's")
-        payload = bytes(data)
-        blank = wire.patch_head(payload, 0, 0)
-        if wire.patch_head(blank, stamp, seq) != payload:
-            raise Unsuited("its header does not rebuild")
-
-        def describe() -> Calibration:
-            plain = wire.camera_info(0, 0, frame_id, fields)
-            template = None if plain == blank else base64.b64encode(blank).decode()
-            return _calibration(frame_id, fields, template)
-
-        variant = self._calibrations.number(blank, describe)
-        self._wire = wire
-        self._columns.append(message, stamp=stamp, seq=seq, variant=variant, ordinal=ordinal)
+        variant = heads.number(
+            parts,
+            memoryview(message.data),
+            describe=lambda template: _calibration(parts.frame_id, fields, template),
+        )
+        self._heads = heads
+        self._columns.append(message, parts, variant=variant, ordinal=ordinal)
 
     def to_model(self) -> CameraInfo | None:
         """The model, or None if no message was taken."""
-        if self._wire is None:
+        if self._heads is None:
             return None
         return CameraInfo(
             channel=ChannelModel.from_record(self.channel),
-            wire=self._wire.name,
+            wire=self._heads.form.wire,
             messages=len(self._columns),
-            calibrations=self._calibrations.items,
+            calibrations=self._heads.items,
             columns=self._columns.to_model(),
         )
 
 
-def _calibration(frame_id: str, fields: CameraInfoFields, template: str | None) -> Calibration:
+def _calibration(frame_id: str, fields: CalibrationFields, template: str | None) -> Calibration:
     x_offset, y_offset, height, width = fields.roi
     roi = Roi(
         x_offset=x_offset,
@@ -93,10 +85,10 @@ def _calibration(frame_id: str, fields: CameraInfoFields, template: str | None) 
     )
 
 
-def fields_of(calibration: Calibration) -> CameraInfoFields:
+def fields_of(calibration: Calibration) -> CalibrationFields:
     """The fields of a calibration, as a wire takes them."""
     roi = calibration.roi
-    return CameraInfoFields(
+    return CalibrationFields(
         height=calibration.height,
         width=calibration.width,
         distortion_model=calibration.distortion_model,

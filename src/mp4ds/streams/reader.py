@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import overload
 
@@ -12,17 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.errors import FormatError
-from mp4ds.layouts import Pixels
+from mp4ds.layouts import Picture, Pixels
 from mp4ds.outputs import digest_file
 from mp4ds.records import Channel, Message
 from mp4ds.sidecar import Calibration, StreamSidecar, load_stream
-from mp4ds.streams.rebuild import (
-    CameraInfoRebuilder,
-    DecodedColumns,
-    ImageRebuilder,
-    message_at,
-)
-from mp4ds.video import VideoDecoder
+from mp4ds.streams.bodies import MessageRebuilder
+from mp4ds.streams.rebuild import CameraInfoRebuilder, DecodedColumns, message_at
+from mp4ds.video import PacketReader, VideoDecoder
 
 
 @dataclass(frozen=True)
@@ -30,7 +26,7 @@ class Frame:
     """One image of a stream.
 
     Attributes:
-        data: Pixels in the recorded encoding, shape (H, W) or (H, W, C), uint8 or uint16.
+        data: Pixels in the encoding, shape as `mp4ds.layouts.Encoding.shape`, native byte order.
         index: Number of the frame in its stream.
         stamp_ns: Header stamp, nanoseconds.
         log_time_ns: When it was recorded, nanoseconds.
@@ -56,13 +52,15 @@ class Stream:
 
     Args:
         path: The sidecar; the video is beside it.
+        jpeg_quality: Of the JPEG files that messages of a transcoded stream get, 1 to 100.
 
     Raises:
         FormatError: The sidecar or its video breaks a rule of the format.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, jpeg_quality: int = 95) -> None:
         self.path = path
+        self._jpeg_quality = jpeg_quality
         self.sidecar: StreamSidecar = load_stream(path)
         self._decoder: VideoDecoder | None = None
 
@@ -77,7 +75,7 @@ class Stream:
         return self.path.parent / self.sidecar.video.file
 
     @cached_property
-    def rebuilder(self) -> ImageRebuilder:
+    def rebuilder(self) -> MessageRebuilder:
         """Makes the stream's messages; checks the columns when first used."""
         try:
             size = self.video_path.stat().st_size
@@ -89,7 +87,7 @@ class Stream:
             raise FormatError(
                 "frame-count", self.path, f"claims {self.sidecar.frames} frames in {size} bytes"
             )
-        return ImageRebuilder(self.sidecar, str(self.path))
+        return MessageRebuilder(self.sidecar, str(self.path), jpeg_quality=self._jpeg_quality)
 
     @property
     def stamps(self) -> NDArray[np.int64]:
@@ -168,7 +166,7 @@ class Stream:
             for index, picture in enumerate(decoder.pictures()):
                 yield self._frame(index, picture)
 
-    def _frame(self, index: int, picture: Pixels) -> Frame:
+    def _frame(self, index: int, picture: Picture) -> Frame:
         columns = self.rebuilder.columns
         return Frame(
             data=self.rebuilder.pixels(picture),
@@ -192,11 +190,35 @@ class Stream:
         rebuilder = self.rebuilder
         if self.sidecar.digests is None:
             self.verify_video()
+        for index, payload in enumerate(self.payloads()):
+            ordinal = int(rebuilder.columns.ordinal[index])
+            yield ordinal, message_at(rebuilder.columns, index, channel, payload)
+
+    def payloads(self) -> Iterator[bytes | bytearray]:
+        """The payloads of all messages, in order; see `messages`."""
+        return (make() for make in self.makers())
+
+    def makers(self) -> Iterator[Callable[[], bytes | bytearray]]:
+        """For each message what makes its payload, to be called before the next one is taken.
+
+        Raises:
+            FormatError: A frame cannot be read; the makers raise what else is wrong with one.
+        """
+        rebuilder = self.rebuilder
+        if self.sidecar.body == "packet":
+            video = self.sidecar.video
+            with PacketReader(
+                self.video_path,
+                codec=video.codec,
+                frames=self.sidecar.frames,
+                coded_size=(video.width, video.height),
+            ) as reader:
+                for index, packet in enumerate(reader.packets()):
+                    yield partial(rebuilder.packet_payload, index, packet)
+            return
         with self.open_video(sequential=True) as decoder:
             for index, picture in enumerate(decoder.pictures()):
-                payload = rebuilder.payload(index, picture)
-                ordinal = int(rebuilder.columns.ordinal[index])
-                yield ordinal, message_at(rebuilder.columns, index, channel, payload)
+                yield partial(rebuilder.payload, index, picture)
 
     def verify_video(self) -> None:
         """Compare the video with its SHA-256, for where no digest of a message tells damage.

@@ -1,4 +1,4 @@
-"""The messages of a stream, rebuilt from its sidecar and the pictures of its video."""
+"""What stands around the bodies of messages, rebuilt from the sidecar; whole calibrations."""
 
 from __future__ import annotations
 
@@ -6,18 +6,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import xxhash
 from numpy.typing import NDArray
 
 from mp4ds.errors import FormatError
-from mp4ds.layouts import ENCODINGS, LAYOUTS, Pixels, pixel_view
 from mp4ds.records import Channel, Message
-from mp4ds.sidecar import Calibration, CameraInfo, Columns, StreamSidecar
-from mp4ds.sidecar.models import decode_base64
+from mp4ds.sidecar import CameraInfo, Columns
+from mp4ds.sidecar.fields import decode_base64
 from mp4ds.streams.camera_info import fields_of
-from mp4ds.streams.writer import picture_format
-from mp4ds.wire import ImageParts
-from mp4ds.wire.formats import WIRES
+from mp4ds.wire import CodedFields, Fields, Form, Slots, Template, WireError, form_of
 
 
 @dataclass(frozen=True)
@@ -29,8 +25,17 @@ class DecodedColumns:
     sequence: NDArray[np.int64]
     stamp: NDArray[np.int64]
     seq: NDArray[np.int64] | None
+    pts: NDArray[np.int64] | None
     variant: NDArray[np.int64]
     ordinal: NDArray[np.int64]
+
+    def slots(self, index: int) -> Slots:
+        """What fills the blank of a message."""
+        return Slots(
+            stamp=int(self.stamp[index]),
+            seq=None if self.seq is None else int(self.seq[index]),
+            pts=None if self.pts is None else int(self.pts[index]),
+        )
 
 
 def decode_columns(columns: Columns, count: int, variants: int, place: str) -> DecodedColumns:
@@ -52,6 +57,7 @@ def decode_columns(columns: Columns, count: int, variants: int, place: str) -> D
         sequence=arrays.get("sequence", zeros),
         stamp=arrays["stamp"],
         seq=arrays.get("seq"),
+        pts=arrays.get("pts"),
         variant=arrays.get("variant", zeros),
         ordinal=arrays.get("ordinal", np.arange(count, dtype=np.int64)),
     )
@@ -66,150 +72,67 @@ def decode_columns(columns: Columns, count: int, variants: int, place: str) -> D
     return decoded
 
 
-def check_stamps(columns: DecodedColumns, wire: str, place: str) -> None:
-    """Refuse stamps and sequence numbers that the serialization has no bits for.
+def check_slots(columns: DecodedColumns, templates: list[Template], place: str) -> None:
+    """Refuse stamps and numbers that the serialization has no bits for.
 
     Raises:
-        FormatError: ``column-invalid``, naming the column.
+        FormatError: ``column-invalid``.
     """
-    low, high = (0, 2**32) if wire == "ros1" else (-(2**31), 2**31)
-    seconds = columns.stamp // 10**9
-    if seconds.min() < low or seconds.max() >= high:
-        raise FormatError(
-            "column-invalid",
-            f"{place} at columns.stamp",
-            f"has seconds outside of {low} to {high}",
-        )
-    seq = columns.seq
-    if seq is not None and (seq.min() < 0 or seq.max() >= 2**32):
-        raise FormatError("column-invalid", f"{place} at columns.seq", "has values beyond 32 bits")
+    names = ("stamp", "seq", "pts")
+    for name in names:
+        values = getattr(columns, name)
+        if values is None:
+            continue
+        for value in (int(values.min()), int(values.max())):
+            slots = Slots(**{"stamp": 0, "seq": 0, "pts": 0, name: value})
+            try:
+                templates[0].around(slots, 0)
+            except WireError as error:
+                raise FormatError(
+                    "column-invalid", f"{place} at columns.{name}", f"holds {value}: {error}"
+                ) from None
 
 
-def _template(text: str, place: str) -> bytes:
+def form_for(channel: Channel, wire: str, place: str) -> Form:
+    """The form of a channel's messages.
+
+    Raises:
+        FormatError: ``header-mismatch``: there is none.
+    """
     try:
-        return decode_base64(text)
-    except ValueError as error:
-        raise FormatError("header-mismatch", place, str(error)) from None
+        return form_of(wire, channel.type_name, channel.schema.data if channel.schema else b"")
+    except WireError as error:
+        raise FormatError("header-mismatch", f"{place} at channel", str(error)) from None
 
 
-class ImageRebuilder:
-    """Makes the image messages of a stream.
+def template_of(
+    form: Form, encoded: str | None, frame_id: str, fields: Fields, place: str
+) -> Template:
+    """The template of a header or calibration.
 
     Args:
-        sidecar: The stream's.
-        place: Name of the sidecar, for errors.
+        form: Of the messages.
+        encoded: The blank in base64, or None for a plain one.
+        frame_id: What the sidecar says beside it.
+        fields: What it says besides; the size of coded images does not count.
+        place: Of the template, for errors.
 
     Raises:
-        FormatError: The sidecar contradicts itself.
+        FormatError: ``header-mismatch``.
     """
-
-    def __init__(self, sidecar: StreamSidecar, place: str) -> None:
-        self._sidecar = sidecar
-        self._place = place
-        self._wire = WIRES[sidecar.wire]
-        self._encoding = ENCODINGS[sidecar.image.encoding]
-        self._layout = LAYOUTS[sidecar.video.layout]
-        self.columns = decode_columns(sidecar.columns, sidecar.frames, len(sidecar.headers), place)
-        self._digests = self._decode_digests()
-        self._heads = [self._head(number) for number in range(len(sidecar.headers))]
-        self._tails = [bytes.fromhex(header.tail) for header in sidecar.headers]
-        check_stamps(self.columns, sidecar.wire, place)
-
-    @property
-    def picture_format(self) -> str:
-        """Pixel format of the pictures that `pixels` takes."""
-        return picture_format(self._layout.pixel_format, self._encoding.mosaic)
-
-    @property
-    def picture_size(self) -> tuple[int, int]:
-        """Width and height of the pictures that `pixels` takes."""
-        return self._layout.picture_size(self._sidecar.image.width, self._sidecar.image.height)
-
-    def pixels(self, picture: Pixels) -> Pixels:
-        """A new array of the image's pixels, shape (H, W) or (H, W, C), native byte order."""
-        image = self._sidecar.image
-        shape: tuple[int, ...] = (image.height, image.width)
-        if self._encoding.channels > 1:
-            shape += (self._encoding.channels,)
-        out: Pixels = np.empty(shape, picture.dtype)
-        self._layout.to_pixels(picture, out)
-        return out
-
-    def payload(self, index: int, picture: Pixels) -> bytearray:
-        """The message of a frame, verified against its digest where there is one.
-
-        Raises:
-            FormatError: ``digest-mismatch``, naming topic and frame.
-        """
-        image = self._sidecar.image
-        columns = self.columns
-        variant = int(columns.variant[index])
-        seq = int(columns.seq[index]) if columns.seq is not None else None
-        head = self._wire.patch_head(self._heads[variant], int(columns.stamp[index]), seq)
-        tail = self._tails[variant]
-        payload = bytearray(len(head) + image.step * image.height + len(tail))
-        payload[: len(head)] = head
-        out = pixel_view(
-            memoryview(payload)[len(head) :],
-            self._encoding,
-            width=image.width,
-            height=image.height,
-            step=image.step,
-            is_bigendian=bool(image.is_bigendian),
-        )
-        self._layout.to_pixels(picture, out)
-        if tail:
-            payload[len(payload) - len(tail) :] = tail
-        if self._digests is not None:
-            self._verify(index, payload)
-        return payload
-
-    def _verify(self, index: int, payload: bytearray) -> None:
-        if self._digests is not None and xxhash.xxh64_intdigest(payload) != self._digests[index]:
-            raise FormatError(
-                "digest-mismatch",
-                self._place,
-                f"message {index} of topic {self._sidecar.channel.topic} does not come back "
-                "as it was recorded",
-            )
-
-    def _decode_digests(self) -> list[int] | None:
-        if self._sidecar.digests is None:
-            return None
-        try:
-            return self._sidecar.digests.decode(self._sidecar.frames).tolist()  # type: ignore[no-any-return]
-        except ValueError as error:
-            raise FormatError("column-invalid", f"{self._place} at digests", str(error)) from None
-
-    def _head(self, number: int) -> bytes:
-        header, image = self._sidecar.headers[number], self._sidecar.image
-        empty = memoryview(b"")
-        plain = self._wire.image_head(
-            ImageParts(
-                stamp=0,
-                seq=None if self.columns.seq is None else 0,
-                frame_id=header.frame_id,
-                height=image.height,
-                width=image.width,
-                encoding=image.encoding,
-                is_bigendian=image.is_bigendian,
-                step=image.step,
-                size=image.step * image.height,
-                head=empty,
-                pixels=empty,
-                tail=empty,
-            )
-        )
-        if header.template is None:
-            return plain
-        template = _template(header.template, f"{self._place} at headers.{number}.template")
-        if len(template) != len(plain):
-            raise FormatError(
-                "header-mismatch",
-                f"{self._place} at headers.{number}.template",
-                f"has {len(template)} bytes where its fields take {len(plain)}",
-            )
-        return template
+    try:
+        blank = form.plain(frame_id, fields) if encoded is None else decode_base64(encoded)
+        if blank is None:
+            raise WireError("a message of this type needs a template")
+        parts = form.split(memoryview(blank))
+        found = parts.fields
+        if isinstance(found, CodedFields):
+            found = CodedFields(found.format)
+        if (parts.frame_id, found) != (frame_id, fields):
+            raise WireError("says something else than the fields beside it")
+        return form.template(blank)
+    except ValueError as error:
+        raise FormatError("header-mismatch", place, str(error)) from None
 
 
 class CameraInfoRebuilder:
@@ -224,42 +147,32 @@ class CameraInfoRebuilder:
     """
 
     def __init__(self, camera_info: CameraInfo, place: str) -> None:
-        self._wire = WIRES[camera_info.wire]
         self._count = camera_info.messages
+        place = f"{place} at camera_info"
         if camera_info.columns is None:
-            raise FormatError("column-invalid", f"{place} at camera_info", "has no columns")
+            raise FormatError("column-invalid", place, "has no columns")
         self.columns = decode_columns(
-            camera_info.columns,
-            camera_info.messages,
-            len(camera_info.calibrations),
-            f"{place} at camera_info",
+            camera_info.columns, camera_info.messages, len(camera_info.calibrations), place
         )
-        check_stamps(self.columns, camera_info.wire, f"{place} at camera_info")
-        self._blanks = [
-            self._blank(calibration, f"{place} at camera_info.calibrations.{number}")
+        form = form_for(camera_info.channel.to_record(0), camera_info.wire, place)
+        self._templates = [
+            template_of(
+                form,
+                calibration.template,
+                calibration.frame_id,
+                fields_of(calibration),
+                f"{place}.calibrations.{number}",
+            )
             for number, calibration in enumerate(camera_info.calibrations)
         ]
-
-    def _blank(self, calibration: Calibration, place: str) -> bytes:
-        plain = self._wire.camera_info(0, 0, calibration.frame_id, fields_of(calibration))
-        if calibration.template is None:
-            return plain
-        template = _template(calibration.template, f"{place}.template")
-        if len(template) < len(plain):
-            raise FormatError(
-                "header-mismatch",
-                f"{place}.template",
-                f"has {len(template)} bytes where its fields take {len(plain)}",
-            )
-        return template
+        check_slots(self.columns, self._templates, place)
 
     def messages(self, channel: Channel) -> Iterator[tuple[int, Message]]:
         """Ordinal and message of each."""
         columns = self.columns
         for index in range(self._count):
-            seq = int(columns.seq[index]) if columns.seq is not None else None
-            blank = self._blanks[int(columns.variant[index])]
-            payload = self._wire.patch_head(blank, int(columns.stamp[index]), seq)
+            template = self._templates[int(columns.variant[index])]
+            payload = b"".join(template.around(columns.slots(index), 0))
             yield int(columns.ordinal[index]), message_at(columns, index, channel, payload)
 
 

@@ -6,13 +6,21 @@ from mp4ds.video.codecs import Recipe, check_codec, recipe_for
 from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.encoder import VideoEncoder, tool_versions
 from mp4ds.video.images import ImageFile
+from mp4ds.video.jpeg import JpegDecoder
+from mp4ds.video.packets import PacketReader, PacketWriter
+from mp4ds.video.trial import Choice, choose
 
 __all__ = [
+    "Choice",
     "ImageFile",
+    "JpegDecoder",
+    "PacketReader",
+    "PacketWriter",
     "Recipe",
     "VideoDecoder",
     "VideoEncoder",
     "check_codec",
+    "choose",
     "recipe_for",
     "tool_versions",
 ]

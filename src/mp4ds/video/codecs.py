@@ -15,6 +15,8 @@ from mp4ds.errors import OptionError
 DEFAULT_GOP = 60
 
 _X264 = MappingProxyType({"bf": "0"})  # without B-frames, frames are coded in the order shown
+_X265 = "bframes=0:open-gop=0"  # an open GOP cannot be sought exactly
+_QUIET = "log-level=error"
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +29,8 @@ class Recipe:
         pixel_format: Pixel format given to the encoder.
         lossless: Whether every sample returns as it was.
         options: Options of the encoder.
+        matrix: Matrix coefficients to tag, by ffmpeg's name: bt709, gbr or smpte170m.
+        full_range: Whether to tag the samples as using their full range.
     """
 
     codec: str
@@ -34,6 +38,8 @@ class Recipe:
     pixel_format: str
     lossless: bool
     options: Mapping[str, str] = field(default_factory=dict)
+    matrix: str = "bt709"
+    full_range: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,34 +48,75 @@ class _Coding:
     pixel_format: str
     options: Mapping[str, str]
     default_preset: str = ""
+    tuning: str = ""  # further x264 parameters of the default preset
+    tried: bool = True  # without being asked for
 
 
 # the converter sites chroma in the middle; untagged, decoders take it for left
 _CENTRED = "chromaloc=1"
 _FFV1 = MappingProxyType({"level": "3", "slicecrc": "1", "slices": "4"})
 _FFV1_8BIT = MappingProxyType({**_FFV1, "coder": "range_tab", "context": "1"})
+_YUV = ("yuv420p", "yuv422p", "yuv444p")
 
-# (codec, pixel format of the picture) -> coding
-_LOSSLESS: dict[tuple[str, str], _Coding] = {
-    ("h264", "gray"): _Coding("libx264", "gray", {**_X264, "qp": "0"}, "veryfast"),
-    ("h264", "rgb24"): _Coding("libx264rgb", "rgb24", {**_X264, "qp": "0"}, "veryfast"),
-    ("h264", "bgr24"): _Coding("libx264rgb", "bgr24", {**_X264, "qp": "0"}, "veryfast"),
-    ("ffv1", "gray"): _Coding("ffv1", "gray", _FFV1_8BIT),
-    ("ffv1", "gray16le"): _Coding("ffv1", "gray16le", _FFV1),
-    ("ffv1", "rgb24"): _Coding("ffv1", "bgr0", _FFV1_8BIT),
-    ("ffv1", "bgr24"): _Coding("ffv1", "bgr0", _FFV1_8BIT),
+
+# as small as x264's default preset without loss, at half its time (benchmarks/RESULTS.md)
+_TUNING = "ref=3:mixed-refs=1:subme=5:me=dia:weightp=0:scenecut=0"
+
+
+def _x264_lossless(pixel_format: str) -> _Coding:
+    return _Coding("libx264", pixel_format, {**_X264, "qp": "0"}, "veryfast", _TUNING)
+
+
+def _x264_rgb(pixel_format: str) -> _Coding:
+    tuning = f"{_TUNING}:8x8dct=0:partitions=p8x8"
+    return _Coding("libx264rgb", pixel_format, {**_X264, "qp": "0"}, "veryfast", tuning)
+
+
+def _x265_lossless(pixel_format: str) -> _Coding:
+    options = {"x265-params": f"{_X265}:lossless=1:{_QUIET}"}
+    # several times slower than the others, and hardly ever smaller than they with folded bits
+    return _Coding("libx265", pixel_format, options, "veryfast", tried=False)
+
+
+# picture format -> codec -> coding; the first is the default
+_LOSSLESS: dict[str, dict[str, _Coding]] = {
+    "gray": {"h264": _x264_lossless("gray"), "ffv1": _Coding("ffv1", "gray", _FFV1_8BIT)},
+    "gray10le": {
+        "h264": _x264_lossless("gray10le"),
+        "ffv1": _Coding("ffv1", "gray10le", _FFV1),
+        "h265": _x265_lossless("gray10le"),
+    },
+    "gray12le": {
+        "ffv1": _Coding("ffv1", "gray12le", _FFV1),
+        "h265": _x265_lossless("gray12le"),
+    },
+    "gray14le": {"ffv1": _Coding("ffv1", "gray14le", _FFV1)},
+    "gray16le": {"ffv1": _Coding("ffv1", "gray16le", _FFV1)},
+    **{
+        packed: {
+            "ffv1": _Coding("ffv1", "bgr0", _FFV1_8BIT),
+            "h264": _x264_rgb(packed),
+        }
+        for packed in ("rgb24", "bgr24")
+    },
+    **{packed: {"ffv1": _Coding("ffv1", "bgra", _FFV1_8BIT)} for packed in ("rgba", "bgra")},
+    **{
+        planar: {"ffv1": _Coding("ffv1", planar, _FFV1)}
+        for bits in (10, 12, 14, 16)
+        for planar in (f"gbrp{bits}le", f"gbrap{bits}le")
+    },
+    **{
+        planar: {"h264": _x264_lossless(planar), "ffv1": _Coding("ffv1", planar, _FFV1_8BIT)}
+        for planar in _YUV
+    },
 }
 _LOSSY: dict[str, _Coding] = {
     "av1": _Coding("libsvtav1", "yuv420p", {}, "6"),
     "h264": _Coding("libx264", "yuv420p", {**_X264, "x264-params": _CENTRED}, "medium"),
     "h265": _Coding(
-        "libx265",
-        "yuv420p",
-        {"x265-params": f"bframes=0:open-gop=0:{_CENTRED}:log-level=error"},
-        "medium",
+        "libx265", "yuv420p", {"x265-params": f"{_X265}:{_CENTRED}:{_QUIET}"}, "medium"
     ),
 }
-_DEFAULT_LOSSLESS = {"gray": "h264", "rgb24": "ffv1", "bgr24": "ffv1", "gray16le": "ffv1"}
 _DEFAULT_LOSSY = "av1"
 
 
@@ -85,19 +132,29 @@ _PRESETS: dict[str, Sequence[str]] = {
 }
 
 
+def lossless_codecs(pixel_format: str) -> Sequence[str]:
+    """The codecs that hold pictures of a format exactly, the default first."""
+    return tuple(_LOSSLESS[pixel_format])
+
+
+def codecs_to_try(pixel_format: str) -> Sequence[str]:
+    """Those of `lossless_codecs` that are worth their time."""
+    return tuple(name for name, coding in _LOSSLESS[pixel_format].items() if coding.tried)
+
+
 def check_codec(codec: str | None, preset: str | None, *, lossless: bool) -> None:
     """Refuse a codec that could make no stream of a profile, or a preset that it does not have.
 
     Raises:
         OptionError: Names those that can.
     """
-    able = {name for name, _ in _LOSSLESS} if lossless else set(_LOSSY)
+    able = {name for codings in _LOSSLESS.values() for name in codings} if lossless else set(_LOSSY)
     if codec is not None and codec not in able:
         kind = "lossless" if lossless else "lossy"
         raise OptionError(
             f"--codec {codec!r} is not one for {kind} packing. Use {', '.join(sorted(able))}."
         )
-    name = codec or (_DEFAULT_LOSSLESS["gray"] if lossless else _DEFAULT_LOSSY)
+    name = codec or (lossless_codecs("gray")[0] if lossless else _DEFAULT_LOSSY)
     if preset is not None and preset not in _PRESETS[name]:
         known = ", ".join(_PRESETS[name])
         raise OptionError(
@@ -121,19 +178,19 @@ def recipe_for(
         lossless: Whether every sample must return as it was.
         codec: ``h264``, ``h265``, ``av1``, ``ffv1``, or None for the default.
         crf: Constant rate factor of a lossy recipe.
-        preset: The encoder's preset, or None for the default.
+        preset: The encoder's preset, or None for the default; encoders without ignore it.
 
     Raises:
         OptionError: The codec is unknown or cannot do it; names those that can.
     """
     if lossless:
-        name = codec or _DEFAULT_LOSSLESS[pixel_format]
-        coding = _LOSSLESS.get((name, pixel_format))
+        codings = _LOSSLESS[pixel_format]
+        name = codec or next(iter(codings))
+        coding = codings.get(name)
         if coding is None:
-            able = sorted({c for c, p in _LOSSLESS if p == pixel_format})
             raise OptionError(
                 f"codec {name} has no lossless form for {pixel_format} pictures; "
-                f"use one of {', '.join(able)}"
+                f"use one of {', '.join(sorted(codings))}"
             )
         options = dict(coding.options)
     else:
@@ -143,6 +200,30 @@ def recipe_for(
             raise OptionError(f"codec {name} is lossless only; use one of {', '.join(_LOSSY)}")
         coding = found
         options = {**coding.options, "crf": str(crf)}
+        if pixel_format in _YUV:
+            options = _sited_left(options)
     if coding.default_preset:
         options["preset"] = preset or coding.default_preset
-    return Recipe(name, coding.encoder, coding.pixel_format, lossless, options=options)
+    if coding.tuning and preset is None:
+        options["x264-params"] = coding.tuning
+    is_yuv = pixel_format in _YUV
+    is_rgb = coding.pixel_format.startswith(("rgb", "bgr", "gbr"))
+    return Recipe(
+        name,
+        coding.encoder,
+        coding.pixel_format,
+        lossless,
+        options=options,
+        # a camera's own YUV is kept, and tagged as what ROS and OpenCV take it for
+        matrix="smpte170m" if is_yuv else "gbr" if is_rgb else "bt709",
+        full_range=not is_yuv,
+    )
+
+
+def _sited_left(options: Mapping[str, str]) -> dict[str, str]:
+    """Options that leave the chroma where cameras and decoders take it to be."""
+    parts = {
+        key: ":".join(part for part in value.split(":") if part != _CENTRED)
+        for key, value in options.items()
+    }
+    return {key: value for key, value in parts.items() if value}

@@ -1,12 +1,12 @@
 """Pictures to video frames and back, with the colours tagged and converted as tagged.
 
-Colour is BT.709, full range (spec/registry.md, "Colour"): what is not tagged is guessed by
-every player in its own way.
+RGB is coded as BT.709, full range (spec/registry.md, "Colour"): what is not tagged is guessed by
+every player in its own way. A camera's own YUV is not converted.
 """
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import av
 import numpy as np
@@ -14,17 +14,23 @@ from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from numpy.typing import NDArray
 
 from mp4ds.errors import VideoError
-from mp4ds.layouts import Pixels
+from mp4ds.layouts import CHROMA_SHIFTS, Picture
 
-BT709 = 1  # primaries, transfer and matrix have the same number in H.273
-FULL_RANGE = 2
+_BT709, _FULL_RANGE = 1, 2  # in a frame's tags (H.273; ffmpeg's AVColorRange)
 
 # libswscale's flags: bicubic, full chroma in and out, accurate rounding, the same everywhere.
 # As numbers, since older PyAV has no names for them.
 _BICUBIC, _FULL_CHROMA, _ACCURATE, _BITEXACT = 0x4, 0x2000 | 0x4000, 0x40000, 0x80000
 _INTERPOLATION = _BICUBIC | _FULL_CHROMA | _ACCURATE | _BITEXACT
-_YUV = ("yuv420p", "yuvj420p")
 _MATRICES = {"bt709": Colorspace.ITU709, "smpte170m": Colorspace.ITU601}
+
+_CHANNELS = {"rgb24": 3, "bgr24": 3, "rgba": 4, "bgra": 4}
+_VIEWED = ("gray", "gray16le", *_CHANNELS)  # PyAV makes frames of their arrays without a copy
+# x264 codes grey with neutral chroma; full range has a name of its own in some decoders
+_DECODED_AS = {
+    "gray": ("gray", "yuv420p", "yuvj420p"),
+    "gray10le": ("gray10le", "yuv420p10le"),
+}
 
 
 class Converter:
@@ -32,16 +38,23 @@ class Converter:
 
     Args:
         matrix: Between RGB and YUV, by ffmpeg's name: ours is bt709, JPEG files have smpte170m.
+            None: what each frame is tagged with.
         source_full_range: Whether the frames to convert use the full range.
     """
 
-    def __init__(self, matrix: str = "bt709", *, source_full_range: bool = True) -> None:
-        self._matrix = _MATRICES.get(matrix, Colorspace.ITU709)
+    def __init__(self, matrix: str | None = "bt709", *, source_full_range: bool = True) -> None:
+        self._is_tagged = matrix is None
+        self._matrix = _MATRICES.get(matrix or "", Colorspace.ITU709)
         self._source_range = ColorRange.JPEG if source_full_range else ColorRange.MPEG
         self._reformatter = VideoReformatter()
 
     def convert(self, frame: av.VideoFrame, pixel_format: str) -> av.VideoFrame:
         """The frame in another pixel format, the colours kept."""
+        if self._is_tagged:
+            # untagged video is BT.601, limited, for ffmpeg and most players
+            self._matrix = Colorspace.ITU709 if frame.colorspace == _BT709 else Colorspace.ITU601
+            is_full = frame.color_range == _FULL_RANGE or frame.format.name.startswith("yuvj")
+            self._source_range = ColorRange.JPEG if is_full else ColorRange.MPEG
         return self._reformatter.reformat(
             frame,
             format=pixel_format,
@@ -55,21 +68,21 @@ class Converter:
 
 
 def picture_to_frame(
-    picture: Pixels, picture_format: str, pixel_format: str, converter: Converter
+    picture: Picture, picture_format: str, pixel_format: str, converter: Converter
 ) -> av.VideoFrame:
-    """A frame for the encoder; a view of the picture where the formats agree.
+    """A frame for the encoder; a view of the picture where formats and rows allow it.
 
     Args:
-        picture: Shape (H, W) or (H, W, C), rows contiguous.
+        picture: One array of shape (H, W) or (H, W, C), or one per plane.
         picture_format: Its pixel format.
         pixel_format: The encoder's.
         converter: The stream's own.
     """
-    if pixel_format in _YUV and picture_format == "gray":
-        return _gray_to_yuv(picture, pixel_format)
-    if pixel_format in _YUV:
-        picture = _pad_to_even(picture)
-    frame = av.VideoFrame.from_numpy_buffer(picture, format=picture_format)
+    if pixel_format == "yuv420p" and picture_format == "gray":
+        return _gray_to_yuv(picture[0], pixel_format)
+    if pixel_format == "yuv420p" and picture_format not in CHROMA_SHIFTS:
+        picture = (_pad_to_even(picture[0]),)
+    frame = plain_frame(picture, picture_format)
     if picture_format.startswith("bayer_"):
         frame = converter.convert(frame, "rgb24")
     if picture_format != pixel_format:
@@ -77,17 +90,32 @@ def picture_to_frame(
     return frame
 
 
-def _pad_to_even(picture: Pixels) -> Pixels:
+def plain_frame(picture: Picture, picture_format: str) -> av.VideoFrame:
+    """A frame of the picture's own format; a view of it where PyAV makes one."""
+    if picture_format in _VIEWED or picture_format.startswith("bayer_"):
+        array = picture[0]
+        row = np.empty_like(array[:1], order="C")  # where samples follow each other
+        if array.strides[1:] != row.strides[1:]:
+            array = array.copy(order="C")
+        return av.VideoFrame.from_numpy_buffer(array, format=picture_format)
+    height, width = picture[0].shape
+    frame = av.VideoFrame(width, height, picture_format)
+    for index, plane in enumerate(picture):
+        rows = _rows(frame, index).view(plane.dtype)
+        rows[: plane.shape[0], : plane.shape[1]] = plane
+    return frame
+
+
+def _pad_to_even(picture: NDArray[Any]) -> NDArray[Any]:
     """Repeat the last row and column where they are odd, for chroma planes of half size."""
     height, width = picture.shape[:2]
     pad = [(0, height % 2), (0, width % 2)] + [(0, 0)] * (picture.ndim - 2)
     if not pad[0][1] and not pad[1][1]:
         return picture
-    padded: Any = np.pad(picture, pad, mode="edge")  # whose type forgets the dtype
-    return cast("Pixels", padded)
+    return np.pad(picture, pad, mode="edge")
 
 
-def _gray_to_yuv(picture: Pixels, pixel_format: str) -> av.VideoFrame:
+def _gray_to_yuv(picture: NDArray[Any], pixel_format: str) -> av.VideoFrame:
     picture = _pad_to_even(picture)
     height, width = picture.shape
     frame = av.VideoFrame(width, height, pixel_format)
@@ -104,8 +132,8 @@ def frame_to_picture(
     height: int,
     converter: Converter,
     place: str,
-) -> Pixels:
-    """The picture in a decoded frame; a view of it where possible.
+) -> Picture:
+    """The picture in a decoded frame; views of it where possible.
 
     Args:
         frame: As decoded.
@@ -124,11 +152,12 @@ def frame_to_picture(
             place,
             f"has frames of {frame.width}x{frame.height} where {width}x{height} are due",
         )
-    if picture_format in ("gray", "gray16le"):
-        return _plane(frame, picture_format, place)[:height, :width]
     if picture_format.startswith("bayer_"):
-        return _sample_mosaic(_packed(frame, "rgb24", converter), picture_format, width, height)
-    return _packed(frame, picture_format, converter)[:height, :width]
+        colours = _packed(frame, "rgb24", converter)
+        return (_sample_mosaic(colours, picture_format, width, height),)
+    if picture_format in _CHANNELS:
+        return (_packed(frame, picture_format, converter)[:height, :width],)
+    return _planes(frame, picture_format, width, height, place)
 
 
 def _rows(frame: av.VideoFrame, index: int) -> NDArray[np.uint8]:
@@ -137,24 +166,38 @@ def _rows(frame: av.VideoFrame, index: int) -> NDArray[np.uint8]:
     return np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
 
 
-def _plane(frame: av.VideoFrame, picture_format: str, place: str) -> Pixels:
-    expected = ("gray16le",) if picture_format == "gray16le" else ("gray", *_YUV)
+def _planes(
+    frame: av.VideoFrame, picture_format: str, width: int, height: int, place: str
+) -> Picture:
+    expected = _DECODED_AS.get(picture_format, (picture_format,))
     if frame.format.name not in expected:
         raise VideoError(
             "codec-mismatch",
             place,
             f"decodes to {frame.format.name} where {' or '.join(expected)} is due",
         )
-    rows = _rows(frame, 0)
-    return rows.view("<u2") if picture_format == "gray16le" else rows
+    if picture_format.startswith("gray"):
+        sizes = [(height, width)]
+    else:
+        across, down = CHROMA_SHIFTS.get(picture_format, (0, 0))
+        chroma = (-(-height >> down), -(-width >> across))
+        sizes = [(height, width)] + [chroma] * (len(frame.planes) - 1)
+    sample = "<u2" if picture_format.endswith("le") else "u1"
+    return tuple(
+        _rows(frame, index).view(sample)[:rows, :columns]
+        for index, (rows, columns) in enumerate(sizes)
+    )
 
 
-def _packed(frame: av.VideoFrame, pixel_format: str, converter: Converter) -> Pixels:
+def _packed(frame: av.VideoFrame, pixel_format: str, converter: Converter) -> NDArray[np.uint8]:
+    channels = _CHANNELS[pixel_format]
     rows = _rows(converter.convert(frame, pixel_format), 0)
-    return rows[: frame.height, : 3 * frame.width].reshape(frame.height, frame.width, 3)
+    return rows[: frame.height, : channels * frame.width].reshape(frame.height, -1, channels)
 
 
-def _sample_mosaic(picture: Pixels, picture_format: str, width: int, height: int) -> Pixels:
+def _sample_mosaic(
+    picture: NDArray[np.uint8], picture_format: str, width: int, height: int
+) -> NDArray[np.uint8]:
     """The mosaic that a sensor with this pattern would have seen."""
     mosaic = picture_format.removeprefix("bayer_")[:4]
     pixels = np.empty((height, width), np.uint8)

@@ -11,10 +11,17 @@ import numpy as np
 from av.error import FFmpegError
 
 from mp4ds.errors import VideoError
-from mp4ds.layouts import Pixels
+from mp4ds.layouts import Picture
 from mp4ds.video.convert import Converter, frame_to_picture
 
-_CODEC_NAMES = {"h264": "h264", "h265": "hevc", "av1": "av1", "ffv1": "ffv1"}
+_CODEC_NAMES = {
+    "h264": "h264",
+    "h265": "hevc",
+    "av1": "av1",
+    "vp9": "vp9",
+    "ffv1": "ffv1",
+    "mjpeg": "mjpeg",
+}
 
 
 class VideoDecoder:
@@ -30,8 +37,8 @@ class VideoDecoder:
         frames: Number of frames that are due.
         picture_format: Pixel format of the pictures wanted.
         picture_size: Width and height of the pictures wanted.
-        matrix: Matrix coefficients of the video's colours.
-        full_range: Whether its samples use their full range.
+        matrix: Matrix coefficients of the video's colours; None where the video itself tells.
+        full_range: Whether its samples use their full range, unless the video itself tells.
         sequential: Decode with all cores, for reading in order.
 
     Raises:
@@ -47,7 +54,7 @@ class VideoDecoder:
         frames: int,
         picture_format: str,
         picture_size: tuple[int, int],
-        matrix: str = "bt709",
+        matrix: str | None = "bt709",
         full_range: bool = True,
         sequential: bool = True,
     ) -> None:
@@ -102,7 +109,7 @@ class VideoDecoder:
         """Frames that the file's index lists."""
         return len(self._stream.index_entries)
 
-    def pictures(self) -> Iterator[Pixels]:
+    def pictures(self) -> Iterator[Picture]:
         """All pictures in order, as views that hold until the next one is asked for.
 
         Raises:
@@ -123,7 +130,24 @@ class VideoDecoder:
                 "frame-count", self._path, f"ends after {number} of {self._frames} frames"
             )
 
-    def picture(self, index: int) -> Pixels:
+    def numbered_pictures(self) -> Iterator[tuple[int, Picture]]:
+        """The pictures that decode, each with its frame's number, for what others encoded.
+
+        Where a packet was lost before it was recorded, those that refer to it do not decode.
+
+        Raises:
+            VideoError: As `pictures`, but not for pictures that do not decode.
+        """
+        ticks = self._presentation_ticks()
+        self._seek(0, 0)
+        due = 0
+        for frame in self._decodable():
+            number = int(np.searchsorted(ticks, frame.pts)) if frame.pts is not None else -1
+            if due <= number < self._frames and ticks[number] == frame.pts:
+                yield number, self._picture(frame)
+                due = number + 1
+
+    def picture(self, index: int) -> Picture:
         """One picture, by seeking to the key frame before it.
 
         Args:
@@ -171,7 +195,18 @@ class VideoDecoder:
                 "decode-failed", self._path, f"frame {number} cannot be decoded: {error}"
             ) from None
 
-    def _picture(self, frame: av.VideoFrame) -> Pixels:
+    def _decodable(self) -> Iterator[av.VideoFrame]:
+        try:
+            for packet in self._container.demux(self._stream):
+                try:
+                    frames = packet.decode()
+                except FFmpegError:
+                    continue
+                yield from (frame for frame in frames if not frame.is_corrupt)
+        except (FFmpegError, OSError) as error:
+            raise VideoError("decode-failed", self._path, f"cannot be read: {error}") from None
+
+    def _picture(self, frame: av.VideoFrame) -> Picture:
         if frame.is_corrupt:
             raise VideoError("decode-failed", self._path, "a frame is marked as corrupt")
         if (frame.width, frame.height) != self._coded_size:

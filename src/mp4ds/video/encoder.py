@@ -12,12 +12,14 @@ import av
 from av.error import FFmpegError
 
 from mp4ds.errors import Mp4dsError
-from mp4ds.layouts import Pixels
+from mp4ds.layouts import Picture
 from mp4ds.stamps import TIMESCALE
 from mp4ds.video.codecs import Recipe
-from mp4ds.video.convert import BT709, FULL_RANGE, Converter, picture_to_frame
+from mp4ds.video.convert import Converter, picture_to_frame
 
 _TIME_BASE = Fraction(1, TIMESCALE)
+_MATRICES = {"gbr": 0, "bt709": 1, "smpte170m": 6}  # as H.273 numbers them
+_BT709 = 1  # of primaries and transfer characteristics
 _LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.1, 30.0, 240.0  # Hz, what every encoder takes
 
 
@@ -58,12 +60,8 @@ class VideoEncoder:
         self.frames = 0
         self._picture_format = picture_format
         self._converter = Converter()
-        halved = recipe.pixel_format == "yuv420p"
-        self.width = width + width % 2 if halved else width
-        self.height = height + height % 2 if halved else height
+        self.width, self.height = coded_size(recipe, width, height)
         self.options = {**recipe.options, "g": str(gop)}
-        # SVT-AV1 prints to stderr on its own; errors reach us as return codes
-        os.environ.setdefault("SVT_LOG", "0")
         self._container = av.open(
             str(path.absolute()),  # ffmpeg takes a relative name with a colon for an address
             "w",
@@ -89,28 +87,18 @@ class VideoEncoder:
             rate=Fraction(hint).limit_denominator(1000),
             options=dict(self.options),
         )
-        stream.width, stream.height = self.width, self.height
-        stream.pix_fmt = self.recipe.pixel_format
         stream.time_base = _TIME_BASE
         context = stream.codec_context
         context.time_base = _TIME_BASE
-        context.thread_count = threads
-        context.colorspace = BT709
-        context.color_primaries = BT709
-        context.color_trc = BT709
-        context.color_range = FULL_RANGE
-        if self.recipe.pixel_format in ("bgr0", "rgb24", "bgr24"):
-            context.colorspace = 0  # RGB has no matrix
-        if self.recipe.encoder == "libsvtav1":
-            context.options = {**context.options, "svtav1-params": f"lp={threads}"}
+        configure(context, self.recipe, self.width, self.height, threads=threads)
         context.open()
         self._stream = stream
 
-    def write(self, picture: Pixels, tick: int) -> None:
+    def write(self, picture: Picture, tick: int) -> None:
         """Encode the next picture.
 
         Args:
-            picture: Shape (H, W) or (H, W, C); must not be changed afterwards.
+            picture: Of the size and format promised; must not be changed afterwards.
             tick: Presentation time in ticks, greater than the last.
 
         Raises:
@@ -121,7 +109,7 @@ class VideoEncoder:
         )
         frame.pts = tick
         frame.time_base = _TIME_BASE
-        frame.color_range = FULL_RANGE
+        frame.color_range = color_range(self.recipe)
         for packet in self._stream.encode(frame):
             self._container.mux(packet)
         self.frames += 1
@@ -144,6 +132,41 @@ class VideoEncoder:
             self._container.close()
         except (FFmpegError, OSError):
             return
+
+
+def coded_size(recipe: Recipe, width: int, height: int) -> tuple[int, int]:
+    """Size of the coded pictures, which is even where chroma is halved."""
+    if recipe.pixel_format == "yuv420p":
+        return width + width % 2, height + height % 2
+    return width, height
+
+
+def color_range(recipe: Recipe) -> int:
+    """Number in ffmpeg of the range of the samples."""
+    return 2 if recipe.full_range else 1
+
+
+def configure(context: Any, recipe: Recipe, width: int, height: int, *, threads: int) -> None:
+    """Tell an encoder what it is to make; its options were given before.
+
+    Args:
+        context: PyAV's context of the encoder, not open yet.
+        recipe: Codec and options.
+        width: Columns of the coded pictures.
+        height: Rows of the coded pictures.
+        threads: Threads of the encoder.
+    """
+    context.width, context.height = width, height
+    context.pix_fmt = recipe.pixel_format
+    context.thread_count = threads
+    context.colorspace = _MATRICES[recipe.matrix]
+    context.color_primaries = _BT709
+    context.color_trc = _BT709
+    context.color_range = color_range(recipe)
+    if recipe.encoder == "libsvtav1":
+        # it prints to stderr on its own; errors reach us as return codes
+        os.environ.setdefault("SVT_LOG", "0")
+        context.options = {**context.options, "svtav1-params": f"lp={threads}"}
 
 
 def tool_versions() -> Mapping[str, str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from mp4ds.wire.base import WireError, text
+from mp4ds.wire.forms import WireError, text
 
 
 class Reader:
@@ -24,13 +24,18 @@ class Reader:
         self._order = order
         self._aligned = aligned
 
+    def align(self, size: int) -> int:
+        """Go to where the next primitive of that size stands; returns the offset."""
+        if self._aligned:
+            self.offset += -(self.offset - self._start) % size
+        return self.offset
+
     def take(self, code: str, count: int = 1) -> tuple[float, ...]:
         """Read `count` primitives of a struct code."""
         if count == 0:
             return ()
         size = struct.calcsize(code)
-        if self._aligned:
-            self.offset += -(self.offset - self._start) % size
+        self.align(size)
         end = self.offset + size * count
         if end > len(self._data):
             raise WireError(f"it ends at byte {len(self._data)}, inside of its fields")

@@ -1,33 +1,117 @@
-"""The table of serializations."""
+"""The tables of serializations and of the message types that they hold."""
 
 from __future__ import annotations
 
-from mp4ds.wire.base import Wire, WireError
-from mp4ds.wire.ros import RosWire
+from collections.abc import Callable, Mapping
 
-_ROS1 = RosWire("ros1", b"", "<", ros2=False)
-_CDR_LE = RosWire("cdr-le", b"\x00\x01\x00\x00", "<", ros2=True)
-_CDR_BE = RosWire("cdr-be", b"\x00\x00\x00\x00", ">", ros2=True)
+from mp4ds.records import Channel
+from mp4ds.wire.forms import CalibrationFields, CodedFields, Fields, Form, ImageFields, WireError
+from mp4ds.wire.ros import LAYOUTS, RosForm, RosWire
 
-WIRES: dict[str, Wire] = {wire.name: wire for wire in (_ROS1, _CDR_LE, _CDR_BE)}
-"""By the name that sidecars use (spec/registry.md, "Wires")."""
+_ROS = {
+    wire.name: wire
+    for wire in (
+        RosWire("ros1", b"", "<", ros2=False),
+        RosWire("cdr-le", b"\x00\x01\x00\x00", "<", ros2=True),
+        RosWire("cdr-be", b"\x00\x00\x00\x00", ">", ros2=True),
+    )
+}
+_FOXGLOVE: Mapping[str, type[Fields]] = {
+    "foxglove.RawImage": ImageFields,
+    "foxglove.CompressedImage": CodedFields,
+    "foxglove.CompressedVideo": CodedFields,
+    "foxglove.CameraCalibration": CalibrationFields,
+}
 
 
-def wire_for(message_encoding: str, data: memoryview) -> Wire:
-    """The wire of a payload.
+def _protobuf(type_name: str, schema: bytes) -> Form:
+    from mp4ds.wire.protobuf import ProtobufForm
+
+    return ProtobufForm(type_name, schema)
+
+
+def _json(type_name: str, schema: bytes) -> Form:
+    from mp4ds.wire.jsonform import JsonForm
+
+    return JsonForm(type_name, schema)
+
+
+def _flatbuffer(type_name: str, schema: bytes) -> Form:
+    from mp4ds.wire.flatbuffer import FlatbufferForm
+
+    return FlatbufferForm(type_name, schema)
+
+
+_OTHERS: Mapping[str, Callable[[str, bytes], Form]] = {
+    "protobuf": _protobuf,
+    "json": _json,
+    "flatbuffer": _flatbuffer,
+}
+
+WIRES = (*_ROS, *_OTHERS)
+"""Serializations, by the names that sidecars use (spec/registry.md, "Wires")."""
+
+
+def kind_of(channel: Channel) -> type[Fields] | None:
+    """What the channel's messages say: fields of raw images, coded ones, or calibrations.
+
+    Returns:
+        The class of their fields; None for a channel that is none of a camera's.
+    """
+    if channel.message_encoding in _OTHERS:
+        return _FOXGLOVE.get(channel.type_name)
+    entry = LAYOUTS.get(_ros_type(channel.type_name))
+    return entry[0] if entry else None
+
+
+def is_camera(channel: Channel) -> bool:
+    """Whether the channel's messages are images, raw or coded."""
+    return kind_of(channel) in (ImageFields, CodedFields)
+
+
+def is_calibration(channel: Channel) -> bool:
+    """Whether the channel's messages are calibrations."""
+    return kind_of(channel) is CalibrationFields
+
+
+def wire_of(message_encoding: str, data: memoryview) -> str:
+    """Name of the wire of a payload.
 
     Args:
-        message_encoding: The channel's, ``ros1`` or ``cdr``.
+        message_encoding: The channel's.
         data: The payload; CDR tells its byte order in its first bytes.
 
     Raises:
         WireError: No wire knows this serialization.
     """
-    if message_encoding == "ros1":
-        return _ROS1
+    if message_encoding == "ros1" or message_encoding in _OTHERS:
+        return message_encoding
     if message_encoding == "cdr":
-        for wire in (_CDR_LE, _CDR_BE):
-            if data[:4] == wire.prefix:
-                return wire
+        for wire in _ROS.values():
+            if wire.ros2 and data[:4] == wire.prefix:
+                return wire.name
         raise WireError(f"its CDR encapsulation {bytes(data[:4]).hex()} is not the plain one")
     raise WireError(f"serialization {message_encoding!r} is not modelled")
+
+
+def form_of(wire: str, type_name: str, schema: bytes) -> Form:
+    """The form of a message type in a serialization.
+
+    Args:
+        wire: One of `WIRES`.
+        type_name: As the source spells it.
+        schema: The recorded definition.
+
+    Raises:
+        WireError: The type is not modelled in that serialization.
+    """
+    if wire in _OTHERS:
+        return _OTHERS[wire](type_name, schema)
+    name = _ros_type(type_name)
+    if wire not in _ROS or name not in LAYOUTS:
+        raise WireError(f"type {type_name!r} is not modelled")
+    return RosForm(_ROS[wire], name)
+
+
+def _ros_type(name: str) -> str:
+    return name.replace("/msg/", "/")

@@ -1,0 +1,212 @@
+"""What a camera message holds, and to which stream it belongs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from mp4ds.coded import PNG_ENCODINGS, PictureParser, Refused, depth, jpeg, packet_codec, png
+from mp4ds.layouts import ENCODINGS, Pixels, padding_is_zero, pixel_view, why_not
+from mp4ds.records import Channel, Message
+from mp4ds.sidecar.fields import Body
+from mp4ds.streams.columns import Unsuited
+from mp4ds.streams.headers import Forms
+from mp4ds.video import JpegDecoder
+from mp4ds.wire import CodedFields, Form, ImageFields, Parts
+
+_MAX_PNG_REFUSALS = 20  # in a row
+
+
+@dataclass(frozen=True, slots=True)
+class StreamKey:
+    """What the messages of one stream have in common.
+
+    Attributes:
+        wire: Serialization.
+        body: What a message's body is to the video (spec/registry.md, "Bodies").
+        codec: Codec of packets; empty where the video is encoded here.
+        encoding: ROS image encoding of the frames.
+        width: Columns.
+        height: Rows.
+        step: Bytes per row.
+        is_bigendian: The byte as it stands.
+    """
+
+    wire: str
+    body: Body
+    codec: str
+    encoding: str
+    width: int
+    height: int
+    step: int
+    is_bigendian: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Wrap:
+    """What makes a body of a packet or of pixels, the same for many messages.
+
+    Attributes:
+        framing: Start codes and delimiters that an mp4 does not keep.
+        prefix: Bytes before the coded picture.
+        png: How its file was written.
+    """
+
+    framing: str = ""
+    prefix: bytes = b""
+    png: png.PngRecipe | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """A camera message, as far as its stream needs to know it.
+
+    Attributes:
+        key: Its stream's.
+        form: How it is serialized.
+        parts: What it consists of.
+        wrap: What its body has beside the packet or pixels.
+        pixels: Its pixels, shape as `mp4ds.layouts.pixel_view` gives it; None for a packet.
+        keyframe: Whether decoding can begin at its packet.
+        parameters: What a decoder needs to know before the packet.
+    """
+
+    key: StreamKey
+    form: Form
+    parts: Parts
+    wrap: Wrap = Wrap()
+    pixels: Pixels | None = None
+    keyframe: bool = True
+    parameters: bytes = b""
+
+
+class Looker:
+    """Looks into the messages of one channel.
+
+    Args:
+        channel: The channel.
+        transcode: Decode JPEG files instead of taking them as packets.
+    """
+
+    def __init__(self, channel: Channel, *, transcode: bool = False) -> None:
+        self._is_packets = not channel.type_name.endswith("CompressedImage")
+        self._forms = Forms(channel)
+        self._parsers: dict[str, PictureParser] = {}
+        self._png: png.PngRecipe | None = None
+        self._png_refusals = 0
+        self._jpeg = JpegDecoder() if transcode else None
+
+    def look(self, message: Message) -> Seen:
+        """What a message holds.
+
+        Raises:
+            Unsuited: No stream can carry it; says why.
+        """
+        form, parts = self._forms.split(message)
+        fields = parts.fields
+        try:
+            if isinstance(fields, ImageFields):
+                return _raw_image(form, parts, fields)
+            if isinstance(fields, CodedFields):
+                return self._kind_of(parts.body, fields)(form, parts)
+        except Refused as reason:
+            raise Unsuited(str(reason)) from None
+        raise Unsuited("it holds no image")
+
+    def leave_out(self, seen: Seen) -> None:
+        """Tell that no stream took what was seen last."""
+        if seen.key.codec in self._parsers:
+            self._parsers[seen.key.codec].leave_out()
+
+    def _kind_of(self, body: memoryview, fields: CodedFields) -> Callable[[Form, Parts], Seen]:
+        if self._is_packets:
+            codec = packet_codec(fields.format)
+            if codec != "mjpeg":
+                return lambda form, parts: self._packet(form, parts, codec)
+        elif bytes(body[: len(png.SIGNATURE)]) == png.SIGNATURE:
+            return self._png_image
+        elif "compressedDepth" in fields.format:
+            return self._depth_image
+        return self._jpeg_image
+
+    def _packet(self, form: Form, parts: Parts, codec: str) -> Seen:
+        if codec not in self._parsers:
+            self._parsers[codec] = PictureParser(codec)
+        parser = self._parsers[codec]
+        picture = parser.parse(parts.body)
+        return Seen(
+            _coded_key(form, "packet", codec, "rgb8", picture.width, picture.height),
+            form,
+            parts,
+            Wrap(framing=picture.framing),
+            keyframe=picture.keyframe,
+            parameters=parser.parameters,
+        )
+
+    def _jpeg_image(self, form: Form, parts: Parts) -> Seen:
+        found = jpeg.parse(parts.body)
+        encoding = "mono8" if found.components == 1 else "rgb8"
+        if self._jpeg is None:
+            key = _coded_key(form, "packet", "mjpeg", encoding, found.width, found.height)
+            return Seen(key, form, parts)
+        pixels = self._jpeg.decode(parts.body, encoding)
+        key = _coded_key(form, "jpeg", "", encoding, found.width, found.height)
+        return Seen(key, form, parts, pixels=pixels)
+
+    def _png_image(self, form: Form, parts: Parts) -> Seen:
+        with self._png_trial():
+            pixels, self._png = png.decode(parts.body, self._png)
+        height, width = pixels.shape[:2]
+        channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+        encoding = PNG_ENCODINGS[pixels.itemsize, channels]
+        key = _coded_key(form, "png", "", encoding, width, height)
+        return Seen(key, form, parts, Wrap(png=self._png), pixels=pixels)
+
+    @contextmanager
+    def _png_trial(self) -> Iterator[None]:
+        """Give up on a topic whose files are none that can be made again: trying is costly."""
+        if self._png_refusals == _MAX_PNG_REFUSALS:
+            raise Refused("PNG files of its topic do not rebuild")
+        try:
+            yield
+        except Refused:
+            self._png_refusals += 1
+            raise
+        self._png_refusals = 0
+
+    def _depth_image(self, form: Form, parts: Parts) -> Seen:
+        with self._png_trial():
+            image = depth.decode(parts.body, self._png)
+        self._png = image.recipe or self._png
+        height, width = image.pixels.shape
+        key = _coded_key(form, "png" if image.recipe else "rvl", "", "16UC1", width, height)
+        wrap = Wrap(prefix=image.header, png=image.recipe)
+        return Seen(key, form, parts, wrap, pixels=image.pixels)
+
+
+def _coded_key(
+    form: Form, body: Body, codec: str, encoding: str, width: int, height: int
+) -> StreamKey:
+    step = width * ENCODINGS[encoding].pixel_bytes
+    return StreamKey(form.wire, body, codec, encoding, width, height, step)
+
+
+def _raw_image(form: Form, parts: Parts, fields: ImageFields) -> Seen:
+    reason = why_not(
+        fields.encoding,
+        width=fields.width,
+        height=fields.height,
+        step=fields.step,
+        size=len(parts.body),
+    )
+    if reason:
+        raise Unsuited(reason)
+    encoding = ENCODINGS[fields.encoding]
+    size = {"width": fields.width, "height": fields.height, "step": fields.step}
+    if not padding_is_zero(parts.body, encoding, **size):
+        raise Unsuited("padding between its rows is not zero")
+    is_bigendian = fields.is_bigendian
+    pixels = pixel_view(parts.body, encoding, **size, is_bigendian=bool(is_bigendian))
+    key = StreamKey(form.wire, "pixels", "", fields.encoding, **size, is_bigendian=is_bigendian)
+    return Seen(key, form, parts, pixels=pixels)

@@ -1,0 +1,360 @@
+"""What a stream's video is made of: pictures that are encoded here, or packets as they came."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from mp4ds.bags.mcap_write import compressed_size
+from mp4ds.coded import Refused
+from mp4ds.errors import OptionError
+from mp4ds.layouts import ENCODINGS, Layout, bind, layout_for
+from mp4ds.plan import Quality, visual_setting
+from mp4ds.sidecar import Color, LayoutParameters
+from mp4ds.streams.columns import Unsuited
+from mp4ds.streams.look import Seen, StreamKey
+from mp4ds.video import PacketWriter, Recipe, VideoEncoder, choose, recipe_for
+from mp4ds.video.encoder import EncoderRefusedError
+
+_KEPT_JPEG = "JPEG files are kept as they are; --transcode encodes them anew"
+_NEGLIGIBLE = 1 / 50
+"""Of the raw size: a video as small as this is kept although zstd would be smaller still."""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSettings:
+    """How streams are to be encoded.
+
+    Attributes:
+        quality: What was asked for.
+        codec: Name of the codec, or None for the default.
+        preset: Preset of the encoder, or None for the default.
+        gop: Most frames between key frames.
+        threads: Threads of each encoder.
+        transcode: Whether JPEG topics are encoded anew.
+    """
+
+    quality: Quality
+    codec: str | None
+    preset: str | None
+    gop: int
+    threads: int
+    transcode: bool = False
+
+
+class Track(Protocol):
+    """A video being written."""
+
+    def refuses(self, seen: Seen) -> str | None:
+        """Why the track cannot carry a message exactly, or None if it can."""
+        ...
+
+    def write(self, seen: Seen, tick: int) -> None:
+        """Write a message's frame.
+
+        Args:
+            seen: The message.
+            tick: Presentation time in ticks, greater than the last.
+
+        Raises:
+            OSError: The disk refused.
+        """
+        ...
+
+    def close(self) -> None:
+        """Finish the file.
+
+        Raises:
+            OSError: The disk refused.
+        """
+        ...
+
+    def abandon(self) -> None:
+        """Close the file as it is; the caller removes it."""
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """What `mp4ds.sidecar.Video` says of it, but for the file."""
+        ...
+
+
+class TrackPlan(Protocol):
+    """How a track may be made."""
+
+    @property
+    def profile(self) -> str:
+        """What the stream's sidecar calls it."""
+        ...
+
+    @property
+    def exact(self) -> bool:
+        """Whether messages come back to the byte."""
+        ...
+
+    @property
+    def note(self) -> str:
+        """What the user should know of it; empty if nothing."""
+        ...
+
+    def open(self, path: Path, seen: Seen, settings: StreamSettings, rate: float | None) -> Track:
+        """Begin the file.
+
+        Args:
+            path: The video to make.
+            seen: The first message.
+            settings: How to encode.
+            rate: Frames per second, where known.
+
+        Raises:
+            Unsuited: The encoder does not take such pictures.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class PicturePlan:
+    """Pictures, encoded here. See `TrackPlan`."""
+
+    layout: Layout
+    recipe: Recipe
+    profile: str
+    exact: bool
+    note: str = ""
+
+    def open(self, path: Path, seen: Seen, settings: StreamSettings, rate: float | None) -> Track:
+        """See `TrackPlan.open`."""
+        return _PictureTrack(self, path, seen.key, settings, rate)
+
+
+class _PictureTrack:
+    """See `Track`."""
+
+    def __init__(
+        self,
+        plan: PicturePlan,
+        path: Path,
+        key: StreamKey,
+        settings: StreamSettings,
+        rate: float | None,
+    ) -> None:
+        self._plan = plan
+        self._layout = plan.layout
+        width, height = self._layout.picture_size(key.width, key.height)
+        try:
+            self._encoder = VideoEncoder(
+                path,
+                plan.recipe,
+                picture_format=self._layout.pixel_format,
+                width=width,
+                height=height,
+                gop=settings.gop,
+                threads=settings.threads,
+                rate=rate,
+            )
+        except EncoderRefusedError as error:
+            path.unlink(missing_ok=True)
+            raise Unsuited(str(error)) from None
+
+    def refuses(self, seen: Seen) -> str | None:
+        """See `Track.refuses`."""
+        if seen.pixels is None:
+            return "it has no pixels"
+        return self._layout.refuses(seen.pixels)
+
+    def write(self, seen: Seen, tick: int) -> None:
+        """See `Track.write`."""
+        if seen.pixels is not None:
+            self._encoder.write(self._layout.to_picture(seen.pixels), tick)
+
+    def close(self) -> None:
+        """See `Track.close`."""
+        self._encoder.close()
+
+    def abandon(self) -> None:
+        """See `Track.abandon`."""
+        self._encoder.abandon()
+
+    def describe(self) -> dict[str, Any]:
+        """See `Track.describe`."""
+        layout, recipe = self._layout, self._plan.recipe
+        values = layout.parameters.to_values()
+        return {
+            "layout": layout.name,
+            "parameters": LayoutParameters.model_validate(values) if values else None,
+            "codec": recipe.codec,
+            "pixel_format": recipe.pixel_format,
+            "width": self._encoder.width,
+            "height": self._encoder.height,
+            "color": _color(recipe) if layout.is_shown else None,
+            "encoder": recipe.encoder,
+            "options": self._encoder.options,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class PacketPlan:
+    """Packets as they came. See `TrackPlan`."""
+
+    profile: str = "lossless"
+    exact: bool = True
+    note: str = ""
+
+    def open(self, path: Path, seen: Seen, settings: StreamSettings, rate: float | None) -> Track:
+        """See `TrackPlan.open`."""
+        return _PacketTrack(path, seen, rate)
+
+
+class _PacketTrack:
+    """See `Track`."""
+
+    def __init__(self, path: Path, seen: Seen, rate: float | None) -> None:
+        self._key = seen.key
+        self._begun = False
+        self._writer = PacketWriter(
+            path,
+            seen.key.codec,
+            width=seen.key.width,
+            height=seen.key.height,
+            parameters=seen.parameters,
+            rate=rate,
+        )
+
+    def refuses(self, seen: Seen) -> str | None:
+        """See `Track.refuses`."""
+        if not self._begun:
+            try:
+                self._writer.begin(seen.parts.body)
+            except Refused as reason:
+                return str(reason)
+            self._begun = True
+        return None
+
+    def write(self, seen: Seen, tick: int) -> None:
+        """See `Track.write`."""
+        self._writer.write(seen.parts.body, tick, keyframe=seen.keyframe)
+
+    def close(self) -> None:
+        """See `Track.close`."""
+        self._writer.close()
+
+    def abandon(self) -> None:
+        """See `Track.abandon`."""
+        self._writer.abandon()
+
+    def describe(self) -> dict[str, Any]:
+        """See `Track.describe`."""
+        key = self._key
+        return {
+            "layout": layout_for(ENCODINGS[key.encoding], lossless=False).name,
+            "codec": key.codec,
+            "width": key.width,
+            "height": key.height,
+        }
+
+
+def needs_trial(seen: Seen, settings: StreamSettings) -> bool:
+    """Whether `plan_tracks` is better for having several messages."""
+    if seen.pixels is None:
+        return False
+    return seen.key.body != "jpeg" and _is_lossless(seen.key.encoding, settings)
+
+
+def _is_lossless(encoding: str, settings: StreamSettings) -> bool:
+    return settings.quality.lossless or ENCODINGS[encoding].lossy is None
+
+
+def plan_tracks(
+    samples: Sequence[Seen], settings: StreamSettings, rate: float | None
+) -> list[TrackPlan]:
+    """How the messages of one key are stored in videos.
+
+    Args:
+        samples: The first messages, at least one.
+        settings: What was asked for.
+        rate: Frames per second, where known.
+
+    Returns:
+        The best plan first; the last one takes every message of the key.
+
+    Raises:
+        Unsuited: A video would be larger than the messages are by zstd.
+    """
+    first = samples[0]
+    if first.pixels is None:
+        can_shrink = first.key.codec == "mjpeg" and not settings.quality.lossless
+        return [PacketPlan(note=_KEPT_JPEG if can_shrink else "")]
+    if not _is_lossless(first.key.encoding, settings):
+        return [_lossy_plan(first.key, settings, rate)]
+    return _lossless_plans(samples, settings)
+
+
+def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) -> PicturePlan:
+    quality = settings.quality
+    layout = layout_for(ENCODINGS[key.encoding], lossless=False)
+    crf, preset = quality.crf, settings.preset
+    if quality.name == "visual":
+        crf, table_preset = visual_setting(rate)
+        if settings.codec in (None, "av1"):
+            preset = preset or str(table_preset)
+    recipe = recipe_for(
+        layout.pixel_format, lossless=False, codec=settings.codec, crf=crf, preset=preset
+    )
+    return PicturePlan(layout, recipe, str(quality), exact=False)
+
+
+def _lossless_plans(samples: Sequence[Seen], settings: StreamSettings) -> list[TrackPlan]:
+    encoding = ENCODINGS[samples[0].key.encoding]
+    pixels = [seen.pixels for seen in samples if seen.pixels is not None]
+    asked = settings.quality.lossless
+    note = "" if asked else f"{encoding.name} is kept lossless"
+    gop, threads = settings.gop, settings.threads
+    try:
+        best = choose(
+            pixels,
+            encoding,
+            codec=settings.codec if asked else None,  # else they were meant for lossy videos
+            preset=settings.preset if asked else None,
+            gop=gop,
+            threads=threads,
+        )
+    except OptionError as error:
+        best = choose(pixels, encoding, codec=None, preset=None, gop=gop, threads=threads)
+        note = "; ".join(filter(None, (note, f"coded as {best.recipe.codec}: {error}")))
+    except EncoderRefusedError as error:
+        raise Unsuited(str(error)) from None
+    _refuse_noise(samples, best.bytes_per_frame)
+    layout = bind(best.layout, encoding, best.parameters)
+    plan = PicturePlan(layout, best.recipe, "lossless", exact=True, note=note)
+    general = layout_for(encoding, lossless=True)
+    if general.name == layout.name:
+        return [plan]
+    recipe = recipe_for(general.pixel_format, lossless=True)
+    return [plan, PicturePlan(general, recipe, "lossless", exact=True)]
+
+
+def _refuse_noise(samples: Sequence[Seen], video_size: float) -> None:
+    """Refuse what a video would not make smaller.
+
+    Raises:
+        Unsuited: Tells both sizes.
+    """
+    bodies = [seen.parts.body for seen in samples]
+    raw = sum(map(len, bodies)) / len(bodies)
+    if video_size <= raw * _NEGLIGIBLE:
+        return
+    verbatim = compressed_size(bodies) / len(bodies)
+    if video_size > verbatim:
+        raise Unsuited(
+            f"a video would not be smaller: about {video_size / verbatim:.2f} times as large"
+        )
+
+
+def _color(recipe: Recipe) -> Color:
+    return Color(
+        primaries="bt709",
+        transfer="bt709",
+        matrix=recipe.matrix,
+        range="full" if recipe.full_range else "limited",
+    )

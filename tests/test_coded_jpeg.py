@@ -1,0 +1,165 @@
+"""JPEG: what is told of it, and what is refused."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from rosbags.rosbag1 import Reader
+
+from coded_tools import decodes, jpeg, mutations, refusal, scene
+from conftest import real
+from mp4ds.coded.jpeg import parse
+
+PICTURE = next(scene(1))
+BASE = jpeg(PICTURE, subsampling=2)
+FRAME_HEADER = BASE.index(b"\xff\xc0")
+
+
+def patched(**changes: int) -> bytes:
+    """The base with bytes of its frame header changed: marker at 1, precision at 4 ..."""
+    data = bytearray(BASE)
+    for name, value in changes.items():
+        data[FRAME_HEADER + int(name[2:])] = value
+    return bytes(data)
+
+
+def exif() -> bytes:
+    tags = Image.Exif()
+    tags[0x010E] = "a wall " * 99
+    return jpeg(PICTURE, exif=tags.tobytes())
+
+
+KINDS: dict[str, tuple[bytes, dict[str, Any]]] = {
+    "444": (jpeg(PICTURE, subsampling=0), {"sampling": "444"}),
+    "422": (jpeg(PICTURE, subsampling=1), {"sampling": "422"}),
+    "420": (jpeg(PICTURE, subsampling=2), {"sampling": "420", "components": 3}),
+    "grey": (jpeg(PICTURE[..., 0]), {"sampling": "gray", "components": 1}),
+    "progressive": (jpeg(PICTURE, progressive=True), {"process": "progressive"}),
+    "optimized": (jpeg(PICTURE, optimize=True), {"process": "baseline"}),
+    "rgb": (jpeg(PICTURE, keep_rgb=True), {"sampling": "444"}),
+    "restarts": (jpeg(PICTURE, restart_marker_blocks=3), {}),
+    "exif": (exif(), {}),
+    "comment": (jpeg(PICTURE, comment=b"\xff\xd8 no image \xff\xd9"), {}),
+    "trailing": (BASE + b"\0\xff\xd8 more", {"trailing": 8}),
+    "extended": (patched(at1=0xC1), {"process": "extended"}),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_headers_are_read(kind: str) -> None:
+    data, expected = KINDS[kind]
+    info = parse(memoryview(data))
+    assert (info.width, info.height, info.precision) == (64, 48, 8)
+    assert info.trailing == expected.get("trailing", 0)
+    for name, value in expected.items():
+        assert getattr(info, name) == value
+    assert decodes("mjpeg", [data]) == 1
+
+
+@pytest.mark.parametrize("sampling", ["411", "420", "422", "440", "444"])
+def test_sampling_of_opencv(sampling: str) -> None:
+    factor = getattr(cv2, f"IMWRITE_JPEG_SAMPLING_FACTOR_{sampling}")
+    data = cv2.imencode(".jpg", PICTURE, [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, factor])[1].tobytes()
+    assert parse(data).sampling == sampling
+    context: Any = av.CodecContext.create("mjpeg", "r")
+    frames = [*context.decode(av.Packet(data)), *context.decode(None)]
+    assert sampling in frames[0].format.name
+
+
+FACTORS = [across << 4 | down for across in range(1, 5) for down in range(1, 5)]
+
+
+@pytest.mark.parametrize("luma", FACTORS)
+def test_every_sampling_taken_is_one_that_decodes(luma: int) -> None:
+    taken = 0
+    for chroma in FACTORS:
+        for last in {chroma, 0x11}:
+            data = patched(at11=luma, at14=chroma, at17=last)
+            if refusal(parse, data):
+                continue
+            taken += 1
+            assert decodes("mjpeg", [data]) == 1
+    assert taken or luma not in (0x11, 0x12, 0x21, 0x22, 0x41)
+
+
+def test_tables_may_be_absent() -> None:
+    """As USB cameras send motion JPEG."""
+    data = jpeg(PICTURE)
+    segments = re.compile(rb"\xff\xc4(..)", re.DOTALL)
+    while found := segments.search(data):
+        end = found.end() - 2 + int.from_bytes(found[1], "big")
+        data = data[: found.start()] + data[end:]
+    assert parse(data).width == 64
+    assert decodes("mjpeg", [data]) == 1
+
+
+def test_fill_bytes_before_markers() -> None:
+    at = BASE.index(b"\xff\xdb")
+    assert parse(BASE[:at] + b"\xff\xff" + BASE[at:]).width == 64
+    assert parse(BASE[:-2] + b"\xff\xff" + BASE[-2:]).trailing == 0
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"", "no JPEG"),
+        (b"\x89PNG", "no JPEG"),
+        (b"\0" + BASE, "no JPEG"),
+        (b"\xff\xd8\xff\xd9", "no picture"),
+        (BASE[:FRAME_HEADER] + BASE[FRAME_HEADER + 19 :], "before its frame header"),
+        (BASE[: FRAME_HEADER + 19] + BASE[FRAME_HEADER:], "two pictures"),
+        (BASE[: FRAME_HEADER + 19] + b"\xff\xd9", "no picture"),
+        (BASE[:-2], "cut short"),
+        (BASE[:2] + BASE, "marker 0xFFD8"),
+        (patched(at1=0xC3), "lossless"),
+        (patched(at1=0xC5), "hierarchical"),
+        (patched(at1=0xC9), "arithmetic"),
+        (patched(at1=0xCA), "arithmetic"),
+        (patched(at1=0xCC), "arithmetic"),
+        (patched(at4=12), "12 bits"),
+        (patched(at5=0, at6=0), "64x0"),
+        (patched(at7=0xFF), "pixels"),
+        (patched(at9=4), "wrong length"),
+        (patched(at11=0x33), "sampling 3x3 1x1 1x1"),
+        (patched(at3=9), "length"),
+        (b"\xff\xd8" + b"\xff\xe0\0\2" * 70_000 + BASE[2:], "segments"),
+        (b"\xff" * 10**7, "no JPEG"),
+        (b"\xff\xd8" + b"\xff" * 10**7, "cut short"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_refusals(data: bytes, reason: str) -> None:
+    assert reason in refusal(parse, data)
+
+
+def test_cmyk_is_refused() -> None:
+    data = jpeg(np.zeros((48, 64, 4), np.uint8), mode="CMYK")
+    assert "4 colour components" in refusal(parse, data)
+
+
+@pytest.mark.parametrize("kind", ["420", "progressive", "exif", "restarts"])
+def test_every_cut_is_refused(kind: str) -> None:
+    data = KINDS[kind][0]
+    for length in range(len(data)):
+        assert refusal(parse, data[:length])
+
+
+@pytest.mark.parametrize("kind", ["420", "progressive", "exif"])
+def test_damage_is_refused_or_read(kind: str) -> None:
+    for damaged in mutations(KINDS[kind][0], 600):
+        refusal(parse, damaged)  # and raises nothing else
+
+
+def test_real_camera() -> None:
+    with Reader(real("bags/fiducials_aruco_marker_raspicam.bag")) as reader:
+        topics = [c for c in reader.connections if c.topic.endswith("compressed")]
+        payloads = [payload for _, _, payload in reader.messages(connections=topics)]
+    data = payloads[0][payloads[0].index(b"\xff\xd8") :]
+    info = parse(data)
+    assert (info.width, info.height, info.sampling, info.trailing) == (1280, 720, "420", 0)

@@ -1,0 +1,383 @@
+"""Packets of video codecs: key frames, sizes, order, and what no mp4 carries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import pytest
+from av.bitstream import BitStreamFilterContext
+
+from coded_tools import (
+    ENCODINGS,
+    IN_ORDER,
+    Encoding,
+    Packet,
+    encode,
+    hide,
+    mutations,
+    refusal,
+    superframe,
+)
+from conftest import real
+from mp4ds.coded import PACKET_CODECS, PictureParser, Refused, annexb, av1, h264, h265, vp9
+from mp4ds.coded.pictures import REORDERED, NoPicture
+
+VIDEO = [name for name in IN_ORDER if ENCODINGS[name].codec in ("h264", "h265", "av1", "vp9")]
+UNITS = {"h264": h264, "h265": h265}
+START = b"\0\0\0\1"
+
+
+def first_refused(codec: str, bodies: list[bytes]) -> int | None:
+    parser = PictureParser(codec)
+    for number, body in enumerate(bodies):
+        if refusal(parser.parse, body):
+            return number
+    return None
+
+
+def without(codec: str, body: bytes, *kinds: int) -> bytes:
+    """A body without NAL units of some types."""
+    units = annexb.split(body)[0]
+    return annexb.join_plain([u for u in units if UNITS[codec].unit_type(u) not in kinds])
+
+
+@pytest.mark.parametrize("name", IN_ORDER)
+@pytest.mark.parametrize(("width", "height"), [(64, 48), (66, 50), (322, 178)])
+def test_streams_in_order(name: str, width: int, height: int) -> None:
+    encoding = ENCODINGS[name]
+    packets = encode(encoding, frames=11, width=width, height=height)
+    parser = PictureParser(encoding.codec)
+    for packet in packets:
+        picture = parser.parse(memoryview(packet.data))
+        assert (picture.width, picture.height) == (width, height)
+        assert picture.keyframe == (packet.keyframe or encoding.codec in ("mjpeg", "png"))
+
+
+def test_every_codec_is_tried() -> None:
+    assert {ENCODINGS[name].codec for name in IN_ORDER} == set(PACKET_CODECS)
+    with pytest.raises(ValueError, match=r"ffv1.*h264"):
+        PictureParser("ffv1")
+
+
+@pytest.mark.parametrize("name", [name for name in ENCODINGS if name not in IN_ORDER])
+def test_pictures_out_of_order(name: str) -> None:
+    """All are refused from the first that is sent after one shown later."""
+    encoding = ENCODINGS[name]
+    packets = encode(encoding, frames=12, gop=12)
+    parser = PictureParser(encoding.codec)
+    reasons = [refusal(parser.parse, packet.data) for packet in packets]
+    times = [packet.pts for packet in packets]
+    first = next(n for n in range(1, len(times)) if times[n] < times[n - 1])
+    assert reasons[:first] == [""] * first
+    assert set(reasons[first:]) == {REORDERED}
+
+
+@pytest.mark.parametrize("name", ["h264-b", "h265-b"])
+def test_reordering_that_is_allowed_but_not_done(name: str) -> None:
+    """Past the wrap of the picture order count, over several key frames."""
+    packets = encode(ENCODINGS[name], frames=150, gop=140, all_p=True)
+    assert [packet.pts for packet in packets] == list(range(150))
+    assert first_refused(ENCODINGS[name].codec, [packet.data for packet in packets]) is None
+
+
+@pytest.mark.parametrize("name", ["h264", "h264-b"])
+def test_parameters_that_do_not_tell_of_reordering(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    packets = [packet.data for packet in encode(ENCODINGS[name], frames=40, gop=30)]
+    expected = first_refused("h264", packets)
+    monkeypatch.setattr(h264, "_vui_reorder", lambda reader: None)
+    assert first_refused("h264", packets) == expected
+    assert (expected is None) == ENCODINGS[name].in_order
+
+    def cut_short(reader: object) -> None:
+        raise Refused("cut short")
+
+    monkeypatch.setattr(h264, "_vui_reorder", cut_short)
+    assert first_refused("h264", packets) == expected
+
+
+REAL = {
+    "bt709_full_range.mp4": "h264",
+    "carnd_solidWhiteRight.mp4": "h264",
+    "decord_rotated90.mov": "h264",
+    "h264_10bits.mp4": "h264",
+    "intel_car-detection.mp4": "h264",
+    "lerobot_aloha_insertion_human_yuv444.mp4": "h264",
+    "nasa_13013.mp4": "h264",
+    "sam2_02_cups.mp4": "h264",
+    "var_fps_video.mp4": "h264",
+    "h265_video.mp4": "h265",
+    "av1_video.mkv": "av1",
+    "lerobot_follower_wrist_ep4_1frame_av1.mp4": "av1",
+}
+
+
+def packets_of(path: Path, codec: str) -> tuple[list[Packet], tuple[int, int]]:
+    """The packets of a real video as they are sent without a container."""
+    packets: list[Packet] = []
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        context: Any = stream.codec_context
+        names = {"h264": "h264_mp4toannexb", "h265": "hevc_mp4toannexb"}
+        unpack = BitStreamFilterContext(names[codec], stream) if codec in names else None
+        for packet in container.demux(stream):
+            found: list[Any] = [packet] if packet.size else []
+            if unpack:
+                found = list(unpack.filter(packet if packet.size else None))
+            packets += [Packet(bytes(p), p.is_keyframe, p.pts) for p in found]
+        return packets, (context.width, context.height)
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_videos(name: str) -> None:
+    """Refused exactly from the first picture that is out of order."""
+    packets, size = packets_of(real(f"video/{name}"), REAL[name])
+    times = [packet.pts for packet in packets]
+    expected = next((n for n in range(1, len(times)) if times[n] < times[n - 1]), len(times))
+    parser = PictureParser(REAL[name])
+    for number, packet in enumerate(packets):
+        if number >= expected:
+            assert refusal(parser.parse, packet.data) == REORDERED
+            continue
+        picture = parser.parse(packet.data)
+        assert (picture.width, picture.height) == size
+        assert picture.keyframe == packet.keyframe
+
+
+# ---------------------------------------------------------------- beginnings and gaps
+
+
+@pytest.mark.parametrize("name", VIDEO)
+def test_a_video_begins_with_a_key_frame(name: str) -> None:
+    packets = encode(ENCODINGS[name])
+    parser = PictureParser(ENCODINGS[name].codec)
+    keys = [number for number, packet in enumerate(packets) if packet.keyframe]
+    for packet in packets[1 : keys[1]]:
+        assert refusal(parser.parse, packet.data)
+    assert parser.parse(packets[keys[1]].data).keyframe
+
+
+@pytest.mark.parametrize("name", VIDEO)
+def test_after_a_gap_the_next_key_frame_is_awaited(name: str) -> None:
+    codec = ENCODINGS[name].codec
+    packets = encode(ENCODINGS[name])
+    second = next(n for n, packet in enumerate(packets) if n and packet.keyframe)
+    assert second > 2
+    for lose in (PictureParser.leave_out, lambda parser: refusal(parser.parse, b"\xff junk")):
+        parser = PictureParser(codec)
+        parser.parse(packets[0].data)
+        lose(parser)
+        for packet in packets[1:second]:
+            assert "pictures before it" in refusal(parser.parse, packet.data)
+        assert parser.parse(packets[second].data).keyframe
+
+
+@pytest.mark.parametrize("codec", ["h264", "h265"])
+def test_parameters_sent_apart(codec: str) -> None:
+    """They are kept in mind; the packet that holds nothing else is no frame."""
+    kinds = (7, 8) if codec == "h264" else (32, 33, 34)
+    body = encode(ENCODINGS[codec], frames=1)[0].data
+    units = annexb.split(body)[0]
+    is_parameter = [UNITS[codec].unit_type(unit) in kinds for unit in units]
+    alone = annexb.join_plain([u for u, chosen in zip(units, is_parameter, strict=True) if chosen])
+    parser = PictureParser(codec)
+    assert "parameter sets were not sent" in refusal(parser.parse, without(codec, body, *kinds))
+    assert parser.parameters == b""
+    with pytest.raises(NoPicture):
+        parser.parse(alone)
+    assert parser.parameters == alone
+    assert parser.parse(without(codec, body, *kinds)).keyframe
+    assert parser.parse(body).keyframe
+
+
+@pytest.mark.parametrize("codec", ["h264", "h265"])
+@pytest.mark.parametrize("kind", [0, 1, 2])
+def test_each_kind_of_parameters_is_needed(codec: str, kind: int) -> None:
+    kinds = (7, 8, 8) if codec == "h264" else (32, 33, 34)
+    body = encode(ENCODINGS[codec], frames=1)[0].data
+    reason = refusal(PictureParser(codec).parse, without(codec, body, kinds[kind]))
+    assert "parameter sets were not sent" in reason
+
+
+@pytest.mark.parametrize("codec", ["h264", "h265"])
+def test_remarks_and_filler_do_not_matter(codec: str) -> None:
+    filler = b"\x0c\xff\xff\x80" if codec == "h264" else b"\x4c\x01\xff\xff\x80"
+    packets = encode(ENCODINGS[codec], frames=3)
+    parser = PictureParser(codec)
+    for packet in packets:
+        body = packet.data + b"\0\0\1" + filler + b"\0\0"
+        assert parser.parse(body).framing.endswith(" 3 +2")
+        with pytest.raises(NoPicture):
+            parser.parse(START + filler)  # which leaves no gap
+
+
+@pytest.mark.parametrize("codec", ["h264", "h265", "av1"])
+def test_two_pictures_in_one_packet(codec: str) -> None:
+    packets = encode(ENCODINGS[codec], frames=3)
+    parser = PictureParser(codec)
+    parser.parse(packets[0].data)
+    both = packets[1].data + packets[2].data.removeprefix(av1.DELIMITER)
+    assert "more than one picture" in refusal(parser.parse, both)
+
+
+def test_a_part_of_a_picture() -> None:
+    packets = encode(ENCODINGS["h264-slices"], frames=2)
+    parser = PictureParser("h264")
+    parser.parse(packets[0].data)
+    slices = annexb.split(packets[1].data)[0]
+    assert len(slices) > 2
+    assert "part of one" in refusal(parser.parse, annexb.join_plain(slices[-2:]))
+
+
+def test_fields_are_refused() -> None:
+    interlaced = Encoding("h264", "libx264", {"bf": "0", "x264-params": "interlaced=1"})
+    body = encode(interlaced, frames=1)[0].data
+    sps = next(u for u in annexb.split(body)[0] if h264.unit_type(u) == h264.SPS)
+    assert not h264.parse_sps(sps).frames_only
+    parser = PictureParser("h264")
+    assert parser.parse(body).height == 48  # a whole picture, although fields could be coded
+    units = annexb.split(body)[0]
+    at = next(n for n, unit in enumerate(units) if h264.unit_type(unit) == h264.IDR)
+    bits = bin(int.from_bytes(b"\1" + units[at], "big"))[3:]
+    # first_mb 0, slice type, PPS 0, then frame_num of four bits and the flag
+    place = 8 + 1 + 7 + 1 + h264.parse_sps(sps).frame_num_bits
+    assert bits[9 : 9 + 7] == "0001000"  # slice type 7: I
+    field = bits[:place] + "1" + bits[place + 1 :]
+    units[at] = int(field, 2).to_bytes(len(units[at]), "big")
+    assert "field" in refusal(PictureParser("h264").parse, annexb.join_plain(units))
+
+
+def test_a_picture_that_is_not_shown() -> None:
+    packets = [packet.data for packet in encode(ENCODINGS["vp9"], frames=4, gop=9)]
+    parser = PictureParser("vp9")
+    parser.parse(packets[0])
+    with pytest.raises(NoPicture, match="shows no picture"):
+        parser.parse(hide(packets[1]))
+    both = superframe(packets[1], packets[2])
+    assert list(vp9.split_superframe(memoryview(both))) == [hide(packets[1]), packets[2]]
+    assert not parser.parse(both).keyframe
+    assert parser.parse(packets[3]).width == 64
+    several = bytearray(both)
+    several[0] |= 2
+    assert "more than one picture" in refusal(parser.parse, bytes(several))
+    assert "superframe" in refusal(parser.parse, b"\x86" + both)
+
+
+# ---------------------------------------------------------------- AV1
+
+
+def obu(kind: int, payload: bytes = b"", flags: int = 2) -> bytes:
+    return bytes([kind << 3 | flags, len(payload)]) + payload
+
+
+UNIT = encode(ENCODINGS["av1"], frames=1)[0].data
+
+
+def test_delimiters_are_a_framing() -> None:
+    assert UNIT.startswith(av1.DELIMITER)
+    bare, framing = av1.strip(UNIT)
+    assert (bytes(bare), framing) == (UNIT[2:], "td")
+    assert av1.strip(bare) == (bare, "")
+    assert av1.join(bytes(bare), framing) == UNIT
+    assert av1.join(bytes(bare), "") == bare
+    assert refusal(av1.join, bytes(bare), "dt")
+    assert PictureParser("av1").parse(UNIT).framing == "td"
+    assert PictureParser("av1").parse(bare).framing == ""
+
+
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        (UNIT + av1.DELIMITER, "temporal delimiter inside"),
+        (av1.DELIMITER + UNIT, "temporal delimiter inside"),
+        (UNIT + obu(15, b"\0\0"), "padding"),
+        (UNIT + obu(8, b"\0\0"), "tile list"),
+        (UNIT + obu(7, b"\0\0"), "redundant"),
+        (UNIT + obu(9, b"\0\0"), "unknown kind 9"),
+        (UNIT + obu(0, b"\0\0"), "unknown kind 0"),
+        (UNIT + obu(5, b"\0\0", flags=0), "size"),
+        (UNIT + b"\xff\xff", "reserved"),
+        (UNIT + b"\x2b\0", "reserved"),
+        (UNIT[:-1], "cut short"),
+        (UNIT + b"\x2a", "cut short"),
+        (UNIT + b"\x2a" + b"\xff" * 9, "cut short"),
+        (UNIT + obu(5) * 5000, "more than"),
+        (b"", "no picture"),
+        (av1.DELIMITER, "no picture"),
+        (av1.DELIMITER + av1.sequence_header(UNIT), "no picture"),
+        (av1.DELIMITER + obu(6, b"\x10"), "sequence header was not sent"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_no_mp4_keeps_of_av1(body: bytes, reason: str) -> None:
+    assert reason in refusal(PictureParser("av1").parse, body)
+
+
+def test_metadata_are_kept() -> None:
+    header = av1.sequence_header(UNIT)
+    at = 2 + len(header)
+    assert UNIT[2:at] == header
+    assert PictureParser("av1").parse(UNIT[:at] + obu(5, b"\4\1") + UNIT[at:]).keyframe
+    assert av1.sequence_header(obu(5)) == b""
+
+
+def test_a_key_frame_without_its_header() -> None:
+    """Decoders cannot begin there, whatever the track says."""
+    packets = [packet.data for packet in encode(ENCODINGS["av1"], frames=8)]
+    bare = [packet.replace(av1.sequence_header(UNIT), b"") for packet in packets]
+    parser = PictureParser("av1")
+    assert refusal(parser.parse, bare[0])
+    assert refusal(parser.parse, av1.DELIMITER + av1.sequence_header(UNIT))
+    assert refusal(parser.parse, bare[0])
+    assert parser.parse(packets[0]).keyframe
+    assert not any(parser.parse(packet).keyframe for packet in bare[1:])
+
+
+# ---------------------------------------------------------------- VP9
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda body: b"", "empty"),
+        (lambda body: b"\0" + body, "marker"),
+        (lambda body: body[:1], "inside of a header"),
+        (lambda body: body[:2] + b"\0" + body[3:], "sync code"),
+        (lambda body: body + b"\xc9\0\0\0\0\xc9", "superframe"),
+        (lambda body: bytes([body[0] | 0x30]) + body[1:], ""),
+    ],
+)
+def test_what_is_no_vp9(change: Callable[[bytes], bytes], reason: str) -> None:
+    body = encode(ENCODINGS["vp9"], frames=1)[0].data
+    assert not refusal(PictureParser("vp9").parse, body)
+    refused = refusal(PictureParser("vp9").parse, change(body))
+    assert reason in refused
+    assert refused
+
+
+@pytest.mark.parametrize("name", ["vp9", "vp9-rgb", "av1", "h264", "h265"])
+def test_damage_is_refused_or_read(name: str) -> None:
+    packets = encode(ENCODINGS[name], frames=2)
+    for packet in packets:
+        for damaged in mutations(packet.data, 300, head=120):
+            parser = PictureParser(ENCODINGS[name].codec)
+            refusal(parser.parse, packets[0].data)
+            refusal(parser.parse, damaged)  # and raises nothing else
+
+
+@pytest.mark.parametrize("name", ["h264-hrd", "h264-matrix", "h264-10bit", "h265-gray12"])
+def test_every_cut_of_parameters_is_refused_or_read(name: str) -> None:
+    codec = ENCODINGS[name].codec
+    units = annexb.split(encode(ENCODINGS[name], frames=1)[0].data)[0]
+    sps = next(u for u in units if UNITS[codec].unit_type(u) in (h264.SPS, h265.SPS))
+    whole = UNITS[codec].parse_sps(sps)
+    assert (whole.width, whole.height) == (64, 48)
+    assert whole.reorder == 0
+    for length in range(1, 8):
+        assert refusal(UNITS[codec].parse_sps, sps[:length])
+    for damaged in mutations(sps, 400):
+        refusal(UNITS[codec].parse_sps, damaged)

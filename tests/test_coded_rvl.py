@@ -1,0 +1,149 @@
+"""RVL against a plain reference, written from the paper."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+from numpy.typing import NDArray
+
+from coded_tools import mutations, refusal
+from mp4ds.coded import Refused
+from mp4ds.coded.rvl import decode, encode
+
+Depth = NDArray[np.uint16]
+
+
+def nibbles_of(value: int) -> list[int]:
+    """A number in groups of three bits, the lowest first."""
+    groups = [value & 7]
+    while value := value >> 3:
+        groups[-1] |= 8
+        groups.append(value & 7)
+    return groups
+
+
+def reference(depth: Depth) -> bytes:
+    """The coder of the paper, pixel by pixel."""
+    pixels = depth.reshape(-1).tolist()
+    nibbles: list[int] = []
+    at = previous = 0
+    while at < len(pixels):
+        start = at
+        while at < len(pixels) and not pixels[at]:
+            at += 1
+        nibbles += nibbles_of(at - start)
+        start = at
+        while at < len(pixels) and pixels[at]:
+            at += 1
+        nibbles += nibbles_of(at - start)
+        for value in pixels[start:at]:
+            delta = value - previous
+            nibbles += nibbles_of((delta << 1) ^ (delta >> 31))
+            previous = value
+    rows, columns = depth.shape
+    return struct.pack("<II", columns, rows) + packed(nibbles)
+
+
+def packed(nibbles: list[int]) -> bytes:
+    nibbles = nibbles + [0] * (-len(nibbles) % 8)
+    words = []
+    for start in range(0, len(nibbles), 8):
+        word = 0
+        for nibble in nibbles[start : start + 8]:
+            word = word << 4 | nibble
+        words.append(word)
+    return struct.pack(f"<{len(words)}I", *words)
+
+
+def coded(columns: int, rows: int, *numbers: int) -> bytes:
+    return struct.pack("<II", columns, rows) + packed([n for v in numbers for n in nibbles_of(v)])
+
+
+def random_depth(shape: tuple[int, int], filled: float, top: int) -> Depth:
+    rng = np.random.default_rng([*shape, top])
+    values = rng.integers(0, top, shape, endpoint=True) * (rng.random(shape) < filled)
+    return values.astype(np.uint16)
+
+
+SHAPES = [(1, 1), (1, 7), (7, 1), (3, 5), (48, 64)]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("filled", [0.0, 0.1, 0.5, 0.9, 1.0])
+@pytest.mark.parametrize("top", [1, 7, 300, 65535])
+def test_like_the_reference(shape: tuple[int, int], filled: float, top: int) -> None:
+    depth = random_depth(shape, filled, top)
+    data = reference(depth)
+    assert encode(depth) == data
+    found = decode(memoryview(data))
+    assert found.dtype == np.uint16
+    assert np.array_equal(found, depth)
+
+
+SMALL: Any = arrays(
+    np.uint16,
+    array_shapes(min_dims=2, max_dims=2, max_side=9),
+    elements=st.sampled_from([0, 0, 0, 1, 2, 8, 4000, 32767, 32768, 65535]),
+)
+
+
+@settings(deadline=None)
+@given(SMALL)
+def test_any_image_comes_back(depth: Depth) -> None:
+    assert encode(depth) == reference(depth)
+    assert np.array_equal(decode(encode(depth)), depth)
+
+
+def test_a_view_of_a_larger_image() -> None:
+    depth = random_depth((20, 20), 0.7, 5000)[::2, 3:11]
+    assert encode(depth) == reference(depth)
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"", "whole number"),
+        (struct.pack("<II", 4, 4), "no number"),
+        (coded(2, 2, 0, 4, 2, 2, 2, 2)[:-1], "whole number"),
+        (coded(0, 2, 0, 0), "0x2"),
+        (coded(20000, 2, 0, 0), "20000x2"),
+        (coded(16384, 16384, 16384 * 16384, 0), "16384x16384"),
+        (coded(3, 3, 0, 9, 2, 2), "cut short|another number"),
+        (coded(2, 2, 3), "cut short|another number"),
+        (coded(2, 2, 0, 5, 2, 2, 2, 2, 2), "another number"),
+        (coded(2, 2, 5, 0), "another number"),
+        (coded(2, 2, 2**31, 2**31), "another number"),
+        (coded(2, 2, 2**36, 0), "32 bits"),
+        (coded(2, 1, 0, 2, 2, 1), "16 bits"),  # a pixel that is zero among those that are not
+        (coded(2, 1, 0, 2, 2, 2), ""),
+        (coded(2, 1, 0, 2, 2**17, 2), "16 bits"),
+        (struct.pack("<II", 2, 2) + b"\xff" * 8, "no number"),
+    ],
+)
+def test_refusals(data: bytes, reason: str) -> None:
+    if not reason:
+        assert decode(data).tolist() == [[1, 2]]
+        return
+    with pytest.raises(Refused, match=reason):
+        decode(data)
+
+
+def test_what_decodes_alike_is_not_the_same_bytes() -> None:
+    """So a decoded image is encoded again and compared before it is trusted."""
+    for data in (
+        coded(3, 1, 1, 0, 0, 2, 2, 2),  # a run cut in two
+        coded(2, 1, 0, 2, 2, 2) + bytes(4),  # words after the end
+        struct.pack("<II", 1, 1) + packed([0, 9, 0, 2]),  # a number with a group of nothing
+    ):
+        assert encode(decode(data)) != data
+
+
+def test_damage_is_refused_or_read() -> None:
+    for damaged in mutations(reference(random_depth((9, 14), 0.6, 3000)), 600):
+        refusal(decode, damaged)

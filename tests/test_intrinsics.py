@@ -1,0 +1,511 @@
+"""``mp4ds info --intrinsics``: every calibration, ready for OpenCV, and the static transforms."""
+
+from __future__ import annotations
+
+import ast
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+from mcap_protobuf.schema import build_file_descriptor_set
+from rosbags.highlevel import AnyReader
+from typer.testing import CliRunner
+
+import mp4ds
+import mp4ds.intrinsics
+from conftest import real
+from foxglove_scenes import FOXGLOVE_SOURCES, foxglove_scene
+from mp4ds.cli import app
+from mp4ds.intrinsics import Camera, Intrinsics, ListedCalibration, effective, intrinsics
+from mp4ds.sidecar import dump_document, load_manifest
+from mp4ds.sidecar.manifest import StaticTransform
+from mp4ds.wire import CalibrationFields
+from mp4ds.wire.transforms import Transform
+from scenes import INFO, PERIOD, START, TF, Record, Scene, calibration, scene
+from sources import SOURCES, write_bag, write_mcap
+
+FOCUS = [100.0, 100.0, 100.0, 125.0, 125.0, 100.0, 150.0, 150.0]  # of one message after the other
+CHANGES = [0, 3, 5, 6]
+SOME_SOURCES = ("bag-lz4", "bag-split", "rosbag2-sqlite3-v9", "rosbag2-mcap-split",
+                "mcap-ros2-zstd", "mcap-unindexed")  # fmt: skip
+LINKS = [
+    ("base", "rig", (0.5, 0.0, 1.5), (0.0, 0.0, 0.6, 0.8)),
+    ("rig", "cam", (0.0, 0.25, 0.0), (0.5, -0.5, 0.5, -0.5)),
+    ("base", "lidar", (0.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0)),
+]
+
+
+def focused(made: Scene, focus: Sequence[float] = FOCUS) -> Scene:
+    """A scene whose calibrations change."""
+    messages, number = [], 0
+    for record in made.messages:
+        if "d" in record.values and "k" in record.values:
+            k = [focus[number], 0, 31.5, 0, focus[number], 23.5, 0, 0, 1]
+            record = replace(record, values={**record.values, "k": k})
+            number += 1
+        messages.append(record)
+    return Scene(messages, made.silent)
+
+
+def infos(made: Scene) -> list[Record]:
+    return [record for record in made.messages if "k" in record.values]
+
+
+def static(*, topic: str = "/tf_static") -> Record:
+    def numbers(names: str, values: Sequence[float]) -> dict[str, float]:
+        return dict(zip(names, values, strict=True))
+
+    links = [
+        {
+            "header": {"seq": 0, "stamp": START, "frame_id": parent},
+            "child_frame_id": child,
+            "transform": {"translation": numbers("xyz", t), "rotation": numbers("xyzw", r)},
+        }
+        for parent, child, t, r in LINKS
+    ]
+    return Record(topic, TF, START, {"transforms": links})
+
+
+def camera_of(result: Intrinsics) -> Camera:
+    (camera,) = result.cameras
+    return camera
+
+
+# ---------------------------------------------------------------- recordings and datasets
+
+
+def check_focused(camera: Camera, made: Scene) -> None:
+    assert camera.frame_id == "cam"
+    assert camera.sizes == [(64, 48)]
+    assert camera.more == 0
+    assert [item.message for item in camera.calibrations] == CHANGES
+    sent = infos(made)
+    for item in camera.calibrations:
+        assert item.message is not None
+        record = sent[item.message]
+        assert item.log_time == record.log_time
+        assert (item.width, item.height, item.frame_id) == (64, 48, "cam")
+        assert item.distortion_model == "plumb_bob"
+        assert item.k == np.reshape(record.values["k"], (3, 3)).tolist()
+        assert item.d == record.values["d"]
+        assert item.r == np.eye(3).tolist()
+        assert item.p == np.reshape(record.values["p"], (3, 4)).tolist()
+        assert (item.binning, item.roi, item.k_effective, item.p_effective) == (None,) * 4
+
+
+@pytest.mark.parametrize("source", SOME_SOURCES)
+def test_recordings_of_every_kind(source: str, tmp_path: Path) -> None:
+    made = focused(scene("mono8"))
+    path = SOURCES[source](tmp_path, made)[0]
+    if source == "bag-split":  # one part has the calibrations of its own messages
+        assert camera_of(intrinsics(path)).calibrations[0].message == 0
+        return
+    camera = camera_of(intrinsics(path))
+    assert (camera.topic, camera.info_topic) == ("/cam/image_raw", "/cam/camera_info")
+    check_focused(camera, made)
+
+
+@pytest.mark.parametrize("source", FOXGLOVE_SOURCES)
+def test_recordings_of_foxglove(source: str, tmp_path: Path) -> None:
+    made = focused(foxglove_scene(partial(scene, "mono8"), frames=8, width=64, height=48))
+    camera = camera_of(intrinsics(FOXGLOVE_SOURCES[source](tmp_path, made)[0]))
+    assert (camera.topic, camera.info_topic) == ("/camera/image", "/camera/calibration")
+    check_focused(camera, made)
+
+
+@pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-zstd"])
+def test_a_dataset_says_what_its_recording_says(source: str, tmp_path: Path) -> None:
+    made = focused(scene("mono8"))
+    paths = SOURCES[source](tmp_path, made)
+    mp4ds.pack(paths, tmp_path / "dataset")
+    packed, recorded = intrinsics(tmp_path / "dataset"), intrinsics(paths[0])
+    assert packed.kind == "dataset"
+    assert packed.cameras == recorded.cameras
+    alone = intrinsics(tmp_path / "dataset" / "cam_image_raw.mp4")
+    assert (alone.kind, alone.cameras) == ("stream", packed.cameras)
+    check_focused(camera_of(packed), made)
+
+
+def test_a_stream_of_version_0() -> None:
+    camera = camera_of(intrinsics(Path(__file__).parent / "fixtures" / "v0" / "drive.yaml"))
+    (item,) = camera.calibrations
+    assert (item.message, item.log_time) == (None, None)
+    assert item.frame_id == camera.frame_id == "GS3_left_L"
+    assert item.k[0][0] > 0
+
+
+def named(made: Scene, names: dict[str, str]) -> Scene:
+    messages = [replace(record, topic=names.get(record.topic, record.topic))
+                for record in made.messages]  # fmt: skip
+    return Scene(messages, made.silent)
+
+
+def test_names_that_tell_nothing_are_paired_by_stamp(tmp_path: Path) -> None:
+    made = named(focused(scene("mono8")), {"/cam/image_raw": "/eye", "/cam/camera_info": "/lens"})
+    path = SOURCES["bag-none"](tmp_path, made)[0]
+    camera = camera_of(intrinsics(path))
+    assert (camera.topic, camera.info_topic) == ("/eye", "/lens")
+    check_focused(camera, made)
+    mp4ds.pack(path, tmp_path / "dataset")
+    assert camera_of(intrinsics(tmp_path / "dataset")) == camera
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_what_belongs_to_no_other_is_listed_too(packed: bool, tmp_path: Path) -> None:
+    left = named(
+        scene("mono8", with_info=False),
+        {"/cam/image_raw": "/left/image_raw"},
+    )
+    lens = {**calibration(64, 48), "width": 64, "height": 48, "header": {"frame_id": "lens"}}
+    alone = [Record("/lens", INFO, START + n * PERIOD, lens) for n in range(4)]
+    path = tmp_path / "drive.bag"
+    write_bag(path, Scene([*left.messages, *alone]))
+    if packed:
+        mp4ds.pack(path, tmp_path / "dataset")
+        path = tmp_path / "dataset"
+    first, second = intrinsics(path).cameras
+    assert (first.topic, first.info_topic, first.calibrations) == ("/left/image_raw", "", [])
+    assert (second.topic, second.info_topic, second.sizes) == ("", "/lens", [])
+    assert [(item.message, item.frame_id) for item in second.calibrations] == [(0, "lens")]
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_calibrations_without_end_are_counted(
+    packed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mp4ds.intrinsics, "MAX_LISTED", 3)
+    path = SOURCES["bag-none"](tmp_path, focused(scene("mono8"), range(100, 108)))[0]
+    if packed:
+        mp4ds.pack(path, tmp_path / "dataset")
+        path = tmp_path / "dataset"
+    camera = camera_of(intrinsics(path))
+    assert [item.message for item in camera.calibrations] == [0, 1, 2]
+    assert camera.more == 5
+
+
+def test_unreadable_messages_are_passed_over(tmp_path: Path) -> None:
+    made = focused(scene("mono8"))
+    broken = [
+        replace(record, ros1=b"\x01", cdr=b"\x00\x01\x00\x00\x01") if record in infos(made)[:2] or (
+            record.topic == "/cam/image_raw" and n < 20) else record
+        for n, record in enumerate(made.messages)
+    ]  # fmt: skip
+    for path in (SOURCES["bag-none"](tmp_path, Scene(broken))[0],
+                 SOURCES["mcap-ros2-none"](tmp_path, Scene(broken))[0]):  # fmt: skip
+        camera = camera_of(intrinsics(path))
+        assert [item.message for item in camera.calibrations] == [2, *CHANGES[1:]]
+        assert camera.sizes == [(64, 48)]
+
+
+# ---------------------------------------------------------------- transforms
+
+PATH = [Transform(*link) for link in LINKS[:2]]
+
+
+@pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-zstd"])
+def test_static_transforms_of_a_recording(source: str, tmp_path: Path) -> None:
+    made = scene("mono8")
+    path = SOURCES[source](tmp_path, Scene([static(), *made.messages]))[0]
+    assert intrinsics(path).transforms == PATH
+    moving = tmp_path / "moving"
+    moving.mkdir()
+    path = SOURCES[source](moving, Scene([static(topic="/tf"), *made.messages]))[0]
+    assert intrinsics(path).transforms == []
+
+
+def test_static_transforms_of_foxglove(tmp_path: Path) -> None:
+    message = FrameTransforms()
+    for parent, child, translation, rotation in LINKS:
+        item = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
+        for part, values in ((item.translation, translation), (item.rotation, rotation)):
+            for name, value in zip("xyzw", values, strict=False):
+                setattr(part, name, value)
+    write_mcap(tmp_path / "images.mcap", scene("mono8"), profile="ros2")
+    with (tmp_path / "drive.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        data = build_file_descriptor_set(FrameTransforms).SerializeToString()
+        schema = writer.register_schema("foxglove.FrameTransforms", "protobuf", data)
+        topic = writer.register_channel("/tf_static", "protobuf", schema)
+        writer.add_message(topic, START, message.SerializeToString(), START)
+        made = scene("mono8")
+        record = infos(made)[0]
+        schema = writer.register_schema("sensor_msgs/msg/CameraInfo", "ros2msg", b"")
+        topic = writer.register_channel("/cam/camera_info", "cdr", schema)
+        writer.add_message(topic, START, record.payload("cdr"), START)
+        writer.finish()  # type: ignore[no-untyped-call]
+    assert intrinsics(tmp_path / "drive.mcap").transforms == PATH
+
+
+def test_static_transforms_of_a_manifest(tmp_path: Path) -> None:
+    mp4ds.pack(SOURCES["bag-none"](tmp_path, scene("mono8")), tmp_path / "dataset")
+    path = tmp_path / "dataset" / "dataset.yaml"
+    manifest = load_manifest(path)
+    models = [StaticTransform.from_record(item) for item in PATH]
+    path.write_bytes(dump_document(manifest.model_copy(update={"transforms": models})))
+    assert load_manifest(path).transforms == models
+    assert intrinsics(tmp_path / "dataset").transforms == PATH
+
+
+# ---------------------------------------------------------------- effective K
+
+Pixels = st.integers(0, 2000)
+Positive = st.floats(0.5, 4000)
+WHOLE = (700, 2, 320.5, 0, 710, 240.25, 0, 0, 1)
+
+
+def fields(
+    binning: tuple[int, int], roi: tuple[int, int, int, int], k: Sequence[float] = WHOLE
+) -> CalibrationFields:
+    p = (*k[:3], -70.5, *k[3:6], 3.0, *k[6:9], 0.0)
+    return CalibrationFields(
+        480, 640, "plumb_bob", (), tuple(map(float, k)), (1.0,) * 9, tuple(map(float, p)),
+        *binning, roi,
+    )  # fmt: skip
+
+
+@settings(deadline=None)
+@given(st.tuples(st.integers(0, 4), st.integers(0, 4)), st.tuples(Pixels, Pixels),
+       st.tuples(Positive, Positive, Positive, Positive),
+       st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(0.1, 9)))  # fmt: skip
+def test_effective_matrices_project_into_the_recorded_image(
+    binning: tuple[int, int], offset: tuple[int, int], focal: Any, point: Any
+) -> None:
+    """A pixel (u, v) of the full resolution is ((u - x) / bx, (v - y) / by) of the image."""
+    k = (focal[0], 0, focal[2], 0, focal[1], focal[3], 0, 0, 1)
+    own = fields(binning, (*offset, 100, 100), k)
+    for whole, cut, where in zip(
+        (own.k, own.p), effective(own), (np.array(point), np.array([*point, 1.0])), strict=True
+    ):
+        full = np.reshape(whole, (3, -1)) @ where
+        seen = np.array(cut) @ where
+        scale = np.maximum(1, binning)
+        expected = (full[:2] / full[2] - np.array(offset)) / scale
+        np.testing.assert_allclose(seen[:2] / seen[2], expected, rtol=1e-9, atol=1e-6)
+
+
+def test_effective_matrices_of_image_geometry() -> None:
+    """Figures worked out by hand from REP 104."""
+    k, p = effective(fields((2, 4), (100, 40, 200, 300)))
+    assert k == [[350.0, 1.0, 110.25], [0.0, 177.5, 50.0625], [0.0, 0.0, 1.0]]
+    assert p == [
+        [350.0, 1.0, 110.25, -35.25], [0.0, 177.5, 50.0625, 0.75], [0.0, 0.0, 1.0, 0.0]
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("binning", "roi", "same"),
+    [
+        ((0, 0), (0, 0, 0, 0), True),
+        ((1, 1), (0, 0, 480, 640), True),
+        ((1, 0), (0, 0, 0, 0), True),
+        ((2, 1), (0, 0, 0, 0), False),
+        ((1, 2), (0, 0, 0, 0), False),
+        ((1, 1), (1, 0, 0, 0), False),
+        ((1, 1), (0, 1, 0, 0), False),
+    ],
+)
+def test_effective_matrices_are_told_where_they_differ(
+    binning: tuple[int, int], roi: tuple[int, int, int, int], same: bool, tmp_path: Path
+) -> None:
+    names = ("x_offset", "y_offset", "height", "width")
+    values = {
+        **calibration(64, 48),
+        "width": 64,
+        "height": 48,
+        "header": {"frame_id": "lens"},
+        "binning_x": binning[0],
+        "binning_y": binning[1],
+        "roi": dict(zip(names, roi, strict=True)),
+    }
+    write_bag(tmp_path / "drive.bag", Scene([Record("/cam/camera_info", INFO, START, values)]))
+    (item,) = camera_of(intrinsics(tmp_path / "drive.bag")).calibrations
+    assert (item.k_effective is None) is same
+    assert (item.p_effective is None) is same
+    assert item.binning == (binning if any(binning) else None)
+    expected = {**dict(zip(names, roi, strict=True)), "do_rectify": 0}
+    assert item.roi == (expected if any(roi) else None)
+    text, _ = command(tmp_path / "drive.bag")
+    assert ("K_effective = " in text) is not same
+    assert ("P_effective = " in text) is not same
+    assert ("binning = " in text) is any(binning)
+    assert ("roi = " in text) is any(roi)
+
+
+# ---------------------------------------------------------------- the command
+
+
+def command(path: Path, *options: str) -> tuple[str, dict[str, Any]]:
+    """What the command prints, and the names that this sets when it is run as Python."""
+    result = CliRunner().invoke(app, ["info", str(path), "--intrinsics", *options])
+    assert result.exit_code == 0, result.output
+    names: dict[str, Any] = {}
+    if "--json" not in options:
+        exec(compile(result.stdout, "printed", "exec"), names)
+    return result.stdout, names
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_what_is_printed_is_python_for_opencv(packed: bool, tmp_path: Path) -> None:
+    made = focused(scene("mono8"))
+    path = SOURCES["bag-none"](tmp_path, Scene([static(), *made.messages]))[0]
+    if packed:
+        mp4ds.pack(path, tmp_path / "dataset")
+        path = tmp_path / "dataset"
+    text, names = command(path)
+    (*_, last) = camera_of(intrinsics(path)).calibrations
+    for name, value in (("K", last.k), ("D", last.d), ("R", last.r), ("P", last.p)):
+        np.testing.assert_array_equal(names[name], value)
+    for number in CHANGES:
+        record = infos(made)[number]
+        assert f"/cam/camera_info, from message {number} at {record.log_time} ns: 64x48" in text
+    picture = np.zeros((48, 64), np.uint8)
+    assert cv2.undistort(picture, names["K"], names["D"]).shape == (48, 64)
+    maps = cv2.initUndistortRectifyMap(
+        names["K"], names["D"], names["R"], names["P"], (64, 48), cv2.CV_32FC1
+    )
+    assert maps[0].shape == (48, 64)
+
+
+def test_transforms_are_printed_as_they_are(tmp_path: Path) -> None:
+    path = SOURCES["bag-none"](tmp_path, Scene([static(), *scene("mono8").messages]))[0]
+    _, names = command(path)
+    assert names["transforms"] == [
+        (parent, child, list(t), list(r)) for parent, child, t, r in LINKS[:2]
+    ]
+    text = json.loads(command(path, "--json")[0])
+    assert text["transforms"] == [
+        {"parent": parent, "child": child, "translation": list(t), "rotation": list(r)}
+        for parent, child, t, r in LINKS[:2]
+    ]
+
+
+def test_json(tmp_path: Path) -> None:
+    path = SOURCES["bag-none"](tmp_path, focused(scene("mono8")))[0]
+    result = json.loads(command(path, "--json")[0])
+    assert result["kind"] == "bag"
+    (camera,) = result["cameras"]
+    assert camera["topic"] == "/cam/image_raw"
+    assert camera["sizes"] == [[64, 48]]
+    listed = camera_of(intrinsics(path)).calibrations
+    assert [item["k"] for item in camera["calibrations"]] == [item.k for item in listed]
+    assert [item["message"] for item in camera["calibrations"]] == CHANGES
+
+
+def test_nothing_that_a_recording_says_becomes_code(tmp_path: Path) -> None:
+    """Names are in comments, or quoted; a line break in one ends neither."""
+    evil = "/a\nimport os #'\"\\\u2028os = 1\r\x85x"
+    lens = {**calibration(64, 48), "distortion_model": evil, "width": 64, "height": 48,
+            "header": {"frame_id": evil}}  # fmt: skip
+    link = {"header": {"frame_id": evil}, "child_frame_id": "b" + evil,
+            "transform": {"rotation": {"w": 1.0}}}  # fmt: skip
+    other = {**link, "header": {"frame_id": "b" + evil}, "child_frame_id": evil[1:]}
+    records = [
+        Record(evil + "/camera_info", INFO, START, lens),
+        Record(evil + "/tf_static", TF, START, {"transforms": [link, other]}),
+    ]
+    cdr = Scene([replace(item, cdr=item.payload("cdr")) for item in records])
+    write_mcap(tmp_path / "drive.mcap", cdr)
+    text, names = command(tmp_path / "drive.mcap")
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.Import):
+            assert ast.unparse(node) == "import numpy as np"
+        else:
+            assert isinstance(node, ast.Assign)
+            assert ast.unparse(node.targets[0]) in {"K", "D", "R", "P", "transforms"}
+    assert "os" not in names
+    found = intrinsics(tmp_path / "drive.mcap").transforms
+    assert names.get("transforms", []) == [
+        (item.parent, item.child, list(item.translation), list(item.rotation)) for item in found
+    ]
+
+
+def test_a_camera_without_calibration_and_one_that_is_not_calibrated(tmp_path: Path) -> None:
+    blank = {"width": 64, "height": 48, "header": {"frame_id": "lens"}}
+    made = scene("mono8", with_info=False)
+    path = tmp_path / "drive.bag"
+    write_bag(path, Scene([*made.messages, Record("/lens", INFO, START, blank)]))
+    text, names = command(path)
+    assert "# /cam/image_raw: 64x48, frame 'cam'\n# no calibration\n" in text
+    assert "# /lens: calibrations that belong to no images\n" in text
+    assert "no distortion model" in text
+    assert "# not calibrated: K is zero\n" in text
+    assert names["D"].shape == (0,)
+
+
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_errors_are_those_of_info(options: list[str], tmp_path: Path) -> None:
+    (tmp_path / "words.txt").write_text("no recording")
+    for name in ("words.txt", "nothing.bag"):
+        arguments = ["info", str(tmp_path / name), "--intrinsics", *options]
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 2
+        assert name in result.output
+
+
+# ---------------------------------------------------------------- real recordings
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "bags/fiducials_aruco_marker_raspicam.bag",
+        "bags/librealsense_depth_color.bag",
+        "bags/ecto_ros_camera_info.bag",
+        "rosbag2/geocamxyz_test_bag_sqlite3",
+    ],
+)
+def test_real_recordings(name: str) -> None:
+    path = real(name)
+    expected: dict[str, list[tuple[int, int, Any]]] = {}
+    with AnyReader([path]) as reader:
+        own = [item for item in reader.connections if "CameraInfo" in item.msgtype]
+        last: dict[str, Any] = {}
+        count: dict[str, int] = {}
+        for connection, time, data in reader.messages(own):
+            message = reader.deserialize(data, connection.msgtype)
+            message.header.stamp.sec = message.header.stamp.nanosec = 0
+            number = count.get(connection.topic, 0)
+            count[connection.topic] = number + 1
+            said = repr(replace_seq(message))
+            if last.get(connection.topic) != said:
+                expected.setdefault(connection.topic, []).append((number, time, message))
+            last[connection.topic] = said
+    result = intrinsics(path)
+    found = {camera.info_topic: camera for camera in result.cameras if camera.calibrations}
+    assert found.keys() == expected.keys()
+    for topic, messages in expected.items():
+        listed = found[topic].calibrations
+        assert len(listed) == len(messages)
+        for item, (number, time, message) in zip(listed, messages, strict=True):
+            check_message(item, number, time, message)
+    command(path)
+
+
+def replace_seq(message: Any) -> Any:
+    if hasattr(message.header, "seq"):
+        message.header.seq = 0
+    return message
+
+
+def check_message(item: ListedCalibration, number: int, time: int, message: Any) -> None:
+    def get(name: str) -> Any:
+        return getattr(message, name, None) if hasattr(message, name) else getattr(
+            message, name.upper()
+        )  # fmt: skip
+
+    assert (item.message, item.log_time) == (number, time)
+    assert (item.width, item.height) == (message.width, message.height)
+    assert item.frame_id == message.header.frame_id
+    for name, mine in (("k", item.k), ("d", item.d), ("r", item.r), ("p", item.p)):
+        assert np.ravel(mine).tolist() == get(name).tolist()

@@ -1,0 +1,513 @@
+"""Packets into mp4 files and back: every byte, and files that play."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from array import array
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+from coded_tools import (
+    DECODERS,
+    ENCODINGS,
+    HEIGHT,
+    IN_ORDER,
+    WIDTH,
+    decodes,
+    encode,
+    hide,
+    jpeg,
+    refusal,
+    scene,
+    superframe,
+)
+from conftest import real
+from mp4ds.coded import CodedPicture, PictureParser, Refused, annexb, av1, body_of, h264, h265
+from mp4ds.errors import VideoError
+from mp4ds.stamps import MAX_GAP_NS, NS_PER_TICK
+from mp4ds.video import PacketReader, PacketWriter, VideoEncoder, recipe_for
+from mp4ds.video.packets import annexb_packets
+from test_coded_pictures import packets_of
+
+STEP = 33_333
+SIZE = (WIDTH, HEIGHT)
+FILLER = {"h264": b"\x0c\xff\xff\x80", "h265": b"\x4c\x01\xff\xff\x80"}
+SEI = {"h264": b"\x06\x05\x01\xaa\x80", "h265": b"\x4e\x01\x05\x01\xaa\x80"}
+
+
+def write(
+    path: Path, codec: str, bodies: list[bytes], ticks: list[int] | None = None
+) -> list[CodedPicture]:
+    """Write bodies as a topic would be; returns what is known of them."""
+    parser = PictureParser(codec)
+    pictures = [parser.parse(body) for body in bodies]
+    first = pictures[0]
+    with PacketWriter(
+        path, codec, width=first.width, height=first.height, parameters=parser.parameters, rate=30.0
+    ) as writer:
+        for number, (body, picture) in enumerate(zip(bodies, pictures, strict=True)):
+            tick = ticks[number] if ticks else number * STEP
+            writer.write(memoryview(body), tick, keyframe=picture.keyframe)
+    assert writer.frames == len(bodies)
+    return pictures
+
+
+def read(path: Path, codec: str, pictures: list[CodedPicture]) -> list[bytes]:
+    with PacketReader(path, codec=codec, frames=len(pictures)) as reader:
+        return [
+            body_of(codec, packet, picture.framing)
+            for packet, picture in zip(reader.packets(), pictures, strict=True)
+        ]
+
+
+def check(path: Path, codec: str, bodies: list[bytes]) -> None:
+    """Write, read, and decode with a decoder that knows nothing of us."""
+    pictures = write(path, codec, bodies)
+    assert read(path, codec, pictures) == bodies
+    with av.open(str(path)) as container:
+        frames = list(container.decode(video=0))
+    assert [frame.pts for frame in frames] == [number * STEP for number in range(len(bodies))]
+    assert not any(frame.is_corrupt for frame in frames)
+
+
+def ffprobe(path: Path) -> Any:
+    if not shutil.which("ffprobe"):
+        pytest.skip("there is no ffprobe")
+    entries = "stream=codec_name,width,height,duration,nb_read_frames,nb_frames,r_frame_rate"
+    command = ["ffprobe", "-v", "warning", "-count_frames", "-of", "json"]
+    done = subprocess.run(
+        [*command, "-show_entries", entries, str(path)], capture_output=True, check=True
+    )
+    assert not done.stderr, done.stderr
+    return json.loads(done.stdout)["streams"]
+
+
+@pytest.mark.parametrize("name", IN_ORDER)
+def test_packets_come_back(name: str, tmp_path: Path) -> None:
+    codec = ENCODINGS[name].codec
+    packets = encode(ENCODINGS[name])
+    check(tmp_path / "a.mp4", codec, [packet.data for packet in packets])
+    with PacketReader(tmp_path / "a.mp4", codec=codec, coded_size=SIZE) as reader:
+        assert list(reader.keyframes) == [
+            packet.keyframe or codec in ("mjpeg", "png") for packet in packets
+        ]
+        assert reader.ticks == array("q", [number * STEP for number in range(len(packets))])
+        everything = list(reader.packets())
+        for index in (5, 0, len(packets) - 1, 5):
+            assert reader.packet(index) == everything[index]
+
+
+@pytest.mark.parametrize("name", IN_ORDER)
+def test_the_file_plays(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    write(path, ENCODINGS[name].codec, [packet.data for packet in encode(ENCODINGS[name])])
+    (stream,) = ffprobe(path)
+    assert stream["codec_name"] == {"h265": "hevc"}.get(
+        ENCODINGS[name].codec, ENCODINGS[name].codec
+    )
+    assert (stream["width"], stream["height"]) == SIZE
+    assert stream["nb_frames"] == stream["nb_read_frames"] == "12"
+    assert float(stream["duration"]) == pytest.approx(12 / 30, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["h264", "h265", "av1", "vp9"])
+@pytest.mark.parametrize(("width", "height"), [(66, 50), (322, 178)])
+def test_sizes_that_are_cropped(name: str, width: int, height: int, tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    packets = encode(ENCODINGS[name], frames=3, width=width, height=height)
+    check(path, ENCODINGS[name].codec, [packet.data for packet in packets])
+    with PacketReader(path, codec=ENCODINGS[name].codec, coded_size=(width, height)):
+        pass
+
+
+def test_times_with_gaps(tmp_path: Path) -> None:
+    """As the presentation clock gives them: a tick, and the longest gap, several times over."""
+    longest = MAX_GAP_NS // NS_PER_TICK
+    ticks = [0, 1, 2, longest, 2 * longest, 3 * longest, 3 * longest + 1]
+    for name in ("mjpeg", "h264"):
+        path = tmp_path / f"{name}.mp4"
+        bodies = [packet.data for packet in encode(ENCODINGS[name], frames=len(ticks))]
+        pictures = write(path, name, bodies, ticks)
+        assert read(path, name, pictures) == bodies
+        with av.open(str(path)) as container:
+            assert [frame.pts for frame in container.decode(video=0)] == ticks
+
+
+@pytest.mark.parametrize("codec", ["mjpeg", "h264"])
+def test_one_packet(codec: str, tmp_path: Path) -> None:
+    check(tmp_path / "a.mp4", codec, [encode(ENCODINGS[codec], frames=1)[0].data])
+
+
+# ---------------------------------------------------------------- framing
+
+
+def reframed(codec: str, body: bytes, framing: str) -> bytes:
+    """A body with SEI and filler among its NAL units, behind other start codes."""
+    module = {"h264": h264, "h265": h265}[codec]
+    units = annexb.split(body)[0]
+    is_slice = [module.unit_type(u) < (6 if codec == "h264" else 32) for u in units]
+    units.insert(is_slice.index(True), SEI[codec])
+    units.append(FILLER[codec])
+    lengths = (framing.split() * len(units))[: len(units)]
+    return annexb.join(units, " ".join([*lengths, "+2"] if framing == "6 3" else lengths))
+
+
+@pytest.mark.parametrize("framing", ["3", "4", "4 3", "6 3"])
+@pytest.mark.parametrize("name", ["h264", "h264-aud", "h264-slices", "h265", "h265-aud"])
+def test_start_codes(name: str, framing: str, tmp_path: Path) -> None:
+    codec = ENCODINGS[name].codec
+    bodies = [reframed(codec, packet.data, framing) for packet in encode(ENCODINGS[name])]
+    check(tmp_path / "a.mp4", codec, bodies)
+
+
+@pytest.mark.parametrize("delimited", [True, False, None])
+def test_temporal_delimiters(delimited: bool | None, tmp_path: Path) -> None:
+    bodies = []
+    for number, packet in enumerate(encode(ENCODINGS["av1"])):
+        bare = packet.data.removeprefix(av1.DELIMITER)
+        keep = number % 2 == 0 if delimited is None else delimited
+        bodies.append(av1.DELIMITER + bare if keep else bare)
+    check(tmp_path / "a.mp4", "av1", bodies)
+
+
+def test_av1_metadata(tmp_path: Path) -> None:
+    packets = [packet.data for packet in encode(ENCODINGS["av1"])]
+    bodies = [packet[:2] + b"\x2a\x06\x04\xb5\0\0\0\x80" + packet[2:] for packet in packets]
+    check(tmp_path / "a.mp4", "av1", bodies)
+
+
+def test_a_vp9_superframe(tmp_path: Path) -> None:
+    frames = [packet.data for packet in encode(ENCODINGS["vp9"], frames=4, gop=9)]
+    check(tmp_path / "a.mp4", "vp9", [frames[0], superframe(frames[1], frames[2]), frames[3]])
+
+
+def test_jpeg_of_all_kinds(tmp_path: Path) -> None:
+    picture, other = scene(2)
+    bodies = [
+        jpeg(picture, subsampling=0),
+        jpeg(picture, subsampling=1),
+        jpeg(picture, subsampling=2, progressive=True),
+        jpeg(picture[..., 0]),
+        jpeg(other, restart_marker_blocks=2),
+        jpeg(other, exif=b"Exif\0\0" + bytes(3000)),
+        jpeg(other, comment=b"\xff\xd8\xff\xd9"),
+        jpeg(other) + b"\0\0 trailing \xff\xd8",
+        jpeg(other, keep_rgb=True),
+    ]
+    check(tmp_path / "a.mp4", "mjpeg", bodies)
+
+
+def test_jpeg_of_several_sizes(tmp_path: Path) -> None:
+    bodies = [jpeg(next(scene(1, width, height))) for width, height in ((64, 48), (32, 16), (8, 8))]
+    pictures = write(tmp_path / "a.mp4", "mjpeg", bodies)
+    assert read(tmp_path / "a.mp4", "mjpeg", pictures) == bodies
+
+
+def test_jpeg_whose_coded_data_are_damaged(tmp_path: Path) -> None:
+    """What does not decode comes back all the same."""
+    body = bytearray(jpeg(next(scene(1))))
+    at = body.index(b"\xff\xda") + 20
+    body[at : at + 200] = b"\x55" * 200
+    pictures = write(tmp_path / "a.mp4", "mjpeg", [bytes(body)] * 3)
+    assert read(tmp_path / "a.mp4", "mjpeg", pictures) == [bytes(body)] * 3
+
+
+@pytest.mark.parametrize("codec", ["h264", "h265"])
+def test_parameters_that_were_sent_before(codec: str, tmp_path: Path) -> None:
+    """The track's header holds them, so that the file plays."""
+    module, kinds = {"h264": (h264, (7, 8)), "h265": (h265, (32, 33, 34))}[codec]
+    whole = [packet.data for packet in encode(ENCODINGS[codec], frames=8)]
+    units = [annexb.split(body)[0] for body in whole]
+    alone = annexb.join_plain([u for u in units[0] if module.unit_type(u) in kinds])
+    bodies = [
+        annexb.join_plain([u for u in body if module.unit_type(u) not in kinds]) for body in units
+    ]
+    parser = PictureParser(codec)
+    assert refusal(parser.parse, bodies[0])
+    assert refusal(parser.parse, alone)
+    pictures = [parser.parse(body) for body in bodies]
+    path = tmp_path / "a.mp4"
+    with PacketWriter(
+        path, codec, width=WIDTH, height=HEIGHT, parameters=parser.parameters
+    ) as writer:
+        for number, (body, picture) in enumerate(zip(bodies, pictures, strict=True)):
+            writer.write(body, number * STEP, keyframe=picture.keyframe)
+    assert read(path, codec, pictures) == bodies
+    with av.open(str(path)) as container:
+        assert sum(1 for _ in container.decode(video=0)) == 8
+    key = next(n for n, picture in enumerate(pictures) if n and picture.keyframe)
+    assert decodes(codec, list(annexb_packets(path, codec))[key:]) == 8 - key
+
+
+# ---------------------------------------------------------------- refusals and faults
+
+
+@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "vp9"])
+def test_a_first_picture_that_cannot_be_used(codec: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    first, second = [packet.data for packet in encode(ENCODINGS[codec], frames=2, gop=9)]
+    writer = PacketWriter(path, codec, width=WIDTH + 2, height=HEIGHT)
+    assert "cannot be decoded" in refusal(lambda: writer.write(first, 0, keyframe=True))
+    if codec != "vp9":  # whose header tells no size
+        writer = PacketWriter(path, codec, width=WIDTH, height=HEIGHT)
+        assert "cannot be decoded" in refusal(lambda: writer.begin(second))
+    writer.close()
+    assert not path.exists()
+
+
+def test_unknown_codecs(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"ffv1.*mjpeg"):
+        PacketWriter(tmp_path / "a.mp4", "ffv1", width=1, height=1)
+
+
+def test_a_writer_that_was_given_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    with PacketWriter(path, "mjpeg", width=WIDTH, height=HEIGHT):
+        pass
+    assert not path.exists()
+    writer = PacketWriter(path, "mjpeg", width=WIDTH, height=HEIGHT)
+    writer.begin(jpeg(next(scene(1))))
+    writer.close()
+    writer.abandon()
+    with pytest.raises(RuntimeError), PacketWriter(path, "mjpeg", width=1, height=1):
+        raise RuntimeError
+
+
+def test_packets_that_a_muxer_joins_are_missed(tmp_path: Path) -> None:
+    """The muxer joins a VP9 frame that is not shown with the next; the parser refuses it."""
+    frames = [packet.data for packet in encode(ENCODINGS["vp9"], frames=4, gop=9)]
+    writer = PacketWriter(tmp_path / "a.mp4", "vp9", width=WIDTH, height=HEIGHT)
+    for number, frame in enumerate((frames[0], hide(frames[1]), frames[2], frames[3])):
+        writer.write(frame, number * STEP, keyframe=not number)
+    with pytest.raises(VideoError) as caught:
+        writer.close()
+    assert caught.value.code == "frame-count"
+
+
+def test_bytes_that_a_muxer_drops_are_missed(tmp_path: Path) -> None:
+    bodies = [packet.data for packet in encode(ENCODINGS["av1"], frames=3)]
+    writer = PacketWriter(tmp_path / "a.mp4", "av1", width=WIDTH, height=HEIGHT)
+    for number, body in enumerate(bodies):
+        padding = b"\x7a\x02\0\x80" if number == 1 else b""
+        writer.write(body + padding, number * STEP, keyframe=not number)
+    with pytest.raises(VideoError, match="as written"):
+        writer.close()
+
+
+@pytest.mark.parametrize("fault", ["tick", "size", "content"])
+def test_what_the_index_says_is_compared(
+    fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = PacketWriter(tmp_path / "a.mp4", "mjpeg", width=WIDTH, height=HEIGHT)
+    for number, picture in enumerate(scene(3)):
+        writer.write(jpeg(picture), number * STEP, keyframe=True)
+    if fault == "content":
+        whole = PacketReader.packet
+        monkeypatch.setattr(
+            PacketReader, "packet", lambda self, index: whole(self, index)[:-1] + b"\0"
+        )
+    else:
+        column = writer._ticks if fault == "tick" else writer._sizes
+        column[1] += 1
+    with pytest.raises(VideoError, match="as written"):
+        writer.close()
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    path = tmp_path / "a.mp4"
+    write(path, "mjpeg", [jpeg(picture) for picture in scene(5)])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("code", "options"),
+    [
+        ("codec-mismatch", {"codec": "h264"}),
+        ("codec-mismatch", {"codec": "nothing"}),
+        ("frame-count", {"codec": "mjpeg", "frames": 4}),
+        ("frame-count", {"codec": "mjpeg", "frames": 6}),
+        ("geometry-mismatch", {"codec": "mjpeg", "coded_size": (WIDTH, HEIGHT + 1)}),
+    ],
+)
+def test_what_a_reader_expects(code: str, options: dict[str, Any], video: Path) -> None:
+    with pytest.raises(VideoError) as caught:
+        PacketReader(video, **options)
+    assert caught.value.code == code
+    assert str(video) in str(caught.value)
+
+
+def test_what_is_no_video_of_ours(tmp_path: Path, video: Path) -> None:
+    cases = {
+        "none.mp4": None,
+        "text.mp4": b"kind: stream\n" * 50,
+        "empty.mp4": b"",
+        "cut.mp4": video.read_bytes()[:-200],
+        "image.mp4": jpeg(next(scene(1))),
+    }
+    for name, content in cases.items():
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+        with pytest.raises(VideoError) as caught:
+            PacketReader(tmp_path / name, codec="mjpeg")
+        expected = "file-missing" if content is None else "video-unreadable"
+        assert caught.value.code == expected, name
+
+
+def patched(video: Path, box: bytes, offset: int, value: int) -> Path:
+    """The video with a 32-bit field of a box changed, counted from the box's type."""
+    data = bytearray(video.read_bytes())
+    at = data.rindex(box) + offset
+    data[at : at + 4] = value.to_bytes(4, "big")
+    forged = video.with_name("forged.mp4")
+    forged.write_bytes(data)
+    return forged
+
+
+@pytest.mark.parametrize("size", [2**31 - 1, 2**28, 0xFFFFFFFF])
+def test_sizes_beyond_the_file(video: Path, size: int) -> None:
+    """Of one packet in the table of sizes: version, size of all, count, sizes."""
+    with pytest.raises(VideoError) as caught:
+        PacketReader(patched(video, b"stsz", 16, size), codec="mjpeg")
+    # ffmpeg leaves out the whole table where a size is beyond 31 bits
+    assert caught.value.code == ("video-unreadable" if size == 2**28 else "frame-count")
+
+
+def test_packets_that_share_their_bytes(video: Path) -> None:
+    """A short file could otherwise promise any amount of data."""
+    length = video.stat().st_size
+    forged = patched(video, b"stsz", 8, length // 3)  # one size for all five
+    with pytest.raises(VideoError):
+        PacketReader(forged, codec="mjpeg", frames=5)
+
+
+def test_a_place_beyond_the_file(video: Path) -> None:
+    with pytest.raises(VideoError):
+        PacketReader(patched(video, b"stco", 12, 2**31), codec="mjpeg", frames=5)
+
+
+def test_a_file_that_shrinks_while_it_is_read(video: Path) -> None:
+    with PacketReader(video, codec="mjpeg") as reader:
+        video.write_bytes(video.read_bytes()[:500])
+        with pytest.raises(VideoError) as caught:
+            reader.packet(4)
+    assert caught.value.code == "decode-failed"
+
+
+def test_files_are_closed(video: Path, recwarn: pytest.WarningsRecorder) -> None:
+    reader = PacketReader(video, codec="mjpeg")
+    reader.close()
+    with pytest.raises(ValueError, match="closed"):
+        reader.packet(0)
+    del reader
+    assert not list(recwarn)
+
+
+# ---------------------------------------------------------------- standing alone
+
+
+@pytest.mark.parametrize("name", IN_ORDER)
+def test_packets_stand_alone(name: str, tmp_path: Path) -> None:
+    codec, path = ENCODINGS[name].codec, tmp_path / "a.mp4"
+    packets = encode(ENCODINGS[name])
+    write(path, codec, [packet.data for packet in packets])
+    alone = list(annexb_packets(path, codec))
+    keys = [number for number, packet in enumerate(packets) if packet.keyframe]
+    for key in keys:
+        assert decodes(codec, alone[key:]) == len(packets) - key
+    parser = PictureParser(codec)
+    assert [parser.parse(body).keyframe for body in alone] == [
+        packet.keyframe or codec in ("mjpeg", "png") for packet in packets
+    ]
+
+
+@pytest.mark.parametrize("codec", ["h264", "h265", "av1"])
+def test_our_videos_stand_alone(codec: str, tmp_path: Path) -> None:
+    """They hold parameters in the header of the track only."""
+    path = tmp_path / "a.mp4"
+    recipe = recipe_for("rgb24", lossless=False, codec=codec, crf=30)
+    encoder = VideoEncoder(
+        path, recipe, picture_format="rgb24", width=WIDTH, height=HEIGHT,
+        gop=4, threads=1, rate=30.0,
+    )  # fmt: skip
+    for number, picture in enumerate(scene(10)):
+        encoder.write((picture,), number * STEP)
+    encoder.close()
+    packets = list(annexb_packets(path, codec))
+    with PacketReader(path, codec=codec, frames=10, coded_size=SIZE) as reader:
+        keys = [index for index, key in enumerate(reader.keyframes) if key]
+    assert len(keys) > 1
+    for key in keys:
+        assert decodes(codec, packets[key:]) == 10 - key
+    parser = PictureParser(codec)
+    pictures = [parser.parse(packet) for packet in packets]
+    assert [n for n, picture in enumerate(pictures) if picture.keyframe] == keys
+    assert {(picture.width, picture.height) for picture in pictures} == {SIZE}
+    _same_pictures(path, codec, packets)
+    check(tmp_path / "b.mp4", codec, packets)  # and go into another video
+
+
+def _same_pictures(path: Path, codec: str, packets: list[bytes]) -> None:
+    context: Any = av.CodecContext.create(DECODERS.get(codec, codec), "r")
+    frames = [frame for packet in packets for frame in context.decode(av.Packet(packet))]
+    frames += context.decode(None)
+    with av.open(str(path)) as container:
+        for alone, whole in zip(frames, container.decode(video=0), strict=True):
+            assert np.array_equal(alone.to_ndarray(), whole.to_ndarray())
+
+
+def test_lossless_video_as_packets(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    recipe = recipe_for("gray", lossless=True, codec="ffv1")
+    with av.open(str(path), "w", format="mp4") as container:
+        stream: Any = container.add_stream(recipe.encoder, rate=Fraction(30))
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "gray"
+        for picture in scene(3):
+            frame = av.VideoFrame.from_ndarray(picture[..., 0].copy(), format="gray")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    assert len(list(annexb_packets(path, "ffv1"))) == 3
+
+
+def test_damaged_parameters(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    write(path, "h264", [packet.data for packet in encode(ENCODINGS["h264"], frames=2)])
+    data = bytearray(path.read_bytes())
+    data[data.index(b"avcC") + 8] = 0xFD  # lengths of two bytes
+    path.write_bytes(data)
+    with pytest.raises(VideoError) as caught:
+        list(annexb_packets(path, "h264"))
+    assert caught.value.code in ("decode-failed", "video-unreadable")
+
+
+# ---------------------------------------------------------------- real videos
+
+REAL = {
+    "carnd_solidWhiteRight.mp4": "h264",
+    "intel_car-detection.mp4": "h264",
+    "lerobot_aloha_insertion_human_yuv444.mp4": "h264",
+    "var_fps_video.mp4": "h264",
+    "av1_video.mkv": "av1",
+}
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_videos(name: str, tmp_path: Path) -> None:
+    packets, size = packets_of(real(f"video/{name}"), REAL[name])
+    bodies = [packet.data for packet in packets[:120]]
+    check(tmp_path / "a.mp4", REAL[name], bodies)
+    with PacketReader(tmp_path / "a.mp4", codec=REAL[name], coded_size=size) as reader:
+        assert len(reader) == len(bodies)
+
+
+def test_a_refusal_is_a_reason() -> None:
+    """Which users read: one clause, in plain words."""
+    with pytest.raises(Refused, match=r"^it .*[^.]$"):
+        PictureParser("h264").parse(b"\xff\xd8")

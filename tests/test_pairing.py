@@ -1,0 +1,575 @@
+"""Which calibrations belong to which images: by choice, by name, by stamp."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.highlevel import AnyReader
+
+from conftest import real
+from mp4ds.bags import open_reader
+from mp4ds.errors import OptionError
+from mp4ds.pairing import (
+    IMAGE_WINDOW,
+    INFO_WINDOW,
+    MAX_CHANNELS,
+    StampPairing,
+    choose_pairs,
+    pair_camera_infos,
+)
+from mp4ds.records import Channel, Message, Schema
+from mp4ds.wire import (
+    CalibrationFields,
+    CodedFields,
+    Fields,
+    ImageFields,
+    Parts,
+    form_of,
+    is_calibration,
+    wire_of,
+)
+
+RAW = ("sensor_msgs/Image", "sensor_msgs/msg/Image", "foxglove.RawImage", "foxglove_msgs/RawImage")
+CODED = (
+    *("sensor_msgs/CompressedImage", "sensor_msgs/msg/CompressedImage"),
+    *("foxglove.CompressedImage", "foxglove_msgs/msg/CompressedImage"),
+    *("foxglove.CompressedVideo", "foxglove_msgs/msg/CompressedVideo"),
+    *("ffmpeg_image_transport_msgs/FFMPEGPacket", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"),
+)
+INFO = (
+    *("sensor_msgs/CameraInfo", "sensor_msgs/msg/CameraInfo"),
+    *("foxglove.CameraCalibration", "foxglove_msgs/msg/CameraCalibration"),
+)
+CODED_NAMES = ("compressed", "compressedDepth", "ffmpeg", "foxglove", "video", "jpeg")
+
+
+def channel(number: int, topic: str, type_name: str) -> Channel:
+    encoding = "ros1" if type_name.count("/") == 1 else "cdr" if "/" in type_name else "protobuf"
+    return Channel(number, topic, encoding, Schema(type_name, "", b""))
+
+
+def channels(*topics: str) -> list[Channel]:
+    """Channels by topic, numbered; the last part tells what they hold."""
+    found = []
+    for number, topic in enumerate(topics):
+        leaf = topic.strip("/").split("/")[-1]
+        kind = INFO if "info" in leaf or "calib" in leaf else CODED if leaf in CODED_NAMES else RAW
+        found.append(channel(number, topic, "std_msgs/String" if leaf == "chat" else kind[0]))
+    return found
+
+
+# ---------------------------------------------------------------- by name
+
+BY_NAME: list[tuple[list[str], dict[int, int]]] = [
+    (["/cam/image_raw", "/cam/camera_info"], {1: 0}),
+    (["/cam/camera_info", "/cam/image_raw"], {0: 1}),
+    (["/cam/image_color", "/cam/image_raw", "/cam/camera_info"], {2: 1}),
+    (["/cam/image_mono", "/cam/image_color", "/cam/camera_info"], {2: 1}),
+    (["/l/image_raw", "/r/image_raw", "/r/camera_info", "/l/camera_info"], {2: 1, 3: 0}),
+    (["/cam/image_raw", "/other/camera_info"], {}),
+    (["/cam/image_raw", "/cam/left_info"], {}),
+    (["/cam/deep/image_raw", "/cam/camera_info"], {}),
+    (["/camera_info", "/image_raw"], {0: 1}),
+    (["image_raw", "/camera_info"], {1: 0}),
+    (["cam/image_raw", "/cam/camera_info"], {1: 0}),
+    (["/cam/image_raw", "/cam/camera_info", "/cam/camera_info"], {}),  # several publishers
+    (["/cam/image_raw", "/cam/image_raw", "/cam/camera_info"], {2: 0}),
+    (["/cam/camera_info"], {}),
+    ([], {}),
+    # transports have the calibration of the image that they carry
+    *((["/cam/image_raw/" + name, "/cam/camera_info"], {1: 0}) for name in CODED_NAMES[:4]),
+    *((["cam/image_raw/" + name, "cam/camera_info/"], {1: 0}) for name in CODED_NAMES[:4]),
+    (["/cam/image_raw/video", "/cam/camera_info"], {}),  # no transport: a topic of its own
+    (["/cam/image_raw/video", "/cam/image_raw/camera_info"], {1: 0}),
+    (["/cam/image_raw/compressed", "/cam/image_raw/camera_info"], {1: 0}),
+    (["/cam/compressed", "/cam/camera_info"], {1: 0}),
+    (["/cam/compressed", "/camera_info"], {1: 0}),
+    (["/cam/compressed", "/cam/image_raw/compressed", "/cam/camera_info"], {2: 1}),
+    (["compressed", "camera_info"], {1: 0}),
+    (["/cam/image_raw/compressed", "/cam/image_mono", "/cam/camera_info"], {2: 1}),  # raw first
+    (["/cam/a/compressed", "/cam/image_raw/ffmpeg", "/cam/camera_info"], {2: 1}),
+    (["/cam/image_raw/ffmpeg", "/cam/image_raw/compressed", "/cam/camera_info"], {2: 1}),
+    # Foxglove's name
+    (["/cam/video", "/cam/calibration"], {1: 0}),
+    (["/cam/image_raw", "/cam/calibration", "/cam/camera_info"], {2: 0}),
+    (["/cam/image_raw", "/cam/image_raw/compressed", "/cam/calibration", "/cam/camera_info"],
+     {3: 0, 2: 1}),
+    (["/cam/image_raw", "/cam/calib"], {}),
+    (["/calibration", "/camera_info", "/chat"], {}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("topics", "pairs"), BY_NAME)
+def test_calibrations_belong_to_the_image_beside_them(
+    topics: list[str], pairs: dict[int, int]
+) -> None:
+    assert pair_camera_infos(channels(*topics)) == pairs
+    assert pair_camera_infos(channels(*topics)[::-1]) == pairs
+
+
+@pytest.mark.parametrize("info", INFO)
+@pytest.mark.parametrize("image", [*RAW, *CODED])
+def test_every_type_of_images_and_calibrations(image: str, info: str) -> None:
+    transport = "/compressed" if image in CODED else ""
+    pair = [channel(7, "/cam/image_raw" + transport, image), channel(3, "/cam/camera_info", info)]
+    assert pair_camera_infos(pair) == {3: 7}
+
+
+def test_only_the_types_count() -> None:
+    image, info = channels("/cam/image_raw", "/cam/camera_info")
+    words = Channel(2, "/cam/image_raw", "ros1", Schema("std_msgs/String", "", b""))
+    ros2 = Channel(3, "/cam/image_raw", "cdr", Schema("sensor_msgs/msg/Image", "", b""))
+    assert pair_camera_infos([words, info]) == {}
+    assert pair_camera_infos([Channel(4, "/cam/image_raw", "json", None), info]) == {}
+    assert pair_camera_infos([ros2, info]) == {1: 3}
+    assert pair_camera_infos([image, Channel(1, "/cam/camera_info", "ros1", None)]) == {}
+
+
+def test_of_coded_images_the_largest_is_taken() -> None:
+    found = channels("/cam/a/compressed", "/cam/b/compressed", "/cam/camera_info")
+    assert pair_camera_infos(found) == {2: 0}
+    assert pair_camera_infos(found, sizes={0: (320, 240), 1: (640, 480)}) == {2: 1}
+    assert pair_camera_infos(found, sizes={0: (640, 480), 1: (320, 240)}) == {2: 0}
+    raw = channels("/cam/a", "/cam/b/compressed", "/cam/camera_info")
+    assert pair_camera_infos(raw, sizes={0: (320, 240), 1: (640, 480)}) == {2: 0}
+
+
+def test_what_was_chosen_stays() -> None:
+    found = channels("/l/image_raw", "/l/camera_info", "/r/image_raw", "/r/camera_info")
+    assert pair_camera_infos(found, chosen={1: 2}) == {1: 2}
+    assert pair_camera_infos(found, chosen={1: 2, 3: 0}) == {1: 2, 3: 0}
+
+
+Topics = st.lists(
+    st.sampled_from(["cam", "l", "image_raw", "image", "compressed", "camera_info", "calibration"]),
+    min_size=1,
+    max_size=4,
+).map("/".join)
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.tuples(Topics, st.sampled_from([RAW[0], CODED[0], INFO[0]])), max_size=12),
+    st.randoms(),
+)
+def test_pairs_are_of_one_to_one_whatever_the_order(
+    topics: list[tuple[str, str]], order: random.Random
+) -> None:
+    found = [channel(n, topic, type_name) for n, (topic, type_name) in enumerate(topics)]
+    pairs = pair_camera_infos(found)
+    assert len(set(pairs.values())) == len(pairs)
+    assert all(topics[info][1] == INFO[0] and topics[image][1] != INFO[0]
+               for info, image in pairs.items())  # fmt: skip
+    order.shuffle(found)
+    assert pair_camera_infos(found) == pairs
+
+
+# ---------------------------------------------------------------- by choice
+
+
+def test_chosen_pairs() -> None:
+    found = channels("/a", "/b/compressed", "/x_info", "/y_info", "/chat")
+    assert choose_pairs([], found) == {}
+    assert choose_pairs(["/a=/y_info", "/b/compressed=/x_info"], found) == {3: 0, 2: 1}
+    assert choose_pairs(["/a=/y_info", "/a=/y_info"], found) == {3: 0}
+
+
+def test_chosen_pairs_of_several_publishers() -> None:
+    found = channels("/a", "/x_info", "/a", "/x_info", "/x_info")
+    assert choose_pairs(["/a=/x_info"], found) == {1: 0, 3: 2}
+
+
+def test_chosen_topics_with_equals_signs() -> None:
+    found = channels("/a=b", "/x=y_info", "/x=y=z_info")
+    assert choose_pairs(["/a=b=/x=y_info"], found) == {1: 0}
+    assert choose_pairs(["/a=b=/x=y=z_info"], found) == {2: 0}
+
+
+@pytest.mark.parametrize(
+    ("choices", "sentence"),
+    [
+        (["/a"], "'/a' is not of the form IMAGE=INFO"),
+        (["=/x_info"], "is not of the form IMAGE=INFO"),
+        (["/a="], "is not of the form IMAGE=INFO"),
+        ([""], "is not of the form IMAGE=INFO"),
+        (["/z=/x_info"], r"no topic '/z' among .* Topics of images: /a, /b\."),
+        (["a=/x_info"], "no topic 'a' among"),  # exact
+        (["/a=/z"], r"no topic '/z' among .* Topics of calibrations: /x_info, /y_info\."),
+        (["/chat=/x_info"], "'/chat' holds std_msgs/String, no images"),
+        (["/a=/chat"], "'/chat' holds std_msgs/String, no calibrations"),
+        (["/x_info=/a"], "'/x_info' holds sensor_msgs/CameraInfo, no images"),
+        (["/a=/b"], "'/b' holds sensor_msgs/Image, no calibrations"),
+        (["/a=/x_info", "/b=/x_info"], "gives /x_info to /a and to /b: .* one stream only"),
+        (["/a=/x_info", "/a=/y_info"], "gives /x_info and /y_info to /a: .* one calibration"),
+    ],
+)
+def test_choices_that_cannot_be(choices: list[str], sentence: str) -> None:
+    with pytest.raises(OptionError, match=sentence):
+        choose_pairs(choices, channels("/a", "/b", "/x_info", "/y_info", "/chat"))
+
+
+def test_a_choice_where_there_is_nothing() -> None:
+    with pytest.raises(OptionError, match="Topics of images: none"):
+        choose_pairs(["/a=/b"], [])
+    many = channels(*(f"/a{n}" for n in range(30)))
+    with pytest.raises(OptionError, match=r", \.\.\.\."):
+        choose_pairs(["/a=/b"], many)
+
+
+# ---------------------------------------------------------------- by stamp
+
+EMPTY = memoryview(b"")
+START = 1_700_000_000_000_000_000
+STAMPS = [START + n * 33_333_333 for n in range(40)]
+MATRICES = {"distortion_model": "plumb_bob", "d": (), "k": (0.0,) * 9, "r": (0.0,) * 9,
+            "p": (0.0,) * 12}  # fmt: skip
+
+
+def message(stamp: int, fields: Fields, frame_id: str = "") -> Parts:
+    return Parts(stamp, None, None, frame_id, fields, EMPTY, b"")
+
+
+def raw(width: int = 640, height: int = 480) -> Fields:
+    return ImageFields("mono8", width, height, width, 0)
+
+
+def info(
+    width: int = 640,
+    height: int = 480,
+    binning: tuple[int, int] = (0, 0),
+    roi: tuple[int, int] = (0, 0),
+) -> Fields:
+    return CalibrationFields(
+        height, width, **MATRICES, binning_x=binning[0], binning_y=binning[1],
+        roi=(4, 4, roi[1], roi[0]),
+    )  # fmt: skip
+
+
+class Recording:
+    """Channels by topic and what they say, in the order of the stamps."""
+
+    def __init__(self) -> None:
+        self.channels: list[Channel] = []
+        self.messages: list[tuple[int, Parts]] = []
+
+    def add(
+        self, topic: str, stamps: Iterable[int], fields: Fields, frame_id: str = ""
+    ) -> Recording:
+        kind = INFO if isinstance(fields, CalibrationFields) else RAW
+        kind = CODED if isinstance(fields, CodedFields) else kind
+        number = len(self.channels)
+        self.channels.append(channel(number, topic, kind[0]))
+        self.messages += [(number, message(stamp, fields, frame_id)) for stamp in stamps]
+        return self
+
+    def pair(
+        self, *paired: tuple[str, str], final: bool = True, in_order: bool = False
+    ) -> dict[str, str]:
+        """What is paired, calibration topic -> image topic."""
+        pairing = StampPairing()
+        key = (lambda item: 0) if in_order else (lambda item: item[1].stamp)
+        for number, parts in sorted(self.messages, key=key):
+            pairing.add(self.channels[number], parts)
+        number_of = {own.topic: own.id for own in self.channels}
+        held = {number_of[info]: number_of[image] for info, image in paired}
+        pairs = pairing.decide(held, final=final)
+        assert pairing.decide(held, final=final) == pairs
+        return {self.channels[i].topic: self.channels[j].topic for i, j in pairs.items()}
+
+
+def test_equal_stamps_pair() -> None:
+    found = Recording().add("/eye", STAMPS, raw()).add("/eye_info", STAMPS, info())
+    assert found.pair() == {"/eye_info": "/eye"}
+    assert found.pair(final=False) == {"/eye_info": "/eye"}
+    assert found.pair(in_order=True) == {"/eye_info": "/eye"}
+
+
+def test_several_cameras_by_their_own_stamps() -> None:
+    found = Recording()
+    for number in range(5):
+        stamps = [stamp + number for stamp in STAMPS]
+        found.add(f"/eye{number}", stamps, raw()).add(f"/info{4 - number}", stamps, info())
+    assert found.pair() == {f"/info{4 - n}": f"/eye{n}" for n in range(5)}
+
+
+@pytest.mark.parametrize(
+    ("lost", "pairs"),
+    [(range(0, 40, 5), True), (range(0, 40, 4), False), (range(0, 40, 2), False)],
+)
+def test_four_of_five_stamps_must_agree(lost: range, pairs: bool) -> None:
+    images = [stamp + (n in lost) for n, stamp in enumerate(STAMPS)]
+    found = Recording().add("/eye", images, raw()).add("/eye_info", STAMPS[1:-1], info())
+    assert bool(found.pair()) == pairs
+
+
+def test_three_common_stamps_are_enough() -> None:
+    late = [*STAMPS[:3], *(stamp + 10**12 for stamp in STAMPS)]
+    found = Recording().add("/eye", STAMPS, raw()).add("/eye_info", late, info())
+    assert found.pair(final=False) == {"/eye_info": "/eye"}
+
+
+def test_frequent_images_and_rare_calibrations() -> None:
+    found = Recording().add("/eye", STAMPS, raw()).add("/eye_info", STAMPS[::10], info())
+    assert found.pair() == {"/eye_info": "/eye"}
+    often = Recording().add("/eye", STAMPS[::10], raw()).add("/eye_info", STAMPS, info())
+    assert often.pair() == {}  # one stamp of ten is an image's
+
+
+def test_only_the_time_of_both_counts() -> None:
+    images = Recording().add("/eye", STAMPS[20:], raw()).add("/eye_info", STAMPS, info())
+    assert images.pair() == {"/eye_info": "/eye"}
+    infos = Recording().add("/eye", STAMPS, raw()).add("/eye_info", STAMPS[30:], info())
+    assert infos.pair() == {"/eye_info": "/eye"}
+    apart = Recording().add("/eye", STAMPS[:20], raw()).add("/eye_info", STAMPS[20:], info())
+    assert apart.pair() == {}
+
+
+@pytest.mark.parametrize(
+    ("image_stamps", "info_stamps", "pairs"),
+    [
+        (STAMPS[:1], STAMPS[:1], True),
+        (STAMPS[:2], STAMPS[:2], True),
+        (STAMPS[:3], STAMPS[:3], True),
+        (STAMPS[:40], STAMPS[7:10], True),
+        (STAMPS[:40], [*STAMPS[7:10], STAMPS[10] + 1], False),  # three of four
+        (STAMPS[:40], STAMPS[4:5], True),  # a single calibration
+        (STAMPS[:40], [STAMPS[4], STAMPS[5] + 1], False),  # one of two
+        (STAMPS[:40], [STAMPS[4], 0], False),
+        (STAMPS[:40], [STAMPS[4]] * 9, False),  # nine messages, one stamp
+        (STAMPS[:1], STAMPS[:9], True),
+        (STAMPS[:1], [stamp + 1 for stamp in STAMPS[:15]], False),  # fifteen to an image
+        ([0], [0], False),
+        ([0] * 9, [0] * 9, False),
+        (STAMPS[:9], [0] * 9, False),
+        (STAMPS[:9], [0] * 2 + STAMPS[2:9], False),  # two of nine are not there
+        (STAMPS[:9], [0, *STAMPS[1:9]], True),
+        (STAMPS[:9], [stamp + 1 for stamp in STAMPS[:9]], False),
+        ([], STAMPS[:9], False),
+        (STAMPS[:9], [], False),
+        ([-5, -4, -3], [-5, -4, -3], True),
+    ],
+)
+def test_few_stamps(image_stamps: list[int], info_stamps: list[int], pairs: bool) -> None:
+    found = Recording().add("/eye", image_stamps, raw()).add("/eye_info", info_stamps, info())
+    assert bool(found.pair()) == pairs
+
+
+def test_few_stamps_do_not_pair_before_the_end() -> None:
+    for count in (1, 2):
+        few = STAMPS[:count]
+        found = Recording().add("/eye", few, raw()).add("/eye_info", few, info())
+        assert found.pair(final=False) == {}
+        assert found.pair() == {"/eye_info": "/eye"}
+
+
+SIZES: list[tuple[Fields, tuple[int, int], bool]] = [
+    (info(640, 480), (640, 480), True),
+    (info(640, 480), (480, 640), False),
+    (info(640, 480), (320, 240), False),
+    (info(640, 480, binning=(2, 2)), (320, 240), True),
+    (info(640, 480, binning=(2, 2)), (640, 480), True),
+    (info(640, 480, binning=(2, 1)), (320, 480), True),
+    (info(640, 480, binning=(2, 1)), (320, 240), False),
+    (info(641, 481, binning=(2, 2)), (320, 240), True),
+    (info(641, 481, binning=(2, 2)), (321, 241), True),
+    (info(641, 481, binning=(2, 2)), (322, 241), False),
+    (info(640, 480, roi=(200, 100)), (200, 100), True),
+    (info(640, 480, roi=(200, 100)), (640, 480), True),
+    (info(640, 480, roi=(200, 100)), (100, 50), False),
+    (info(640, 480, roi=(200, 100), binning=(2, 2)), (100, 50), True),
+    (info(0, 0), (640, 480), True),  # not calibrated
+]
+
+
+@pytest.mark.parametrize(("calibration", "size", "pairs"), SIZES)
+def test_sizes_must_not_contradict(calibration: Fields, size: tuple[int, int], pairs: bool) -> None:
+    found = Recording().add("/eye", STAMPS, raw(*size)).add("/eye_info", STAMPS, calibration)
+    assert bool(found.pair()) == pairs
+
+
+def test_the_size_of_a_coded_image_may_be_told() -> None:
+    for size, pairs in (((0, 0), {1: 0}), ((640, 480), {1: 0}), ((320, 240), {})):
+        eye, calibration = channels("/eye/compressed", "/eye_info")
+        pairing = StampPairing()
+        for stamp in STAMPS:
+            pairing.add(eye, message(stamp, CodedFields("jpeg")), size=size)
+            pairing.add(calibration, message(stamp, info()))
+        assert pairing.decide({}) == pairs
+
+
+def test_a_size_decides_between_cameras_that_are_triggered_together() -> None:
+    found = Recording()
+    for name, size in (("a", (640, 480)), ("b", (320, 240))):
+        found.add(f"/{name}", STAMPS, raw(*size)).add(f"/{name}_info", STAMPS, info(*size))
+    assert found.pair() == {"/a_info": "/a", "/b_info": "/b"}
+
+
+def test_a_frame_id_decides_between_cameras_that_are_triggered_together() -> None:
+    found = Recording()
+    for name in "ab":
+        found.add(f"/{name}", STAMPS, raw(), f"/{name}_frame")
+        found.add(f"/{name}_info", STAMPS, info(), f"{name}_frame")
+    assert found.pair() == {"/a_info": "/a", "/b_info": "/b"}
+
+
+def test_a_frame_id_that_is_told_outweighs_one_that_is_not() -> None:
+    found = Recording().add("/a", STAMPS, raw(), "eye").add("/b", STAMPS, raw())
+    assert found.add("/info", STAMPS, info(), "eye").pair() == {"/info": "/a"}
+
+
+def test_cameras_that_cannot_be_told_apart_are_not_paired() -> None:
+    for frame_id in ("", "rig"):
+        found = Recording()
+        for name in "ab":
+            found.add(f"/{name}", STAMPS, raw(), frame_id)
+            found.add(f"/{name}_info", STAMPS, info(), frame_id)
+        assert found.pair() == {}
+
+
+def test_a_dropped_frame_does_not_tell_cameras_apart() -> None:
+    found = Recording().add("/a", STAMPS, raw()).add("/b", STAMPS[:5] + STAMPS[6:], raw())
+    assert found.add("/info", STAMPS, info()).pair() == {}
+
+
+def test_another_frame_is_another_camera() -> None:
+    found = Recording().add("/eye", STAMPS, raw(), "left").add("/eye_info", STAMPS, info(), "right")
+    assert found.pair() == {}
+
+
+def test_of_the_views_of_one_camera_the_raw_image_is_taken() -> None:
+    found = Recording()
+    found.add("/cam/image_raw/compressed", STAMPS, CodedFields("jpeg"))
+    found.add("/cam/image_rect", STAMPS, raw()).add("/cam/image_raw", STAMPS, raw())
+    assert found.add("/calibs/cam_info", STAMPS, info()).pair() == {
+        "/calibs/cam_info": "/cam/image_raw"
+    }
+    small = Recording().add("/cam/image_raw", STAMPS, raw(320, 240))
+    small.add("/cam/image_color", STAMPS, raw())
+    assert small.add("/info", STAMPS, info()).pair() == {"/info": "/cam/image_color"}
+
+
+def test_two_calibrations_of_one_camera_are_not_paired() -> None:
+    found = Recording().add("/eye", STAMPS, raw())
+    assert found.add("/a_info", STAMPS, info()).add("/b_info", STAMPS, info()).pair() == {}
+
+
+def test_what_is_paired_stays_and_is_a_rival() -> None:
+    found = Recording().add("/a", STAMPS, raw()).add("/b", STAMPS, raw())
+    found.add("/a_info", STAMPS, info()).add("/b_info", STAMPS, info())
+    assert found.pair(("/a_info", "/a")) == {}  # /b_info may be of a third camera
+    one = Recording().add("/a", STAMPS, raw()).add("/a_info", STAMPS, info())
+    assert one.add("/other_info", STAMPS, info()).pair(("/a_info", "/a")) == {}
+    assert one.pair(("/a_info", "/a"), ("/other_info", "/a")) == {}
+
+
+def test_memory_is_bounded_and_a_late_start_is_found() -> None:
+    eye, calibration = channels("/eye", "/eye_info")
+    pairing = StampPairing()
+    for n in range(5 * IMAGE_WINDOW):
+        pairing.add(calibration, message(n + 1, info()))
+    for n in range(5 * IMAGE_WINDOW, 5 * IMAGE_WINDOW + INFO_WINDOW):
+        pairing.add(eye, message(n + 1, raw()))
+        pairing.add(calibration, message(n + 1, info()))
+    assert pairing.decide({}) == {1: 0}
+    for n in range(IMAGE_WINDOW):  # images go on, their calibration does not
+        pairing.add(eye, message(10**9 + n, raw()))
+    assert pairing.decide({}) == {}
+
+
+def test_too_many_channels_are_not_compared() -> None:
+    for extra, paired in ((0, MAX_CHANNELS), (1, 0)):
+        found = Recording()
+        for number in range(MAX_CHANNELS + extra):
+            stamps = [stamp + number for stamp in STAMPS[:3]]
+            found.add(f"/eye{number}", stamps, raw()).add(f"/info{number}", stamps, info())
+        assert len(found.pair()) == paired
+
+
+Stamps = st.lists(st.sampled_from([0, 1, 2, 3, 5, 8, 9]), max_size=8)
+
+
+@settings(deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["/a", "/b", "/c/image_raw", "/c/image"]), Stamps), max_size=4
+    ),
+    st.lists(Stamps, max_size=3),
+    st.booleans(),
+)
+def test_what_pairs_follows_the_rule(
+    images: Sequence[tuple[str, list[int]]], infos: Sequence[list[int]], final: bool
+) -> None:
+    found = Recording()
+    for topic, stamps in images:
+        found.add(topic, stamps, raw())
+    for number, stamps in enumerate(infos):
+        found.add(f"/info{number}", stamps, info())
+    pairs = found.pair(final=final, in_order=True)
+    assert len(set(pairs.values())) == len(pairs)
+    for info_topic, image_topic in pairs.items():
+        own = infos[int(info_topic[-1])]
+        candidates = [set(stamps) - {0} for topic, stamps in images if topic == image_topic]
+        assert any(
+            len(set(own) & stamps) >= min(3, len(own), *([] if not final else [len(stamps)]))
+            for stamps in candidates
+        )
+        if not final:
+            assert len(set(own) - {0}) >= 3
+
+
+# ---------------------------------------------------------------- real recordings
+
+REAL: list[tuple[str, dict[str, str]]] = [
+    (
+        "bags/fiducials_aruco_marker_raspicam.bag",
+        {"/raspicam_node/camera_info": "/raspicam_node/image/compressed"},
+    ),
+    ("bags/librealsense_depth_color.bag", {}),
+    ("bags/ecto_ros_camera_info.bag", {}),
+    (
+        "rosbag2/geocamxyz_test_bag_sqlite3",
+        {"/test/sensor_msgs/camera_info": "/test/sensor_msgs/image"},
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "pairs"), REAL)
+def test_real_recordings_by_name(name: str, pairs: dict[str, str]) -> None:
+    with open_reader(real(name)) as reader:
+        topics = {own.id: own.topic for own in reader.channels}
+        found = pair_camera_infos(reader.channels)
+    assert {topics[i]: topics[j] for i, j in found.items()} == pairs
+
+
+@pytest.mark.parametrize("name", [name for name, _ in REAL])
+def test_real_recordings_by_stamp(name: str) -> None:
+    """Zero stamps, no common stamps, no images: none of these may pair."""
+    path = real(name)
+    with open_reader(path) as reader:
+        pairing, count = StampPairing(), 0
+        for record in reader.records():
+            if isinstance(record, Message) and any(
+                word in record.channel.type_name
+                for word in ("/Image", "/Compressed", "/CameraInfo")
+            ):
+                pairing.add(record.channel, split(record))
+                count += is_calibration(record.channel)
+    assert count == infos_of(path)
+    assert pairing.decide({}) == {}
+
+
+def split(record: Message) -> Parts:
+    data, schema = memoryview(record.data), record.channel.schema
+    wire = wire_of(record.channel.message_encoding, data)
+    return form_of(wire, record.channel.type_name, schema.data if schema else b"").split(data)
+
+
+def infos_of(path: Path) -> int:
+    """Calibrations in a recording, by other means."""
+    with AnyReader([path]) as reader:
+        return sum(own.msgcount for own in reader.connections if "CameraInfo" in own.msgtype)

@@ -1,0 +1,433 @@
+"""What spec/registry.md lists is what the code has: names, tables, codes and reasons."""
+
+from __future__ import annotations
+
+import ast
+import re
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+
+from mp4ds.coded import PACKET_CODECS, packet_codec, zlib_fingerprint
+from mp4ds.coded.png_filters import RULES
+from mp4ds.layouts import ENCODINGS, LAYOUTS, SCALES, Layout, Parameters, bind
+from mp4ds.plan import VISUAL_TABLE
+from mp4ds.sidecar.fields import Body
+from mp4ds.sidecar.models import CODECS, PIXEL_FORMATS
+from mp4ds.video import recipe_for
+from mp4ds.video.codecs import codecs_to_try, lossless_codecs
+from mp4ds.wire import WIRES
+from mp4ds.wire.foxglove import TYPES as FOXGLOVE_TYPES
+from mp4ds.wire.ros import LAYOUTS as ROS_TYPES
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src" / "mp4ds"
+MODULES = sorted(SOURCE.rglob("*.py"))
+SPEC = ROOT / "spec"
+
+Rows = list[list[str]]
+
+
+def section(text: str, title: str) -> str:
+    return text.split(f"\n## {title}\n", 1)[1].split("\n## ", 1)[0]
+
+
+def registry(title: str) -> str:
+    return section((SPEC / "registry.md").read_text(), title)
+
+
+def first_cells(text: str) -> list[str]:
+    """Names in backticks in the first cell of each row of a section's tables."""
+    rows = re.findall(r"^\| ((?:`[^`]+` ?)+)\|", text, re.MULTILINE)
+    return [name for row in rows for name in re.findall(r"`([^`]+)`", row)]
+
+
+def tables(text: str) -> list[Rows]:
+    """The tables of a section: their rows without the title row, as cells."""
+    found: list[Rows] = []
+    for block in re.findall(r"(?:^\|.*\n?)+", text, re.MULTILINE):
+        lines = block.strip().split("\n")
+        found.append([[cell.strip() for cell in line[1:-1].split("|")] for line in lines[2:]])
+    return found
+
+
+def quoted(cell: str) -> list[str]:
+    """The names in backticks."""
+    return re.findall(r"`([^`]+)`", cell)
+
+
+# ---------------------------------------------------------------- problem codes
+
+CODE = re.compile(r"[a-z0-9]+(-[a-z0-9]+)+")
+CODED = {"FormatError", "VideoError", "Problem", "_failure"}
+PASSED_ON = {"error.code", "code"}
+"""What a code may be called that comes from elsewhere, such as the callers of `_failure`."""
+
+
+def emitted_codes() -> dict[str, list[str]]:
+    """Code -> places where it is the first argument of an error or a problem."""
+    found: dict[str, list[str]] = {}
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not (isinstance(node, ast.Call) and node.args):
+                continue
+            name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            is_super = isinstance(node.func, ast.Attribute) and name == "__init__"
+            first = node.args[0]
+            if name not in CODED and not (is_super and path.name == "errors.py"):
+                continue
+            if isinstance(first, ast.Constant) and isinstance(first.value, str):
+                if CODE.fullmatch(first.value):
+                    found.setdefault(first.value, []).append(f"{path.name}:{node.lineno}")
+            elif name in CODED and ast.unparse(first) not in PASSED_ON:
+                # a code that is passed on must be one that is found elsewhere
+                pytest.fail(f"{path.name}:{node.lineno}: the code is {ast.unparse(first)}")
+    return found
+
+
+def test_the_registry_lists_exactly_the_codes_of_the_code() -> None:
+    codes = emitted_codes()
+    listed = first_cells(registry("Problem codes"))
+    assert len(listed) == len(set(listed))
+    assert {code: places for code, places in codes.items() if code not in listed} == {}
+    assert sorted(set(listed) - set(codes)) == []
+
+
+def test_the_spec_uses_no_other_codes() -> None:
+    listed = set(first_cells(registry("Problem codes")))
+    text = (SPEC / "index.md").read_text()
+    used = set(re.findall(r"\(`([a-z]+(?:-[a-z]+)+)`\)", text))
+    assert used
+    assert used <= listed
+
+
+# ---------------------------------------------------------------- other registries
+
+SAMPLES = {"u": "uint", "i": "int", "f": "float"}
+# a set of parameters -> values that give every kind of picture of a layout with these
+PARAMETERS: dict[frozenset[str], list[dict[str, Any]]] = {
+    frozenset(): [{}],
+    frozenset({"bits", "shift"}): [{"bits": bits, "shift": 0} for bits in (8, 10, 12, 14)],
+    frozenset({"bits", "shift", "low"}): [
+        {"bits": 12, "shift": 4, "low": 4},
+        {"bits": 16, "shift": 0, "low": 6},
+    ],
+    frozenset({"entries"}): [{"entries": 256}, {"entries": 1024}],
+    frozenset({"table"}): [{"table": (3, 5)}, {"table": tuple(range(0, 900, 3))}],
+    frozenset({"hole", "scale"}): [{"hole": 0, "scale": scale} for scale in SCALES],
+    frozenset({"alpha"}): [{"alpha": 255}],
+}
+
+
+def test_the_registry_lists_exactly_the_encodings() -> None:
+    listed: dict[str, tuple[str, str, list[str], list[str], str]] = {}
+    (rows,) = tables(registry("Encodings"))
+    for names, channels, samples, exact, lossy in rows:
+        counts = channels.split(", ")
+        for name, count in zip(
+            quoted(names), counts * (len(quoted(names)) // len(counts)), strict=True
+        ):
+            assert name not in listed
+            bold = re.findall(r"\*\*`(\w+)`\*\*", exact)
+            listed[name] = (count, samples, bold, quoted(exact), lossy)
+    assert listed == {
+        name: (
+            str(encoding.channels),
+            f"{SAMPLES[encoding.dtype[0]]}{8 * encoding.bytes_per_sample}",
+            [encoding.general],
+            [encoding.general, *(other for other in encoding.exact if other != encoding.general)],
+            f"`{encoding.lossy}`" if encoding.lossy else "none",
+        )
+        for name, encoding in ENCODINGS.items()
+    }
+
+
+def bound_layouts() -> Iterator[tuple[str, Layout]]:
+    """Every layout, with every encoding that has it and parameters of each kind."""
+    for encoding in ENCODINGS.values():
+        for name in {*encoding.exact, encoding.lossy or encoding.general}:
+            for values in PARAMETERS[LAYOUTS[name].parameters]:
+                if name in ("gbr_bits", "gbra_bits") and values["bits"] == 8:
+                    continue  # no planes of colours have 8 bits
+                yield name, bind(name, encoding, Parameters.from_values(values))
+
+
+def test_the_registry_lists_exactly_the_layouts() -> None:
+    (rows,) = tables(registry("Layouts"))
+    first = [row[0] for row in rows]
+    assert list(map(quoted, first)) == [[name] for name in LAYOUTS]
+    formats: dict[str, set[str]] = {}
+    for name, layout in bound_layouts():
+        formats.setdefault(name, set()).add(layout.pixel_format)
+    for (name,), row in zip(map(quoted, first), rows, strict=True):
+        kind = LAYOUTS[name]
+        assert set(quoted(row[4])) == kind.parameters, name
+        assert row[5:] == ["yes" if kind.is_exact else "no", "yes" if kind.is_shown else "no"]
+        cell = row[1].replace("`*n*`", "N")
+        listed = {text.replace("N", bits) for text in quoted(cell) for bits in ("10", "12", "14")}
+        listed |= {"gray"} if "grayNle" in cell else set()  # of 8 bits
+        assert formats[name] == listed, name
+    described = section((SPEC / "index.md").read_text(), "Layouts")
+    values, places = (
+        {name for row in rows for name in quoted(row[0])} for rows in tables(described)
+    )
+    assert {name for row in rows for name in quoted(row[2])} == values
+    assert {name for row in rows for name in quoted(row[3])} == places
+
+
+def test_the_registry_lists_exactly_the_wires_and_bodies() -> None:
+    assert first_cells(registry("Wires")) == list(WIRES)
+    assert first_cells(registry("Bodies")) == list(get_args(Body))
+    index = (SPEC / "index.md").read_text().split("\n### Bodies\n")[1]
+    assert [quoted(row[0]) for row in tables(index)[0]] == [[body] for body in get_args(Body)]
+
+
+def test_the_registry_has_the_message_types() -> None:
+    ros, foxglove = tables(registry("Message types"))[:2]
+    codes = {"uint32": "I", "int32": "i", "uint8": "B", "uint64": "Q", "string": "s"}
+    codes |= {"float64[]": "d*", "float64[9]": "9d", "float64[12]": "12d"}
+    names = {"timestamp": "time", "data": "body"}
+    assert {
+        quoted(row[0])[0]: [
+            (names.get(name, name), codes.get(kind, ""))
+            for name, _, kind in (field.partition(": ") for field in row[1].split(", "))
+        ]
+        for row in ros
+    } == {name: list(layout) for name, (_, layout) in ROS_TYPES.items()}
+    assert {
+        quoted(row[0])[0]: dict(field.split(": ") for field in row[1].split(", "))
+        for row in foxglove
+    } == {
+        name: {
+            field: kind if kind in ("time", "text", "u32", "doubles") else "data"
+            for field, kind in kinds.items()
+        }
+        for name, kinds in FOXGLOVE_TYPES.items()
+    }
+
+
+def test_the_registry_has_the_names_of_packets() -> None:
+    (rows,) = tables(registry("Packets"))
+    assert rows
+    for codec, names, _ in rows:
+        for name in quoted(names):
+            assert [packet_codec(text) for text in (name, f"{name.upper()};x", f"{name}_x")] == (
+                quoted(codec) * 3
+            )
+
+
+def test_the_registry_has_the_rules_of_png_filters() -> None:
+    (rows,) = tables(registry("PNG files"))
+    assert {
+        quoted(name)[0]: (tuple(map(int, kinds.split(", "))), first) for name, kinds, first in rows
+    } == {
+        name: (rule.kinds, "as the others" if rule.first is None else str(rule.first))
+        for name, rule in RULES.items()
+    }
+    text = " ".join(registry("PNG files").split())
+    for name, rule in RULES.items():
+        assert rule.narrow == (f"`{name}`" in text.split("leave out")[0].rsplit(". ", 1)[1]), name
+    assert {name: rule.weight for name, rule in RULES.items() if rule.weight} == {"ffmpeg-mixed": 1}
+    assert "`ffmpeg-mixed` adds the filter's number to each sum" in text
+
+
+def test_the_fingerprint_is_the_one_that_the_registry_describes() -> None:
+    x, data, checksum = 1, bytearray(), 0
+    for i in range(65536):
+        x = (69069 * x + 1) % 2**32
+        data.append((i * i // 2**14 + x // 2**29) % 256)
+    for level in (1, 3, 6, 9):
+        for strategy in (0, 1, 2, 3):
+            deflate = zlib.compressobj(level, 8, 15, 8, strategy)
+            checksum = zlib.crc32(deflate.compress(data) + deflate.flush(), checksum)
+    assert zlib_fingerprint() == f"{checksum:08x}"
+    if re.fullmatch(r"1\.(2\.(8|11|12|13)|3(\.1)?)", zlib.ZLIB_RUNTIME_VERSION):
+        assert f"`{checksum:08x}`" in registry("PNG files")
+
+
+def test_the_registry_has_the_table_of_the_paper() -> None:
+    rows = re.findall(r"^\| (\d+) \| (\d+) \| (\d+) \|$", registry("Profiles"), re.MULTILINE)
+    assert [(float(rate), int(crf), int(preset)) for rate, crf, preset in rows] == list(
+        VISUAL_TABLE
+    )
+
+
+def test_the_registry_lists_exactly_the_codecs() -> None:
+    rows = tables(registry("Codecs"))[0]
+    assert [quoted(row[0]) for row in rows] == [[codec] for codec in CODECS]
+    for row in rows:
+        (codec,) = quoted(row[0])
+        made = {item.mode for item in codec_rows() if item.codec == codec}
+        assert set(row[3].split(", ")) == (made or {"no"}), codec
+        assert row[4] == ("yes" if codec in PACKET_CODECS else "no"), codec
+
+
+@dataclass(frozen=True)
+class CodecRow:
+    """A row of the table of what encoders are given."""
+
+    formats: list[str]
+    mode: str
+    codec: str
+    default: bool
+    tried: bool
+    encoder: str
+    pixel_format: str
+    options: dict[str, str]
+
+
+def codec_rows() -> Iterator[CodecRow]:
+    for cells in tables(registry("Codecs"))[1]:
+        (codec,) = quoted(cells[2])
+        options = dict((*option.partition("=")[::2],) for option in quoted(cells[5]))
+        same = cells[4] == "the same"
+        yield CodecRow(
+            quoted(cells[0]),
+            cells[1],
+            codec,
+            cells[2].endswith("*"),
+            not cells[2].startswith("("),
+            cells[3],
+            "" if same else quoted(cells[4])[0],
+            options,
+        )
+
+
+def test_the_registry_has_the_codecs_and_their_defaults() -> None:
+    for row in codec_rows():
+        assert row.mode in ("lossless", "lossy")
+        lossless = row.mode == "lossless"
+        for name in row.formats:
+            place = f"{name} {row.mode} {row.codec}"
+            recipe = recipe_for(name, lossless=lossless, codec=row.codec, crf=20)
+            assert recipe.encoder == row.encoder, place
+            assert recipe.pixel_format == (row.pixel_format or name), place
+            found = {
+                key: text.removesuffix(":log-level=error") for key, text in recipe.options.items()
+            }
+            assert found == row.options | ({} if lossless else {"crf": "20"}), place
+            assert row.default == (recipe_for(name, lossless=lossless, crf=20) == recipe), place
+            assert row.tried == (not lossless or row.codec in codecs_to_try(name)), place
+
+
+def test_the_registry_has_every_lossless_coding() -> None:
+    listed = [
+        (name, row.codec) for row in codec_rows() if row.mode == "lossless" for name in row.formats
+    ]
+    assert len(listed) == len(set(listed))
+    formats = {layout.pixel_format for name, layout in bound_layouts() if LAYOUTS[name].is_exact}
+    assert {(name, codec) for name in formats for codec in lossless_codecs(name)} == set(listed)
+    coded = {recipe_for(name, lossless=True, codec=codec).pixel_format for name, codec in listed}
+    assert coded == set(PIXEL_FORMATS)
+
+
+# ---------------------------------------------------------------- reasons for verbatim storage
+
+REFUSALS = {"Unsuited", "Refused", "NoPicture", "WireError", "EncoderRefusedError"}
+ROOMS = ("coded", "layouts", "streams", "video", "wire", "packing")
+OF_READING = {
+    *("* is no framing of NAL units", "* is no framing of AV1", "* is no framing of *"),
+    "it has * NAL units where its framing has *",
+    *("a NAL unit's length in the video is wrong", "no PNG holds such pixels"),
+    "its NAL units do not stand behind lengths of four bytes",
+    *("the parameters of the track are cut short", "its PNG recipe holds unknown values"),
+    *("a message of this type needs a template", "says something else than the fields beside it"),
+    *("a blank message has data", "a blank message has a timestamp or data"),
+    "it has no pixels",
+}
+"""Refusals of what a sidecar or a video says, which no message meets while it is packed."""
+
+
+def blanked(text: str) -> str:
+    """A reason with a ``*`` for each part that varies."""
+    return re.sub(r"\s*\*(\s*\*)*\s*", "*", text)
+
+
+def texts_of(node: ast.AST, names: dict[str, str]) -> list[str]:
+    """The texts that an expression may give, with a ``*`` for each part that is not known."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return [node.value]
+    if isinstance(node, ast.Name) and node.id in names:
+        return [names[node.id]]
+    if isinstance(node, ast.FormattedValue):
+        return texts_of(node.value, names) or ["*"]
+    if isinstance(node, ast.JoinedStr):
+        return ["".join(text for part in node.values for text in texts_of(part, names)[:1])]
+    if isinstance(node, ast.BinOp):
+        return ["".join((texts_of(part, names) or ["*"])[0] for part in (node.left, node.right))]
+    if isinstance(node, ast.IfExp):
+        return texts_of(node.body, names) + texts_of(node.orelse, names)
+    return []
+
+
+def reasons_of_the_code() -> dict[str, str]:
+    """Reasons for verbatim storage, blanked -> a place of each."""
+    trees = {
+        path: ast.parse(path.read_text())
+        for path in MODULES
+        if path.relative_to(SOURCE).parts[0] in ROOMS and path.name != "transforms.py"
+    }
+    names = {
+        node.targets[0].id: node.value.value
+        for tree in trees.values()
+        for node in tree.body
+        if isinstance(node, ast.Assign)
+        and isinstance(node.targets[0], ast.Name)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    }
+    found: dict[str, str] = {}
+    for path, tree in trees.items():
+        for node in ast.walk(tree):
+            values: list[ast.expr] = []
+            if isinstance(node, ast.Call) and node.args:
+                name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+                values = node.args[:1] if name in REFUSALS else []
+            elif isinstance(node, ast.FunctionDef) and node.name in ("why_not", "refuses"):
+                values = [n.value for n in ast.walk(node) if isinstance(n, ast.Return) and n.value]
+            elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "route.refusal":
+                values = [node.value]
+            for value in values:
+                for text in texts_of(value, names):
+                    found[blanked(text)] = f"{path.name}:{value.lineno}"
+    return found
+
+
+def test_the_registry_lists_exactly_the_reasons_of_the_code() -> None:
+    text = registry("Reasons for verbatim storage")
+    listed = {blanked(re.sub(r"\*[^*]+\*", "*", row[0])) for rows in tables(text) for row in rows}
+    found = reasons_of_the_code()
+    expected = {
+        reason: place
+        for reason, place in found.items()
+        if reason not in set(map(blanked, OF_READING))
+    }
+    assert {reason: place for reason, place in expected.items() if reason not in listed} == {}
+    assert listed - set(expected) == set()
+    assert set(map(blanked, OF_READING)) <= set(found)
+
+
+# ---------------------------------------------------------------- references
+
+
+def references() -> Iterator[tuple[str, str, str]]:
+    """Place, file and title of each section of the spec that the code or a table names."""
+    for path in MODULES:
+        text = re.sub(r"\s+#?\s*", " ", path.read_text())
+        name = str(path.relative_to(SOURCE))
+        for file, title in re.findall(r'spec/(\w+\.md), "([^"]+)"', text):
+            yield name, file, title
+        for title in re.findall(r"\(registry, ([A-Z][\w ]*)\)", text):
+            yield name, "registry.md", title
+
+
+def test_the_sections_that_the_code_names_are_there() -> None:
+    found = list(references())
+    assert len(found) > 10
+    for place, file, title in found:
+        headings = re.findall(r"^#+ (.*)$", (SPEC / file).read_text(), re.MULTILINE)
+        assert title in headings, f"{place} names {file}, {title}"

@@ -1,0 +1,1062 @@
+"""``unpack --images``: cameras as raw images, files or video packets, decoded by public libraries.
+
+Each kind of source is given as each kind of message in each format of recording; `republished`
+reads what came out and shares no code with the package.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+import mp4ds
+from coded_scenes import CODED, MakeScene
+from definitions import CODED_VIDEO, COMPRESSED, IMAGE
+from encoders import cv, nal_units
+from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
+from mp4ds.errors import ConversionError, FormatError, OptionError
+from mp4ds.packing import PackOptions
+from mp4ds.republish import KINDS, Republished
+from mp4ds.republish.topics import FreeTopics, republished_topic
+from mp4ds.unpacking import UnpackOptions, UnpackSummary
+from pictures import YUV, picture, sample_format
+from republished import (
+    CAMERAS,
+    Array,
+    Read,
+    decoded,
+    file_picture,
+    halved,
+    psnr,
+    read,
+    shown,
+    subscribed,
+    truth,
+)
+from scenes import Record, Scene, instant, scene, together, typestore
+from sources import SOURCES
+
+TARGETS = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap"}
+TYPES = {"raw": IMAGE, "jpeg": COMPRESSED, "png": COMPRESSED, "compressed-video": CODED_VIDEO}
+ALREADY = {
+    "raw": "they are raw images already",
+    "jpeg": "they are JPEG files already",
+    "png": "they are PNG files already",
+    "compressed-video": "they are CompressedVideo already",
+}
+NO_CODEC = "CompressedVideo has the codecs h264, h265, av1, vp9, and this video is {}"
+
+
+H264 = PackOptions(codec="h264")
+CODED_AS_H264 = (
+    "raw-mono8",
+    "raw-padded",
+    "raw-rgb8",
+    "raw-bgr8",
+    "raw-bayer",
+    "raw-nv12",
+    "png-rgb",
+    "png-gray",
+)
+
+
+class Packed:
+    """A scene, its recording, and the dataset made of it."""
+
+    def __init__(
+        self, folder: Path, made: Scene, source: str, options: PackOptions | None = None
+    ) -> None:
+        (folder / "source").mkdir(parents=True)
+        write = SOURCES.get(source) or FOXGLOVE_SOURCES[source]
+        self.folder = folder
+        self.scene = made
+        self.paths = write(folder / "source", made)
+        self.summary = mp4ds.pack(self.paths, folder / "dataset", options or PackOptions())
+        self.cameras = sorted(
+            (record for record in made.messages if record.msgtype in CAMERAS),
+            key=lambda record: record.log_time,
+        )
+        self.topic = self.cameras[0].topic
+
+    def unpack(self, to: str, kind: str | None, **options: Any) -> tuple[UnpackSummary, list[Read]]:
+        output = self.folder / f"again{TARGETS[to]}"
+        chosen = UnpackOptions(images=kind, force=True, **options)
+        summary = mp4ds.unpack(self.folder / "dataset", to, output, chosen)
+        assert sum(summary.messages.values()) == len(read(output))
+        return summary, read(output)
+
+
+Pack = Callable[..., Packed]
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pack]:
+    """Packs a scene of a source once: scene, name of the source, options of packing."""
+    found: dict[tuple[Any, ...], Packed] = {}
+
+    def pack(name: str, source: str, options: PackOptions | None = None) -> Packed:
+        key = (name, source, repr(options))
+        if key not in found:
+            folder = tmp_path_factory.mktemp("packed")
+            best = H264 if any(part in name for part in CODED_AS_H264) else PackOptions()
+            found[key] = Packed(folder, SCENES[name](), source, options or best)
+        return found[key]
+
+    yield pack
+    found.clear()
+
+
+def still(
+    encoding: str, told: str, extension: str = ".png", *, frames: int = 6, topic: str = "compressed"
+) -> Scene:
+    """Files of one picture, so that a video of them is small."""
+    rng = np.random.default_rng(5)
+    groups = []
+    for n in range(frames):
+        stamp, log = instant(n, rng)
+        data = cv(picture(encoding, frame=0, width=64, height=48, rng=None), extension)
+        header = {"seq": 3 * n, "stamp": stamp, "frame_id": "cam"}
+        values = {"header": header, "format": told, "data": data}
+        groups.append([Record(f"/cam/image_raw/{topic}", COMPRESSED, log, values)])
+    return together(groups)
+
+
+def both(first: Scene, second: Scene) -> Scene:
+    """Two scenes at once."""
+    messages = [*first.messages, *second.messages]
+    return Scene(sorted(messages, key=lambda message: message.log_time))
+
+
+def on(topic: str, made: Scene) -> Scene:
+    """The cameras of a scene alone, on another topic."""
+    cameras = [record for record in made.messages if record.msgtype in CAMERAS]
+    return Scene(
+        [Record(topic, r.msgtype, r.log_time, r.values, publisher=r.publisher) for r in cameras]
+    )
+
+
+SCENES: dict[str, MakeScene | Callable[[], Scene]] = {
+    **{f"raw-{name}": partial(scene, name) for name in ("mono8", "bgr8", "16UC1", "32FC1")},
+    "raw-padded": partial(scene, "mono8", pad=5),
+    "raw-big-endian": partial(scene, "mono16", big_endian=True),
+    "raw-bayer_gbrg8": partial(scene, "bayer_gbrg8"),
+    "raw-nv12": partial(scene, "nv12"),
+    "png-rgb": partial(still, "bgr8", "rgb8; png compressed bgr8"),
+    **{name: CODED[name] for name in CODED},
+    **{f"foxglove-{name}": FOXGLOVE[name] for name in FOXGLOVE},
+}
+
+# name of a scene -> what is to become of it: given, already, or why it stays
+RAW = {"raw": ALREADY["raw"], "jpeg": "given", "png": "given"}
+FILE = {"raw": "given", "jpeg": "given", "png": "given"}
+DEPTH = FILE | {"jpeg": "JPEG files cannot hold 16UC1 images"}
+METRES = {
+    "raw": "given",
+    "jpeg": "JPEG files cannot hold 32FC1 images",
+    "png": "PNG files cannot hold 32FC1 images",
+}
+VIDEO = FILE | {"compressed-video": "given"}
+FFV1, MJPEG = ({"compressed-video": NO_CODEC.format(codec)} for codec in ("ffv1", "mjpeg"))
+SHOWN = {"compressed-video": "given"}
+MOSAIC = {
+    "compressed-video": "its video does not show the images as they are seen (layout mosaic8)"
+}
+DONE = {kind: {kind: reason} for kind, reason in ALREADY.items()}
+FATES: dict[str, dict[str, str]] = {
+    "raw-mono8": RAW | SHOWN,
+    "raw-padded": RAW | SHOWN,
+    "raw-bgr8": RAW | SHOWN,
+    "raw-16UC1": RAW | DEPTH | DONE["raw"] | FFV1,
+    "raw-big-endian": RAW | {"jpeg": "JPEG files cannot hold mono16 images"} | FFV1,
+    "raw-32FC1": METRES | DONE["raw"] | FFV1,
+    "raw-bayer_gbrg8": RAW | MOSAIC,
+    "raw-nv12": RAW | SHOWN,
+    "jpeg-rgb": FILE | DONE["jpeg"] | MJPEG,
+    "jpeg-gray": FILE | DONE["jpeg"] | MJPEG,
+    "jpeg-420": FILE | DONE["jpeg"] | MJPEG,
+    "jpeg-progressive": FILE | DONE["jpeg"] | MJPEG,
+    "png-rgb": FILE | DONE["png"] | SHOWN,
+    "png-gray-cv2": FILE | DONE["png"] | SHOWN,
+    "png-16-bit-pillow": FILE | DONE["png"] | FFV1 | {
+        "jpeg": "JPEG files cannot hold 16UC1 images"
+    },
+    "png-rgba-cv2": FILE | DONE["png"] | FFV1,
+    "depth-16UC1-png": DEPTH | FFV1,
+    "depth-16UC1-rvl": DEPTH | FFV1,
+    "depth-16UC1-unnamed": DEPTH | FFV1,
+    "depth-32FC1-png": METRES | FFV1,
+    "depth-32FC1-rvl": METRES | FFV1,
+    **{
+        f"video-{name}": VIDEO | DONE["compressed-video"]
+        for name in ("h264", "h264-slices", "h264-headers-once", "h265", "av1", "vp9")
+    },
+    "ffmpeg-libx264": VIDEO,
+    "ffmpeg-hevc-yuv420p-bgr8-rgb8": VIDEO,
+    "ffmpeg-av1-yuv420p-bgr8-bayer_rggb8": VIDEO,
+    "ffmpeg-vp9-yuv420p-bgr8-bgr8": VIDEO,
+    "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8": FILE | MJPEG,
+}  # fmt: skip
+FOXGLOVE_FATES: dict[str, dict[str, str]] = {
+    "foxglove-raw-mono8": VIDEO,
+    "foxglove-raw-padded": VIDEO,
+    "foxglove-raw-rgb8": VIDEO,
+    "foxglove-raw-16UC1": DEPTH | FFV1,
+    "foxglove-jpeg-rgb": FILE | MJPEG,
+    "foxglove-jpeg-progressive": FILE | MJPEG,
+    "foxglove-video-h264": VIDEO,
+    "foxglove-video-h265": VIDEO,
+    "foxglove-video-av1": VIDEO,
+    "foxglove-video-vp9": VIDEO,
+}
+SOURCE_OF = {"bag": "mcap-ros2-zstd", "rosbag2": "bag-lz4", "mcap": "rosbag2-sqlite3-v9"}
+"""Targets, each with a source of another format."""
+
+
+def kept(made: Packed, found: Sequence[Read]) -> list[Read]:
+    """Messages on the recorded topic."""
+    return [message for message in found if message.topic == made.topic]
+
+
+def check_times(made: Packed, found: Sequence[Read], to: str) -> None:
+    """Stamps, frame ids and log times are those of the scene, in order."""
+    assert len(found) == len(made.cameras)
+    for message, record in zip(found, made.cameras, strict=True):
+        header = record.values.get("header") or {
+            "stamp": record.values["timestamp"],
+            "frame_id": record.values["frame_id"],
+        }
+        assert message.stamp == header["stamp"]
+        assert message.frame_id == header["frame_id"]
+        assert message.log_time == record.log_time
+        assert message.encoding == ("ros1" if to == "bag" else "cdr")
+
+
+def check_pictures(name: str, kind: str, found: list[Array], expected: list[Array]) -> None:
+    """Equal where nothing is lost, else near."""
+    assert len(found) == len(expected)
+    is_jpeg = kind == "jpeg" or name.startswith(("jpeg", "foxglove-jpeg", "ffmpeg-mjpeg"))
+    for picture_, original in zip(found, expected, strict=True):
+        if original.dtype.kind == "f":
+            assert picture_.dtype == np.float32
+            assert np.array_equal(np.isnan(picture_), np.isnan(original))
+            assert np.allclose(picture_, original, rtol=1e-5, equal_nan=True)
+        elif is_jpeg:
+            assert picture_.shape[:2] == original.shape[:2]
+            assert psnr(halved(picture_), halved(original)) > 31
+        else:
+            same = original if picture_.ndim == original.ndim else as_colour(original)
+            assert picture_.dtype == original.dtype
+            assert np.array_equal(picture_, same)
+
+
+def as_colour(grey: Array) -> Array:
+    return np.repeat(grey[..., None], 3, axis=2)
+
+
+COMPARED = [
+    name for name in (*FATES, *FOXGLOVE_FATES) if "bayer" not in name and "nv12" not in name
+]
+
+
+def in_turn(*tables: Sequence[str]) -> list[Any]:
+    """Every combination; a part of them covers all pairs, and the others are slow."""
+    turns = len(tables[-1])
+    found = []
+    for places in product(*(range(len(table)) for table in tables)):
+        values = [table[place] for table, place in zip(tables, places, strict=True)]
+        is_due = places[-1] == sum(places[:-1]) % turns
+        found.append(pytest.param(*values, marks=[] if is_due else pytest.mark.slow))
+    return found
+
+
+@pytest.mark.parametrize(("name", "kind", "to"), in_turn([*FATES], KINDS, [*TARGETS]))
+def test_every_camera_as_every_kind(packed: Pack, name: str, kind: str, to: str) -> None:
+    made = packed(name, SOURCE_OF[to])
+    summary, messages = made.unpack(to, kind)
+    check(made, summary, messages, name, kind, to, FATES[name][kind])
+
+
+FOXGLOVE_TARGETS = [
+    f"{source} {to}" for source in ("protobuf", "json", "flatbuffer") for to in TARGETS
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "source_and_target"), in_turn([*FOXGLOVE_FATES], KINDS, FOXGLOVE_TARGETS)
+)
+def test_foxglove_cameras_as_every_kind(
+    packed: Pack, name: str, kind: str, source_and_target: str
+) -> None:
+    source, to = source_and_target.split()
+    made = packed(name, f"mcap-{source}")
+    fate = FOXGLOVE_FATES[name][kind]
+    if fate != "given" and to != "mcap":
+        with pytest.raises(ConversionError, match=made.topic):
+            made.unpack(to, kind, topics=[made.topic])
+        return
+    summary, messages = made.unpack(to, kind, topics=[made.topic])
+    check(made, summary, messages, name, kind, to, fate)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["foxglove-raw-mono8", "foxglove-jpeg-rgb", "foxglove-video-h264"])
+def test_foxglove_cameras_of_ros2(packed: Pack, name: str, kind: str) -> None:
+    made = packed(name, "mcap-foxglove-ros2")
+    summary, messages = made.unpack("bag", kind)
+    fate = FOXGLOVE_FATES[name][kind]
+    if (name, kind) == ("foxglove-video-h264", "compressed-video"):
+        fate = ALREADY[kind]
+    check(made, summary, messages, name, kind, "bag", fate)
+
+
+def check(
+    made: Packed,
+    summary: UnpackSummary,
+    messages: list[Read],
+    name: str,
+    kind: str,
+    to: str,
+    fate: str,
+) -> None:
+    if fate != "given":
+        assert summary.republished == {}
+        assert summary.as_recorded == {made.topic: {fate: len(made.cameras)}}
+        same = kept(made, messages)
+        assert len(same) == len(made.cameras)
+        if to == "mcap":  # of a source with the same serialization
+            payloads = [record.payload("cdr") for record in made.cameras]
+            is_ros = made.paths[0].suffix != ".mcap"
+            assert not is_ros or [message.payload for message in same] == payloads
+        return
+    assert list(summary.republished) == [made.topic]
+    assert summary.as_recorded == {}
+    now = summary.republished[made.topic]
+    assert now.instead_of == ""
+    assert now.type_name == (TYPES[kind].replace("/msg/", "/") if to == "bag" else TYPES[kind])
+    if now.topic != made.topic:
+        assert not kept(made, messages)
+    found = [message for message in messages if message.topic == now.topic]
+    assert summary.messages[now.topic] == len(found)
+    assert {message.type_name for message in found} == {TYPES[kind]}
+    check_times(made, found, to)
+    if name in COMPARED:
+        check_pictures(name, kind, shown(found), truth(rvl_as_png(name, made.cameras)))
+
+
+def rvl_as_png(name: str, records: Sequence[Record]) -> Sequence[Record]:
+    """The same depths coded as PNG, which OpenCV decodes."""
+    if not name.endswith("-rvl"):
+        return records
+    scene_ = CODED[name.replace("-rvl", "-png")]()
+    return [record for record in scene_.messages if record.msgtype == COMPRESSED]
+
+
+# ---------------------------------------------------------------- raw images as files
+
+
+def files(encoding: str) -> bool:
+    dtype, samples = sample_format(encoding)
+    return dtype.kind == "u" and dtype.itemsize < 4 and (samples != 2 or encoding in YUV)
+
+
+ENCODINGS = [
+    *("mono8", "8UC1", "rgb8", "bgr8", "rgba8", "bgra8", "8UC3", "8UC4", "mono16", "16UC1"),
+    *("rgb16", "bgra16", "16UC3", "bayer_rggb8", "bayer_grbg16", "yuv422", "nv21"),
+    *("8UC2", "16UC2", "8SC1", "16SC1", "32FC3"),
+]
+
+
+@pytest.mark.parametrize("target", ["bag", "mcap"])
+@pytest.mark.parametrize("kind", ["png", "jpeg"])
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_files_of_every_encoding(encoding: str, kind: str, target: str, tmp_path: Path) -> None:
+    """A subscriber is given what was recorded, or something that looks like it."""
+    made = Packed(tmp_path, scene(encoding, noisy=False, frames=3), "mcap-ros2-none")
+    summary, messages = made.unpack(target, kind)
+    itemsize = sample_format(encoding)[0].itemsize
+    if not files(encoding) or (kind == "jpeg" and itemsize == 2):
+        reason = f"{kind.upper()} files cannot hold {encoding} images"
+        assert summary.as_recorded == {"/cam/image_raw": {reason: 3}}
+        return
+    found = [message for message in messages if message.type_name == COMPRESSED]
+    assert len(found) == 3
+    for number, (message, record) in enumerate(zip(found, made.cameras, strict=True)):
+        told, data = message.value.format, message.value.data.tobytes()
+        assert data.startswith(b"\x89PNG" if kind == "png" else b"\xff\xd8")
+        assert f"; {kind} compressed " in told
+        given, image = subscribed(told, data)
+        original = truth([record])[0]
+        if kind == "png" and encoding not in YUV:
+            assert given == encoding
+            raw = picture(encoding, frame=number, width=64, height=48, rng=None)
+            assert image.dtype == raw.dtype
+            assert np.array_equal(image, raw)
+            continue
+        colour = picture("rgb8", frame=number, width=64, height=48, rng=None)
+        if "bayer" in encoding or encoding in YUV:
+            assert given == "rgb8"
+            # chroma of half the resolution, or a mosaic's colours guessed
+            inner = (slice(2, -2), slice(2, -2))
+            assert psnr(image[inner], colour[inner]) > 18
+        else:
+            assert given == encoding.replace("8UC4", "8UC3")
+            assert psnr(file_picture(data), original) > 33
+
+
+@pytest.mark.parametrize(
+    ("encoding", "kind", "ros1", "ros2"),
+    [
+        ("rgb8", "jpeg", "rgb8; jpeg compressed bgr8", None),
+        ("bgr8", "png", "bgr8; png compressed bgr8", None),
+        ("bgra8", "jpeg", "bgra8; jpeg compressed bgr8", None),
+        ("rgb16", "png", "rgb16; png compressed bgr16", None),
+        ("mono8", "jpeg", "mono8; jpeg compressed ", "mono8; jpeg compressed mono8"),
+        ("mono8", "png", "mono8; png compressed ", None),
+        ("16UC1", "png", "16UC1; png compressed ", None),
+        ("bayer_rggb8", "png", "bayer_rggb8; png compressed ", None),
+        ("bayer_rggb8", "jpeg", "rgb8; jpeg compressed bgr8", None),
+        ("yuv422", "jpeg", "rgb8; jpeg compressed bgr8", None),
+        ("8UC3", "jpeg", "8UC3; jpeg compressed ", None),
+    ],
+)
+def test_formats_are_those_of_the_transport(
+    encoding: str, kind: str, ros1: str, ros2: str | None, tmp_path: Path
+) -> None:
+    made = Packed(tmp_path, scene(encoding, noisy=False, frames=2), "bag-none")
+    for to, told in (("bag", ros1), ("rosbag2", ros2 or ros1)):
+        found = [m for m in made.unpack(to, kind)[1] if m.type_name == COMPRESSED]
+        assert {message.value.format for message in found} == {told}
+
+
+@pytest.mark.parametrize("quality", [5, 60, 95])
+@pytest.mark.parametrize("name", ["raw-bgr8", "raw-mono8"])
+def test_jpeg_quality(packed: Pack, name: str, quality: int) -> None:
+    """Files are about as good as libjpeg's of that quality."""
+    made = packed(name, "mcap-ros2-zstd")
+    found = made.unpack("mcap", "jpeg", jpeg_quality=quality)[1]
+    pictures = shown([message for message in found if message.type_name == COMPRESSED])
+    for image, original in zip(pictures, truth(made.cameras), strict=True):
+        source = original if original.ndim == 2 else original[..., ::-1]
+        sampling = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+        reference = cv(source, ".jpg", cv2.IMWRITE_JPEG_QUALITY, quality, *sampling)
+        assert -1 < psnr(image, original) - psnr(file_picture(reference), original) < 5
+
+
+@pytest.mark.parametrize("extension", [".png", ".jpg"])
+def test_the_encoding_in_a_format_tells_a_mosaic(extension: str, tmp_path: Path) -> None:
+    """As in compressed_image_transport, whose files of a mosaic are grey."""
+    own = "png" if extension == ".png" else "jpeg"
+    told = f"bayer_rggb8; {own} compressed "
+    made = Packed(tmp_path, still("bayer_rggb8", told, extension), "bag-none")
+    raw = [m for m in made.unpack("bag", "raw")[1] if m.type_name == IMAGE]
+    assert {message.value.encoding for message in raw} == {"bayer_rggb8"}
+    other = "jpeg" if own == "png" else "png"
+    files_ = [m for m in made.unpack("bag", other)[1] if m.type_name == COMPRESSED]
+    new = "rgb8; jpeg compressed bgr8" if other == "jpeg" else "bayer_rggb8; png compressed "
+    assert {message.value.format for message in files_} == {new}
+    for image, original in zip(shown(raw), truth(made.cameras), strict=True):
+        assert np.array_equal(image, original) or (own == "jpeg" and psnr(image, original) > 45)
+    if other == "jpeg":
+        colour = picture("rgb8", frame=0, width=64, height=48, rng=None)
+        assert psnr(shown(files_)[0][2:-2, 2:-2], colour[2:-2, 2:-2]) > 18
+    else:
+        assert all(map(np.array_equal, shown(files_), shown(raw)))
+
+
+# ---------------------------------------------------------------- files stay as they are
+
+
+@pytest.mark.parametrize("to", ["bag", "mcap"])
+@pytest.mark.parametrize(
+    ("name", "source", "kind"),
+    [
+        ("foxglove-jpeg-progressive", "mcap-protobuf", "jpeg"),
+        ("foxglove-jpeg-rgb", "mcap-json", "jpeg"),
+        ("ffmpeg-mjpeg-yuvj420p-bgr8-bgr8", "mcap-ros2-zstd", "jpeg"),
+        ("jpeg-exif-trailing", "mcap-ros2-zstd", "jpeg"),
+        ("png-gray-pillow", "mcap-ros2-zstd", "png"),
+    ],
+)
+def test_files_stay_byte_for_byte(packed: Pack, name: str, source: str, kind: str, to: str) -> None:
+    made = packed(name, source)
+    messages = made.unpack(to, kind, topics=[made.topic])[1]
+    assert {message.type_name for message in messages} == {COMPRESSED}
+    found = [message.value.data.tobytes() for message in messages]
+    assert found == [record.values["data"] for record in made.cameras]
+
+
+def test_a_png_of_depths_stays_byte_for_byte(packed: Pack) -> None:
+    """Without the header that compressedDepth puts before it."""
+    made = packed("depth-16UC1-png", "mcap-ros2-zstd")
+    messages = made.unpack("mcap", "png", topics=[made.topic])[1]
+    assert {message.value.format for message in messages} == {"16UC1; png compressed "}
+    found = [message.value.data.tobytes() for message in messages]
+    assert found == [record.values["data"][12:] for record in made.cameras]
+
+
+@pytest.mark.parametrize(
+    ("name", "image_format", "suffix"),
+    [("jpeg-exif-trailing", "jpeg", "jpg"), ("png-gray-cv2", "png", "png")],
+)
+def test_unpacked_images_are_the_recorded_files(
+    packed: Pack, name: str, image_format: str, suffix: str, tmp_path: Path
+) -> None:
+    made = packed(name, "mcap-ros2-zstd")
+    options = UnpackOptions(image_format=image_format)
+    mp4ds.unpack(made.folder / "dataset", "images", tmp_path / "images", options)
+    folder = tmp_path / "images" / "cam_image_raw_compressed"
+    found = [path.read_bytes() for path in sorted(folder.glob(f"*.{suffix}"))]
+    assert found == [record.values["data"] for record in made.cameras]
+    rows = (folder / "stamps.csv").read_text().splitlines()[1:]
+    for row, record in zip(rows, made.cameras, strict=True):
+        header = record.values["header"]
+        assert row.split(",")[1:] == [str(header["stamp"]), str(record.log_time), "cam"]
+
+
+def test_unpacked_jpeg_images_have_the_quality(packed: Pack, tmp_path: Path) -> None:
+    made = packed("raw-bgr8", "mcap-ros2-zstd")
+    sizes = []
+    for quality in (20, 95):
+        options = UnpackOptions(image_format="jpeg", jpeg_quality=quality, force=True)
+        mp4ds.unpack(made.folder / "dataset", "images", tmp_path / "images", options)
+        sizes.append(sum(p.stat().st_size for p in (tmp_path / "images").rglob("*.jpg")))
+    assert 2 * sizes[0] < sizes[1]
+
+
+# ---------------------------------------------------------------- transcoded JPEG
+
+TRANSCODED = PackOptions(transcode=True, quality="crf=20")
+
+
+@pytest.mark.parametrize("name", ["jpeg-rgb", "jpeg-gray"])
+def test_transcoded_jpeg_returns_as_jpeg(packed: Pack, name: str) -> None:
+    made = packed(name, "mcap-ros2-zstd", TRANSCODED)
+    sizes = {}
+    for quality in (30, 95):
+        summary, messages = made.unpack("mcap", None, jpeg_quality=quality)
+        found = kept(made, messages)
+        check_times(made, found, "mcap")
+        assert [m.value.format for m in found] == [r.values["format"] for r in made.cameras]
+        assert summary.republished == summary.as_recorded == {}
+        for image, original in zip(shown(found), truth(made.cameras), strict=True):
+            assert image.shape == original.shape  # of as many components
+            assert psnr(image, original) > 22
+        sizes[quality] = sum(len(message.payload) for message in found)
+        again = kept(made, made.unpack("mcap", "jpeg", jpeg_quality=quality)[1])
+        assert [m.payload for m in again] == [m.payload for m in found]
+    assert sizes[30] < 0.8 * sizes[95]
+
+
+def test_transcoded_jpeg_as_video(packed: Pack) -> None:
+    made = packed("jpeg-rgb", "mcap-ros2-zstd", TRANSCODED)
+    found = made.unpack("mcap", "compressed-video", topics=[made.topic])[1]
+    assert {message.value.format for message in found} == {"av1"}
+    for image, original in zip(shown(found), truth(made.cameras), strict=True):
+        assert psnr(image, original) > 22
+
+
+# ---------------------------------------------------------------- video without decoding
+
+
+@pytest.mark.parametrize("codec", ["h264", "h265", "av1"])
+@pytest.mark.parametrize("encoding", ["rgb8", "bayer_rggb8"])
+def test_lossy_video(encoding: str, codec: str, tmp_path: Path) -> None:
+    options = PackOptions(quality="crf=18", codec=codec, gop=3)
+    made = Packed(tmp_path, scene(encoding, noisy=False), "bag-none", options)
+    found = made.unpack("rosbag2", "compressed-video", topics=["/cam/image_raw"])[1]
+    assert {message.value.format for message in found} == {codec}
+    check_times(made, found, "rosbag2")
+    for number, image in enumerate(shown(found)):
+        original = picture("rgb8", frame=number, width=64, height=48, rng=None)
+        assert psnr(image[2:-2, 2:-2], original[2:-2, 2:-2]) > 18
+    check_stand_alone(codec, found)
+
+
+def check_stand_alone(codec: str, found: Sequence[Read]) -> None:
+    """Key frames hold what a decoder needs: it can begin at any of them."""
+    data = [message.value.data.tobytes() for message in found]
+    if codec in ("h264", "h265"):
+        assert all(packet.startswith(b"\0\0\0\1") for packet in data)
+        kinds = [
+            {unit[0] & 31 if codec == "h264" else unit[0] >> 1 & 63 for _, unit in nal_units(p)}
+            for p in data
+        ]
+        keys = [
+            n for n, kind in enumerate(kinds) if kind & ({5} if codec == "h264" else {19, 20, 21})
+        ]
+        needed = {7, 8} if codec == "h264" else {32, 33, 34}
+        assert all(needed <= kinds[n] for n in keys)
+    else:
+        assert all(packet.startswith(b"\x12\0") for packet in data)
+        keys = [n for n, packet in enumerate(data) if packet[2] >> 3 & 15 == 1]
+    assert keys[0] == 0
+    assert len(keys) > 1
+    name = {"h265": "hevc", "av1": "libdav1d"}.get(codec, codec)
+    whole, tail = decoded(name, data), decoded(name, data[keys[-1] :])
+    assert all(map(np.array_equal, whole[keys[-1] :], tail))
+
+
+@pytest.mark.parametrize(
+    ("name", "codec"),
+    [
+        ("ffmpeg-libx264", "h264"),
+        ("ffmpeg-hevc-yuv420p-bgr8-rgb8", "h265"),
+        ("ffmpeg-av1-yuv420p-bgr8-bayer_rggb8", "av1"),
+        ("foxglove-video-h264", "h264"),
+    ],
+)
+def test_recorded_packets_stand_alone(packed: Pack, name: str, codec: str) -> None:
+    made = packed(name, "mcap-protobuf" if "foxglove" in name else "mcap-ros2-zstd")
+    found = made.unpack("mcap", "compressed-video", topics=[made.topic])[1]
+    assert {message.value.format for message in found} == {codec}
+    check_stand_alone(codec, found)
+    for message, record in zip(found, made.cameras, strict=True):
+        data, recorded = message.value.data.tobytes(), record.values["data"]
+        if codec == "av1":
+            assert data == recorded
+        else:  # start codes have four bytes now
+            assert [unit for _, unit in nal_units(data)] == [u for _, u in nal_units(recorded)]
+
+
+def test_parameters_sent_once_are_repeated(tmp_path: Path) -> None:
+    """As Foxglove wants it; a recorded CompressedVideo of ROS stays as it is."""
+    from coded_scenes import _headers_once, _video
+
+    made = Packed(
+        tmp_path,
+        FOXGLOVE_LIKE(partial(_video, "h264", "h264", _headers_once)),
+        "mcap-protobuf",
+    )
+    found = made.unpack("mcap", "compressed-video", topics=[made.topic])[1]
+    check_stand_alone("h264", found)
+
+
+def FOXGLOVE_LIKE(make: MakeScene) -> Scene:
+    from foxglove_scenes import foxglove_scene
+
+    return foxglove_scene(make)
+
+
+def test_nothing_is_decoded_for_video(packed: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = packed("raw-mono8", "mcap-ros2-zstd")
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a video was decoded")
+
+    monkeypatch.setattr("mp4ds.streams.Stream.open_video", refuse)
+    summary, _ = made.unpack("mcap", "compressed-video")
+    assert summary.messages["/cam/image_raw/compressed_video"] == len(made.cameras)
+
+
+# ---------------------------------------------------------------- what stays
+
+
+def test_verbatim_messages_stay_and_are_counted(packed: Pack) -> None:
+    made = packed("jpeg-cut-one", "mcap-ros2-zstd")
+    summary, messages = made.unpack("mcap", "raw")
+    assert summary.republished == {made.topic: Republished("/cam/image_raw", IMAGE)}
+    (reason,) = summary.as_recorded[made.topic]
+    assert reason.startswith("stored as it was: its JPEG is cut short")
+    assert summary.as_recorded == {made.topic: {reason: 1}}
+    assert summary.messages[made.topic] == 1
+    assert summary.messages["/cam/image_raw"] == len(made.cameras) - 1
+    (stayed,) = kept(made, messages)
+    assert stayed.payload == made.cameras[3].payload("cdr")
+    order = [m.stamp for m in messages if m.topic in (made.topic, "/cam/image_raw")]
+    assert order == [record.values["header"]["stamp"] for record in made.cameras]
+
+
+def test_a_topic_on_which_messages_stay_is_taken(packed: Pack) -> None:
+    made = packed("jpeg-cut-one", "mcap-ros2-zstd")
+    summary, messages = made.unpack("mcap", "png")
+    now = Republished("/cam/image_raw/compressed_png", COMPRESSED, made.topic)
+    assert summary.republished == {made.topic: now}
+    assert len(kept(made, messages)) == 1
+
+
+def test_a_recorded_topic_is_taken(tmp_path: Path) -> None:
+    made = both(scene("rgb8"), on("/cam/image_raw/compressed", CODED["jpeg-rgb"](frames=8)))
+    both_ = Packed(tmp_path, made, "bag-none")
+    for kind, old, new, taken in (
+        ("raw", "/cam/image_raw/compressed", "/cam/image_raw_raw", "/cam/image_raw"),
+        ("jpeg", "/cam/image_raw", "/cam/image_raw/compressed_jpeg", "/cam/image_raw/compressed"),
+    ):
+        summary, messages = both_.unpack("bag", kind)
+        type_name = TYPES[kind].replace("/msg/", "/")
+        assert summary.republished == {old: Republished(new, type_name, taken)}
+        assert len([message for message in messages if message.topic == new]) == 8
+        assert len([message for message in messages if message.topic == taken]) == 8
+
+
+def test_packets_that_do_not_decode_stay(packed: Pack) -> None:
+    """Those that refer to a lost one."""
+    made = packed("video-h265-lost", "mcap-ros2-zstd")
+    summary, messages = made.unpack("mcap", "raw")
+    reason = "its picture does not decode"
+    count = summary.as_recorded[made.topic][reason]
+    assert 0 < count < len(made.cameras)
+    stayed = kept(made, messages)
+    payloads = {record.values["timestamp"]: record.payload("cdr") for record in made.cameras}
+    assert len(stayed) == count
+    assert all(message.payload == payloads[message.stamp] for message in stayed)
+    raw = [message for message in messages if message.type_name == IMAGE]
+    stamps = [message.stamp for message in sorted([*raw, *stayed], key=lambda m: m.log_time)]
+    assert stamps == [record.values["timestamp"] for record in made.cameras]
+    assert summary.messages == {
+        topic: len([m for m in messages if m.topic == topic]) for topic in summary.messages
+    }
+
+
+def test_depths_of_unknown_unit_stay(tmp_path: Path) -> None:
+    def depth(n: int) -> bytes:
+        return bytes(12) + cv(picture("16UC1", frame=0, width=64, height=48, rng=None), ".png")
+
+    records = [
+        Record(
+            "/depth/compressedDepth",
+            COMPRESSED,
+            10**18 + n * 10**8,
+            {"header": {"stamp": 10**18}, "format": "compressedDepth", "data": depth(n)},
+        )
+        for n in range(4)
+    ]
+    made = Packed(tmp_path, Scene(records), "mcap-ros2-none")
+    for kind in ("raw", "png"):
+        summary, _ = made.unpack("mcap", kind)
+        reason = "its format 'compressedDepth' does not tell the unit of its depths"
+        assert summary.as_recorded == {made.topic: {reason: 4}}
+
+
+def test_a_camera_that_changes(packed: Pack, tmp_path: Path) -> None:
+    """Streams of one topic come in the recorded order; each becomes what it can."""
+    made = packed("jpeg-mixed-sizes", "bag-none")
+    messages = made.unpack("bag", "raw")[1]
+    found = [message for message in messages if message.type_name == IMAGE]
+    check_times(made, found, "bag")
+    assert len({message.value.width for message in found}) == 2
+    assert [image.shape for image in shown(found)] == [t.shape for t in truth(made.cameras)]
+    for image, original in zip(shown(found), truth(made.cameras), strict=True):
+        assert psnr(halved(image), halved(original)) > 31
+    first, then = scene("mono8", frames=4), scene("16UC1", frames=8)
+    late = Scene([r for r in then.messages if r.log_time > first.messages[-1].log_time])
+    changing = Packed(tmp_path, both(first, late), "mcap-ros2-zstd")
+    summary, messages = changing.unpack("mcap", "jpeg")
+    count = len([r for r in late.messages if r.msgtype == IMAGE])
+    assert summary.as_recorded == {"/cam/image_raw": {"JPEG files cannot hold 16UC1 images": count}}
+    assert summary.messages["/cam/image_raw"] == count > 1
+    assert summary.messages["/cam/image_raw/compressed"] == 4
+
+
+def test_other_topics_stay_byte_for_byte(packed: Pack) -> None:
+    made = packed("raw-mono8", "mcap-ros2-zstd")
+    plain, messages = (made.unpack("mcap", kind)[1] for kind in (None, "png"))
+    others = [
+        [
+            (m.topic, m.type_name, m.log_time, m.publish_time, m.sequence, m.payload, m.metadata)
+            for m in found
+            if "image_raw" not in m.topic
+        ]
+        for found in (plain, messages)
+    ]
+    assert others[0] == others[1]
+    assert any(other[0] == "/cam/camera_info" for other in others[0])
+
+
+# ---------------------------------------------------------------- channels
+
+
+def md5sum(text: str) -> str:
+    return hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()
+
+
+MD5SUMS = {
+    "raw": "060021388200f6f0f447d0fcd9c64743",  # as ROS 1 has them
+    "jpeg": "8f7a12909da2c9d3332d540a0977563f",
+    "compressed-video": md5sum("time timestamp\nstring frame_id\nuint8[] data\nstring format"),
+}
+
+
+@pytest.mark.parametrize("source", ["bag-none", "mcap-ros1-zstd", "mcap-ros2-zstd"])
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("jpeg-rgb", "raw"), ("raw-mono8", "jpeg"), ("raw-mono8", "compressed-video")],
+)
+def test_channels_of_ros1(packed: Pack, name: str, kind: str, source: str) -> None:
+    made = packed(name, source)
+    for to in ("bag", "mcap") if source != "mcap-ros2-zstd" else ("bag",):
+        _, messages = made.unpack(to, kind)
+        found = [message for message in messages if message.type_name == TYPES[kind]]
+        assert {message.encoding for message in found} == {"ros1"}
+        metadata = found[0].metadata
+        assert MD5SUMS[kind] in (metadata.get("digest"), metadata.get("md5sum"))
+        if source != "mcap-ros2-zstd":
+            assert metadata["callerid"] == "/first"
+            assert metadata.get("topic", found[0].topic) == found[0].topic
+        if kind != "compressed-video":
+            seqs = [record.values["header"]["seq"] for record in made.cameras]
+            expected = [0] * len(seqs) if source == "mcap-ros2-zstd" else seqs
+            assert [message.value.header.seq for message in found] == expected
+
+
+@pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-zstd"])
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("jpeg-rgb", "raw"), ("raw-mono8", "jpeg"), ("raw-mono8", "compressed-video")],
+)
+def test_channels_of_ros2(packed: Pack, name: str, kind: str, source: str) -> None:
+    made = packed(name, source)
+    to = "rosbag2" if source == "bag-none" else "mcap"
+    summary, messages = made.unpack(to, kind)
+    found = [message for message in messages if message.type_name == TYPES[kind]]
+    digest = typestore("cdr").hash_rihs01(TYPES[kind])
+    metadata = found[0].metadata
+    assert digest in (metadata.get("digest"), metadata.get("topic_type_hash"))
+    if source == "mcap-ros2-zstd":
+        plain = made.unpack("mcap", None)[1]
+        (before,) = {m.metadata["offered_qos_profiles"] for m in plain if m.topic == made.topic}
+        assert metadata["offered_qos_profiles"] == before != ""
+        times = [(m.log_time, m.publish_time, m.sequence) for m in found]
+        old = [(m.log_time, m.publish_time, m.sequence) for m in plain if m.topic == made.topic]
+        assert times == old
+    else:
+        lost = "messages with a header's sequence number, which ROS 2 has not"
+        # of all cameras, and what else has a header
+        assert summary.omitted[lost] >= len(made.cameras)
+
+
+def latched(encoding: str) -> Scene:
+    made = scene(encoding, frames=3)
+    return Scene(
+        [
+            Record(r.topic, r.msgtype, r.log_time, r.values, publisher=int(r.msgtype == IMAGE))
+            for r in made.messages
+            if r.msgtype == IMAGE
+        ]
+    )
+
+
+def test_latching_is_kept_as_qos(tmp_path: Path) -> None:
+    made = Packed(tmp_path / "a", latched("mono8"), "bag-none")
+    messages = made.unpack("bag", "png")[1]
+    assert {message.metadata["latching"] for message in messages} == {1}
+    made.unpack("rosbag2", "png")
+    mp4ds.pack(made.folder / "again", tmp_path / "second")
+    mp4ds.unpack(tmp_path / "second", "bag", tmp_path / "back.bag", UnpackOptions(images="raw"))
+    back = [m for m in read(tmp_path / "back.bag") if m.topic == "/cam/image_raw"]
+    assert {(m.metadata["latching"], m.metadata["callerid"]) for m in back} == {(1, "/second")}
+    assert {m.metadata["digest"] for m in back} == {MD5SUMS["raw"]}
+    assert all(map(np.array_equal, shown(back), truth(made.cameras)))
+
+
+def test_two_publishers_of_a_topic(tmp_path: Path) -> None:
+    one = scene("mono8", frames=4)
+    two = [
+        Record(r.topic, r.msgtype, r.log_time + 7, r.values, publisher=1)
+        for r in scene("mono8", frames=4, seed=1).messages
+        if r.msgtype == IMAGE
+    ]
+    made = Packed(tmp_path, both(one, Scene(two)), "bag-none")
+    summary, messages = made.unpack("bag", "jpeg")
+    assert list(summary.republished) == ["/cam/image_raw"]
+    found = [message for message in messages if message.type_name == COMPRESSED]
+    check_times(made, found, "bag")
+    assert {m.metadata["callerid"] for m in found} == {"/first", "/second"}
+    assert {m.topic for m in found} == {"/cam/image_raw/compressed"}
+
+
+def test_a_pair_alone(packed: Pack, tmp_path: Path) -> None:
+    made = packed("jpeg-rgb", "bag-none")
+    for suffix in ("yaml", "mp4"):
+        name = f"cam_image_raw_compressed.{suffix}"
+        (tmp_path / name).write_bytes((made.folder / "dataset" / name).read_bytes())
+    output = tmp_path / "out.mcap"
+    mp4ds.unpack(
+        tmp_path / "cam_image_raw_compressed.mp4", "mcap", output, UnpackOptions(images="raw")
+    )
+    found = [message for message in read(output) if message.type_name == IMAGE]
+    check_times(made, found, "bag")
+    assert psnr(halved(shown(found)[0]), halved(truth(made.cameras)[0])) > 31
+
+
+def test_a_profile_of_neither_ros(packed: Pack) -> None:
+    made = packed("raw-mono8", "mcap-none-profile")
+    _, messages = made.unpack("mcap", "compressed-video")
+    found = [message for message in messages if message.type_name == CODED_VIDEO]
+    check_times(made, found, "mcap")
+
+
+def test_other_protobuf_topics_have_no_place_in_a_bag(packed: Pack) -> None:
+    made = packed("foxglove-raw-mono8", "mcap-protobuf")
+    with pytest.raises(ConversionError, match="protobuf, which has no counterpart in ROS"):
+        made.unpack("bag", "raw")
+
+
+def test_stamps_beyond_32_bits_have_no_place_in_ros(tmp_path: Path) -> None:
+    made = FOXGLOVE["raw-mono8"](frames=2)
+    late = [
+        Record(r.topic, r.msgtype, r.log_time, {**r.values, "timestamp": 2**33 * 10**9})
+        for r in made.messages
+        if r.topic == "/camera/image"
+    ]
+    packed_ = Packed(tmp_path, Scene(late), "mcap-protobuf")
+    for kind in ("raw", "compressed-video"):
+        with pytest.raises(ConversionError, match=r"/camera/image: message 0: .* bits for"):
+            packed_.unpack("mcap", kind)
+    assert not (tmp_path / "again.mcap").exists()
+
+
+# ---------------------------------------------------------------- topics
+
+
+@pytest.mark.parametrize(
+    ("topic", "type_name", "kind", "expected"),
+    [
+        ("/cam/image_raw", "sensor_msgs/Image", "jpeg", "/cam/image_raw/compressed"),
+        ("/cam/image_raw", "sensor_msgs/msg/Image", "png", "/cam/image_raw/compressed"),
+        ("/cam", "foxglove.RawImage", "compressed-video", "/cam/compressed_video"),
+        ("/cam", "foxglove.RawImage", "raw", "/cam"),
+        ("/cam/compressed", "sensor_msgs/Image", "jpeg", "/cam/compressed/compressed"),
+        ("/cam/compressed", "sensor_msgs/CompressedImage", "raw", "/cam"),
+        ("/cam/compressed", "sensor_msgs/CompressedImage", "png", "/cam/compressed"),
+        ("/cam/compressedDepth", "sensor_msgs/CompressedImage", "png", "/cam/compressed"),
+        ("/cam/compressedDepth", "sensor_msgs/CompressedImage", "raw", "/cam"),
+        ("/cam/jpg", "sensor_msgs/CompressedImage", "raw", "/cam/jpg/raw"),
+        ("/cam/jpg", "sensor_msgs/CompressedImage", "png", "/cam/jpg"),
+        ("/cam/jpg", "foxglove.CompressedImage", "jpeg", "/cam/jpg"),
+        ("/cam/jpg", "foxglove.CompressedImage", "compressed-video", "/cam/jpg/compressed_video"),
+        ("/cam/ffmpeg", "x/msg/FFMPEGPacket", "compressed-video", "/cam/compressed_video"),
+        ("/cam/ffmpeg", "x/msg/FFMPEGPacket", "jpeg", "/cam/compressed"),
+        ("/cam/ffmpeg", "x/msg/FFMPEGPacket", "raw", "/cam"),
+        ("/cam/foxglove", "foxglove_msgs/CompressedVideo", "raw", "/cam"),
+        ("/cam/compressed_video", "foxglove.CompressedVideo", "png", "/cam/compressed"),
+        ("/video", "foxglove.CompressedVideo", "compressed-video", "/video"),
+        ("/compressed", "sensor_msgs/CompressedImage", "raw", "/compressed/raw"),
+        ("compressed", "sensor_msgs/CompressedImage", "raw", "compressed/raw"),
+        ("cam/compressed", "sensor_msgs/CompressedImage", "raw", "cam"),
+        ("", "sensor_msgs/Image", "jpeg", "/compressed"),
+    ],
+)
+def test_topics_are_those_of_image_transport(
+    topic: str, type_name: str, kind: str, expected: str
+) -> None:
+    assert republished_topic(topic, type_name, kind) == expected
+
+
+def test_no_topic_is_taken_twice() -> None:
+    free = FreeTopics(["/a", "/b", "/b_compressed_video"], "compressed-video")
+    taken = [free.take(topic) for topic in ("/a", "/a", "/b", "/c", "/c")]
+    assert taken == [
+        "/a_compressed_video",
+        "/a_compressed_video_compressed_video",
+        "/b_compressed_video_compressed_video",
+        "/c",
+        "/c_compressed_video",
+    ]
+
+
+# ---------------------------------------------------------------- options, errors, command line
+
+
+@pytest.mark.parametrize(
+    ("to", "options", "problem"),
+    [
+        ("mcap", {"images": "bmp"}, "--images 'bmp' is not known. Use raw, jpeg, png, compressed"),
+        ("images", {"images": "raw"}, "--images goes with a recording"),
+        ("mcap", {"jpeg_quality": 0}, "--jpeg-quality 0 is not from 1 to 100"),
+        ("mcap", {"jpeg_quality": 101}, "--jpeg-quality 101 is not from 1 to 100"),
+    ],
+)
+def test_options_that_contradict(
+    packed: Pack, tmp_path: Path, to: str, options: dict[str, Any], problem: str
+) -> None:
+    made = packed("raw-mono8", "mcap-ros2-zstd")
+    with pytest.raises(OptionError, match=problem):
+        mp4ds.unpack(made.folder / "dataset", to, tmp_path / "out", UnpackOptions(**options))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("raw-mono8", "compressed-video"),
+        ("raw-mono8", "jpeg"),
+        ("ffmpeg-libx264", "compressed-video"),
+        ("video-h264", "raw"),
+        ("jpeg-rgb", "raw"),
+        ("depth-16UC1-png", "raw"),
+        ("depth-16UC1-png", "png"),
+    ],
+)
+@pytest.mark.parametrize("with_sum", [True, False])
+def test_a_damaged_video_is_refused(name: str, kind: str, with_sum: bool, tmp_path: Path) -> None:
+    made = Packed(tmp_path, SCENES[name](), "mcap-ros2-zstd")
+    (video,) = (tmp_path / "dataset").glob("*.mp4")
+    with av.open(str(video)) as opened:
+        entry = opened.streams.video[0].index_entries[3]
+    data = bytearray(video.read_bytes())
+    data[entry.pos + entry.size * 2 // 3] ^= 0x10
+    video.write_bytes(data)
+    if not with_sum:
+        without_sum(video.with_suffix(".yaml"))
+    with pytest.raises(FormatError):
+        made.unpack("mcap", kind)
+    assert not (tmp_path / "again.mcap").exists()
+
+
+def without_sum(sidecar: Path) -> None:
+    lines = sidecar.read_text("utf-8").splitlines(keepends=True)
+    kept_ = [line for line in lines if not line.startswith(("  sha256:", "checksum:"))]
+    sidecar.write_text("".join(kept_), "utf-8")
+
+
+@pytest.mark.parametrize("frames", [5, 9])
+@pytest.mark.parametrize("kind", ["compressed-video", "jpeg"])
+def test_a_video_of_other_frames_is_refused(
+    packed: Pack, kind: str, frames: int, tmp_path: Path
+) -> None:
+    made = packed("raw-mono8", "mcap-ros2-zstd")
+    other = Packed(tmp_path / "other", scene("mono8", frames=frames), "mcap-ros2-zstd")
+    for folder, suffix in ((made.folder, "yaml"), (other.folder, "mp4")):
+        name = f"cam_image_raw.{suffix}"
+        (tmp_path / name).write_bytes((folder / "dataset" / name).read_bytes())
+    without_sum(tmp_path / "cam_image_raw.yaml")
+    output, options = tmp_path / "out.mcap", UnpackOptions(images=kind)
+    with pytest.raises(FormatError, match=r"frame-count|digest-mismatch"):
+        mp4ds.unpack(tmp_path / "cam_image_raw.yaml", "mcap", output, options)
+    assert not output.exists()
+
+
+def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "mp4ds", *map(str, arguments)], capture_output=True, text=True
+    )
+
+
+def test_the_command_line(packed: Pack, tmp_path: Path) -> None:
+    made = packed("jpeg-cut-one", "mcap-ros2-zstd")
+    arguments = ["unpack", made.folder / "dataset", "--to", "mcap", "--images", "png"]
+    done = command(*arguments, "--jpeg-quality", "80", "-o", tmp_path / "a.mcap")
+    assert done.returncode == 0, done.stderr
+    now = "/cam/image_raw/compressed_png, sensor_msgs/msg/CompressedImage"
+    assert f"/cam/image_raw/compressed: given as {now}" in done.stdout
+    assert "(/cam/image_raw/compressed is taken)" in done.stdout
+    assert "/cam/image_raw/compressed: 1 messages as recorded: stored as it was" in done.stdout
+    done = command(*arguments, "--json", "-o", tmp_path / "b.mcap")
+    told = json.loads(done.stdout)
+    assert told["republished"]["/cam/image_raw/compressed"]["topic"].endswith("compressed_png")
+    assert list(told["as_recorded"]["/cam/image_raw/compressed"].values()) == [1]
+    for wrong in (["--images", "gif"], ["--jpeg-quality", "0"]):
+        done = command("unpack", made.folder / "dataset", "--to", "mcap", *wrong)
+        assert done.returncode == 2

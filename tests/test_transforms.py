@@ -1,0 +1,619 @@
+"""Static transforms out of messages of every kind, and which of them connect cameras."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import pytest
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from google.protobuf import descriptor_pb2, message_factory
+from google.protobuf.descriptor_pool import DescriptorPool
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap_protobuf.schema import build_file_descriptor_set
+from pydantic import ValidationError
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from conftest import real
+from mp4ds import yamlio
+from mp4ds.bags import open_reader
+from mp4ds.records import Channel, Message, Schema
+from mp4ds.sidecar.manifest import StaticTransform
+from mp4ds.wire import WireError
+from mp4ds.wire.transforms import (
+    MAX_TRANSFORMS,
+    Transform,
+    TransformCollector,
+    parse_transforms,
+    transform_parser,
+)
+
+Vector = tuple[float, float, float]
+Rotation = tuple[float, float, float, float]
+TURN = (0.0, 0.0, math.sin(0.5), math.cos(0.5))
+TREE = [
+    Transform("base", "head", (0.5, -0.25, 1.75), TURN),
+    Transform("head", "left", (0.0, 0.05, 0.0), (0.5, 0.5, 0.5, 0.5)),
+    Transform("head", "right \u00e4", (0.0, -0.05, 0.0), (-0.5, 0.5, -0.5, 0.5)),
+    Transform("base", "lidar", (0.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0)),
+]
+
+
+# ---------------------------------------------------------------- writers of messages
+
+
+def store_of(encoding: str) -> Any:
+    store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+    stamped = "geometry_msgs/TransformStamped[] transforms"
+    one = (
+        "builtin_interfaces/Time timestamp\nstring parent_frame_id\nstring child_frame_id\n"
+        "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation"
+    )
+    many = "foxglove_msgs/FrameTransform[] transforms"
+    for name, text in (
+        ("tf2_msgs/msg/TFMessage", stamped),
+        ("tf/msg/tfMessage", stamped),
+        ("foxglove_msgs/msg/FrameTransform", one),
+        ("foxglove_msgs/msg/FrameTransforms", many),
+    ):
+        if name not in store.types:
+            store.register(get_types_from_msg(text, name))
+    return store
+
+
+STORES = {encoding: store_of(encoding) for encoding in ("ros1", "cdr")}
+
+
+def ros(encoding: str, name: str, transforms: Sequence[Transform], *, little: bool = True) -> bytes:
+    store = STORES[encoding]
+    types = store.types
+
+    def parts(item: Transform) -> tuple[Any, Any]:
+        return (
+            types["geometry_msgs/msg/Vector3"](*item.translation),
+            types["geometry_msgs/msg/Quaternion"](*item.rotation),
+        )
+
+    time = types["builtin_interfaces/msg/Time"](17, 18)
+    seq = {"seq": 3} if encoding == "ros1" else {}
+    stamped = [
+        types["geometry_msgs/msg/TransformStamped"](
+            types["std_msgs/msg/Header"](stamp=time, frame_id=item.parent, **seq),
+            item.child,
+            types["geometry_msgs/msg/Transform"](*parts(item)),
+        )
+        for item in transforms
+    ]
+    singles = [
+        types["foxglove_msgs/msg/FrameTransform"](time, item.parent, item.child, *parts(item))
+        for item in transforms
+    ]
+    if name == "foxglove_msgs/msg/FrameTransform":
+        message = singles[0]
+    else:
+        message = types[name](stamped if "tf" in name else singles)
+    if encoding == "ros1":
+        return bytes(store.serialize_ros1(message, name))
+    return bytes(store.serialize_cdr(message, name, little_endian=little))
+
+
+def fill(message: Any, item: Transform) -> Any:
+    message.timestamp.seconds = 17
+    message.parent_frame_id, message.child_frame_id = item.parent, item.child
+    for part, values in (("translation", item.translation), ("rotation", item.rotation)):
+        for name, value in zip("xyzw", values, strict=False):
+            setattr(getattr(message, part), name, value)
+    return message
+
+
+def protobuf(transforms: Sequence[Transform]) -> bytes:
+    message = FrameTransforms()
+    for item in transforms:
+        fill(message.transforms.add(), item)
+    return bytes(message.SerializeToString())
+
+
+def node(item: Transform) -> dict[str, Any]:
+    return {
+        "timestamp": {"sec": 17, "nsec": 18},
+        "parent_frame_id": item.parent,
+        "child_frame_id": item.child,
+        "translation": dict(zip("xyz", item.translation, strict=True)),
+        "rotation": dict(zip("xyzw", item.rotation, strict=True)),
+    }
+
+
+def channel(encoding: str, type_name: str, data: bytes = b"", topic: str = "/tf_static") -> Channel:
+    return Channel(1, topic, encoding, Schema(type_name, encoding, data))
+
+
+ONE, MANY = "foxglove.FrameTransform", "foxglove.FrameTransforms"
+ONE_SCHEMA, MANY_SCHEMA = (
+    build_file_descriptor_set(kind).SerializeToString()
+    for kind in (FrameTransform, FrameTransforms)
+)
+PROTOBUF = channel("protobuf", MANY, MANY_SCHEMA)
+
+Writer = Callable[[Sequence[Transform]], bytes]
+MANY_KINDS: dict[str, tuple[Channel, Writer]] = {
+    "protobuf": (PROTOBUF, protobuf),
+    "json": (
+        channel("json", MANY),
+        lambda items: json.dumps({"transforms": [node(item) for item in items]}).encode(),
+    ),
+}
+for _name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", "foxglove_msgs/msg/FrameTransforms"):
+    _ros1 = (channel("ros1", _name.replace("/msg/", "/")), _name)
+    MANY_KINDS[f"ros1 {_name}"] = (
+        _ros1[0],
+        lambda items, name=_name: ros("ros1", name, items),
+    )
+    for _little in (True, False):
+        MANY_KINDS[f"cdr {_name} {'le' if _little else 'be'}"] = (
+            channel("cdr", _name),
+            lambda items, name=_name, little=_little: ros("cdr", name, items, little=little),
+        )
+ONE_KINDS: dict[str, tuple[Channel, Callable[[Transform], bytes]]] = {
+    "protobuf": (
+        channel("protobuf", ONE, ONE_SCHEMA),
+        lambda item: bytes(fill(FrameTransform(), item).SerializeToString()),
+    ),
+    "json": (channel("json", ONE), lambda item: json.dumps(node(item)).encode()),
+    "ros1": (
+        channel("ros1", "foxglove_msgs/FrameTransform"),
+        lambda item: ros("ros1", "foxglove_msgs/msg/FrameTransform", [item]),
+    ),
+    "cdr": (
+        channel("cdr", "foxglove_msgs/msg/FrameTransform"),
+        lambda item: ros("cdr", "foxglove_msgs/msg/FrameTransform", [item]),
+    ),
+    "cdr-be": (
+        channel("cdr", "foxglove_msgs/msg/FrameTransform"),
+        lambda item: ros("cdr", "foxglove_msgs/msg/FrameTransform", [item], little=False),
+    ),
+}
+
+Numbers = st.floats(allow_nan=False, allow_infinity=False)
+Names = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=12)
+Transforms = st.builds(
+    Transform,
+    Names,
+    Names,
+    st.tuples(Numbers, Numbers, Numbers),
+    st.tuples(Numbers, Numbers, Numbers, Numbers),
+)
+
+
+# ---------------------------------------------------------------- parsing
+
+
+@pytest.mark.parametrize("kind", MANY_KINDS)
+def test_messages_of_several_transforms(kind: str) -> None:
+    own, write = MANY_KINDS[kind]
+    for items in (TREE, TREE[:1], []):
+        assert parse_transforms(own, write(items)) == items
+        assert parse_transforms(own, memoryview(write(items))) == items
+
+
+@pytest.mark.parametrize("kind", ONE_KINDS)
+def test_messages_of_one_transform(kind: str) -> None:
+    own, write = ONE_KINDS[kind]
+    for item in TREE:
+        assert parse_transforms(own, write(item)) == [item]
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.lists(Transforms, max_size=4))
+def test_any_transforms_return(items: list[Transform]) -> None:
+    for own, write in MANY_KINDS.values():
+        assert parse_transforms(own, write(items)) == items
+
+
+def test_ros_messages_have_numbers_that_are_none() -> None:
+    item = Transform("a", "b", (math.nan, math.inf, -math.inf), (0.0, 0.0, 0.0, 0.0))
+    (found,) = parse_transforms(
+        channel("ros1", "tf2_msgs/TFMessage"), ros("ros1", "tf2_msgs/msg/TFMessage", [item])
+    )
+    assert math.isnan(found.translation[0])
+    assert not found.is_usable
+
+
+@pytest.mark.parametrize("kind", ["protobuf", "json"])
+def test_absent_parts_are_the_identity(kind: str) -> None:
+    own, _ = ONE_KINDS[kind]
+    bare = FrameTransform(parent_frame_id="a", child_frame_id="b")
+    data = {
+        "protobuf": bare.SerializeToString(),
+        "json": b'{"parent_frame_id": "a", "child_frame_id": "b", "rotation": null}',
+    }[kind]
+    expected = Transform("a", "b", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    assert parse_transforms(own, data) == [expected]
+    assert parse_transforms(own, b"{}" if kind == "json" else b"")[0].parent == ""
+
+
+def test_fields_are_found_by_the_recorded_descriptor() -> None:
+    """Renumbered fields, and files that stand before those that they import."""
+    files = descriptor_pb2.FileDescriptorSet.FromString(MANY_SCHEMA)
+    for file in files.file:
+        for kind in file.message_type if file.package == "foxglove" else ():
+            for field in kind.field:
+                field.number += 40
+    renumbered = files.SerializeToString()
+    pool = DescriptorPool()
+    todo = list(files.file)
+    while todo:
+        file = todo.pop(0)
+        try:
+            pool.Add(file)
+        except TypeError:
+            todo.append(file)
+    message = message_factory.GetMessageClass(pool.FindMessageTypeByName(MANY))()
+    for item in TREE:
+        fill(message.transforms.add(), item)
+    data = message.SerializeToString()
+    assert parse_transforms(PROTOBUF, data) == []  # of other numbers: unknown fields
+    assert parse_transforms(channel("protobuf", MANY, renumbered), data) == TREE
+    for order in (1, -1):
+        mixed = descriptor_pb2.FileDescriptorSet(file=sorted(files.file, key=len_of)[::order])
+        own = channel("protobuf", MANY, mixed.SerializeToString())
+        assert parse_transforms(own, data) == TREE
+
+
+def len_of(file: Any) -> int:
+    return len(file.SerializeToString())
+
+
+@pytest.mark.parametrize(
+    "own",
+    [
+        channel("ros1", "sensor_msgs/Image"),
+        channel("ros1", "foxglove.FrameTransform"),
+        channel("json", "tf2_msgs/TFMessage"),
+        channel("flatbuffer", ONE),
+        channel("", ""),
+        Channel(1, "/tf_static", "protobuf", None),
+        channel("protobuf", ONE),
+        channel("protobuf", ONE, b"\xff\xff\xff"),
+        channel("protobuf", MANY, ONE_SCHEMA),
+        channel("protobuf", ONE, ONE_SCHEMA + bytes(1 << 20)),
+        channel("protobuf", ONE, ONE_SCHEMA[:-40]),
+    ],
+)
+def test_what_is_no_transform(own: Channel) -> None:
+    with pytest.raises(WireError):
+        transform_parser(own)
+
+
+def test_descriptors_that_are_not_whole() -> None:
+    files = descriptor_pb2.FileDescriptorSet.FromString(ONE_SCHEMA)
+    without = descriptor_pb2.FileDescriptorSet(
+        file=[file for file in files.file if "Vector3" not in file.name]
+    )
+    circle = descriptor_pb2.FileDescriptorSet()
+    for name, other in (("a", "b"), ("b", "a")):
+        circle.file.add(name=name, dependency=[other])
+    many = descriptor_pb2.FileDescriptorSet(file=files.file)
+    for number in range(101):
+        many.file.add(name=str(number))
+    for schema in (without, circle, many):
+        with pytest.raises(WireError, match="descriptor does not parse"):
+            transform_parser(channel("protobuf", ONE, schema.SerializeToString()))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "{", "[]", "7", "null", '"text"', '{"transforms": 7}', '{"transforms": [7]}',
+        '{"transforms": ["a"]}', '{"transforms": [null]}', '{"transforms": {"a": 1}}',
+        '{"transforms": [{"parent_frame_id": 7}]}', '{"transforms": [{"translation": 7}]}',
+        '{"transforms": [{"translation": {"x": "1.0"}}]}',
+        '{"transforms": [{"translation": {"x": null}}]}',
+        '{"transforms": [{"rotation": [1, 2, 3, 4]}]}',
+        '{"transforms": [{"translation": {"x": 1' + "0" * 400 + "}}]}",
+        '{"transforms": [{"translation": {"x": 1' + "0" * 5000 + "}}]}",
+        "[" * 100_000, '{"transforms": [' + "{}," * 10_000 + "{}]}",
+        '{"transforms": []' + " " * (1 << 20) + "}", "\ud800",
+    ],
+)  # fmt: skip
+def test_json_of_another_shape(text: str) -> None:
+    with pytest.raises(WireError):
+        parse_transforms(channel("json", MANY), text.encode("utf-8", "surrogatepass"))
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"parent_frame_id": 5},
+        {"child_frame_id": None},
+        {"translation": 1},
+        {"rotation": None},
+    ],
+)
+def test_descriptors_of_another_shape(fields: dict[str, int | None]) -> None:
+    """Fields that are absent or of another type than they should."""
+    files = descriptor_pb2.FileDescriptorSet.FromString(ONE_SCHEMA)
+    (kind,) = (m for f in files.file for m in f.message_type if m.name == "FrameTransform")
+    for field in list(kind.field):
+        if field.name in fields:
+            if fields[field.name] is None:
+                kind.field.remove(field)
+            else:
+                field.type = fields[field.name] or 0
+                field.ClearField("type_name")
+    with pytest.raises(WireError, match="fields are not those"):
+        parse_transforms(channel("protobuf", ONE, files.SerializeToString()), b"")
+
+
+def test_a_message_beyond_all_measure() -> None:
+    for own, write in MANY_KINDS.values():
+        parse = transform_parser(own)
+        with pytest.raises(WireError, match="bytes"):
+            parse(memoryview(write(TREE) + bytes(1 << 20)))
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.data())
+def test_damaged_messages_end_in_a_wire_error(data: st.DataObject) -> None:
+    own, write = MANY_KINDS[data.draw(st.sampled_from(sorted(MANY_KINDS)))]
+    payload = bytearray(write(TREE))
+    for _ in range(data.draw(st.integers(1, 4))):
+        payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    cut = data.draw(st.integers(0, len(payload)))
+    for damaged in (bytes(payload), bytes(payload[:cut])):
+        try:
+            found = parse_transforms(own, damaged)
+        except WireError:
+            continue
+        assert all(isinstance(item, Transform) for item in found)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in MANY_KINDS if kind[:3] in ("ros", "cdr")])
+def test_a_count_that_the_message_does_not_hold(kind: str) -> None:
+    own, write = MANY_KINDS[kind]
+    payload = bytearray(write(TREE))
+    order = ">" if kind.endswith("be") else "<"
+    struct.pack_into(f"{order}I", payload, 0 if kind.startswith("ros1") else 4, 2**32 - 1)
+    with pytest.raises(WireError):
+        parse_transforms(own, bytes(payload))
+
+
+def test_without_protobuf_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> Any:
+        raise ImportError(name)
+
+    monkeypatch.setattr("mp4ds.wire.transforms.import_module", missing)
+    with pytest.raises(WireError, match="protobuf is not installed"):
+        transform_parser(PROTOBUF)
+    collector = TransformCollector()
+    collector.add(PROTOBUF, protobuf(TREE))
+    assert collector.transforms == []
+
+
+# ---------------------------------------------------------------- collecting
+
+
+def collected(items: Iterable[Transform], **options: Any) -> TransformCollector:
+    collector = TransformCollector(**options)
+    for item in items:
+        collector.add(PROTOBUF, protobuf([item]))
+    return collector
+
+
+@pytest.mark.parametrize("kind", MANY_KINDS)
+def test_a_collector_takes_every_kind(kind: str) -> None:
+    own, write = MANY_KINDS[kind]
+    collector = TransformCollector()
+    assert collector.takes(own)
+    collector.add(own, write(TREE))
+    assert collector.transforms == TREE
+
+
+@pytest.mark.parametrize(
+    ("topic", "taken"),
+    [
+        ("/tf_static", True),
+        ("tf_static", True),
+        ("/robot1/tf_static", True),
+        ("/tf_static/", True),
+        ("/tf", False),
+        ("/tf_static/other", False),
+        ("/my_tf_static", False),
+        ("", False),
+    ],
+)
+def test_topics_of_static_transforms(topic: str, taken: bool) -> None:
+    own = channel("protobuf", MANY, MANY_SCHEMA, topic)
+    collector = TransformCollector()
+    collector.add(own, protobuf(TREE))
+    assert collector.takes(own) is taken
+    assert bool(collector.transforms) is taken
+    assert not collector.takes(channel("ros1", "std_msgs/String", b"", topic))
+
+
+def test_the_latest_of_each_child_holds() -> None:
+    moved = Transform("base", "head", (9.0, 9.0, 9.0), TURN)
+    elsewhere = Transform("other", "/left", (0.0, 0.0, 0.0), TURN)  # a name as tf had it
+    collector = collected([*TREE, moved, elsewhere])
+    assert collector.transforms == [moved, elsewhere, *TREE[2:]]
+
+
+@pytest.mark.parametrize(
+    "item",
+    [
+        Transform("", "b", (0.0, 0.0, 0.0), TURN),
+        Transform("a", "", (0.0, 0.0, 0.0), TURN),
+        Transform("a", "a", (0.0, 0.0, 0.0), TURN),
+        Transform("/a", "a", (0.0, 0.0, 0.0), TURN),
+        Transform("a", "b", (math.nan, 0.0, 0.0), TURN),
+        Transform("a", "b", (0.0, math.inf, 0.0), TURN),
+        Transform("a", "b", (0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0)),
+        Transform("a", "b", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)),
+        Transform("a", "b", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.1)),
+        Transform("a", "b", (0.0, 0.0, 0.0), (1e300, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_what_tf2_refuses_is_left_out(item: Transform) -> None:
+    assert not item.is_usable
+    assert collected([item, TREE[0]]).transforms == [TREE[0]]
+
+
+def test_a_rotation_may_be_rounded() -> None:
+    assert Transform("a", "b", (0.0, 0.0, 0.0), (0.0, 0.0, 0.707, 0.707)).is_usable
+
+
+def test_what_does_not_parse_is_ignored() -> None:
+    collector = collected(TREE)
+    collector.add(PROTOBUF, b"\xff")
+    collector.add(channel("protobuf", MANY, b"\xff"), protobuf(TREE))
+    collector.add(channel("cbor", MANY), b"")
+    collector.add(channel("cdr", "tf2_msgs/msg/TFMessage"), b"\x00\x07\x00\x00")
+    collector.add(channel("ros1", "tf2_msgs/TFMessage"), b"\x01")
+    assert collector.transforms == TREE
+
+
+def test_the_number_of_children_is_bounded() -> None:
+    many = [Transform("a", f"c{n}", (0.0, 0.0, float(n)), TURN) for n in range(7)]
+    moved = Transform("b", "c3", (1.0, 1.0, 1.0), TURN)
+    found = collected([*many, moved], limit=5).transforms
+    assert found == [*many[:3], moved, many[4]]
+    crowd = [Transform("a", f"c{n}", (0.0, 0.0, 0.0), TURN) for n in range(MAX_TRANSFORMS + 1)]
+    collector = TransformCollector()
+    collector.add(PROTOBUF, protobuf(crowd))
+    assert collector.transforms == crowd[:-1]
+
+
+# ---------------------------------------------------------------- between cameras
+
+
+@pytest.mark.parametrize(
+    ("frames", "children"),
+    [
+        (["left", "right \u00e4"], ["head", "left", "right \u00e4"]),
+        (["/left", "right \u00e4"], ["head", "left", "right \u00e4"]),
+        (["left"], ["head", "left"]),
+        (["head", "left"], ["head", "left"]),
+        (["lidar", "left"], ["head", "left", "lidar"]),
+        (["base"], []),
+        (["nowhere", ""], []),
+        ([], []),
+    ],
+)
+def test_paths_between_cameras(frames: list[str], children: list[str]) -> None:
+    found = collected(TREE).between(frames)
+    assert [item.child for item in found] == children
+    assert all(item in TREE for item in found)
+
+
+def test_separate_trees_and_circles() -> None:
+    def edge(parent: str, child: str) -> Transform:
+        return Transform(parent, child, (0.0, 0.0, 0.0), TURN)
+
+    edges = [edge("r", "a"), edge("s", "b"), edge("x", "y"), edge("y", "z"), edge("z", "x")]
+    found = collected(edges)
+    assert found.between(["a", "b"]) == edges[:2]
+    assert found.between(["z"]) == edges[2:]
+    assert found.between(["z", "a", "y"]) == [edges[0], *edges[2:]]
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), max_size=20),
+    st.lists(st.integers(0, 9), max_size=4),
+)
+def test_any_graph_gives_the_ancestors(edges: list[tuple[int, int]], frames: list[int]) -> None:
+    items = [Transform(f"f{a}", f"f{b}", (0.0, 0.0, 0.0), TURN) for a, b in edges if a != b]
+    collector = collected(items)
+    parents = {item.child: item.parent for item in collector.transforms}
+    above: set[str] = set()
+    todo = [f"f{n}" for n in frames]
+    while todo:
+        name = todo.pop()
+        if name in parents and name not in above:
+            above.add(name)
+            todo.append(parents[name])
+    found = collector.between(f"f{n}" for n in frames)
+    assert {item.child for item in found} == above
+    assert found == [item for item in collector.transforms if item.child in above]
+
+
+# ---------------------------------------------------------------- in a manifest
+
+
+def test_a_manifest_holds_them_bit_for_bit() -> None:
+    models = [StaticTransform.from_record(item) for item in TREE]
+    text = yamlio.dump({"transforms": [model.model_dump() for model in models]})
+    (loaded,) = yamlio.load(text, "here").values()
+    assert [StaticTransform.model_validate(item) for item in loaded] == models
+    assert [tuple(item["translation"]) for item in loaded] == [item.translation for item in TREE]
+    assert [tuple(item["rotation"]) for item in loaded] == [item.rotation for item in TREE]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"translation": [0.0, 0.0]},
+        {"translation": [0.0, 0.0, 0.0, 0.0]},
+        {"rotation": [0.0, 0.0, 1.0]},
+        {"rotation": [0.0, 0.0, 0.0, "1"]},
+        {"rotation": [0.0, 0.0, 0.0, math.nan]},
+        {"translation": [0.0, 0.0, math.inf]},
+        {"parent": 7},
+        {"child": None},
+        {"stamp": 0},
+    ],
+)
+def test_a_manifest_refuses_other_shapes(change: dict[str, Any]) -> None:
+    good = {"parent": "a", "child": "b", "translation": [0.0] * 3, "rotation": [0.0, 0.0, 0.0, 1.0]}
+    assert StaticTransform.model_validate(good).child == "b"
+    with pytest.raises(ValidationError):
+        StaticTransform.model_validate({**good, **change})
+
+
+# ---------------------------------------------------------------- real recordings
+
+
+@pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
+def test_a_real_recording(compression: str) -> None:
+    path = real(f"bags/example_turtle_{compression}.bag")
+    collector = TransformCollector()
+    with open_reader(path) as reader:
+        for record in reader.records():
+            if isinstance(record, Message):
+                collector.add(record.channel, record.data)
+    expected: dict[str, Any] = {}
+    with AnyReader([path]) as bag:
+        own = [connection for connection in bag.connections if connection.topic == "/tf_static"]
+        for connection, _, data in bag.messages(own):
+            for item in bag.deserialize(data, connection.msgtype).transforms:
+                expected[item.child_frame_id] = item
+    assert expected
+    for found, item in zip(collector.transforms, expected.values(), strict=True):
+        t, r = item.transform.translation, item.transform.rotation
+        assert found == Transform(
+            item.header.frame_id, item.child_frame_id, (t.x, t.y, t.z), (r.x, r.y, r.z, r.w)
+        )
+
+
+def test_a_real_message_of_ros2() -> None:
+    path = real("rosbag2/geocamxyz_test_bag_sqlite3")
+    with open_reader(path) as reader:
+        (own,) = (item for item in reader.channels if item.type_name == "tf2_msgs/msg/TFMessage")
+        message = reader.first(own)
+    assert message is not None
+    with AnyReader([path]) as bag:
+        (connection,) = (item for item in bag.connections if item.topic == own.topic)
+        _, _, data = next(bag.messages([connection]))
+        expected = bag.deserialize(data, connection.msgtype).transforms
+    found = parse_transforms(own, message.data)
+    assert [(item.parent, item.child) for item in found] == [
+        (item.header.frame_id, item.child_frame_id) for item in expected
+    ]
+    assert [item.translation[0] for item in found] == [
+        item.transform.translation.x for item in expected
+    ]

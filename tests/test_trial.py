@@ -1,0 +1,261 @@
+"""Which layout and codec are chosen for a stream, and that the estimate is near the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mp4ds.errors import OptionError
+from mp4ds.layouts import ENCODINGS, MAX_SIDE, bind, fit
+from mp4ds.video import VideoEncoder, choose, recipe_for
+from mp4ds.video.codecs import lossless_codecs
+from mp4ds.video.encoder import EncoderRefusedError
+from mp4ds.video.trial import NEAR, Choice, estimate
+from pictures import picture
+from pixel_kinds import as_message, rounded
+
+Pixels = NDArray[Any]
+
+
+def chosen(samples: Sequence[Pixels], encoding: str, **options: Any) -> Choice:
+    given = {"codec": None, "preset": None, "gop": 60, "threads": 1, **options}
+    return choose(samples, ENCODINGS[encoding], **given)
+
+
+def scene(encoding: str, frames: int = 6, width: int = 96, height: int = 66) -> list[Pixels]:
+    rng = np.random.default_rng(1)
+    width, height = rounded(ENCODINGS[encoding], width, height)
+    return [
+        np.ascontiguousarray(picture(encoding, frame=n, width=width, height=height, rng=rng))
+        for n in range(frames)
+    ]
+
+
+def texture(rng: np.random.Generator, top: int, width: int = 96, height: int = 64) -> Pixels:
+    return rng.integers(0, top, (height, width), np.uint16, endpoint=True)
+
+
+def video_size(path: Path, samples: Sequence[Pixels], encoding: str, choice: Choice) -> int:
+    layout = bind(choice.layout, ENCODINGS[encoding], choice.parameters)
+    pictures = [layout.to_picture(pixels) for pixels in samples]
+    height, width = pictures[0][0].shape[:2]
+    encoder = VideoEncoder(
+        path, choice.recipe, picture_format=layout.pixel_format, width=width, height=height,
+        gop=60, threads=1, rate=30.0,
+    )  # fmt: skip
+    for number, planes in enumerate(pictures):
+        encoder.write(planes, number * 33_333)
+    encoder.close()
+    return path.stat().st_size
+
+
+# ---------------------------------------------------------------- estimates
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_the_estimate_is_near_the_truth(encoding: str, tmp_path: Path) -> None:
+    samples = scene(encoding, 24)
+    choice = chosen(samples[:6], encoding)
+    layout = bind(choice.layout, ENCODINGS[encoding], choice.parameters)
+    if any(map(layout.refuses, samples)):
+        samples = [*samples[:6], *samples[5::-1]] * 2
+    size = video_size(tmp_path / "v.mp4", samples, encoding, choice)
+    assert 0.75 < 60 * choice.bytes_per_frame / (60 / 24 * size) < 1.25
+
+
+@pytest.mark.parametrize("codec", ["h264", "ffv1"])
+def test_key_frames_are_weighed_by_their_number(codec: str) -> None:
+    """Of a still scene, a key frame costs much and the others hardly anything."""
+    rng = np.random.default_rng(0)
+    pictures = [(texture(rng, 255).astype(np.uint8),)] * 6
+    recipe = recipe_for("gray", lossless=True, codec=codec)
+    sizes = [
+        estimate(pictures, recipe, picture_format="gray", gop=gop, threads=1) for gop in (1, 2, 60)
+    ]
+    first = estimate(pictures[:1], recipe, picture_format="gray", gop=60, threads=1)
+    assert sizes[0] == pytest.approx(first, rel=0.01)
+    others = 2 * sizes[1] - first
+    assert sizes[2] == pytest.approx((first + 59 * others) / 60, abs=first / 1000)
+    if codec == "h264":
+        assert others < first / 20
+
+
+def test_an_encoder_that_refuses() -> None:
+    recipe = recipe_for("gray12le", lossless=True, codec="h265")
+    with pytest.raises(EncoderRefusedError, match="libx265 does not take pictures of 2x2"):
+        estimate(
+            [(np.zeros((2, 2), np.uint16),)],
+            recipe,
+            picture_format="gray12le",
+            gop=60,
+            threads=1,
+        )
+
+
+# ---------------------------------------------------------------- choices
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_some_layout_is_chosen_for_every_encoding(encoding: str) -> None:
+    samples = scene(encoding)
+    first, again = chosen(samples, encoding), chosen(samples, encoding)
+    assert first == again
+    assert first.recipe.lossless
+    assert first.layout in ENCODINGS[encoding].exact
+    layout = bind(first.layout, ENCODINGS[encoding], first.parameters)
+    assert not any(map(layout.refuses, samples))
+    assert 0 < first.bytes_per_frame < samples[0].nbytes * 1.1
+    views = [
+        as_message(pixels, ENCODINGS[encoding], pad=8, is_bigendian=True) for pixels in samples
+    ]
+    assert chosen(views, encoding) == first
+
+
+def test_inter_coding_is_chosen_for_what_stays() -> None:
+    rng = np.random.default_rng(0)
+    still = [texture(rng, 255).astype(np.uint8)] * 6
+    assert chosen(still, "mono8").recipe.codec == "h264"
+    assert chosen([still[0]] * 6, "mono8", gop=1).recipe.codec == "ffv1"
+    noise = [texture(rng, 255).astype(np.uint8) for _ in range(6)]
+    assert chosen(noise, "mono8").recipe.codec == "ffv1"
+
+
+def test_left_aligned_values_are_shifted() -> None:
+    samples = [(pixels >> 4) << 4 for pixels in scene("mono16")]
+    choice = chosen(samples, "mono16")
+    assert choice.layout in ("gray_bits", "fold")
+    assert (choice.parameters.bits, choice.parameters.shift) == (12, 4)
+
+
+def test_an_alpha_that_says_nothing_is_left_out() -> None:
+    samples = scene("rgba8")[:1] * 6
+    assert chosen(samples, "rgba8").layout == "rgba"
+    samples[0][..., 3] = 255
+    choice = chosen(samples, "rgba8")
+    assert (choice.layout, choice.parameters.alpha) == ("opaque", 255)
+    assert choice.recipe.codec == "h264"
+
+
+def test_noise_below_the_signal_is_folded_away() -> None:
+    """What inter coding finds again is in the high bits."""
+    rng = np.random.default_rng(0)
+    still = texture(rng, 4095)
+    samples = [still + rng.integers(0, 4, still.shape, np.uint16) for _ in range(6)]
+    samples = [np.minimum(pixels, 4095) for pixels in samples]
+    choice = chosen(samples, "mono16")
+    assert (choice.layout, choice.recipe.codec) == ("fold", "h264")
+    assert (choice.parameters.bits, choice.parameters.low) == (12, 3)
+
+
+def test_values_that_change_are_listed_in_each_picture() -> None:
+    """As of a stereo camera that moves: depth is f * B / disparity."""
+    y, x = np.mgrid[:256, :320]
+    samples = []
+    for n in range(6):
+        disparity = np.rint(400 + 180 * np.sin((x + n) / 90) + 100 * np.cos(y / 40) + 3 * n)
+        samples.append((np.float32(70.123) / disparity).astype(np.float32))
+    choice = chosen(samples, "32FC1")
+    assert choice.layout == "palette"
+    assert choice.bytes_per_frame < samples[0].nbytes / 8
+
+
+def test_few_values_are_numbered() -> None:
+    rng = np.random.default_rng(0)
+    levels = np.unique(rng.integers(300, 60000, 200)).astype(np.uint16)
+    y, x = np.mgrid[:64, :96]
+    smooth = [100 + 70 * np.sin((x + n) / 15) + 40 * np.cos(y / 9) for n in range(6)]
+    noisy = [surface + rng.normal(0, 2, surface.shape) for surface in smooth]
+    samples = [levels[np.clip(surface, 40, 160).astype(int)] for surface in noisy]
+    choice = chosen(samples, "16UC1")
+    assert choice.layout == "table"
+    assert set(choice.parameters.table or ()) == set(np.unique(samples).tolist())
+
+
+@pytest.mark.parametrize("scale", ["product", "quotient"])
+def test_metres_are_stored_as_millimetres(scale: str) -> None:
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:64, :96]
+    samples = []
+    for n in range(6):
+        counts = (2000 + 10 * x + 5 * y + 3 * n + rng.integers(0, 9, x.shape)).astype(np.float32)
+        metres = counts * np.float32(0.001) if scale == "product" else counts / np.float32(1000)
+        metres[(x + n) % 13 == 0] = np.nan
+        samples.append(metres)
+    choice = chosen(samples, "32FC1")
+    assert choice.layout in ("metres16", "metres_fold")
+    assert choice.parameters.scale == scale
+    samples[3][5, 5] = 1.00025  # one is no whole number of millimetres
+    assert chosen(samples, "32FC1").layout == "palette"
+    noise = [s + rng.normal(0, 0.01, s.shape).astype(np.float32) for s in samples]
+    assert chosen(noise, "32FC1").layout == "bytes"
+
+
+def test_the_earlier_of_two_near_ones_is_taken() -> None:
+    """Its order is that of the encoding's layouts and the codecs of their pictures."""
+    samples = scene("mono16")
+    choice = chosen(samples, "mono16")
+    every = [chosen(samples, "mono16", codec=codec).bytes_per_frame for codec in ("h264", "ffv1")]
+    assert choice.bytes_per_frame <= NEAR * min(every)
+
+
+@pytest.mark.parametrize("codec", ["h264", "h265", "ffv1"])
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_a_codec_that_was_asked_for(codec: str, encoding: str) -> None:
+    samples = scene(encoding)
+    able = {
+        name
+        for layout in ENCODINGS[encoding].exact
+        for fitted in [fit(layout, ENCODINGS[encoding], samples)]
+        if fitted is not None
+        for name in lossless_codecs(fitted.pixel_format)
+    }
+    assert "ffv1" in able
+    if codec in able:
+        assert chosen(samples, encoding, codec=codec).recipe.codec == codec
+        return
+    with pytest.raises(OptionError, match=f"codec {codec} has no lossless form for .*ffv1"):
+        chosen(samples, encoding, codec=codec)
+
+
+def test_a_preset_that_was_asked_for() -> None:
+    samples = scene("mono8")
+    choice = chosen(samples, "mono8", codec="h264", preset="ultrafast")
+    assert choice.recipe.options["preset"] == "ultrafast"
+    assert chosen(samples, "mono8", codec="ffv1", preset="ultrafast").recipe.codec == "ffv1"
+
+
+def test_one_sample_and_tiny_images() -> None:
+    for width, height in ((2, 2), (3, 5), (301, 2)):
+        samples = [np.full((height, width), 9, np.uint8)]
+        assert chosen(samples, "mono8").bytes_per_frame > 0
+    with pytest.raises(EncoderRefusedError, match="does not take pictures of 1x1"):
+        chosen([np.zeros((1, 1), np.uint16)], "mono16", codec="ffv1")
+
+
+def test_pictures_beyond_the_bounds_are_not_tried() -> None:
+    """Twice the height of this image is more than a video may have."""
+    rng = np.random.default_rng(0)
+    ramp = np.cumsum(rng.integers(0, 3, (MAX_SIDE // 2 + 2, 4)), axis=0).astype(np.uint16)
+    assert chosen([ramp], "mono16").layout != "fold"
+    assert chosen([ramp], "mono16", codec="ffv1").recipe.pixel_format == "gray16le"
+
+
+@pytest.mark.parametrize("encoding", ["mono8", "rgb8", "uyvy", "bayer_rggb8", "nv12"])
+def test_large_images_are_tried_in_part(encoding: str) -> None:
+    """The estimate is for the whole."""
+    samples = scene(encoding, 3, width=1602, height=1202)
+    choice = chosen(samples, encoding)
+    layout = bind(choice.layout, ENCODINGS[encoding], choice.parameters)
+    whole = estimate(
+        [layout.to_picture(pixels) for pixels in samples],
+        choice.recipe,
+        picture_format=layout.pixel_format,
+        gop=60,
+        threads=1,
+    )
+    assert choice.bytes_per_frame == pytest.approx(whole, rel=0.1)
