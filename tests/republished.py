@@ -6,7 +6,7 @@ the messages of a scene.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from av.video.reformatter import VideoReformatter
 from mcap.reader import make_reader
+from mcap.records import Schema
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -72,32 +73,36 @@ def read(path: Path) -> list[Read]:
 
 def _read_mcap(path: Path) -> list[Read]:
     found = []
+    decoders: dict[int, Callable[[bytes], Any]] = {}
     with path.open("rb") as stream:
         for schema, channel, message in make_reader(stream).iter_messages():
-            name, value = schema.name if schema else "", None
-            if channel.message_encoding in ("ros1", "cdr"):
-                assert schema is not None
-                name = normalize_msgtype(name)
-                is_ros1 = channel.message_encoding == "ros1"
-                store = get_typestore(Stores.EMPTY if is_ros1 else Stores.ROS2_HUMBLE)
-                types = get_types_from_msg(schema.data.decode(), name)
-                store.register({key: t for key, t in types.items() if key not in store.types})
-                decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
-                value = decode(message.data, name)
+            if channel.id not in decoders:
+                decoders[channel.id] = _decoder(schema, channel.message_encoding)
             found.append(
                 Read(
                     channel.topic,
-                    name,
+                    normalize_msgtype(schema.name) if schema and "/" in schema.name else "",
                     channel.message_encoding,
                     message.log_time,
                     message.publish_time,
                     message.sequence,
                     message.data,
-                    value,
+                    decoders[channel.id](message.data),
                     dict(channel.metadata),
                 )
             )
     return found
+
+
+def _decoder(schema: Schema | None, encoding: str) -> Callable[[bytes], Any]:
+    if schema is None or encoding not in ("ros1", "cdr"):
+        return lambda data: None
+    name = normalize_msgtype(schema.name)
+    store = get_typestore(Stores.EMPTY if encoding == "ros1" else Stores.ROS2_HUMBLE)
+    types = get_types_from_msg(schema.data.decode(), name)
+    store.register({key: known for key, known in types.items() if key not in store.types})
+    decode = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
+    return lambda data: decode(data, name)
 
 
 def _read_ros(path: Path) -> list[Read]:

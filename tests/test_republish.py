@@ -25,7 +25,7 @@ import mp4ds
 from coded_scenes import CODED, MakeScene
 from definitions import CODED_VIDEO, COMPRESSED, IMAGE
 from encoders import cv, nal_units
-from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
+from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.errors import ConversionError, FormatError, OptionError
 from mp4ds.packing import PackOptions
 from mp4ds.republish import KINDS, Republished
@@ -94,8 +94,9 @@ class Packed:
         output = self.folder / f"again{TARGETS[to]}"
         chosen = UnpackOptions(images=kind, force=True, **options)
         summary = mp4ds.unpack(self.folder / "dataset", to, output, chosen)
-        assert sum(summary.messages.values()) == len(read(output))
-        return summary, read(output)
+        found = read(output)
+        assert sum(summary.messages.values()) == len(found)
+        return summary, found
 
 
 Pack = Callable[..., Packed]
@@ -632,21 +633,9 @@ def test_recorded_packets_stand_alone(packed: Pack, name: str, codec: str) -> No
 
 def test_parameters_sent_once_are_repeated(tmp_path: Path) -> None:
     """As Foxglove wants it; a recorded CompressedVideo of ROS stays as it is."""
-    from coded_scenes import _headers_once, _video
-
-    made = Packed(
-        tmp_path,
-        FOXGLOVE_LIKE(partial(_video, "h264", "h264", _headers_once)),
-        "mcap-protobuf",
-    )
+    made = Packed(tmp_path, foxglove_scene(CODED["video-h264-headers-once"]), "mcap-protobuf")
     found = made.unpack("mcap", "compressed-video", topics=[made.topic])[1]
     check_stand_alone("h264", found)
-
-
-def FOXGLOVE_LIKE(make: MakeScene) -> Scene:
-    from foxglove_scenes import foxglove_scene
-
-    return foxglove_scene(make)
 
 
 def test_nothing_is_decoded_for_video(packed: Pack, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -72,10 +72,12 @@ def imports_of(path: Path) -> Iterator[str]:
 HOMES = {
     "rosbags": ("bags",),
     "mcap": ("bags",),
-    "zstandard": ("bags", "streams"),  # streams compare a video with what zstd makes of it
+    "zstandard": ("bags",),
     "lz4": ("bags",),
     "sqlite3": ("bags",),
     "av": ("video",),
+    "PIL": ("video",),
+    "google": ("wire",),
     "typer": ("cli",),
     "rich": ("cli",),
     "yaml": ("yamlio.py", "bags"),

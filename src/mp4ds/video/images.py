@@ -1,18 +1,17 @@
-"""Single images as PNG or JPEG files, through the same library as the videos."""
+"""Single images as files: PNG through the library of the videos, JPEG through libjpeg."""
 
 from __future__ import annotations
 
+import io
 from fractions import Fraction
 from typing import Any
 
 import av
+import numpy as np
 
-from mp4ds.coded import jpeg_gray
 from mp4ds.errors import OptionError
 from mp4ds.layouts import CHROMA_SHIFTS, ENCODINGS, Encoding, Layout, Pixels, bind
 from mp4ds.video.convert import Converter, plain_frame
-
-_COARSEST = 31  # of ffmpeg's quantiser scales for JPEG
 
 _PNG_FORMATS = {
     "gray": "gray",
@@ -53,43 +52,51 @@ class ImageFile:
             )
         if self._jpeg and known.bytes_per_sample == 2:
             raise OptionError(f"JPEG cannot hold {encoding} images; use png")
-        self._quality, self._scale = quality, _quantiser_scale(quality)
+        if not 1 <= quality <= 100:
+            raise OptionError(f"a JPEG quality of {quality}: use 1 to 100")
+        self._quality = quality
         self._layout = _layout(known, demosaic=self._jpeg)
         self._is_yuv = self._layout.pixel_format in CHROMA_SHIFTS
         self._from_yuv = Converter("smpte170m", source_full_range=False)
         self._converter = Converter("smpte170m")
-        self._pixel_format = "yuvj444p" if self._jpeg else _PNG_FORMATS[self._layout.pixel_format]
+        self._pixel_format = _PNG_FORMATS.get(self._layout.pixel_format, "rgb24")
+        if self._jpeg and self._pixel_format != "gray":
+            self._pixel_format = "rgb24"  # libjpeg knows no alpha
 
     def encode(self, pixels: Pixels) -> bytes:
         """The file's bytes for an image as `mp4ds.layouts.pixel_view` gives it."""
-        picture = self._layout.to_picture(pixels)
-        if self._jpeg and self._layout.pixel_format == "gray":
-            return jpeg_gray.encode(picture[0], self._quality)
-        frame = plain_frame(picture, self._layout.pixel_format)
+        frame = plain_frame(self._layout.to_picture(pixels), self._layout.pixel_format)
         if self._is_yuv:
             frame = self._from_yuv.convert(frame, "rgb24")
         elif frame.format.name.startswith("bayer_"):
             frame = self._converter.convert(frame, "rgb24")
         if frame.format.name != self._pixel_format:
             frame = self._converter.convert(frame, self._pixel_format)
-        frame.pts = 0
-        context: Any = av.CodecContext.create("mjpeg" if self._jpeg else "png", "w")
-        context.width, context.height = frame.width, frame.height
-        context.pix_fmt = self._pixel_format
-        context.time_base = Fraction(1, 25)
-        if self._jpeg:
-            context.color_range = 2
-            context.qmin = context.qmax = self._scale
-        packets = [*context.encode(frame), *context.encode(None)]
-        return b"".join(bytes(packet) for packet in packets)
+        return self._jpeg_file(frame) if self._jpeg else _png_file(frame)
+
+    def _jpeg_file(self, frame: av.VideoFrame) -> bytes:
+        from PIL import Image
+
+        channels = 1 if self._pixel_format == "gray" else 3
+        plane: Any = frame.planes[0]
+        rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+        packed = np.ascontiguousarray(rows[: frame.height, : channels * frame.width])
+        mode, size = ("L" if channels == 1 else "RGB"), (frame.width, frame.height)
+        file = io.BytesIO()
+        # full chroma: what is published as colour was often demosaiced, and is sharp in it
+        Image.frombuffer(mode, size, packed, "raw", mode, 0, 1).save(
+            file, "JPEG", quality=self._quality, subsampling=0
+        )
+        return file.getvalue()
 
 
-def _quantiser_scale(quality: int) -> int:
-    """The scale that makes files of about the size and error that libjpeg's have."""
-    if not 1 <= quality <= 100:
-        raise OptionError(f"a JPEG quality of {quality}: use 1 to 100")
-    percent = 5000 / quality if quality < 50 else 200 - 2 * quality  # of libjpeg's tables
-    return min(max(round(percent * 8 / 100), 1), _COARSEST)
+def _png_file(frame: av.VideoFrame) -> bytes:
+    frame.pts = 0
+    context: Any = av.CodecContext.create("png", "w")
+    context.width, context.height = frame.width, frame.height
+    context.pix_fmt = frame.format.name
+    context.time_base = Fraction(1, 25)
+    return b"".join(map(bytes, [*context.encode(frame), *context.encode(None)]))
 
 
 def _layout(encoding: Encoding, *, demosaic: bool) -> Layout:
