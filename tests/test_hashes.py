@@ -1,7 +1,9 @@
 """The structural hash of MCAP files by a foreign tool, before and after.
 
 ``pymcap-cli hash`` (PyPI: pymcap-cli) covers profile, schemas, channels with their metadata,
-message counts and log times; not payloads, which other tests compare.
+message counts and log times; not payloads, which other tests compare. It believes a file's own
+index, and counts a schema as often as it is told: such files are first written again by the
+``mcap`` library.
 """
 
 from __future__ import annotations
@@ -10,13 +12,18 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+from mcap import records
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
 
 from coded_scenes import CODED
 from conftest import DATA, real
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from round_trips import journey, own_target, round_trip
+from scenes import Scene
 from sources import SOURCES, scene
 
 TOOL = shutil.which("pymcap-cli", path=str(Path(sys.executable).parent)) or shutil.which(
@@ -41,27 +48,76 @@ def storage_of(path: Path) -> Path:
     return found
 
 
+def rewritten(path: Path, folder: Path) -> Path:
+    """The same file with a whole index, and with equal schemas told once."""
+    schemas: dict[tuple[str, str, bytes], int] = {}
+    ids: dict[int, int] = {0: 0}
+    channels: dict[int, int] = {}
+    target = folder / "rewritten.mcap"
+    with path.open("rb") as source, target.open("wb") as sink:
+        writer = Writer(sink)
+        for record in StreamReader(source).records:
+            if isinstance(record, records.Header):
+                writer.start(record.profile, record.library)
+            elif isinstance(record, records.Schema):
+                key = record.name, record.encoding, record.data
+                ids[record.id] = schemas.get(key) or writer.register_schema(*key)
+                schemas[key] = ids[record.id]
+            elif isinstance(record, records.Channel):
+                if record.id not in channels:
+                    channels[record.id] = writer.register_channel(
+                        record.topic,
+                        record.message_encoding,
+                        ids[record.schema_id],
+                        record.metadata,
+                    )
+            elif isinstance(record, records.Message):
+                number, times = channels[record.channel_id], (record.publish_time, record.sequence)
+                writer.add_message(number, record.log_time, record.data, *times)
+            elif isinstance(record, records.Attachment):
+                times = record.create_time, record.log_time
+                writer.add_attachment(*times, record.name, record.media_type, record.data)
+            elif isinstance(record, records.Metadata):
+                writer.add_metadata(record.name, record.metadata)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return target
+
+
+def without_twins(recorded: Scene) -> Scene:
+    """A scene in which no two channels have one type, as they would tell their schemas twice."""
+    return Scene([m for m in recorded.messages if m.topic != "/chatter" or not m.publisher])
+
+
 ONE_FILE = [name for name in SOURCES if name.startswith("mcap-")]
 ONE_FILE += ["rosbag2-mcap-v5", "rosbag2-mcap-v9"]
 
 
-@pytest.mark.parametrize("source", ONE_FILE)
+def some(names: list[str], every: int) -> list[Any]:
+    """All names, of which every n-th is in the ordinary run."""
+    return [
+        pytest.param(name, marks=[pytest.mark.slow] if n % every else [])
+        for n, name in enumerate(names)
+    ]
+
+
+@pytest.mark.parametrize("source", some(ONE_FILE, 4))
 def test_hashes_of_written_files(source: str, tmp_path: Path) -> None:
-    done = journey(tmp_path, SOURCES[source], scene("bgr8"), own_target(source))
-    expected = hash_of(storage_of(done.sources[0]))
+    done = journey(tmp_path, SOURCES[source], without_twins(scene("bgr8")), own_target(source))
+    path = storage_of(done.sources[0])
+    expected = hash_of(rewritten(path, tmp_path) if "unindexed" in source else path)
     assert expected.startswith("mcap-index-v1:")
     assert hash_of(storage_of(done.output)) == expected
 
 
-@pytest.mark.parametrize("name", ["jpeg-cut-one", "depth-32FC1-rvl", "video-h264-mid-gop"])
+@pytest.mark.parametrize("name", some(["depth-32FC1-rvl", "jpeg-cut-one", "video-av1-mid-gop"], 3))
 def test_hashes_of_coded_pictures(name: str, tmp_path: Path) -> None:
-    done = journey(tmp_path, SOURCES["mcap-ros2-lz4"], CODED[name](), "mcap")
+    done = journey(tmp_path, SOURCES["mcap-ros2-lz4"], without_twins(CODED[name]()), "mcap")
     expected = hash_of(done.sources[0])
     assert expected.startswith("mcap-index-v1:")
     assert hash_of(done.output) == expected
 
 
-@pytest.mark.parametrize("source", FOXGLOVE_SOURCES)
+@pytest.mark.parametrize("source", some([*FOXGLOVE_SOURCES], 4))
 def test_hashes_of_foxglove_messages(source: str, tmp_path: Path) -> None:
     done = journey(tmp_path, FOXGLOVE_SOURCES[source], FOXGLOVE["jpeg-cut-one"](), "mcap")
     expected = hash_of(done.sources[0])
@@ -71,32 +127,49 @@ def test_hashes_of_foxglove_messages(source: str, tmp_path: Path) -> None:
 
 def test_the_hash_tells_recordings_apart(tmp_path: Path) -> None:
     found = set()
-    for seed in range(3):
-        (tmp_path / str(seed)).mkdir()
-        found.add(
-            hash_of(SOURCES["mcap-ros2-lz4"](tmp_path / str(seed), scene("bgr8", seed=seed))[0])
-        )
-    assert len(found) == 3
+    for seed in range(2):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        found.add(hash_of(SOURCES["mcap-ros2-lz4"](folder, scene("bgr8", seed=seed))[0]))
+    assert len(found) == 2
 
 
-REAL = sorted(
-    str(path.relative_to(DATA))
-    for pattern in ("mcap/**/*.mcap", "corrupt/sample_ok.mcap")
-    for path in DATA.glob(pattern)
-)
+def is_believed(path: Path) -> bool:
+    """Whether the tool sees all of a file: its index is whole or it does without.
+
+    The conformance files tell by the letters of their names what they leave out: chunks (ch)
+    without message indexes (mx), or a summary (chx, st) without schemas (rsh) or channels (rch).
+    """
+    flags = set(path.stem.split("-")[1:])
+    if "ch" not in flags:
+        return True
+    return "mx" in flags and not ({"chx", "st"} <= flags and not {"rch", "rsh"} <= flags)
+
+
+TELLS_TWICE = {"roboto_tiny_dvs_ros1profile.mcap"}
+ALL_REAL = sorted(str(path.relative_to(DATA)) for path in DATA.glob("mcap/**/*.mcap"))
+CONFORMANCE = [name for name in ALL_REAL if "conformance" in name]
+REAL = [name for name in ALL_REAL if name not in CONFORMANCE]
 
 
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[pytest.mark.slow] if "conformance" in name else [])
-        for name in REAL or ["mcap"]
+        *(some(REAL, 4) or ["mcap"]),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in CONFORMANCE[::5]),
     ],
 )
 def test_hashes_of_real_files(name: str, tmp_path: Path) -> None:
+    """The tool refuses none of them."""
     path = real(name)
-    expected = hash_of(path)
     output = round_trip([path], tmp_path, "mcap")
-    if not expected:
-        pytest.skip(f"pymcap-cli refuses {name}")
+    if path.name in TELLS_TWICE or not is_believed(path):
+        path = rewritten(path, tmp_path)
+    expected = hash_of(path)
+    assert expected.startswith("mcap-index-v1:")
     assert hash_of(output) == expected
+
+
+def test_rewriting_changes_no_hash(tmp_path: Path) -> None:
+    (path,) = SOURCES["mcap-ros2-zstd"](tmp_path, without_twins(scene("bgr8")))
+    assert hash_of(rewritten(path, tmp_path)) == hash_of(path)

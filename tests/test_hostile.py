@@ -6,6 +6,7 @@ with a fitting checksum, as whoever means harm would.
 
 from __future__ import annotations
 
+import base64
 import copy
 import hashlib
 import io
@@ -23,9 +24,13 @@ import av
 import pytest
 
 import mp4ds
+from coded_scenes import CODED
+from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from jail import Jail, Outcome
 from mp4ds import Mp4dsError, VersionError, yamlio
 from mp4ds.sidecar.fields import MAX_CAMERA_INFOS, MAX_FRAMES
+from scenes import Scene
+from sources import SOURCES, scene
 
 Document = dict[str, Any]
 Change = Callable[[Document], None]
@@ -865,6 +870,372 @@ def test_a_folder_whose_name_looks_like_something_else(
     assert mp4ds.validate(folder, deep=True) == []
     with mp4ds.open(folder) as dataset:
         assert len(list(dataset.streams[0])) == FRAMES
+
+
+# ---------------------------------------------------------------- coded pictures and packets
+
+KINDS: dict[str, tuple[str, Scene]] = {
+    "h264": ("mcap-ros2-none", CODED["video-h264"](frames=6)),
+    "av1": ("mcap-ros2-none", CODED["video-av1"](frames=6)),
+    "vp9": ("bag-none", CODED["ffmpeg-vp9-yuv420p-bgr8-bgr8"](frames=6)),
+    "jpeg": ("bag-none", CODED["jpeg-rgb"](frames=6)),
+    "jpeg-grey": ("bag-none", CODED["jpeg-gray"](frames=6)),
+    "png": ("bag-none", CODED["png-gray-cv2"](frames=6)),
+    "png16": ("bag-none", CODED["png-16-bit-pillow"](frames=6)),
+    "depth": ("bag-none", CODED["depth-16UC1-png"](frames=6)),
+    "rvl": ("mcap-ros2-none", CODED["depth-32FC1-rvl"](frames=6)),
+    "bits": ("bag-none", scene("rgb16", content="12-bit-high", frames=6)),
+    "table": ("bag-none", scene("mono16", content="few-values", frames=6)),
+    "metres": ("bag-none", scene("32FC1", content="millimetres", frames=6)),
+    "yuv": ("bag-none", scene("nv12", frames=6)),
+    "protobuf": ("mcap-protobuf", FOXGLOVE["jpeg-rgb"](frames=6)),
+    "json": ("mcap-json", FOXGLOVE["jpeg-rgb"](frames=6)),
+    "flatbuffer": ("mcap-flatbuffer", FOXGLOVE["jpeg-rgb"](frames=6)),
+    "transcoded": ("bag-none", CODED["jpeg-rgb"](frames=6)),
+}
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Sidecars of every kind, each made once; not to be changed."""
+    made: dict[str, Path] = {}
+
+    def make(kind: str) -> Path:
+        if kind not in made:
+            folder = tmp_path_factory.mktemp(kind)
+            source, recorded = KINDS[kind]
+            write = {**SOURCES, **FOXGLOVE_SOURCES}[source]
+            lossy = {"quality": "visual", "transcode": True} if kind == "transcoded" else {}
+            options = mp4ds.PackOptions(**lossy)
+            mp4ds.pack(write(folder, recorded), folder / "dataset", options)
+            (video,) = (folder / "dataset").glob("*.mp4")
+            made[kind] = video.with_suffix(".yaml")
+        return made[kind]
+
+    return make
+
+
+def copied(sidecar: Path, folder: Path) -> Path:
+    for suffix in (".mp4", ".yaml"):
+        shutil.copy(sidecar.with_suffix(suffix), folder)
+    return folder / sidecar.name
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_good_ones_of_every_kind_are_accepted(
+    kind: str, pairs: Callable[[str], Path], tmp_path: Path, jail: Jail
+) -> None:
+    pair = copied(pairs(kind), tmp_path)
+    accepted(jail, pair)
+    assert jail.read(pair).frames == 6
+
+
+def header(**values: Any) -> Change:
+    """A change of all headers; dots lead into them."""
+
+    def change(document: Document) -> None:
+        for one in document["headers"]:
+            for key, value in values.items():
+                *places, last = key.split("__")
+                node = one[places[0]] if places else one
+                node[last] = copy.deepcopy(value)
+
+    return change
+
+
+def video_of(**values: Any) -> Change:
+    return both(*(put("video", key, value=value) for key, value in values.items()))
+
+
+def image_of(encoding: str, bytes_per_pixel: int, **more: Any) -> Change:
+    """Another encoding of the same size."""
+
+    def change(document: Document) -> None:
+        image = document["image"]
+        image |= {"encoding": encoding, "step": image["width"] * bytes_per_pixel, **more}
+
+    return change
+
+
+def layout(name: str, **parameters: Any) -> Change:
+    change = put("video", "layout", value=name)
+    return both(change, put("video", "parameters", value=parameters)) if parameters else change
+
+
+def twice_as_large(document: Document) -> None:
+    for key in ("width", "height", "step"):
+        document["image"][key] *= 2
+
+
+NOT_AS_RECORDED = {"digest-mismatch", "decode-failed", "header-mismatch"}
+BAD_YAML = BAD_DOCUMENT | {"yaml-invalid"}
+BAD = BAD_DOCUMENT | NOT_AS_RECORDED | {"geometry-mismatch", "codec-mismatch"}
+FORGED: dict[str, tuple[str, Change, set[str]]] = {
+    # framing
+    **{
+        f"framing-{name}": ("h264", header(framing=value), BAD_DOCUMENT | NOT_AS_RECORDED)
+        for name, value in {
+            "none": "",
+            "letters": "x y z",
+            "delimiter": "td",
+            "zeros": "0 0 0",
+            "two": "2 2 2 2",
+            "one": "4",
+            "many": "4 " * 2000 + "4",
+            "beyond": "4 " * 100_000 + "4",
+            "digits": "4" * 4096,
+            "long-zeros": "4096 4096 4096 4096",
+            "too-long": "4097 4 4 4",
+            "trailing": "4 4 3 3 +4096",
+            "trailing-beyond": "4 4 3 3 +9999",
+            "trailing-alone": "+4",
+            "trailing-twice": "4 4 3 3 +1 +1",
+            "trailing-first": "+1 4 4 3 3",
+            "spaces": " 4  4 3  3 ",
+            "signs": "-4 4 3 3",
+            "huge": "9" * 4000 + " 4",
+        }.items()
+    },
+    "framing-av1-none": ("av1", header(framing=""), NOT_AS_RECORDED),
+    "framing-av1-units": ("av1", header(framing="4 4"), NOT_AS_RECORDED),
+    "framing-vp9": ("vp9", header(framing="4"), NOT_AS_RECORDED),
+    "framing-jpeg": ("jpeg", header(framing="td"), NOT_AS_RECORDED),
+    # what stands before a picture
+    "prefix-long": ("depth", header(prefix="00" * 33), BAD_DOCUMENT),
+    "prefix-half": ("depth", header(prefix="000"), BAD_DOCUMENT),
+    "prefix-letters": ("depth", header(prefix="zz"), BAD_DOCUMENT),
+    "prefix-none": ("depth", header(prefix=""), NOT_AS_RECORDED),
+    "prefix-most": ("rvl", header(prefix="ab" * 32), NOT_AS_RECORDED),
+    # recipes of PNG files
+    "png-larger": ("png", twice_as_large, BAD_DOCUMENT),
+    "png-larger-video": (
+        "png",
+        both(twice_as_large, video_of(width=128, height=96)),
+        {"geometry-mismatch"},
+    ),
+    "png-smaller": (
+        "png",
+        both(put("image", "width", value=8), put("image", "step", value=8)),
+        NOT_AS_RECORDED,
+    ),
+    "png-narrow": ("png", both(put("image", "width", value=1), put("image", "step", value=1)), BAD),
+    **{
+        f"png-{name}": ("png", header(**{f"png__{key}": value}), BAD_DOCUMENT | NOT_AS_RECORDED)
+        for name, key, value in [
+            ("filters", "filters", "magic"),
+            ("filters-none", "filters", ""),
+            ("filters-long", "filters", "sub " * 2**20),
+            ("level", "level", 10),
+            ("level-0", "level", 0),
+            ("strategy", "strategy", 5),
+            ("strategy-fixed", "strategy", 4),
+            ("memory", "memory_level", 10),
+            ("memory-1", "memory_level", 1),
+            ("window", "window_bits", 16),
+            ("window-raw", "window_bits", -15),
+            ("header", "zlib_header", "xxxx"),
+            ("header-other", "zlib_header", "ffff"),
+            ("chunks-1", "chunk_bytes", 1),
+            ("chunks-256", "chunk_bytes", 256),
+            ("chunks-beyond", "chunk_bytes", 2**40),
+            ("before", "before", "A" * 4 * 2**20),
+            ("before-broken", "before", "A"),
+            ("before-padding", "before", "AA=A"),
+            ("after", "after", ""),
+            ("after-long", "after", "A" * 4 * 2**20),
+        ]
+    },
+    "png-none": ("png", header(png=None), BAD),
+    "png-of-packets": ("h264", header(png={}), BAD_DOCUMENT),
+    "png-float": ("png", both(image_of("32FC1", 4), layout("bytes")), BAD),
+    "png-float-colours": ("png", both(image_of("64FC4", 32), layout("bytes")), BAD),
+    "png-signed": ("png", image_of("8SC1", 1), BAD),
+    "png-yuv": ("png", both(image_of("yuyv", 2), layout("planar422")), BAD),
+    "png-nv24": ("png", both(image_of("nv24", 1), layout("planar444")), BAD),
+    "png-two-channels": ("png", both(image_of("8UC2", 2), layout("stack8")), BAD),
+    "png-bayer": ("png16", both(image_of("bayer_rggb8", 1), layout("mosaic8")), BAD),
+    # RVL of what it has no form for
+    "rvl-bytes": ("rvl", both(image_of("mono8", 1), layout("gray8")), BAD),
+    "rvl-colours": ("rvl", both(image_of("rgb8", 3), layout("rgb24")), BAD),
+    "rvl-floats": ("rvl", both(image_of("32FC1", 4), layout("bytes")), BAD),
+    "rvl-signed": ("rvl", image_of("16SC1", 2), BAD),
+    "rvl-of-png": ("png16", both(put("body", value="rvl"), header(png=None)), BAD),
+    "rvl-of-colours": ("bits", put("body", value="rvl"), BAD),
+    # new JPEG files of what JPEG does not hold
+    **{
+        f"jpeg-{encoding}": (
+            "transcoded",
+            both(image_of(encoding, size), layout(name)),
+            BAD,
+        )
+        for encoding, size, name in [
+            ("16UC1", 2, "gray16"),
+            ("32FC1", 4, "bytes"),
+            ("64FC4", 32, "bytes"),
+            ("nv12", 1, "planar420"),
+            ("uyvy", 2, "planar422"),
+            ("8SC3", 3, "bgr24"),
+            ("rgba8", 4, "rgba"),
+            ("bayer_rggb8", 1, "demosaic8"),
+        ]
+    },
+    "jpeg-of-pixels": ("bits", put("body", value="jpeg"), BAD),
+    "jpeg-of-depth": ("depth", put("body", value="jpeg"), BAD),
+    # bodies and codecs that do not belong together
+    **{
+        f"codec-{codec}-of-{kind}": (
+            kind,
+            video_of(codec=codec),
+            {"model-invalid" if codec == "ffv1" else "codec-mismatch"},
+        )
+        for kind, codec in [
+            *(("h264", codec) for codec in ("ffv1", "mjpeg", "av1", "vp9", "h265")),
+            *(("jpeg", codec) for codec in ("ffv1", "h264")),
+            *(("bits", codec) for codec in ("mjpeg", "vp9")),
+        ]
+    },
+    "codec-png": ("jpeg", video_of(codec="png"), BAD_DOCUMENT),
+    "packets-of-pixels": ("bits", put("body", value="packet"), BAD),
+    "packets-of-depth": ("rvl", put("body", value="packet"), BAD),
+    "pixels-of-packets": ("h264", put("body", value="pixels"), BAD),
+    "pixels-of-jpeg": ("jpeg", put("body", value="pixels"), BAD),
+    "png-of-jpeg": ("jpeg", put("body", value="png"), BAD),
+    "jpeg-of-packets": ("h264", put("body", value="jpeg"), BAD),
+    "body-unknown": ("h264", put("body", value="tiff"), BAD_DOCUMENT),
+    # layouts of packets
+    "packets-in-a-table": (
+        "jpeg-grey",
+        both(image_of("16UC1", 2), layout("table", table=[1, 2])),
+        BAD,
+    ),
+    "packets-of-few-bits": (
+        "jpeg",
+        both(image_of("mono16", 2), layout("gray_bits", bits=12, shift=0)),
+        BAD,
+    ),
+    "packets-of-floats": ("jpeg", both(image_of("64FC4", 32), layout("bytes")), BAD),
+    "packets-without-a-layout": ("jpeg", layout("planar422"), BAD_DOCUMENT),
+    # parameters
+    **{
+        f"bits-{name}": ("bits", layout("gbr_bits", **parameters), BAD_DOCUMENT)
+        for name, parameters in {
+            "0": {"bits": 0, "shift": 4},
+            "negative": {"bits": -12, "shift": 4},
+            "13": {"bits": 13, "shift": 3},
+            "17": {"bits": 17, "shift": 0},
+            "2**40": {"bits": 2**40, "shift": 4},
+            "shift-beyond": {"bits": 12, "shift": 5},
+            "shift-2**40": {"bits": 12, "shift": 2**40},
+            "shift-negative": {"bits": 12, "shift": -1},
+            "none": {"bits": None, "shift": None},
+            "float": {"bits": 12.0, "shift": 4},
+            "text": {"bits": "12", "shift": 4},
+            "alone": {"bits": 12},
+            "with-a-table": {"bits": 12, "shift": 4, "table": [1]},
+            "unknown": {"bits": 12, "shift": 4, "gain": 2},
+        }.items()
+    },
+    "bits-fewer": ("bits", layout("gbr_bits", bits=10, shift=4), {"codec-mismatch"}),
+    "bits-shifted": ("bits", layout("gbr_bits", bits=12, shift=3), {"digest-mismatch"}),
+    **{
+        f"table-{name}": ("table", layout("table", table=table), BAD_DOCUMENT)
+        for name, table in {
+            "empty": [],
+            "falling": [3, 2, 1],
+            "repeating": [5, 5],
+            "negative": [-1, 5],
+            "beyond": [0, 2**16],
+            "beyond-64-bits": [0, 2**64],
+            "floats": [0.0, 1.0],
+            "text": ["0", "1"],
+            "nested": [[0]],
+            "nothing": None,
+            "map": {"0": 1},
+            "large": list(range(4097)),
+            "huge": list(range(300_000)),
+        }.items()
+    },
+    "table-short": ("table", layout("table", table=[7]), {"digest-mismatch"}),
+    "table-other": ("table", layout("table", table=list(range(200))), {"digest-mismatch"}),
+    "table-wide": ("table", layout("table", table=list(range(4096))), BAD),
+    **{
+        f"metres-{name}": ("metres", put("video", "parameters", value=value), BAD_YAML)
+        for name, value in {
+            "hole-beyond": {"hole": 2**32, "scale": "product"},
+            "hole-negative": {"hole": -1, "scale": "product"},
+            "hole-nan": {"hole": float("nan"), "scale": "product"},
+            "scale": {"hole": 0, "scale": "inches"},
+            "scale-empty": {"hole": 0, "scale": ""},
+            "scale-long": {"hole": 0, "scale": "x" * 2**20},
+            "none": {},
+        }.items()
+    },
+    "metres-hole": (
+        "metres",
+        put("video", "parameters", "hole", value=0x7F800000),
+        {"digest-mismatch"},
+    ),
+    "nv12-odd": (
+        "yuv",
+        both(put("image", "width", value=63), put("image", "height", value=47)),
+        BAD_DOCUMENT,
+    ),
+    # columns of packets
+    "pts-beyond": (
+        "vp9",
+        put("columns", "pts", value=column(2**63 - 1, 1, "0*5")),
+        {"column-invalid"},
+    ),
+    "pts-short": ("vp9", put("columns", "pts", value=column(0, 1, "0*4")), {"column-invalid"}),
+    "pts-none": ("vp9", drop("columns", "pts"), BAD | {"column-invalid"}),
+    # formats and templates
+    "format-none": ("jpeg", header(format=None), NOT_AS_RECORDED),
+    "format-other": ("jpeg", header(format="png"), NOT_AS_RECORDED),
+    "format-huge": ("jpeg", header(format="x" * 2**22), NOT_AS_RECORDED),
+    **{
+        f"template-{kind}-{name}": (kind, header(template=value), BAD_YAML | NOT_AS_RECORDED)
+        for kind in ("h264", "protobuf", "json", "flatbuffer")
+        for name, value in {
+            "empty": "",
+            "zeros": "A" * 400,
+            "ones": "/" * 400,
+            "large": "A" * 4 * 2**21,
+            "json": base64.b64encode(b'{"timestamp":{"sec":0,"nsec":0}}').decode(),
+            "nested": base64.b64encode(b"[" * 100_000).decode(),
+            "self": base64.b64encode(bytes([4, 0, 0, 0] * 50)).decode(),
+        }.items()
+    },
+    # definitions that are read to find the fields
+    **{
+        f"schema-{kind}-{name}": (
+            kind,
+            put("channel", "schema", "base64", value=base64.b64encode(value).decode()),
+            BAD_DOCUMENT | NOT_AS_RECORDED,
+        )
+        for kind in ("protobuf", "flatbuffer")
+        for name, value in {
+            "empty": b"",
+            "zeros": bytes(300),
+            "ones": b"\xff" * 300,
+            "nested": b"\x0a\x7f" * 2000,
+            "offsets": bytes([8, 0, 0, 0]) * 500,
+            "large": bytes(2**21),
+        }.items()
+    },
+    "wire-of-another": ("protobuf", put("wire", value="json"), BAD),
+    "wire-of-ros": ("protobuf", put("wire", value="ros1"), BAD),
+    "wire-foreign": ("jpeg", put("wire", value="protobuf"), BAD),
+}
+
+
+@pytest.mark.parametrize("name", FORGED)
+def test_a_forged_sidecar_of_coded_pictures(
+    name: str, pairs: Callable[[str], Path], tmp_path: Path, jail: Jail
+) -> None:
+    kind, change, codes = FORGED[name]
+    pair = copied(pairs(kind), tmp_path)
+    changed(pair, change)
+    refused(jail, pair, *codes)
 
 
 # ---------------------------------------------------------------- manifests

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 import mp4ds
+from coded_scenes import CODED
 from mp4ds import FormatError, Mp4dsError, SourceError, yamlio
 from scenes import Scene
 from sources import SOURCES, load_tool, scene
@@ -228,6 +229,147 @@ def test_shallow_validation_finds_a_flipped_bit_of_the_sidecar(dataset: Path) ->
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
     assert codes(dataset, deep=False) == ["checksum-mismatch", "hash-mismatch"]
+
+
+# ---------------------------------------------------------------- coded pictures and packets
+
+CODED_KINDS = [
+    *("jpeg-rgb", "png-16-bit-cv2", "depth-16UC1-png", "depth-32FC1-rvl", "video-h264"),
+    *("video-h265", "video-av1", "video-vp9", "ffmpeg-libx264"),
+]
+MakeCoded = Callable[[str], tuple[list[Path], Path]]
+
+
+@pytest.fixture(scope="module")
+def coded(tmp_path_factory: pytest.TempPathFactory) -> MakeCoded:
+    """Recordings of coded pictures and their datasets, made once; not to be changed."""
+    made: dict[str, tuple[list[Path], Path]] = {}
+
+    def make(name: str) -> tuple[list[Path], Path]:
+        if name not in made:
+            folder = tmp_path_factory.mktemp(name)
+            (folder / "source").mkdir()
+            paths = SOURCES["mcap-ros2-none"](folder / "source", CODED[name](frames=6))
+            mp4ds.pack(paths, folder / "dataset")
+            made[name] = paths, folder / "dataset"
+        return made[name]
+
+    return make
+
+
+def copied(good: Path, folder: Path) -> tuple[Path, Path]:
+    """A copy of a dataset of one stream, and the video in it."""
+    copy = Path(shutil.copytree(good, folder / "dataset"))
+    (video,) = copy.glob("*.mp4")
+    return copy, video
+
+
+def unsealed(document: Document) -> None:
+    """Without what tells that the video is another one."""
+    del document["video"]["size"], document["video"]["sha256"]
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".yaml"])
+@pytest.mark.parametrize("kind", CODED_KINDS)
+def test_a_flipped_bit_of_coded_pictures_is_found(
+    kind: str, suffix: str, coded: MakeCoded, tmp_path: Path
+) -> None:
+    recording, good = coded(kind)
+    folder, video = copied(good, tmp_path)
+    path, output = video.with_suffix(suffix), tmp_path / "again.mcap"
+    wrong = []
+    for position, data in list(flips(path.read_bytes(), f"{kind} {suffix}"))[::3]:
+        path.write_bytes(data)
+        if problem := found_in(folder, path.name):
+            wrong.append(f"byte {position}: {problem}")
+        if not unpacked(folder, "mcap", output):
+            wrong += [f"byte {position}: unpacked: {text}" for text in compare(recording, output)]
+            output.unlink()
+    assert wrong == []
+
+
+def coded_data(video: bytes) -> tuple[int, int]:
+    """Where the coded frames of an mp4 begin and end."""
+    start = video.index(b"mdat")
+    return start + 4, start - 4 + int.from_bytes(video[start - 4 : start], "big")
+
+
+@pytest.mark.parametrize("kind", CODED_KINDS)
+def test_digests_tell_of_each_coded_byte(kind: str, coded: MakeCoded, tmp_path: Path) -> None:
+    """Although sidecar and manifest agree with the damaged video."""
+    folder, video = copied(coded(kind)[1], tmp_path)
+    data, sidecar = video.read_bytes(), video.with_suffix(".yaml")
+    changed(sidecar, unsealed)
+    start, end = coded_data(data)
+    rng = random.Random(kind)
+    for position in sorted({start, end - 1, *(rng.randrange(start, end) for _ in range(12))}):
+        damaged = bytearray(data)
+        damaged[position] ^= 1 << rng.randrange(8)
+        video.write_bytes(damaged)
+        agreed(folder)
+        found = set(codes(folder))
+        assert found, f"byte {position}"
+        assert found <= {"digest-mismatch", "decode-failed", "header-mismatch"}, f"byte {position}"
+        assert any(f"[{code}]" in refused(folder) for code in found)
+
+
+@pytest.mark.parametrize("length", [0, 1, 40, 0.3, 0.9, -1])
+@pytest.mark.parametrize("kind", CODED_KINDS)
+def test_a_video_of_coded_pictures_that_was_cut_short(
+    kind: str, length: float, coded: MakeCoded, tmp_path: Path
+) -> None:
+    folder, video = copied(coded(kind)[1], tmp_path)
+    data = video.read_bytes()
+    video.write_bytes(data[: int(length * len(data)) if 0 < length < 1 else int(length)])
+    assert "size-mismatch" in codes(folder, deep=False)
+    if length != -1:
+        refused(folder)
+    changed(video.with_suffix(".yaml"), unsealed)
+    agreed(folder)
+    # the last byte of an mp4 belongs to a text, without which every message is whole
+    assert set(codes(folder)) <= {"video-unreadable", "frame-count"}
+    if length != -1:
+        assert codes(folder)
+        refused(folder)
+
+
+@pytest.mark.parametrize(
+    ("kind", "key", "value"),
+    [
+        ("depth-16UC1-png", "prefix", "00" * 12),
+        ("depth-16UC1-png", "prefix", ""),
+        ("depth-32FC1-rvl", "prefix", "ff" * 12),
+        ("depth-16UC1-png", "png.level", 1),
+        ("png-16-bit-cv2", "png.strategy", 0),
+        ("png-16-bit-cv2", "png.memory_level", 4),
+        ("png-16-bit-cv2", "png.chunk_bytes", 256),
+        ("png-16-bit-cv2", "png.zlib_header", "78da"),
+        ("png-16-bit-cv2", "png.after", "AAAA"),
+        ("png-16-bit-cv2", "png.before", "AAAA"),
+        ("video-h264", "framing", "3 3 3 3"),
+        ("video-av1", "framing", ""),
+        ("ffmpeg-libx264", "framing", "+1"),
+    ],
+)
+def test_a_recipe_that_was_changed(
+    kind: str, key: str, value: Any, coded: MakeCoded, tmp_path: Path
+) -> None:
+    """The key of all headers, so that every message of the stream comes out as another one."""
+    folder, video = copied(coded(kind)[1], tmp_path)
+
+    def change(document: Document) -> None:
+        for header in document["headers"]:
+            *places, last = key.split(".")
+            node = header[places[0]] if places else header
+            assert node.get(last) != value
+            node[last] = value
+
+    changed(video.with_suffix(".yaml"), change)
+    agreed(folder)
+    found = [problem.code for problem in mp4ds.validate(folder, deep=True)]
+    assert set(found) <= {"digest-mismatch", "decode-failed", "header-mismatch"}
+    assert len(found) == 6
+    assert f"[{found[0]}]" in refused(folder)
 
 
 # ---------------------------------------------------------------- whole files

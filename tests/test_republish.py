@@ -507,20 +507,15 @@ def test_a_png_of_depths_stays_byte_for_byte(packed: Pack) -> None:
     assert found == [record.values["data"][12:] for record in made.cameras]
 
 
-@pytest.mark.parametrize(
-    ("name", "image_format", "suffix"),
-    [("jpeg-exif-trailing", "jpeg", "jpg"), ("png-gray-cv2", "png", "png")],
-)
-def test_unpacked_images_are_the_recorded_files(
-    packed: Pack, name: str, image_format: str, suffix: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("name", ["jpeg-exif-trailing", "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"])
+def test_unpacked_images_are_the_recorded_files(packed: Pack, name: str, tmp_path: Path) -> None:
     made = packed(name, "mcap-ros2-zstd")
-    options = UnpackOptions(image_format=image_format)
+    options = UnpackOptions(image_format="jpeg")
     mp4ds.unpack(made.folder / "dataset", "images", tmp_path / "images", options)
-    folder = tmp_path / "images" / "cam_image_raw_compressed"
-    found = [path.read_bytes() for path in sorted(folder.glob(f"*.{suffix}"))]
+    (folder,) = (tmp_path / "images").iterdir()
+    found = [path.read_bytes() for path in sorted(folder.glob("*.jpg"))]
     assert found == [record.values["data"] for record in made.cameras]
-    rows = (folder / "stamps.csv").read_text().splitlines()[1:]
+    rows = (folder / "stamps.csv").read_text("utf-8").splitlines()[1:]
     for row, record in zip(rows, made.cameras, strict=True):
         header = record.values["header"]
         assert row.split(",")[1:] == [str(header["stamp"]), str(record.log_time), "cam"]
@@ -706,6 +701,20 @@ def test_packets_that_do_not_decode_stay(packed: Pack) -> None:
     assert summary.messages == {
         topic: len([m for m in messages if m.topic == topic]) for topic in summary.messages
     }
+
+
+def test_only_16_bits_are_depths(tmp_path: Path) -> None:
+    """Whatever a sidecar says of the format."""
+    made = Packed(tmp_path, still("bgr8", "jpeg", ".jpg"), "bag-none")
+    sidecar = tmp_path / "dataset" / "cam_image_raw_compressed.yaml"
+    text = sidecar.read_text("utf-8").replace("format: jpeg", "format: 16UC1; compressedDepth")
+    assert "compressedDepth" in text
+    sidecar.write_text(text.partition("checksum:")[0], "utf-8")
+    output = tmp_path / "out.mcap"
+    mp4ds.unpack(sidecar, "mcap", output, UnpackOptions(images="raw"))
+    found = read(output)
+    assert {(m.topic, m.value.encoding) for m in found} == {("/cam/image_raw", "rgb8")}
+    assert len(found) == len(made.cameras)
 
 
 def test_depths_of_unknown_unit_stay(tmp_path: Path) -> None:

@@ -360,8 +360,8 @@ def _write_images(stream: Stream, folder: Path, options: UnpackOptions) -> Itera
 
 
 def _files(stream: Stream, options: UnpackOptions) -> Iterator[bytes | memoryview]:
-    """The recorded files where they are of the format, else files of the frames."""
-    if holds_files(stream.sidecar, options.image_format):
+    """The recorded JPEG files where these are wanted, else files of the frames."""
+    if options.image_format == "jpeg" and holds_files(stream.sidecar, "jpeg"):
         return files_of(stream)
     quality = options.jpeg_quality
     writer = ImageFile(stream.sidecar.image.encoding, options.image_format, quality=quality)

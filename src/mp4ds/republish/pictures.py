@@ -101,7 +101,7 @@ def holds_files(sidecar: StreamSidecar, kind: str) -> bool:
     """Whether the messages of a stream hold JPEG or PNG files already."""
     if kind == "jpeg":
         return sidecar.body == "packet" and sidecar.video.codec == "mjpeg"
-    is_metres = any(_is_inverse(header) for header in sidecar.headers)
+    is_metres = any(_is_inverse(sidecar, header) for header in sidecar.headers)
     return kind == "png" and sidecar.body == "png" and not is_metres
 
 
@@ -111,10 +111,10 @@ def files_of(stream: Stream) -> Iterator[memoryview]:
     Raises:
         FormatError: A message does not come back as it was recorded.
     """
-    columns = stream.rebuilder.columns
+    variants = stream.rebuilder.columns.variant
+    starts = [len(header.prefix) // 2 for header in stream.sidecar.headers]
     for index, body in enumerate(_bodies(stream)):
-        header = stream.sidecar.headers[int(columns.variant[index])]
-        yield body[len(header.prefix) // 2 :]
+        yield body[starts[variants[index]] :] if stream.sidecar.body == "png" else body
 
 
 def _video(stream: Stream) -> Frames:
@@ -152,12 +152,14 @@ _Maker = Callable[[Pixels], Given]
 
 def _maker(sidecar: StreamSidecar, header: Header, form: Form) -> _Maker:
     """What makes the new form of an image that a header belongs to."""
-    if _is_inverse(header) and len(header.prefix) != 2 * HEADER_BYTES:
+    if _is_inverse(sidecar, header) and len(header.prefix) != 2 * HEADER_BYTES:
         raise AsRecorded("the parameters of its quantised depths are missing")
     encoding = _encoding_of(sidecar, header)
     if form.kind == "raw":
         prefix = bytes.fromhex(header.prefix)
-        as_metres = partial(_metres, parameters=prefix[4:]) if _is_inverse(header) else None
+        as_metres = (
+            partial(_metres, parameters=prefix[4:]) if _is_inverse(sidecar, header) else None
+        )
         return partial(_raw, encoding=encoding, convert=as_metres)
     try:
         file = ImageFile(encoding, form.kind, quality=form.jpeg_quality)
@@ -172,7 +174,7 @@ def _encoding_of(sidecar: StreamSidecar, header: Header) -> str:
     own, told = ENCODINGS[sidecar.image.encoding], _told(header)
     if sidecar.body == "pixels":
         return own.name
-    if _is_depth(header):
+    if _is_depth(sidecar, header):
         if told not in (*_DEPTHS, _INVERSE_DEPTHS):
             raise AsRecorded(f"its format {header.format!r} does not tell the unit of its depths")
         return told
@@ -185,12 +187,15 @@ def _told(header: Header) -> str:
     return (header.format or "").partition(";")[0].strip()
 
 
-def _is_depth(header: Header) -> bool:
-    return bool(header.prefix) or "compressedDepth" in (header.format or "")
+def _is_depth(sidecar: StreamSidecar, header: Header) -> bool:
+    """Whether the messages are those of compressed_depth_image_transport."""
+    is_coded = sidecar.body in ("png", "rvl") and sidecar.image.encoding == _DEPTHS[0]
+    return is_coded and (bool(header.prefix) or "compressedDepth" in (header.format or ""))
 
 
-def _is_inverse(header: Header) -> bool:
-    return _is_depth(header) and _told(header) == _INVERSE_DEPTHS
+def _is_inverse(sidecar: StreamSidecar, header: Header) -> bool:
+    """Whether its depths are quantised inverse metres."""
+    return _is_depth(sidecar, header) and _told(header) == _INVERSE_DEPTHS
 
 
 def _format(encoding: str, form: Form, *, has_mosaic: bool) -> str:
