@@ -11,7 +11,11 @@ its bits on. So each frame is exposed anew, as a sensor does it, *before* it is 
 
 The noise is independent from pixel to pixel and from frame to frame. ``rgb8`` is what a camera
 driver publishes: the noisy, quantised mosaic, demosaiced bilinearly. ``mono16`` has the same
-camera's 12 bits, right-aligned. The same seed gives the same clip.
+camera's 12 bits, right-aligned, ``bayer_rggb16`` its mosaic of 12 bits, ``rgb16`` that mosaic
+demosaiced. ``rgba8`` is ``rgb8`` with an alpha of 255, ``yuv422`` and ``nv12`` are ``rgb8``
+converted (BT.601, full range). The same seed gives the same clip.
+
+Range images, and pictures that are no camera's, are in depth_clips.py.
 
 The scenes are in the folder ``../shared/data`` beside the project, or in $MP4DS_DATA. Where that
 is missing, the scene of ``mp4ds demo`` is used.
@@ -20,10 +24,9 @@ is missing, the scene of ``mp4ds demo`` is used.
 from __future__ import annotations
 
 import os
-import re
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -33,10 +36,16 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-Pixels = NDArray[Any]  # uint8 or uint16, shape (H, W) or (H, W, 3)
+import depth_clips
+from depth_clips import read_pnm, sobel
+
+Pixels = NDArray[Any]  # shape (H, W) or (H, W, C); nv12: (H * 3 / 2, W)
 Signal = NDArray[np.float32]
 
-FAMILIES = ("bayer_rggb8", "mono8", "rgb8", "mono16", "16UC1")
+FAMILIES = (
+    *("bayer_rggb8", "mono8", "rgb8", "mono16", "bayer_rggb16", "rgb16", "rgba8"),
+    *("yuv422", "nv12", "16UC1", "16SC1", "32FC1"),
+)
 SEED = 20240409
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
@@ -78,6 +87,8 @@ SENSORS = {
 }
 AS_RECORDED = "recorded"
 """Instead of a sensor: frames that no codec has touched have their own camera's noise."""
+AS_MADE = "own"
+"""Instead of a sensor: depth_clips.py has the noise of its scenes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,9 +102,11 @@ SCENES = {
     "cars": _Scene("video/intel_car-detection.mp4"),  # 768x432, camera at rest
     "people": _Scene("video/vtest.avi"),  # 768x576, camera at rest
     "stereo": _Scene("images/image_pipeline_wide_stereo_pgm/left*.pgm", ("rgb8",)),
-    "kinect": _Scene("depth/slambook2_rgbd/depth/*.pgm", ("16UC1",)),
+    "openisp": _Scene("images/openISP_bayer_rggb12_1920x1080.raw", ("bayer_rggb16",)),
 }
 DEMO = "demo"
+GRADIENT, WIDE = "gradient", "wide"
+"""Made of a camera's pictures: 16SC1 and 16UC1 (see depth_clips.py)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +116,7 @@ class ClipSpec:
     Attributes:
         scene: One of `SCENES`, or `DEMO`.
         encoding: ROS image encoding, one of `FAMILIES`.
-        noise: One of `SENSORS`, or `AS_RECORDED`.
+        noise: One of `SENSORS`, `AS_RECORDED` or `AS_MADE`.
         frames: How many; a scene that is shorter gives fewer.
         size: Width and height to crop and resize to, both even; None for the scene's own.
     """
@@ -143,33 +156,45 @@ def specs(
 ) -> list[ClipSpec]:
     """All clips of a family that can be made here."""
     folder = data_folder()
-    if folder is None:
-        scenes = {} if family == "16UC1" else {DEMO: _Scene("")}
-    else:
-        scenes = {name: scene for name, scene in SCENES.items() if any(folder.glob(scene.pattern))}
     found = []
-    for name, scene in scenes.items():
-        if scene.encodings:
-            if family in scene.encodings:
+    if family in _CAMERA:
+        if folder is None:
+            scenes = {DEMO: _Scene("")}
+        else:
+            scenes = {n: scene for n, scene in SCENES.items() if any(folder.glob(scene.pattern))}
+        for name, scene in scenes.items():
+            if not scene.encodings:
+                found += [ClipSpec(name, family, noise, frames, size) for noise in noises]
+            elif family in scene.encodings:
                 found.append(ClipSpec(name, family, AS_RECORDED, frames))
-        elif family != "16UC1":
-            found += [ClipSpec(name, family, noise, frames, size) for noise in noises]
+    for scene_name, encoding in depth_clips.MAKERS:
+        needs = depth_clips.NEEDS.get(scene_name)
+        if encoding == family and (needs is None or (folder and any(folder.glob(needs)))):
+            recorded = scene_name in depth_clips.RECORDED
+            found.append(ClipSpec(scene_name, family, AS_RECORDED if recorded else AS_MADE, frames))
+    made_of_camera = {"16SC1": GRADIENT, "16UC1": WIDE}.get(family)
+    if made_of_camera:
+        found.append(ClipSpec(made_of_camera, family, "low", frames, size))
     return found
 
 
 def make(spec: ClipSpec) -> Iterator[Pixels]:
     """The frames of a clip, one after the other."""
     folder = data_folder()
+    maker = depth_clips.MAKERS.get((spec.scene, spec.encoding))
+    if maker:
+        yield from maker(folder or Path(), spec.encoding, spec.frames)
+        return
     if spec.noise == AS_RECORDED:
         if folder is None:
             raise SystemExit(f"{spec.scene}: set MP4DS_DATA to the folder of recordings.")
         paths = sorted(folder.glob(SCENES[spec.scene].pattern))
-        yield from (read_pnm(path) for path in paths[: spec.frames])
+        yield from (_read_still(path) for path in paths[: spec.frames])
         return
     sensor = SENSORS[spec.noise]
     for number, rgb in enumerate(islice(_rgb_frames(spec), spec.frames)):
         rng = np.random.default_rng((SEED, list(SENSORS).index(spec.noise), number))
-        yield _camera(rgb, spec.encoding, sensor, rng)
+        yield _camera(spec, rgb, sensor, rng)
 
 
 def load(spec: ClipSpec, cache: Path | None = None) -> Pixels:
@@ -191,18 +216,44 @@ def load(spec: ClipSpec, cache: Path | None = None) -> Pixels:
     return clip
 
 
-def _camera(rgb: Signal, encoding: str, sensor: Sensor, rng: np.random.Generator) -> Pixels:
-    """What a camera with that sensor publishes of a scene, given in grey levels of 8 bits."""
-    if encoding == "mono8":
-        return sensor.expose(rgb @ _LUMINANCE, 255, rng)
-    if encoding == "mono16":
-        return sensor.expose((rgb @ _LUMINANCE) * np.float32(4095 / 255), 4095, rng)
-    mosaic = sensor.expose(_sample_rggb(rgb), 255, rng)
-    if encoding == "bayer_rggb8":
-        return mosaic
-    if encoding == "rgb8":
-        return demosaic_bilinear(mosaic)
-    raise ValueError(f"no camera for {encoding}")
+def _mono(levels: int) -> Callable[[Signal, Sensor, np.random.Generator], Pixels]:
+    def expose(rgb: Signal, sensor: Sensor, rng: np.random.Generator) -> Pixels:
+        return sensor.expose((rgb @ _LUMINANCE) * np.float32(levels / 255), levels, rng)
+
+    return expose
+
+
+def _mosaic(levels: int) -> Callable[[Signal, Sensor, np.random.Generator], Pixels]:
+    def expose(rgb: Signal, sensor: Sensor, rng: np.random.Generator) -> Pixels:
+        return sensor.expose(_sample_rggb(rgb) * np.float32(levels / 255), levels, rng)
+
+    return expose
+
+
+_GRAY8, _GRAY12, _GRAY16 = _mono(255), _mono(4095), _mono(65535)
+_BAYER8, _BAYER12 = _mosaic(255), _mosaic(4095)
+
+_CAMERA: dict[str, Callable[[Signal, Sensor, np.random.Generator], Pixels]] = {
+    "mono8": _GRAY8,
+    "mono16": _GRAY12,
+    "bayer_rggb8": _BAYER8,
+    "bayer_rggb16": _BAYER12,
+    "rgb8": lambda *scene: demosaic_bilinear(_BAYER8(*scene)),
+    "rgb16": lambda *scene: demosaic_bilinear(_BAYER12(*scene)),
+    "rgba8": lambda *scene: _opaque(demosaic_bilinear(_BAYER8(*scene))),
+    "yuv422": lambda *scene: uyvy(demosaic_bilinear(_BAYER8(*scene))),
+    "nv12": lambda *scene: nv12(demosaic_bilinear(_BAYER8(*scene))),
+}
+"""Encoding -> what a camera publishes of a scene, given in grey levels of 8 bits."""
+CAMERA_FAMILIES = tuple(_CAMERA)
+
+
+def _camera(spec: ClipSpec, rgb: Signal, sensor: Sensor, rng: np.random.Generator) -> Pixels:
+    if spec.scene == GRADIENT:
+        return sobel(_GRAY8(rgb, sensor, rng))
+    if spec.scene == WIDE:
+        return _GRAY16(rgb, sensor, rng)
+    return _CAMERA[spec.encoding](rgb, sensor, rng)
 
 
 _RGGB = ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2))  # row, column, colour
@@ -215,11 +266,11 @@ def _sample_rggb(rgb: Signal) -> Signal:
     return mosaic
 
 
-def demosaic_bilinear(mosaic: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """An rggb mosaic of even size as rgb; samples that are there stay as they are."""
+def demosaic_bilinear(mosaic: Pixels) -> Pixels:
+    """An rggb mosaic of even size, up to 12 bits, as rgb; samples that are there stay."""
     height, width = mosaic.shape
     padded = np.pad(mosaic.astype(np.uint16), 1, mode="reflect")  # keeps the pattern's phase
-    rgb = np.empty((height, width, 3), np.uint8)
+    rgb = np.empty((height, width, 3), mosaic.dtype)
     for color in range(3):
         plane = np.zeros_like(padded)
         for row, column, sampled in _RGGB:
@@ -236,6 +287,41 @@ def demosaic_bilinear(mosaic: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return rgb
 
 
+def _opaque(rgb: Pixels) -> Pixels:
+    return np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
+
+
+_YCBCR = np.array(  # BT.601, full range
+    [[0.299, 0.587, 0.114], [-0.168736, -0.331264, 0.5], [0.5, -0.418688, -0.081312]], np.float32
+)
+
+
+def _ycbcr(rgb: Pixels) -> Signal:
+    signal: Signal = rgb.astype(np.float32) @ _YCBCR.T
+    signal[..., 1:] += 128
+    return signal
+
+
+def _round8(signal: NDArray[Any]) -> Pixels:
+    pixels: Pixels = np.clip(np.rint(signal), 0, 255).astype(np.uint8)
+    return pixels
+
+
+def uyvy(rgb: Pixels) -> Pixels:
+    """4:2:2 of an rgb picture of even width, shape (H, W, 2): chroma, then luma."""
+    signal = _ycbcr(rgb)
+    pairs = (signal[:, ::2, 1:] + signal[:, 1::2, 1:]) / 2
+    return np.stack([_round8(pairs).reshape(rgb.shape[:2]), _round8(signal[..., 0])], axis=-1)
+
+
+def nv12(rgb: Pixels) -> Pixels:
+    """4:2:0 of an rgb picture of even size, shape (H * 3 / 2, W): luma over chroma pairs."""
+    height, width = rgb.shape[:2]
+    signal = _ycbcr(rgb)
+    blocks = signal[..., 1:].reshape(height // 2, 2, width // 2, 2, 2).mean(axis=(1, 3))
+    return np.vstack([_round8(signal[..., 0]), _round8(blocks).reshape(height // 2, width)])
+
+
 # ---------------------------------------------------------------- scenes
 
 
@@ -244,7 +330,8 @@ def _rgb_frames(spec: ClipSpec) -> Iterator[Signal]:
     if spec.scene == DEMO or folder is None:
         frames = _demo_frames(spec.frames)
     else:
-        frames = _video_frames(folder / SCENES[spec.scene].pattern)
+        scene = "cups" if spec.scene in (GRADIENT, WIDE) else spec.scene
+        frames = _video_frames(folder / SCENES[scene].pattern)
     for frame in frames:
         yield _fit(frame, spec.size)
 
@@ -289,14 +376,7 @@ def _demo_frames(count: int) -> Iterator[av.VideoFrame]:
                 yield av.VideoFrame.from_ndarray(rgb, format="rgb24")
 
 
-def read_pnm(path: Path) -> Pixels:
-    """A binary PGM or PPM file without comments, 8 or 16 bits."""
-    data = path.read_bytes()
-    header = re.match(rb"P([56])\s+(\d+)\s+(\d+)\s+(\d+)\s", data)
-    if header is None:
-        raise SystemExit(f"{path} is no binary PGM or PPM file.")
-    kind, width, height, levels = map(int, header.groups())
-    dtype = np.dtype(np.uint8) if levels < 256 else np.dtype(">u2")
-    shape = (height, width) if kind == 5 else (height, width, 3)
-    pixels = np.frombuffer(data, dtype, offset=header.end()).reshape(shape)
-    return pixels.astype(dtype.newbyteorder("="))
+def _read_still(path: Path) -> Pixels:
+    if path.suffix == ".raw":  # 16 bits without a header, as its name says
+        return np.fromfile(path, "<u2").reshape(1080, 1920)
+    return read_pnm(path)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import resource
+import shutil
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -17,6 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+HERTZ = 30.0
+"""Frames per second of the recordings."""
 
 
 class Cpu:
@@ -44,11 +48,11 @@ def pack(
     """Pack losslessly, after importing.
 
     Returns:
-        ``cpu`` seconds; ``codec`` that was used, None where the one asked for was refused;
-        ``peak`` of memory; bytes of ``dataset`` and ``video``.
+        ``cpu`` seconds; the ``recipe`` that was used, layout and codec, None where the codec
+        asked for has no lossless form; ``reasons`` of messages stored verbatim, with their
+        number; ``peak`` of memory; bytes of ``dataset`` and ``video``.
     """
     import mp4ds
-    from mp4ds.sidecar import load_stream
 
     run, options = mp4ds.pack, mp4ds.PackOptions(codec=codec, jobs=jobs)
     cpu = Cpu()
@@ -56,14 +60,30 @@ def pack(
         try:
             summary = run(source, target, options)
         except mp4ds.OptionError:
-            return {"codec": None}  # it has no lossless form at all
+            return {"recipe": None}
+    recipes = [video_of(path) for path in sidecars(target)]
+    reasons = {r: count for topic in summary.topics for r, (count, _) in topic.verbatim.items()}
     return {
         "cpu": cpu.seconds,
         "peak": _peak_bytes(),
         "dataset": summary.dataset_bytes,
-        "codec": load_stream(next(Path(target).glob("*_raw.yaml"))).video.codec,
-        "video": next(Path(target).glob("*.mp4")).stat().st_size,
+        "recipe": ", ".join(f"{v.layout} {v.codec}" for v in recipes) or "verbatim",
+        "codecs": [video.codec for video in recipes],
+        "reasons": reasons,
+        "video": sum(path.stat().st_size for path in Path(target).glob("*.mp4")),
     }
+
+
+def sidecars(dataset: str) -> list[Path]:
+    """Those of a dataset's streams."""
+    return sorted(Path(dataset).glob("*_raw*.yaml"))
+
+
+def video_of(path: Path) -> Any:
+    """What a sidecar says of its video."""
+    from mp4ds.sidecar import load_stream
+
+    return load_stream(path).video
 
 
 def _peak_bytes() -> int:
@@ -81,21 +101,69 @@ def _peak_bytes() -> int:
 
 
 def decode(dataset: str, frames: str) -> dict[str, Any]:
-    """Read all frames of a dataset's only stream; then compare them with the clip, unmeasured.
+    """Read all frames of a dataset's streams; then compare all images with the clip, unmeasured.
 
     Returns:
-        ``cpu`` seconds, and whether each frame is ``exact``.
+        ``cpu`` seconds, and whether each image, in a video or verbatim, is ``exact``: the bytes
+        of its pixels, so that one NaN is not another.
     """
     from mp4ds.dataset import Dataset
+    from recordings import times
 
     cpu = Cpu()
+    clip = np.load(frames, mmap_mode="r")
+    missing = dict(zip(times(len(clip), HERTZ)[0].tolist(), clip, strict=True))
     with Dataset(dataset) as opened:
-        (stream,) = opened.streams
         with cpu.measured():
-            count = sum(1 for _ in stream)
-        clip = np.load(frames, mmap_mode="r")
-        exact = all(np.array_equal(frame.data, clip[number]) for number, frame in enumerate(stream))
-    return {"cpu": cpu.seconds, "exact": exact and count == len(clip)}
+            count = sum(1 for stream in opened.streams for _ in stream)
+        for stream in opened.streams:
+            for frame in stream:
+                expected = missing.pop(frame.stamp_ns)
+                if frame.data.dtype != expected.dtype or frame.data.shape != expected.shape:
+                    return {"cpu": cpu.seconds, "exact": False}
+                if frame.data.tobytes() != expected.tobytes():
+                    return {"cpu": cpu.seconds, "exact": False}
+    found = list(_verbatim(Path(dataset) / "messages.mcap"))
+    exact = count + len(found) == len(clip) and all(
+        data == missing.pop(stamp).tobytes() for stamp, data in found
+    )
+    return {"cpu": cpu.seconds, "exact": exact and not missing}
+
+
+def _verbatim(path: Path) -> Iterator[tuple[int, bytes]]:
+    """Stamps and pixels of the images in messages.mcap, read without mp4ds."""
+    from mcap.reader import make_reader
+    from rosbags.typesys import Stores, get_typestore
+
+    from recordings import IMAGE, TOPIC
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with path.open("rb") as stream:
+        for _, _, message in make_reader(stream).iter_messages(topics=[TOPIC]):
+            image: Any = store.deserialize_cdr(message.data, IMAGE)
+            time = image.header.stamp
+            yield time.sec * 10**9 + time.nanosec, image.data.tobytes()
+
+
+def recipes(source: str, folder: str, frames: str, codecs: list[str | None]) -> dict[str, Any]:
+    """Pack with each codec, None for the default, and decode again, one after the other.
+
+    Returns:
+        ``results`` of `pack` with those of `decode` as ``decoded``.
+    """
+    import mp4ds
+    from mp4ds.dataset import Dataset
+
+    _ = mp4ds.pack, Dataset  # imported before anything is measured
+    results: list[dict[str, Any]] = []
+    for codec in codecs:
+        target = Path(folder) / f"dataset-{codec}"
+        packed = pack(source, str(target), codec)
+        if packed["recipe"]:
+            packed["decoded"] = decode(str(target), frames)
+            shutil.rmtree(target)
+        results.append(packed)
+    return {"results": results}
 
 
 def bare(dataset: str, frames: str, output: str, threads: int) -> dict[str, Any]:
@@ -117,20 +185,23 @@ def bare(dataset: str, frames: str, output: str, threads: int) -> dict[str, Any]
 
     import av
 
-    from mp4ds.layouts import LAYOUTS
+    from mp4ds.layouts import ENCODINGS, NO_PARAMETERS, Parameters, bind
     from mp4ds.sidecar import load_stream
+    from mp4ds.video.convert import Converter, picture_to_frame
 
-    sidecar = load_stream(next(Path(dataset).glob("*_raw.yaml")))
-    video, layout = sidecar.video, LAYOUTS[sidecar.video.layout]
+    sidecar = load_stream(sidecars(dataset)[0])
+    video, values = sidecar.video, sidecar.video.parameters
+    parameters = (
+        Parameters.from_values(values.model_dump(exclude_none=True)) if values else NO_PARAMETERS
+    )
+    layout = bind(video.layout, ENCODINGS[sidecar.image.encoding], parameters)
+    converter, coded = Converter(), video.pixel_format or layout.pixel_format
     stamps = sidecar.columns.stamp.decode(sidecar.frames)
     ticks = ((stamps - stamps[0]) // 1000).tolist()
     prepared = []
     for pixels in np.load(frames):
-        picture: Any = np.ascontiguousarray(layout.to_picture(pixels))
-        frame = av.VideoFrame.from_numpy_buffer(picture, format=layout.pixel_format)
-        if layout.pixel_format != video.pixel_format:
-            frame = frame.reformat(format=video.pixel_format, threads=1)
-        prepared.append(frame)
+        picture = tuple(np.ascontiguousarray(plane) for plane in layout.to_picture(pixels))
+        prepared.append(picture_to_frame(picture, layout.pixel_format, coded, converter))
     time_base = Fraction(1, 1_000_000)
     cpu = Cpu()
     with cpu.measured():
@@ -189,14 +260,18 @@ def write_sidecar(path: str, frames: int, kind: str) -> dict[str, Any]:
         Video,
         dump_document,
     )
-    from mp4ds.sidecar.models import FORMAT_VERSION
+    from mp4ds.sidecar.fields import FORMAT_VERSION
     from mp4ds.streams.columns import ColumnsWriter
+    from mp4ds.wire import Parts
+    from mp4ds.wire.forms import ImageFields
     from recordings import times
 
     ros1 = kind.startswith("ros1")
     type_name = "sensor_msgs/Image" if ros1 else "sensor_msgs/msg/Image"
     definition = Schema(type_name, "ros1msg" if ros1 else "ros2msg", b"uint32 height\n" * 100)
     channel = Channel(0, "/camera/image_raw", "ros1" if ros1 else "cdr", definition)
+
+    fields = ImageFields("bayer_rggb8", 1280, 720, 1280, 0)
 
     def columns(delay: int) -> Any:
         writer = ColumnsWriter()
@@ -209,7 +284,8 @@ def write_sidecar(path: str, frames: int, kind: str) -> dict[str, Any]:
             else:
                 message = Message(channel, log_time, publish_time, number, b"")
             seq = number if ros1 else None
-            writer.append(message, stamp=stamp, seq=seq, variant=0, ordinal=number)
+            parts = Parts(stamp, seq, None, "camera", fields, memoryview(b""), b"")
+            writer.append(message, parts, variant=0, ordinal=number)
         return writer.to_model()
 
     words = np.random.default_rng(2).integers(0, 2**63, frames)
@@ -296,7 +372,7 @@ def load_sidecar(path: str, rounds: int) -> dict[str, Any]:
 
 JOBS: dict[str, Callable[..., dict[str, Any]]] = {
     function.__name__: function
-    for function in (pack, decode, bare, write_long, write_sidecar, load_sidecar)
+    for function in (pack, decode, recipes, bare, write_long, write_sidecar, load_sidecar)
 }
 
 if __name__ == "__main__":

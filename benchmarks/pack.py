@@ -26,7 +26,7 @@ from statistics import median
 
 import clips
 from measure import job, parse_size, print_machine, print_table, python, spread
-from recordings import write_bag, write_mcap
+from recordings import image_size, write_bag, write_mcap
 
 HERTZ = 30.0
 EMPTY = "import mp4ds; mp4ds.pack"
@@ -39,7 +39,7 @@ def main() -> None:
     )
     parser.add_argument("--frames", type=int, default=240)
     parser.add_argument("--size", type=parse_size, default=(1280, 720), help="WxH")
-    parser.add_argument("--encoding", choices=clips.FAMILIES[:-1], default="bayer_rggb8")
+    parser.add_argument("--encoding", choices=clips.CAMERA_FAMILIES, default="bayer_rggb8")
     parser.add_argument("--noise", choices=list(clips.SENSORS), default="low")
     parser.add_argument("--scene", default=None, help="the first that is there by default")
     parser.add_argument("--rounds", type=int, default=5)
@@ -79,13 +79,13 @@ def compare_cpu(spec: clips.ClipSpec, folder: Path, rounds: int, jobs: int) -> N
             hertz=HERTZ,
         )
     write_bag(folder / "source.bag", clip, len(clip), spec.encoding, hertz=HERTZ)
-    height, width = clip.shape[1:3]
+    height, width = image_size(clip[0], spec.encoding)
     print(
         f"- clip: {spec.scene}, noise {spec.noise}, {len(clip)} frames of {width}x{height} "
         f"{spec.encoding}; encoder threads: {jobs}"
     )
     reference = folder / "reference"
-    codec = job("pack", source=sources["ROS 1 bag"], target=reference, jobs=jobs)["codec"]
+    recipe = job("pack", source=sources["ROS 1 bag"], target=reference, jobs=jobs)["recipe"]
     cpu: dict[str, list[float]] = {name: [] for name in (*sources, "bare", "empty")}
     sizes = set()
     for _ in range(rounds):
@@ -99,7 +99,7 @@ def compare_cpu(spec: clips.ClipSpec, folder: Path, rounds: int, jobs: int) -> N
             run, size = pack_once(source, folder / "dataset", jobs)
             cpu[name].append(run)
             sizes.add((size, encoded["video"]))
-    print(f"- codec: {codec}; bytes of the video (pack, bare encoder): {sorted(sizes)}")
+    print(f"- layout and codec: {recipe}; bytes of the video (pack, bare encoder): {sorted(sizes)}")
     print(f"- bare encoder: CPU s {spread(cpu['bare'])}")
     print(f"- empty process (`{EMPTY}`): CPU s {spread(cpu['empty'])}")
     print_table(

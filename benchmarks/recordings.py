@@ -6,6 +6,7 @@ One camera: an image and a CameraInfo per frame, with jittered stamps and log ti
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ TOPIC = "/camera/image_raw"
 TOPICS = {TOPIC: IMAGE, "/camera/camera_info": INFO}
 START_NS = 1_712_647_128_027_473_200
 CHUNK_BYTES = 1 << 20  # the MCAP libraries' own default
+_ROWS = {"nv12": Fraction(3, 2)}  # of the array for each of the image, where not 1
 _QOS = """\
 - history: 1
   depth: 10
@@ -100,8 +102,15 @@ def _messages(
         zip(frames, stamps.tolist(), log_times.tolist(), strict=False)
     ):
         header = _header(seq, stamp, ros)
+        height, width = image_size(pixels, encoding)
         yield TOPIC, stamp, time, _image(header, pixels, encoding, ros)
-        yield "/camera/camera_info", stamp, time + 20_000, _info(header, pixels, ros)
+        yield "/camera/camera_info", stamp, time + 20_000, _info(header, height, width, ros)
+
+
+def image_size(pixels: NDArray[Any], encoding: str) -> tuple[int, int]:
+    """Height and width of the image whose array this is."""
+    rows, columns = pixels.shape[:2]
+    return int(rows / _ROWS.get(encoding, 1)), columns
 
 
 def _header(seq: int, stamp: int, ros: int) -> Any:
@@ -114,15 +123,15 @@ def _header(seq: int, stamp: int, ros: int) -> Any:
 
 def _image(header: Any, pixels: NDArray[Any], encoding: str, ros: int) -> Any:
     data = np.ascontiguousarray(pixels)
-    height, width = data.shape[:2]
+    height, width = image_size(data, encoding)
+    step = data.nbytes // len(data)
     return _store(ros).types[IMAGE](
-        header, height, width, encoding, 0, data.nbytes // height, data.reshape(-1).view(np.uint8)
+        header, height, width, encoding, 0, step, data.reshape(-1).view(np.uint8)
     )
 
 
-def _info(header: Any, pixels: NDArray[Any], ros: int) -> Any:
+def _info(header: Any, height: int, width: int, ros: int) -> Any:
     types = _store(ros).types
-    height, width = pixels.shape[:2]
     k = np.array([width, 0, width / 2, 0, width, height / 2, 0, 0, 1.0])
     return types[INFO](
         header,

@@ -11,16 +11,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
+import cv2
 import numpy as np
 import pytest
+from av.video.reformatter import Interpolation
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 import mp4ds
+from coded_scenes import CODED
+from definitions import PICTURES
 from mp4ds.packing import PackOptions
 from mp4ds.unpacking import UnpackOptions
+from pictures import pixels
 from sources import (
     COMMON,
+    ENCODINGS,
     IMAGE,
     INFO,
     PERIOD,
@@ -120,6 +127,138 @@ def test_frames_of_a_lossy_dataset_are_near(encoding: str, tmp_path: Path) -> No
                 assert np.array_equal(frame.data, expected)
             error = np.abs(frame.data - expected).mean()
             assert error < (12 if "bayer" in encoding else 6)  # hard edges, smeared colours
+
+
+SHAPES: list[dict[str, Any]] = [{"width": 63, "height": 47}, {"pad": 3}, {"big_endian": True}]
+
+
+@pytest.mark.parametrize("encoding", [name for name in ENCODINGS if name not in COMMON])
+def test_frames_of_every_other_encoding(encoding: str, tmp_path: Path) -> None:
+    shape = SHAPES[ENCODINGS.index(encoding) % 3]
+    source = scene(encoding, **shape)
+    with mp4ds.open(packed(tmp_path, source, "mcap-ros2-none")) as dataset:
+        stream = dataset[TOPIC]
+        for number, (frame, message) in enumerate(zip(stream, images(source), strict=True)):
+            expected = pixels(message.values)
+            assert frame.encoding == encoding
+            assert frame.data.dtype == expected.dtype
+            assert frame.data.dtype.isnative
+            assert frame.data.shape == expected.shape
+            assert frame.data.tobytes() == expected.tobytes()  # NaN and all
+            assert stream[number].data.tobytes() == expected.tobytes()
+
+
+# ---------------------------------------------------------------- frames of coded messages
+
+
+def camera(source: Scene) -> list[Any]:
+    return [message for message in source.messages if message.msgtype in PICTURES]
+
+
+def psnr(one: np.ndarray[Any, Any], other: np.ndarray[Any, Any]) -> float:
+    assert one.shape == other.shape
+    error = np.mean((one.astype(float) - other.astype(float)) ** 2)
+    return 10 * float(np.log10(255**2 / max(float(error), 1e-9)))
+
+
+PNG_ENCODINGS = {
+    "png-gray-cv2": "mono8",
+    "png-16-bit-cv2-9": "16UC1",
+    "png-rgba-cv2": "rgba8",
+    "depth-16UC1-png": "16UC1",
+    "depth-32FC1-png": "16UC1",  # the inverse depths as they are coded
+}
+
+
+@pytest.mark.parametrize("name", PNG_ENCODINGS)
+def test_frames_of_png_files_are_their_pixels(name: str, tmp_path: Path) -> None:
+    source = CODED[name](frames=5)
+    with mp4ds.open(packed(tmp_path, source)) as dataset:
+        (stream,) = dataset.streams
+        for number, (frame, message) in enumerate(zip(stream, camera(source), strict=True)):
+            data = bytes(message.values["data"])
+            data = data[data.index(b"\x89PNG") :]
+            expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            if expected.ndim == 3:
+                expected = expected[..., [2, 1, 0, 3]]
+            assert frame.encoding == PNG_ENCODINGS[name]
+            assert np.array_equal(frame.data, expected)
+            assert np.array_equal(stream[number].data, expected)
+            assert frame.stamp_ns == message.values["header"]["stamp"]
+            assert frame.log_time_ns == message.log_time
+            assert frame.intrinsics is not None
+
+
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+def test_frames_of_rvl_are_those_of_png(encoding: str, tmp_path: Path) -> None:
+    found = []
+    for codec in ("png", "rvl"):
+        dataset = packed(tmp_path / codec, CODED[f"depth-{encoding}-{codec}"](frames=5))
+        with mp4ds.open(dataset) as opened:
+            found.append([frame.data for frame in opened.streams[0]])
+    assert len(found[0]) == 5
+    assert np.array_equal(*found)
+
+
+JPEGS = ["jpeg-rgb", "jpeg-gray", "jpeg-444", "jpeg-422", "jpeg-progressive", "jpeg-restart"]
+
+
+@pytest.mark.parametrize("name", [*JPEGS, "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"])
+def test_frames_of_jpeg_files(name: str, tmp_path: Path) -> None:
+    source = CODED[name](frames=5)
+    with mp4ds.open(packed(tmp_path, source)) as dataset:
+        (stream,) = dataset.streams
+        assert len(stream) == 5
+        for number, (frame, message) in enumerate(zip(stream, camera(source), strict=True)):
+            data = np.frombuffer(bytes(message.values["data"]), np.uint8)
+            expected = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+            assert frame.encoding == ("mono8" if expected.ndim == 2 else "rgb8")
+            if expected.ndim == 3:
+                expected = expected[..., ::-1]
+            # decoders round and interpolate chroma in their own ways
+            assert psnr(frame.data, expected) > (55 if name in ("jpeg-gray", "jpeg-444") else 27)
+            assert np.array_equal(stream[number].data, frame.data)
+
+
+def as_rgb(frame: av.VideoFrame) -> np.ndarray[Any, Any]:
+    """Converted with care; by default, PyAV takes the nearest sample of chroma."""
+    flags = Interpolation.BICUBIC | Interpolation.ACCURATE_RND
+    flags |= Interpolation.FULL_CHR_H_INT | Interpolation.FULL_CHR_H_INP
+    rgb = frame.reformat(format="rgb24", src_colorspace="itu601", interpolation=flags)
+    return rgb.to_ndarray()
+
+
+DECODERS = {"av1": "libdav1d", "h265": "hevc"}
+PACKETS = [
+    *("video-h264", "video-h264-slices", "video-h264-headers-once", "video-h264-mid-gop"),
+    *("video-h265", "video-av1", "video-av1-no-delimiter", "video-vp9", "ffmpeg-libx265"),
+]
+
+
+@pytest.mark.parametrize("name", PACKETS)
+def test_frames_of_packets(name: str, tmp_path: Path) -> None:
+    source = CODED[name](frames=12)
+    codec = "h265" if "265" in name else name.split("-")[1]
+    context: Any = av.CodecContext.create(DECODERS.get(codec, codec), "r")
+    with mp4ds.open(packed(tmp_path, source)) as dataset:
+        (stream,) = dataset.streams
+        recorded = camera(source)[-len(stream) :]
+        decoded = [
+            frame
+            for message in recorded
+            for frame in context.decode(av.Packet(bytes(message.values["data"])))
+        ]
+        decoded += context.decode(None)
+        assert len(stream) == len(decoded) == (8 if "mid" in name else 12)
+        frames = list(stream)
+        for frame, expected, message in zip(frames, decoded, recorded, strict=True):
+            values = message.values
+            stamp = values["header"]["stamp"] if "header" in values else values["timestamp"]
+            assert frame.stamp_ns == stamp
+            assert np.abs(frame.data.astype(int) - as_rgb(expected)).max() <= 1
+        for number in (9, 0, 5, 4, 7, 1, -1):
+            number %= len(stream)
+            assert np.array_equal(stream[number].data, frames[number].data)
 
 
 def test_numbers_and_slices(colour: tuple[Path, Scene]) -> None:

@@ -429,14 +429,18 @@ REFUSED: dict[str, list[tuple[str, Any]]] = {
         *((f"columns.pts.{key}", value) for key in ("start", "step")
           for value in (2**63, -(2**63) - 1, 0.0, "0", None, ...)),
         *(("video.codec", value) for value in ("hevc", "png", "H264", "", None, ...)),
-        *(("video.pixel_format", value) for value in ("yuvj420p", "", 5)),
+        *(("video.pixel_format", value) for value in ("yuvj420p", "", 5, "gray")),
+        ("video.codec", "ffv1"),
+        *(("body", value) for value in ("pixels", "png", "rvl", "jpeg", ...)),
         *(("video.parameters", value) for value in ({"bits": 12, "shift": 0}, [], 5)),
     ],
     "png": [
         ("body", ...),
         *(("headers.0.prefix", value)
           for value in ("0", "0g", "FF", "00" * 33, " 00", "00\n", None, 0, ["00"])),
-        *(("headers.0.png", value) for value in ({}, [], "sub", 5)),
+        *(("headers.0.png", value) for value in ({}, [], "sub", 5, None, ...)),
+        *(("body", value) for value in ("pixels", "packet", "rvl", "jpeg")),
+        ("video.pixel_format", ...),
         *(("headers.0.png.filters", value) for value in (None, 5, ...)),
         *(("headers.0.png.level", value) for value in (-1, 10, 2**70, 1.0, "1", True, None, ...)),
         *(("headers.0.png.strategy", value) for value in (-1, 5, True, None, ...)),
@@ -444,6 +448,8 @@ REFUSED: dict[str, list[tuple[str, Any]]] = {
         *(("headers.0.png.window_bits", value) for value in (8, 16, -15, 31, None, ...)),
         *(("headers.0.png.zlib_header", value)
           for value in ("", "78", "789", "78zz", "789C", "7801\n", "780100", 7801, None, ...)),
+        *(("headers.0.png.deflate", value)
+          for value in ("", "c1f62ae", "c1f62ae5\n", "C1F62AE5", "c1f62ae50", 5, None, ...)),
         *(("headers.0.png.chunk_bytes", value) for value in (-1, 2**31 + 1, 1.0, None, ...)),
         *((f"headers.0.png.{part}", value)
           for part in ("before", "after") for value in ("A\n", "\u00e4", "A A", 5, None)),
@@ -524,8 +530,10 @@ _ONLY_MODEL: list[tuple[str, Any]] = [
     ("channel.schema.base64", "AAAA"),
     ("digests", ...),
     # which layout takes which parameters, which encoding which layout, and which body what
-    *(("video.codec", value) for value in ("hevc", "png", "H264", "")),
-    *(("video.pixel_format", value) for value in ("yuvj420p", "")),
+    *(("body", value) for value in ("pixels", "packet", "png", "rvl", "jpeg")),
+    ("headers.0.png", ...),
+    *(("video.codec", value) for value in ("hevc", "png", "H264", "", "ffv1")),
+    *(("video.pixel_format", value) for value in ("yuvj420p", "", "gray", ...)),
     ("body", ...),
     *(("image.encoding", value) for value in ("32FC1", "rgb8", "mono8")),
     *(("video.layout", value) for value in ("mosaic_bits", "gbr_bits", "gray8", "metres16")),

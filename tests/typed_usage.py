@@ -20,6 +20,11 @@ def pack(source: Path, dataset: str) -> dict[str, tuple[int, int]]:
     """Messages and frames of each topic."""
     options = mp4ds.PackOptions(topics=["/cam*"], quality="crf=22", codec="av1", jobs=2)
     summary: mp4ds.PackSummary = mp4ds.pack(source, dataset, options)
+    cameras = ["/cam/image_raw=/cam/camera_info"]
+    anew = mp4ds.PackOptions(quality="visual", transcode=True, camera_info=cameras, gop=30)
+    for topic in mp4ds.pack(source, Path(dataset), anew).topics:
+        reasons: dict[str, tuple[int, int]] = topic.verbatim
+        use(reasons, topic.notes, topic.files, topic.raw_bytes > topic.packed_bytes)
     mp4ds.pack([source, str(source)], Path(dataset), progress=lambda state: use(state.frames))
     return {topic.topic: (topic.messages, topic.frames) for topic in summary.topics}
 
@@ -28,7 +33,12 @@ def unpack(dataset: str | Path) -> Path:
     """The recording made."""
     options = mp4ds.UnpackOptions(storage="mcap", force=True)
     summary: mp4ds.UnpackSummary = mp4ds.unpack(dataset, "rosbag2", "drive", options)
+    others = mp4ds.UnpackOptions(images="jpeg", jpeg_quality=90, topics=["/cam*"])
+    for old, new in mp4ds.unpack(dataset, "mcap", None, others).republished.items():
+        use(old.upper(), new.topic.upper(), new.type_name.upper())
+    reasons: dict[str, dict[str, int]] = summary.as_recorded
     counts: dict[str, int] = summary.messages
+    use(reasons)
     omitted: dict[str, int] = summary.omitted
     use(sum(counts.values()), omitted, summary.converted, summary.left_out)
     return summary.output

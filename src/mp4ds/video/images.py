@@ -36,13 +36,13 @@ class ImageFile:
     Args:
         encoding: ROS image encoding.
         image_format: ``png`` or ``jpeg``.
-        quality: Of JPEG, 1 to 100, as libjpeg has it; above 95 nothing is gained.
+        quality: Of JPEG, 1 to 100, as libjpeg has it.
 
     Raises:
         OptionError: The format cannot hold the encoding, or there is no such quality.
     """
 
-    def __init__(self, encoding: str, image_format: str, *, quality: int = 90) -> None:
+    def __init__(self, encoding: str, image_format: str, *, quality: int = 95) -> None:
         known = ENCODINGS[encoding]
         self._jpeg = image_format == "jpeg"
         if known.dtype not in ("u1", "u2") or known.general.startswith("stack"):
