@@ -26,6 +26,7 @@ from typing import Any
 import pytest
 
 import mp4ds
+from coded_scenes import CODED
 from conftest import real
 from mp4ds.cli import app
 from scenes import ENCODINGS, IMAGE, START, Record, Scene, image_cdr, image_ros1, picture
@@ -746,6 +747,26 @@ def test_a_full_disk_leaves_what_was_there(demo: Path, small_dataset: Path, tmp_
             refused(result, 1, "No space left")
 
 
+CODED_KINDS = ["jpeg-444", "png-16-bit-cv2", "depth-32FC1-rvl", "video-h264", "video-vp9"]
+
+
+@pytest.mark.parametrize("to", ["dataset", "mcap"])
+@pytest.mark.parametrize("kind", CODED_KINDS)
+def test_a_disk_that_is_full_of_coded_pictures(kind: str, to: str, tmp_path: Path) -> None:
+    recorded = CODED[kind](frames=24, width=320, height=240)
+    (source,) = SOURCES["bag-none"](tmp_path, recorded)
+    dataset = tmp_path / "dataset"
+    if to == "mcap":
+        assert call("pack", source, "-o", dataset).code == 0
+    with mounted(tmp_path / "disk", "size=96k") as disk, unchanged(source.parent):
+        if to == "dataset":
+            result = call("pack", source, "-o", disk / "x")
+        else:
+            result = call("unpack", dataset, "--to", "mcap", "-o", disk / "x")
+        refused(result, 1, str(disk / "x"), "No space left")
+        assert tree(disk) == {}
+
+
 @pytest.mark.parametrize("job", ["pack", "images"])
 def test_a_disk_without_room_for_another_file(job: str, demo: Path, tmp_path: Path) -> None:
     with mounted(tmp_path / "disk", "size=64m,nr_inodes=6") as disk:
@@ -841,6 +862,24 @@ BAD_OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
         "/cam/image_raw",
     ),
     "demo": (("demo", "OUT"), ".bag"),
+    "transcode-lossless": (("pack", "BAG", "-o", "OUT", "--transcode"), "--quality"),
+    **{
+        f"camera-info {value}": (("pack", "BAG", "-o", "OUT", "--camera-info", value), word)
+        for value, word in {
+            "/cam/image_raw": "IMAGE=INFO",
+            "=": "IMAGE=INFO",
+            "/none=/cam/camera_info": "'/none'",
+            "/cam/image_raw=/none": "'/none'",
+        }.items()
+    },
+    "images-kind": (
+        ("unpack", "DATASET", "--to", "bag", "--images", "gif", "-o", "OUT"),
+        "raw, jpeg, png, compressed-video",
+    ),
+    "images-twice": (
+        ("unpack", "DATASET", "--to", "images", "--images", "raw", "-o", "OUT"),
+        "--image-format",
+    ),
 }
 
 
@@ -852,6 +891,17 @@ def test_an_option_that_is_wrong(
     paths = {"BAG": small_bag, "DATASET": small_dataset, "OUT": tmp_path / "out"}
     with unchanged(tmp_path):
         refused(call(*(paths.get(argument, argument) for argument in arguments)), 2, word)
+
+
+@pytest.mark.parametrize("quality", [0, -1, 101])
+def test_a_jpeg_quality_that_is_wrong(quality: int, small_dataset: Path, tmp_path: Path) -> None:
+    options = ("--to", "mcap", "-o", tmp_path / "x", "--jpeg-quality", quality)
+    with unchanged(tmp_path):
+        result = call("unpack", small_dataset, *options)
+        assert result.code == 2
+        assert "--jpeg-quality" in result.err
+    with unchanged(tmp_path), pytest.raises(mp4ds.OptionError, match=f"{quality} is not from 1"):
+        mp4ds.unpack(small_dataset, "mcap", None, mp4ds.UnpackOptions(jpeg_quality=quality))
 
 
 @pytest.mark.parametrize("codec", ["h264", "av1"])
