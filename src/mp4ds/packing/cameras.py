@@ -54,7 +54,7 @@ class _Route:
     """Where the messages of one key go: into the first of the streams that takes them.
 
     Attributes:
-        plans: How streams for them may be made, the best first; empty to store them verbatim.
+        plans: How further streams for them may be made, the best first.
         streams: Those that were made, in the order of the plans.
         refusal: Why there is no stream for what none of these takes.
     """
@@ -183,18 +183,20 @@ class Cameras:
     ) -> Iterator[StreamWriter]:
         """The streams that may take a message; the next one is made when the others refuse."""
         yield from route.streams
-        while len(route.streams) < len(route.plans) and not route.refusal:
+        while route.plans and not route.refusal:
             made = sum(len(other.streams) for other in state.routes.values())
             if made == MAX_STREAMS_PER_CHANNEL:
                 route.refusal = (
                     f"more than {MAX_STREAMS_PER_CHANNEL} sizes or encodings on one topic"
                 )
                 return
+            plan = route.plans.pop(0)
             try:
-                stream = self._new_stream(item, route.plans[len(route.streams)])
+                stream = self._new_stream(item, plan)
             except Unsuited as reason:
-                route.refusal = str(reason)
-                return
+                if not route.plans and not route.streams:
+                    route.refusal = str(reason)
+                continue
             route.streams.append(stream)
             yield stream
 
