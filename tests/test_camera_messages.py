@@ -360,6 +360,19 @@ def test_raw_images_in_a_lossy_profile(
         assert compare(done.sources, done.output) == []
 
 
+@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("size", [(16, 16), (34, 18), (48, 32), (48, 200), (62, 62), (64, 16)])
+def test_narrow_images_in_a_lossy_profile(
+    size: tuple[int, int], quality: str, tmp_path: Path, compare: Compare
+) -> None:
+    """With its usual options, x265 damages the memory where there are up to 48 columns."""
+    recorded = scene("mono8", frames=12, width=size[0], height=size[1], noisy=False)
+    done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", **QUALITIES[quality])
+    assert done.frames(TOPIC) == (12, 12)
+    assert compare(done.sources, done.output, ignore_pixels=[TOPIC]) == []
+    assert 38 < least_psnr(done, TOPIC) < 90
+
+
 TRANSCODED = [
     name
     for name in CODED

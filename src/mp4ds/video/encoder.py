@@ -21,6 +21,7 @@ _TIME_BASE = Fraction(1, TIMESCALE)
 _MATRICES = {"gbr": 0, "bt709": 1, "smpte170m": 6}  # as H.273 numbers them
 _BT709 = 1  # of primaries and transfer characteristics
 _LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.1, 30.0, 240.0  # Hz, what every encoder takes
+_NARROW = 64  # columns
 
 
 class EncoderRefusedError(Mp4dsError):
@@ -61,7 +62,7 @@ class VideoEncoder:
         self._picture_format = picture_format
         self._converter = Converter()
         self.width, self.height = coded_size(recipe, width, height)
-        self.options = {**recipe.options, "g": str(gop)}
+        self.options = {**options_for(recipe, self.width), "g": str(gop)}
         self._container = av.open(
             str(path.absolute()),  # ffmpeg takes a relative name with a colon for an address
             "w",
@@ -139,6 +140,15 @@ def coded_size(recipe: Recipe, width: int, height: int) -> tuple[int, int]:
     if recipe.pixel_format == "yuv420p":
         return width + width % 2, height + height % 2
     return width, height
+
+
+def options_for(recipe: Recipe, width: int) -> dict[str, str]:
+    """Options of the encoder for pictures of a width."""
+    options = dict(recipe.options)
+    if recipe.encoder == "libx265" and not recipe.lossless and width < _NARROW:
+        # its look-ahead writes beyond its buffers, seen up to 48 columns
+        options["x265-params"] += ":cutree=0"
+    return options
 
 
 def color_range(recipe: Recipe) -> int:
