@@ -365,11 +365,17 @@ def test_raw_images_in_a_lossy_profile(
 def test_narrow_images_in_a_lossy_profile(
     size: tuple[int, int], quality: str, tmp_path: Path, compare: Compare
 ) -> None:
-    """With its usual options, x265 damages the memory where there are up to 48 columns."""
+    """x265 damages pictures, or the memory, where there are up to 48 columns: it is not asked."""
     recorded = scene("mono8", frames=12, width=size[0], height=size[1], noisy=False)
     done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", **QUALITIES[quality])
-    assert done.frames(TOPIC) == (12, 12)
     assert compare(done.sources, done.output, ignore_pixels=[TOPIC]) == []
+    if quality == "crf-h265" and size[0] < 64:
+        assert done.frames(TOPIC) == (12, 0)
+        assert list(done.reasons(TOPIC)) == [
+            f"libx265 does not take pictures of {size[0]}x{size[1]}"
+        ]
+        return
+    assert done.frames(TOPIC) == (12, 12)
     assert 38 < least_psnr(done, TOPIC) < 90
 
 

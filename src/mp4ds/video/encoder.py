@@ -59,10 +59,12 @@ class VideoEncoder:
     ) -> None:
         self.recipe = recipe
         self.frames = 0
+        if not takes(recipe, width):
+            raise _refused(recipe, width, height)
         self._picture_format = picture_format
         self._converter = Converter()
         self.width, self.height = coded_size(recipe, width, height)
-        self.options = {**options_for(recipe, self.width), "g": str(gop)}
+        self.options = {**recipe.options, "g": str(gop)}
         self._container = av.open(
             str(path.absolute()),  # ffmpeg takes a relative name with a colon for an address
             "w",
@@ -76,9 +78,7 @@ class VideoEncoder:
             self._open_stream(threads, rate)
         except (FFmpegError, ValueError):
             self._container.close()
-            raise EncoderRefusedError(
-                f"{recipe.encoder} does not take pictures of {width}x{height}"
-            ) from None
+            raise _refused(recipe, width, height) from None
 
     def _open_stream(self, threads: int, rate: float | None) -> None:
         # the rate gives the last frame its duration: one of no ticks would be cut off
@@ -135,6 +135,10 @@ class VideoEncoder:
             return
 
 
+def _refused(recipe: Recipe, width: int, height: int) -> EncoderRefusedError:
+    return EncoderRefusedError(f"{recipe.encoder} does not take pictures of {width}x{height}")
+
+
 def coded_size(recipe: Recipe, width: int, height: int) -> tuple[int, int]:
     """Size of the coded pictures, which is even where chroma is halved."""
     if recipe.pixel_format == "yuv420p":
@@ -142,13 +146,13 @@ def coded_size(recipe: Recipe, width: int, height: int) -> tuple[int, int]:
     return width, height
 
 
-def options_for(recipe: Recipe, width: int) -> dict[str, str]:
-    """Options of the encoder for pictures of a width."""
-    options = dict(recipe.options)
-    if recipe.encoder == "libx265" and not recipe.lossless and width < _NARROW:
-        # its look-ahead writes beyond its buffers, seen up to 48 columns
-        options["x265-params"] += ":cutree=0"
-    return options
+def takes(recipe: Recipe, width: int) -> bool:
+    """Whether the encoder is sound for pictures of a width.
+
+    In narrow pictures the look-ahead of libx265 writes beyond its buffers: it was seen to crash at
+    48 columns, and to give wrong pictures up to 32.
+    """
+    return recipe.encoder != "libx265" or recipe.lossless or width >= _NARROW
 
 
 def color_range(recipe: Recipe) -> int:
