@@ -379,6 +379,16 @@ def test_narrow_images_in_a_lossy_profile(
     assert 38 < least_psnr(done, TOPIC) < 90
 
 
+def test_narrow_images_in_a_lossless_h265_video_are_kept_verbatim(
+    tmp_path: Path, compare: Compare
+) -> None:
+    """Its lossless pictures of 16 columns are wrong, too."""
+    recorded = scene("mono16", frames=6, width=16, height=64, content="12-bit")
+    done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", codec="h265")
+    assert list(done.reasons(TOPIC)) == ["libx265 does not take pictures of 16x64"]
+    assert compare(done.sources, done.output) == []
+
+
 TRANSCODED = [
     name
     for name in CODED

@@ -59,8 +59,6 @@ class VideoEncoder:
     ) -> None:
         self.recipe = recipe
         self.frames = 0
-        if not takes(recipe, width):
-            raise _refused(recipe, width, height)
         self._picture_format = picture_format
         self._converter = Converter()
         self.width, self.height = coded_size(recipe, width, height)
@@ -78,7 +76,9 @@ class VideoEncoder:
             self._open_stream(threads, rate)
         except (FFmpegError, ValueError):
             self._container.close()
-            raise _refused(recipe, width, height) from None
+            raise EncoderRefusedError(
+                f"{recipe.encoder} does not take pictures of {width}x{height}"
+            ) from None
 
     def _open_stream(self, threads: int, rate: float | None) -> None:
         # the rate gives the last frame its duration: one of no ticks would be cut off
@@ -135,24 +135,11 @@ class VideoEncoder:
             return
 
 
-def _refused(recipe: Recipe, width: int, height: int) -> EncoderRefusedError:
-    return EncoderRefusedError(f"{recipe.encoder} does not take pictures of {width}x{height}")
-
-
 def coded_size(recipe: Recipe, width: int, height: int) -> tuple[int, int]:
     """Size of the coded pictures, which is even where chroma is halved."""
     if recipe.pixel_format == "yuv420p":
         return width + width % 2, height + height % 2
     return width, height
-
-
-def takes(recipe: Recipe, width: int) -> bool:
-    """Whether the encoder is sound for pictures of a width.
-
-    In narrow pictures the look-ahead of libx265 writes beyond its buffers: it was seen to crash at
-    48 columns, and to give wrong pictures up to 32.
-    """
-    return recipe.encoder != "libx265" or recipe.lossless or width >= _NARROW
 
 
 def color_range(recipe: Recipe) -> int:
@@ -169,7 +156,14 @@ def configure(context: Any, recipe: Recipe, width: int, height: int, *, threads:
         width: Columns of the coded pictures.
         height: Rows of the coded pictures.
         threads: Threads of the encoder.
+
+    Raises:
+        ValueError: The encoder would damage such pictures.
     """
+    if recipe.encoder == "libx265" and width < _NARROW:
+        # its look-ahead writes beyond its buffers: seen to crash at 48 columns,
+        # and to give wrong pictures up to 32
+        raise ValueError("too narrow")
     context.width, context.height = width, height
     context.pix_fmt = recipe.pixel_format
     context.thread_count = threads

@@ -82,8 +82,8 @@ def _packets(
     context.options = {**recipe.options, "g": str(len(pictures))}
     context.time_base = Fraction(1, 30)
     context.framerate = Fraction(30)
-    configure(context, recipe, width, height, threads=threads)
     try:
+        configure(context, recipe, width, height, threads=threads)
         context.open()
         for number, picture in enumerate(pictures):
             frame = picture_to_frame(picture, picture_format, recipe.pixel_format, converter)
