@@ -342,7 +342,7 @@ def test_compressed_payloads(tmp_path: Path) -> None:
     assert first is not None
     assert message.data == first.data == b"payload"
     write_all(path, [Message(channel, 1, 1, 0, b"no zstd")])
-    with pytest.raises(SourceError, match=r"message 1, topic /a: zstd data is damaged"):
+    with pytest.raises(SourceError, match=r"log time 1, topic /a: zstd data is damaged"):
         list(McapReader(path, message_decompress=unzstd).records())
 
 

@@ -296,8 +296,7 @@ def test_chunks_that_overlap_in_time_are_unpacked_once(
     assert len(unpacked) == 4
     monkeypatch.setattr(ros1, "CACHED_BYTES", 1)
     with Ros1Reader(path) as reader:
-        list(reader.records())
-        assert len(reader._chunks) == 2
+        assert max(len(reader._chunks) for _ in reader.records()) == 2
     assert len(unpacked) > 100
 
 

@@ -521,7 +521,7 @@ def test_compressed_files(tmp_path: Path, storage: str, spelling: str) -> None:
             assert list(map(fields, messages(records))) == list(map(fields, scene()))
             assert reader.position == sum(file.stat().st_size for file in reader.files)
         assert len(reader.channels) == 4
-        assert len(metadata(records, TABLES_RECORD)) == (2 if storage == "sqlite3" else 0)
+        assert len(metadata(records, TABLES_RECORD)) == (1 if storage == "sqlite3" else 0)
         check_index(reader, messages(records))
     assert list(work.iterdir()) == []
 

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -496,16 +495,16 @@ class Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
 
-@pytest.fixture(scope="module")
-def played(
-    datasets: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[dict[str, Any]]:
-    """What a browser says of each video."""
+def browse(videos: dict[str, Path], jobs: dict[str, list[float]], profile: Path) -> dict[str, Any]:
+    """What a browser says of each video.
+
+    Args:
+        videos: By name.
+        jobs: For each the times to be sought, in seconds.
+        profile: An empty folder.
+    """
     if not CHROMIUM:
         pytest.skip("there is no Chromium")
-    videos = {name: video_of(datasets[name]) for name in PLAYED}
-    jobs = {name: middle_times(datasets[name]) for name in PLAYED}
-    profile = tmp_path_factory.mktemp("profile")
     with Server(videos, jobs) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.05,))
         thread.start()
@@ -537,8 +536,17 @@ def played(
             thread.join()
         if not server.results:
             pytest.fail(f"the browser played nothing: {(profile / 'log.txt').read_text()[-2000:]}")
-        yield server.results
+        results = server.results
     shutil.rmtree(profile, ignore_errors=True)
+    return results
+
+
+@pytest.fixture(scope="module")
+def played(datasets: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What a browser says of each video."""
+    videos = {name: video_of(datasets[name]) for name in PLAYED}
+    jobs = {name: middle_times(datasets[name]) for name in PLAYED}
+    return browse(videos, jobs, tmp_path_factory.mktemp("profile"))
 
 
 CHOSEN = (0, 7, 3, FRAMES - 2)

@@ -18,6 +18,7 @@ from mp4ds import errors
 
 ROOT = Path(__file__).parents[1]
 NAMES = [
+    "ClusterError",
     "ConversionError",
     "Dataset",
     "FormatError",
@@ -26,7 +27,9 @@ NAMES = [
     "OptionError",
     "PackOptions",
     "PackSummary",
+    "PartsFailedError",
     "Problem",
+    "RemoteError",
     "SourceError",
     "SourceNotFoundError",
     "Stream",
@@ -40,6 +43,8 @@ NAMES = [
     "__version__",
     "open",
     "pack",
+    "pack_each",
+    "pack_share",
     "unpack",
     "validate",
 ]
@@ -101,6 +106,9 @@ def test_every_error_is_public() -> None:
         ("VideoError", ValueError, 1),
         ("ConversionError", ValueError, 1),
         ("WriteError", OSError, 1),
+        ("ClusterError", ConnectionError, 1),
+        ("RemoteError", Exception, 1),
+        ("PartsFailedError", Exception, 1),
         ("Mp4dsError", Exception, 1),
     ],
 )

@@ -193,6 +193,18 @@ def dataset() -> Document:
         "library": "a recorder",
         "sources": [{"name": "drive.bag", "size": 5, "sha256": "a" * 64}],
         "messages": 9,
+        "losses": [
+            {
+                "file": "drive.bag",
+                "offset": 4109,
+                "size": 768000,
+                "problem": "the bz2 data of a chunk is damaged",
+                "messages": 25,
+                "topics": ["/cam/image_raw", "/imu"],
+                "start": -5,
+                "end": 2**64 - 1,
+            }
+        ],
         "topics_left_out": ["/other"],
         "time_range": {"start": -5, "end": 2**64 - 1},
         "streams": [
@@ -476,6 +488,13 @@ REFUSED: dict[str, list[tuple[str, Any]]] = {
         *(("streams.0.frames", value) for value in (-1, MAX_FRAMES + 1, True, ...)),
         *(("time_range.start", value) for value in (-(2**63) - 1, 0.0, None, ...)),
         *(("time_range.end", value) for value in (2**64, "0", ...)),
+        *(("losses", value) for value in ({}, None, "lost", [5])),
+        *(("losses.0." + key, value)
+          for key in ("file", "problem") for value in (None, 5, ...)),
+        *(("losses.0." + key, value)
+          for key in ("offset", "size", "messages") for value in (-1, 2**63, "0", 0.0)),
+        *(("losses.0.topics", value) for value in ([1], "x", None, ["/t"] * 65)),
+        *(("losses.0." + key, value) for key in ("start", "end") for value in (2**64, "0", 0.0)),
         *(("topics_left_out", value) for value in ([1], "x", None)),
         *(("transforms", value) for value in ({}, None, "base_link", [5])),
         *(("transforms.0." + key, value)

@@ -76,6 +76,7 @@ HOMES = {
     "lz4": ("bags",),
     "sqlite3": ("bags",),
     "av": ("video",),
+    "fsspec": ("remote",),
     "PIL": ("video",),
     "google": ("wire",),
     "typer": ("cli",),

@@ -26,6 +26,10 @@ def pack(source: Path, dataset: str) -> dict[str, tuple[int, int]]:
         reasons: dict[str, tuple[int, int]] = topic.verbatim
         use(reasons, topic.notes, topic.files, topic.raw_bytes > topic.packed_bytes)
     mp4ds.pack([source, str(source)], Path(dataset), progress=lambda state: use(state.frames))
+    share = (1, 2)
+    mp4ds.pack_share(source, dataset, share, mp4ds.PackOptions(window=600))
+    for other in mp4ds.pack_each([source], "datasets", mp4ds.PackOptions(keep_going=True)):
+        use(other.dataset.name, other.losses)
     return {topic.topic: (topic.messages, topic.frames) for topic in summary.topics}
 
 

@@ -24,10 +24,13 @@ if TYPE_CHECKING:
     from mp4ds.dataset import Dataset, Frame, Stream
     from mp4ds.dataset import open_dataset as open
     from mp4ds.errors import (
+        ClusterError,
         ConversionError,
         FormatError,
         Mp4dsError,
         OptionError,
+        PartsFailedError,
+        RemoteError,
         SourceError,
         SourceNotFoundError,
         TargetError,
@@ -36,17 +39,20 @@ if TYPE_CHECKING:
         VideoError,
         WriteError,
     )
-    from mp4ds.packing import PackOptions, PackSummary, pack
+    from mp4ds.packing import PackOptions, PackSummary, pack, pack_each, pack_share
     from mp4ds.unpacking import UnpackOptions, UnpackSummary, unpack
 
 _HOMES = {
     "checks": ("Problem", "validate"),
     "dataset": ("Dataset", "Frame", "Stream"),
     "errors": (
+        "ClusterError",
         "ConversionError",
         "FormatError",
         "Mp4dsError",
         "OptionError",
+        "PartsFailedError",
+        "RemoteError",
         "SourceError",
         "SourceNotFoundError",
         "TargetError",
@@ -55,11 +61,12 @@ _HOMES = {
         "VideoError",
         "WriteError",
     ),
-    "packing": ("PackOptions", "PackSummary", "pack"),
+    "packing": ("PackOptions", "PackSummary", "pack", "pack_each", "pack_share"),
     "unpacking": ("UnpackOptions", "UnpackSummary", "unpack"),
 }
 
 __all__ = [
+    "ClusterError",
     "ConversionError",
     "Dataset",
     "FormatError",
@@ -68,7 +75,9 @@ __all__ = [
     "OptionError",
     "PackOptions",
     "PackSummary",
+    "PartsFailedError",
     "Problem",
+    "RemoteError",
     "SourceError",
     "SourceNotFoundError",
     "Stream",
@@ -82,6 +91,8 @@ __all__ = [
     "__version__",
     "open",
     "pack",
+    "pack_each",
+    "pack_share",
     "unpack",
     "validate",
 ]

@@ -20,6 +20,7 @@ from mp4ds.dataset import Dataset, Stream
 from mp4ds.errors import FormatError, SourceError, SourceNotFoundError
 from mp4ds.outputs import digest_file
 from mp4ds.records import Message
+from mp4ds.remote import location
 from mp4ds.sidecar import (
     MANIFEST_NAME,
     MESSAGES_NAME,
@@ -55,7 +56,7 @@ def validate(
     """Find all problems of a sidecar, a video with its sidecar, a dataset, or a folder of them.
 
     Args:
-        path: What to validate.
+        path: What to validate, or its URL.
         deep: Also hash every file, decode every frame, rebuild every message, and compare.
         progress: Called with a phrase before each costly step.
 
@@ -66,7 +67,7 @@ def validate(
         SourceNotFoundError: There is nothing at the path.
         SourceError: It is nothing that can be validated.
     """
-    path = Path(path)
+    path = location(path)
     report = progress or (lambda _: None)
     if not path.exists():
         raise SourceNotFoundError(path)

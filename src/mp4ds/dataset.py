@@ -15,6 +15,7 @@ from mp4ds.bags.mcap import McapReader
 from mp4ds.errors import FormatError, OptionError, SourceError, SourceNotFoundError
 from mp4ds.outputs import digest_file
 from mp4ds.records import Channel, Message, Record, Schema
+from mp4ds.remote import location
 from mp4ds.sidecar import (
     MANIFEST_NAME,
     MESSAGES_NAME,
@@ -52,7 +53,7 @@ class Dataset:
     one, and iteration gives all streams.
 
     Args:
-        path: The folder, a manifest, a sidecar, or a video beside its sidecar.
+        path: The folder, a manifest, a sidecar, or a video beside its sidecar; or its URL.
         jpeg_quality: Of the JPEG files that messages of transcoded streams get, 1 to 100.
 
     Raises:
@@ -62,7 +63,7 @@ class Dataset:
     """
 
     def __init__(self, path: Path | str, *, jpeg_quality: int = 95) -> None:
-        self.path = Path(path)
+        self.path = location(path)
         if not self.path.exists():
             raise SourceNotFoundError(self.path)
         if self.path.name == MANIFEST_NAME:
@@ -131,7 +132,7 @@ class Dataset:
         with McapReader(self._messages_path) as reader:
             return list(reader.unused_schemas)
 
-    @property
+    @cached_property
     def _messages_path(self) -> Path | None:
         return self.path / MESSAGES_NAME if self.manifest else None
 

@@ -12,7 +12,10 @@
     │   ├── VersionError               1  written by a newer major version
     │   └── VideoError                 1  a video that cannot be decoded as its sidecar says
     ├── ConversionError (ValueError)   1  a message that the target cannot hold
-    └── WriteError (OSError)           1  the disk refused while writing
+    ├── WriteError (OSError)           1  the disk refused while writing
+    ├── PartsFailedError               1  parts of a pack failed, the others are kept
+    ├── ClusterError (ConnectionError) 1  a cluster that does not answer, or was lost
+    └── RemoteError                    1  a store or web server that fails
 
 The classes build their sentence from their fields: what, where, and what to do.
 The exit code is the one that the command line ends with.
@@ -20,6 +23,7 @@ The exit code is the one that the command line ends with.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 
@@ -27,6 +31,10 @@ class Mp4dsError(Exception):
     """Base of every error raised on purpose; ``str()`` is one clear sentence."""
 
     exit_code = 1
+
+
+def _as_path(path: Path | str) -> Path:
+    return Path(path) if isinstance(path, str) else path
 
 
 class SourceError(Mp4dsError, ValueError):
@@ -41,7 +49,7 @@ class SourceError(Mp4dsError, ValueError):
     exit_code = 2
 
     def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
-        self.path = Path(path)
+        self.path = _as_path(path)
         super().__init__(f"{path}: {problem}." + (f" {remedy}" if remedy else ""))
 
 
@@ -58,7 +66,7 @@ class TargetError(Mp4dsError, OSError):
     exit_code = 2
 
     def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
-        self.path = Path(path)
+        self.path = _as_path(path)
         super().__init__(f"{path}: {problem}." + (f" {remedy}" if remedy else ""))
 
 
@@ -119,9 +127,66 @@ class WriteError(Mp4dsError, OSError):
     """The disk refused while an output was written; nothing stays under its final name."""
 
     def __init__(self, path: Path | str, cause: BaseException) -> None:
-        self.path = Path(path)
+        self.path = _as_path(path)
         reason = getattr(cause, "strerror", None) or str(cause)
         super().__init__(
             f"{path}: could not be written: {reason}. "
             "The source is untouched and the unfinished output was removed."
         )
+
+
+class PartsFailedError(Mp4dsError):
+    """Parts of a pack failed; what was finished is kept, so that the same command goes on.
+
+    Args:
+        dataset: What was being made.
+        failures: Name and sentence of each part that failed.
+        total: Parts that there are.
+        exit_code: That of the first failure.
+    """
+
+    def __init__(
+        self, dataset: Path | str, failures: Sequence[tuple[str, str]], total: int, exit_code: int
+    ) -> None:
+        self.dataset = Path(dataset)
+        self.failures = list(failures)
+        self.exit_code = exit_code
+        listed = " ".join(
+            f"Part {name}: {sentence.rstrip('.')}." for name, sentence in failures[:5]
+        )
+        more = f" And {len(failures) - 5} more." if len(failures) > 5 else ""
+        super().__init__(
+            f"{dataset}: {len(failures)} of {total} parts could not be packed. {listed}{more} "
+            "What is finished is kept: run the same command again to go on."
+        )
+
+
+class ClusterError(Mp4dsError, ConnectionError):
+    """A cluster does not answer, refuses, or was lost.
+
+    Args:
+        address: What the user called it.
+        problem: What is wrong, without a full stop.
+        remedy: What the user can do.
+    """
+
+    def __init__(self, address: str, problem: str, remedy: str) -> None:
+        self.address = address
+        super().__init__(f"{address}: {problem}. {remedy}")
+
+
+class RemoteError(Mp4dsError):
+    """A store or web server did not answer, or the network failed, while reading or uploading.
+
+    It is neither a `ValueError` nor an `OSError` on purpose: what handles a damaged recording or a
+    full disk must not take it for that.
+
+    Args:
+        path: What was read or uploaded.
+        problem: What is wrong, without a full stop.
+        remedy: What the user can do, if anything.
+    """
+
+    def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
+        self.path = _as_path(path)
+        super().__init__(f"{path}: {problem}." + (f" {remedy}" if remedy else ""))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mp4ds.bags import BagReader, open_reader
 from mp4ds.dataset import Dataset, Stream
 from mp4ds.records import Channel
+from mp4ds.remote import location
 from mp4ds.sidecar import MANIFEST_NAME
 from mp4ds.streams import Forms, Unsuited
 from mp4ds.wire import CodedFields, ImageFields, kind_of
@@ -75,13 +76,16 @@ class Info:
 def info(path: Path | str) -> Info:
     """Look into a recording, a dataset, or a video with its sidecar.
 
+    Args:
+        path: Where it is, or its URL.
+
     Raises:
         SourceError: It is no recording or cannot be read.
         FormatError: The dataset breaks a rule of the format.
     """
-    path = Path(path)
-    is_dataset = (path / MANIFEST_NAME).is_file() or path.suffix in (".yaml", ".yml", ".mp4")
-    if is_dataset and path.exists():
+    path = location(path)
+    is_whole = path.is_dir() and (path / MANIFEST_NAME).is_file()
+    if is_whole or (path.suffix in (".yaml", ".yml", ".mp4") and path.exists()):
         with Dataset(path) as dataset:
             return _dataset_info(dataset)
     with open_reader(path) as reader:

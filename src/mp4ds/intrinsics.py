@@ -16,6 +16,7 @@ from mp4ds.bags import BagReader, open_reader
 from mp4ds.dataset import Dataset, Stream
 from mp4ds.pairing import StampPairing, pair_camera_infos
 from mp4ds.records import Channel, Message
+from mp4ds.remote import location
 from mp4ds.sidecar import MANIFEST_NAME
 from mp4ds.streams import Forms, Looker, Unsuited
 from mp4ds.streams.camera_info import fields_of
@@ -107,13 +108,16 @@ class Intrinsics:
 def intrinsics(path: Path | str) -> Intrinsics:
     """The intrinsics and extrinsics in a recording, a dataset, or a video with its sidecar.
 
+    Args:
+        path: Where it is, or its URL.
+
     Raises:
         SourceError: It is no recording or cannot be read.
         FormatError: The dataset breaks a rule of the format.
     """
-    path = Path(path)
-    is_dataset = (path / MANIFEST_NAME).is_file() or path.suffix in (".yaml", ".yml", ".mp4")
-    if is_dataset and path.exists():
+    path = location(path)
+    is_whole = path.is_dir() and (path / MANIFEST_NAME).is_file()
+    if is_whole or (path.suffix in (".yaml", ".yml", ".mp4") and path.exists()):
         with Dataset(path) as dataset:
             return _of_dataset(dataset)
     with open_reader(path) as reader:

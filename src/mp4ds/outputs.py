@@ -10,6 +10,7 @@ import errno
 import hashlib
 import os
 import shutil
+import socket
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -38,8 +39,7 @@ def staged(
         TargetError: It may not be written or replaced.
         WriteError: The disk refused.
     """
-    _refuse_overlap(target, sources)
-    check_target(target, force=force, replaceable=replaceable)
+    check_target(target, force=force, replaceable=replaceable, sources=sources)
     try:
         folder = Path(
             tempfile.mkdtemp(prefix=f".{target.name[:60]}.", suffix=".part", dir=target.parent)
@@ -52,16 +52,23 @@ def staged(
         path = folder / target.name
         try:
             yield path
-            _sync(path)
-            _move_into_place(path, target, folder, force=force)
+            sync(path)
+            move_into_place(path, target, folder, force=force)
         except OSError as error:
             raise as_write_error(error, target) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def check_target(target: Path, *, force: bool, replaceable: Callable[[Path], bool]) -> None:
-    """Refuse a target early, before any work is done. See `staged` for the errors."""
+def check_target(
+    target: Path,
+    *,
+    force: bool,
+    replaceable: Callable[[Path], bool],
+    sources: Sequence[Path] = (),
+) -> None:
+    """Refuse a target early, before any work is done. See `staged`."""
+    _refuse_overlap(target, sources)
     if not target.parent.is_dir():
         raise TargetError(target, f"{target.parent} is no folder", "Make the folder first.")
     if not os.path.lexists(target):
@@ -108,7 +115,7 @@ _WRITE_ERRNOS = {
 }
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
     """Bring an output's bytes to the disk before its name is."""
     files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
     for file in files:
@@ -116,7 +123,55 @@ def _sync(path: Path) -> None:
             os.fsync(stream.fileno())
 
 
-def _move_into_place(path: Path, target: Path, folder: Path, *, force: bool) -> None:
+def write_synced(path: Path, data: bytes, *, replace: bool = True) -> None:
+    """Write a small file whole or not at all, whatever happens meanwhile.
+
+    Args:
+        path: The file.
+        data: Its content.
+        replace: Replace the file if it is there.
+
+    Raises:
+        FileExistsError: It is there, and is not to be replaced.
+        OSError: The disk refused.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.{socket.gethostname()}.part")
+    try:
+        with part.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        if replace:
+            part.replace(path)
+        else:
+            path.hardlink_to(part)
+    finally:
+        part.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Bring the names in a folder to the disk, where the system can."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def move_into_place(path: Path, target: Path, folder: Path, *, force: bool) -> None:
+    """Give an output its final name.
+
+    Args:
+        path: The output, whole.
+        target: Its final name.
+        folder: Where what stands there is put meanwhile; on the same file system.
+        force: Replace what stands there.
+
+    Raises:
+        TargetExistsError: Something stands there and ``force`` is not set.
+    """
     old = folder / "replaced"
     replaced = os.path.lexists(target)
     if replaced and not force:

@@ -75,6 +75,10 @@ class Message:
     sequence: int
     data: bytes | memoryview
 
+    def of_channel(self, channel: Channel) -> Message:
+        """The same message on another channel."""
+        return Message(channel, self.log_time, self.publish_time, self.sequence, self.data)
+
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
@@ -99,6 +103,87 @@ Record = Message | Attachment | MetadataRecord
 
 
 @dataclass(frozen=True, slots=True)
+class Excerpt:
+    """A part of a recording: a span of log time, and some of the topics.
+
+    Attributes:
+        start: The first log time that it may have, nanoseconds; None for open.
+        end: The first log time after it, nanoseconds; None for open.
+        topics: Only these; None for all.
+        without: All but these.
+        others: Attachments and metadata records too, all of them whatever the span.
+    """
+
+    start: int | None = None
+    end: int | None = None
+    topics: frozenset[str] | None = None
+    without: frozenset[str] = frozenset()
+    others: bool = True
+
+    @property
+    def has_messages(self) -> bool:
+        """Whether there may be any message in it."""
+        if self.start is not None and self.end is not None and self.start >= self.end:
+            return False
+        return self.topics is None or not self.topics <= self.without
+
+    def has_topic(self, topic: str) -> bool:
+        """Whether messages of a topic are part of it."""
+        return topic not in self.without and (self.topics is None or topic in self.topics)
+
+    def has_time(self, time: int) -> bool:
+        """Whether messages of a log time, nanoseconds, are part of it."""
+        return (self.start is None or self.start <= time) and (self.end is None or time < self.end)
+
+    def touches(self, first: int, last: int) -> bool:
+        """Whether some log time from `first` to `last`, both included, is part of it."""
+        return (self.start is None or self.start <= last) and (self.end is None or first < self.end)
+
+    def has(self, record: Record) -> bool:
+        """Whether a record is part of it."""
+        if isinstance(record, Message):
+            return self.has_time(record.log_time) and self.has_topic(record.channel.topic)
+        return self.others
+
+
+EVERYTHING = Excerpt()
+"""The whole recording."""
+
+
+MAX_LOSSES = 1000
+"""Losses of a recording that are told one by one; the last one then sums up the rest."""
+
+MAX_LOST_TOPICS = 64
+"""Topics that one loss names; the last name then tells how many more there are."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """Something of a recording that could not be read.
+
+    Attributes:
+        file: Name of the file.
+        offset: Byte where it begins, None where it has no place in the file.
+        size: Bytes of it, of which some may have been read all the same; None where not known.
+        problem: What is wrong, a phrase.
+        messages: How many are lost, None where nothing tells. Where all that tells is what
+            several places lost together, the largest of them has it.
+        topics: Of what is known to be lost.
+        start: Log time of the last message read before it, ns; None where not known.
+        end: Log time of the first message read after it, ns; None where not known.
+    """
+
+    file: str
+    offset: int | None
+    size: int | None
+    problem: str
+    messages: int | None = None
+    topics: tuple[str, ...] = ()
+    start: int | None = None
+    end: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class ChannelStats:
     """What an index tells of a channel without reading its messages.
 
@@ -118,3 +203,11 @@ class ChannelStats:
         if self.count < 2 or self.end <= self.start:
             return None
         return (self.count - 1) * 1e9 / (self.end - self.start)
+
+    def plus(self, other: ChannelStats) -> ChannelStats:
+        """What both tell together; without messages there is no span."""
+        if not self.count or not other.count:
+            return self if self.count else other
+        return ChannelStats(
+            self.count + other.count, min(self.start, other.start), max(self.end, other.end)
+        )

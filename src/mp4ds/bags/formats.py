@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal, overload
 
 from mp4ds.bags.multi import MultiReader
 from mp4ds.bags.protocols import BagReader, BagWriter
 from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
+from mp4ds.remote import remote
+
+if TYPE_CHECKING:
+    from mp4ds.bags.salvage.reader import Salvage, SalvageReader
 
 # each imports its library when it is needed: a recording is of one format
 
@@ -35,6 +40,31 @@ _READERS: dict[str, Callable[[Path], BagReader]] = {
     "bag": _read_bag,
     "mcap": _read_mcap,
     "rosbag2": _read_rosbag2,
+}
+
+
+def _salvage_bag(path: Path) -> Salvage:
+    from mp4ds.bags.salvage.ros1 import Ros1Salvage
+
+    return Ros1Salvage(path)
+
+
+def _salvage_mcap(path: Path) -> Salvage:
+    from mp4ds.bags.salvage.mcap import McapSalvage
+
+    return McapSalvage(path)
+
+
+def _salvage_rosbag2(path: Path) -> Salvage:
+    from mp4ds.bags.salvage.rosbag2 import Rosbag2Salvage
+
+    return Rosbag2Salvage(path)
+
+
+_SALVAGERS: dict[str, Callable[[Path], Salvage]] = {
+    "bag": _salvage_bag,
+    "mcap": _salvage_mcap,
+    "rosbag2": _salvage_rosbag2,
 }
 
 _MAGIC = {b"#ROSBAG V": "bag", b"\x89MCAP0\r\n": "mcap", b"SQLite format 3\0": "rosbag2"}
@@ -82,8 +112,20 @@ def open_reader(path: Path) -> BagReader:
     return _READERS[format_of(path)](path)
 
 
-def open_sources(paths: Sequence[Path]) -> BagReader:
+@overload
+def open_sources(paths: Sequence[Path], *, salvage: Literal[True]) -> SalvageReader: ...
+
+
+@overload
+def open_sources(paths: Sequence[Path], *, salvage: bool = False) -> BagReader: ...
+
+
+def open_sources(paths: Sequence[Path], *, salvage: bool = False) -> BagReader:
     """Open recordings that belong together, such as a split bag, as one.
+
+    Args:
+        paths: The recordings.
+        salvage: Read what can be read of damaged ones, with a `SalvageReader`.
 
     Raises:
         SourceError: One of them cannot be read, or is given twice.
@@ -96,9 +138,22 @@ def open_sources(paths: Sequence[Path]) -> BagReader:
         if resolved in seen:
             raise SourceError(path, "is given twice")
         seen.add(resolved)
+    if salvage:
+        return _open_salvaged(paths)
     if len(paths) == 1:
         return open_reader(paths[0])
     return MultiReader([partial(open_reader, path) for path in paths])
+
+
+def _open_salvaged(paths: Sequence[Path]) -> SalvageReader:
+    for path in filter(remote, paths):
+        raise SourceError(path, "is not salvaged where it is", "Download it first.")
+    openers = [partial(_SALVAGERS[format_of(path)], path) for path in paths]
+    if len(paths) == 1:
+        return openers[0]()
+    from mp4ds.bags.salvage.multi import MultiSalvage
+
+    return MultiSalvage(openers)
 
 
 def open_writer(

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 
@@ -14,9 +14,14 @@ from mcap import records as mcap_records
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from mp4ds.bags import ordering
+from mp4ds.bags.mcap_between import Between, look_between
+from mp4ds.bags.mcap_declared import Declared
+from mp4ds.bags.mcap_excerpt import read_chunks, read_others
 from mp4ds.bags.mcap_index import Summary, read_summary
 from mp4ds.bags.mcap_records import (
-    PRIVATE_OPCODE,
+    MAGIC,
+    SALVAGE_REMEDY,
     ByteStream,
     DamageError,
     MessageHead,
@@ -25,19 +30,19 @@ from mp4ds.bags.mcap_records import (
     chunk_records,
     open_source,
     parse,
-    parse_attachment,
     parse_message,
     unpack_chunk,
 )
 from mp4ds.bags.mcap_write import McapWriter
 from mp4ds.bags.ordering import HoldBack
 from mp4ds.bags.protocols import Format
+from mp4ds.errors import SourceError
 from mp4ds.records import (
-    Attachment,
+    EVERYTHING,
     Channel,
     ChannelStats,
+    Excerpt,
     Message,
-    MetadataRecord,
     Record,
     Schema,
 )
@@ -80,10 +85,7 @@ class McapReader:
         self._open_stream = open_stream
         self._decompress = message_decompress
         self._in_file_order = in_file_order
-        self._schemas: dict[int, mcap_records.Schema] = {}
-        self._channel_records: dict[int, mcap_records.Channel] = {}
-        self._channels: dict[int, Channel] = {}
-        self._skipped: Counter[str] = Counter()
+        self._declared = Declared()
         self._first: dict[int, Message] | None = None
         self._pass: RecordStream | None = None
         self._position = 0
@@ -103,17 +105,21 @@ class McapReader:
         self.library: str = header.library
         self._summary = read_summary(stream)
         if self._summary:
-            self._schemas.update(self._summary.schemas)
+            schemas = self._summary.schemas
+            for schema in schemas.values():
+                self._declared.add_schema(schema)
             for channel in self._summary.channels.values():
-                if not channel.schema_id or channel.schema_id in self._schemas:
-                    self._add_channel(channel)  # else its schema stands in the data alone
+                if not channel.schema_id or channel.schema_id in schemas:
+                    self._declared.add_channel(channel)  # else its schema is in the data alone
 
     def _start_pass(self) -> RecordStream:
         if self._open_stream:
             stream = RecordStream(self._open_stream(), self.path, None)
         else:
             file = open_source(self.path)
-            stream = RecordStream(file, self.path, os.fstat(file.fileno()).st_size)
+            size = file.seek(0, os.SEEK_END)
+            file.seek(0)
+            stream = RecordStream(file, self.path, size)
         try:
             stream.read_magic()
         except BaseException:
@@ -124,19 +130,17 @@ class McapReader:
     @property
     def channels(self) -> Sequence[Channel]:
         """All channels known so far: those of the summary, then those met while reading."""
-        return list(self._channels.values())
+        return list(self._declared.channels.values())
 
     @property
     def unused_schemas(self) -> Sequence[Schema]:
         """Schemas that no channel refers to, known so far."""
-        used = {channel.schema for channel in self._channels.values()}
-        unused = (_schema(record) for record in self._schemas.values())
-        return list(dict.fromkeys(schema for schema in unused if schema not in used))
+        return self._declared.unused_schemas
 
     @property
     def skipped(self) -> Mapping[str, int]:
         """Records that only the application that wrote them understands: name -> count."""
-        return dict(self._skipped)
+        return dict(self._declared.skipped)
 
     @property
     def has_statistics(self) -> bool:
@@ -153,44 +157,93 @@ class McapReader:
         """Bytes of the file that `records` has consumed."""
         return self._pass.tell() if self._pass else self._position
 
-    def records(self) -> Iterator[Record]:
-        """Read everything once. See `BagReader.records`."""
+    @property
+    def is_indexed(self) -> bool:
+        """See `BagReader.is_indexed`; so it is where all that the summary tells fits together."""
+        return self._between is not None
+
+    @cached_property
+    def _between(self) -> Between | None:
+        """What stands between the chunks, where excerpts can be read from these alone."""
+        summary = self._summary
+        if summary is None or self._in_file_order or not summary.is_consistent:
+            return None
+        if summary.chunks.held_in_time_order() > ordering.HOLD_BYTES:
+            return None
+        with closing(self._start_pass()) as stream:
+            found = look_between(stream, summary)
+        return found if found.is_sound else None
+
+    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+        """Read everything once, or a part of it. See `BagReader.records`."""
         stream = self._start_pass()
         self._pass = stream
+        self._declared.skipped.clear()
         try:
-            yield from self._read(stream)
+            yield from self._read(stream, excerpt)
             self._position = self.path.stat().st_size
         finally:
             self._pass = None
             stream.close()
 
-    def _read(self, stream: RecordStream) -> Iterator[Record]:
-        in_time_order = self._summary and self._summary.is_indexed and not self._in_file_order
-        held = HoldBack() if in_time_order else None
-        self._skipped.clear()
-        number = 0
+    def _read(self, stream: RecordStream, excerpt: Excerpt) -> Iterator[Record]:
+        if self._between and self._summary and self._needs_chunks_alone(self._summary, excerpt):
+            yield from self._read_chunks(stream, excerpt, self._summary, self._between)
+        elif excerpt.has_messages or stream.size is None:
+            yield from filter(excerpt.has, self._read_through(stream))
+        elif excerpt.others:
+            yield from read_others(stream, self._declared)
+
+    @staticmethod
+    def _needs_chunks_alone(summary: Summary, excerpt: Excerpt) -> bool:
+        # The whole is read as it lies, unless it is too much out of order.
+        return excerpt != EVERYTHING or summary.chunks.held_in_file_order() > ordering.HOLD_BYTES
+
+    def _read_chunks(
+        self, stream: RecordStream, excerpt: Excerpt, summary: Summary, between: Between
+    ) -> Iterator[Record]:
+        count = 0
+        for record in read_chunks(stream, excerpt, summary, between, self._declared):
+            if isinstance(record, Message):
+                count += 1
+                yield self._unpacked(record)
+            else:
+                yield record
+        if excerpt == EVERYTHING and not summary.covers(count):
+            raise SourceError(
+                self.path,
+                f"is damaged: its chunks hold {count} messages, its statistics others",
+                SALVAGE_REMEDY,
+            )
+
+    def _read_through(self, stream: RecordStream) -> Iterator[Record]:
+        in_time_order = self._summary and self._summary.chunks.has_messages
+        held = HoldBack() if in_time_order and not self._in_file_order else None
+        declared = self._declared
+        read = 0
         while True:
             opcode, body = stream.next()
             if opcode == Opcode.FOOTER:
                 break
             try:
-                for message in self._messages(opcode, body):
-                    number += 1
-                    read = self._message(message, number)
+                for head in self._messages(opcode, body):
+                    read += 1
+                    message = declared.message(head, f"message {read}")
                     if held is None:
-                        yield read
+                        yield self._unpacked(message)
                     else:
-                        held.add(read)
-                record = self._other(opcode, body)
+                        held.add(message)
+                record = declared.other(opcode, body)
             except DamageError as error:
                 raise stream.damaged(error) from None
             if held is not None and self._summary:
-                yield from held.release(self._summary.later_start(stream.start))
+                until = self._summary.chunks.later_start(stream.start)
+                yield from map(self._unpacked, held.release(until))
             if record:
                 yield record
         stream.read_magic()
         if held is not None:
-            yield from held.release(None)
+            yield from map(self._unpacked, held.release(None))
 
     def _messages(self, opcode: int, body: bytes) -> Iterator[MessageHead]:
         """The messages of a top-level record, declaring what stands between them."""
@@ -201,62 +254,20 @@ class McapReader:
                 if kind == Opcode.MESSAGE:
                     yield parse_message(part)
                 else:
-                    self._declare(kind, part)
+                    self._declared.take(kind, part)
 
-    def _other(self, opcode: int, body: bytes) -> Attachment | MetadataRecord | None:
-        """A top-level record that is no message, to pass on."""
-        if opcode == Opcode.ATTACHMENT:
-            found = parse_attachment(body)
-            return Attachment(
-                found.name, found.media_type, found.create_time, found.log_time, found.data
-            )
-        if opcode == Opcode.METADATA:
-            record = parse(mcap_records.Metadata, body)
-            return MetadataRecord(record.name, record.metadata)
-        self._declare(opcode, body)
-        return None
-
-    def _declare(self, opcode: int, body: bytes | memoryview) -> None:
-        if opcode == Opcode.SCHEMA:
-            schema = parse(mcap_records.Schema, body)
-            if self._schemas.setdefault(schema.id, schema) != schema:
-                raise DamageError(f"schema {schema.id} is defined twice and differently")
-        elif opcode == Opcode.CHANNEL:
-            self._add_channel(parse(mcap_records.Channel, body))
-        elif opcode >= PRIVATE_OPCODE:
-            self._skipped[f"private MCAP records (opcode 0x{opcode:02x})"] += 1
-
-    def _add_channel(self, record: mcap_records.Channel) -> None:
-        if self._channel_records.setdefault(record.id, record) != record:
-            raise DamageError(
-                f"channel {record.id} ({record.topic}) is defined twice and differently"
-            )
-        if record.id not in self._channels:
-            schema = self._schemas.get(record.schema_id) if record.schema_id else None
-            self._channels[record.id] = Channel(
-                record.id,
-                record.topic,
-                record.message_encoding,
-                _schema(schema) if schema else None,
-                record.metadata,
-            )
-
-    def _message(self, head: MessageHead, number: int) -> Message:
-        channel = self._channels.get(head.channel_id)
-        if channel is None:
-            raise DamageError(
-                f"message {number} is of channel {head.channel_id}, which is not defined"
-            )
-        return self._payload(channel, head, f"message {number}")
-
-    def _payload(self, channel: Channel, head: MessageHead, place: str) -> Message:
-        data: bytes | memoryview = head.data
-        if self._decompress:
-            try:
-                data = self._decompress(head.data)
-            except DamageError as error:
-                raise DamageError(f"{place}, topic {channel.topic}: {error}") from None
-        return Message(channel, head.log_time, head.publish_time, head.sequence, data)
+    def _unpacked(self, message: Message) -> Message:
+        """A message with its payload as it was before it was compressed by itself."""
+        if self._decompress is None:
+            return message
+        try:
+            data = self._decompress(memoryview(message.data))
+        except DamageError as error:
+            place = f"message of log time {message.log_time}, topic {message.channel.topic}"
+            raise SourceError(self.path, f"is damaged: {place}: {error}", SALVAGE_REMEDY) from None
+        return Message(
+            message.channel, message.log_time, message.publish_time, message.sequence, data
+        )
 
     def stats(self) -> Mapping[int, ChannelStats]:
         """Counts by the statistics record, spans by the chunks that hold the channel."""
@@ -268,7 +279,7 @@ class McapReader:
         Times past the year 2262 do not fit and are given as the last one that does.
         """
         pieces: dict[int, list[NDArray[np.uint64]]] = {}
-        if self._summary and self._summary.is_indexed:
+        if self._summary and self._summary.chunks.has_messages:
             with closing(self._start_pass()) as stream:
                 try:
                     for entries in self._summary.entries(stream):
@@ -283,7 +294,7 @@ class McapReader:
     def _times_by_reading(self) -> dict[int, NDArray[np.int64]]:
         found: dict[int, list[int]] = {}
         with closing(self._start_pass()) as stream:
-            for record in self._read(stream):
+            for record in self._read_through(stream):
                 if isinstance(record, Message):
                     found.setdefault(record.channel.id, []).append(record.log_time)
         return {key: _sorted(np.array(times, dtype=np.uint64)) for key, times in found.items()}
@@ -300,24 +311,12 @@ class McapReader:
         return self._first.get(channel.id)
 
     def _first_by_index(self) -> dict[int, Message] | None:
-        if not self._summary or not self._summary.is_indexed:
+        if not self._summary or not self._summary.chunks.has_messages:
             return None
-        places: dict[int, tuple[int, int, int]] = {}
-        count = 0
         with closing(self._start_pass()) as stream:
             try:
-                for entries in self._summary.entries(stream):
-                    count += len(entries.log_times)
-                    if len(entries.log_times):
-                        row = int(np.argmin(entries.log_times))
-                        place = (
-                            int(entries.log_times[row]),
-                            entries.chunk,
-                            int(entries.offsets[row]),
-                        )
-                        known = places.get(entries.channel_id, place)
-                        places[entries.channel_id] = min(known, place)
-                if not self._summary.covers(count) or not places.keys() <= self._channels.keys():
+                places = self._summary.first_places(stream)
+                if places is None or not places.keys() <= self._declared.channels.keys():
                     return None
                 return dict(self._read_places(stream, places))
             except DamageError as error:
@@ -340,13 +339,13 @@ class McapReader:
             head = parse_message(part) if kind == Opcode.MESSAGE else None
             if head is None or head.channel_id != channel_id:
                 raise DamageError("its message index points beside the messages")
-            message = self._payload(self._channels[channel_id], head, "the first message")
-            yield channel_id, _own_payload(message)
+            message = self._declared.message(head, "the first message")
+            yield channel_id, _own_payload(self._unpacked(message))
 
     def _first_by_reading(self) -> dict[int, Message]:
         first: dict[int, Message] = {}
         with closing(self._start_pass()) as stream:
-            for record in self._read(stream):
+            for record in self._read_through(stream):
                 if isinstance(record, Message):
                     known = first.get(record.channel.id)
                     if known is None or record.log_time < known.log_time:
@@ -366,8 +365,20 @@ class McapReader:
             self._pass.close()
 
 
-def _schema(record: mcap_records.Schema) -> Schema:
-    return Schema(record.name, record.encoding, record.data)
+def is_mcap(path: Path, is_compressed: bool) -> bool:
+    """Whether a storage file of rosbag2 is one of MCAP.
+
+    Args:
+        path: The file.
+        is_compressed: Whether it is as a whole, so that its name must tell.
+
+    Raises:
+        SourceError: It cannot be read.
+    """
+    if is_compressed:
+        return ".mcap" in path.suffixes
+    with open_source(path) as stream:
+        return stream.read(len(MAGIC)) == MAGIC
 
 
 def _own_payload(message: Message) -> Message:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import bisect
 import struct
-from array import array
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -14,8 +13,26 @@ from mcap import records as mcap_records
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from mp4ds.bags.mcap_records import FOOTER_BYTES, MAGIC, DamageError, RecordStream, parse
+from mp4ds.bags.mcap_chunks import ChunkTable
+from mp4ds.bags.mcap_records import (
+    FOOTER_BYTES,
+    MAGIC,
+    PRIVATE_OPCODE,
+    DamageError,
+    RecordStream,
+    parse,
+)
 from mp4ds.records import ChannelStats
+
+_OF_SUMMARY = {
+    Opcode.SCHEMA,
+    Opcode.CHANNEL,
+    Opcode.STATISTICS,
+    Opcode.CHUNK_INDEX,
+    Opcode.ATTACHMENT_INDEX,
+    Opcode.METADATA_INDEX,
+    Opcode.SUMMARY_OFFSET,
+}
 
 
 class IndexEntries(NamedTuple):
@@ -36,58 +53,57 @@ class IndexEntries(NamedTuple):
 
 @dataclass
 class Summary:
-    """A summary section, without what grows with each chunk and channel together.
+    """A summary section.
 
     Attributes:
+        offset: Byte offset of its first record.
         schemas: Schema records by id.
         channels: Channel records by id.
         statistics: The statistics record, if there is one.
-        spans: Least and greatest log time of the chunks that hold a channel, by its id.
+        chunks: The chunks that it lists.
+        private: How many records of each private opcode it holds.
+        has_data: Whether it holds records that belong into the data section.
     """
 
+    offset: int
     schemas: dict[int, mcap_records.Schema] = field(default_factory=dict)
     channels: dict[int, mcap_records.Channel] = field(default_factory=dict)
     statistics: mcap_records.Statistics | None = None
-    spans: dict[int, tuple[int, int]] = field(default_factory=dict)
-    _chunks: list[tuple[int, int, int, int]] = field(default_factory=list)
-    _offsets: array[int] = field(default_factory=lambda: array("Q"))
-    _later_starts: array[int] = field(default_factory=lambda: array("Q"))
-
-    @property
-    def is_indexed(self) -> bool:
-        """Whether the file's chunks are listed."""
-        return bool(self._chunks)
+    chunks: ChunkTable = field(default_factory=ChunkTable)
+    private: Counter[int] = field(default_factory=Counter)
+    has_data: bool = False
 
     @property
     def start(self) -> int | None:
         """The earliest log time, or None without messages or without knowing."""
-        if self.statistics and self.statistics.message_count:
-            return self.statistics.message_start_time
-        return self._later_starts[0] if self._later_starts else None
+        span = self._span()
+        return span[0] if span else None
 
-    def add_chunk(self, index: mcap_records.ChunkIndex) -> None:
-        """Take in what a chunk index tells."""
-        holds_channels = index.message_index_offsets
-        start, end = index.message_start_time, index.message_end_time
-        if not holds_channels and not start and not end:
-            return  # no messages: its start of 0 would hold back everything before it
-        first = index.chunk_start_offset + index.chunk_length
-        self._chunks.append((index.chunk_start_offset, start, first, index.message_index_length))
-        for channel_id in holds_channels:
-            known = self.spans.get(channel_id, (start, end))
-            self.spans[channel_id] = (min(known[0], start), max(known[1], end))
+    def _span(self) -> tuple[int, int] | None:
+        """The least and the greatest log time that anything tells of."""
+        statistics, listed = self.statistics, self.chunks.span()
+        if not statistics or not statistics.message_count:
+            return listed
+        first, last = statistics.message_start_time, statistics.message_end_time
+        return (min(first, listed[0]), max(last, listed[1])) if listed else (first, last)
 
-    def finish(self) -> None:
-        """Order the chunks as they lie in the file."""
-        self._chunks.sort()
-        self._offsets = array("Q", (chunk[0] for chunk in self._chunks))
-        starts = np.array([chunk[1] for chunk in self._chunks], dtype=np.uint64)
-        self._later_starts = array("Q", np.minimum.accumulate(starts[::-1])[::-1].tobytes())
-
-    def later_start(self, offset: int) -> int | None:
-        """The earliest log time in the chunks after a byte offset; None after the last."""
-        position = bisect.bisect_right(self._offsets, offset)
-        return self._later_starts[position] if position < len(self._later_starts) else None
+    @property
+    def is_consistent(self) -> bool:
+        """Whether its parts agree that it lists all channels, schemas and chunks."""
+        statistics = self.statistics
+        if statistics is None or self.has_data:
+            return False
+        counts = statistics.channel_message_counts
+        schemas = {channel.schema_id for channel in self.channels.values()} - {0}
+        return (
+            self.covers(sum(counts.values()))
+            and counts.keys() <= self.channels.keys()
+            and schemas <= self.schemas.keys()
+            and statistics.channel_count == len(self.channels)
+            and statistics.schema_count == len(self.schemas)
+            and statistics.chunk_count == len(self.chunks)
+            and self.chunks.is_sound
+        )
 
     def stats(self) -> dict[int, ChannelStats]:
         """Counts and spans by channel id; empty where the counts do not add up."""
@@ -95,13 +111,13 @@ class Summary:
         if not statistics:
             return {}
         counts = statistics.channel_message_counts
-        if sum(counts.values()) != statistics.message_count:
+        if not self.covers(sum(counts.values())):
             return {}
-        whole = statistics.message_start_time, statistics.message_end_time
+        whole, spans = self._span() or (0, 0), self.chunks.spans()
         stats = {}
         for channel_id in self.channels.keys() | counts.keys():
             count = counts.get(channel_id, 0)
-            span = self.spans.get(channel_id, whole) if count else (0, 0)
+            span = spans.get(channel_id, whole) if count else (0, 0)
             stats[channel_id] = ChannelStats(count, *span)
         return stats
 
@@ -111,9 +127,9 @@ class Summary:
         Raises:
             DamageError: An index record is damaged.
         """
-        for chunk, _, first, length in self._chunks:
+        stream.expect((first, end) for _, first, end in self.chunks.places())
+        for chunk, first, end in self.chunks.places():
             stream.seek(first)
-            end = first + length
             while stream.tell() < end:
                 opcode, body = stream.next()
                 if opcode != Opcode.MESSAGE_INDEX:
@@ -121,8 +137,28 @@ class Summary:
                 yield _parse_entries(chunk, body)
 
     def covers(self, count: int) -> bool:
-        """Whether so many indexed messages are all that the file has."""
+        """Whether so many messages are all that the file has."""
         return self.statistics is not None and self.statistics.message_count == count
+
+    def first_places(self, stream: RecordStream) -> dict[int, tuple[int, int, int]] | None:
+        """Where each channel's first message is, by the message indexes.
+
+        Returns:
+            Log time, byte offset of the chunk, and offset in its content, by the channel's id;
+            None where the indexes do not have all messages.
+
+        Raises:
+            DamageError: An index record is damaged.
+        """
+        places: dict[int, tuple[int, int, int]] = {}
+        count = 0
+        for entries in self.entries(stream):
+            count += len(entries.log_times)
+            if len(entries.log_times):
+                row = int(np.argmin(entries.log_times))
+                place = int(entries.log_times[row]), entries.chunk, int(entries.offsets[row])
+                places[entries.channel_id] = min(places.get(entries.channel_id, place), place)
+        return places if self.covers(count) else None
 
 
 def _parse_entries(chunk: int, body: bytes) -> IndexEntries:
@@ -158,18 +194,20 @@ def read_summary(stream: RecordStream) -> Summary | None:
     if not summary_start:
         return None
     stream.seek(summary_start)
-    summary = Summary()
+    summary = Summary(summary_start)
     while True:
         opcode, body = stream.next()
         if opcode == Opcode.FOOTER:
             break
         _add(summary, opcode, body)
-    summary.finish()
+    summary.chunks.finish()
     return summary
 
 
 def _add(summary: Summary, opcode: int, body: bytes) -> None:
-    if opcode == Opcode.SCHEMA:
+    if opcode == Opcode.CHUNK_INDEX:
+        summary.chunks.add(body)
+    elif opcode == Opcode.SCHEMA:
         schema = parse(mcap_records.Schema, body)
         summary.schemas[schema.id] = schema
     elif opcode == Opcode.CHANNEL:
@@ -177,5 +215,7 @@ def _add(summary: Summary, opcode: int, body: bytes) -> None:
         summary.channels[channel.id] = channel
     elif opcode == Opcode.STATISTICS:
         summary.statistics = parse(mcap_records.Statistics, body)
-    elif opcode == Opcode.CHUNK_INDEX:
-        summary.add_chunk(parse(mcap_records.ChunkIndex, body))
+    elif opcode >= PRIVATE_OPCODE:
+        summary.private[opcode] += 1
+    elif opcode not in _OF_SUMMARY:
+        summary.has_data = True

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import io
 import struct
-import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, Protocol, TypeVar
 
@@ -21,12 +20,21 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 
 from mp4ds.errors import SourceError, SourceNotFoundError
+from mp4ds.remote import expect
+
+try:
+    from isal.isal_zlib import crc32  # more than ten times as fast as zlib's
+except ImportError:  # no wheel for this machine
+    from zlib import crc32
 
 MAGIC = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES = 4 * 2**30
 FOOTER_BYTES = 9 + 20 + len(MAGIC)
 PRIVATE_OPCODE = 0x80
-CUT_SHORT_REMEDY = "The recording was cut short; recover it with `mcap recover` first."
+SALVAGE_REMEDY = "`mp4ds pack --salvage` packs what can be read."
+CUT_SHORT_REMEDY = (
+    "The recording was cut short: recover it with `mcap recover`, or not at all; " + SALVAGE_REMEDY
+)
 
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 _PIECE_BYTES = 16 * 2**20
@@ -137,6 +145,10 @@ class RecordStream:
         self._stream.seek(offset)
         self._offset = offset
 
+    def expect(self, ranges: Iterable[tuple[int, int]]) -> None:
+        """Tell which bytes will be read, first and end of each, in that order."""
+        expect(self._stream, ranges)
+
     def read_magic(self) -> None:
         """Read the magic bytes that begin and end a file."""
         at_start = self._offset == 0
@@ -155,7 +167,9 @@ class RecordStream:
             else:
                 data = self._read_in_pieces(length)
         except zstandard.ZstdError as error:
-            raise SourceError(self.path, f"its zstd compression is damaged: {error}") from None
+            raise SourceError(
+                self.path, f"its zstd compression is damaged: {error}", SALVAGE_REMEDY
+            ) from None
         except OSError as error:
             raise SourceError(self.path, f"cannot be read: {error.strerror or error}") from None
         if len(data) != length:
@@ -183,7 +197,9 @@ class RecordStream:
         opcode, length = _FRAME.unpack(self.read(_FRAME.size))
         if length > MAX_RECORD_BYTES:
             raise SourceError(
-                self.path, f"holds a record of {length} bytes at byte {self.start}: it is damaged"
+                self.path,
+                f"holds a record of {length} bytes at byte {self.start}: it is damaged",
+                SALVAGE_REMEDY,
             )
         return opcode, self.read(length)
 
@@ -193,12 +209,17 @@ class RecordStream:
 
     def damaged(self, problem: object) -> SourceError:
         """The error for a damaged record: the one that was read last."""
-        return SourceError(self.path, f"is damaged in its record at byte {self.start}: {problem}")
+        return SourceError(
+            self.path, f"is damaged in its record at byte {self.start}: {problem}", SALVAGE_REMEDY
+        )
 
 
 class _ExactStream(ReadDataStream):
     def read(self, length: int) -> bytes:
-        data = super().read(length)
+        try:
+            data = super().read(length)
+        except OverflowError:  # no file is as long as that
+            raise EndOfFile from None
         if len(data) != length:
             raise EndOfFile
         return data
@@ -217,7 +238,7 @@ def _parse(kind: type[_Parsed[_RecordT]], body: bytes | memoryview) -> tuple[_Re
     stream = _ExactStream(io.BytesIO(body))
     try:
         return kind.read(stream), stream.count
-    except (EndOfFile, struct.error):
+    except (EndOfFile, struct.error, OverflowError):
         problem = "is shorter than its fields"
     except UnicodeDecodeError:
         problem = "holds text that is not UTF-8"
@@ -229,7 +250,7 @@ def parse_attachment(body: bytes) -> mcap_records.Attachment:
     attachment: mcap_records.Attachment
     attachment, length = _parse(mcap_records.Attachment, body)
     (crc,) = struct.unpack_from("<I", body, length - 4)
-    if crc and crc != zlib.crc32(memoryview(body)[: length - 4]):
+    if crc and crc != crc32(memoryview(body)[: length - 4]):
         raise DamageError(f"the attachment {attachment.name!r} does not match its checksum")
     return attachment
 
@@ -265,7 +286,7 @@ def unpack_chunk(body: bytes) -> bytes | memoryview:
     content = _decompress(compression, data, size)
     if len(content) != size:
         raise DamageError(f"a chunk holds {len(content)} bytes instead of {size}")
-    if crc and crc != zlib.crc32(content):
+    if crc and crc != crc32(content):
         raise DamageError("a chunk does not match its checksum")
     return content
 

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-import heapq
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.bags.ordering import Part, merged
 from mp4ds.bags.protocols import BagReader
 from mp4ds.records import (
-    Attachment,
+    EVERYTHING,
     Channel,
     ChannelStats,
+    Excerpt,
     Message,
     Record,
     Schema,
 )
+
+_NO_STATS = ChannelStats(0, 0, 0)
 
 
 class MultiReader:
@@ -31,16 +35,20 @@ class MultiReader:
 
     Args:
         openers: Each opens one part; a part is open only while it is read.
+
+    Attributes:
+        is_indexed: Whether all parts are.
     """
 
     def __init__(self, openers: Sequence[Callable[[], BagReader]]) -> None:
         self._openers = openers
         self._channels: dict[tuple[object, ...], Channel] = {}
-        self._schemas: list[Schema] = []
+        self._schemas: dict[Schema, None] = {}
         self._skipped: Counter[str] = Counter()
         self._done = 0
         self._active: list[BagReader] = []
         self._stats: dict[int, ChannelStats] = {}
+        self.is_indexed = True
         spans: list[tuple[int, int, int]] = []
         files: list[list[Path]] = []
         for number, opener in enumerate(openers):
@@ -50,18 +58,19 @@ class MultiReader:
                     self.profile, self.library = part.profile, part.library
                 elif part.profile != self.profile:
                     self.profile = ""
+                self.is_indexed &= part.is_indexed
                 files.append(list(part.files))
                 for channel in part.channels:
                     self._shared(channel)
+                self._schemas.update(dict.fromkeys(part.unused_schemas))
                 stats = part.stats()
                 self._add_stats(part, stats)
                 known = [item for item in stats.values() if item.count]
                 start = min((item.start for item in known), default=0)
                 end = max((item.end for item in known), default=2**63)
                 spans.append((start, end, number))
-        self._groups = _overlapping(sorted(spans))
-        order = [number for group in self._groups for number in group]
-        self.files: Sequence[Path] = [file for number in order for file in files[number]]
+        self._spans = sorted(spans)
+        self.files: Sequence[Path] = [file for *_, number in self._spans for file in files[number]]
 
     def _shared(self, channel: Channel) -> Channel:
         key = channel.identity
@@ -71,13 +80,9 @@ class MultiReader:
 
     def _add_stats(self, part: BagReader, stats: Mapping[int, ChannelStats]) -> None:
         for channel in part.channels:
-            if channel.id not in stats or not stats[channel.id].count:
-                continue
-            shared, new = self._shared(channel).id, stats[channel.id]
-            old = self._stats.get(shared, ChannelStats(0, new.start, new.end))
-            self._stats[shared] = ChannelStats(
-                old.count + new.count, min(old.start, new.start), max(old.end, new.end)
-            )
+            if channel.id in stats and stats[channel.id].count:
+                shared = self._shared(channel).id
+                self._stats[shared] = self._stats.get(shared, _NO_STATS).plus(stats[channel.id])
 
     @property
     def channels(self) -> Sequence[Channel]:
@@ -87,7 +92,7 @@ class MultiReader:
     @property
     def unused_schemas(self) -> Sequence[Schema]:
         """See `BagReader.unused_schemas`."""
-        return self._schemas
+        return list(self._schemas)
 
     @property
     def skipped(self) -> Mapping[str, int]:
@@ -99,37 +104,41 @@ class MultiReader:
         """See `BagReader.position`."""
         return self._done + sum(part.position for part in self._active)
 
-    def records(self) -> Iterator[Record]:
+    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """See `BagReader.records`."""
         self._done = 0
-        for group in self._groups:
-            self._active = [self._openers[number]() for number in group]
-            try:
-                iterators = [self._part_records(part) for part in self._active]
-                if len(iterators) == 1:
-                    yield from iterators[0]
-                else:
-                    yield from heapq.merge(*iterators, key=_time_of)
-                self._done += sum(
-                    file.stat().st_size for part in self._active for file in part.files
-                )
-            finally:
-                for part in self._active:
-                    part.__exit__(None, None, None)
-                self._active = []
+        self._skipped.clear()
+        if self.is_indexed:
+            return self._merged(excerpt)
+        # What is out of order would be merged otherwise without what is not wanted.
+        return filter(excerpt.has, self._merged(EVERYTHING if excerpt.has_messages else excerpt))
 
-    def _part_records(self, part: BagReader) -> Iterator[Record]:
-        for record in part.records():
-            if isinstance(record, Message):
-                yield replace(record, channel=self._shared(record.channel))
-            else:
-                yield record
-        for channel in part.channels:
-            self._shared(channel)
-        self._skipped.update(part.skipped)
-        for schema in part.unused_schemas:
-            if schema not in self._schemas:
-                self._schemas.append(schema)
+    def _merged(self, excerpt: Excerpt) -> Iterator[Record]:
+        return merged(
+            [
+                Part(start, partial(self._part_records, number, excerpt))
+                for start, end, number in self._spans
+                if excerpt.others or excerpt.touches(start, end)
+            ]
+        )
+
+    def _part_records(self, number: int, excerpt: Excerpt) -> Iterator[Record]:
+        part = self._openers[number]()
+        self._active.append(part)
+        try:
+            for record in part.records(excerpt):
+                if isinstance(record, Message):
+                    yield record.of_channel(self._shared(record.channel))
+                else:
+                    yield record
+            for channel in part.channels:
+                self._shared(channel)
+            self._skipped.update(part.skipped)
+            self._schemas.update(dict.fromkeys(part.unused_schemas))
+            self._done += sum(file.stat().st_size for file in part.files)
+        finally:
+            self._active.remove(part)
+            part.__exit__(None, None, None)
 
     def stats(self) -> Mapping[int, ChannelStats]:
         """See `BagReader.stats`."""
@@ -156,7 +165,7 @@ class MultiReader:
                         continue
                     message = part.first(own)
                     if message and (best is None or message.log_time < best.log_time):
-                        best = replace(message, channel=channel)
+                        best = message.of_channel(channel)
         return best
 
     def __enter__(self) -> MultiReader:
@@ -170,24 +179,3 @@ class MultiReader:
     ) -> None:
         for part in self._active:
             part.__exit__(exc_type, exc, tb)
-        self._active = []
-
-
-def _overlapping(spans: Sequence[tuple[int, int, int]]) -> list[list[int]]:
-    """Group parts, sorted by start, so that no two groups overlap in time."""
-    groups: list[list[int]] = []
-    group_end = -1
-    for start, end, number in spans:
-        if groups and start < group_end:
-            groups[-1].append(number)
-            group_end = max(group_end, end)
-        else:
-            groups.append([number])
-            group_end = end
-    return groups
-
-
-def _time_of(record: Record) -> int:
-    if isinstance(record, (Message, Attachment)):
-        return record.log_time
-    return 0  # metadata has no time: it comes as soon as its file does

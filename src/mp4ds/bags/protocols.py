@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.records import (
+    EVERYTHING,
     Attachment,
     Channel,
     ChannelStats,
+    Excerpt,
     Message,
     MetadataRecord,
     Record,
@@ -45,30 +47,53 @@ class BagReader(Protocol):
 
     @property
     def channels(self) -> Sequence[Channel]:
-        """All channels known so far; complete once `records` is exhausted."""
+        """All channels known so far.
+
+        Complete once `records` of everything is exhausted, or where the recording `is_indexed`.
+        """
         ...
 
     @property
     def unused_schemas(self) -> Sequence[Schema]:
-        """Definitions that no channel refers to; complete once `records` is exhausted."""
+        """Definitions that no channel refers to.
+
+        Complete once `records` of everything is exhausted, or where the recording `is_indexed`.
+        """
         ...
 
     @property
     def skipped(self) -> Mapping[str, int]:
-        """What the source holds and no dataset can: a phrase -> how many; to be told."""
+        """What the source holds and no dataset can: a phrase -> how many; to be told.
+
+        Of what the last `records` came across.
+        """
         ...
 
     @property
     def position(self) -> int:
-        """Bytes of `files` consumed so far, for progress and hashing."""
+        """Bytes of `files` that `records` of everything has consumed, for progress and hashing."""
         ...
 
-    def records(self) -> Iterator[Record]:
-        """Read everything once.
+    @property
+    def is_indexed(self) -> bool:
+        """Whether an excerpt is read, in log-time order, without reading the rest."""
+        ...
+
+    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+        """Read everything once, or a part of it.
 
         Messages of one channel come in log-time order, ties in source order; where a file
         has no index (some MCAP files) they come in file order. Attachments and metadata
         records come where the file holds them.
+
+        An excerpt has what is part of it, in the order of the whole. Where the recording
+        `is_indexed`, the messages of consecutive spans are, for each channel, those of the whole
+        one after the other. What a damaged index hides is told by the counts of `stats` alone:
+        let the spans be open at both ends, and count their messages.
+
+        Args:
+            excerpt: What to read. Where the recording `is_indexed`, little else is read;
+                else all is, and what is not part of it left out.
 
         Raises:
             SourceError: The file is damaged; names the file and, where known, the topic.

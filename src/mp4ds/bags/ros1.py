@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from array import array
 from collections import OrderedDict, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType, TracebackType
@@ -48,7 +48,16 @@ from mp4ds.bags.ros1_records import (
 )
 from mp4ds.bags.ros1_write import Ros1Writer
 from mp4ds.errors import SourceError
-from mp4ds.records import Channel, ChannelStats, Message, Record, Schema
+from mp4ds.records import (
+    EVERYTHING,
+    Channel,
+    ChannelStats,
+    Excerpt,
+    Message,
+    Record,
+    Schema,
+)
+from mp4ds.remote import expect
 
 __all__ = ["Ros1Reader", "Ros1Writer"]
 
@@ -56,6 +65,8 @@ CACHED_CHUNKS = 8
 CACHED_BYTES = 64 * 2**20
 """Unpacked chunks are kept up to both limits, but always two: chunks may overlap in time."""
 
+_LATEST = 2**63 - 1  # more than any time of a bag
+_CHUNK_HEAD, _INDEX_HEAD = 96, 64  # bytes at most, of the records as everybody writes them
 _INDEX_ENTRY = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
 
 
@@ -65,6 +76,14 @@ class _Index(NamedTuple):
     times: NDArray[np.int64]
     chunks: NDArray[np.int32]
     offsets: NDArray[np.uint32]
+
+    def within(self, excerpt: Excerpt) -> _Index:
+        """The messages of an excerpt's span."""
+        start, end = (
+            None if time is None else int(np.searchsorted(self.times, min(max(time, 0), _LATEST)))
+            for time in (excerpt.start, excerpt.end)
+        )
+        return _Index(self.times[start:end], self.chunks[start:end], self.offsets[start:end])
 
 
 class Ros1Reader:
@@ -110,31 +129,42 @@ class Ros1Reader:
         """Bytes of the chunks that `records` has come to; the file's size at its end."""
         return self._position
 
-    def records(self) -> Iterator[Record]:
-        """Every message in log-time order. See `BagReader.records`."""
+    @property
+    def is_indexed(self) -> bool:
+        """See `BagReader.is_indexed`: a bag without an index is not read at all."""
+        return True
+
+    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+        """Messages in log-time order, from the chunks that hold them. See `BagReader.records`."""
         self._position = 0
         visited: set[int] = set()
-        for channel, time, chunk, offset in self._entries():
+        for channel, time, chunk, offset, is_last in self._entries(excerpt):
             if chunk not in visited:
                 visited.add(chunk)
                 self._position += self._bag.chunk_at(chunk).datasize
             yield self._message(channel, time, chunk, offset)
+            if is_last:
+                self._chunks.pop(chunk, None)
         self._position = self._size
 
-    def _entries(self) -> Iterator[tuple[Channel, int, int, int]]:
-        """Channel, log time, chunk number and offset of every message, in order."""
-        channels = self.channels
-        parts = [self._index[channel.id] for channel in channels]
+    def _entries(self, excerpt: Excerpt) -> Iterator[tuple[Channel, int, int, int, bool]]:
+        """Of every message: channel, log time, chunk number, offset, if it ends its chunk's use."""
+        channels = [channel for channel in self.channels if excerpt.has_topic(channel.topic)]
+        parts = [self._index[channel.id].within(excerpt) for channel in channels]
         if not parts:
             return
         times, chunks, offsets = (np.concatenate(column) for column in zip(*parts, strict=True))
         owners = np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.times) for p in parts])
         order = np.lexsort((offsets, chunks, times))
+        self._bag.expect(() if excerpt == EVERYTHING else _first_seen(chunks[order]))
+        last = np.full(len(self._bag.chunk_infos), -1)
+        last[chunks[order]] = np.arange(len(order))
         for start in range(0, len(order), 4096):
             rows = order[start : start + 4096]
+            ends = last[chunks[rows]] == np.arange(start, start + len(rows))
             columns = (column[rows].tolist() for column in (owners, times, chunks, offsets))
-            for owner, time, chunk, offset in zip(*columns, strict=True):
-                yield channels[owner], time, chunk, offset
+            for owner, time, chunk, offset, is_last in zip(*columns, ends.tolist(), strict=True):
+                yield channels[owner], time, chunk, offset, is_last
 
     def _message(self, channel: Channel, time: int, chunk: int, offset: int) -> Message:
         try:
@@ -197,6 +227,13 @@ class Ros1Reader:
             self._bag.bio.close()
 
 
+def _first_seen(numbers: NDArray[np.int32]) -> list[int]:
+    """Each number once, where it comes first."""
+    found, places = np.unique(numbers, return_index=True)
+    ordered: list[int] = found[np.argsort(places)].tolist()
+    return ordered
+
+
 class _Bag(Reader):
     """rosbags' reader, with connections as `Channel` and the index in arrays.
 
@@ -207,7 +244,7 @@ class _Bag(Reader):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self.channels: dict[int, Channel] = {}
-        self._index_end = 0
+        self._index_start = self._index_end = 0
         # By connection: raw index entries; number of a chunk and of its entries, alternating.
         self._index_entries: defaultdict[int, bytearray] = defaultdict(bytearray)
         self._index_runs: defaultdict[int, array[int]] = defaultdict(partial(array, "I"))
@@ -252,6 +289,8 @@ class _Bag(Reader):
 
     def read_connection(self) -> Connection:
         """Read a connection record, keeping its header verbatim."""
+        if not self.channels:
+            self._index_start = self.file.tell()
         record = dict(split_header(read_bytes(self.file, read_uint32(self.file))))
         if record.get(b"op") != bytes([RecordType.CONNECTION]):
             raise ReaderError("a connection record is missing")
@@ -270,8 +309,29 @@ class _Bag(Reader):
             self,
         )
 
+    def expect(self, chunks: Iterable[int]) -> None:
+        """Tell which chunks will be read, by their numbers, in that order."""
+        places = map(self.chunk_at, chunks)
+        expect(self.file, ((chunk.datapos, chunk.datapos + chunk.datasize) for chunk in places))
+
+    def _index_ranges(self) -> Iterator[tuple[int, int]]:
+        """Where the index lies: between the data of the chunks."""
+        infos = self.chunk_infos
+        ends = [info.pos for info in infos[1:]] + [self._index_start]
+        for info, end in zip(infos, ends, strict=True):
+            head = info.pos + _CHUNK_HEAD
+            yield info.pos, head
+            size = sum(
+                _INDEX_HEAD + _INDEX_ENTRY.itemsize * count
+                for count in info.connection_counts.values()
+            )
+            if head < end:
+                yield max(head, end - size), end
+
     def read_chunk(self) -> Chunk:
         """Read a chunk's header; it will unpack to the size that this tells."""
+        if not self.chunks:
+            expect(self.file, self._index_ranges())
         header = Header.read(self.file, RecordType.CHUNK)
         unpack = partial(unpack_chunk, header.get_string("compression"), header.get_uint32("size"))
         size = read_uint32(self.file)

@@ -14,13 +14,13 @@ import lz4.frame
 from rosbags.rosbag1 import ReaderError
 from rosbags.rosbag1.reader import Header, RecordType
 
-from mp4ds.bags.mcap_records import open_source
+from mp4ds.bags.mcap_records import SALVAGE_REMEDY, open_source
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, Schema
 
 MAGIC = b"#ROSBAG V2.0\n"
 UINT32 = struct.Struct("<I")
-COPY_AGAIN = "Copy it again, or repair it with `rosbag reindex`."
+COPY_AGAIN = f"Copy it again, or repair it with `rosbag reindex`; {SALVAGE_REMEDY}"
 DAMAGE = (
     ReaderError,
     AssertionError,
@@ -51,7 +51,7 @@ def check_bag(path: Path) -> int:
         size = path.stat().st_size
         start = stream.read(32)
         if not start.startswith(MAGIC):
-            raise _other_format(path, start)
+            raise other_format(path, start)
         try:
             stream.seek(len(MAGIC))
             header = Header.read(stream, RecordType.BAGHEADER)
@@ -64,7 +64,7 @@ def check_bag(path: Path) -> int:
         raise SourceError(
             path,
             "is not indexed: the recording was cut short",
-            "Reindex it with `rosbag reindex` first.",
+            f"Reindex it with `rosbag reindex` first, or not at all; {SALVAGE_REMEDY}",
         )
     if index > size:
         problem = f"is cut short: its index should begin at byte {index}, and it has {size} bytes"
@@ -72,7 +72,13 @@ def check_bag(path: Path) -> int:
     return size
 
 
-def _other_format(path: Path, start: bytes) -> SourceError:
+def other_format(path: Path, start: bytes) -> SourceError:
+    """The error for a file that is no bag of version 2.0.
+
+    Args:
+        path: The file.
+        start: Its first bytes.
+    """
     version = re.match(rb"#ROS(?:BAG|RECORD|LOG) V(\d+\.\d+)", start)
     if version and version[1] != b"2.0":
         return SourceError(

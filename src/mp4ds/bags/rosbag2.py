@@ -14,29 +14,39 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.mcap import McapReader
-from mp4ds.bags.mcap_records import MAGIC, open_source, unzstd
-from mp4ds.bags.ordering import HoldBack
+from mp4ds.bags.mcap import McapReader, is_mcap
+from mp4ds.bags.mcap_records import SALVAGE_REMEDY, unzstd
+from mp4ds.bags.ordering import HoldBack, Part, merged
 from mp4ds.bags.protocols import Format
 from mp4ds.bags.rosbag2_metadata import (
     METADATA_FILE,
     RECORD,
     TABLES_RECORD,
     BagInfo,
-    Topic,
     parse_bag_info,
     read_bag_info,
 )
-from mp4ds.bags.rosbag2_sqlite import HASH_KEY, QOS_KEY, SqliteReader
+from mp4ds.bags.rosbag2_sqlite import QOS_KEY, SqliteReader
 from mp4ds.bags.rosbag2_write import Rosbag2Writer
-from mp4ds.bags.zstd_files import ZstdFile, decompress_file, is_zstd
+from mp4ds.bags.zstd_files import ZstdFile, copy_file, decompress_file, is_zstd
 from mp4ds.errors import SourceError, SourceNotFoundError
-from mp4ds.records import Channel, ChannelStats, Message, MetadataRecord, Record, Schema
+from mp4ds.records import (
+    EVERYTHING,
+    Channel,
+    ChannelStats,
+    Excerpt,
+    Message,
+    MetadataRecord,
+    Record,
+    Schema,
+)
+from mp4ds.remote import remote
 
 __all__ = ["Rosbag2Reader", "Rosbag2Writer"]
 
 StorageReader = McapReader | SqliteReader
 _NO_STATS = ChannelStats(0, 0, 0)
+_GO_ON = "go without: " + SALVAGE_REMEDY
 
 
 class Rosbag2Reader:
@@ -48,8 +58,8 @@ class Rosbag2Reader:
 
     Args:
         path: A folder, or one ``.db3`` or ``.mcap`` file.
-        workdir: Where an sqlite3 file that is compressed as a whole is decompressed for as
-            long as it is read; the system's temporary folder by default.
+        workdir: Where an sqlite3 file that is compressed as a whole is decompressed, and a
+            remote one copied, for as long as it is read; the system's temporary folder by default.
 
     Raises:
         SourceError: The recording is incomplete, damaged, or of an unknown kind.
@@ -77,32 +87,40 @@ class Rosbag2Reader:
         self._seen: Counter[tuple[int, tuple[object, ...]]] = Counter()
         self._schemas: dict[Schema, None] = {}
         self._unpacked: ExitStack | None = None
-        self._active: tuple[int, StorageReader] | None = None
+        self._active: list[tuple[int, StorageReader]] = []
         self._done = 0
         self._readers = [self._storage_reader(file) for file in self._storage_files]
         mcaps = [reader for reader in self._readers if isinstance(reader, McapReader)]
         self.library = mcaps[0].library if mcaps else ""
         self._storage = "mcap" if mcaps else "sqlite3" if self._readers else ""
+        self._is_packed = [reader is None for reader in self._readers]
         for number, reader in enumerate(self._readers):
             if reader:
                 self._take_over(number, reader)
         if self._readers and self._readers[0] is None:
             self._unpack_first()
+        self._tables = {
+            number: reader.tables
+            for number, reader in enumerate(self._readers)
+            if isinstance(reader, SqliteReader)
+        }
         if all(reader is not None and _is_complete(reader) for reader in self._readers):
             self._add_listed_topics()
 
     def _storage_reader(self, file: Path) -> StorageReader | None:
-        """The reader of a storage file; None where it must be decompressed first."""
+        """The reader of a storage file; None where it must be decompressed or fetched first."""
         decompress = unzstd if self._info and self._info.compression == "message" else None
         compressed = is_zstd(file)
-        if (self._info and self._info.storage == "mcap") or _is_mcap(file, compressed):
+        if (self._info and self._info.storage == "mcap") or is_mcap(file, compressed):
             opener = partial(ZstdFile, file) if compressed else None
             return McapReader(file, open_stream=opener, message_decompress=decompress)
-        if compressed:
-            return None
-        reader = SqliteReader(file, message_decompress=decompress)
+        return None if compressed or remote(file) else self._sqlite_reader(file)
+
+    def _sqlite_reader(self, file: Path, shown: Path | None = None) -> SqliteReader:
+        decompress = unzstd if self._info and self._info.compression == "message" else None
+        reader = SqliteReader(file, shown=shown, message_decompress=decompress)
         if not self._info and _tells_message_compression(reader):
-            return SqliteReader(file, message_decompress=unzstd)
+            return SqliteReader(file, shown=shown, message_decompress=unzstd)
         return reader
 
     def _unpack_first(self) -> None:
@@ -123,9 +141,8 @@ class Rosbag2Reader:
         file = self._storage_files[number]
         with tempfile.TemporaryDirectory(prefix="mp4ds-", dir=self._workdir) as folder:
             copy = Path(folder) / "storage.db3"
-            decompress_file(file, copy)
-            decompress = unzstd if self._info and self._info.compression == "message" else None
-            yield SqliteReader(copy, shown=file, message_decompress=decompress)
+            (decompress_file if is_zstd(file) else copy_file)(file, copy)
+            yield self._sqlite_reader(copy, file)
 
     def _drop_unpacked(self) -> None:
         if self._unpacked:
@@ -169,7 +186,7 @@ class Rosbag2Reader:
         known = {(channel.topic, channel.type_name) for channel in self._channels.values()}
         for topic in self._info.topics:
             if (topic.name, topic.type_name) not in known:
-                channel = _listed_channel(topic, len(self._channels))
+                channel = topic.to_channel(len(self._channels))
                 self._channels[channel.identity, 0] = channel
 
     @property
@@ -195,23 +212,54 @@ class Rosbag2Reader:
     @property
     def position(self) -> int:
         """Bytes consumed; within an sqlite3 file by the part of its messages read."""
-        if not self._active:
-            return self._done
-        number, reader = self._active
-        if isinstance(reader, McapReader):
-            return self._done + reader.position
-        return self._done + int(reader.fraction * self._storage_files[number].stat().st_size)
+        return self._done + sum(
+            reader.position
+            if isinstance(reader, McapReader)
+            else int(reader.fraction * self._storage_files[number].stat().st_size)
+            for number, reader in self._active
+        )
 
-    def records(self) -> Iterator[Record]:
-        """Read everything once. See `BagReader.records`."""
+    @property
+    def is_indexed(self) -> bool:
+        """See `BagReader.is_indexed`; files that must be decompressed as a whole are not."""
+        return self._gives_excerpts and all(
+            reader and reader.is_indexed for reader in self._readers
+        )
+
+    @property
+    def _gives_excerpts(self) -> bool:
+        """Whether each storage file gives excerpts in log-time order, if not always fast."""
+        return not any(self._is_packed) and all(
+            isinstance(reader, SqliteReader) or (reader is not None and reader.is_indexed)
+            for reader in self._readers
+        )
+
+    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+        """Read everything once, or a part of it. See `BagReader.records`."""
         self._done = 0
-        yield self._info_record()
+        if excerpt.others:
+            yield self._info_record()
         if self.path.is_dir():
             self._done += self.files[0].stat().st_size
+        if self._gives_excerpts:
+            starts = [reader.start or 0 for reader in self._readers if reader]
+            yield from merged(
+                [
+                    Part(start, partial(self._file_records, number, excerpt))
+                    for number, start in enumerate(starts)
+                ]
+            )
+        else:
+            yield from filter(excerpt.has, self._consecutive_records(excerpt))
+        self._add_listed_topics()
+
+    def _consecutive_records(self, excerpt: Excerpt) -> Iterator[Record]:
+        """What an excerpt needs at least, file by file."""
         held = HoldBack()
+        part = EVERYTHING if excerpt.has_messages else excerpt
         for number in range(len(self._storage_files)):
             until = self._later_start(number)
-            for record in self._file_records(number):
+            for record in self._file_records(number, part):
                 if isinstance(record, Message) and (
                     held or (until is not None and record.log_time > until)
                 ):
@@ -221,23 +269,21 @@ class Rosbag2Reader:
                 else:
                     yield record
         yield from held.release(None)
-        self._add_listed_topics()
 
-    def _file_records(self, number: int) -> Iterator[Record]:
-        packed = self._readers[number] is None
+    def _file_records(self, number: int, excerpt: Excerpt) -> Iterator[Record]:
         with self._opened(number) as reader:
             self._take_over(number, reader)
-            if packed and isinstance(reader, SqliteReader):
+            if isinstance(reader, SqliteReader) and number not in self._tables:
                 yield MetadataRecord(TABLES_RECORD, reader.tables)
-            self._active = number, reader
+            self._active.append((number, reader))
             try:
-                for record in reader.records():
+                for record in reader.records(excerpt):
                     if isinstance(record, Message):
-                        yield replace(record, channel=self._share(number, record.channel))
+                        yield record.of_channel(self._share(number, record.channel))
                     else:
                         yield record
             finally:
-                self._active = None
+                self._active.remove((number, reader))
             self._take_over(number, reader)
         self._done += self._storage_files[number].stat().st_size
         if number == 0:
@@ -254,9 +300,8 @@ class Rosbag2Reader:
         }
         if self._info:
             content[METADATA_FILE] = self._info.text
-        for reader in self._readers:
-            if isinstance(reader, SqliteReader):
-                content.update(reader.tables)
+        for tables in self._tables.values():
+            content.update(tables)
         return MetadataRecord(RECORD, content)
 
     def stats(self) -> Mapping[int, ChannelStats]:
@@ -268,7 +313,7 @@ class Rosbag2Reader:
                 return {}
             for channel in reader.channels:
                 shared = self._share(number, channel).id
-                total[shared] = _add_stats(total.get(shared), stats.get(channel.id, _NO_STATS))
+                total[shared] = total.get(shared, _NO_STATS).plus(stats.get(channel.id, _NO_STATS))
         for channel in self._channels.values():
             total.setdefault(channel.id, _NO_STATS)
         return total
@@ -297,7 +342,7 @@ class Rosbag2Reader:
                         continue
                     message = reader.first(own)
                     if message and (best is None or message.log_time < best.log_time):
-                        best = replace(message, channel=channel)
+                        best = message.of_channel(channel)
         return best
 
     def __enter__(self) -> Rosbag2Reader:
@@ -320,7 +365,7 @@ def _folder_info(path: Path) -> BagInfo:
         raise SourceError(
             path,
             f"has no {METADATA_FILE}",
-            "If it is a rosbag2 recording, run `ros2 bag reindex` on it first.",
+            f"If it is a rosbag2 recording, run `ros2 bag reindex` on it first, or {_GO_ON}",
         )
     info = read_bag_info(path / METADATA_FILE)
     missing = [name for name in info.file_names if not (path / name).exists()]
@@ -329,7 +374,7 @@ def _folder_info(path: Path) -> BagInfo:
         raise SourceError(
             path,
             f"is incomplete: {missing[0]}{more}, which its {METADATA_FILE} names, is missing",
-            "Add what is missing, or run `ros2 bag reindex` to go without it.",
+            f"Add what is missing, or run `ros2 bag reindex` to go without it, or {_GO_ON}",
         )
     return info
 
@@ -343,13 +388,6 @@ def _sibling_info(path: Path) -> BagInfo | None:
     return info if path.name in info.file_names else None
 
 
-def _is_mcap(file: Path, compressed: bool) -> bool:
-    if compressed:
-        return ".mcap" in file.suffixes
-    with open_source(file) as stream:
-        return stream.read(len(MAGIC)) == MAGIC
-
-
 def _tells_message_compression(reader: SqliteReader) -> bool:
     texts = [text for key, text in reader.tables.items() if ":metadata:" in key]
     return bool(texts) and parse_bag_info(texts[-1], reader.path).compression == "message"
@@ -358,22 +396,3 @@ def _tells_message_compression(reader: SqliteReader) -> bool:
 def _is_complete(reader: StorageReader) -> bool:
     """Whether all channels are known without reading."""
     return isinstance(reader, SqliteReader) or reader.has_statistics
-
-
-def _listed_channel(topic: Topic, channel_id: int) -> Channel:
-    metadata = {QOS_KEY: topic.qos, HASH_KEY: topic.type_hash}
-    return Channel(
-        channel_id,
-        topic.name,
-        topic.serialization_format,
-        Schema(topic.type_name, "", b""),
-        {key: value for key, value in metadata.items() if value is not None},
-    )
-
-
-def _add_stats(old: ChannelStats | None, new: ChannelStats) -> ChannelStats:
-    if old is None or not old.count:
-        return new
-    if not new.count:
-        return old
-    return ChannelStats(old.count + new.count, min(old.start, new.start), max(old.end, new.end))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +11,10 @@ from typing import Any
 
 import yaml
 
+from mp4ds.bags.mcap_records import SALVAGE_REMEDY
+from mp4ds.bags.rosbag2_sqlite import HASH_KEY, QOS_KEY
 from mp4ds.errors import SourceError
+from mp4ds.records import Channel, Schema
 
 METADATA_FILE = "metadata.yaml"
 NEWEST_VERSION = 9
@@ -76,6 +80,17 @@ class Topic:
     type_hash: str | None
     count: int
 
+    def to_channel(self, channel_id: int) -> Channel:
+        """The channel of a topic that the storage does not have."""
+        metadata = {QOS_KEY: self.qos, HASH_KEY: self.type_hash}
+        return Channel(
+            channel_id,
+            self.name,
+            self.serialization_format,
+            Schema(self.type_name, "", b""),
+            {key: value for key, value in metadata.items() if value is not None},
+        )
+
 
 @dataclass(frozen=True)
 class BagInfo:
@@ -115,11 +130,13 @@ def read_bag_info(path: Path) -> BagInfo:
     if len(data) > _MAX_BYTES:
         raise SourceError(path, f"is larger than {_MAX_BYTES} bytes")
     if not data.strip():
-        raise SourceError(path, "is empty", "Make it anew with `ros2 bag reindex`.")
+        raise SourceError(
+            path, "is empty", f"Make it anew with `ros2 bag reindex`; {SALVAGE_REMEDY}"
+        )
     try:
         return parse_bag_info(data.decode(), path)
     except UnicodeDecodeError:
-        raise SourceError(path, "is not UTF-8 text") from None
+        raise SourceError(path, "is not UTF-8 text", SALVAGE_REMEDY) from None
 
 
 def parse_bag_info(text: str, path: Path) -> BagInfo:
@@ -135,7 +152,8 @@ def parse_bag_info(text: str, path: Path) -> BagInfo:
     document = _load(text, path)
     info = document.get(_TOP_KEY, document) if isinstance(document, dict) else None
     if not isinstance(info, dict) or "version" not in info:
-        raise SourceError(path, f"is no metadata of rosbag2: it has no {_TOP_KEY}")
+        problem = f"is no metadata of rosbag2: it has no {_TOP_KEY}"
+        raise SourceError(path, problem, SALVAGE_REMEDY)
     try:
         version = int(info["version"])
         if version > NEWEST_VERSION:
@@ -161,15 +179,18 @@ def parse_bag_info(text: str, path: Path) -> BagInfo:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         if isinstance(error, SourceError):
             raise
-        raise SourceError(path, f"is no metadata of rosbag2 as expected: {error!r}") from None
+        problem = f"is no metadata of rosbag2 as expected: {error!r}"
+        raise SourceError(path, problem, SALVAGE_REMEDY) from None
 
 
 def _load(text: str, path: Path) -> Any:
     try:
-        return yaml.load(text, Loader=_Loader)
+        value = yaml.load(text, Loader=_Loader)
+        json.dumps(value, default=str)  # refuses what holds itself, by an alias
+        return value
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
-        raise SourceError(path, f"is not valid YAML: {reason}") from None
+        raise SourceError(path, f"is not valid YAML: {reason}", SALVAGE_REMEDY) from None
 
 
 def _text(value: Any) -> str:

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.mcap_records import DamageError, open_source
+from mp4ds.bags.mcap_records import SALVAGE_REMEDY, DamageError, open_source
 from mp4ds.errors import SourceError
-from mp4ds.records import Channel, ChannelStats, Message, Schema
+from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Schema
 
 QOS_KEY = "offered_qos_profiles"
 HASH_KEY = "topic_type_hash"
@@ -24,6 +24,11 @@ _TOPIC_COLUMNS = ("id", "name", "type", "serialization_format")
 _MESSAGE_COLUMNS = {"id", "topic_id", "timestamp", "data"}
 _KNOWN_TABLES = {"messages", "topics", "schema", "metadata", "message_definitions"}
 _METADATA_KEYS = {"type_description_hash": HASH_KEY}
+_TIME_INDEXES = """
+    SELECT COUNT(*) FROM pragma_index_list('messages') AS list, pragma_index_info(list.name) AS info
+    WHERE NOT list.partial AND info.seqno = 0 AND info.name = 'timestamp'
+"""
+_INT64 = -(2**63), 2**63 - 1
 
 
 class SqliteReader:
@@ -39,6 +44,7 @@ class SqliteReader:
 
     Attributes:
         tables: Content of the small tables by ``db3:<file>:<column>``, verbatim.
+        is_indexed: Whether a span of log time is found without looking at all messages.
 
     Raises:
         SourceError: The file is missing, damaged, or no database of rosbag2.
@@ -66,6 +72,7 @@ class SqliteReader:
             self._definitions = list(self._read_definitions(connection))
             self._channels = {channel.id: channel for channel in self._read_topics(connection)}
             self.tables: Mapping[str, str] = dict(self._read_tables(connection))
+            self.is_indexed = connection.execute(_TIME_INDEXES).fetchone() != (0,)
 
     @contextmanager
     def _connected(self) -> Iterator[sqlite3.Connection]:
@@ -86,9 +93,11 @@ class SqliteReader:
             yield connection
         except (sqlite3.Error, UnicodeDecodeError) as error:
             remedy = (
-                "It was not closed properly: open and close it once with the sqlite3 tool."
+                "It was not closed properly: open and close it once with the sqlite3 tool; "
+                + SALVAGE_REMEDY
                 if pending
-                else "If it was cut short, try the `.recover` command of the sqlite3 tool."
+                else "If it was cut short, try `.recover` of the sqlite3 tool, or not at all; "
+                + SALVAGE_REMEDY
             )
             raise SourceError(self._shown, f"cannot be read as sqlite3: {error}", remedy) from None
         finally:
@@ -206,8 +215,14 @@ class SqliteReader:
         """Part of the messages that `records` has read."""
         return min(1.0, self._rows_read / self._rows) if self._rows else 0.0
 
-    def records(self) -> Iterator[Message]:
-        """Read all messages by log time, ties as the file numbers them."""
+    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Message]:
+        """Read all messages or an excerpt by log time, ties as the file numbers them."""
+        if excerpt == EVERYTHING:
+            yield from self._all_records()
+        elif excerpt.has_messages:
+            yield from self._excerpt_records(excerpt)
+
+    def _all_records(self) -> Iterator[Message]:
         with self._connected() as connection:
             self._rows_read = 0
             # Counted without the index, which may lack messages where it is damaged.
@@ -220,11 +235,23 @@ class SqliteReader:
             if self._rows_read != self._rows:
                 raise self._bad_index()
 
+    def _excerpt_records(self, excerpt: Excerpt) -> Iterator[Message]:
+        channels = self._channels.values()
+        unwanted = {channel.id for channel in channels if not excerpt.has_topic(channel.topic)}
+        # A message of a topic id that is in no table is nobody's: everybody refuses it.
+        column = "topic_id" if unwanted else "NULL"
+        with self._connected() as connection:
+            for where, times in _conditions(excerpt):
+                query = f"SELECT id, {column} FROM messages {where} ORDER BY timestamp, id"
+                for row_id, topic_id in connection.execute(query, times):
+                    if topic_id not in unwanted:
+                        yield self._message(connection, row_id, f"message of id {row_id}")
+
     def _bad_index(self) -> SourceError:
         return SourceError(
             self._shown,
             "is damaged: its index of times does not list its messages",
-            "Make it anew with `REINDEX` in the sqlite3 tool.",
+            f"Make it anew with `REINDEX` in the sqlite3 tool; {SALVAGE_REMEDY}",
         )
 
     def _message(self, connection: sqlite3.Connection, row_id: int, place: str) -> Message:
@@ -239,18 +266,20 @@ class SqliteReader:
             raise SourceError(
                 self._shown,
                 f"{place} is of topic id {topic_id}, which its table of topics does not have",
-                "`ros2 bag convert` leaves such messages out.",
+                f"`ros2 bag convert` leaves such messages out; {SALVAGE_REMEDY}",
             )
         place = f"{place}, topic {channel.topic}"
         if not isinstance(timestamp, int) or timestamp < 0:
-            raise SourceError(self._shown, f"{place}: the time {timestamp!r} is no time")
+            problem = f"{place}: the time {timestamp!r} is no time"
+            raise SourceError(self._shown, problem, SALVAGE_REMEDY)
         if kind != b"blob":
-            raise SourceError(self._shown, f"{place}: the payload is {kind.decode()} and no blob")
+            problem = f"{place}: the payload is {kind.decode()} and no blob"
+            raise SourceError(self._shown, problem, SALVAGE_REMEDY)
         if self._decompress:
             try:
                 data = self._decompress(data)
             except DamageError as error:
-                raise SourceError(self._shown, f"{place}: {error}") from None
+                raise SourceError(self._shown, f"{place}: {error}", SALVAGE_REMEDY) from None
         return Message(channel, timestamp, timestamp, 0, data)
 
     def stats(self) -> Mapping[int, ChannelStats]:
@@ -259,7 +288,7 @@ class SqliteReader:
         with self._connected() as connection:
             for topic_id, count, start, end in connection.execute(
                 "SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp)"
-                " FROM messages GROUP BY topic_id"
+                " FROM messages NOT INDEXED GROUP BY topic_id"
             ):
                 if topic_id in stats and isinstance(start, int) and isinstance(end, int):
                     stats[topic_id] = ChannelStats(count, start, end)
@@ -283,3 +312,25 @@ class SqliteReader:
                 (channel.id,),
             ).fetchone()
             return self._message(connection, row[0], "the first message") if row else None
+
+
+def _conditions(excerpt: Excerpt) -> Iterator[tuple[str, list[int]]]:
+    """For each query of an excerpt's span, its condition and the times that this names.
+
+    Sqlite sorts null before all numbers, and text and blobs behind them: as nothing of that is
+    a time, the spans that are open at the start or the end refuse it.
+    """
+    first, last = _INT64
+    start, end = excerpt.start, excerpt.end
+    if (start is not None and start > last) or (end is not None and end <= first):
+        return
+    if start is not None and start <= first:
+        start = None
+    if end is not None and end > last:
+        end = None
+    terms = {"timestamp >= ?": start, "timestamp < ?": end}
+    known = {term: time for term, time in terms.items() if time is not None}
+    if start is None and end is not None:
+        yield "WHERE timestamp IS NULL", []
+    condition = f"WHERE {' AND '.join(known)}" if known else ""
+    yield condition, list(known.values())

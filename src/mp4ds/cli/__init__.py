@@ -15,13 +15,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated, NoReturn, Optional
+from typing import Annotated, Any, NoReturn, Optional
 
 import typer
 
 from mp4ds._version import __version__
+from mp4ds.cli.arguments import parse_share, parse_size
 from mp4ds.cli.output import (
-    pack_progress,
     print_info,
     print_json,
     print_pack,
@@ -31,8 +31,10 @@ from mp4ds.cli.output import (
     status_line,
     unpack_progress,
 )
-from mp4ds.errors import Mp4dsError
+from mp4ds.cli.progress import pack_progress
+from mp4ds.errors import Mp4dsError, OptionError
 
+_AGAIN = "run the same command again to go on"
 _BAD_PATH = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EACCES, errno.EINVAL)
 
 app = typer.Typer(
@@ -69,13 +71,19 @@ def _top(
 @app.command()
 def pack(
     sources: Annotated[
-        list[Path],
+        list[str],
         typer.Argument(
             metavar="SOURCE...", help="A .bag, a rosbag2 folder or an .mcap; or several parts."
         ),
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="DATASET", help="The folder to make.")
+        str,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="DATASET",
+            help="The folder to make; with a slash at its end, one dataset per SOURCE in it.",
+        ),
     ],
     topics: TopicsOption = None,
     exclude: ExcludeOption = None,
@@ -107,46 +115,104 @@ def pack(
     gop: Annotated[
         int, typer.Option("--gop", min=1, max=100_000, help="Most frames between key frames.")
     ] = 60,
+    window: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(
+            "--window",
+            min=2,
+            max=10_000_000,
+            help="Frames in each part of a long recording; 10 groups of --gop by default.",
+        ),
+    ] = None,
     jobs: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option("--jobs", "-j", min=1, max=256, help="Cores to use; all by default."),
+        typer.Option(
+            "--jobs", "-j", min=1, max=1024, help="Processes at a time; all cores by default."
+        ),
     ] = None,
+    memory: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            "--memory", metavar="SIZE", help="Such as 8G; half of the machine's by default."
+        ),
+    ] = None,
+    cluster: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            "--cluster", metavar="ADDRESS", help="Dask scheduler, tcp://HOST:PORT, or slurm."
+        ),
+    ] = None,
+    shard: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--shard", metavar="I/N", help="Pack one share of the parts only."),
+    ] = None,
+    join: Annotated[
+        bool, typer.Option("--join", help="Make the dataset of what the shards packed.")
+    ] = False,
+    keep_going: Annotated[
+        bool, typer.Option("--keep-going", help="Where a part fails, go on with the others.")
+    ] = False,
+    salvage: Annotated[
+        bool, typer.Option("--salvage", help="Pack what can be read of a damaged recording.")
+    ] = False,
+    restart: Annotated[
+        bool, typer.Option("--restart", help="Begin anew where an unfinished pack was left.")
+    ] = False,
     force: ForceFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Pack a recording into a dataset of mp4 files.
 
-    Lossless by default: `mp4ds unpack` gives every message back as it was.
+    Lossless by default: `mp4ds unpack` gives every message back as it was. A pack that was
+    interrupted goes on when the same command is run again.
     """
-    from mp4ds.packing import PackOptions
+    from mp4ds.packing import PackOptions, PackSummary, pack_each, pack_share
     from mp4ds.packing import pack as run
 
-    options = PackOptions(
-        topics=topics or (),
-        exclude=exclude or (),
-        quality=quality,
-        codec=codec,
-        preset=preset,
-        transcode=transcode,
-        camera_info=camera_info or (),
-        gop=gop,
-        jobs=jobs,
-        force=force,
-    )
-    with _errors(as_json), pack_progress(as_json) as progress:
-        summary = run(sources, output, options, progress=progress)
+    summaries: list[PackSummary] = []
+    with _errors(as_json), pack_progress(as_json, whole=not shard) as progress:
+        options = PackOptions(
+            topics=topics or (),
+            exclude=exclude or (),
+            quality=quality,
+            codec=codec,
+            preset=preset,
+            transcode=transcode,
+            camera_info=camera_info or (),
+            gop=gop,
+            window=window,
+            jobs=jobs,
+            memory=parse_size(memory) if memory else None,
+            cluster=cluster,
+            join=join,
+            keep_going=keep_going,
+            salvage=salvage,
+            restart=restart,
+            force=force,
+        )
+        if shard and (join or output.endswith("/")):
+            raise OptionError("--shard goes neither with --join nor with several datasets.")
+        if shard:
+            pack_share(sources, output, parse_share(shard), options, progress=progress)
+        elif output.endswith("/"):
+            summaries = pack_each(sources, output, options, progress=progress)
+        else:
+            summaries = [run(sources, output, options, progress=progress)]
     if as_json:
-        print_json(summary)
-    else:
+        print_json(summaries if output.endswith("/") or shard else summaries[0])
+        return
+    for summary in summaries:
         print_pack(summary)
+    if shard:
+        print(f"share {shard} is packed; when all are, --join makes the dataset")
 
 
 @app.command()
 def unpack(
-    dataset: Annotated[Path, typer.Argument(help="A dataset, or a sidecar beside its video.")],
+    dataset: Annotated[str, typer.Argument(help="A dataset, or a sidecar beside its video.")],
     to: Annotated[str, typer.Option("--to", help="bag, rosbag2, mcap or images.")],
     output: Annotated[
-        Optional[Path],  # noqa: UP045
+        Optional[str],  # noqa: UP045
         typer.Option("--output", "-o", metavar="OUT", help="What to make."),
     ] = None,
     storage: Annotated[
@@ -198,7 +264,7 @@ def unpack(
 
 @app.command()
 def validate(
-    path: Annotated[Path, typer.Argument(help="A sidecar, a dataset, or a folder of datasets.")],
+    path: Annotated[str, typer.Argument(help="A sidecar, a dataset, or a folder of datasets.")],
     deep: Annotated[
         bool, typer.Option("--deep", help="Also decode every frame and compare every message.")
     ] = False,
@@ -206,19 +272,21 @@ def validate(
 ) -> None:
     """List every problem of a dataset; exit code 1 if there is one."""
     from mp4ds.checks import validate as run
+    from mp4ds.remote import location
 
     with _errors(as_json), status_line(as_json) as report:
-        problems = run(path, deep=deep, progress=report)
+        where = location(path)
+        problems = run(where, deep=deep, progress=report)
     if as_json:
-        print_json({"path": path, "deep": deep, "problems": problems})
+        print_json({"path": where, "deep": deep, "problems": problems})
     else:
-        print_validation(path, problems, deep=deep)
+        print_validation(where, problems, deep=deep)
     raise typer.Exit(1 if problems else 0)
 
 
 @app.command()
 def info(
-    path: Annotated[Path, typer.Argument(help="A bag, rosbag2 folder, MCAP, dataset or sidecar.")],
+    path: Annotated[str, typer.Argument(help="A bag, rosbag2 folder, MCAP, dataset or sidecar.")],
     intrinsics: Annotated[
         bool,
         typer.Option(
@@ -241,7 +309,7 @@ def info(
         print_info(result)
 
 
-def _print_intrinsics(path: Path, as_json: bool) -> None:
+def _print_intrinsics(path: str, as_json: bool) -> None:
     from mp4ds.cli.calibrations import print_intrinsics
     from mp4ds.intrinsics import intrinsics as run
 
@@ -294,8 +362,10 @@ def _errors(as_json: bool) -> Iterator[None]:
     """Turn errors raised on purpose into one sentence and an exit code."""
     try:
         yield
-    except KeyboardInterrupt:
-        _fail("interrupted; nothing unfinished was left behind", 130, as_json)
+    except KeyboardInterrupt as interrupt:
+        _fail(str(interrupt) or "interrupted; nothing unfinished was left behind", 130, as_json)
+    except SystemExit as ended:  # by SIGTERM
+        _fail("ended; what is finished of a pack in parts is kept: " + _AGAIN, ended.code, as_json)
     except Mp4dsError as error:
         _fail(str(error), error.exit_code, as_json)
     except OSError as error:
@@ -306,7 +376,7 @@ def _errors(as_json: bool) -> Iterator[None]:
         _fail("out of memory; try fewer --jobs", 1, as_json)
 
 
-def _fail(message: str, code: int, as_json: bool) -> NoReturn:
+def _fail(message: str, code: Any, as_json: bool) -> NoReturn:
     if as_json:
         print_json({"error": message, "exit_code": code})
     print(f"mp4ds: {shown(message)}", file=sys.stderr)

@@ -15,8 +15,11 @@ if TYPE_CHECKING:
 
     from mp4ds.checks import Problem
     from mp4ds.info import Info, TopicInfo
-    from mp4ds.packing import PackProgress, PackSummary, TopicSummary
+    from mp4ds.packing import PackSummary, TopicSummary
+    from mp4ds.records import Loss
     from mp4ds.unpacking import UnpackProgress, UnpackSummary
+
+_LOSSES_SHOWN = 20
 
 
 def _jsonable(value: Any) -> Any:
@@ -34,46 +37,6 @@ def _console() -> Console:
     from rich.console import Console
 
     return Console(stderr=True)
-
-
-@contextmanager
-def pack_progress(as_json: bool) -> Iterator[Callable[[PackProgress], None] | None]:
-    """A bar on a terminal: bytes read, rate, size so far, time left."""
-    console = _console()
-    if as_json or not console.is_terminal:
-        yield None
-        return
-    from rich.progress import (
-        BarColumn,
-        DownloadColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-        TransferSpeedColumn,
-    )
-
-    with Progress(
-        TextColumn("packing"),
-        BarColumn(),
-        DownloadColumn(binary_units=False),
-        TransferSpeedColumn(),
-        TextColumn("-> {task.fields[written]}, {task.fields[frames]} frames"),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-    ) as bar:
-        task = bar.add_task("pack", total=None, written="0 B", frames=0)
-
-        def report(state: PackProgress) -> None:
-            bar.update(
-                task,
-                completed=state.bytes_read,
-                total=state.bytes_total,
-                written=_size(state.bytes_written),
-                frames=state.frames,
-            )
-
-        yield report
 
 
 @contextmanager
@@ -132,7 +95,8 @@ def say(value: object) -> None:
     print(shown(value))
 
 
-def _size(count: float) -> str:
+def size_text(count: float) -> str:
+    """Bytes in the unit that suits them."""
     for unit in ("B", "kB", "MB", "GB"):
         if count < 1000:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
@@ -174,13 +138,26 @@ def print_pack(summary: PackSummary) -> None:
         say(f"not packed, as no dataset can hold it: {count} {what}")
     if summary.left_out:
         say(f"left out: {', '.join(summary.left_out)}")
+    for loss in summary.losses[:_LOSSES_SHOWN]:
+        say(f"lost: {_loss_text(loss)}")
+    if len(summary.losses) > _LOSSES_SHOWN:
+        say(f"lost: {len(summary.losses) - _LOSSES_SHOWN} places more; dataset.yaml lists them")
     if not any(topic.files for topic in summary.topics):
         say("no topic became a video: all messages are in messages.mcap as they were")
     ratio = summary.source_bytes / summary.dataset_bytes
     say(
-        f"{summary.dataset}: {_size(summary.source_bytes)} -> {_size(summary.dataset_bytes)} "
-        f"({ratio:.2f} times smaller), of which messages.mcap {_size(summary.messages_bytes)}"
+        f"{summary.dataset}: {size_text(summary.source_bytes)} -> "
+        f"{size_text(summary.dataset_bytes)} "
+        f"({ratio:.2f} times smaller), of which messages.mcap {size_text(summary.messages_bytes)}"
     )
+
+
+def _loss_text(loss: Loss) -> str:
+    place = f" at byte {loss.offset}" if loss.offset is not None else ""
+    size = f", {size_text(loss.size)}" if loss.size is not None else ""
+    messages = f"; {loss.messages} messages" if loss.messages is not None else ""
+    topics = f" of {', '.join(loss.topics)}" if loss.topics else ""
+    return f"{loss.file}{place}{size}: {loss.problem}{messages}{topics}"
 
 
 def _pack_row(topic: TopicSummary) -> list[str]:
@@ -194,8 +171,8 @@ def _pack_row(topic: TopicSummary) -> list[str]:
         topic.type_name,
         str(topic.messages),
         str(topic.frames) if topic.files else "",
-        _size(topic.raw_bytes),
-        _size(topic.packed_bytes) if topic.packed_bytes else "",
+        size_text(topic.raw_bytes),
+        size_text(topic.packed_bytes) if topic.packed_bytes else "",
         _number(ratio, 2),
         stored,
     ]
@@ -235,7 +212,7 @@ def print_validation(path: Path, problems: list[Problem], *, deep: bool) -> None
 
 def print_info(result: Info) -> None:
     """Print what is in a recording or dataset."""
-    say(f"{result.path}: {result.kind}, profile {result.profile or '-'}, {_size(result.bytes)}")
+    say(f"{result.path}: {result.kind}, profile {result.profile or '-'}, {size_text(result.bytes)}")
     if result.start is not None and result.end is not None:
         start = datetime.fromtimestamp(result.start / 1e9, timezone.utc)
         say(
@@ -256,7 +233,7 @@ def _info_row(topic: TopicInfo) -> list[str]:
         _number(topic.jitter_ms, 2),
         str(topic.gaps) if topic.gaps else "",
         _number(topic.longest_gap_s, 3),
-        _size(topic.bytes) if topic.bytes is not None else "",
+        size_text(topic.bytes) if topic.bytes is not None else "",
         topic.content,
         topic.stored,
     ]

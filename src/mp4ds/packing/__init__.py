@@ -1,21 +1,45 @@
-"""Source -> dataset: one pass over a recording, images into videos, all the rest verbatim."""
+"""Source -> dataset: images into videos, all the rest verbatim.
+
+A short recording is packed in one pass. A long one is divided into tasks, which run on every
+core or on other machines, and whose results stay until all are there.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from mp4ds.bags import open_sources
-from mp4ds.errors import OptionError, SourceError, WriteError
-from mp4ds.outputs import staged
-from mp4ds.packing.packer import Packer
+from mp4ds.engine import Engine, ProcessEngine
+from mp4ds.errors import FormatError, OptionError, SourceError, TargetExistsError, WriteError
+from mp4ds.outputs import check_target, staged
+from mp4ds.packing.coordinator import Coordinator, Run, claimed
+from mp4ds.packing.job import outcome_options
+from mp4ds.packing.planning import Means, plan_job
 from mp4ds.packing.report import PackOptions, PackProgress, PackSummary, TopicSummary
+from mp4ds.packing.single import pack_in_one_pass
+from mp4ds.packing.uploading import pack_to_store, shared_folder
+from mp4ds.packing.work import command
+from mp4ds.packing.workplace import Workplace
 from mp4ds.plan import parse_quality
-from mp4ds.sidecar import MANIFEST_NAME
+from mp4ds.remote import RemotePath, location, remote
+from mp4ds.sidecar import MANIFEST_NAME, load_manifest
 from mp4ds.video import check_codec
 
-__all__ = ["PackOptions", "PackProgress", "PackSummary", "TopicSummary", "is_dataset", "pack"]
+__all__ = [
+    "PackOptions",
+    "PackProgress",
+    "PackSummary",
+    "TopicSummary",
+    "is_dataset",
+    "pack",
+    "pack_each",
+    "pack_share",
+]
+
+Report = Callable[[PackProgress], None]
 
 
 def pack(
@@ -23,13 +47,13 @@ def pack(
     dataset: Path | str,
     options: PackOptions | None = None,
     *,
-    progress: Callable[[PackProgress], None] | None = None,
+    progress: Report | None = None,
 ) -> PackSummary:
     """Pack a recording into a dataset.
 
     Args:
-        sources: A bag, rosbag2 folder or MCAP file, or several that belong together.
-        dataset: The folder to make.
+        sources: A bag, rosbag2 folder or MCAP file, or several that belong together; or URLs.
+        dataset: The folder to make, or its URL.
         options: How; the default loses nothing.
         progress: Called several times a second.
 
@@ -37,32 +61,216 @@ def pack(
         What became of each topic.
 
     Raises:
-        SourceError: The recording cannot be read. Nothing is left behind.
+        SourceError: The recording cannot be read.
         TargetError: The dataset may not be written there.
-        WriteError: The disk refused. Nothing is left behind.
+        WriteError: The disk refused.
+        RemoteError: A store or web server fails.
         OptionError: An option is wrong.
+        PartsFailedError: Parts of a long recording failed; those finished are kept beside the
+            dataset, and calling again goes on with the others. Else nothing is left behind.
     """
-    chosen = options or PackOptions()
-    paths = [Path(sources)] if isinstance(sources, (str, Path)) else [Path(p) for p in sources]
-    target = Path(os.path.abspath(dataset))  # noqa: PTH100 - keeps links, unlike resolve()
-    quality = parse_quality(chosen.quality)
-    if chosen.transcode and quality.lossless:
+    chosen = _checked(options or PackOptions())
+    return _pack(_paths(sources), _absolute(dataset), chosen, progress)
+
+
+def _pack(
+    paths: Sequence[Path], target: Path, options: PackOptions, progress: Report | None
+) -> PackSummary:
+    store = remote(target)
+    if store:
+        pack_here = partial(_pack, paths)
+        return pack_to_store(paths, store, options, is_dataset, pack_here, progress)
+    run = _plan(paths, target, options)
+    if run.is_new and run.job.is_single and not options.cluster:
+        return _pack_in_one_pass(run, progress)
+    return _pack_runs([run], options, progress)[0]
+
+
+def pack_share(
+    sources: Sequence[Path | str] | Path | str,
+    dataset: Path | str,
+    share: tuple[int, int],
+    options: PackOptions | None = None,
+    *,
+    progress: Report | None = None,
+) -> None:
+    """Pack one machine's share of a recording; `pack` makes the dataset when all shares are there.
+
+    Args:
+        sources: As for `pack`, under the same path on all machines.
+        dataset: The folder to make in the end; beside it the parts are made.
+        share: Number of this share, from 1, and how many there are.
+        options: How; the same for all shares.
+        progress: Called several times a second.
+
+    Raises:
+        Mp4dsError: As `pack`.
+    """
+    chosen = _checked(options or PackOptions())
+    target = _absolute(dataset)
+    store = remote(target)
+    run = _plan(_paths(sources), shared_folder(store) if store else target, chosen)
+    _pack_runs([run], chosen, progress, share=share)
+
+
+def pack_each(
+    sources: Sequence[Path | str],
+    folder: Path | str,
+    options: PackOptions | None = None,
+    *,
+    progress: Report | None = None,
+) -> list[PackSummary]:
+    """Pack recordings into one dataset each, as one job.
+
+    Args:
+        sources: Each a bag, rosbag2 folder or MCAP file, or its URL.
+        folder: Where, or at which URL, to make the datasets; each is named as its recording.
+        options: How.
+        progress: Called several times a second.
+
+    Returns:
+        What became of each that was packed now; datasets that are there already, of the same
+        recordings, are left as they are.
+
+    Raises:
+        Mp4dsError: As `pack`.
+    """
+    chosen = _checked(options or PackOptions())
+    parent = _absolute(folder)
+    targets: dict[Path, Path] = {}
+    for source in map(location, sources):
+        target = parent / (source.name if source.is_dir() else source.stem)
+        if target in targets:
+            raise OptionError(
+                f"{targets[target]} and {source} would both become {target}. Pack one elsewhere."
+            )
+        targets[target] = source
+    if remote(parent):  # one after the other, so that only one is on this machine at a time
+        return [
+            _pack([source], target, chosen, progress)
+            for target, source in targets.items()
+            if chosen.force or not _is_packed(source, target)
+        ]
+    parent.mkdir(exist_ok=True)
+    runs = []
+    for target, source in targets.items():
+        if chosen.force or not _is_packed(source, target):
+            runs.append(_plan([source], target, chosen, recordings=len(targets)))
+    return _pack_runs(runs, chosen, progress)
+
+
+def _is_packed(source: Path, target: Path) -> bool:
+    """Whether a dataset of a recording is there already."""
+    if not (target / MANIFEST_NAME).exists() if remote(target) else not os.path.lexists(target):
+        return False
+    with open_sources([source]) as reader:
+        sizes = sorted(path.stat().st_size for path in reader.files)
+    try:
+        manifest = load_manifest(target / MANIFEST_NAME)
+    except FormatError:
+        raise TargetExistsError(target) from None
+    if sorted(item.size for item in manifest.sources) != sizes:
+        raise TargetExistsError(target)
+    return True
+
+
+def _checked(options: PackOptions) -> PackOptions:
+    """Refuse options that contradict each other.
+
+    Raises:
+        OptionError: They do.
+    """
+    quality = parse_quality(options.quality)
+    if options.transcode and quality.lossless:
         raise OptionError(
             "--transcode goes with a lossy --quality, such as visual: without loss, a JPEG file "
             "is smaller than any video of its pixels."
         )
-    check_codec(chosen.codec, chosen.preset, lossless=quality.lossless)
+    check_codec(options.codec, options.preset, lossless=quality.lossless)
+    return options
+
+
+def _plan(paths: Sequence[Path], target: Path, options: PackOptions, *, recordings: int = 1) -> Run:
+    """The pack of a recording: one that was begun before, or a new one."""
+    check_target(target, force=options.force, replaceable=is_dataset, sources=paths)
+    place = Workplace.beside(target)
+    job = None if options.restart else place.job()
+    if job is not None:
+        return Run(job, place, paths, target, options.force, is_new=False)
+    if options.join:
+        raise OptionError(
+            f"There is nothing to join: {place.folder} holds no pack. Run the shards first."
+        )
+    with open_sources(paths, salvage=options.salvage) as reader:
+        job = plan_job(reader, paths, options, Means.of(options).for_one_of(recordings))
+    return Run(job, place, paths, target, options.force, is_new=True)
+
+
+def _pack_in_one_pass(run: Run, progress: Report | None) -> PackSummary:
     with (
-        open_sources(paths) as reader,
-        staged(target, force=chosen.force, replaceable=is_dataset, sources=paths) as folder,
+        run.job.open() as reader,
+        staged(run.target, force=run.force, replaceable=is_dataset, sources=run.paths) as folder,
     ):
         folder.mkdir()
         try:
-            return Packer(reader, folder, chosen, quality, progress).run(target)
+            return pack_in_one_pass(reader, run.job, folder, run.target, progress)
         except OSError as error:
             if isinstance(error, SourceError) or error.errno is None:
                 raise
-            raise WriteError(target, error) from error
+            raise WriteError(run.target, error) from error
+
+
+def _pack_runs(
+    runs: Sequence[Run],
+    options: PackOptions,
+    progress: Report | None,
+    *,
+    share: tuple[int, int] | None = None,
+) -> list[PackSummary]:
+    """Run the tasks of packs, and make their datasets unless only a share of the tasks is run."""
+    summaries = []
+    with claimed(runs, shared=share is not None):
+        for run in runs:
+            run.begin(outcome_options(options), anew=options.restart, alone=share is None)
+        coordinator = Coordinator(
+            runs,
+            _engine(runs, options),
+            keep_going=options.keep_going,
+            share_of=share or (1, 1),
+            report=progress,
+        )
+        if options.join:
+            coordinator.refuse_missing()
+        for run in coordinator.run():
+            if share is None:
+                summaries.append(coordinator.finish(run))
+    return summaries
+
+
+def _engine(runs: Sequence[Run], options: PackOptions) -> Engine:
+    if options.cluster:
+        from mp4ds.engine.cluster import ClusterEngine
+        from mp4ds.packing.work import run_task
+
+        return ClusterEngine(run_task, options.cluster, task_bytes=_task_bytes(runs))
+    means = Means.of(options)
+    return ProcessEngine(command, min((means.slots(run.job) for run in runs), default=1))
+
+
+def _task_bytes(runs: Sequence[Run]) -> int:
+    return max((run.job.task_bytes for run in runs), default=0)
+
+
+def _paths(sources: Sequence[Path | str] | Path | str) -> list[Path]:
+    several = [sources] if isinstance(sources, (str, Path, RemotePath)) else sources
+    return [location(path) for path in several]
+
+
+def _absolute(path: Path | str) -> Path:
+    found = location(path)
+    if remote(found):
+        return found
+    return Path(os.path.abspath(found))  # noqa: PTH100 - keeps links, unlike resolve()
 
 
 def is_dataset(path: Path) -> bool:

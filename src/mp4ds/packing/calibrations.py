@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from mp4ds.packing.report import TopicSummary
@@ -21,8 +22,14 @@ class _InfoChannel:
 
     writer: CameraInfoWriter
     owner: StreamWriter | None = None
-    count: int = 0
-    pending: list[Message] = field(default_factory=list)
+    pending: list[tuple[Message, int]] = field(default_factory=list)
+
+
+def unpaired_infos(channels: Sequence[Channel], pairs: Mapping[int, int]) -> set[int]:
+    """Ids of the calibration channels that stamps may pair with images."""
+    if not any(map(is_camera, channels)):
+        return set()
+    return {channel.id for channel in filter(is_calibration, channels)} - set(pairs)
 
 
 class Calibrations:
@@ -31,6 +38,7 @@ class Calibrations:
     Args:
         channels: The recording's, as far as they are packed.
         chosen: Pairs that the user names, ``IMAGE=INFO``.
+        surveyed: Pairs that stamps told before, by id; None to look at the stamps here.
         topic_of: The summary of a channel's topic.
         keep: Stores what belongs to no stream.
 
@@ -42,6 +50,7 @@ class Calibrations:
         self,
         channels: Sequence[Channel],
         chosen: Sequence[str],
+        surveyed: Mapping[int, int] | None = None,
         *,
         topic_of: Callable[[Channel], TopicSummary],
         keep: Callable[[Message], None],
@@ -50,27 +59,32 @@ class Calibrations:
         self._keep = keep
         self._channels = {channel.id: channel for channel in channels}
         self._pairs = pair_camera_infos(channels, chosen=choose_pairs(chosen, channels))
-        infos = [channel.id for channel in filter(is_calibration, channels)]
-        unpaired = set(infos) - set(self._pairs)
-        has_images = any(map(is_camera, channels))
-        self._by_stamp = StampPairing() if unpaired and has_images else None
+        self._by_stamp = None
+        if surveyed is not None:
+            self._pairs.update(surveyed)
+        elif unpaired_infos(channels, self._pairs):
+            self._by_stamp = StampPairing()
         self._forms: dict[int, Forms] = {}
         self._infos: dict[int, _InfoChannel | None] = {}
+        self._counts: Counter[tuple[object, ...]] = Counter()
         self._streams: dict[tuple[object, ...], StreamWriter] = {}
 
     def take(self, message: Message) -> None:
         """Take a calibration into its stream, or keep it if it belongs to none."""
         channel = message.channel
+        # its place among those of all channels that cannot be told apart from its own
+        ordinal = self._counts[channel.identity]
+        self._counts[channel.identity] += 1
         if channel.id not in self._infos:
             self._infos[channel.id] = self._new(channel)
         state = self._infos[channel.id]
         if state is None:
             self._keep(message)
         elif state.owner is not None:
-            self._add(state, message)
+            self._add(state, message, ordinal)
         elif len(state.pending) < _MAX_PENDING:
             # a copy: a view would keep the reader's whole chunk in memory
-            state.pending.append(replace(message, data=bytes(message.data)))
+            state.pending.append((replace(message, data=bytes(message.data)), ordinal))
             self._pair_by_stamp(message, state)
         else:
             self._give_up(channel.id, state)
@@ -99,14 +113,6 @@ class Calibrations:
                 self._give_up(info_id, state)
             else:
                 state.owner.camera_info = state.writer.to_model()
-
-    def in_sidecars(self) -> set[tuple[object, ...]]:
-        """Identities of the channels that a sidecar describes; call after `finish`."""
-        return {
-            state.writer.channel.identity
-            for state in self._infos.values()
-            if state is not None and state.owner is not None and state.owner.camera_info
-        }
 
     def _new(self, channel: Channel) -> _InfoChannel | None:
         if channel.id not in self._pairs and self._by_stamp is None:
@@ -143,13 +149,11 @@ class Calibrations:
             state.owner = self._owner_of(info_id)
             if state.owner is not None:
                 pending, state.pending = state.pending, []
-                for message in pending:
-                    self._add(state, message)
+                for message, ordinal in pending:
+                    self._add(state, message, ordinal)
 
-    def _add(self, state: _InfoChannel, message: Message) -> None:
+    def _add(self, state: _InfoChannel, message: Message, ordinal: int) -> None:
         topic = self._topic_of(message.channel)
-        ordinal = state.count
-        state.count += 1
         try:
             state.writer.accept(message, ordinal)
             topic.frames += 1
@@ -158,6 +162,6 @@ class Calibrations:
             self._keep(message)
 
     def _give_up(self, info_id: int, state: _InfoChannel) -> None:
-        for message in state.pending:
+        for message, _ in state.pending:
             self._keep(message)
         self._infos[info_id] = None

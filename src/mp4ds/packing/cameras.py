@@ -10,10 +10,17 @@ from pathlib import Path
 from mp4ds.bags import BagReader
 from mp4ds.engine import Workers
 from mp4ds.packing.calibrations import Calibrations
+from mp4ds.packing.part import PartStream
 from mp4ds.packing.report import TopicSummary
+from mp4ds.packing.survey import (
+    MAX_STREAMS_PER_CHANNEL,
+    SAMPLES,
+    Survey,
+    decide,
+    rate_of,
+)
 from mp4ds.plan import FileNames
 from mp4ds.records import Channel, Message
-from mp4ds.sidecar import StreamSidecar
 from mp4ds.streams import (
     Looker,
     Seen,
@@ -23,14 +30,9 @@ from mp4ds.streams import (
     TrackPlan,
     Unsuited,
     needs_trial,
-    plan_tracks,
 )
 
-MAX_STREAMS_PER_CHANNEL = 16
-"""A topic that changes its geometry more often than this is not split any further."""
-
-_SAMPLES = 6
-"""Images of a stream that are held back until they have shown how it is best encoded."""
+NOT_SURVEYED = "images of its size or encoding were not met where the recording was looked into"
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +74,7 @@ class _CameraChannel:
     count: int = 0
     routes: dict[StreamKey, _Route] = field(default_factory=dict)
     held: list[_Item] = field(default_factory=list)
+    is_surveyed: bool = False
 
 
 class Cameras:
@@ -82,6 +85,7 @@ class Cameras:
         folder: Where the streams' files are made.
         settings: How to encode.
         calibrations: Takes notice of new streams.
+        survey: What was decided before; None to decide here.
         topic_of: The summary of a channel's topic.
         keep: Stores what no stream can carry exactly.
     """
@@ -92,6 +96,7 @@ class Cameras:
         folder: Path,
         settings: StreamSettings,
         calibrations: Calibrations,
+        survey: Survey | None,
         *,
         topic_of: Callable[[Channel], TopicSummary],
         keep: Callable[[Message], None],
@@ -100,21 +105,18 @@ class Cameras:
         self._folder = folder
         self._settings = settings
         self._calibrations = calibrations
+        self._survey = survey
         self._topic_of = topic_of
         self._keep = keep
         self._names = FileNames()
         self._channels: dict[tuple[object, ...], _CameraChannel] = {}
         self._streams: list[StreamWriter] = []
-        self.frames = 0
+        self._renamed: set[str] = set()
 
     def take(self, message: Message, workers: Workers) -> None:
         """Encode an image, hold it back, or keep it with the reason why no stream takes it."""
         channel = message.channel
-        if channel.identity not in self._channels:
-            self._channels[channel.identity] = _CameraChannel(
-                Looker(channel, transcode=self._settings.transcode)
-            )
-        state = self._channels[channel.identity]
+        state = self._state_of(channel)
         ordinal, number = state.count, self._topic_of(channel).messages - 1
         state.count += 1
         try:
@@ -125,14 +127,28 @@ class Cameras:
             return
         self._calibrations.saw(channel, seen)
         item = _Item(message, ordinal, number, seen)
+        if state.is_surveyed:
+            state.routes.setdefault(seen.key, _Route([], refusal=NOT_SURVEYED))
         if seen.key in state.routes and not state.held:
             self._write(state, item, workers)
             return
         state.held.append(item)
         held = Counter(other.seen.key for other in state.held)
-        enough = held[seen.key] == _SAMPLES or len(state.held) == 2 * _SAMPLES
+        enough = held[seen.key] == SAMPLES or len(state.held) == 2 * SAMPLES
         if enough or not needs_trial(seen, self._settings):
             self._settle(state, workers)
+
+    def _state_of(self, channel: Channel) -> _CameraChannel:
+        if channel.identity not in self._channels:
+            looker = Looker(channel, transcode=self._settings.transcode)
+            state = self._channels[channel.identity] = _CameraChannel(looker)
+            decisions = self._survey.decisions.get(channel.id) if self._survey else None
+            if decisions is not None:
+                state.is_surveyed = True
+                state.routes = {
+                    item.key: _Route(list(item.plans), refusal=item.refusal) for item in decisions
+                }
+        return self._channels[channel.identity]
 
     def settle(self, workers: Workers) -> None:
         """Write everything that is held back: the recording is at its end."""
@@ -150,14 +166,11 @@ class Cameras:
             self._write(state, item, workers)
 
     def _plan(self, samples: list[Seen], channel: Channel) -> _Route:
-        try:
-            return _Route(plan_tracks(samples, self._settings, self._rate(channel)))
-        except Unsuited as reason:
-            return _Route([], refusal=str(reason))
+        decision = decide(samples, self._settings, self._rate(channel))
+        return _Route(decision.plans, refusal=decision.refusal)
 
     def _rate(self, channel: Channel) -> float | None:
-        stats = self._reader.stats().get(channel.id)
-        return stats.rate if stats else None
+        return rate_of(self._reader, channel)
 
     def _write(self, state: _CameraChannel, item: _Item, workers: Workers) -> None:
         route = state.routes[item.seen.key]
@@ -168,9 +181,7 @@ class Cameras:
             except Unsuited as refusal:
                 reason = str(refusal)
                 continue
-            topic = self._topic_of(item.message.channel)
-            topic.frames += 1
-            self.frames += 1
+            self._topic_of(item.message.channel).frames += 1
             if stream.frames == 1:
                 self._calibrations.adopt(stream)
             workers.submit(self._streams.index(stream), job)
@@ -213,43 +224,27 @@ class Cameras:
             rate=self._rate(channel),
         )
         self._streams.append(stream)
-        topic = self._topic_of(channel)
-        if plan.note:
-            topic.notes.append(plan.note)
         if renamed:
-            topic.notes.append(f"stored as {stem}.mp4: the plain name was taken")
+            self._renamed.add(stem)
+        if plan.note:
+            self._topic_of(channel).notes.append(plan.note)
         return stream
 
     def _keep_verbatim(self, message: Message, number: int, reason: str) -> None:
         self._topic_of(message.channel).count_verbatim(reason, number)
         self._keep(message)
 
-    def finish(
-        self, digest: Callable[[Path], tuple[int, str]]
-    ) -> list[tuple[StreamWriter, StreamSidecar]]:
-        """Complete all videos and write their sidecars; all jobs must have run.
-
-        Args:
-            digest: Gives the size and SHA-256 of a file.
-        """
+    def finish(self) -> list[PartStream]:
+        """Complete all videos and write their sidecars; all jobs must have run."""
         finished = []
         for stream in self._streams:
             if not stream.frames:
                 stream.abandon()
                 stream.video_path.unlink(missing_ok=True)
                 continue
-            sidecar = stream.finish(digest)
-            topic = self._topic_of(stream.channel)
-            topic.files.append(stream.video_path.name)
-            topic.packed_bytes += sum(
-                path.stat().st_size for path in (stream.video_path, stream.sidecar_path)
-            )
-            finished.append((stream, sidecar))
+            stem = stream.video_path.stem
+            finished.append(PartStream(stem, stream.finish(), stem in self._renamed))
         return finished
-
-    def in_videos(self) -> set[tuple[object, ...]]:
-        """Identities of the channels that have streams."""
-        return {stream.channel.identity for stream in self._streams if stream.frames}
 
     def abandon(self) -> None:
         """Close all videos as they are; the caller removes them."""

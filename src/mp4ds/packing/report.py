@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from mp4ds.records import Loss
 from mp4ds.video.codecs import DEFAULT_GOP
 
 _MAX_REASONS = 10
+_OTHER = "other reasons"
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,16 @@ class PackOptions:
         transcode: Encode JPEG topics anew, by `quality`, instead of copying their files.
         camera_info: Pairs ``IMAGE=INFO`` of topics that belong together, beyond what names tell.
         gop: Most frames from one key frame to the next.
-        jobs: Streams encoded side by side; None for one per core.
+        window: Frames of the busiest camera in each part that is packed apart; None: 10 `gop`.
+        jobs: Processes at a time, of a recording that is packed in parts, else streams encoded
+            side by side; None for as many as keep all cores busy.
+        memory: Bytes that may be used; None for half of the machine's.
+        cluster: Dask scheduler (``tcp://HOST:PORT``) or batch system (``slurm`` ...) whose
+            workers run the parts; None for this machine.
+        join: Only make the dataset of what `mp4ds.packing.pack_share` packed.
+        keep_going: Go on with the other parts where one fails, and report all failures at the end.
+        salvage: Pack what can be read of a damaged recording.
+        restart: Begin anew where an unfinished pack was left.
         force: Replace an existing dataset.
     """
 
@@ -36,7 +47,14 @@ class PackOptions:
     transcode: bool = False
     camera_info: Sequence[str] = ()
     gop: int = DEFAULT_GOP
+    window: int | None = None
     jobs: int | None = None
+    memory: int | None = None
+    cluster: str | None = None
+    join: bool = False
+    keep_going: bool = False
+    salvage: bool = False
+    restart: bool = False
     force: bool = False
 
 
@@ -45,16 +63,37 @@ class PackProgress:
     """Where a pack stands.
 
     Attributes:
-        bytes_read: Bytes of the source consumed.
-        bytes_total: Bytes of the source.
+        dataset: What is being made.
+        phase: ``planning``, ``packing`` or ``joining``.
+        done: Share of the work of this phase that is done, 0 to 1; None where nothing tells.
+        bytes_read: Payload bytes of the messages packed so far.
+        bytes_total: Bytes of the source files.
         bytes_written: Bytes of the dataset so far.
-        frames: Frames accepted so far.
+        topics: Messages packed so far and in all (None: not known), by topic of a camera.
+        tasks_done: Parts that are done.
+        tasks_total: Parts that there are; 0 for a recording packed in one go.
+        tasks_before: Of those done, the ones that an earlier run did.
+        failed: Parts that failed.
+        note: What is being done now, if it is worth telling.
     """
 
+    dataset: Path
+    phase: str
+    done: float | None
     bytes_read: int
     bytes_total: int
     bytes_written: int
-    frames: int
+    topics: Mapping[str, tuple[int, int | None]]
+    tasks_done: int = 0
+    tasks_total: int = 0
+    tasks_before: int = 0
+    failed: int = 0
+    note: str = ""
+
+    @property
+    def frames(self) -> int:
+        """Camera messages packed so far."""
+        return sum(done for done, _ in self.topics.values())
 
 
 @dataclass
@@ -86,9 +125,26 @@ class TopicSummary:
     def count_verbatim(self, reason: str, number: int) -> None:
         """Count one more message stored verbatim, the topic's message of that number."""
         if reason not in self.verbatim and len(self.verbatim) >= _MAX_REASONS:
-            reason = "other reasons"
+            reason = _OTHER
         count, first = self.verbatim.get(reason, (0, number))
         self.verbatim[reason] = (count + 1, first)
+
+    def extend(self, later: TopicSummary, before: int) -> None:
+        """Add what became of later messages.
+
+        Args:
+            later: Of these messages alone.
+            before: Messages of the topic before them.
+        """
+        self.messages += later.messages
+        self.frames += later.frames
+        self.raw_bytes += later.raw_bytes
+        for reason, (count, number) in later.verbatim.items():
+            if reason not in self.verbatim and len(self.verbatim) >= _MAX_REASONS:
+                reason = _OTHER
+            known, first = self.verbatim.get(reason, (0, before + number))
+            self.verbatim[reason] = (known + count, first)
+        self.notes.extend(note for note in later.notes if note not in self.notes)
 
 
 @dataclass(frozen=True)
@@ -103,6 +159,7 @@ class PackSummary:
         messages_bytes: Bytes of messages.mcap.
         left_out: Topics left out on request.
         skipped: What the source holds and no dataset can: a phrase -> how many.
+        losses: What could not be read of a damaged recording.
     """
 
     dataset: Path
@@ -112,3 +169,4 @@ class PackSummary:
     messages_bytes: int
     left_out: list[str]
     skipped: dict[str, int]
+    losses: list[Loss] = field(default_factory=list)

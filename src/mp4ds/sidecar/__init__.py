@@ -14,6 +14,7 @@ from mp4ds.sidecar.io import (
 )
 from mp4ds.sidecar.manifest import (
     FileEntry,
+    LossEntry,
     Manifest,
     Source,
     StaticTransform,
@@ -51,6 +52,7 @@ __all__ = [
     "Header",
     "Image",
     "LayoutParameters",
+    "LossEntry",
     "Manifest",
     "PngFile",
     "Roi",

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, model_validator
 
+from mp4ds.records import MAX_LOSSES, MAX_LOST_TOPICS, Loss
 from mp4ds.sidecar.fields import Count, FileName, Model, Profile, Sha256, Size, Time, Version
 from mp4ds.wire.transforms import MAX_TRANSFORMS, Transform
 
@@ -71,6 +72,43 @@ class StaticTransform(Model):
         )
 
 
+class LossEntry(Model):
+    """Something of the recording that could not be read when it was packed."""
+
+    file: str = Field(description="Name of the recording's file.")
+    offset: Size | None = Field(None, description="Byte where it begins; absent without a place.")
+    size: Size | None = Field(
+        None, description="Bytes, of which some may have been read; absent where not known."
+    )
+    problem: str = Field(description="What is wrong, in words.")
+    messages: Size | None = Field(
+        None, description="Messages that are lost; absent where nothing tells."
+    )
+    topics: Annotated[list[str], Field(max_length=MAX_LOST_TOPICS)] = Field(
+        default_factory=list, description="Of the messages that are lost, as far as known."
+    )
+    start: Time | None = Field(
+        None, description="Log time of the last message read before it, ns; absent if not known."
+    )
+    end: Time | None = Field(
+        None, description="Log time of the first message read after it, ns; absent if not known."
+    )
+
+    @classmethod
+    def from_record(cls, loss: Loss) -> LossEntry:
+        """The model of a loss."""
+        return cls(
+            file=loss.file,
+            offset=loss.offset,
+            size=loss.size,
+            problem=loss.problem,
+            messages=loss.messages,
+            topics=list(loss.topics),
+            start=loss.start,
+            end=loss.end,
+        )
+
+
 class TimeRange(Model):
     """Log times of the first and the last message, ns, both included."""
 
@@ -89,6 +127,9 @@ class Manifest(Model):
     library: str = Field("", description="The recording's own library string.")
     sources: list[Source]
     messages: Size = Field(description="Messages of the recording that were packed.")
+    losses: Annotated[list[LossEntry], Field(max_length=MAX_LOSSES)] = Field(
+        default_factory=list, description="What of the recording could not be read."
+    )
     topics_left_out: list[str] = Field(
         default_factory=list, description="Topics that were left out on request."
     )

@@ -6,10 +6,12 @@ from mp4ds.streams.bodies import MessageRebuilder
 from mp4ds.streams.camera_info import CameraInfoWriter
 from mp4ds.streams.columns import ColumnsWriter, Unsuited
 from mp4ds.streams.headers import Forms
-from mp4ds.streams.look import Looker, Seen, StreamKey
+from mp4ds.streams.join import StreamJoin
+from mp4ds.streams.look import Looker, Seen, StreamKey, depends_on_others
+from mp4ds.streams.planning import needs_trial, plan_from_values, plan_to_values, plan_tracks
 from mp4ds.streams.reader import Frame, Stream
 from mp4ds.streams.rebuild import CameraInfoRebuilder
-from mp4ds.streams.tracks import StreamSettings, TrackPlan, needs_trial, plan_tracks
+from mp4ds.streams.tracks import PicturePlan, StreamSettings, TrackPlan
 from mp4ds.streams.writer import StreamWriter
 
 __all__ = [
@@ -20,13 +22,18 @@ __all__ = [
     "Frame",
     "Looker",
     "MessageRebuilder",
+    "PicturePlan",
     "Seen",
     "Stream",
+    "StreamJoin",
     "StreamKey",
     "StreamSettings",
     "StreamWriter",
     "TrackPlan",
     "Unsuited",
+    "depends_on_others",
     "needs_trial",
+    "plan_from_values",
+    "plan_to_values",
     "plan_tracks",
 ]

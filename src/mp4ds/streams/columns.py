@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.records import Message
-from mp4ds.sidecar import Column, Columns
+from mp4ds.sidecar import Column, Columns, Digests
 from mp4ds.stamps import INT64_MAX, INT64_MIN, Int64Column, encode_column
 from mp4ds.wire import Parts
+
+_DIGESTS_PER_LINE = 12
 
 
 class Unsuited(Exception):  # noqa: N818 - no error: the message is stored verbatim
@@ -56,20 +60,50 @@ class ColumnsWriter:
         self._ordinal.append(ordinal)
 
     def to_model(self) -> Columns:
-        """The columns as the sidecar holds them; what follows from the rest is left out."""
-        log_time = self._log_time.to_numpy()
-        publish_time = self._publish_time.to_numpy()
-        ordinal = self._ordinal.to_numpy()
-        return Columns(
-            log_time=_column(log_time),
-            publish_time=None if _same(publish_time, log_time) else _column(publish_time),
-            sequence=_unless_zero(self._sequence.to_numpy()),
-            stamp=_column(self._stamp.to_numpy()),
-            seq=_column(self._seq.to_numpy()) if len(self._seq) else None,
-            pts=_column(self._pts.to_numpy()) if len(self._pts) else None,
-            variant=_unless_zero(self._variant.to_numpy()),
-            ordinal=None if _same(ordinal, np.arange(len(self))) else _column(ordinal),
-        )
+        """The columns as the sidecar holds them."""
+        columns = {
+            "log_time": self._log_time,
+            "publish_time": self._publish_time,
+            "sequence": self._sequence,
+            "stamp": self._stamp,
+            **({"seq": self._seq} if len(self._seq) else {}),
+            **({"pts": self._pts} if len(self._pts) else {}),
+            "variant": self._variant,
+            "ordinal": self._ordinal,
+        }
+        return columns_model({name: column.to_numpy() for name, column in columns.items()})
+
+
+def columns_model(values: Mapping[str, NDArray[np.int64]]) -> Columns:
+    """Columns as the sidecar holds them; what follows from the rest is left out.
+
+    Args:
+        values: All that `Columns` has by name, shape (messages,); ``seq`` and ``pts`` where
+            the messages have them.
+    """
+    log_time, publish_time, ordinal = (
+        values[name] for name in ("log_time", "publish_time", "ordinal")
+    )
+    return Columns(
+        log_time=_column(log_time),
+        publish_time=None if _same(publish_time, log_time) else _column(publish_time),
+        sequence=_unless_zero(values["sequence"]),
+        stamp=_column(values["stamp"]),
+        seq=_column(values["seq"]) if "seq" in values else None,
+        pts=_column(values["pts"]) if "pts" in values else None,
+        variant=_unless_zero(values["variant"]),
+        ordinal=None if _same(ordinal, np.arange(len(ordinal))) else _column(ordinal),
+    )
+
+
+def digests_model(digests: Iterable[int]) -> Digests:
+    """XXH64 digests of messages, as the sidecar holds them."""
+    words = [f"{value:016x}" for value in digests]
+    lines = (
+        " ".join(words[start : start + _DIGESTS_PER_LINE])
+        for start in range(0, len(words), _DIGESTS_PER_LINE)
+    )
+    return Digests(algorithm="xxh64", values="\n".join(lines) + "\n")
 
 
 def _same(a: NDArray[np.int64], b: NDArray[np.int64]) -> bool:

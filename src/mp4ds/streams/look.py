@@ -90,7 +90,7 @@ class Looker:
     """
 
     def __init__(self, channel: Channel, *, transcode: bool = False) -> None:
-        self._is_packets = not channel.type_name.endswith("CompressedImage")
+        self._is_packets = _holds_packets(channel)
         self._forms = Forms(channel)
         self._parsers: dict[str, PictureParser] = {}
         self._png: png.PngRecipe | None = None
@@ -183,6 +183,27 @@ class Looker:
         key = _coded_key(form, "png" if image.recipe else "rvl", "", "16UC1", width, height)
         wrap = Wrap(prefix=image.header, png=image.recipe)
         return Seen(key, form, parts, wrap, pixels=image.pixels)
+
+
+def depends_on_others(channel: Channel, message: Message) -> bool:
+    """Whether messages of a channel cannot be understood without earlier ones.
+
+    Args:
+        channel: A camera channel.
+        message: One of its messages.
+    """
+    try:
+        _, parts = Forms(channel).split(message)
+        fields = parts.fields
+        if not isinstance(fields, CodedFields) or not _holds_packets(channel):
+            return False
+        return packet_codec(fields.format) != "mjpeg"
+    except (Unsuited, Refused):
+        return _holds_packets(channel)
+
+
+def _holds_packets(channel: Channel) -> bool:
+    return not channel.type_name.endswith("CompressedImage")
 
 
 def _coded_key(

@@ -69,7 +69,7 @@ class Stream:
         """Topic of the images."""
         return self.sidecar.channel.topic
 
-    @property
+    @cached_property
     def video_path(self) -> Path:
         """The stream's video."""
         return self.path.parent / self.sidecar.video.file

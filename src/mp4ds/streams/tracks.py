@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from mp4ds.bags.mcap_write import compressed_size
 from mp4ds.coded import Refused
-from mp4ds.errors import OptionError
-from mp4ds.layouts import ENCODINGS, Layout, bind, layout_for
-from mp4ds.plan import Quality, visual_setting
+from mp4ds.layouts import ENCODINGS, Layout, layout_for
+from mp4ds.plan import Quality
 from mp4ds.sidecar import Color, LayoutParameters
 from mp4ds.streams.columns import Unsuited
 from mp4ds.streams.look import Seen, StreamKey
-from mp4ds.video import PacketWriter, Recipe, VideoEncoder, choose, recipe_for
+from mp4ds.video import PacketWriter, Recipe, VideoEncoder
 from mp4ds.video.encoder import EncoderRefusedError
-
-_KEPT_JPEG = "JPEG files are kept as they are; --transcode encodes them anew"
-_NEGLIGIBLE = 1 / 50
-"""Of the raw size: a video as small as this is kept although zstd would be smaller still."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,103 +245,6 @@ class _PacketTrack:
             "width": key.width,
             "height": key.height,
         }
-
-
-def needs_trial(seen: Seen, settings: StreamSettings) -> bool:
-    """Whether `plan_tracks` is better for having several messages."""
-    if seen.pixels is None:
-        return False
-    return seen.key.body != "jpeg" and _is_lossless(seen.key.encoding, settings)
-
-
-def _is_lossless(encoding: str, settings: StreamSettings) -> bool:
-    return settings.quality.lossless or ENCODINGS[encoding].lossy is None
-
-
-def plan_tracks(
-    samples: Sequence[Seen], settings: StreamSettings, rate: float | None
-) -> list[TrackPlan]:
-    """How the messages of one key are stored in videos.
-
-    Args:
-        samples: The first messages, at least one.
-        settings: What was asked for.
-        rate: Frames per second, where known.
-
-    Returns:
-        The best plan first; the last one takes every message of the key.
-
-    Raises:
-        Unsuited: A video would be larger than the messages are by zstd.
-    """
-    first = samples[0]
-    if first.pixels is None:
-        can_shrink = first.key.codec == "mjpeg" and not settings.quality.lossless
-        return [PacketPlan(note=_KEPT_JPEG if can_shrink else "")]
-    if not _is_lossless(first.key.encoding, settings):
-        return [_lossy_plan(first.key, settings, rate)]
-    return _lossless_plans(samples, settings)
-
-
-def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) -> PicturePlan:
-    quality = settings.quality
-    layout = layout_for(ENCODINGS[key.encoding], lossless=False)
-    crf, preset = quality.crf, settings.preset
-    if quality.name == "visual":
-        crf, table_preset = visual_setting(rate)
-        if settings.codec in (None, "av1"):
-            preset = preset or str(table_preset)
-    recipe = recipe_for(
-        layout.pixel_format, lossless=False, codec=settings.codec, crf=crf, preset=preset
-    )
-    return PicturePlan(layout, recipe, str(quality), exact=False)
-
-
-def _lossless_plans(samples: Sequence[Seen], settings: StreamSettings) -> list[TrackPlan]:
-    encoding = ENCODINGS[samples[0].key.encoding]
-    pixels = [seen.pixels for seen in samples if seen.pixels is not None]
-    asked = settings.quality.lossless
-    note = "" if asked else f"{encoding.name} is kept lossless"
-    gop, threads = settings.gop, settings.threads
-    try:
-        best = choose(
-            pixels,
-            encoding,
-            codec=settings.codec if asked else None,  # else they were meant for lossy videos
-            preset=settings.preset if asked else None,
-            gop=gop,
-            threads=threads,
-        )
-    except OptionError as error:
-        best = choose(pixels, encoding, codec=None, preset=None, gop=gop, threads=threads)
-        note = "; ".join(filter(None, (note, f"coded as {best.recipe.codec}: {error}")))
-    except EncoderRefusedError as error:
-        raise Unsuited(str(error)) from None
-    _refuse_noise(samples, best.bytes_per_frame)
-    layout = bind(best.layout, encoding, best.parameters)
-    plan = PicturePlan(layout, best.recipe, "lossless", exact=True, note=note)
-    general = layout_for(encoding, lossless=True)
-    if general.name == layout.name:
-        return [plan]
-    recipe = recipe_for(general.pixel_format, lossless=True)
-    return [plan, PicturePlan(general, recipe, "lossless", exact=True)]
-
-
-def _refuse_noise(samples: Sequence[Seen], video_size: float) -> None:
-    """Refuse what a video would not make smaller.
-
-    Raises:
-        Unsuited: Tells both sizes.
-    """
-    bodies = [seen.parts.body for seen in samples]
-    raw = sum(map(len, bodies)) / len(bodies)
-    if video_size <= raw * _NEGLIGIBLE:
-        return
-    verbatim = compressed_size(bodies) / len(bodies)
-    if video_size > verbatim:
-        raise Unsuited(
-            f"a video would not be smaller: about {video_size / verbatim:.2f} times as large"
-        )
 
 
 def _color(recipe: Recipe) -> Color:

@@ -10,11 +10,11 @@ from pathlib import Path
 import xxhash
 
 from mp4ds.coded import PngRecipe, zlib_fingerprint
+from mp4ds.outputs import digest_file
 from mp4ds.records import Channel, Message
 from mp4ds.sidecar import (
     CameraInfo,
     ChannelModel,
-    Digests,
     Header,
     Image,
     StreamSidecar,
@@ -24,13 +24,11 @@ from mp4ds.sidecar import (
 from mp4ds.sidecar.fields import FORMAT_VERSION, MAX_FRAMES
 from mp4ds.sidecar.models import PngFile
 from mp4ds.stamps import PresentationClock
-from mp4ds.streams.columns import ColumnsWriter, Unsuited
+from mp4ds.streams.columns import ColumnsWriter, Unsuited, digests_model
 from mp4ds.streams.headers import Heads
 from mp4ds.streams.look import Seen
 from mp4ds.streams.tracks import StreamSettings, TrackPlan
 from mp4ds.wire import CodedFields
-
-_DIGESTS_PER_LINE = 12
 
 
 class StreamWriter:
@@ -116,11 +114,8 @@ class StreamWriter:
 
         return write
 
-    def finish(self, digest: Callable[[Path], tuple[int, str]]) -> StreamSidecar:
+    def finish(self) -> StreamSidecar:
         """Complete the video and write the sidecar; all jobs must have run.
-
-        Args:
-            digest: Gives the size and SHA-256 of a file.
 
         Returns:
             The sidecar.
@@ -129,7 +124,7 @@ class StreamWriter:
             OSError: The disk refused.
         """
         self._track.close()
-        size, sha256 = digest(self.video_path)
+        size, sha256 = digest_file(self.video_path)
         key = self._key
         sidecar = StreamSidecar(
             mp4ds=FORMAT_VERSION,
@@ -152,18 +147,10 @@ class StreamWriter:
             ),
             camera_info=self.camera_info,
             columns=self._columns.to_model(),
-            digests=self._digests_model() if self._plan.exact else None,
+            digests=digests_model(self._digests) if self._plan.exact else None,
         )
         self.sidecar_path.write_bytes(dump_document(sidecar))
         return sidecar
-
-    def _digests_model(self) -> Digests:
-        words = [f"{value:016x}" for value in self._digests]
-        lines = (
-            " ".join(words[start : start + _DIGESTS_PER_LINE])
-            for start in range(0, len(words), _DIGESTS_PER_LINE)
-        )
-        return Digests(algorithm="xxh64", values="\n".join(lines) + "\n")
 
     def abandon(self) -> None:
         """Stop writing; the caller removes the files."""

@@ -6,8 +6,11 @@ from mp4ds.video.codecs import Recipe, check_codec, recipe_for
 from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.encoder import VideoEncoder, tool_versions
 from mp4ds.video.images import ImageFile
+from mp4ds.video.join import SegmentsDifferError, join_segments
 from mp4ds.video.jpeg import JpegDecoder
+from mp4ds.video.memory import encoder_bytes
 from mp4ds.video.packets import PacketReader, PacketWriter
+from mp4ds.video.sample_entry import read_sample_entry
 from mp4ds.video.trial import Choice, choose
 
 __all__ = [
@@ -17,10 +20,14 @@ __all__ = [
     "PacketReader",
     "PacketWriter",
     "Recipe",
+    "SegmentsDifferError",
     "VideoDecoder",
     "VideoEncoder",
     "check_codec",
     "choose",
+    "encoder_bytes",
+    "join_segments",
+    "read_sample_entry",
     "recipe_for",
     "tool_versions",
 ]

@@ -13,6 +13,7 @@ from av.error import FFmpegError
 from mp4ds.errors import VideoError
 from mp4ds.layouts import Picture
 from mp4ds.video.convert import Converter, frame_to_picture
+from mp4ds.video.media import Media
 
 _CODEC_NAMES = {
     "h264": "h264",
@@ -68,16 +69,16 @@ class VideoDecoder:
         if not path.is_file():
             raise VideoError("file-missing", path, "does not exist")
         try:
-            # absolute: ffmpeg takes a relative name with a colon for an address
-            self._container = av.open(str(path.absolute()), "r", metadata_errors="ignore")
+            self._media = Media(path)
         except (FFmpegError, OSError) as error:
             raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
+        self._container = self._media.container
         try:
             self._check(codec, coded_size)
             self._stream = self._container.streams.video[0]
             self._stream.thread_type = "AUTO" if sequential else "SLICE"
         except BaseException:
-            self._container.close()
+            self.close()
             raise
 
     def _check(self, codec: str, coded_size: tuple[int, int]) -> None:
@@ -223,7 +224,7 @@ class VideoDecoder:
 
     def close(self) -> None:
         """Close the file."""
-        self._container.close()
+        self._media.close()
 
     def __enter__(self) -> VideoDecoder:
         return self

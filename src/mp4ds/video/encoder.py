@@ -74,6 +74,9 @@ class VideoEncoder:
         )
         try:
             self._open_stream(threads, rate)
+        except MemoryError:  # which FFmpegError may be, too: no fault of the pictures
+            self._container.close()
+            raise
         except (FFmpegError, ValueError):
             self._container.close()
             raise EncoderRefusedError(
@@ -175,6 +178,10 @@ def configure(context: Any, recipe: Recipe, width: int, height: int, *, threads:
         # it prints to stderr on its own; errors reach us as return codes
         os.environ.setdefault("SVT_LOG", "0")
         context.options = {**context.options, "svtav1-params": f"lp={threads}"}
+    if recipe.encoder == "libx265":
+        # it would write its threads and the processor beside the parameter sets
+        parameters = f"{context.options['x265-params']}:info=0"
+        context.options = {**context.options, "x265-params": parameters}
 
 
 def tool_versions() -> Mapping[str, str]:

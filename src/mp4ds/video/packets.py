@@ -9,6 +9,7 @@ import io
 import struct
 from array import array
 from collections.abc import Iterator
+from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from mp4ds.coded.configuration import parameter_units
 from mp4ds.coded.packets import plain_body
 from mp4ds.errors import VideoError
 from mp4ds.stamps import TIMESCALE
+from mp4ds.video.media import Media
 
 _TIME_BASE = Fraction(1, TIMESCALE)
 _LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.1, 30.0, 240.0  # Hz
@@ -116,7 +118,7 @@ class PacketWriter:
         """
         plain = plain_body(self.codec, body)
         if self.codec in ("mjpeg", "png"):
-            self._container = _new_mp4(self._path)
+            self._container = new_mp4(self._path)
             self._stream = self._container.add_mux_stream(
                 self.codec, rate=self._rate, width=self.width, height=self.height
             )
@@ -126,7 +128,7 @@ class PacketWriter:
                 context = template.codec_context
                 if (context.width, context.height) != (self.width, self.height):
                     raise Refused("its first picture cannot be decoded")
-                self._container = _new_mp4(self._path)
+                self._container = new_mp4(self._path)
                 self._stream = self._container.add_stream_from_template(template, opaque=True)
         self._stream.time_base = _TIME_BASE
 
@@ -171,7 +173,8 @@ class PacketWriter:
             self.abandon()
 
 
-def _new_mp4(path: Path) -> Any:
+def new_mp4(path: Path) -> Any:
+    """An mp4 to write to, its times in ticks of the track."""
     return av.open(
         str(path.absolute()),  # ffmpeg takes a relative name with a colon for an address
         "w",
@@ -243,11 +246,11 @@ class PacketReader:
         if not path.is_file():
             raise VideoError("file-missing", path, "does not exist")
         try:
-            # absolute: ffmpeg takes a relative name with a colon for an address
-            container = av.open(str(path.absolute()), "r", metadata_errors="ignore")
+            media = Media(path)
         except (FFmpegError, OSError) as error:
             raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
-        with container:
+        with closing(media):
+            container = media.container
             self._check(container, codec, coded_size)
             stream = container.streams.video[0]
             context: Any = stream.codec_context

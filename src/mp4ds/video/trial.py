@@ -94,6 +94,8 @@ def _packets(
                 yield packet.pts, packet.size
         for packet in context.encode(None):
             yield packet.pts, packet.size
+    except MemoryError:
+        raise
     except (FFmpegError, ValueError):
         raise EncoderRefusedError(
             f"{recipe.encoder} does not take pictures of {columns}x{rows}"

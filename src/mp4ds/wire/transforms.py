@@ -252,13 +252,15 @@ class TransformCollector:
     and transforms that tf2 would refuse are left out, and so are child frames beyond the limit.
 
     Args:
+        known: Those of earlier messages, in their order.
         limit: Most child frames.
     """
 
-    def __init__(self, limit: int = MAX_TRANSFORMS) -> None:
+    def __init__(self, known: Iterable[Transform] = (), *, limit: int = MAX_TRANSFORMS) -> None:
         self._limit = limit
         self._latest: dict[str, Transform] = {}
         self._parsers: dict[tuple[str, Schema | None], Parser | None] = {}
+        self._take(known)
 
     @staticmethod
     def takes(channel: Channel) -> bool:
@@ -275,7 +277,10 @@ class TransformCollector:
             found = parser(memoryview(data)) if parser else []
         except WireError:
             return
-        for transform in found:
+        self._take(found)
+
+    def _take(self, transforms: Iterable[Transform]) -> None:
+        for transform in transforms:
             child = _name(transform.child)
             if transform.is_usable and (child in self._latest or len(self._latest) < self._limit):
                 self._latest[child] = transform

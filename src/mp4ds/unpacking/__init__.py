@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-import csv
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
+from mp4ds._version import __version__
 from mp4ds.bags import BagWriter, open_writer
 from mp4ds.bags.convert import Converter
-from mp4ds.dataset import Dataset, Stream
+from mp4ds.dataset import Dataset
 from mp4ds.errors import FormatError, OptionError, WriteError
-from mp4ds.outputs import staged
+from mp4ds.outputs import digest_file, staged
 from mp4ds.plan import FileNames, Selection
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord
-from mp4ds.republish import KINDS, Republished, Republisher, files_of, holds_files
-from mp4ds.video import ImageFile
+from mp4ds.remote import RemotePath, location, remote
+from mp4ds.republish import KINDS, Republished, Republisher
+from mp4ds.sidecar import MANIFEST_NAME
+from mp4ds.unpacking.images import write_images
+from mp4ds.uploads import Upload
 
 TARGETS = ("bag", "rosbag2", "mcap", "images")
 _SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
@@ -94,9 +97,10 @@ def unpack(
     Every message of a lossless stream is compared with its digest on the way.
 
     Args:
-        dataset: A dataset, or one video with its sidecar.
+        dataset: A dataset, or one video with its sidecar; or its URL.
         to: ``bag``, ``rosbag2``, ``mcap`` or ``images``.
-        output: The file or folder to make; None for the dataset's name beside it.
+        output: The file or folder to make, or its URL; None for the dataset's name beside it, or
+            in the current folder where the dataset is at a URL.
         options: How.
         progress: Called after every few messages.
 
@@ -108,11 +112,16 @@ def unpack(
         ConversionError: The target cannot hold a topic; names it.
         TargetError: The output may not be written there.
         WriteError: The disk refused; nothing is left behind.
+        RemoteError: A store or web server fails.
     """
     chosen = options or UnpackOptions()
     _check(to, chosen)
+    store = remote(location(output)) if output else None
+    if store:
+        return _unpack_to_store(dataset, to, store, chosen, progress)
     with Dataset(dataset, jpeg_quality=chosen.jpeg_quality) as opened:
-        target = Path(os.path.abspath(output or default_output(opened.path, to)))  # noqa: PTH100
+        given = location(output) if output else default_output(opened.path, to)
+        target = Path(os.path.abspath(given))  # noqa: PTH100
         replaceable = _is_image_folder if to == "images" else _is_recording
         if to != "images":
             opened.verify_messages()
@@ -153,8 +162,47 @@ def _check(to: str, options: UnpackOptions) -> None:
 
 def default_output(dataset: Path, to: str) -> Path:
     """The output for a dataset when none is named: beside it, never the source's own name."""
+    if remote(dataset):
+        stem = dataset.name if dataset.is_dir() else dataset.stem
+        return Path(f"{stem}_unpacked{_SUFFIXES[to]}")
     stem = dataset.resolve().name if dataset.is_dir() else dataset.stem
     return dataset.resolve().parent / f"{stem}_unpacked{_SUFFIXES[to]}"
+
+
+def _unpack_to_store(
+    dataset: Path | str,
+    to: str,
+    target: RemotePath,
+    options: UnpackOptions,
+    progress: Callable[[UnpackProgress], None] | None,
+) -> UnpackSummary:
+    """Unpack on this machine, then upload; what an earlier run could not upload is not made again.
+
+    Raises:
+        RemoteError: It could not be uploaded; it is kept here.
+        Mp4dsError: As `unpack`.
+    """
+
+    def make(local: Path) -> dict[str, object]:
+        return asdict(unpack(dataset, to, local, options, progress=progress)) | {"output": ""}
+
+    last = "metadata.yaml" if to == "rosbag2" else ""
+    values = Upload(target, is_folder=to in ("rosbag2", "images"), last=last).run(
+        lambda: _order(dataset, to, options),
+        make,
+        force=options.force,
+        replaceable=_is_image_folder if to == "images" else _is_recording,
+    )
+    again = {topic: Republished(**item) for topic, item in values["republished"].items()}
+    return UnpackSummary(**{**values, "output": target, "republished": again})
+
+
+def _order(dataset: Path | str, to: str, options: UnpackOptions) -> dict[str, object]:
+    """What tells whether an output is what the same command would make now."""
+    with Dataset(dataset) as opened:
+        path = opened.path / MANIFEST_NAME if opened.manifest else opened.streams[0].path
+        digest = digest_file(path)[1]
+    return {"dataset": digest, "to": to, "options": asdict(options), "mp4ds": __version__}
 
 
 def _is_recording(path: Path) -> bool:
@@ -164,7 +212,9 @@ def _is_recording(path: Path) -> bool:
 
 
 def _is_image_folder(path: Path) -> bool:
-    return path.is_dir() and (any(path.glob("*/stamps.csv")) or not any(path.iterdir()))
+    if not path.is_dir():
+        return False
+    return not any(path.iterdir()) or any((p / "stamps.csv").is_file() for p in path.iterdir())
 
 
 def _unpack_recording(
@@ -333,7 +383,9 @@ def _unpack_images(
         stem, _ = names.name_for(stream.topic)
         folder = path / stem
         folder.mkdir()
-        for _ in _write_images(stream, folder, options):
+        for _ in write_images(
+            stream, folder, image_format=options.image_format, jpeg_quality=options.jpeg_quality
+        ):
             done += 1
             if progress:
                 progress(UnpackProgress(done, total))
@@ -341,28 +393,3 @@ def _unpack_images(
     others = {channel.topic for channel in dataset.channels} - set(summary.messages)
     summary.left_out.extend(sorted(others))
     return summary
-
-
-def _write_images(stream: Stream, folder: Path, options: UnpackOptions) -> Iterator[None]:
-    """One file per frame, and stamps.csv that tells the times of each."""
-    columns, headers = stream.rebuilder.columns, stream.sidecar.headers
-    suffix = "jpg" if options.image_format == "jpeg" else "png"
-    digits = len(str(len(stream) - 1))
-    with (folder / "stamps.csv").open("w", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(["file", "stamp_ns", "log_time_ns", "frame_id"])
-        for index, data in enumerate(_files(stream, options)):
-            name = f"{index:0{digits}d}.{suffix}"
-            (folder / name).write_bytes(data)
-            frame_id = headers[int(columns.variant[index])].frame_id
-            rows.writerow([name, int(columns.stamp[index]), int(columns.log_time[index]), frame_id])
-            yield
-
-
-def _files(stream: Stream, options: UnpackOptions) -> Iterator[bytes | memoryview]:
-    """The recorded JPEG files where these are wanted, else files of the frames."""
-    if options.image_format == "jpeg" and holds_files(stream.sidecar, "jpeg"):
-        return files_of(stream)
-    quality = options.jpeg_quality
-    writer = ImageFile(stream.sidecar.image.encoding, options.image_format, quality=quality)
-    return (writer.encode(frame.data) for frame in stream)

@@ -1,0 +1,303 @@
+"""Runs the tasks of divided packs on an engine, and makes the datasets of what they leave."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mp4ds import errors
+from mp4ds.engine import Engine, Outcome
+from mp4ds.errors import (
+    FormatError,
+    OptionError,
+    PartsFailedError,
+    SourceError,
+    TargetError,
+    WriteError,
+)
+from mp4ds.outputs import move_into_place, sync
+from mp4ds.packing.assemble import Assembler
+from mp4ds.packing.job import Job, Task, absolute, source_name
+from mp4ds.packing.manifest import folder_size, summarize, write_manifest
+from mp4ds.packing.part import RECORD_NAME, Part, read_record
+from mp4ds.packing.progress import JobProgress, Report
+from mp4ds.packing.report import PackSummary
+from mp4ds.packing.spans import share
+from mp4ds.packing.workplace import Workplace
+from mp4ds.plan import Selection
+
+_LISTED = 10
+_JOINED_AT_ONCE = 4  # more would only wait for the disk
+_KEPT = "interrupted; what is finished is kept: run the same command again to go on"
+
+
+@dataclass
+class Run:
+    """One recording being packed by tasks.
+
+    Attributes:
+        job: What is to be done.
+        place: Where its parts are made.
+        paths: What is to be packed, as it was given.
+        target: The dataset.
+        force: Replace an existing dataset.
+        is_new: Whether the job was planned just now.
+        failures: Name and sentence of each task that failed.
+        exit_code: What the first of them asks for.
+    """
+
+    job: Job
+    place: Workplace
+    paths: Sequence[Path]
+    target: Path
+    force: bool
+    is_new: bool
+    failures: list[tuple[str, str]] = field(default_factory=list)
+    exit_code: int = 1
+
+    def begin(self, options: dict[str, object], *, anew: bool, alone: bool) -> None:
+        """Take the place over; it is held.
+
+        Args:
+            options: Those that decide what comes out.
+            anew: Forget what is there.
+            alone: Nobody else is at work there.
+
+        Raises:
+            OptionError: An unfinished pack with other options is there.
+            SourceError: The recording has changed since.
+        """
+        if anew and alone:
+            self.place.clear()
+        if self.is_new:
+            self.job = self.place.begin(self.job)
+        self.place.check(self.job, options, absolute(self.paths))
+        if alone:
+            self.place.sweep()
+
+    @property
+    def missing(self) -> list[Task]:
+        """The tasks whose results are not there."""
+        return [task for task in self.job.tasks if not self.place.is_done(task)]
+
+    def fail(self, name: str, kind: str, sentence: str) -> None:
+        """Take notice of a task that failed."""
+        if not self.failures:
+            self.exit_code = getattr(getattr(errors, kind, None), "exit_code", 1)
+        self.failures.append((name, sentence))
+
+    def raise_failures(self) -> None:
+        """Report the tasks that failed.
+
+        Raises:
+            PartsFailedError: There are some.
+        """
+        if self.failures:
+            raise PartsFailedError(self.target, self.failures, len(self.job.tasks), self.exit_code)
+
+
+class Coordinator:
+    """Runs the tasks of several packs as one.
+
+    Args:
+        runs: The packs.
+        engine: Runs the tasks.
+        keep_going: Go on with other tasks where one fails.
+        share_of: Number of the share of the tasks to run, and how many shares there are.
+        report: Told of progress.
+    """
+
+    def __init__(
+        self,
+        runs: Sequence[Run],
+        engine: Engine,
+        *,
+        keep_going: bool = False,
+        share_of: tuple[int, int] = (1, 1),
+        report: Report | None = None,
+    ) -> None:
+        self._runs = {str(run.place.folder): run for run in runs}
+        self._engine = engine
+        self._keep_going = keep_going
+        self._share = share_of
+        self._progress = {
+            folder: JobProgress(run.job, run.target, report) for folder, run in self._runs.items()
+        }
+
+    def refuse_missing(self) -> None:
+        """Refuse to join what is not there.
+
+        Raises:
+            OptionError: Names the parts that are missing.
+        """
+        for run in self._runs.values():
+            names = [task.name for task in run.missing]
+            if names:
+                listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
+                raise OptionError(
+                    f"{run.target}: {len(names)} of {len(run.job.tasks)} parts are missing: "
+                    f"{listed}. Run their shards, or pack without --join to make them here."
+                )
+
+    def run(self) -> Iterator[Run]:
+        """Run all tasks.
+
+        Yields:
+            Each pack of which all tasks are done.
+
+        Raises:
+            PartsFailedError: Tasks failed.
+        """
+        tasks: list[tuple[str, ...]] = []
+        waiting: dict[str, int] = {}
+        for folder, run in self._runs.items():
+            missing = {task.name for task in run.missing}
+            own = share(self._share[0], [(task.name,) for task in run.job.tasks], self._share[1])
+            names = [name for (name,) in own if name in missing]
+            waiting[folder] = len(missing)
+            tasks += [(folder, name) for name in names]
+            self._tell_done(run, [task for task in run.job.tasks if task.name not in missing])
+        for progress in self._progress.values():
+            progress.report(now=True)  # so that all work is known from the beginning
+        for folder, run in self._runs.items():
+            if not waiting[folder]:
+                yield run
+        if tasks:
+            yield from self._run(tasks, waiting)
+        for run in self._runs.values():
+            run.raise_failures()
+
+    def _run(self, tasks: list[tuple[str, ...]], waiting: dict[str, int]) -> Iterator[Run]:
+        outcomes = self._engine.run(tasks, self._heard)
+        try:
+            for outcome in outcomes:
+                run = self._take(outcome)
+                if run.failures and not self._keep_going:
+                    return
+                waiting[outcome.task[0]] -= outcome.error is None
+                if not waiting[outcome.task[0]]:
+                    yield run
+        finally:
+            close: Any = getattr(outcomes, "close", None)
+            if close is not None:
+                close()
+
+    def _heard(self, task: tuple[str, ...], told: dict[str, Any]) -> None:
+        self._progress[task[0]].heard(task[1], told)
+
+    def _take(self, outcome: Outcome) -> Run:
+        folder, name = outcome.task
+        run, progress = self._runs[folder], self._progress[folder]
+        if outcome.error is None:
+            self._tell_done(run, [run.job.task(name)], before=False)
+        else:
+            run.fail(name, *outcome.error)
+            progress.failed += 1
+            progress.report(now=True)
+        return run
+
+    def _tell_done(self, run: Run, tasks: Sequence[Task], *, before: bool = True) -> None:
+        progress = self._progress[str(run.place.folder)]
+        for task in tasks:
+            if task.source is not None:
+                continue
+            place = run.place.parts / task.name
+            record = read_record(place) or {"topics": []}
+            progress.bytes_written += folder_size(place)
+            topics = {t["topic"]: (t["messages"], t["raw_bytes"]) for t in record["topics"]}
+            progress.finished(task.name, topics, before=before)
+
+    def finish(self, run: Run) -> PackSummary:
+        """Make the dataset of a pack whose tasks are done, and remove what it was made of.
+
+        Raises:
+            PartsFailedError: The disk refused; what is finished is kept.
+            FormatError: A part was damaged since it was made.
+        """
+        progress = self._progress[str(run.place.folder)]
+        progress.report("joining", now=True)
+        folder = run.place.folder / "dataset"
+        try:
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            part = self._join(run, folder, progress)
+            with run.job.open() as reader:
+                where = reader.path if reader.path.is_dir() else None
+                digests = [
+                    (source_name(path, where), *_digest(run.place, number))
+                    for number, path in enumerate(reader.files)
+                ]
+                run.job.check_sources()
+                write_manifest(part, reader, digests, run.job.options["quality"])
+            sync(folder)
+            summary = summarize(part, run.target, sum(source.size for source in run.job.sources))
+            move_into_place(folder, run.target, run.place.folder, force=run.force)
+        except OSError as error:
+            if isinstance(error, (SourceError, TargetError)):
+                raise
+            refused = error if isinstance(error, WriteError) else WriteError(run.target, error)
+            raise PartsFailedError(
+                run.target, [("joining", str(refused))], len(run.job.tasks), 1
+            ) from None
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)  # gone already if all went well
+        run.place.remove()
+        return summary
+
+    @staticmethod
+    def _join(run: Run, folder: Path, progress: JobProgress) -> Part:
+        job, parts = run.job, run.place.parts
+        tasks = [task for task in job.tasks if task.source is None]
+        if tasks[0].whole:
+            part = Part.load(parts / tasks[0].name)
+            for path in sorted(part.folder.iterdir()):
+                if path.name != RECORD_NAME:
+                    _link(path, folder / path.name)
+            part.folder = folder
+            return part
+        selected = Selection(job.options["topics"], job.options["exclude"])
+        with job.open() as reader:
+            assembler = Assembler(reader, selected, folder, threads=_JOINED_AT_ONCE)
+            for task in tasks:
+                chain = task.name if task.solo else task.name.partition("-")[2]
+                assembler.add(Part.load(parts / task.name), chain)
+            return assembler.finish(lambda name: progress.report("joining", name, now=True))
+
+
+def _link(path: Path, new: Path) -> None:
+    try:
+        new.hardlink_to(path)
+    except OSError:
+        shutil.copyfile(path, new)
+
+
+def _digest(place: Workplace, number: int) -> tuple[int, str]:
+    folder = place.parts / f"source-{number}"
+    record = read_record(folder)
+    if record is None:
+        raise FormatError("file-missing", folder, "is gone, or damaged since it was made")
+    return record["size"], record["sha256"]
+
+
+@contextmanager
+def claimed(runs: Sequence[Run], *, shared: bool) -> Iterator[None]:
+    """Hold the places of packs; what is left of none that has any result is removed at the end."""
+    with ExitStack() as stack:
+        for run in runs:
+            stack.enter_context(run.place.claimed(shared=shared))
+        try:
+            yield
+        except BaseException as error:
+            kept = shared
+            for run in runs:
+                if run.place.has_results():
+                    kept = True
+                elif not shared:
+                    run.place.remove()
+            if kept and isinstance(error, KeyboardInterrupt):
+                raise KeyboardInterrupt(_KEPT) from None
+            raise

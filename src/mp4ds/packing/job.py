@@ -1,0 +1,285 @@
+"""A pack that is divided into tasks: what each is to do, on whatever machine it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import xxhash
+
+from mp4ds._version import __version__
+from mp4ds.bags import BagReader, open_sources
+from mp4ds.errors import SourceError
+from mp4ds.outputs import digest_file
+from mp4ds.packing.kept import dump_kept, load_kept
+from mp4ds.packing.packer import PartSettings
+from mp4ds.packing.report import PackOptions
+from mp4ds.packing.survey import Survey
+from mp4ds.plan import Selection, parse_quality
+from mp4ds.records import Excerpt
+from mp4ds.remote import location, remote, spelled
+from mp4ds.streams import StreamSettings
+from mp4ds.video import tool_versions
+
+_SAMPLE = 2**16
+_OUTCOME_OPTIONS = (
+    *("topics", "exclude", "quality", "codec", "preset", "transcode", "camera_info"),
+    *("gop", "window", "salvage"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class SourceState:
+    """A file of the recording, as far as a change would show.
+
+    Attributes:
+        path: Absolute, or a URL.
+        size: Bytes.
+        modified_ns: When it was written, as the file system tells; 0 at a URL.
+        sample: XXH64 of its first and last bytes; at a URL, what the store says of its content,
+            such as an ETag, where it says anything.
+    """
+
+    path: str
+    size: int
+    modified_ns: int
+    sample: str
+
+    @classmethod
+    def of(cls, path: Path) -> SourceState:
+        """The state of a file now.
+
+        Raises:
+            SourceError: It cannot be read.
+        """
+        try:
+            stat = path.stat()
+            found = remote(path)
+            if found and found.tag:
+                return cls(found.url, stat.st_size, 0, found.tag)
+            with path.open("rb") as stream:
+                digest = xxhash.xxh64(stream.read(_SAMPLE))
+                if stat.st_size > _SAMPLE:
+                    stream.seek(max(_SAMPLE, stat.st_size - _SAMPLE))
+                    digest.update(stream.read(_SAMPLE))
+        except OSError as error:
+            raise SourceError(path, f"cannot be read: {error.strerror}") from None
+        return cls(spelled(path), stat.st_size, stat.st_mtime_ns, digest.hexdigest())
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One part of a job.
+
+    Attributes:
+        name: Of the folder of its result.
+        start: It takes log times from here on, ns; None: from the first.
+        end: To before here; None: to the last.
+        topics: It takes these topics; None: all but `without`.
+        without: Topics that others take.
+        others: Whether it takes attachments and metadata.
+        source: Number of the file whose digest is all it makes; None for others.
+        solo: Whether it takes its topics from end to end.
+        whole: Whether it takes the whole recording, so that nothing is to be joined.
+    """
+
+    name: str
+    start: int | None = None
+    end: int | None = None
+    topics: tuple[str, ...] | None = None
+    without: tuple[str, ...] = ()
+    others: bool = False
+    source: int | None = None
+    solo: bool = False
+    whole: bool = False
+
+    @property
+    def excerpt(self) -> Excerpt:
+        """What it reads."""
+        topics = None if self.topics is None else frozenset(self.topics)
+        return Excerpt(
+            start=self.start,
+            end=self.end,
+            topics=topics,
+            without=frozenset(self.without),
+            others=self.others,
+        )
+
+
+@dataclass(frozen=True)
+class Job:
+    """A pack, planned.
+
+    Attributes:
+        paths: The recordings, absolute or URLs, as they were given.
+        sources: The state of all their files.
+        options: Those that decide what comes out.
+        threads: Of each encoder.
+        workers: Streams that a task encodes side by side.
+        task_bytes: Memory of the largest task.
+        survey: What all tasks agree on.
+        tasks: In the order of their time.
+        work: By topic, its messages and what one of them costs, in any unit.
+        cameras: The topics of images.
+        tools: Versions of what packs.
+    """
+
+    paths: list[str]
+    sources: list[SourceState]
+    options: dict[str, Any]
+    threads: int
+    workers: int
+    task_bytes: int
+    survey: Survey
+    tasks: list[Task]
+    work: dict[str, tuple[int, float]]
+    cameras: list[str]
+    tools: dict[str, str]
+
+    def to_json(self) -> bytes:
+        """The job's file."""
+        values = {
+            "paths": self.paths,
+            "sources": [asdict(source) for source in self.sources],
+            "options": self.options,
+            "threads": self.threads,
+            "workers": self.workers,
+            "task_bytes": self.task_bytes,
+            "survey": self.survey.to_values(),
+            "tasks": [asdict(task) for task in self.tasks],
+            "work": self.work,
+            "cameras": self.cameras,
+            "tools": self.tools,
+        }
+        return dump_kept(values)
+
+    @classmethod
+    def from_json(cls, data: bytes) -> Job:
+        """The job of a file.
+
+        Raises:
+            ValueError: It is damaged, or another version's.
+        """
+        values = load_kept(data)
+        try:
+            return cls(
+                **{
+                    **values,
+                    "sources": [SourceState(**item) for item in values["sources"]],
+                    "survey": Survey.from_values(values["survey"]),
+                    "tasks": [_task(item) for item in values["tasks"]],
+                    "work": {topic: tuple(pair) for topic, pair in values["work"].items()},
+                }
+            )
+        except (TypeError, LookupError, AttributeError) as error:
+            raise ValueError(f"not a job of this version: {error}") from None
+
+    @property
+    def is_single(self) -> bool:
+        """Whether one task packs everything."""
+        return any(task.whole for task in self.tasks)
+
+    def task(self, name: str) -> Task:
+        """The task of a name.
+
+        Raises:
+            LookupError: There is none.
+        """
+        return {task.name: task for task in self.tasks}[name]
+
+    def open(self) -> BagReader:
+        """The recording."""
+        paths = [location(path) for path in self.paths]
+        return open_sources(paths, salvage=bool(self.options["salvage"]))
+
+    def check_sources(self) -> None:
+        """Refuse a recording that is not what it was when the job was planned.
+
+        Raises:
+            SourceError: Names the file that changed.
+        """
+        for source in self.sources:
+            path = location(source.path)
+            if SourceState.of(path) != source:
+                raise SourceError(
+                    path,
+                    "has changed since its packing began",
+                    "Begin anew with --restart, or give the file back as it was.",
+                )
+
+    def settings(self, task: Task) -> PartSettings:
+        """How a task packs."""
+        options = self.options
+        return PartSettings(
+            streams=StreamSettings(
+                quality=parse_quality(options["quality"]),
+                codec=options["codec"],
+                preset=options["preset"],
+                gop=options["gop"],
+                threads=self.threads,
+                transcode=options["transcode"],
+            ),
+            selected=Selection(options["topics"], options["exclude"]),
+            excerpt=task.excerpt,
+            survey=self._survey_for(task),
+            camera_info=tuple(options["camera_info"]),
+            workers=self.workers,
+            compression="zstd" if task.whole else "lz4",  # that is read once, in the joining
+            is_whole=task.whole,
+        )
+
+    def _survey_for(self, task: Task) -> Survey | None:
+        if task.whole:
+            return None
+        return Survey(pairs=self.survey.pairs) if task.solo else self.survey
+
+
+def _task(item: Mapping[str, Any]) -> Task:
+    topics = item["topics"]
+    return Task(
+        **{
+            **item,
+            "topics": None if topics is None else tuple(topics),
+            "without": tuple(item["without"]),
+        }
+    )
+
+
+def outcome_options(options: PackOptions) -> dict[str, Any]:
+    """The options that decide what comes out, as JSON has them."""
+    values = {name: getattr(options, name) for name in _OUTCOME_OPTIONS}
+    return {
+        name: list(value) if isinstance(value, (list, tuple)) else value
+        for name, value in values.items()
+    }
+
+
+def tools() -> dict[str, str]:
+    """Versions of what packs: parts that others made may not fit together."""
+    return {"mp4ds": __version__, **tool_versions()}
+
+
+def absolute(paths: Sequence[Path]) -> list[str]:
+    """Recordings as a job names them."""
+    return [spelled(path) for path in paths]
+
+
+def source_name(path: Path, folder: Path | None) -> str:
+    """Name of a recording's file in a manifest: with its folder's, where that was given."""
+    inside = folder is not None and path.parent == folder
+    return f"{path.parent.name}/{path.name}" if inside else path.name
+
+
+def digest_source(source: SourceState) -> Sequence[object]:
+    """Size and SHA-256 of a recording's file.
+
+    Raises:
+        SourceError: It cannot be read.
+    """
+    path = location(source.path)
+    try:
+        return digest_file(path)
+    except OSError as error:
+        raise SourceError(path, f"cannot be read: {error.strerror}") from None

@@ -1,0 +1,153 @@
+"""What the packing of a part of a recording leaves: the files of its streams, and a record."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mp4ds.errors import FormatError
+from mp4ds.outputs import write_synced
+from mp4ds.packing.kept import dump_kept, load_kept
+from mp4ds.packing.report import TopicSummary
+from mp4ds.records import Channel, Loss
+from mp4ds.sidecar import MESSAGES_NAME, StreamSidecar, load_stream
+from mp4ds.wire.transforms import Transform
+
+RECORD_NAME = "part.json"
+
+
+@dataclass(frozen=True, slots=True)
+class PartStream:
+    """A stream of a part, or of a whole recording.
+
+    Attributes:
+        stem: File name of its video and sidecar, without ending.
+        sidecar: Its sidecar.
+        is_renamed: Whether another stream had taken its plain name.
+    """
+
+    stem: str
+    sidecar: StreamSidecar
+    is_renamed: bool = False
+
+
+@dataclass
+class Part:
+    """What was packed of a recording into a folder, but for the manifest.
+
+    Attributes:
+        folder: Where the files are.
+        topics: What became of each topic, in the order of the recording.
+        counts: Messages read by channel id.
+        streams: In the order in which they began.
+        span: Log times of the first and last message, ns; None without messages.
+        left_out: Topics left out on request.
+        skipped: What the source holds and no dataset can: a phrase -> how many.
+        transforms: Static transforms, the latest of each child frame.
+        kept: Messages, attachments and metadata records in messages.mcap.
+        losses: What could not be read of a damaged recording.
+    """
+
+    folder: Path
+    topics: dict[str, TopicSummary] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    streams: list[PartStream] = field(default_factory=list)
+    span: tuple[int, int] | None = None
+    left_out: dict[str, None] = field(default_factory=dict)
+    skipped: dict[str, int] = field(default_factory=dict)
+    transforms: list[Transform] = field(default_factory=list)
+    kept: int = 0
+    losses: list[Loss] = field(default_factory=list)
+
+    @property
+    def messages_path(self) -> Path:
+        """Its messages.mcap."""
+        return self.folder / MESSAGES_NAME
+
+    def topic(self, channel: Channel) -> TopicSummary:
+        """The summary of a channel's topic."""
+        if channel.topic not in self.topics:
+            self.topics[channel.topic] = TopicSummary(channel.topic, channel.type_name)
+        return self.topics[channel.topic]
+
+    def saw(self, times: Iterable[int]) -> None:
+        """Widen the span to hold log times."""
+        for time in times:
+            start, end = self.span or (time, time)
+            self.span = (min(start, time), max(end, time))
+
+    def save(self) -> None:
+        """Write the record; the part is whole then."""
+        record = {
+            "topics": [asdict(topic) for topic in self.topics.values()],
+            "counts": {str(key): count for key, count in self.counts.items()},
+            "streams": [stream.stem for stream in self.streams],
+            "span": self.span,
+            "left_out": list(self.left_out),
+            "skipped": self.skipped,
+            "transforms": [asdict(transform) for transform in self.transforms],
+            "kept": self.kept,
+            "losses": [asdict(loss) for loss in self.losses],
+            "files": {
+                path.name: path.stat().st_size
+                for path in sorted(self.folder.iterdir())
+                if path.name != RECORD_NAME
+            },
+        }
+        write_synced(self.folder / RECORD_NAME, dump_kept(record))
+
+    def forget(self) -> None:
+        """Let it no longer count as whole, so that it is made again."""
+        (self.folder / RECORD_NAME).unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, folder: Path) -> Part:
+        """Read what `save` wrote.
+
+        Raises:
+            FormatError: It is gone or damaged.
+        """
+        record = read_record(folder)
+        if record is None:
+            raise FormatError("file-missing", folder, "is gone, or damaged since it was made")
+        try:
+            sidecars = [load_stream(folder / f"{stem}.yaml") for stem in record["streams"]]
+        except FormatError:
+            (folder / RECORD_NAME).unlink(missing_ok=True)  # to be made again
+            raise
+        return cls(
+            folder=folder,
+            topics={item["topic"]: _topic(item) for item in record["topics"]},
+            counts={int(key): count for key, count in record["counts"].items()},
+            streams=[PartStream(*pair) for pair in zip(record["streams"], sidecars, strict=True)],
+            span=tuple(record["span"]) if record["span"] else None,
+            left_out=dict.fromkeys(record["left_out"]),
+            skipped=record["skipped"],
+            transforms=[_transform(item) for item in record["transforms"]],
+            kept=record["kept"],
+            losses=[Loss(**{**item, "topics": tuple(item["topics"])}) for item in record["losses"]],
+        )
+
+
+def read_record(folder: Path) -> dict[str, Any] | None:
+    """The record of a part; None where the part is not whole: a file is missing or cut short."""
+    try:
+        record: dict[str, Any] = load_kept((folder / RECORD_NAME).read_bytes())
+        sizes = record["files"].items()
+        if all((folder / name).stat().st_size == size for name, size in sizes):
+            return record
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        pass
+    return None
+
+
+def _topic(item: Mapping[str, Any]) -> TopicSummary:
+    verbatim = {reason: (count, first) for reason, (count, first) in item["verbatim"].items()}
+    return TopicSummary(**{**item, "verbatim": verbatim})
+
+
+def _transform(item: Mapping[str, Any]) -> Transform:
+    lists = {key: tuple(value) for key, value in item.items() if isinstance(value, list)}
+    return Transform(**{**item, **lists})

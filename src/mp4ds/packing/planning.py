@@ -1,0 +1,343 @@
+"""Divides a pack into tasks that know nothing of each other."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from mp4ds.bags import BagReader
+from mp4ds.errors import OptionError
+from mp4ds.packing.calibrations import unpaired_infos
+from mp4ds.packing.job import Job, SourceState, Task, absolute, outcome_options, tools
+from mp4ds.packing.report import PackOptions
+from mp4ds.packing.spans import GOPS_PER_WINDOW, cut_times, group_topics, spans_of
+from mp4ds.packing.survey import (
+    Decision,
+    Survey,
+    decide,
+    rate_of,
+    survey_channel,
+    survey_pairs,
+)
+from mp4ds.pairing import choose_pairs, pair_camera_infos
+from mp4ds.plan import Selection, parse_quality
+from mp4ds.records import Channel
+from mp4ds.streams import (
+    Looker,
+    PicturePlan,
+    StreamSettings,
+    Unsuited,
+    depends_on_others,
+    needs_trial,
+)
+from mp4ds.video import encoder_bytes
+from mp4ds.wire import is_calibration, is_camera
+
+TASK_BYTES = 160 * 2**20
+"""A task's memory beside its encoders: the interpreter, libraries, and chunks of the source."""
+
+_MESSAGES_IN_FLIGHT = 8
+_ASSUMED_ROW = 32  # bytes of a lossless encoder for each of a message
+_UNKNOWN_BYTES = 2**30  # of a task whose cameras no index tells
+_COPIED, _OTHER_COST = 0.02, 1_000.0  # of a message that is not encoded; only for progress
+
+
+@dataclass(frozen=True, slots=True)
+class Means:
+    """What a machine gives to a pack.
+
+    Attributes:
+        cores: Processors.
+        memory: Bytes that may be used.
+        jobs: Processes at a time that were asked for, or None.
+    """
+
+    cores: int
+    memory: int
+    jobs: int | None = None
+
+    @classmethod
+    def of(cls, options: PackOptions) -> Means:
+        """Of this machine, as far as the options allow."""
+        return cls(available_cores(), options.memory or available_memory() // 2, options.jobs)
+
+    def for_one_of(self, recordings: int) -> Means:
+        """What each of several recordings gets that are packed at the same time."""
+        if recordings < 2:
+            return self
+        return replace(self, cores=max(1, self.cores // recordings), jobs=None)
+
+    def slots(self, job: Job) -> int:
+        """Processes at a time for a job: as many as the cores keep busy and the memory holds.
+
+        Raises:
+            OptionError: Not one fits into the memory.
+        """
+        busy = max(1, self.cores // max(1, job.threads * job.workers))
+        fitting = (self.memory - TASK_BYTES) // job.task_bytes  # but for what coordinates them
+        if fitting < 1 and self.memory < job.task_bytes:
+            needed = -(-job.task_bytes // 2**20)
+            raise OptionError(
+                f"--memory of {self.memory // 2**20} MiB is too little: one encoder of the "
+                f"largest images takes about {needed} MiB with what is around it."
+            )
+        return min(self.jobs or busy, max(1, fitting))
+
+
+def available_cores() -> int:
+    """Processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def available_memory() -> int:
+    """Bytes of this machine's memory, or of the container's where that is less."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    for name in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        try:
+            total = min(total, int(Path(name).read_text()))
+        except (OSError, ValueError):
+            continue
+    return total
+
+
+@dataclass(frozen=True, slots=True)
+class _Topics:
+    """The camera channels of a recording, by how they can be divided.
+
+    Attributes:
+        free: Their messages do not depend on each other, so that they can be cut anywhere.
+        bound: Those that one task takes from end to end.
+        infos: Topics of calibrations -> the topic of their images.
+    """
+
+    free: list[Channel]
+    bound: list[Channel]
+    infos: dict[str, str]
+
+
+def plan_job(reader: BagReader, paths: Sequence[Path], options: PackOptions, means: Means) -> Job:
+    """Plan a pack.
+
+    Args:
+        reader: The recording.
+        paths: What it was opened from.
+        options: How to pack.
+        means: What there is to pack with.
+
+    Returns:
+        The job; of one task where the recording is short, or without an index.
+
+    Raises:
+        OptionError: An option is wrong.
+    """
+    selected = Selection(options.topics, options.exclude)
+    selected.check(channel.topic for channel in reader.channels)
+    channels = [channel for channel in reader.channels if selected(channel.topic)]
+    if not reader.is_indexed:
+        return _single(reader, paths, options, means, _UNKNOWN_BYTES)
+    topics, pairs = _topics(reader, channels, options)
+    settings = StreamSettings(
+        quality=parse_quality(options.quality),
+        codec=options.codec,
+        preset=options.preset,
+        gop=options.gop,
+        threads=_side_by_side(reader, means)[1],
+        transcode=options.transcode,
+    )
+    needed = _assumed_bytes(reader, topics, settings)
+    if not topics.free:
+        return _single(reader, paths, options, means, needed)
+    window = options.window or GOPS_PER_WINDOW * options.gop
+    times = reader.times()
+    columns = [times[channel.id] for channel in topics.free if len(times.get(channel.id, ()))]
+    spans = spans_of(cut_times(columns, window))
+    if len(spans) == 1 and needed <= means.memory:
+        return _single(reader, paths, options, means, needed)
+    survey = _survey(reader, channels, topics, pairs, spans, replace(settings, threads=1))
+    costs = _costs(reader, topics, survey, threads=1)
+    budget = max(max(costs.values()), means.memory // (means.jobs or means.cores) - TASK_BYTES)
+    groups = group_topics(costs, budget)
+    tasks = _tasks(spans, groups, topics, reader)
+    spare = max(1, means.cores // len(tasks))
+    workers = min(spare, max(map(len, groups)))
+    threads = max(1, spare // workers)
+    largest = _largest(groups, _costs(reader, topics, survey, threads=threads))
+    if TASK_BYTES + largest > means.memory:
+        threads, largest = 1, _largest(groups, costs)
+    return Job(
+        paths=absolute(paths),
+        sources=[SourceState.of(path) for path in reader.files],
+        options=outcome_options(options),
+        threads=threads,
+        workers=workers,
+        task_bytes=TASK_BYTES + largest,
+        survey=survey,
+        tasks=tasks,
+        work=_work(reader, channels, survey),
+        cameras=list(dict.fromkeys(channel.topic for channel in (*topics.free, *topics.bound))),
+        tools=tools(),
+    )
+
+
+def _single(
+    reader: BagReader, paths: Sequence[Path], options: PackOptions, means: Means, needed: int
+) -> Job:
+    """The job of one task that takes everything."""
+    workers, threads = _side_by_side(reader, means)
+    return Job(
+        paths=absolute(paths),
+        sources=[SourceState.of(path) for path in reader.files],
+        options=outcome_options(options),
+        threads=threads,
+        workers=workers,
+        task_bytes=needed,
+        survey=Survey(),
+        tasks=[*_digest_tasks(reader), Task("all", others=True, whole=True)],
+        work={},
+        cameras=[],
+        tools=tools(),
+    )
+
+
+def _side_by_side(reader: BagReader, means: Means) -> tuple[int, int]:
+    """Streams that one process encodes at a time, and the threads of each encoder."""
+    cores = means.jobs or means.cores
+    workers = min(cores, sum(map(is_camera, reader.channels)) or 1)
+    return workers, max(1, -(-cores // workers))
+
+
+def _digest_tasks(reader: BagReader) -> list[Task]:
+    return [Task(f"source-{number}", source=number) for number in range(len(reader.files))]
+
+
+def _work(
+    reader: BagReader, channels: Sequence[Channel], survey: Survey
+) -> dict[str, tuple[int, float]]:
+    """Messages of each topic, and what one costs: its bytes, more where it is encoded."""
+    stats = reader.stats()
+    work: dict[str, tuple[int, float]] = {}
+    for channel in channels:
+        first = reader.first(channel) if channel.id in survey.decisions else None
+        encoded = any(item.plans for item in survey.decisions.get(channel.id, ()))
+        cost = len(first.data) * (1.0 if encoded else _COPIED) if first else _OTHER_COST
+        count, _ = work.get(channel.topic, (0, 0.0))
+        count += stats[channel.id].count if channel.id in stats else 0
+        work[channel.topic] = (count, cost)
+    return work
+
+
+def _topics(
+    reader: BagReader, channels: Sequence[Channel], options: PackOptions
+) -> tuple[_Topics, dict[int, int]]:
+    """How the camera channels can be divided, and the calibrations that names pair."""
+    cameras = [channel for channel in channels if is_camera(channel)]
+    bound = {channel.topic for channel in cameras if _is_bound(reader, channel)}
+    pairs = pair_camera_infos(channels, chosen=choose_pairs(options.camera_info, channels))
+    by_id = {channel.id: channel.topic for channel in channels}
+    return (
+        _Topics(
+            [channel for channel in cameras if channel.topic not in bound],
+            [channel for channel in cameras if channel.topic in bound],
+            {by_id[info]: by_id[image] for info, image in pairs.items()},
+        ),
+        pairs,
+    )
+
+
+def _is_bound(reader: BagReader, channel: Channel) -> bool:
+    first = reader.first(channel)
+    return first is not None and depends_on_others(channel, first)
+
+
+def _survey(
+    reader: BagReader,
+    channels: Sequence[Channel],
+    topics: _Topics,
+    pairs: dict[int, int],
+    spans: Sequence[tuple[int | None, int | None]],
+    settings: StreamSettings,
+) -> Survey:
+    infos = [channel for channel in channels if is_calibration(channel)]
+    found: dict[int, int] = {}
+    if unpaired_infos(channels, pairs):
+        found = survey_pairs(reader, topics.free, infos, pairs)
+        by_id = {channel.id: channel.topic for channel in channels}
+        topics.infos.update({by_id[info]: by_id[image] for info, image in found.items()})
+    starts = [start for start, _ in spans]
+    decisions = {
+        channel.id: survey_channel(reader, channel, starts, settings) for channel in topics.free
+    }
+    return Survey(decisions, found)
+
+
+def _largest(groups: Sequence[Sequence[str]], costs: Mapping[str, int]) -> int:
+    return max(sum(costs[topic] for topic in group) for group in groups)
+
+
+def _costs(reader: BagReader, topics: _Topics, survey: Survey, *, threads: int) -> dict[str, int]:
+    """Memory of each topic's encoders and of its messages on their way, bytes."""
+    costs: dict[str, int] = {}
+    for channel in topics.free:
+        first = reader.first(channel)
+        cost = _MESSAGES_IN_FLIGHT * len(first.data) if first else 0
+        cost += sum(_encoder_bytes(item, threads) for item in survey.decisions[channel.id])
+        costs[channel.topic] = costs.get(channel.topic, 0) + cost
+    return costs
+
+
+def _encoder_bytes(decision: Decision, threads: int) -> int:
+    """Memory of the encoder of a key's images; of the first plan, as others are rarely needed."""
+    for plan in decision.plans[:1]:
+        if isinstance(plan, PicturePlan):
+            size = plan.layout.picture_size(decision.key.width, decision.key.height)
+            return encoder_bytes(plan.recipe, *size, threads)
+    return 0
+
+
+def _assumed_bytes(reader: BagReader, topics: _Topics, settings: StreamSettings) -> int:
+    """Memory of packing everything at once, before the images were looked at closely."""
+    needed = TASK_BYTES
+    for channel in topics.free:
+        first = reader.first(channel)
+        if first is None:
+            continue
+        needed += _ASSUMED_ROW * len(first.data)
+        with suppress(Unsuited):
+            seen = Looker(channel, transcode=settings.transcode).look(first)
+            if not needs_trial(seen, settings):
+                decision = decide([seen], settings, rate_of(reader, channel))
+                needed += _encoder_bytes(decision, settings.threads)
+    return needed
+
+
+def _tasks(
+    spans: Sequence[tuple[int | None, int | None]],
+    groups: Sequence[Sequence[str]],
+    topics: _Topics,
+    reader: BagReader,
+) -> list[Task]:
+    """All tasks, those of one time together; the first group takes what is no camera's, too."""
+    apart = [_with_infos(group, topics) for group in groups[1:]]
+    solo = [
+        _with_infos([topic], topics)
+        for topic in dict.fromkeys(channel.topic for channel in topics.bound)
+    ]
+    without = tuple(sorted(topic for group in (*apart, *solo) for topic in group))
+    tasks = _digest_tasks(reader)
+    tasks += [Task(f"whole-{n}", topics=group, solo=True) for n, group in enumerate(solo)]
+    for number, (start, end) in enumerate(spans):
+        name = f"{number:05}"
+        tasks.append(Task(f"{name}-0", start, end, without=without, others=number == 0))
+        tasks += [Task(f"{name}-{n}", start, end, group) for n, group in enumerate(apart, start=1)]
+    return tasks
+
+
+def _with_infos(group: Sequence[str], topics: _Topics) -> tuple[str, ...]:
+    """Topics of a group, with those of the calibrations that go with them."""
+    infos = [info for info, image in topics.infos.items() if image in group]
+    return tuple(sorted({*group, *infos}))

@@ -1,0 +1,205 @@
+"""What is decided of a recording before it is packed in parts, so that all parts agree."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from mp4ds.bags import BagReader
+from mp4ds.pairing import StampPairing
+from mp4ds.records import Channel, Excerpt, Message
+from mp4ds.streams import (
+    Forms,
+    Looker,
+    Seen,
+    StreamKey,
+    StreamSettings,
+    TrackPlan,
+    Unsuited,
+    needs_trial,
+    plan_from_values,
+    plan_to_values,
+    plan_tracks,
+)
+from mp4ds.wire import is_calibration
+
+SAMPLES = 6
+"""Images of a stream that show how it is best encoded."""
+
+MAX_STREAMS_PER_CHANNEL = 16
+"""A channel that changes its geometry more often than this is not split any further."""
+
+_MAX_LOOKS = 64
+_PAIRING_MESSAGES = 5_000
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """How images of one key are stored.
+
+    Attributes:
+        key: What they have in common.
+        plans: The best first; none where no video is made of them.
+        refusal: Why there is none.
+    """
+
+    key: StreamKey
+    plans: list[TrackPlan]
+    refusal: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What all parts of a recording are to agree on.
+
+    Attributes:
+        decisions: Of the keys of each camera channel, by its id; channels that are packed by one
+            task alone are not here.
+        pairs: Calibration channels that stamps paired: their id -> that of the images.
+    """
+
+    decisions: Mapping[int, Sequence[Decision]] = field(default_factory=dict)
+    pairs: Mapping[int, int] = field(default_factory=dict)
+
+    def to_values(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {
+            "decisions": {
+                str(channel): [
+                    {
+                        "key": asdict(item.key),
+                        "plans": [plan_to_values(plan) for plan in item.plans],
+                        "refusal": item.refusal,
+                    }
+                    for item in items
+                ]
+                for channel, items in self.decisions.items()
+            },
+            "pairs": {str(info): image for info, image in self.pairs.items()},
+        }
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, Any]) -> Survey:
+        """The survey that `to_values` was called on."""
+        return cls(
+            {
+                int(channel): [
+                    Decision(
+                        StreamKey(**item["key"]),
+                        [plan_from_values(plan) for plan in item["plans"]],
+                        item["refusal"],
+                    )
+                    for item in items
+                ]
+                for channel, items in values["decisions"].items()
+            },
+            {int(info): image for info, image in values["pairs"].items()},
+        )
+
+
+def rate_of(reader: BagReader, channel: Channel) -> float | None:
+    """Messages per second of a channel, where an index tells."""
+    stats = reader.stats().get(channel.id)
+    return stats.rate if stats else None
+
+
+def decide(samples: Sequence[Seen], settings: StreamSettings, rate: float | None) -> Decision:
+    """How images are stored, by looking at the first of them.
+
+    Args:
+        samples: The first images of one key, at least one, at most `SAMPLES`.
+        settings: What was asked for.
+        rate: Frames per second, where known.
+    """
+    key = samples[0].key
+    try:
+        return Decision(key, plan_tracks(samples, settings, rate))
+    except Unsuited as reason:
+        return Decision(key, [], str(reason))
+
+
+def survey_channel(
+    reader: BagReader, channel: Channel, starts: Sequence[int | None], settings: StreamSettings
+) -> list[Decision]:
+    """Look at a camera channel where its parts begin, and decide for each key that is there.
+
+    Args:
+        reader: The recording, indexed.
+        channel: One whose messages do not depend on each other.
+        starts: Log times, ns, at which parts begin; None for the recording's start.
+        settings: What was asked for.
+    """
+    looker = Looker(channel, transcode=settings.transcode)
+    decisions: dict[StreamKey, Decision] = {}
+    step = -(-len(starts) // _MAX_LOOKS) or 1
+    for start in starts[::step]:
+        samples = _samples(reader, channel, start, looker, settings)
+        if samples and samples[0].key not in decisions:
+            decisions[samples[0].key] = decide(samples, settings, rate_of(reader, channel))
+            if len(decisions) == MAX_STREAMS_PER_CHANNEL:
+                break
+    return list(decisions.values())
+
+
+def _samples(
+    reader: BagReader,
+    channel: Channel,
+    start: int | None,
+    looker: Looker,
+    settings: StreamSettings,
+) -> list[Seen]:
+    """The first images of one key from a log time on, as many as decide."""
+    samples: list[Seen] = []
+    excerpt = Excerpt(start=start, topics=frozenset([channel.topic]), others=False)
+    for number, record in enumerate(reader.records(excerpt)):
+        if isinstance(record, Message) and record.channel.id == channel.id:
+            with suppress(Unsuited):
+                seen = looker.look(record)
+                if not samples or seen.key == samples[0].key:
+                    samples.append(seen)
+        enough = SAMPLES if samples and needs_trial(samples[0], settings) else 1
+        if len(samples) == enough or number == 4 * SAMPLES:
+            break
+    return samples
+
+
+def survey_pairs(
+    reader: BagReader,
+    cameras: Sequence[Channel],
+    infos: Sequence[Channel],
+    pairs: Mapping[int, int],
+) -> dict[int, int]:
+    """Pair calibrations with images by the stamps of the recording's first messages.
+
+    Args:
+        reader: The recording, indexed.
+        cameras: Camera channels whose messages do not depend on each other.
+        infos: Calibration channels, some of which are not paired.
+        pairs: Pairs that hold already.
+    """
+    topics = frozenset(channel.topic for channel in (*cameras, *infos))
+    forms = {channel.id: Forms(channel) for channel in infos}
+    lookers = {channel.id: Looker(channel) for channel in cameras}
+    pairing = StampPairing()
+    found = dict(pairs)
+    records = reader.records(Excerpt(topics=topics, others=False))
+    for number, record in enumerate(records):
+        if not isinstance(record, Message) or number == _PAIRING_MESSAGES:
+            break
+        channel = record.channel
+        try:
+            if is_calibration(channel) and channel.id in forms:
+                pairing.add(channel, forms[channel.id].split(record)[1])
+            elif channel.id in lookers:
+                seen = lookers[channel.id].look(record)
+                pairing.add(channel, seen.parts, size=(seen.key.width, seen.key.height))
+        except Unsuited:
+            continue
+        if number % 100 == 0:
+            found.update(pairing.decide(found, final=False))
+            if all(channel.id in found for channel in infos):
+                break
+    found.update(pairing.decide(found))
+    return {info: image for info, image in found.items() if info not in pairs}

@@ -1,0 +1,206 @@
+"""One task of a divided pack; ``python -m mp4ds.packing.work FOLDER TASK`` runs it.
+
+Every engine calls `run_task`. It is idempotent: where its result is there, it does nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import queue
+import resource
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from mp4ds.bags import BagReader
+from mp4ds.errors import Mp4dsError
+from mp4ds.outputs import write_synced
+from mp4ds.packing.job import Job, Task, digest_source
+from mp4ds.packing.kept import dump_kept
+from mp4ds.packing.packer import Packer
+from mp4ds.packing.part import RECORD_NAME, Part
+from mp4ds.packing.workplace import Workplace
+
+_REPORT_SECONDS = 0.5
+_KEPT_BYTES = 400 * 2**20
+
+
+Progress = Callable[[dict[str, Any]], None]
+
+
+def run_task(folder: str, name: str, progress: Progress | None = None) -> None:
+    """Make the result of a task, unless it is there.
+
+    Args:
+        folder: Of the pack.
+        name: Of the task.
+        progress: Called twice a second with frames and messages done, by topic.
+
+    Raises:
+        SourceError: The recording is damaged, or not what it was.
+        OSError: The disk refused.
+    """
+    with Tasks() as tasks:
+        tasks.run(folder, name, progress)
+
+
+class Tasks:
+    """Runs tasks one after the other; a recording stays open between those of one pack."""
+
+    def __init__(self) -> None:
+        self._job: Job | None = None
+        self._reader: BagReader | None = None
+
+    def run(self, folder: str, name: str, progress: Progress | None = None) -> None:
+        """See `run_task`."""
+        place = Workplace(Path(folder))
+        job = place.job()
+        if job is None:
+            raise Mp4dsError(f"{folder} holds no pack that was begun.")
+        task = job.task(name)
+        with place.making(task) as into:
+            if into is None:
+                return
+            job.check_sources()
+            if task.source is not None:
+                _digest(job, task.source, into)
+            else:
+                self._pack(job, task, into, progress)
+            job.check_sources()
+
+    def _pack(self, job: Job, task: Task, into: Path, progress: Progress | None) -> None:
+        next_report = 0.0
+
+        def report(part: Part) -> None:
+            nonlocal next_report
+            now = time.monotonic()
+            if progress is not None and now >= next_report:
+                next_report = now + _REPORT_SECONDS
+                progress(told(part))
+
+        part = Packer(self._open(job), into, job.settings(task), report).run()
+        if progress is not None:
+            progress(told(part))
+        part.save()
+
+    def _open(self, job: Job) -> BagReader:
+        # an index of millions of messages is not to be read for every task
+        if self._reader is None or self._job != job:
+            self.close()
+            self._reader = job.open()
+            self._job = job
+        return self._reader
+
+    def close(self) -> None:
+        """Close the recording."""
+        if self._reader is not None:
+            self._reader.__exit__(None, None, None)
+        self._reader = None
+
+    def __enter__(self) -> Tasks:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        tb: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def _digest(job: Job, number: int, into: Path) -> None:
+    size, sha256 = digest_source(job.sources[number])
+    record = {"size": size, "sha256": sha256, "files": {}}
+    write_synced(into / RECORD_NAME, dump_kept(record))
+
+
+def told(part: Part) -> dict[str, Any]:
+    """What a task tells of its progress: messages and bytes of each topic."""
+    return {
+        "topics": {topic.topic: (topic.messages, topic.raw_bytes) for topic in part.topics.values()}
+    }
+
+
+def command(task: tuple[str, ...]) -> list[str]:
+    """The command line that runs a task, and then those that it is given on standard input."""
+    return [sys.executable, "-m", "mp4ds.packing.work", *task]
+
+
+class _Orders:
+    """The tasks of this process: the first, then one for each line of its standard input.
+
+    Where the input ends in the middle of a task, nobody waits for its result: the process ends.
+    """
+
+    def __init__(self, first: list[str]) -> None:
+        self._queue: queue.SimpleQueue[list[str] | None] = queue.SimpleQueue()
+        self._queue.put(first)
+        self._busy = True
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def _watch(self) -> None:
+        # unbuffered: Python could not end while another thread waits within a buffer
+        for line in io.FileIO(sys.stdin.fileno(), closefd=False):
+            self._queue.put(json.loads(line))
+        self._queue.put(None)
+        if self._busy:
+            os._exit(1)
+
+    def __iter__(self) -> Iterator[list[str]]:
+        while True:
+            self._busy = False
+            task = self._queue.get()
+            if task is None:
+                return
+            self._busy = True
+            yield task
+
+
+def _tell(values: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(values) + "\n")
+    sys.stdout.flush()
+
+
+def _outcome(tasks: Tasks, folder: str, name: str) -> dict[str, Any]:
+    """Run a task and tell how it went."""
+    begun, used = time.monotonic(), time.process_time()
+    try:
+        tasks.run(folder, name, _tell)
+    except MemoryError:
+        return {"error": ("MemoryError", "out of memory; try fewer --jobs")}
+    except (Mp4dsError, OSError) as error:
+        tasks.close()  # it may be damaged where it was read ahead
+        return {"error": (type(error).__name__, str(error)), "ready": True}
+    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {
+        "done": True,
+        # what large encoders leave in pieces is given back by ending only
+        "ready": peak < _KEPT_BYTES,
+        "seconds": time.monotonic() - begun,
+        "cpu_seconds": time.process_time() - used,
+        "peak_bytes": peak,
+    }
+
+
+def _main() -> None:
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    with Tasks() as tasks:
+        for folder, name in _Orders(sys.argv[1:]):
+            outcome = _outcome(tasks, folder, name)
+            _tell(outcome)
+            if not outcome.get("ready"):
+                sys.exit(0 if "done" in outcome else 1)
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(BrokenPipeError):
+        _main()

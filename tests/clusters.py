@@ -1,0 +1,98 @@
+"""Clusters on this machine's loopback: processes of Dask, started and ended by their number."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+
+HERE = Path(__file__).parent
+SECONDS = 60.0
+
+_LOOPBACK = ("--host", "127.0.0.1", "--no-dashboard")
+
+
+def wait_until(true: Callable[[], bool], seconds: float = SECONDS) -> None:
+    """Wait for something, but not for ever."""
+    deadline = time.monotonic() + seconds
+    while not true():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"not in {seconds:g} s")
+        time.sleep(0.02)
+
+
+class RealCluster:
+    """A scheduler and its workers; a context manager that ends them.
+
+    Args:
+        folder: For what they write.
+        workers: How many to start.
+        arguments: More arguments of the workers.
+        config: Values of Dask's configuration, as its environment has them.
+        path: Where processes find modules, besides what is installed.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        workers: int = 2,
+        arguments: tuple[str, ...] = ("--nthreads", "1"),
+        config: dict[str, str] | None = None,
+        path: Path = HERE,
+    ) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder = folder
+        self._environment = {**os.environ, "PYTHONPATH": str(path), **(config or {})}
+        self._arguments = arguments
+        self.workers: list[subprocess.Popen[bytes]] = []
+        file = folder / "scheduler.json"
+        self.scheduler = self._start("dask_scheduler", "--port", "0", "--scheduler-file", str(file))
+        try:
+            wait_until(lambda: file.exists() and bool(file.read_text()))
+            self.address: str = json.loads(file.read_text())["address"]
+            for _ in range(workers):
+                self.add_worker()
+        except BaseException:
+            self.end()
+            raise
+
+    def _start(self, command: str, *arguments: str) -> subprocess.Popen[bytes]:
+        with (self._folder / "log").open("ab") as log:
+            return subprocess.Popen(
+                [sys.executable, "-m", f"distributed.cli.{command}", *_LOOPBACK, *arguments],
+                env=self._environment,
+                stdout=log,
+                stderr=log,
+            )
+
+    def add_worker(self) -> None:
+        """Start one more, which need not be there yet."""
+        arguments = ("--local-directory", str(self._folder), *self._arguments)
+        self.workers.append(self._start("dask_worker", self.address, *arguments))
+
+    def end(self) -> None:
+        """End what still runs; the nannies of workers end these."""
+        for process in (*self.workers, self.scheduler):
+            process.terminate()
+            try:
+                process.wait(20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def __enter__(self) -> RealCluster:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        tb: TracebackType | None,
+    ) -> None:
+        self.end()

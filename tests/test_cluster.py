@@ -1,0 +1,466 @@
+"""Tasks on the workers of a Dask cluster, and what becomes of them when machines die."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from importlib import import_module
+from pathlib import Path
+
+import dask
+import pytest
+
+import cluster_tasks
+from clusters import RealCluster, wait_until
+from mp4ds.engine import Engine, Outcome
+from mp4ds.engine import cluster_access as access
+from mp4ds.engine.cluster import ClusterEngine
+from mp4ds.errors import ClusterError, OptionError
+
+MIB = 2**20
+
+
+@pytest.fixture(autouse=True)
+def _settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep the packages from writing their defaults into the home folder."""
+    monkeypatch.setattr(dask.config, "PATH", str(tmp_path / "settings"))
+    import_module("dask_jobqueue")  # brings settings, which those of a test are to cover
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RealCluster]:
+    """One that no test harms."""
+    with RealCluster(tmp_path_factory.mktemp("cluster")) as cluster:
+        yield cluster
+
+
+def tasks_in(folder: Path, *names: str) -> list[tuple[str, ...]]:
+    return [(str(folder), name) for name in names]
+
+
+def numbered(count: int) -> list[str]:
+    return [f"{number:03}" for number in range(count)]
+
+
+def run(engine: Engine, tasks: list[tuple[str, ...]]) -> dict[str, Outcome]:
+    """Run tasks; by name, their outcomes."""
+    outcomes = list(engine.run(tasks, lambda *_: None))
+    assert sorted(outcome.task for outcome in outcomes) == sorted(tasks)
+    return {outcome.task[1]: outcome for outcome in outcomes}
+
+
+def errors(outcomes: dict[str, Outcome]) -> dict[str, tuple[str, str]]:
+    return {name: outcome.error for name, outcome in outcomes.items() if outcome.error}
+
+
+def results(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.glob("[0-9]*") if not path.suffix}
+
+
+def started(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.by-*"))
+
+
+# ---------------------------------------------------------------- tasks
+
+
+def test_all_tasks_run(cluster: RealCluster, tmp_path: Path) -> None:
+    names = numbered(12)
+    engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+    assert not errors(run(engine, tasks_in(tmp_path, *names)))
+    assert results(tmp_path) == {name: cluster_tasks.result(name) for name in names}
+    assert len({path.suffix for path in started(tmp_path)}) == 2  # processes: both worked
+    assert len(started(tmp_path)) == len(names)  # once each
+
+
+def test_no_tasks_need_no_cluster() -> None:
+    engine = ClusterEngine(cluster_tasks.write, "tcp://127.0.0.1:1", task_bytes=MIB)
+    assert run(engine, []) == {}
+
+
+def test_outcomes_come_as_tasks_end(cluster: RealCluster, tmp_path: Path) -> None:
+    engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+    with closing(engine.run(tasks_in(tmp_path, *numbered(20)), lambda *_: None)) as outcomes:
+        next(outcomes)
+        assert len(results(tmp_path)) < 10
+
+
+def test_errors_of_tasks_are_told_and_not_tried_again(cluster: RealCluster, tmp_path: Path) -> None:
+    names = ["source", "disk", "odd", "silent", "memory", "fine"]
+    engine = ClusterEngine(cluster_tasks.fail, cluster.address, task_bytes=MIB)
+    found = errors(run(engine, tasks_in(tmp_path, *names)))
+    for name, kind, sentence in [
+        ("source", "SourceError", "drive.bag: is damaged. Copy it again."),
+        ("disk", "OSError", "[Errno 28] No space left on device"),
+        ("odd", "OddError", "strange"),
+        ("silent", "RuntimeError", "RuntimeError"),
+        ("memory", "MemoryError", "out of memory."),
+    ]:
+        assert found[name][0] == kind
+        assert re.fullmatch(
+            rf"on worker tcp://127.0.0.1:\d+: {re.escape(sentence)}", found[name][1]
+        )
+    assert "fine" not in found
+    assert all((tmp_path / name).read_text() == "once\n" for name in names)
+
+
+def test_a_function_that_the_cluster_lacks(tmp_path: Path) -> None:
+    with RealCluster(tmp_path / "dask", workers=1, path=tmp_path) as cluster:
+        engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+        found = errors(run(engine, tasks_in(tmp_path, "a", "b")))
+    assert {kind for kind, _ in found.values()} == {"Failed"}
+    for _, sentence in found.values():
+        assert "No module named 'cluster_tasks'" in sentence
+        assert "The same version of mp4ds must be installed" in sentence
+
+
+def test_closing_drops_what_waits_and_leaves_the_cluster(
+    cluster: RealCluster, tmp_path: Path
+) -> None:
+    engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+    outcomes = engine.run(tasks_in(tmp_path, *numbered(50)), lambda *_: None)
+    with closing(outcomes):
+        assert next(outcomes).error is None
+    begun = len(started(tmp_path))
+    time.sleep(4 * cluster_tasks.SECONDS)
+    assert len(started(tmp_path)) <= begun + 2  # those that workers had fetched
+    (tmp_path / "next").mkdir()
+    assert not errors(run(engine, tasks_in(tmp_path / "next", *numbered(4))))
+    assert cluster.scheduler.poll() is None
+    assert all(worker.poll() is None for worker in cluster.workers)
+
+
+# ---------------------------------------------------------------- memory
+
+
+def test_workers_run_as_many_tasks_as_their_memory_holds(tmp_path: Path) -> None:
+    names = numbered(8)
+    limits = ("--nthreads", "4", "--memory-limit", "1GiB")
+    with RealCluster(tmp_path / "dask", workers=1, arguments=limits) as cluster:
+        for task_bytes, most in [(400 * MIB, 2), (MIB, 4)]:
+            folder = tmp_path / str(most)
+            folder.mkdir()
+            engine = ClusterEngine(cluster_tasks.crowd, cluster.address, task_bytes=task_bytes)
+            assert not errors(run(engine, tasks_in(folder, *names)))
+            assert max(int((folder / name).read_text()) for name in names) == most
+        engine = ClusterEngine(cluster_tasks.crowd, cluster.address, task_bytes=2048 * MIB)
+        found = errors(run(engine, tasks_in(tmp_path, "large")))
+    kind, sentence = found["large"]
+    assert kind == "OptionError"
+    assert "it has 1024 MiB of memory, and a task takes up to 2048 MiB" in sentence
+    assert not (tmp_path / "large").exists()
+
+
+def test_a_task_leaves_no_memory_behind(cluster: RealCluster, tmp_path: Path) -> None:
+    engine = ClusterEngine(cluster_tasks.leave_large, cluster.address, task_bytes=MIB)
+    assert not errors(run(engine, tasks_in(tmp_path, *numbered(4))))
+    assert len(list(tmp_path.glob("*.freed"))) == 4
+
+
+# ---------------------------------------------------------------- deaths
+
+
+def test_tasks_of_a_killed_worker_run_on_another(tmp_path: Path) -> None:
+    names = numbered(8)
+    arguments = ("--nthreads", "1", "--no-nanny")
+    with RealCluster(tmp_path / "dask", arguments=arguments) as cluster:
+        engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+        outcomes = engine.run(tasks_in(tmp_path, *names), lambda *_: None)
+        done = [next(outcomes)]
+        victim = cluster.workers[0]
+        mine = f"*.by-{victim.pid}"
+
+        def is_at_work() -> bool:
+            return any(not path.with_suffix("").exists() for path in tmp_path.glob(mine))
+
+        wait_until(is_at_work)
+        victim.kill()
+        unfinished = [p.stem for p in tmp_path.glob(mine) if not p.with_suffix("").exists()]
+        done += outcomes
+    assert unfinished
+    assert not any(outcome.error for outcome in done)
+    assert sorted(outcome.task[1] for outcome in done) == names
+    assert results(tmp_path) == {name: cluster_tasks.result(name) for name in names}
+    for name in unfinished:
+        assert len(list(tmp_path.glob(f"{name}.by-*"))) == 2
+
+
+def test_a_task_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
+    config = {
+        "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
+        "DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION": "1.0",
+    }
+    with RealCluster(tmp_path / "dask", config=config) as cluster:
+        engine = ClusterEngine(cluster_tasks.die, cluster.address, task_bytes=300 * MIB)
+        found = errors(run(engine, tasks_in(tmp_path, "deadly", *numbered(6))))
+    assert set(found) == {"deadly"}
+    kind, sentence = found["deadly"]
+    assert kind == "Killed"
+    assert sentence.startswith("2 workers died over it, perhaps for want of memory")
+    assert "300 MiB" in sentence
+
+
+def test_a_lost_scheduler_is_an_error_and_the_next_one_goes_on(tmp_path: Path) -> None:
+    names = numbered(8)
+    with RealCluster(tmp_path / "dask") as cluster:
+        engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+        outcomes = engine.run(tasks_in(tmp_path, *names), lambda *_: None)
+        next(outcomes)
+        cluster.scheduler.kill()
+        begun = time.monotonic()
+        with pytest.raises(ClusterError, match="run the same command again to go on"):
+            list(outcomes)
+        assert time.monotonic() - begun < 10
+    kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("0??")}
+    assert 0 < len(kept) < len(names)
+    with RealCluster(tmp_path / "dask-2", workers=1) as cluster:
+        engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+        assert not errors(run(engine, tasks_in(tmp_path, *names)))
+    assert results(tmp_path).keys() >= set(names)
+    assert all((tmp_path / name).stat().st_mtime_ns == kept[name] for name in kept)
+
+
+def test_a_cluster_without_workers_is_given_up(tmp_path: Path) -> None:
+    with (
+        RealCluster(tmp_path / "dask", workers=0) as cluster,
+        dask.config.set({"mp4ds.worker-timeout": "1 s"}),
+    ):
+        engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+        with pytest.raises(ClusterError, match="has had no worker for 1 s"):
+            run(engine, tasks_in(tmp_path, "a"))
+
+
+def test_workers_may_come_late(tmp_path: Path) -> None:
+    with RealCluster(tmp_path / "dask", workers=0) as cluster:
+        engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+        timer = threading.Timer(1, cluster.add_worker)
+        timer.start()
+        assert not errors(run(engine, tasks_in(tmp_path, "a")))
+        timer.join()
+
+
+# ---------------------------------------------------------------- ways to a cluster
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        *("", "slrum", "127.0.0.1:8786", "tcp://127.0.0.1", "tcp://:8786", "tcp://host:99999"),
+        *("http://127.0.0.1:8786", "tcp://host:1/path", "tcp://[::1:8786", "tcp://host:x", "\0"),
+    ],
+)
+def test_other_addresses_are_refused(address: str) -> None:
+    with pytest.raises(OptionError, match=r"tcp://HOST:PORT .* slurm, pbs,"):
+        ClusterEngine(cluster_tasks.write, address, task_bytes=MIB)
+
+
+@pytest.mark.parametrize(
+    ("address", "module", "package"),
+    [("tcp://127.0.0.1:1", "distributed", "distributed"), ("local", "distributed", "distributed")]
+    + [(system, "dask_jobqueue", "dask-jobqueue") for system in access.BATCH_SYSTEMS],
+)
+def test_a_missing_package_is_named(
+    address: str, module: str, package: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(OptionError, match=rf"needs {package}.*pip install 'mp4ds\[cluster\]'"):
+        ClusterEngine(cluster_tasks.write, address, task_bytes=MIB)
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(access, "_CONNECT_SECONDS", 1.0)
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "tcp://no-such-host.invalid:8786"])
+def test_nobody_at_the_address(address: str, tmp_path: Path) -> None:
+    engine = ClusterEngine(cluster_tasks.write, address, task_bytes=MIB)
+    begun = time.monotonic()
+    with pytest.raises(ClusterError, match="no Dask scheduler could be reached"):
+        run(engine, tasks_in(tmp_path, "a"))
+    assert time.monotonic() - begun < 10
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize(
+    ("says", "problem"),
+    [
+        (b"", "no Dask scheduler could be reached"),
+        (b"SSH-2.0-OpenSSH_9.2p1 Debian-2\r\n", "is not a Dask scheduler"),
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n", "is not a Dask scheduler"),
+        (b"\xff" * 1000, "is not a Dask scheduler"),
+        (bytes(1000), "is not a Dask scheduler"),
+        ((2**31).to_bytes(8, "little"), "no Dask scheduler could be reached"),
+    ],
+)
+def test_another_server_at_the_address(says: bytes, problem: str, tmp_path: Path) -> None:
+    kept: list[socket.socket] = []
+
+    def serve(server: socket.socket) -> None:
+        connection, _ = server.accept()
+        kept.append(connection)
+        connection.sendall(says)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=serve, args=(server,))
+        thread.start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        engine = ClusterEngine(cluster_tasks.write, address, task_bytes=MIB)
+        begun = time.monotonic()
+        with pytest.raises(ClusterError, match=problem):
+            run(engine, tasks_in(tmp_path, "a"))
+        assert time.monotonic() - begun < 10
+        thread.join()
+    for connection in kept:
+        connection.close()
+
+
+def test_tls_needs_certificates(tmp_path: Path) -> None:
+    engine = ClusterEngine(cluster_tasks.write, "tls://127.0.0.1:1", task_bytes=MIB)
+    with pytest.raises(OptionError, match="needs certificates"):
+        run(engine, tasks_in(tmp_path, "a"))
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_a_cluster_on_this_machine(tmp_path: Path) -> None:
+    engine = ClusterEngine(cluster_tasks.write, "local", task_bytes=MIB)
+    assert not errors(run(engine, tasks_in(tmp_path, *numbered(4))))
+    workers = {int(path.suffix.removeprefix(".by-")) for path in started(tmp_path)}
+    assert os.getpid() not in workers
+    wait_until(lambda: not any(map(is_alive, workers)))
+
+
+# ---------------------------------------------------------------- batch systems
+
+SBATCH = """#!/bin/sh
+[ -e {folder}/refuse ] && echo "sbatch: error: invalid partition specified: robots" >&2 && exit 1
+cp "$1" {folder}/script-$$
+setsid bash {folder}/script-$$ >> {folder}/log 2>&1 &
+echo $! >> {folder}/jobs
+echo "Submitted batch job $!"
+"""
+SCANCEL = """#!/bin/sh
+echo $1 >> {folder}/cancelled
+kill -TERM -- -$1
+"""
+
+
+class Batch:
+    """Stands in for SLURM: jobs are processes of this machine, their numbers process groups."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir()
+        self.folder = folder
+        for name, script in [("sbatch", SBATCH), ("scancel", SCANCEL)]:
+            path = folder / name
+            path.write_text(script.format(folder=folder))
+            path.chmod(0o755)
+
+    def numbers(self, name: str) -> list[int]:
+        path = self.folder / name
+        return [int(line) for line in path.read_text().split()] if path.exists() else []
+
+
+@pytest.fixture
+def batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Batch]:
+    system = Batch(tmp_path / "batch")
+    monkeypatch.setenv("PATH", f"{system.folder}:{os.environ['PATH']}")
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    slurm = {
+        "cores": 1,
+        "processes": 1,
+        "memory": "1GiB",
+        "local-directory": str(system.folder),
+        "scheduler-options": {"host": "127.0.0.1", "dashboard_address": ":0"},
+        "worker-extra-args": ["--host", "127.0.0.1", "--no-dashboard"],
+    }
+    settings = {f"jobqueue.slurm.{name}": value for name, value in slurm.items()}
+    with dask.config.set({**settings, "distributed.deploy.lost-worker-timeout": "100 ms"}):
+        yield system
+    assert sorted(set(system.numbers("jobs"))) == sorted(set(system.numbers("cancelled")))
+    wait_until(lambda: not any(map(is_alive, system.numbers("jobs"))))
+
+
+def test_jobs_of_a_batch_system_run_the_tasks(batch: Batch, tmp_path: Path) -> None:
+    engine = ClusterEngine(cluster_tasks.write, "slurm", task_bytes=MIB)
+    with dask.config.set({"mp4ds.jobs": 2}):
+        assert not errors(run(engine, tasks_in(tmp_path, *numbered(8))))
+    assert len(batch.numbers("jobs")) == 2
+
+
+def test_there_are_not_more_jobs_than_tasks(batch: Batch, tmp_path: Path) -> None:
+    engine = ClusterEngine(cluster_tasks.write, "slurm", task_bytes=MIB)
+    assert not errors(run(engine, tasks_in(tmp_path, "a")))
+    assert len(batch.numbers("jobs")) == 1
+
+
+def test_a_job_that_ended_is_submitted_again(
+    batch: Batch, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(access, "_LOOK_SECONDS", 0.5)
+    engine = ClusterEngine(cluster_tasks.write, "slurm", task_bytes=MIB)
+    with dask.config.set({"mp4ds.jobs": 1}):
+        outcomes = engine.run(tasks_in(tmp_path, *numbered(6)), lambda *_: None)
+        done = [next(outcomes)]
+        os.killpg(batch.numbers("jobs")[0], signal.SIGKILL)
+        done += outcomes
+    assert not any(outcome.error for outcome in done)
+    assert sorted(outcome.task[1] for outcome in done) == numbered(6)
+    assert len(batch.numbers("jobs")) == 2
+
+
+def test_what_the_batch_system_refuses_is_told(batch: Batch, tmp_path: Path) -> None:
+    (batch.folder / "refuse").touch()
+    engine = ClusterEngine(cluster_tasks.write, "slurm", task_bytes=MIB)
+    with pytest.raises(ClusterError, match=r"could not be submitted.*invalid partition specified"):
+        run(engine, tasks_in(tmp_path, "a", "b"))
+
+
+@pytest.mark.parametrize("system", access.BATCH_SYSTEMS)
+def test_a_batch_system_that_is_not_there(system: str, tmp_path: Path) -> None:
+    settings = {
+        "cores": 1,
+        "memory": "1GiB",
+        "disk": "1GiB",  # of HTCondor
+        "memory-per-core-property-name": "mem_core",  # of OAR
+        "scheduler-options": {"host": "127.0.0.1", "dashboard_address": ":0"},
+    }
+    named = {f"jobqueue.{system}.{name}": value for name, value in settings.items()}
+    engine = ClusterEngine(cluster_tasks.write, system, task_bytes=MIB)
+    with dask.config.set(named), pytest.raises(ClusterError, match="could not be submitted"):
+        run(engine, tasks_in(tmp_path, "a"))
+
+
+@pytest.mark.parametrize("system", access.BATCH_SYSTEMS)
+def test_a_batch_system_that_is_not_set_up(system: str, tmp_path: Path) -> None:
+    engine = ClusterEngine(cluster_tasks.write, system, task_bytes=MIB)
+    with pytest.raises(OptionError, match=rf"--cluster {system}: .*jobqueue.yaml"):
+        run(engine, tasks_in(tmp_path, "a"))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "variable"),
+    [("mp4ds.jobs", value, "DASK_MP4DS__JOBS") for value in (0, -1, "many", 1.5)]
+    + [("mp4ds.worker-timeout", v, "DASK_MP4DS__WORKER_TIMEOUT") for v in ("soon", [])],
+)
+def test_settings_are_checked(
+    name: str, value: object, variable: str, batch: Batch, tmp_path: Path
+) -> None:
+    engine = ClusterEngine(cluster_tasks.write, "slurm", task_bytes=MIB)
+    with dask.config.set({name: value}), pytest.raises(OptionError, match=variable):
+        run(engine, tasks_in(tmp_path, "a"))

@@ -1,0 +1,169 @@
+"""A recording packed on a Dask cluster: what comes out is what one machine makes."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mp4ds
+from clusters import RealCluster, wait_until
+from in_parts import facts, leftovers
+from mp4ds.errors import PartsFailedError
+from mp4ds.packing import PackOptions
+from round_trips import Compare, unpacked
+from sources import SOURCES, scene
+
+FRAMES = 120
+WINDOW = 3
+PARTS = FRAMES // WINDOW
+WORK = ".dataset.mp4ds-part"
+OTHER_VERSION = "import mp4ds._version\nmp4ds._version.__version__ = '0.0.1'\n"
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RealCluster]:
+    """One that no test harms."""
+    with RealCluster(tmp_path_factory.mktemp("cluster")) as cluster:
+        yield cluster
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("source")
+    (path,) = SOURCES["bag-none"](folder, scene("bayer_rggb8", frames=FRAMES))
+    return path
+
+
+@pytest.fixture(scope="module")
+def expected(source: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    folder = tmp_path_factory.mktemp("expected")
+    mp4ds.pack(source, folder / "dataset", PackOptions(codec="h264"))
+    return facts(folder / "dataset")
+
+
+def on(cluster: RealCluster) -> PackOptions:
+    return PackOptions(codec="h264", window=WINDOW, cluster=cluster.address)
+
+
+def command(source: Path, folder: Path, cluster: RealCluster) -> subprocess.Popen[str]:
+    """The command line at work."""
+    options = ["--codec", "h264", "--window", str(WINDOW), "--cluster", cluster.address]
+    return subprocess.Popen(
+        [sys.executable, "-m", "mp4ds", "pack", source, "-o", folder / "dataset", *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def finished(folder: Path) -> dict[str, int]:
+    """Parts whose results are there -> when they came."""
+    parts = sorted((folder / WORK / "parts").glob("0*"))
+    return {part.name: part.stat().st_mtime_ns for part in parts}
+
+
+def test_it_is_the_same_dataset(
+    cluster: RealCluster, source: Path, expected: dict[str, Any], tmp_path: Path, compare: Compare
+) -> None:
+    seen = []
+    mp4ds.pack(source, tmp_path / "dataset", on(cluster), progress=seen.append)
+    assert facts(tmp_path / "dataset") == expected
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare([source], unpacked(tmp_path, "bag")) == []
+    assert leftovers(tmp_path) == []
+    assert {progress.tasks_done for progress in seen} >= {1, PARTS}  # each is told as it ends
+
+
+def test_the_command_line_says_nothing_of_dask(
+    cluster: RealCluster, source: Path, expected: dict[str, Any], tmp_path: Path
+) -> None:
+    with command(source, tmp_path, cluster) as process:
+        _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 0, stderr
+    assert not re.search("distributed|dask|Traceback|Warning", stderr)
+    assert facts(tmp_path / "dataset") == expected
+
+
+def test_a_killed_worker_does_not_matter(
+    source: Path, expected: dict[str, Any], tmp_path: Path
+) -> None:
+    arguments = ("--nthreads", "1", "--no-nanny")
+    with (
+        RealCluster(tmp_path / "dask", arguments=arguments) as cluster,
+        command(source, tmp_path, cluster) as process,
+    ):
+        wait_until(lambda: len(finished(tmp_path)) >= 2)
+        cluster.workers[0].kill()
+        assert len(finished(tmp_path)) < PARTS
+        _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 0, stderr
+    assert facts(tmp_path / "dataset") == expected
+
+
+def test_a_lost_scheduler_is_told_and_another_goes_on(
+    cluster: RealCluster, source: Path, expected: dict[str, Any], tmp_path: Path
+) -> None:
+    with (
+        RealCluster(tmp_path / "dask") as lost,
+        command(source, tmp_path, lost) as process,
+    ):
+        wait_until(lambda: len(finished(tmp_path)) >= 2)
+        lost.scheduler.kill()
+        _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "Traceback" not in stderr
+    said = " ".join(stderr.split())  # as it is folded to the terminal's width
+    assert f"{lost.address}: the connection to the Dask scheduler was lost" in said
+    assert "run the same command again to go on" in said
+    assert not (tmp_path / "dataset").exists()
+    kept = finished(tmp_path)
+    assert 2 <= len(kept) < PARTS
+    mp4ds.pack(source, tmp_path / "dataset", on(cluster), progress=(seen := []).append)
+    assert max(progress.tasks_before for progress in seen) == len(kept)
+    assert facts(tmp_path / "dataset") == expected
+    assert leftovers(tmp_path) == []
+
+
+@pytest.mark.parametrize(("sign", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
+def test_a_command_that_ended_leaves_the_cluster_idle(
+    sign: int,
+    code: int,
+    cluster: RealCluster,
+    source: Path,
+    expected: dict[str, Any],
+    tmp_path: Path,
+) -> None:
+    with command(source, tmp_path, cluster) as process:
+        wait_until(lambda: len(finished(tmp_path)) >= 2)
+        process.send_signal(sign)
+        _, stderr = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert "Traceback" not in stderr
+    if sign == signal.SIGINT:
+        assert "run the same command again to go on" in " ".join(stderr.split())
+    time.sleep(3)
+    idle = finished(tmp_path)
+    time.sleep(2)
+    assert finished(tmp_path) == idle
+    assert len(idle) < PARTS
+    assert all(p.poll() is None for p in (cluster.scheduler, *cluster.workers))
+    mp4ds.pack(source, tmp_path / "dataset", on(cluster))
+    assert facts(tmp_path / "dataset") == expected
+
+
+def test_workers_of_another_version_are_refused(source: Path, tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text(OTHER_VERSION)
+    with (
+        RealCluster(tmp_path / "dask", path=tmp_path) as cluster,
+        pytest.raises(PartsFailedError, match=r"on worker tcp:.* other versions: mp4ds"),
+    ):
+        mp4ds.pack(source, tmp_path / "dataset", on(cluster))
+    assert not (tmp_path / "dataset").exists()

@@ -1,0 +1,842 @@
+"""Parts of a recording: spans and topics add up to the whole, and nothing else is read."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap.writer import IndexType, Writer
+from rosbags.rosbag1 import Reader as BagReader
+
+from conftest import real
+from mp4ds.bags import ordering
+from mp4ds.bags.formats import open_reader, open_sources
+from mp4ds.bags.mcap import McapReader
+from mp4ds.bags.multi import MultiReader
+from mp4ds.bags.ordering import Part, merged
+from mp4ds.errors import SourceError
+from mp4ds.records import (
+    EVERYTHING,
+    Channel,
+    ChannelStats,
+    Excerpt,
+    Message,
+    MetadataRecord,
+    Record,
+)
+from sources import PERIOD, SOURCES, START, Scene, scene, write_bag, write_mcap, write_rosbag2
+from test_bags_ros1 import REAL_BAGS
+
+NOT_INDEXED = {
+    "rosbag2-sqlite3-zstd-file",
+    "rosbag2-mcap-zstd-file",
+    "mcap-unchunked",
+    "mcap-unindexed",
+}
+INDEXED = [name for name in SOURCES if name not in NOT_INDEXED]
+NO_MESSAGES = Excerpt(topics=frozenset())
+
+Row = tuple[int, int, int, bytes]
+
+
+def row(message: Message) -> Row:
+    return (message.log_time, message.publish_time, message.sequence, bytes(message.data))
+
+
+def rows(records: Iterable[Record]) -> list[tuple[object, Row]]:
+    """Channel and content of each message."""
+    return [(r.channel.identity, row(r)) for r in records if isinstance(r, Message)]
+
+
+def by_channel(records: Iterable[Record]) -> dict[int, list[Row]]:
+    found: dict[int, list[Row]] = defaultdict(list)
+    for record in records:
+        if isinstance(record, Message):
+            found[record.channel.id].append(row(record))
+    return dict(found)
+
+
+def others(records: Iterable[Record]) -> list[Record]:
+    return [record for record in records if not isinstance(record, Message)]
+
+
+def consecutive(edges: Sequence[int], **more: Any) -> list[Excerpt]:
+    ends = [None, *edges, None]
+    return [Excerpt(start, end, **more) for start, end in pairwise(ends)]
+
+
+def read_all(reader: Any, excerpts: Iterable[Excerpt]) -> list[Record]:
+    return [record for excerpt in excerpts for record in reader.records(excerpt)]
+
+
+def random_edges(times: Sequence[int], rng: np.random.Generator, count: int) -> list[int]:
+    """Times of messages, times beside them, and some that occur twice."""
+    picked = rng.choice(np.array(times, np.uint64), count).tolist()
+    steps = rng.integers(-1, 2, count).tolist()
+    return sorted(time + step for time, step in zip(picked, steps, strict=True))
+
+
+def check(reader: Any, seed: int = 0, *, ordered: bool | None = None) -> list[Record]:
+    """That spans, topics and both together give what one pass gives; returns that."""
+    whole = list(reader.records())
+    expected, all_others = by_channel(whole), sorted(others(whole), key=repr)
+    times = [record.log_time for record in whole if isinstance(record, Message)] or [0]
+    rng = np.random.default_rng(seed)
+    spans = consecutive(random_edges(times, rng, 6), others=False)
+    topics = partition(sorted({channel.topic for channel in reader.channels}), rng)
+    both = [
+        Excerpt(span.start, span.end, part.topics, part.without, others=False)
+        for part in topics
+        for span in spans
+    ]
+    narrow = Excerpt(spans[2].start, spans[2].end)
+    asked = (*spans, *topics, *both, narrow)
+    pieces = {excerpt: list(reader.records(excerpt)) for excerpt in asked}
+    for excerpt, piece in pieces.items():
+        assert sorted(others(piece), key=repr) == (all_others if excerpt.others else [])
+        assert by_channel(piece) == by_channel(filter(excerpt.has, whole))
+    joined = {n: [r for e in part for r in pieces[e]] for n, part in enumerate((spans, both))}
+    if reader.is_indexed if ordered is None else ordered:
+        assert by_channel(joined[0]) == by_channel(joined[1]) == expected
+        assert rows(joined[0]) == rows(whole)
+    assert by_channel(chain.from_iterable(pieces[part] for part in topics)) == expected
+    assert sorted(reader.records(NO_MESSAGES), key=repr) == all_others
+    assert rows(reader.records()) == rows(whole)
+    return whole
+
+
+def partition(topics: Sequence[str], rng: np.random.Generator) -> list[Excerpt]:
+    """Each topic in one of three, the last of which takes what the others do not."""
+    groups: list[set[str]] = [set(), set(), set()]
+    for topic in topics:
+        groups[int(rng.integers(0, 3))].add(topic)
+    named = frozenset(groups[0] | groups[1])
+    return [
+        Excerpt(topics=frozenset(groups[0])),
+        Excerpt(topics=named, without=frozenset(groups[0])),
+        Excerpt(without=named),
+    ]
+
+
+# ---------------------------------------------------------------- what an excerpt is
+
+
+def test_what_an_excerpt_has() -> None:
+    excerpt = Excerpt(10, 20, frozenset({"/a", "/b"}), frozenset({"/b"}))
+    assert [excerpt.has_topic(topic) for topic in ("/a", "/b", "/c")] == [True, False, False]
+    assert [excerpt.has_time(time) for time in (9, 10, 19, 20)] == [False, True, True, False]
+    assert [excerpt.touches(*span) for span in ((0, 9), (0, 10), (19, 30), (20, 30))] == [
+        False, True, True, False,
+    ]  # fmt: skip
+    assert EVERYTHING.has_topic("")
+    assert EVERYTHING.has_time(-1)
+    assert EVERYTHING.touches(2**64, 2**64)
+    assert EVERYTHING.has_messages
+    for empty in (Excerpt(5, 5), Excerpt(topics=frozenset("a"), without=frozenset("ab"))):
+        assert not empty.has_messages
+
+
+def test_stats_of_two_parts() -> None:
+    none, one, two = ChannelStats(0, 0, 0), ChannelStats(2, 5, 9), ChannelStats(1, 7, 20)
+    assert none.plus(one) == one.plus(none) == one
+    assert one.plus(two) == ChannelStats(3, 5, 20)
+
+
+# ---------------------------------------------------------------- all kinds of sources
+
+
+@pytest.mark.parametrize("name", SOURCES)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_parts_of_every_source(name: str, seed: int, tmp_path: Path) -> None:
+    paths = SOURCES[name](tmp_path, scene("mono8", frames=24))
+    with open_sources(paths) as reader:
+        assert reader.is_indexed == (name not in NOT_INDEXED)
+        whole = check(reader, seed)
+        assert len(rows(whole)) == 24 * 8
+    # every task opens the recording by itself
+    apart = []
+    for span in consecutive(random_edges([START + PERIOD * 24], np.random.default_rng(0), 1)):
+        with open_sources(paths) as reader:
+            apart += list(reader.records(span))
+    assert sorted(rows(apart), key=repr) == sorted(rows(whole), key=repr)
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_spans_without_messages(name: str, tmp_path: Path) -> None:
+    paths = SOURCES[name](tmp_path, scene("mono8", frames=4))
+    with open_sources(paths) as reader:
+        whole = list(reader.records())
+        times = [record.log_time for record in whole if isinstance(record, Message)]
+        first, last = min(times), max(times)
+        for start, end in (
+            (None, first),
+            (last + 1, None),
+            (first, first),
+            (last, first),
+            (-(2**70), -1),
+            (None, -(2**70)),
+            (2**70, 2**71),
+            (2**64, None),
+            (first + 1, first + 2),
+        ):
+            assert list(reader.records(Excerpt(start, end, others=False))) == []
+            assert list(reader.records(Excerpt(start, end))) == others(whole)
+        for start, end in ((first, last + 1), (-(2**70), 2**70), (0, None), (None, 2**64)):
+            assert rows(reader.records(Excerpt(start, end))) == rows(whole)
+        assert list(reader.records(Excerpt(topics=frozenset({"/none"}), others=False))) == []
+
+
+@pytest.mark.parametrize("name", REAL_BAGS)
+def test_parts_of_real_bags(name: str) -> None:
+    with open_reader(real(name)) as reader:
+        assert reader.is_indexed
+        check(reader)
+
+
+def test_parts_of_real_mcap_files() -> None:
+    files = sorted(real("mcap").rglob("*.mcap"))
+    indexed = 0
+    for file in files:
+        with open_reader(file) as reader:
+            indexed += reader.is_indexed
+            check(reader)
+    assert 20 < indexed < len(files)
+
+
+def test_parts_of_real_rosbag2_folders() -> None:
+    folders = [path.parent for path in real("rosbag2").rglob("metadata.yaml")]
+    assert folders
+    read = 0
+    for folder in folders:
+        try:
+            reader = open_reader(folder)
+        except SourceError:
+            continue
+        with reader:
+            check(reader)
+            read += 1
+    assert read > 3
+
+
+def test_several_excerpts_at_once(tmp_path: Path) -> None:
+    for name in ("bag-lz4", "mcap-ros2-zstd", "rosbag2-sqlite3-v9", "rosbag2-mcap-split"):
+        (tmp_path / name).mkdir()
+        paths = SOURCES[name](tmp_path / name, scene("mono8", frames=24))
+        with open_sources(paths) as reader:
+            spans = consecutive([START + 6 * PERIOD, START + 12 * PERIOD], others=False)
+            expected = [rows(reader.records(span)) for span in spans]
+            assert all(expected)
+            running = [iter(reader.records(span)) for span in spans]
+            found: list[list[Record]] = [[] for _ in spans]
+            for _ in range(200):
+                for records, so_far in zip(running, found, strict=True):
+                    so_far += [record for record in [next(records, None)] if record]
+            assert [rows(records) for records in found] == expected
+            next(iter(reader.records(spans[0])))  # left where it is
+            assert rows(reader.records(spans[1])) == expected[1]
+
+
+# ---------------------------------------------------------------- what is not read
+
+
+def damage_chunks(path: Path, keep: Callable[[Any], bool]) -> int:
+    """Overwrite the contents of the chunks of an MCAP file that are not to be kept."""
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary
+    data = bytearray(path.read_bytes())
+    lost = [chunk for chunk in summary.chunk_indexes if not keep(chunk)]
+    for chunk in lost:
+        start = chunk.chunk_start_offset + 9
+        data[start : chunk.chunk_start_offset + chunk.chunk_length] = b"\xff" * (
+            chunk.chunk_length - 9
+        )
+    path.write_bytes(data)
+    return len(lost)
+
+
+def damage_bag(path: Path, keep: Callable[[Any], bool]) -> int:
+    """Overwrite the contents of the chunks of a bag that are not to be kept."""
+    with BagReader(path) as reader:
+        lost = [reader.chunks[info.pos] for info in reader.chunk_infos if not keep(info)]
+    data = bytearray(path.read_bytes())
+    for chunk in lost:
+        data[chunk.datapos : chunk.datapos + chunk.datasize] = b"\xff" * chunk.datasize
+    path.write_bytes(data)
+    return len(lost)
+
+
+CHUNKED = [
+    "bag-none", "bag-bz2", "bag-lz4", "bag-split", "mcap-ros1-zstd", "mcap-ros2-none",
+    "mcap-ros2-lz4", "mcap-ros2-zstd", "rosbag2-mcap-v5", "rosbag2-mcap-split",
+    "rosbag2-mcap-zstd-message",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CHUNKED)
+def test_chunks_outside_of_a_span_are_not_read(name: str, tmp_path: Path) -> None:
+    span = Excerpt(START + 20 * PERIOD, START + 26 * PERIOD)
+    paths = SOURCES[name](tmp_path, scene("mono8", frames=60))
+    with open_sources(paths) as reader:
+        expected = list(reader.records(span))
+        assert 40 < len(rows(expected)) < 60
+        topics = by_channel(reader.records())
+    lost = 0
+    for path in sorted(tmp_path.rglob("*.*")):
+        if path.suffix == ".bag":
+            lost += damage_bag(path, lambda c: span.touches(c.start_time, c.end_time - 1))
+        elif path.suffix == ".mcap":
+            lost += damage_chunks(
+                path, lambda c: span.touches(c.message_start_time, c.message_end_time)
+            )
+    assert lost > 1
+    with open_sources(paths) as reader:
+        assert rows(reader.records(span)) == rows(expected)
+        assert others(reader.records(span)) == others(expected)
+        assert sum(s.count for s in reader.stats().values()) == sum(map(len, topics.values()))
+        with pytest.raises(SourceError, match="is damaged"):
+            list(reader.records())
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_chunks_of_other_topics_are_not_read(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"a.{kind}"
+    by_topic = sorted(scene("mono8", frames=24).messages, key=lambda m: (m.topic, m.log_time))
+    messages = Scene(by_topic)
+    wanted = Excerpt(topics=frozenset({"/cam/image_raw"}))
+    if kind == "bag":
+        write_bag(path, messages, chunk_size=1)
+    else:
+        write_one_by_one(path, messages)
+    with open_reader(path) as reader:
+        expected = rows(reader.records(wanted))
+        assert len(expected) == 24
+    if kind == "bag":
+        with BagReader(path) as library:
+            ids = {c.id for c in library.connections if c.topic == "/cam/image_raw"}
+        assert damage_bag(path, lambda c: bool(ids & c.connection_counts.keys())) > 100
+    else:
+        with path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+        assert summary
+        ids = {c.id for c in summary.channels.values() if c.topic == "/cam/image_raw"}
+        assert damage_chunks(path, lambda c: bool(ids & c.message_index_offsets.keys())) > 100
+    with open_reader(path) as reader:
+        assert rows(reader.records(wanted)) == expected
+        with pytest.raises(SourceError, match="is damaged"):
+            list(reader.records(Excerpt(without=frozenset({"/cam/image_raw"}))))
+
+
+def write_one_by_one(path: Path, messages: Scene) -> None:
+    """Each message in a chunk of its own."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=1)
+        writer.start()
+        ids: dict[str, int] = {}
+        for number, message in enumerate(messages.messages):
+            if message.topic not in ids:
+                ids[message.topic] = writer.register_channel(message.topic, "cdr", 0)
+            data = message.payload("cdr")
+            writer.add_message(ids[message.topic], message.log_time, data, number, number)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_attachments_are_found_without_the_chunks(indexed: bool, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write_mcap(path, scene("mono8", frames=24), indexed=indexed)
+    with open_reader(path) as reader:
+        expected = others(reader.records())
+        assert len(expected) == 4
+    data = bytearray(path.read_bytes())
+    starts = list(chunk_starts(path))
+    assert len(starts) > 2
+    for start in starts:
+        (length,) = struct.unpack_from("<Q", data, start + 1)
+        data[start + 9 : start + 9 + length] = b"\xff" * length
+    path.write_bytes(data)
+    with open_reader(path) as reader:
+        assert reader.is_indexed == indexed
+        assert list(reader.records(NO_MESSAGES)) == expected
+        assert list(reader.records(Excerpt(5, 5))) == expected
+        with pytest.raises(SourceError, match="is damaged"):
+            list(reader.records(Excerpt(0)))
+
+
+def chunk_starts(path: Path) -> Iterator[int]:
+    data = path.read_bytes()
+    place = 8
+    while data[place] != 2:
+        if data[place] == 6:
+            yield place
+        place += 9 + struct.unpack_from("<Q", data, place + 1)[0]
+
+
+@pytest.mark.parametrize("files", [1, 3])
+def test_pages_outside_of_a_span_are_not_read(files: int, tmp_path: Path) -> None:
+    span = Excerpt(START + 20 * PERIOD, START + 26 * PERIOD)
+    rest = Excerpt(START + 20 * PERIOD, START + 40 * PERIOD, without=frozenset({"/cam/image_raw"}))
+    paths = SOURCES["rosbag2-sqlite3-split" if files > 1 else "rosbag2-sqlite3-v9"](
+        tmp_path, scene("mono8", frames=60, width=160, height=120)
+    )
+    with open_sources(paths) as reader:
+        expected = rows(reader.records(span)), rows(reader.records(rest))
+        assert len(expected[0]) > 40
+        images = [
+            bytes(record.data)
+            for record in reader.records(Excerpt(topics=frozenset({"/cam/image_raw"})))
+            if isinstance(record, Message) and not span.has_time(record.log_time)
+        ]
+    for path in tmp_path.rglob("*.db3"):
+        data = bytearray(path.read_bytes())
+        for image in images:
+            # The payload goes on in pages that each begin with the number of the next one.
+            page = data.find(image[5000:6000]) // 4096 * 4096
+            if page >= 0:
+                data[page : page + 4] = b"\xff" * 4
+        path.write_bytes(data)
+    with open_sources(paths) as reader:
+        assert (rows(reader.records(span)), rows(reader.records(rest))) == expected
+        with pytest.raises(SourceError, match="cannot be read as sqlite3"):
+            list(reader.records())
+
+
+def test_only_the_files_of_a_span_are_opened(tmp_path: Path) -> None:
+    paths = SOURCES["bag-split"](tmp_path, scene("mono8", frames=24))
+    opened: list[Path] = []
+
+    def opener(path: Path) -> Callable[[], Any]:
+        def open_it() -> Any:
+            opened.append(path)
+            return open_reader(path)
+
+        return open_it
+
+    reader = MultiReader([opener(path) for path in paths])
+    opened.clear()
+    assert rows(reader.records(Excerpt(None, START + 4 * PERIOD, others=False)))
+    assert opened == paths[:1]
+    opened.clear()
+    list(reader.records())
+    assert opened == paths
+
+
+# ---------------------------------------------------------------- chunks that overlap
+
+
+def write_channels(
+    path: Path, messages: Iterable[tuple[str, int]], **options: Any
+) -> list[tuple[str, int, int]]:
+    """An MCAP file of small messages (topic, log time); returns them with their numbers."""
+    written = []
+    with path.open("wb") as stream:
+        writer = Writer(stream, **{"chunk_size": 600, **options})
+        writer.start()
+        ids: dict[str, int] = {}
+        for number, (topic, time) in enumerate(messages):
+            if topic not in ids:
+                ids[topic] = writer.register_channel(topic, "cdr", 0)
+            writer.add_message(ids[topic], time, number.to_bytes(40, "little"), time, number)
+            written.append((topic, time, number))
+        writer.finish()  # type: ignore[no-untyped-call]
+    return written
+
+
+def numbers(records: Iterable[Record]) -> list[tuple[str, int, int]]:
+    return [(r.channel.topic, r.log_time, r.sequence) for r in records if isinstance(r, Message)]
+
+
+def shuffled() -> list[tuple[str, int]]:
+    order = np.random.default_rng(3).permutation(300).tolist()
+    return [("/ab"[: 1 + n % 2 + n % 3 % 2], time // 3) for n, time in enumerate(order)]
+
+
+ARRANGED: dict[str, list[tuple[str, int]]] = {
+    "topic after topic": [(topic, time // 2) for topic in "abc" for time in range(100)],
+    "parts exchanged": [
+        ("a", time) for start in (200, 0, 100) for time in range(start, start + 100)
+    ],
+    "all at once": [("ab"[time % 2], 7) for time in range(300)],
+    "backwards": [("ab"[time % 2], 300 - time // 3) for time in range(300)],
+    "shuffled": shuffled(),
+    "up to the end of time": [("a", 2**64 - 300 + time) for time in range(300)],
+    "from zero": [("ab"[time // 7 % 2], time) for time in range(300)],
+}
+
+
+@pytest.mark.parametrize("name", ARRANGED)
+@pytest.mark.parametrize("hold", [None, 3900])
+def test_chunks_in_any_order(
+    name: str, hold: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.mcap"
+    written = write_channels(path, ARRANGED[name])
+    if hold:
+        monkeypatch.setattr(ordering, "HOLD_BYTES", hold)
+    with McapReader(path) as reader:
+        # What fits in time order is in time order, in one pass, too.
+        assert reader.is_indexed == (hold is None or name not in ("all at once", "shuffled"))
+        for seed in range(5):
+            whole = check(reader, seed)
+        if reader.is_indexed:
+            assert numbers(whole) == sorted(written, key=lambda item: item[1])
+        assert sorted(numbers(whole)) == sorted(written)
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4", "bz2"])
+def test_bag_chunks_in_any_order(compression: str, tmp_path: Path) -> None:
+    messages = scene("mono8", frames=24).messages
+    messages.sort(key=lambda message: (message.topic, message.log_time // (7 * PERIOD)))
+    write_bag(tmp_path / "a.bag", Scene(messages), compression, chunk_size=2000)
+    with open_reader(tmp_path / "a.bag") as reader:
+        for seed in range(5):
+            whole = check(reader, seed)
+        times = [time for _, (time, *_) in rows(whole)]
+        assert times == sorted(times)
+
+
+# ---------------------------------------------------------------- an index that lies
+
+
+def patched(path: Path, opcode: int, change: Callable[[bytearray, int], None]) -> None:
+    """Change the records of one kind in the summary: their body, and their number."""
+    data = bytearray(path.read_bytes())
+    (place,) = struct.unpack_from("<Q", data, len(data) - 28)
+    number = 0
+    while data[place] != 2:
+        (length,) = struct.unpack_from("<Q", data, place + 1)
+        if data[place] == opcode:
+            body = data[place + 9 : place + 9 + length]
+            change(body, number)
+            data[place + 9 : place + 9 + length] = body
+            number += 1
+        place += 9 + length
+    assert number
+    path.write_bytes(data)
+
+
+def put(form: str, offset: int, value: int, only: int | None = 3) -> Callable[..., None]:
+    def change(body: bytearray, number: int) -> None:
+        if only in (None, number):
+            struct.pack_into(form, body, offset, value)
+
+    return change
+
+
+def add(form: str, offset: int, value: int, only: int | None = 3) -> Callable[..., None]:
+    def change(body: bytearray, number: int) -> None:
+        if only in (None, number):
+            (old,) = struct.unpack_from(form, body, offset)
+            struct.pack_into(form, body, offset, old + value)
+
+    return change
+
+
+# Fields of a chunk index: start 0, end 8, offset 16, length 24, size of the map 32, map 36.
+LIES: dict[str, tuple[int, Callable[..., None], bool]] = {
+    "ends too early": (8, add("<Q", 8, -2), True),
+    "begins too late": (8, add("<Q", 0, 2), True),
+    "is elsewhere in time": (8, lambda b, n: n == 3 and struct.pack_into("<QQ", b, 0, 0, 1), True),
+    "ends before it begins": (8, put("<Q", 8, 0), False),
+    "other channel": (8, lambda b, n: n == 3 and struct.pack_into("<H", b, 36, 99), True),
+    "other chunk": (8, add("<Q", 16, 1), False),
+    "chunk too short": (8, add("<Q", 24, -1), False),
+    "index too long": (8, add("<Q", -28, 5), False),
+    "far away": (8, put("<Q", 16, 2**63), False),
+    "endless": (8, put("<Q", 24, 2**64 - 1), False),
+    "huge": (8, put("<Q", -8, 2**60), False),
+    "small": (8, put("<Q", -8, 1), True),
+    "chunk count": (11, add("<I", 22, 1, 0), False),
+    "channel count": (11, add("<I", 10, 1, 0), False),
+    "schema count": (11, add("<H", 8, 1, 0), False),
+    "message count": (11, add("<Q", 0, 1, 0), False),
+    "count of a channel": (11, add("<Q", -8, 1, 0), False),
+    "another kind of record": (4, lambda b, n: None, True),
+}
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_an_index_that_lies_loses_nothing_in_silence(name: str, tmp_path: Path) -> None:
+    """Either it is not used, or what is lost is told."""
+    opcode, change, is_used = LIES[name]
+    path = tmp_path / "a.mcap"
+    written = write_channels(path, ARRANGED["from zero"])
+    patched(path, opcode, change)
+    with McapReader(path) as reader:
+        assert reader.is_indexed == is_used
+        assert sorted(numbers(reader.records())) == sorted(written)
+        if not is_used:
+            check(reader)
+        elif name != "another kind of record":
+            with pytest.raises(SourceError, match=r"is damaged in its record at byte \d+: it "):
+                read_all(reader, consecutive([50, 100, 150, 200, 250], others=False))
+            topics = [Excerpt(topics=frozenset({topic})) for topic in "ab"]
+            with pytest.raises(SourceError, match=r"is damaged in its record at byte \d+: it "):
+                read_all(reader, topics)
+
+
+def test_a_chunk_that_tells_of_no_messages_is_looked_into(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    options = {"index_types": IndexType.ALL & ~IndexType.MESSAGE}
+    written = write_channels(path, ARRANGED["from zero"], **options)
+    with McapReader(path) as reader:
+        assert reader.is_indexed
+        for seed in range(5):
+            assert numbers(check(reader, seed)) == written
+    patched(path, 8, lambda body, number: struct.pack_into("<QQ", body, 0, 0, 0))
+    with McapReader(path) as reader, pytest.raises(SourceError, match="of log time"):
+        list(reader.records(Excerpt(30, 31)))
+
+
+def with_record(path: Path, opcode: int, body: bytes, *, in_summary: bool) -> None:
+    """Add a record to the end of the data, or to the summary."""
+    data = path.read_bytes()
+    (summary,) = struct.unpack_from("<Q", data, len(data) - 28)
+    place = summary if in_summary else summary - 13  # before the end of the data
+    added = struct.pack("<BQ", opcode, len(body)) + body
+    start = summary if in_summary else summary + len(added)
+    footer = data[-37:-28] + struct.pack("<QQI", start, 0, 0) + data[-8:]
+    path.write_bytes(data[:place] + added + data[place:-37] + footer)
+
+
+@pytest.mark.parametrize("in_summary", [True, False])
+def test_messages_beside_the_chunks(in_summary: bool, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    written = write_channels(path, ARRANGED["from zero"])
+    with_record(path, 5, struct.pack("<HIQQ", 1, 77, 30, 30), in_summary=in_summary)
+    with McapReader(path) as reader:
+        assert not reader.is_indexed
+        assert sorted(numbers(check(reader))) == sorted([*written, ("a", 30, 77)])
+
+
+@pytest.mark.parametrize("in_summary", [True, False])
+def test_private_records_are_counted_once(in_summary: bool, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write_channels(path, ARRANGED["from zero"])
+    with_record(path, 0x90, b"mine", in_summary=in_summary)
+    with McapReader(path) as reader:
+        assert reader.is_indexed
+        for excerpt in (EVERYTHING, Excerpt(0, 20), NO_MESSAGES):
+            list(reader.records(excerpt))
+            assert reader.skipped == {"private MCAP records (opcode 0x90)": 1}
+        list(reader.records(Excerpt(0, 20, others=False)))
+        assert reader.skipped == {}
+
+
+def test_a_compressed_payload_outside_is_not_looked_at(tmp_path: Path) -> None:
+    write_rosbag2(tmp_path / "a", scene("mono8", frames=8), "mcap", compression="message")
+    path = next((tmp_path / "a").glob("*.mcap"))
+    with path.open("rb") as stream:
+        found = [r for r in StreamReader(stream).records if type(r).__name__ == "Message"]
+    assert len({message.log_time for message in found}) > 8
+    with open_reader(tmp_path / "a") as reader:
+        check(reader)
+
+
+# ---------------------------------------------------------------- databases
+
+
+def changed_database(folder: Path, *statements: str) -> Path:
+    write_rosbag2(folder / "a", scene("mono8", frames=24), "sqlite3")
+    path = next((folder / "a").glob("*.db3"))
+    with closing(sqlite3.connect(path)) as connection, connection:
+        for statement in statements:
+            connection.execute(statement)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("statements", "indexed"),
+    [
+        ([], True),
+        (["DROP INDEX timestamp_idx"], False),
+        (["DROP INDEX timestamp_idx", "CREATE INDEX t ON messages(topic_id, timestamp)"], False),
+        (["DROP INDEX timestamp_idx", "CREATE INDEX t ON messages(timestamp) WHERE id < 9"], False),
+        (["DROP INDEX timestamp_idx", "CREATE INDEX t ON messages(timestamp, topic_id)"], True),
+        (["UPDATE messages SET timestamp = 5"], True),
+        (["UPDATE messages SET timestamp = 1000 - id"], True),
+        (["DELETE FROM messages"], True),
+    ],
+)
+def test_parts_of_databases(statements: list[str], indexed: bool, tmp_path: Path) -> None:
+    path = changed_database(tmp_path, *statements)
+    for where in (path, path.parent):
+        with open_reader(where) as reader:
+            assert reader.is_indexed == indexed
+            for seed in range(3):
+                check(reader, seed, ordered=True)
+
+
+REBUILT = (
+    "CREATE TABLE m(id INTEGER PRIMARY KEY, topic_id, timestamp, data)",
+    "INSERT INTO m SELECT * FROM messages",
+    "DROP TABLE messages",
+    "ALTER TABLE m RENAME TO messages",
+    "CREATE INDEX t ON messages(timestamp)",
+)
+
+
+@pytest.mark.parametrize("value", ["NULL", "'text'", "x'ff'", "-5", "1e300", "-1e300"])
+def test_what_is_no_time_is_refused_by_some_span(value: str, tmp_path: Path) -> None:
+    path = changed_database(
+        tmp_path, *REBUILT, f"UPDATE messages SET timestamp = {value} WHERE id = 50"
+    )
+    with open_reader(path) as reader:
+        assert reader.is_indexed
+        spans = consecutive([START + 5 * PERIOD, START + 12 * PERIOD])
+        with pytest.raises(SourceError, match=r"message of id 50, topic .*: the time"):
+            read_all(reader, spans)
+        assert rows(reader.records(spans[1]))
+
+
+def test_a_message_of_no_topic_is_refused_by_all_topics(tmp_path: Path) -> None:
+    path = changed_database(tmp_path, "UPDATE messages SET topic_id = 77 WHERE id = 50")
+    with open_reader(path) as reader:
+        for channel in reader.channels:
+            with pytest.raises(SourceError, match="of topic id 77"):
+                list(reader.records(Excerpt(topics=frozenset({channel.topic}))))
+        assert rows(reader.records(Excerpt(None, START))) == []
+
+
+@pytest.mark.parametrize("columns", ["timestamp", "topic_id, timestamp"])
+def test_counts_do_not_trust_the_index(columns: str, tmp_path: Path) -> None:
+    path = changed_database(
+        tmp_path, "DROP INDEX timestamp_idx", f"CREATE INDEX damaged ON messages({columns})"
+    )
+    with open_reader(path) as reader:
+        expected = reader.stats()
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("PRAGMA writable_schema = ON")
+        connection.execute("CREATE TABLE other(topic_id, timestamp)")
+        connection.execute(f"CREATE INDEX other_idx ON other({columns})")
+        connection.execute(
+            "UPDATE sqlite_master SET rootpage = (SELECT rootpage FROM sqlite_master"
+            " WHERE name = 'other_idx') WHERE name = 'damaged'"
+        )
+    with open_reader(path) as reader:
+        assert reader.stats() == expected
+        assert sum(item.count for item in expected.values()) == 24 * 8
+        found = rows(read_all(reader, consecutive([START + 5 * PERIOD])))
+        assert len(found) < 24 * 8
+
+
+# ---------------------------------------------------------------- several recordings
+
+
+def test_parts_wait_until_their_time_has_come() -> None:
+    channel = Channel(1, "/a", "cdr", None)
+    times = {"a": (5, 5, 9), "b": (0, 5, 5, 7), "c": (5,), "d": (8, 10)}
+    opened: list[str] = []
+
+    def part(name: str) -> Part:
+        def records() -> Iterator[Record]:
+            opened.append(name)
+            yield MetadataRecord(name, {})
+            for time in times[name]:
+                yield Message(channel, time, 0, 0, name.encode())
+
+        return Part(min(times[name]), records)
+
+    found = []
+    for record in merged([part(name) for name in times]):
+        if isinstance(record, Message):
+            found.append((record.log_time, bytes(record.data).decode()))
+            assert set(opened) == {n for n in times if min(times[n]) <= record.log_time}
+    assert found == sorted((time, name) for name in times for time in times[name])
+    assert opened == ["b", "a", "c", "d"]
+    assert list(merged([])) == []
+
+
+def side_by_side(kind: str, folder: Path) -> list[Path]:
+    """Three recordings: two of the same time and topics, one that follows and overlaps."""
+    first, late = scene("mono8", frames=12), scene("mono8", frames=12, seed=1)
+    shift = 9 * PERIOD
+    moved = [
+        type(message)(**{**vars_of(message), "log_time": message.log_time + shift})
+        for message in late.messages
+    ]
+    parts = [first, Scene(first.messages[::2], first.silent), Scene(moved)]
+    paths = []
+    for number, part in enumerate(parts):
+        path = folder / f"part{number}{'' if kind.startswith('rosbag2') else '.' + kind}"
+        if kind == "bag":
+            write_bag(path, part)
+        elif kind == "mcap":
+            write_mcap(path, part)
+        else:
+            write_rosbag2(path, part, kind.partition("-")[2])
+        paths.append(path)
+    return paths
+
+
+def vars_of(message: Any) -> dict[str, Any]:
+    return {name: getattr(message, name) for name in message.__dataclass_fields__}
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap", "rosbag2-sqlite3", "rosbag2-mcap"])
+def test_recordings_side_by_side(kind: str, tmp_path: Path) -> None:
+    paths = side_by_side(kind, tmp_path)
+    for order in (paths, paths[::-1]):
+        with open_sources(order) as reader:
+            assert reader.is_indexed
+            for seed in range(3):
+                whole = check(reader, seed)
+            found = [time for _, (time, *_) in rows(whole)]
+            assert found == sorted(found)
+            assert len(found) == sum(item.count for item in reader.stats().values()) == 240
+            if kind == "mcap":
+                assert len(others(whole)) == 12
+
+
+def test_one_part_without_an_index(tmp_path: Path) -> None:
+    paths = side_by_side("mcap", tmp_path)
+    write_mcap(paths[1], scene("mono8", frames=8), indexed=False)
+    with open_sources(paths) as reader:
+        assert not reader.is_indexed
+        for seed in range(3):
+            check(reader, seed)
+
+
+def test_parts_that_are_not_in_order_are_merged_as_in_the_whole(tmp_path: Path) -> None:
+    write_channels(tmp_path / "a.mcap", [("c", time) for time in range(1, 11)])
+    disorder = [("d", 8), ("c", 2), ("c", 9), ("c", 3)]
+    write_channels(tmp_path / "b.mcap", disorder, index_types=IndexType.NONE)
+    with open_sources([tmp_path / "a.mcap", tmp_path / "b.mcap"]) as reader:
+        assert not reader.is_indexed
+        for seed in range(5):
+            check(reader, seed)
+
+
+def test_what_is_passed_over_is_counted_once(tmp_path: Path) -> None:
+    paths = side_by_side("mcap", tmp_path)
+    with_record(paths[0], 0x90, b"mine", in_summary=False)
+    with open_sources(paths) as reader:
+        for _ in range(3):
+            list(reader.records())
+            assert reader.skipped == {"private MCAP records (opcode 0x90)": 1}
+
+
+def test_files_of_a_folder_that_overlap(tmp_path: Path) -> None:
+    for storage in ("sqlite3", "mcap"):
+        messages = scene("mono8", frames=24).messages
+        # every file holds every second message of two thirds of the time
+        parts = messages[:130:2] + messages[60::2] + messages[1:130:2] + messages[61::2]
+        parts = parts[: len(parts) // 3 * 3]
+        write_rosbag2(tmp_path / storage, Scene(parts), storage, files=3)
+        with open_reader(tmp_path / storage) as reader:
+            assert reader.is_indexed
+            for seed in range(3):
+                whole = check(reader, seed)
+            times = [time for _, (time, *_) in rows(whole)]
+            assert times == sorted(times)
+            assert len(times) == len(parts)

@@ -1,0 +1,707 @@
+"""Hard times of a pack in parts: each is told in a sentence, and the same command ends it well.
+
+The disk is full at every page and every file, the recording fails or changes while it is read,
+processes die, folders vanish. The recording is never touched, nothing stands under the dataset's
+name before it is whole, and what comes out at last is what an undisturbed pack makes.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import io
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mp4ds
+from in_parts import InlineEngine, facts, leftovers
+from mp4ds.demo import demo
+from mp4ds.errors import Mp4dsError, PartsFailedError, SourceError, TargetError, WriteError
+from mp4ds.packing import PackOptions
+from mp4ds.packing.work import command
+from round_trips import Compare, unpacked
+from sources import SOURCES, scene
+from test_bad_input import NEEDS_ROOT, run, start, tree
+
+IN_PARTS = PackOptions(window=3, codec="h264")
+PARTS = ["00000-0", "00001-0"]
+WORK = ".dataset.mp4ds-part"
+PAGE = 4096
+KINDS = ["bag-none", "mcap-ros2-zstd", "rosbag2-sqlite3-v9", "rosbag2-mcap-v9"]
+AGAIN = "run the same command again to go on"
+
+
+def recorded(folder: Path, kind: str = "bag-none") -> Path:
+    """A recording of two parts."""
+    (folder / "source").mkdir()
+    (path,) = SOURCES[kind](folder / "source", scene("bayer_rggb8", frames=6))
+    return path
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    return recorded(tmp_path)
+
+
+@pytest.fixture
+def expected(source: Path, tmp_path: Path) -> dict[str, Any]:
+    return undisturbed(source, tmp_path)
+
+
+def undisturbed(source: Path, folder: Path) -> dict[str, Any]:
+    """What an undisturbed pack in one pass makes."""
+    mp4ds.pack(source, folder / "undisturbed", PackOptions(codec="h264"))
+    return facts(folder / "undisturbed")
+
+
+def use(monkeypatch: pytest.MonkeyPatch, engine: InlineEngine) -> InlineEngine:
+    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: engine)
+    return engine
+
+
+def before_task(name: str, action: Callable[[], object]) -> InlineEngine:
+    """An engine that does something before it runs a task."""
+
+    def meanwhile(task: str) -> bool:
+        if task == name:
+            action()
+        return False
+
+    return InlineEngine(meanwhile)
+
+
+@contextmanager
+def disk_of(folder: Path, *options: str) -> Iterator[Path]:
+    """A small file system of its own in memory."""
+    folder.mkdir(exist_ok=True)
+    _mount("-t", "tmpfs", "-o", ",".join(options), "tmpfs", str(folder))
+    try:
+        yield folder
+    finally:
+        # lazily: an encoder that was refused its first byte keeps its file open until it is freed
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def _mount(*arguments: str) -> None:
+    try:
+        done = subprocess.run(["mount", *arguments], capture_output=True, check=False)
+    except OSError:
+        pytest.skip(NEEDS_ROOT)
+    if done.returncode:
+        pytest.skip(NEEDS_ROOT)
+
+
+def with_room(disk: Path) -> None:
+    """Somebody makes space."""
+    _mount("-o", "remount,size=64m,nr_inodes=10000", str(disk))
+
+
+def goes_on(
+    source: Path, target: Path, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> list[str]:
+    """The same command ends well; returns the tasks that it ran."""
+    engine = use(monkeypatch, InlineEngine())
+    mp4ds.pack(source, target, IN_PARTS)
+    assert facts(target) == expected
+    assert mp4ds.validate(target, deep=True) == []
+    assert leftovers(target.parent) == []
+    return engine.ran
+
+
+# ---------------------------------------------------------------- a disk that is full
+
+
+REACHED = {
+    "pages": {("00000", "nothing"), ("00001", "mp4"), ("00001", "yaml"), ("joined", "yaml")},
+    "files": {("00000", "nothing"), ("00001", "yaml"), ("joined", "nothing"), ("joined", "yaml")},
+}
+"""Where packs must have been interrupted for this to be a test: folder, and last file in it."""
+
+
+def _state(work: Path) -> str:
+    """The last file, in the order of their making, of which something was written."""
+    order = ["job.json", "mp4", "messages.mcap", "yaml", "part.json", "dataset.yaml"]
+    found = {path.name for path in work.rglob("*") if path.is_file() and path.stat().st_size}
+    kinds = {name if name in order else name.rpartition(".")[2] for name in found}
+    return max((kind for kind in kinds if kind in order), key=order.index, default="nothing")
+
+
+@pytest.fixture
+def reached(monkeypatch: pytest.MonkeyPatch) -> set[tuple[str, str]]:
+    """Which folders that were to be filled were given up, and how far they had come."""
+    seen: set[tuple[str, str]] = set()
+    remove = shutil.rmtree
+
+    def spy(folder: Path, *args: Any, **options: Any) -> None:
+        if folder.name == "dataset" or folder.name.startswith("."):
+            kind = "joined" if folder.name == "dataset" else folder.name[1:6]
+            if folder.is_dir() and folder.parent.name != "mp4ds":
+                seen.add((kind, _state(folder)))
+        remove(folder, *args, **options)
+
+    monkeypatch.setattr("shutil.rmtree", spy)
+    return seen
+
+
+def refusal(source: Path, target: Path) -> Mp4dsError | None:
+    """The error of a pack, if there is one."""
+    try:
+        mp4ds.pack(source, target, IN_PARTS)
+    except Mp4dsError as error:
+        return error
+    return None
+
+
+@pytest.mark.parametrize("limit", REACHED)
+def test_a_disk_that_is_full_at_any_moment(
+    limit: str,
+    tmp_path: Path,
+    source: Path,
+    expected: dict[str, Any],
+    reached: set[tuple[str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    compare: Compare,
+) -> None:
+    before = tree(source.parent)
+    refusals = 0
+    for number in range(1, 100):
+        options = (
+            [f"size={number * PAGE}"] if limit == "pages" else ["size=64m", f"nr_inodes={number}"]
+        )
+        with disk_of(tmp_path / "disk", *options) as disk:
+            use(monkeypatch, InlineEngine())
+            error = refusal(source, disk / "dataset")
+            if error is None:
+                break
+            refusals += 1
+            assert "No space left" in str(error)
+            assert str(disk) in str(error)
+            assert error.exit_code == 1
+            assert not (disk / "dataset").exists()
+            assert not (disk / WORK / "dataset").exists()
+            assert tree(source.parent) == before
+            with_room(disk)
+            goes_on(source, disk / "dataset", expected, monkeypatch)
+            if number % 6 == 0:
+                shutil.copytree(disk / "dataset", tmp_path / str(number) / "dataset")
+                assert compare([source], unpacked(tmp_path / str(number), "bag")) == []
+    assert refusals >= 12
+    assert REACHED[limit] <= reached
+
+
+@pytest.mark.parametrize(
+    "name", ["job.json", "part.json", "messages.mcap", "cam_image_raw.yaml", "dataset.yaml"]
+)
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EROFS], ids=errno.errorcode.get)
+def test_a_file_that_the_disk_refuses(
+    code: int,
+    name: str,
+    tmp_path: Path,
+    source: Path,
+    expected: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Every file that is written by Python, in a part or in the joining."""
+    target = tmp_path / "dataset"
+    with failing_open(monkeypatch, lambda path, mode: "w" in mode and name in path, code):
+        use(monkeypatch, InlineEngine())
+        with pytest.raises((PartsFailedError, WriteError), match=os.strerror(code)) as caught:
+            mp4ds.pack(source, target, IN_PARTS)
+    assert caught.value.exit_code == 1
+    assert str(tmp_path) in str(caught.value)
+    assert not target.exists()
+    goes_on(source, target, expected, monkeypatch)
+
+
+@contextmanager
+def failing_open(
+    monkeypatch: pytest.MonkeyPatch, fails: Callable[[str, str], bool], code: int
+) -> Iterator[None]:
+    """Opening some files fails."""
+    real = io.open
+
+    def refuse(file: Any, mode: str = "r", *args: Any, **options: Any) -> Any:
+        if isinstance(file, (str, Path)) and fails(str(file), mode):
+            raise OSError(code, os.strerror(code), str(file))
+        return real(file, mode, *args, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("io.open", refuse)
+        yield
+
+
+@pytest.mark.parametrize("size", ["300k", "1400k"])
+def test_the_real_command_on_a_full_disk(size: str, tmp_path: Path, compare: Compare) -> None:
+    (tmp_path / "source").mkdir()
+    bag = tmp_path / "source" / "drive.bag"
+    demo(bag, seconds=1)
+    before = tree(bag.parent)
+    with disk_of(tmp_path / "disk", f"size={size}") as disk:
+        arguments = ("pack", bag, "-o", disk / "dataset", "--codec", "ffv1", "--window", 5)
+        failed = run(*arguments, "--jobs", 2)
+        lines = failed.err.strip().splitlines()
+        assert "Traceback" not in failed.err
+        assert failed.code == 1, failed.err
+        assert "No space left" in lines[-1]
+        assert str(disk) in lines[-1]
+        assert not (disk / "dataset").exists()
+        assert tree(bag.parent) == before
+        with_room(disk)
+        again = run(*arguments)
+        assert again.code == 0, again.err
+        assert leftovers(disk) == []
+        mp4ds.pack(bag, tmp_path / "whole", PackOptions(codec="ffv1"))
+        assert facts(disk / "dataset") == facts(tmp_path / "whole")
+        shutil.copytree(disk / "dataset", tmp_path / "dataset")
+    assert compare([bag], unpacked(tmp_path, "bag")) == []
+
+
+# ---------------------------------------------------------------- a source that fails
+
+
+class _BadSector(io.FileIO):
+    """A file of which some bytes cannot be read, while `broken` is set."""
+
+    broken = False
+
+    def __init__(self, path: str, bad: range) -> None:
+        super().__init__(path)
+        self._bad = bad
+
+    def _check(self, size: int) -> None:
+        start = self.tell()
+        if type(self).broken and start < self._bad.stop and start + size > self._bad.start:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    def readinto(self, buffer: Any) -> int | None:
+        self._check(len(memoryview(buffer)))
+        return super().readinto(buffer)
+
+    def readall(self) -> bytes:
+        self._check(2**40)
+        return super().readall()
+
+
+@pytest.mark.parametrize("kind", ["bag-none", "bag-bz2", "mcap-ros2-zstd", "mcap-ros2-none"])
+def test_a_bad_sector(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compare: Compare
+) -> None:
+    source = recorded(tmp_path, kind)
+    expected = undisturbed(source, tmp_path)
+    middle = source.stat().st_size // 2
+    real = io.open
+
+    class Drive(_BadSector):
+        pass
+
+    def opened(file: Any, mode: str = "r", buffering: int = -1, *args: Any, **options: Any) -> Any:
+        if str(file) == str(source) and mode == "rb":
+            return io.BufferedReader(Drive(str(file), range(middle, middle + 512)), 512)
+        return real(file, mode, buffering, *args, **options)
+
+    engine = use(monkeypatch, before_task(PARTS[0], lambda: setattr(Drive, "broken", True)))
+    with monkeypatch.context() as patch:
+        patch.setattr("io.open", opened)
+        with pytest.raises(PartsFailedError, match="Input/output error") as caught:
+            mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, keep_going=True))
+    assert engine.ran == ["source-0", *PARTS]
+    sentence = str(caught.value)
+    assert "could not be written" not in sentence
+    assert str(source) in sentence
+    assert not (tmp_path / "dataset").exists()
+    goes_on(source, tmp_path / "dataset", expected, monkeypatch)
+    own = kind.partition("-")[0]
+    assert compare([source], unpacked(tmp_path, own)) == []
+
+
+def files_of(source: Path) -> list[Path]:
+    return [source] if source.is_file() else sorted(source.iterdir())
+
+
+CHANGES: dict[str, Callable[[Path], object]] = {
+    "cut short": lambda path: os.truncate(path, path.stat().st_size // 2),
+    "longer": lambda path: path.write_bytes(path.read_bytes() + b"more"),
+    "another": lambda path: path.write_bytes(hashlib.sha512(b"").digest() * 100),
+    "gone": Path.unlink,
+    "a folder": lambda path: [change() for change in (path.unlink, path.mkdir)],
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_source_that_changes_while_it_is_packed(
+    kind: str, change: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = recorded(tmp_path, kind)
+    expected = undisturbed(source, tmp_path)
+    file = max(files_of(source), key=lambda path: path.stat().st_size)
+    times = file.stat().st_atime_ns, file.stat().st_mtime_ns
+    data = file.read_bytes()
+    use(monkeypatch, before_task(PARTS[1], lambda: CHANGES[change](file)))
+    with pytest.raises(PartsFailedError, match=f"Part {PARTS[1]}: .*{file.name}") as caught:
+        mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
+    assert caught.value.exit_code == 2
+    with pytest.raises(SourceError):  # it is still not what it was
+        mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
+    if file.is_dir():
+        file.rmdir()
+    file.write_bytes(data)
+    os.utime(file, ns=times)
+    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == [PARTS[1]]
+
+
+def test_a_source_that_goes_before_the_joining(
+    tmp_path: Path,
+    source: Path,
+    expected: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    use(monkeypatch, InlineEngine())
+    away = source.with_suffix(".away")
+
+    def vanish(told: mp4ds.PackProgress) -> None:
+        if told.phase == "joining" and source.exists():
+            source.rename(away)
+
+    with pytest.raises(SourceError, match=r"no such file"):
+        mp4ds.pack(source, tmp_path / "dataset", IN_PARTS, progress=vanish)
+    away.rename(source)
+    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == []
+
+
+# ---------------------------------------------------------------- processes that die
+
+
+def use_harmed(monkeypatch: pytest.MonkeyPatch, name: str, harm: str) -> None:
+    """Let processes do something before they run a task; Python with what it needs imported."""
+    code = (
+        "import os, signal, sys\n"
+        "from mp4ds.packing import work\n"
+        "run = work.Tasks.run\n"
+        "def harmed(self, folder, name, *rest):\n"
+        f"    if name == {name!r}:\n"
+        f"        {harm}\n"
+        "    return run(self, folder, name, *rest)\n"
+        "work.Tasks.run = harmed\n"
+        "sys.exit(work._main())"
+    )
+    monkeypatch.setattr("mp4ds.packing.command", lambda task: [sys.executable, "-c", code, *task])
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_a_process_that_is_killed_again_and_again(
+    jobs: int,
+    tmp_path: Path,
+    source: Path,
+    expected: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    log = tmp_path / "tries"
+    kill = "os.kill(os.getpid(), signal.SIGKILL)"
+    use_harmed(monkeypatch, PARTS[0], f"open({str(log)!r}, 'a').write('x'); {kill}")
+    options = replace(IN_PARTS, keep_going=True, jobs=jobs)
+    with pytest.raises(PartsFailedError, match=r"SIGKILL, perhaps for want of memory") as caught:
+        mp4ds.pack(source, tmp_path / "dataset", options)
+    assert [name for name, _ in caught.value.failures] == [PARTS[0]]
+    assert caught.value.exit_code == 1
+    assert AGAIN in str(caught.value)
+    assert log.read_text() == "xx"  # it is tried once more, and no oftener
+    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == [PARTS[0]]
+
+
+def test_a_process_that_finds_its_source_gone(
+    tmp_path: Path, source: Path, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    away = source.with_suffix(".away")
+    use_harmed(monkeypatch, PARTS[1], f"os.rename({str(source)!r}, {str(away)!r})")
+    with pytest.raises(PartsFailedError, match=rf"Part {PARTS[1]}: .*drive\.bag: cannot be read"):
+        mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, jobs=1))
+    away.rename(source)
+    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == [PARTS[1]]
+
+
+@pytest.mark.parametrize(
+    ("harm", "sentence"),
+    [
+        ("raise MemoryError", "out of memory; try fewer --jobs"),
+        ("bytearray(2**60)", "out of memory; try fewer --jobs"),
+        ("sys.exit(3)", "its process ended with code 3"),
+        ("os.abort()", "its process was ended by SIGABRT"),
+        ("raise ArithmeticError('odd')", "its process ended with code 1: ArithmeticError: odd"),
+    ],
+)
+def test_a_task_that_ends_its_process(
+    harm: str,
+    sentence: str,
+    tmp_path: Path,
+    source: Path,
+    expected: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    use_harmed(monkeypatch, PARTS[1], harm)
+    with pytest.raises(PartsFailedError) as caught:
+        mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, keep_going=True, jobs=1))
+    assert f"Part {PARTS[1]}: {sentence}" in str(caught.value)
+    assert AGAIN in str(caught.value)
+    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == [PARTS[1]]
+
+
+@pytest.mark.skipif(shutil.which("prlimit") is None, reason="prlimit is not installed")
+@pytest.mark.parametrize("megabytes", [20, 150])
+def test_processes_that_cannot_begin_for_want_of_memory(
+    megabytes: int,
+    tmp_path: Path,
+    source: Path,
+    expected: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    limit = ["prlimit", f"--as={megabytes * 2**20}"]
+    monkeypatch.setattr("mp4ds.packing.command", lambda task: [*limit, *command(task)])
+    with pytest.raises(PartsFailedError, match=r"Part source-0: its process ended") as caught:
+        mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, jobs=1))
+    assert "\n" not in str(caught.value)
+    assert leftovers(tmp_path) == []
+    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == ["source-0", *PARTS]
+
+
+# ---------------------------------------------------------------- folders that are not as they were
+
+
+def test_a_work_folder_that_is_removed_meanwhile(
+    tmp_path: Path, source: Path, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use(monkeypatch, before_task(PARTS[1], lambda: shutil.rmtree(tmp_path / WORK)))
+    with pytest.raises(PartsFailedError, match="holds no pack that was begun"):
+        mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
+    ran = goes_on(source, tmp_path / "dataset", expected, monkeypatch)
+    assert ran == ["source-0", *PARTS]
+
+
+@pytest.mark.parametrize(
+    ("gone", "again"),
+    [
+        (".", ["source-0", *PARTS]),
+        ("parts", ["source-0", *PARTS]),
+        (f"parts/{PARTS[0]}", PARTS[:1]),
+        (f"parts/{PARTS[0]}/part.json", PARTS[:1]),
+        (f"parts/{PARTS[1]}/messages.mcap", PARTS[1:]),
+        (f"parts/{PARTS[1]}/cam_image_raw.mp4", PARTS[1:]),
+        ("parts/source-0", ["source-0"]),
+    ],
+)
+def test_what_is_removed_before_the_joining(
+    gone: str,
+    again: list[str],
+    tmp_path: Path,
+    source: Path,
+    expected: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    use(monkeypatch, InlineEngine())
+    place = tmp_path / WORK / gone
+
+    def vanish(told: mp4ds.PackProgress) -> None:
+        if told.phase == "joining" and not told.note and place.exists():
+            shutil.rmtree(place) if place.is_dir() else place.unlink()
+
+    with pytest.raises(Mp4dsError, match=r"mp4ds-part|No such file"):
+        mp4ds.pack(source, tmp_path / "dataset", IN_PARTS, progress=vanish)
+    assert not (tmp_path / "dataset").exists()
+    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == again
+
+
+@pytest.mark.parametrize("name", ["messages.mcap", "cam_image_raw.yaml", "cam_image_raw.mp4"])
+def test_what_rots_before_the_joining_is_made_again(
+    name: str,
+    tmp_path: Path,
+    source: Path,
+    expected: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    use(monkeypatch, InlineEngine())
+
+    def rot(told: mp4ds.PackProgress) -> None:
+        path = tmp_path / WORK / "parts" / PARTS[0] / name
+        if told.phase == "joining" and not told.note:
+            data = bytearray(path.read_bytes())
+            data[len(data) // 2] ^= 0x10
+            path.write_bytes(data)
+
+    with pytest.raises(Mp4dsError, match=rf"{PARTS[0]}/{name}"):
+        mp4ds.pack(source, tmp_path / "dataset", IN_PARTS, progress=rot)
+    assert not (tmp_path / "dataset").exists()
+    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == PARTS[:1]
+
+
+@contextmanager
+def read_only(folder: Path) -> Iterator[None]:
+    """A folder that nobody can write into, not even root."""
+    _mount("--bind", str(folder), str(folder))
+    try:
+        _mount("-o", "remount,bind,ro", str(folder))
+        yield
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def test_a_target_folder_that_is_read_only(
+    tmp_path: Path, source: Path, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use(monkeypatch, InlineEngine())
+    (tmp_path / "out").mkdir()
+    with (
+        read_only(tmp_path / "out"),
+        pytest.raises(TargetError, match="cannot be made: Read-only file system"),
+    ):
+        mp4ds.pack(source, tmp_path / "out" / "dataset", IN_PARTS)
+    goes_on(source, tmp_path / "out" / "dataset", expected, monkeypatch)
+
+
+@pytest.mark.parametrize("when", ["packing", "joining"])
+def test_a_work_folder_that_becomes_read_only(
+    when: str,
+    tmp_path: Path,
+    source: Path,
+    expected: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    work = tmp_path / WORK
+    folder = work / "parts" if when == "packing" else work
+
+    def protect(task: str) -> bool:
+        if task == PARTS[1] and when == "packing":
+            _mount("--bind", str(folder), str(folder))
+            _mount("-o", "remount,bind,ro", str(folder))
+        return False
+
+    def told(progress: mp4ds.PackProgress) -> None:
+        if progress.phase == "joining" and when == "joining" and not os.path.ismount(folder):
+            _mount("--bind", str(folder), str(folder))
+            _mount("-o", "remount,bind,ro", str(folder))
+
+    use(monkeypatch, InlineEngine(protect))
+    try:
+        with pytest.raises(PartsFailedError, match="Read-only file system"):
+            mp4ds.pack(source, tmp_path / "dataset", IN_PARTS, progress=told)
+        if when == "packing":  # now the same command, and --restart, cannot do anything
+            for options in (IN_PARTS, replace(IN_PARTS, restart=True)):
+                use(monkeypatch, InlineEngine())
+                with pytest.raises(Mp4dsError, match="Read-only file system"):
+                    mp4ds.pack(source, tmp_path / "dataset", options)
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+    goes_on(source, tmp_path / "dataset", expected, monkeypatch)
+
+
+@pytest.mark.parametrize("year", [1970, 2100])
+def test_a_clock_that_goes_wrong(
+    year: int,
+    tmp_path: Path,
+    source: Path,
+    expected: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = (year - 1970) * 31_556_952
+
+    def wrong() -> None:
+        for path in (tmp_path / WORK).rglob("*"):
+            os.utime(path, (now, now))
+        clock = iter(range(now + 10**6, 0, -1))
+        monkeypatch.setattr("time.time", lambda: float(next(clock)))
+
+    use(monkeypatch, before_task(PARTS[1], wrong))
+    mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
+    assert facts(tmp_path / "dataset") == expected
+
+
+# ---------------------------------------------------------------- signals
+
+
+@pytest.fixture(scope="module")
+def long_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("long") / "drive.bag"
+    demo(path, seconds=4)
+    return path
+
+
+def _children(pid: int) -> list[int]:
+    text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    return [int(word) for word in text.split()]
+
+
+def _lives(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="there is no /proc here")
+@pytest.mark.parametrize(
+    ("signals", "code"),
+    [([signal.SIGINT], 130), ([signal.SIGTERM], 143), ([signal.SIGINT] * 4, 130)],
+    ids=["ctrl-c", "sigterm", "ctrl-c again and again"],
+)
+def test_a_parallel_pack_that_is_interrupted(
+    signals: list[signal.Signals], code: int, long_bag: Path, tmp_path: Path
+) -> None:
+    before = tree(long_bag.parent)
+    arguments = ("pack", long_bag, "-o", tmp_path / "dataset", "--window", 10, "--codec", "h264")
+    process = start(*arguments, "--jobs", 2)
+    end = time.monotonic() + 60
+    while not list((tmp_path / WORK).glob("parts/0*/part.json")):
+        if process.poll() is not None or time.monotonic() > end:
+            process.kill()
+            pytest.fail(f"it did not come to its second part: {process.communicate()}")
+        time.sleep(0.01)
+    children: list[int] = []
+    while not children and process.poll() is None:
+        children = _children(process.pid)
+    for number in signals:
+        process.send_signal(number)
+        time.sleep(0.02)
+    _, err = process.communicate(timeout=30)
+    # one that comes while Python ends is the death of it; a shell calls that 130, too
+    assert process.returncode in (code, -signal.SIGINT if len(signals) > 1 else code), err
+    assert "Traceback" not in err
+    assert AGAIN in err
+    end = time.monotonic() + 5
+    while any(map(_lives, children)) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not any(map(_lives, children))
+    assert leftovers(tmp_path) == [WORK]
+    assert not (tmp_path / "dataset").exists()
+    assert tree(long_bag.parent) == before
+    again = run(*arguments)
+    assert again.code == 0, again.err
+    mp4ds.pack(long_bag, tmp_path / "whole", PackOptions(codec="h264"))
+    assert facts(tmp_path / "dataset") == facts(tmp_path / "whole")
+    assert leftovers(tmp_path) == []
+
+
+def test_an_interruption_before_anything_is_finished(long_bag: Path, tmp_path: Path) -> None:
+    process = start("pack", long_bag, "-o", tmp_path / "dataset", "--window", 20, "--jobs", 1)
+    end = time.monotonic() + 60
+    while not list((tmp_path / WORK).glob("parts/.0*")):
+        if process.poll() is not None or time.monotonic() > end:
+            process.kill()
+            pytest.fail(f"it did not begin a part: {process.communicate()}")
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, out) == (130, "")
+    assert "Traceback" not in err
+    # unless the part was just then finished
+    assert list((tmp_path / WORK).glob("parts/0*/part.json")) or tree(tmp_path) == {}

@@ -1,0 +1,783 @@
+"""Videos of parts of a stream joined into one: as if they had never been apart."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+from coded_tools import ENCODINGS, IN_ORDER, hide, jpeg, superframe
+from coded_tools import encode as encode_packets
+from coded_tools import scene as packet_scene
+from mp4ds.errors import Mp4dsError, VideoError
+from mp4ds.stamps import MAX_GAP_NS, NS_PER_TICK
+from mp4ds.video import (
+    PacketReader,
+    PacketWriter,
+    Recipe,
+    SegmentsDifferError,
+    VideoDecoder,
+    VideoEncoder,
+    join_segments,
+    recipe_for,
+)
+from mp4ds.video.sample_entry import read_sample_entry
+from test_packets import write as write_packets
+from test_players import blocks as means_of_blocks
+from test_players import browse, ffprobe
+from test_video import LOSSLESS, LOSSY, decode, encode, noise, same, scene_pictures
+
+GOP = 4
+WIDTH, HEIGHT = 66, 50  # x265 takes no fewer than 64 columns
+LENGTHS = (6, 1, 5)
+TOTAL = sum(LENGTHS)
+THREADS = (1, 3, 2)
+STEP = 33_333
+KINDS = [
+    *((codec, picture_format, True) for codec, picture_format in LOSSLESS),
+    *((codec, picture_format, False) for codec in LOSSY for picture_format in ("rgb24", "yuv420p")),
+]
+IDS = [f"{kind[0]}-{kind[1]}-{'lossless' if kind[2] else 'lossy'}" for kind in KINDS]
+TESTS = Path(__file__).parent
+
+
+def recipe_of(kind: tuple[str, str, bool]) -> Recipe:
+    codec, picture_format, lossless = kind
+    return recipe_for(picture_format, lossless=lossless, codec=codec, crf=25)
+
+
+@cache
+def pictures_of(kind: tuple[str, str, bool]) -> list[Any]:
+    """Noise where it comes back, a moving scene where it is only to look alike."""
+    _, picture_format, lossless = kind
+    if lossless:
+        return noise(picture_format, WIDTH, HEIGHT, TOTAL)
+    if picture_format == "rgb24":
+        return scene_pictures("rgb8", WIDTH, HEIGHT, TOTAL)
+    colours = scene_pictures("nv12", WIDTH, HEIGHT, TOTAL)
+    return [(p[:HEIGHT], p[HEIGHT:, ::2].copy(), p[HEIGHT:, 1::2].copy()) for p in colours]
+
+
+def edges() -> list[tuple[int, int]]:
+    """First and last frame of each segment, half-open."""
+    ends = list(itertools.accumulate(LENGTHS))
+    return list(zip([0, *ends[:-1]], ends, strict=True))
+
+
+def make_segment(path: Path, kind: tuple[str, str, bool], number: int) -> dict[str, Any]:
+    """Encode one segment, each with other threads and from another time on."""
+    begin, end = edges()[number]
+    return encode(
+        path,
+        recipe_of(kind),
+        pictures_of(kind)[begin:end],
+        kind[1],
+        ticks=[n * STEP for n in range(begin, end)],
+        gop=GOP,
+        threads=THREADS[number],
+    )
+
+
+def make_elsewhere(folder: str) -> None:
+    """The middle segment of every kind; called in a process of its own."""
+    for kind, name in zip(KINDS, IDS, strict=True):
+        make_segment(Path(folder) / f"{name}.mp4", kind, 1)
+
+
+@pytest.fixture(scope="module")
+def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Segments that another process has encoded."""
+    folder = tmp_path_factory.mktemp("elsewhere")
+    code = f"import test_join; test_join.make_elsewhere({str(folder)!r})"
+    subprocess.run([sys.executable, "-c", code], cwd=TESTS, check=True)
+    return folder
+
+
+def told_of(kind: tuple[str, str, bool], told: dict[str, Any], frames: int) -> dict[str, Any]:
+    recipe = recipe_of(kind)
+    return {**told, "frames": frames, "matrix": recipe.matrix, "full_range": recipe.full_range}
+
+
+# ---------------------------------------------------------------- boxes
+
+CONTAINERS = ("moov", "trak", "edts", "mdia", "minf", "stbl", "dinf", "udta")
+
+
+def boxes(data: bytes, place: str = "") -> Iterator[tuple[str, bytes]]:
+    """Leaves of the tree of boxes, by their paths, and of the sample entry its parts."""
+    at = 0
+    while at < len(data):
+        size, name = struct.unpack_from(">I4s", data, at)
+        if size == 1:
+            (size,) = struct.unpack_from(">Q", data, at + 8)
+        body, path = data[at + 8 : at + size], f"{place}/{name.decode()}"
+        if name.decode() in CONTAINERS:
+            yield from boxes(body, path)
+        elif name == b"stsd":
+            yield path, body[8:94]
+            yield from boxes(body[94:], path)
+        else:
+            yield path, body
+        at += size
+
+
+def tree(path: Path) -> dict[str, bytes]:
+    found = list(boxes(path.read_bytes()))
+    assert len(found) == len(dict(found))
+    return dict(found)
+
+
+def differing(a: Path, b: Path) -> set[str]:
+    """Names of the boxes that only one has, or that differ."""
+    of_a, of_b = tree(a), tree(b)
+    kinds = {kind for kind in of_a.keys() | of_b.keys() if of_a.get(kind) != of_b.get(kind)}
+    return {kind.rpartition("/")[2] for kind in kinds}
+
+
+# What does not come out alike: of x264 and x265 the greatest bit rate is 0, for unknown, and of a
+# copy the mean one; SVT-AV1 calls frames dispensable, not all of them rightly, which no copy has.
+LEFT_OUT = {"h264": {"btrt"}, "h265": {"btrt"}, "av1": {"sdtp"}, "ffv1": set()}
+
+
+# ---------------------------------------------------------------- videos that are encoded here
+
+
+@pytest.fixture
+def joined(
+    request: pytest.FixtureRequest, elsewhere: Path, tmp_path: Path
+) -> tuple[Path, list[Path], dict[str, Any], tuple[str, str, bool]]:
+    kind: tuple[str, str, bool] = request.param
+    segments = [tmp_path / f"{number}.mp4" for number in range(3)]
+    told = make_segment(segments[0], kind, 0)
+    make_segment(segments[2], kind, 2)
+    segments[1] = elsewhere / f"{IDS[KINDS.index(kind)]}.mp4"
+    target = tmp_path / "joined.mp4"
+    ticks = (number * STEP for number in range(TOTAL))
+    assert join_segments(segments, ticks, target) == TOTAL
+    return target, segments, told, kind
+
+
+Joined = tuple[Path, list[Path], dict[str, Any], tuple[str, str, bool]]
+every_kind = pytest.mark.parametrize("joined", KINDS, ids=IDS, indirect=True)
+
+
+@every_kind
+def test_pictures_are_those_of_the_segments(joined: Joined) -> None:
+    target, segments, told, kind = joined
+    expected = [
+        picture
+        for path, length in zip(segments, LENGTHS, strict=True)
+        for picture in decode(path, told_of(kind, told, length))
+    ]
+    if kind[2]:
+        assert all(map(same, expected, pictures_of(kind)))
+    all_told = told_of(kind, told, TOTAL)
+    found = decode(target, all_told)
+    assert len(found) == TOTAL
+    assert all(map(same, found, expected))
+    with VideoDecoder(target, **all_told, sequential=False) as decoder:
+        for number in (*range(TOTAL), *reversed(range(TOTAL))):
+            planes = tuple(plane.copy() for plane in decoder.picture(number))
+            assert same(planes if len(planes) > 1 else planes[0], expected[number]), number
+
+
+@every_kind
+def test_the_file_is_as_one_encoder_writes_it(joined: Joined, tmp_path: Path) -> None:
+    target, segments, _, kind = joined
+    uncut = tmp_path / "uncut.mp4"
+    ticks = [number * STEP for number in range(TOTAL)]
+    encode(uncut, recipe_of(kind), pictures_of(kind), kind[1], ticks=ticks, gop=GOP, threads=2)
+    # the packets are others, and of AV1 the index has a box more
+    assert differing(uncut, target) <= {"mdat", "stsz", "stss", "stco", "stsc", "btrt", "sdtp"}
+    assert read_sample_entry(target) == read_sample_entry(uncut)
+    found = tree(target)
+    parts = [tree(segment) for segment in segments]
+    assert found["/mdat"] == b"".join(part["/mdat"] for part in parts)
+    with PacketReader(target, codec=kind[0], frames=TOTAL) as reader:
+        assert list(reader.ticks) == ticks
+        keys = [number for number in range(TOTAL) if reader.keyframes[number]]
+    expected = [n for begin, end in edges() for n in range(begin, end, GOP)]
+    assert keys == expected
+
+
+@every_kind
+def test_one_segment_is_the_file_itself(joined: Joined, tmp_path: Path) -> None:
+    segment, kind = joined[1][0], joined[3]
+    target = tmp_path / "alone.mp4"
+    assert join_segments([segment], [n * STEP for n in range(LENGTHS[0])], target) == LENGTHS[0]
+    left_out = LEFT_OUT[kind[0]]
+    assert differing(segment, target) <= left_out
+    if not left_out:
+        assert target.read_bytes() == segment.read_bytes()
+
+
+@pytest.mark.parametrize("picture_format", [f for codec, f in LOSSLESS if codec == "ffv1"])
+def test_parts_that_end_at_key_frames_give_the_uncut_file(
+    picture_format: str, tmp_path: Path
+) -> None:
+    """FFV1 has nothing in a packet that depends on those before the key frame."""
+    recipe = recipe_for(picture_format, lossless=True, codec="ffv1")
+    pictures = noise(picture_format, WIDTH, HEIGHT, 10)
+    ticks = [0, 1, 40_000, 90_001, 90_002, 5_000_000, 5_000_001, 6_000_000, 6_100_000, 6_200_000]
+    segments = []
+    for begin in range(0, 10, GOP):
+        part = slice(begin, begin + GOP)
+        segments.append(tmp_path / f"{begin}.mp4")
+        encode(segments[-1], recipe, pictures[part], picture_format, ticks=ticks[part], gop=GOP)
+    encode(tmp_path / "uncut.mp4", recipe, pictures, picture_format, ticks=ticks, gop=GOP)
+    join_segments(segments, ticks, tmp_path / "joined.mp4")
+    assert (tmp_path / "joined.mp4").read_bytes() == (tmp_path / "uncut.mp4").read_bytes()
+
+
+def ffmpeg_says(path: Path) -> tuple[int, str]:
+    """What comes of decoding all, and what is written while it is done."""
+    if not shutil.which("ffmpeg"):
+        pytest.skip("there is no ffmpeg")
+    command = ["ffmpeg", "-v", "warning", "-i", str(path), "-fps_mode", "passthrough"]
+    done = subprocess.run([*command, "-f", "null", "-"], capture_output=True, check=False)
+    return done.returncode, done.stderr.decode()
+
+
+@every_kind
+def test_ffmpeg_reads_it_without_a_word(joined: Joined) -> None:
+    target, segments, told, _ = joined
+    if ffmpeg_says(segments[0])[0]:
+        pytest.skip("this ffmpeg does not decode such videos")
+    assert ffmpeg_says(target) == (0, "")
+    found = ffprobe(target, "-count_frames", "-show_streams", "-show_frames")
+    (stream,) = found["streams"]
+    assert int(stream["nb_frames"]) == int(stream["nb_read_frames"]) == TOTAL
+    assert (stream["width"], stream["height"]) == told["coded_size"]
+    assert stream["has_b_frames"] == 0
+    assert stream["time_base"] == "1/1000000"
+    assert stream["duration_ts"] == TOTAL * STEP
+    times = [frame["best_effort_timestamp"] for frame in found["frames"]]
+    assert times == [number * STEP for number in range(TOTAL)]
+
+
+@every_kind
+def test_pyav_seeks_across_the_seams(joined: Joined) -> None:
+    target = joined[0]
+    with av.open(str(target)) as container:
+        stream = container.streams.video[0]
+        assert stream.start_time == 0
+        order = [*range(TOTAL), *reversed(range(TOTAL))]
+        for number in order:
+            container.seek(number * STEP, stream=stream)
+            times = [frame.pts for frame in container.decode(stream)]
+            begin = next(begin for begin, end in edges() if begin <= number < end)
+            assert times[0] == (begin + (number - begin) // GOP * GOP) * STEP
+            assert times == list(range(times[0], TOTAL * STEP, STEP))
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=IDS)
+@pytest.mark.parametrize("size", [(640, 360), (1920, 1200)])
+def test_what_a_track_says_does_not_hang_on_threads(
+    kind: tuple[str, str, bool], size: tuple[int, int], tmp_path: Path
+) -> None:
+    width, height = size
+    entries = set()
+    picture = noise(kind[1], width, height, 1)[0]
+    for threads in (1, 2, 5):
+        encode(tmp_path / "v.mp4", recipe_of(kind), [picture], kind[1], gop=GOP, threads=threads)
+        entries.add(read_sample_entry(tmp_path / "v.mp4"))
+    (entry,) = entries
+    assert not any(b"thread" in body or b"cpu" in body for _, body in entry.boxes)
+
+
+# ---------------------------------------------------------------- packets that are copied
+
+
+def bodies_of(name: str) -> list[tuple[bytes, bool]]:
+    """Packets of an encoder and whether each is a key frame, every fourth at least."""
+    packets = encode_packets(ENCODINGS[name], frames=14, gop=4)
+    codec = ENCODINGS[name].codec
+    return [(packet.data, packet.keyframe or codec in ("mjpeg", "png")) for packet in packets]
+
+
+def cut_at_keys(bodies: Sequence[tuple[bytes, bool]]) -> list[list[bytes]]:
+    """The bodies in three parts or more, each of which begins with a key frame."""
+    parts: list[list[bytes]] = []
+    for body, is_key in bodies:
+        if is_key and (not parts or len(parts[-1]) > 2):
+            parts.append([])
+        parts[-1].append(body)
+    return parts
+
+
+@pytest.mark.parametrize("name", IN_ORDER)
+def test_copied_packets_give_the_uncut_file(name: str, tmp_path: Path) -> None:
+    codec = ENCODINGS[name].codec
+    bodies = bodies_of(name)
+    parts = cut_at_keys(bodies)
+    assert len(parts) > 2
+    ticks = [number * STEP + number**3 for number in range(len(bodies))]
+    segments, at = [], 0
+    for number, part in enumerate(parts):
+        segments.append(tmp_path / f"{number}.mp4")
+        own = [tick - ticks[at] for tick in ticks[at : at + len(part)]]
+        write_packets(segments[-1], codec, part, own)
+        at += len(part)
+    write_packets(tmp_path / "uncut.mp4", codec, [body for body, _ in bodies], ticks)
+    target = tmp_path / "joined.mp4"
+    assert join_segments(segments, ticks, target) == len(bodies)
+    assert target.read_bytes() == (tmp_path / "uncut.mp4").read_bytes()
+    with av.open(str(target)) as container:
+        frames = list(container.decode(video=0))
+    assert [frame.pts for frame in frames] == ticks
+    assert not any(frame.is_corrupt for frame in frames)
+
+
+def test_a_vp9_superframe(tmp_path: Path) -> None:
+    frames = [packet.data for packet in encode_packets(ENCODINGS["vp9"], frames=4, gop=9)]
+    bodies = [frames[0], superframe(frames[1], frames[2]), frames[3]]
+    write_packets(tmp_path / "a.mp4", "vp9", bodies)
+    join_segments([tmp_path / "a.mp4"] * 2, range(6), tmp_path / "joined.mp4")
+    with PacketReader(tmp_path / "joined.mp4", codec="vp9", frames=6) as reader:
+        assert list(reader.packets()) == bodies * 2
+
+
+def test_pictures_that_are_not_square_stay_so(tmp_path: Path) -> None:
+    """H.264 may say it of its pixels; what a JPEG says of them no track repeats."""
+    picture = next(packet_scene(1))
+    told = [jpeg(picture, dpi=(72, 144)), jpeg(picture, dpi=(300, 300)), jpeg(picture[..., 0])]
+    for number, body in enumerate(told):
+        write_packets(tmp_path / f"{number}.mp4", "mjpeg", [body])
+    write_packets(tmp_path / "uncut.mp4", "mjpeg", told)
+    join_segments(
+        [tmp_path / f"{n}.mp4" for n in range(3)], [0, STEP, 2 * STEP], tmp_path / "joined.mp4"
+    )
+    assert (tmp_path / "joined.mp4").read_bytes() == (tmp_path / "uncut.mp4").read_bytes()
+    wide = with_options("h264", {"x264-params": "sar=4/3"})
+    write_packets(tmp_path / "wide.mp4", "h264", wide)
+    write_packets(tmp_path / "twice.mp4", "h264", wide * 2)
+    assert read_sample_entry(tmp_path / "wide.mp4").aspect_ratio == Fraction(4, 3)
+    ticks = [number * STEP for number in range(2 * len(wide))]
+    join_segments([tmp_path / "wide.mp4"] * 2, ticks, tmp_path / "joined.mp4")
+    assert (tmp_path / "joined.mp4").read_bytes() == (tmp_path / "twice.mp4").read_bytes()
+
+
+def with_options(name: str, options: dict[str, str], **more: int) -> list[bytes]:
+    base = ENCODINGS[name]
+    encoding = type(base)(base.codec, base.encoder, {**base.options, **options}, base.pixel_format)
+    return [packet.data for packet in encode_packets(encoding, frames=4, **more)]
+
+
+# ---------------------------------------------------------------- times
+
+
+def test_times_with_gaps(tmp_path: Path) -> None:
+    """A tick, and the longest gap, several times over: beyond 32 bits."""
+    longest = MAX_GAP_NS // NS_PER_TICK
+    ticks = [0, 1, 2, longest, 2 * longest, 3 * longest, 4 * longest, 5 * longest, 5 * longest + 1]
+    bodies = [jpeg(picture) for picture in packet_scene(len(ticks))]
+    assert ticks[-1] > 2**32
+    segments = []
+    for begin in range(0, len(ticks), 4):
+        segments.append(tmp_path / f"{begin}.mp4")
+        write_packets(segments[-1], "mjpeg", bodies[begin : begin + 4])
+    write_packets(tmp_path / "uncut.mp4", "mjpeg", bodies, ticks)
+    join_segments(segments, ticks, tmp_path / "joined.mp4")
+    assert (tmp_path / "joined.mp4").read_bytes() == (tmp_path / "uncut.mp4").read_bytes()
+
+
+@pytest.mark.parametrize("rate", [0.5, 10.0, 30.0, 120.0, None])
+def test_the_last_frame_lasts_as_the_rate_says(rate: float | None, tmp_path: Path) -> None:
+    bodies = [jpeg(picture) for picture in packet_scene(6)]
+
+    def part(path: Path, begin: int, end: int) -> Path:
+        with PacketWriter(path, "mjpeg", width=64, height=48, rate=rate) as writer:
+            for number in range(begin, end):
+                writer.write(bodies[number], (number - begin) * 7, keyframe=True)
+        return path
+
+    uncut = part(tmp_path / "uncut.mp4", 0, 6)
+    segments = [part(tmp_path / f"{n}.mp4", 2 * n, 2 * n + 2) for n in range(3)]
+    join_segments(segments, range(0, 42, 7), tmp_path / "joined.mp4")
+    assert (tmp_path / "joined.mp4").read_bytes() == uncut.read_bytes()
+    with av.open(str(tmp_path / "joined.mp4")) as container:
+        expected = 35 + 1_000_000 / (rate or 30.0)
+        assert container.streams.video[0].duration == pytest.approx(expected, abs=1)
+
+
+# ---------------------------------------------------------------- refusals and faults
+
+
+def small(path: Path, **changes: Any) -> Path:
+    """Five frames of noise; returns the path."""
+    options: dict[str, Any] = {"codec": "h264", "format": "gray", "size": (64, 48), "gop": 4}
+    options |= {"lossless": True, "matrix": None, **changes}
+    recipe = recipe_for(
+        options["format"], lossless=options["lossless"], codec=options["codec"], crf=20
+    )
+    if options["matrix"]:
+        recipe = Recipe(
+            recipe.codec, recipe.encoder, recipe.pixel_format, recipe.lossless, recipe.options,
+            options["matrix"], recipe.full_range,
+        )  # fmt: skip
+    encode(path, recipe, noise(options["format"], *options["size"], 5), options["format"],
+           gop=options["gop"])  # fmt: skip
+    return path
+
+
+DIFFERENCES: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
+    "codec": ({}, {"codec": "ffv1"}, r"their codec \(avc1 and FFV1\)"),
+    "size": ({}, {"size": (64, 50)}, r"their size \(64x48 and 64x50\)"),
+    "bits": ({}, {"format": "gray10le"}, "avcC"),
+    "bits of ffv1": ({"codec": "ffv1"}, {"codec": "ffv1", "format": "gray16le"}, "glbl|FFV1"),
+    "chroma": ({"format": "yuv420p"}, {"format": "yuv444p"}, "avcC"),
+    "order of colours": ({"format": "rgb24"}, {"format": "yuv444p"}, "avcC"),
+    "matrix of grey": ({}, {"matrix": "smpte170m"}, r"\(colr\)"),
+    "lossless or not": (
+        {"format": "yuv420p"}, {"format": "yuv420p", "lossless": False}, "avcC"
+    ),
+    "no other frames than key frames": ({"codec": "ffv1"}, {"codec": "ffv1", "gop": 1}, "glbl|F"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DIFFERENCES)
+def test_videos_that_cannot_be_one(name: str, tmp_path: Path) -> None:
+    first, other, problem = DIFFERENCES[name]
+    segments = [small(tmp_path / "a.mp4", **first), small(tmp_path / "b.mp4", **other)]
+    target = tmp_path / "joined.mp4"
+    for paths in (segments, [segments[0], *segments], segments[::-1]):
+        with pytest.raises(SegmentsDifferError) as caught:
+            join_segments(paths, range(100), target)
+        assert not target.exists()
+        assert isinstance(caught.value, Mp4dsError)
+        assert (caught.value.first, caught.value.other) == (paths[0], paths[-1])
+    with pytest.raises(SegmentsDifferError, match=problem) as caught:
+        join_segments(segments, range(100), target)
+    assert str(caught.value).startswith(f"{segments[1]}: ")
+    assert str(caught.value).endswith(".")
+
+
+@pytest.mark.parametrize("codec", ["h264", "h265", "av1"])
+def test_rates_that_change_between_segments(codec: str, tmp_path: Path) -> None:
+    """Encoders derive a level from it, and x265 tells it."""
+    recipe = recipe_for("yuv420p", lossless=False, codec=codec, crf=30)
+    size = {"width": 1920, "height": 1200}
+    for name, rate in (("a", 30.0), ("b", 30.0), ("c", 240.0)):
+        encoder = VideoEncoder(
+            tmp_path / f"{name}.mp4", recipe, picture_format="yuv420p", **size,
+            gop=GOP, threads=2, rate=rate,
+        )  # fmt: skip
+        encoder.write(noise("yuv420p", *size.values(), 1)[0], 0)
+        encoder.close()
+    paths = {name: tmp_path / f"{name}.mp4" for name in "abc"}
+    assert join_segments([paths["a"], paths["b"]], range(2), tmp_path / "j.mp4") == 2
+    with pytest.raises(SegmentsDifferError, match=r"avcC|hvcC|av1C"):
+        join_segments([paths["a"], paths["c"]], range(2), tmp_path / "j.mp4")
+
+
+CHANGED = {
+    "h264": {"x264-params": "ref=4:8x8dct=0"},
+    "h265": {"x265-params": "bframes=0:log-level=none:repeat-headers=1:min-keyint=5:ref=1"},
+}
+
+
+@pytest.mark.parametrize("codec", CHANGED)
+def test_parameter_sets_that_change_between_segments(codec: str, tmp_path: Path) -> None:
+    bodies = [packet.data for packet in encode_packets(ENCODINGS[codec], frames=4)]
+    write_packets(tmp_path / "a.mp4", codec, bodies)
+    write_packets(tmp_path / "b.mp4", codec, with_options(codec, CHANGED[codec]))
+    for path in ("a", "b"):
+        assert join_segments([tmp_path / f"{path}.mp4"] * 2, range(8), tmp_path / "j.mp4") == 8
+    (tmp_path / "j.mp4").unlink()
+    with pytest.raises(SegmentsDifferError, match=r"avcC|hvcC"):
+        join_segments([tmp_path / "a.mp4", tmp_path / "b.mp4"], range(8), tmp_path / "j.mp4")
+    assert not (tmp_path / "j.mp4").exists()
+
+
+@pytest.mark.parametrize("codec", ["vp9", "av1"])
+def test_other_sequences_between_segments(codec: str, tmp_path: Path) -> None:
+    write_packets(tmp_path / "a.mp4", codec, [p.data for p in encode_packets(ENCODINGS[codec])])
+    other = encode_packets(ENCODINGS[codec], width=80)
+    write_packets(tmp_path / "b.mp4", codec, [p.data for p in other])
+    with pytest.raises(SegmentsDifferError, match="their size"):
+        join_segments([tmp_path / "a.mp4", tmp_path / "b.mp4"], range(24), tmp_path / "j.mp4")
+
+
+@pytest.mark.parametrize(("count", "match"), [(9, "5 frames, 4 of them are due"), (11, "10 frames"),
+                                              (0, "5 frames, 0 of them")])  # fmt: skip
+def test_ticks_for_other_frames(count: int, match: str, tmp_path: Path) -> None:
+    segment = small(tmp_path / "a.mp4")
+    with pytest.raises(VideoError, match=match) as caught:
+        join_segments([segment, segment], iter(range(count)), tmp_path / "j.mp4")
+    assert caught.value.code == "frame-count"
+    assert not (tmp_path / "j.mp4").exists()
+
+
+@pytest.mark.parametrize("ticks", [[0, 1, 2, 3, 3], [5, 4, 3, 2, 1], [0, 1, -1, 2, 3]])
+def test_ticks_that_do_not_increase(ticks: list[int], tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="does not follow"):
+        join_segments([small(tmp_path / "a.mp4")], ticks, tmp_path / "j.mp4")
+    assert not (tmp_path / "j.mp4").exists()
+
+
+def test_no_segments(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no segments"):
+        join_segments([], [], tmp_path / "j.mp4")
+
+
+def renamed(data: bytes, name: bytes, new: bytes) -> bytes:
+    assert data.count(name) == 1
+    return data.replace(name, new)
+
+
+FAULTS = {
+    "empty": lambda data: b"",
+    "text": lambda data: b"not a video\n" * 100,
+    "half": lambda data: data[: len(data) // 2],
+    "cut in the index": lambda data: data[:-100],
+    "no track": lambda data: renamed(data, b"trak", b"free"),
+    "no entry": lambda data: renamed(data, b"stsd", b"free"),
+    "no index": lambda data: renamed(data, b"stsz", b"free"),
+    "unknown codec": lambda data: renamed(data, b"avc1\0\0\0", b"zzzz\0\0\0"),
+    "an entry of no size": lambda data: data.replace(
+        data[data.index(b"avcC") - 4 : data.index(b"avcC")], bytes(4)
+    ),
+    "a box of no size": lambda data: renamed(
+        data, data[data.index(b"mdat") - 4 :][:8], b"\0\0\0\7mdat"
+    ),
+    "several entries": lambda data: renamed(data, b"stsd\0\0\0\0\0\0\0\1", b"stsd\0\0\0\0\0\0\0\2"),
+    "no frames": lambda data: empty_index(data),
+}
+
+
+def empty_index(data: bytes) -> bytes:
+    at = data.index(b"stsz") + 12
+    return data[:at] + bytes(4) + data[at + 4 :]
+
+
+@pytest.mark.parametrize("place", [0, 1])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_segment_that_cannot_be_read(fault: str, place: int, tmp_path: Path) -> None:
+    segments = [small(tmp_path / "a.mp4"), small(tmp_path / "b.mp4")]
+    segments[place].write_bytes(FAULTS[fault](segments[place].read_bytes()))
+    with pytest.raises((VideoError, SegmentsDifferError)) as caught:
+        join_segments(segments, range(10), tmp_path / "j.mp4")
+    if isinstance(caught.value, SegmentsDifferError):
+        assert fault == "unknown codec"
+    else:
+        assert caught.value.place == str(segments[place])
+    assert not (tmp_path / "j.mp4").exists()
+    if fault == "unknown codec":
+        with pytest.raises(VideoError, match="known codec"):
+            join_segments([segments[place]], range(5), tmp_path / "j.mp4")
+
+
+def test_a_segment_that_is_missing(tmp_path: Path) -> None:
+    for paths in ([tmp_path / "b.mp4"], [small(tmp_path / "a.mp4"), tmp_path / "b.mp4"]):
+        with pytest.raises(VideoError, match="does not exist") as caught:
+            join_segments(paths, range(10), tmp_path / "j.mp4")
+        assert caught.value.code == "file-missing"
+
+
+def rewrite(path: Path, codec: str, number: int, damaged: bytes) -> None:
+    """Change a packet where it stands."""
+    with PacketReader(path, codec=codec) as reader:
+        packet = reader.packet(number)
+    assert len(damaged) == len(packet)
+    path.write_bytes(renamed(path.read_bytes(), packet, damaged))
+
+
+def test_packets_that_the_muxer_refuses(tmp_path: Path) -> None:
+    """VP9 frames that are not shown wait for one that is, but no more than eight."""
+    path = tmp_path / "a.mp4"
+    bodies = [p.data for p in encode_packets(ENCODINGS["vp9"], frames=14, gop=20)]
+    write_packets(path, "vp9", bodies)
+    for number in range(1, 14):
+        rewrite(path, "vp9", number, hide(bodies[number]))
+    with pytest.raises(VideoError, match=r"packet \d+ is damaged") as caught:
+        join_segments([path], range(14), tmp_path / "j.mp4")
+    assert caught.value.place == str(path)
+    assert not (tmp_path / "j.mp4").exists()
+
+
+def test_packets_that_the_muxer_mistakes(tmp_path: Path) -> None:
+    """The size of an OBU goes beyond the packet; ffmpeg writes on, without an index."""
+    path = tmp_path / "a.mp4"
+    write_packets(path, "av1", [p.data for p in encode_packets(ENCODINGS["av1"], frames=3)])
+    with PacketReader(path, codec="av1") as reader:
+        packet = reader.packet(1)
+    rewrite(path, "av1", 1, packet[:1] + b"\xff\xff\x7f" + packet[4:])
+    with pytest.raises(VideoError, match="one is damaged"):
+        join_segments([path], range(3), tmp_path / "j.mp4")
+    assert not (tmp_path / "j.mp4").exists()
+
+
+def test_packets_that_the_muxer_joins(tmp_path: Path) -> None:
+    """A VP9 frame that is not shown and the next one."""
+    path = tmp_path / "a.mp4"
+    bodies = [p.data for p in encode_packets(ENCODINGS["vp9"], frames=4, gop=20)]
+    write_packets(path, "vp9", bodies)
+    rewrite(path, "vp9", 1, hide(bodies[1]))
+    with pytest.raises(VideoError, match="one is damaged"):
+        join_segments([path], range(4), tmp_path / "j.mp4")
+
+
+def test_a_folder_that_is_missing(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="No such file"):
+        join_segments([small(tmp_path / "a.mp4")], range(5), tmp_path / "none" / "j.mp4")
+
+
+def test_names_that_look_like_addresses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    small(Path("http:a.mp4"))
+    assert join_segments([Path("http:a.mp4")], range(5), Path("pipe:1.mp4")) == 5
+    assert (tmp_path / "pipe:1.mp4").exists()
+
+
+# ---------------------------------------------------------------- large files
+
+
+def large(path: Path, packets: int, size: int) -> Path:
+    """A video of JPEG files with much behind their ends."""
+    body = jpeg(next(packet_scene(1)))
+    body += bytes(size - len(body))
+    with PacketWriter(path, "mjpeg", width=64, height=48, rate=30.0) as writer:
+        for number in range(packets):
+            writer.write(body, number * STEP, keyframe=True)
+    return path
+
+
+def run_apart(code: str, *arguments: str) -> str:
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, cwd=TESTS, check=True, capture_output=True, text=True).stdout
+
+
+MEASURE = """
+import resource, sys
+from pathlib import Path
+from mp4ds.video import join_segments
+def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+small, segment, target, count, copies = map(str, sys.argv[1:])
+join_segments([Path(small)], range(3), Path(target))
+before = peak()
+ticks = range(int(count) * int(copies))
+assert join_segments([Path(segment)] * int(copies), ticks, Path(target)) == len(ticks)
+print(peak() - before)
+"""
+
+
+@pytest.mark.parametrize(
+    ("packets", "size", "copies", "bound"),
+    [(16, 1 << 20, 16, 16 << 20), (15_000, 2_000, 4, 32 << 20)],
+    ids=["256 MiB", "60000 packets"],
+)
+def test_memory_is_bounded(
+    packets: int, size: int, copies: int, bound: int, tmp_path: Path
+) -> None:
+    small = large(tmp_path / "small.mp4", 3, 2_000)
+    segment = large(tmp_path / "a.mp4", packets, size)
+    target = tmp_path / "j.mp4"
+    told = run_apart(MEASURE, str(small), str(segment), str(target), str(packets), str(copies))
+    assert target.stat().st_size > packets * size * copies
+    assert int(told) < bound
+
+
+FULL = """
+import resource, signal, sys
+from pathlib import Path
+from mp4ds.video import join_segments
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)
+try:
+    join_segments([Path(sys.argv[1])] * 2, range(40), Path(sys.argv[2]))
+except OSError as error:
+    print(type(error).__mro__[-4].__name__, error.strerror)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="the system limits no files")
+@pytest.mark.parametrize("short", [1, 700, 5_000, 300_000, 2_000_000])
+def test_a_disk_that_is_full(short: int, tmp_path: Path) -> None:
+    """In the packets, in the index at the end, and in its last byte."""
+    segment = large(tmp_path / "a.mp4", 20, 100_000)
+    target = tmp_path / "j.mp4"
+    join_segments([segment, segment], range(40), target)
+    length = target.stat().st_size
+    told = run_apart(FULL, str(segment), str(target), str(length - short))
+    assert "File too large" in told
+    assert not target.exists()
+
+
+# ---------------------------------------------------------------- a browser
+
+PLAYED = [
+    ("h264", "gray", True),
+    ("h264", "yuv420p", True),
+    *((codec, kind, False) for codec in ("h264", "av1") for kind in ("rgb24", "yuv420p")),
+]
+PLAYED_IDS = [IDS[KINDS.index(kind)] for kind in PLAYED]
+PACKETS_PLAYED = ["h264", "av1", "vp9"]
+SOUGHT = (0, 5, 6, 7, 10, 3)  # the last of a segment, the first, ...
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What a browser says of joined videos, and their pictures."""
+    folder = tmp_path_factory.mktemp("videos")
+    ticks = [number * 100_000 for number in range(TOTAL)]
+    videos: dict[str, Path] = {}
+    for kind, name in zip(PLAYED, PLAYED_IDS, strict=True):
+        encoding = {"gray": "mono8", "rgb24": "rgb8", "yuv420p": "nv12"}[kind[1]]
+        pictures: list[Any] = scene_pictures(encoding, 96, 66, TOTAL)
+        if encoding == "nv12":
+            pictures = [(p[:66], p[66:, ::2].copy(), p[66:, 1::2].copy()) for p in pictures]
+        segments = []
+        for begin, end in edges():
+            segments.append(folder / f"{name}-{begin}.mp4")
+            encode(segments[-1], recipe_of(kind), pictures[begin:end], kind[1], gop=GOP)
+        videos[name] = folder / f"{name}.mp4"
+        join_segments(segments, ticks, videos[name])
+    for name in PACKETS_PLAYED:
+        segments = []
+        packets = encode_packets(ENCODINGS[name], frames=TOTAL, width=96, height=66, gop=6)
+        for begin in (0, 6):
+            segments.append(folder / f"packets-{name}-{begin}.mp4")
+            part = [packet.data for packet in packets[begin : begin + 6]]
+            write_packets(segments[-1], ENCODINGS[name].codec, part)
+        videos[f"packets-{name}"] = folder / f"packets-{name}.mp4"
+        join_segments(segments, ticks, videos[f"packets-{name}"])
+    jobs = {name: [ticks[number] / 1e6 + 0.05 for number in SOUGHT] for name in videos}
+    told = browse(videos, jobs, tmp_path_factory.mktemp("profile"))
+    return {name: (videos[name], told.get(name)) for name in videos}
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("name", [*PLAYED_IDS, *(f"packets-{name}" for name in PACKETS_PLAYED)])
+def test_a_browser_plays_across_the_seams(name: str, seen: dict[str, Any]) -> None:
+    path, result = seen[name]
+    assert result is not None, "the browser did not come to this video in time"
+    assert "error" not in result, result["error"]
+    assert result["size"] == [96, 66]
+    assert result["decoded"] == TOTAL
+    assert result["ended"] == pytest.approx(result["duration"], abs=0.05)
+    with av.open(str(path)) as container:
+        luma = [
+            np.frombuffer(frame.planes[0], np.uint8).reshape(66, -1)[:, :96].astype(float)
+            for frame in container.decode(video=0)
+        ]
+    blocks = [
+        means_of_blocks(np.repeat(plane[..., None], 3, axis=2))[..., 0].ravel() for plane in luma
+    ]
+    for number, found in zip(SOUGHT, result["frames"], strict=True):
+        assert found["mediaTime"] == pytest.approx(number / 10, abs=2e-6)
+        shown = np.array(found["means"]).reshape(48, 3) @ (0.2126, 0.7152, 0.0722)
+        likeness = [np.corrcoef(shown, block)[0, 1] for block in blocks]
+        assert int(np.argmax(likeness)) == number
+        assert likeness[number] > 0.95

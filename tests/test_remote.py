@@ -1,0 +1,579 @@
+"""Recordings and datasets are read at URLs as they are here, and no more of them than is needed."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mp4ds
+from in_parts import InlineEngine, facts
+from mp4ds.bags import open_sources
+from mp4ds.cli import app
+from mp4ds.errors import (
+    OptionError,
+    PartsFailedError,
+    RemoteError,
+    SourceError,
+)
+from mp4ds.info import info
+from mp4ds.intrinsics import intrinsics
+from mp4ds.packing import PackOptions
+from mp4ds.records import Excerpt, Message
+from mp4ds.remote import RemotePath, expect, location
+from mp4ds.remote.file import KEPT_BYTES, RemoteFile, Segments
+from remote_servers import Request, Server, web_server
+from remote_stores import Put, folder_url, put, s3, s3_running, stores, web
+from round_trips import Compare, own_target, unpacked
+from sources import SOURCES, Scene, scene, write_bag, write_mcap
+
+__all__ = ["folder_url", "put", "s3", "s3_running", "stores", "web"]
+
+TOPIC = "/cam/image_raw"
+SECRET = "X-Amz-Signature=4711"
+
+
+@pytest.fixture
+def engine(monkeypatch: pytest.MonkeyPatch) -> InlineEngine:
+    inline = InlineEngine()
+    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: inline)
+    return inline
+
+
+def large_scene(frames: int = 60) -> Scene:
+    """Noise of 196 kB an image, which no compression makes smaller."""
+    return scene("mono8", frames=frames, width=512, height=384)
+
+
+def covered(ranges: Sequence[tuple[int, int]]) -> int:
+    """Bytes that ranges have in all."""
+    return sum(end - start for start, end in ranges)
+
+
+# ---------------------------------------------------------------- names
+
+
+@pytest.mark.parametrize(
+    ("url", "shown", "name", "parent", "child"),
+    [
+        ("s3://b/k/drive.mcap", "s3://b/k/drive.mcap", "drive.mcap", "s3://b/k", "s3://b/k/a b"),
+        ("S3://b/k/drive/", "s3://b/k/drive", "drive", "s3://b/k", "s3://b/k/a b"),
+        ("s3://b", "s3://b", "b", "s3://b", "s3://b/a b"),
+        ("s3://b/50%?.bag", "s3://b/50%?.bag", "50%?.bag", "s3://b", "s3://b/a b"),
+        ("https://h/a%20b.bag", "https://h/a%20b.bag", "a b.bag", "https://h", "https://h/a%20b"),
+        (
+            f"https://me:pw@h:8/k/x.bag?{SECRET}#part",
+            "https://h:8/k/x.bag",
+            "x.bag",
+            f"https://me:pw@h:8/k?{SECRET}",
+            f"https://me:pw@h:8/k/a%20b?{SECRET}",
+        ),
+    ],
+)
+def test_names(url: str, shown: str, name: str, parent: str, child: str) -> None:
+    path = RemotePath(url)
+    assert (str(path), path.name, path.parent.url) == (shown, name, parent)
+    assert path.with_name("a b").url == child
+    assert (path.suffix, path.stem) == (Path(name).suffix, Path(name).stem)
+    assert path == RemotePath(path.url)
+    assert "4711" not in repr(path)
+    assert "pw" not in repr(path)
+    assert list(path.parents) == (
+        [] if path.parent == path else [path.parent, *path.parent.parents]
+    )
+
+
+def test_local_paths_stay_paths(tmp_path: Path) -> None:
+    assert location("drive.bag") == Path("drive.bag")
+    assert location(tmp_path) is tmp_path
+    assert location("a:b/c.bag") == Path("a:b/c.bag")
+    assert location("file:///data/a%20b.bag") == Path("/data/a b.bag")
+
+
+def test_nothing_of_it_is_imported_for_local_paths(packed_bag: Path) -> None:
+    code = (
+        "import sys, mp4ds, mp4ds.cli\n"
+        "from mp4ds.info import info\n"
+        f"info({str(packed_bag)!r}), mp4ds.validate({str(packed_bag)!r})\n"
+        "print({'fsspec', 's3fs', 'aiohttp', 'asyncio'} & set(sys.modules))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+# ---------------------------------------------------------------- a file by ranges
+
+
+class Origin:
+    """A file that is somewhere else, and what was fetched of it."""
+
+    def __init__(self, size: int) -> None:
+        self.data = random.Random(size).randbytes(size)
+        self.fetched: list[tuple[int, int]] = []
+        self.segments = Segments()
+
+    def fetch(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
+        self.fetched += ranges
+        assert all(0 <= start < end <= len(self.data) for start, end in ranges)
+        return [self.data[start:end] for start, end in ranges]
+
+    def open(self) -> RemoteFile:
+        return RemoteFile(len(self.data), self.fetch, self.segments)
+
+
+RANGES = st.lists(st.tuples(st.integers(0, 600_000), st.integers(1, 300_000)), max_size=8)
+
+
+@settings(deadline=None)
+@given(
+    size=st.sampled_from([0, 1, 100, 2**17, 700_001]),
+    passes=st.lists(
+        st.tuples(RANGES, st.lists(st.tuples(st.integers(0, 800_000), st.integers(-1, 400_000)))),
+        min_size=1,
+        max_size=4,
+    ),
+)
+def test_reads_are_exact_whatever_was_announced(size: int, passes: Any) -> None:
+    origin = Origin(size)
+    for announced, reads in passes:
+        with origin.open() as stream:
+            plan = [(start, min(start + length, size)) for start, length in announced]
+            stream.expect([(start, end) for start, end in plan if start < end])
+            for place, length in reads:
+                stream.seek(place)
+                end = None if length < 0 else place + length
+                assert stream.read(length) == origin.data[place:end]
+                assert stream.tell() == max(place, size if end is None else min(end, size))
+    assert len(origin.fetched) <= sum(len(a) + 2 * len(r) for a, r in passes) + 8
+
+
+def test_reading_in_order_fetches_everything_once_and_ahead() -> None:
+    origin = Origin(20_000_000)
+    with origin.open() as stream:
+        while block := stream.read(10_000):
+            assert len(block) == 10_000
+    assert covered(origin.fetched) == 20_000_000
+    assert len(origin.fetched) < 12
+
+
+def test_what_comes_after_the_reader_fetches_nothing() -> None:
+    """The source is hashed behind the reader."""
+    origin = Origin(KEPT_BYTES * 2)
+    with origin.open() as first:
+        while first.read(2**20):
+            with origin.open() as second:
+                second.seek(max(0, first.tell() - 2**22))
+                second.read(2**20)
+    assert covered(origin.fetched) == KEPT_BYTES * 2
+
+
+def test_announced_ranges_alone_are_fetched() -> None:
+    origin = Origin(20_000_000)
+    ranges = [(start, start + 1000) for start in range(0, 20_000_000, 100_000)]
+    with origin.open() as stream:
+        stream.expect(ranges)
+        for start, end in ranges:
+            stream.seek(start)
+            assert stream.read(end - start) == origin.data[start:end]
+    assert origin.fetched == ranges
+
+
+def test_of_a_file_that_is_read_little_is_kept() -> None:
+    origin = Origin(3 * KEPT_BYTES)
+    with origin.open() as stream:
+        stream.read()
+        assert origin.segments._size <= KEPT_BYTES
+    assert origin.segments._size <= 2**20
+
+
+def test_local_files_take_announcements_too(tmp_path: Path) -> None:
+    (tmp_path / "x").write_bytes(b"abc")
+    with (tmp_path / "x").open("rb") as stream:
+        expect(stream, [(0, 2)])
+        assert stream.read() == b"abc"
+
+
+# ---------------------------------------------------------------- recordings
+
+
+def round_trip(
+    paths: Sequence[Path], urls: Sequence[str], folder: Path, source: str, compare: Compare
+) -> None:
+    mp4ds.pack(urls, folder / "dataset", PackOptions(window=3))
+    assert mp4ds.validate(folder / "dataset", deep=True) == []
+    assert compare(paths, unpacked(folder, own_target(source))) == []
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_every_source_in_a_store(
+    source: str, tmp_path: Path, put: Put, compare: Compare, engine: InlineEngine
+) -> None:
+    (tmp_path / "source").mkdir()
+    paths = SOURCES[source](tmp_path / "source", scene("bayer_rggb8", frames=7))
+    round_trip(paths, [put(path) for path in paths], tmp_path, source, compare)
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_every_source_on_a_web_server(
+    source: str, tmp_path: Path, web: Server, compare: Compare, engine: InlineEngine
+) -> None:
+    paths = SOURCES[source](tmp_path / "web", scene("bayer_rggb8", frames=7))
+    urls = [f"{web.url}/{path.name}" for path in paths]
+    round_trip(paths, urls, tmp_path, source, compare)
+
+
+def test_windows_are_packed_by_other_processes(tmp_path: Path, put: Put, compare: Compare) -> None:
+    write_bag(tmp_path / "drive.bag", scene("mono8", frames=6))
+    mp4ds.pack(put(tmp_path / "drive.bag"), tmp_path / "dataset", PackOptions(window=3, jobs=1))
+    assert compare([tmp_path / "drive.bag"], unpacked(tmp_path, "bag")) == []
+
+
+def test_a_divided_pack_becomes_the_same(tmp_path: Path, put: Put, engine: InlineEngine) -> None:
+    write_mcap(tmp_path / "drive.mcap", scene("mono8", frames=10))
+    mp4ds.pack(tmp_path / "drive.mcap", tmp_path / "here", PackOptions(window=3))
+    mp4ds.pack(put(tmp_path / "drive.mcap"), tmp_path / "there", PackOptions(window=3))
+    assert facts(tmp_path / "here") == facts(tmp_path / "there")
+
+
+def test_names_with_spaces(tmp_path: Path, web: Server, put: Put) -> None:
+    name = "a drive #1 50%.mcap"
+    write_mcap(tmp_path / "web" / name, scene("mono8"))
+    assert info(f"{web.url}/a%20drive%20%231%2050%25.mcap").topics
+    assert info(put(tmp_path / "web" / name)).topics
+
+
+@pytest.mark.parametrize("source", ["bag-lz4", "mcap-ros2-zstd", "rosbag2-mcap-split"])
+def test_info_and_intrinsics_say_the_same(
+    source: str, tmp_path: Path, web: Server, put: Put
+) -> None:
+    (path,) = SOURCES[source](tmp_path / "web", scene("mono8"))
+    for look in (info, intrinsics):
+        here = look(path)
+        for url in (put(path), f"{web.url}/{path.name}"):
+            there = look(url)
+            assert str(there.path) == url
+            there.path = path
+            assert there == here
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a bag and an MCAP file of 12 MB."""
+    folder = tmp_path_factory.mktemp("large")
+    write_bag(folder / "drive.bag", large_scene(), chunk_size=400_000)
+    write_mcap(folder / "drive.mcap", large_scene())
+    return folder
+
+
+@pytest.mark.parametrize("name", ["drive.bag", "drive.mcap"])
+def test_info_reads_the_ends_and_the_index(name: str, large: Path) -> None:
+    with web_server(large) as web:
+        found = info(f"{web.url}/{name}")
+        assert found.topics == info(large / name).topics
+        size = (large / name).stat().st_size
+        assert covered(web.fetched(name)) < 0.2 * size  # of several GB, the same few chunks
+
+
+@pytest.mark.parametrize("name", ["drive.bag", "drive.mcap"])
+def test_an_excerpt_reads_its_chunks(name: str, large: Path) -> None:
+    """Twelve images of 192 kB in the middle."""
+    with web_server(large) as web, open_sources([location(f"{web.url}/{name}")]) as reader:
+        (channel,) = (channel for channel in reader.channels if channel.topic == TOPIC)
+        times = reader.times()[channel.id]
+        list(reader.records(Excerpt(start=int(times[0]), end=int(times[1]))))
+        web.forget()
+        excerpt = Excerpt(start=int(times[30]), end=int(times[42]), others=False)
+        found = [record for record in reader.records(excerpt) if isinstance(record, Message)]
+        assert sum(record.channel.topic == TOPIC for record in found) == 12
+        assert covered(web.fetched(name)) < 16 * 512 * 384
+        with open_sources([large / name]) as here:
+            assert [(m.log_time, bytes(m.data)) for m in found] == [
+                (m.log_time, bytes(m.data)) for m in here.records(excerpt) if isinstance(m, Message)
+            ]
+
+
+@pytest.mark.parametrize("name", ["drive.bag", "drive.mcap"])
+def test_a_pass_fetches_the_file_once(name: str, large: Path, tmp_path: Path) -> None:
+    """It is hashed, too; some is read before, for planning."""
+    with web_server(large) as web:
+        fast = PackOptions(jobs=1, codec="h264", preset="ultrafast")
+        mp4ds.pack(f"{web.url}/{name}", tmp_path / "dataset", fast)
+        size = (large / name).stat().st_size
+        assert size <= covered(web.fetched(name)) < 1.3 * size
+
+
+def test_a_database_comes_with_what_is_beside_it(tmp_path: Path, put: Put) -> None:
+    (path,) = SOURCES["rosbag2-sqlite3-v9"](tmp_path, scene("mono8"))
+    (database,) = path.glob("*.db3")
+    journal = database.with_name(f"{database.name}-journal")
+    journal.write_bytes(b"\xd9\xd5\x05\xf9 not a journal")
+    for where in (path, put(path)):
+        with pytest.raises(SourceError, match=r"was not closed properly"):
+            info(where)
+
+
+def test_a_database_without_room(tmp_path: Path, put: Put, monkeypatch: pytest.MonkeyPatch) -> None:
+    (path,) = SOURCES["rosbag2-sqlite3-v9"](tmp_path, scene("mono8"))
+    monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 10}))
+    with pytest.raises(SourceError, match=r"no room for it\. Name another folder by TMPDIR"):
+        info(put(path))
+
+
+# ---------------------------------------------------------------- datasets
+
+
+@pytest.fixture(params=["s3", "web"])
+def dataset_url(
+    request: pytest.FixtureRequest, packed_bag: Path, put: Put
+) -> Iterator[tuple[str, Path, Server]]:
+    if request.param == "s3":
+        yield put(packed_bag), packed_bag, request.getfixturevalue("s3")
+    else:
+        with web_server(packed_bag.parent) as web:
+            yield f"{web.url}/{packed_bag.name}", packed_bag, web
+
+
+def test_a_dataset_is_open_there(dataset_url: tuple[str, Path, Server]) -> None:
+    url, here, _ = dataset_url
+    with mp4ds.open(url) as there, mp4ds.open(here) as local:
+        assert there.topics == local.topics
+        for number in (5, 0, -1):
+            assert np.array_equal(there[TOPIC][number].data, local[TOPIC][number].data)
+        for ours, theirs in zip(there.records(), local.records(), strict=True):
+            if isinstance(ours, Message):
+                assert bytes(ours.data) == bytes(theirs.data)  # type: ignore[union-attr]
+    with mp4ds.open(f"{url}/cam_image_raw.mp4") as alone:
+        assert len(alone[TOPIC]) == 8
+
+
+def test_a_dataset_is_valid_there(dataset_url: tuple[str, Path, Server]) -> None:
+    url, here, _ = dataset_url
+    assert mp4ds.validate(url, deep=True) == []
+    assert mp4ds.validate(f"{url}/cam_image_raw.yaml", deep=True) == []
+    there = info(url)
+    assert there.kind == "dataset"
+    assert (there.topics, there.bytes) == (info(here).topics, info(here).bytes)
+
+
+def test_a_dataset_is_unpacked_from_there(
+    dataset_url: tuple[str, Path, Server], tmp_path: Path, compare: Compare
+) -> None:
+    url, here, _ = dataset_url
+    mp4ds.unpack(url, "bag", tmp_path / "again.bag")
+    mp4ds.unpack(here, "bag", tmp_path / "local.bag")
+    assert compare([tmp_path / "again.bag"], tmp_path / "local.bag") == []
+
+
+def test_an_unpack_without_a_name_comes_here(
+    packed_bag: Path, put: Put, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    mp4ds.unpack(put(packed_bag), "mcap")
+    assert [path.name for path in tmp_path.iterdir()] == ["dataset_unpacked.mcap"]
+
+
+def test_problems_of_a_dataset_are_found_there(
+    packed_bag: Path, put: Put, stores: Any, s3: Server
+) -> None:
+    url = put(packed_bag)
+    stores.pipe_file(f"{url}/stray.mp4", b"x")
+    stores.pipe_file(f"{url}/messages.mcap", b"x")
+    codes = {problem.code for problem in mp4ds.validate(url)}
+    assert codes == {"file-unlisted", "size-mismatch"}
+    stores.rm_file(f"{url}/messages.mcap")
+    assert "file-missing" in {problem.code for problem in mp4ds.validate(url)}
+    assert mp4ds.validate(url.rpartition("/")[0]) != []  # the folder that it is in
+
+
+# ---------------------------------------------------------------- failures
+
+
+def run(*arguments: str) -> tuple[int, str]:
+    """Exit code of a command, and what it says on stderr."""
+    from typer.testing import CliRunner
+
+    result = CliRunner().invoke(app, list(arguments))
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    assert "Traceback" not in result.output
+    return result.exit_code, result.output
+
+
+@pytest.mark.parametrize("command", [["info"], ["validate"], ["pack", "-o", "x"]])
+def test_what_is_not_there(command: list[str], folder_url: str, s3: Server, web: Server) -> None:
+    for url in (f"{folder_url}/none.bag", "s3://nobody/none.bag", f"{web.url}/none.bag"):
+        code, said = run(*command, url)
+        assert code == 2
+        assert f"{url}: no such file or folder. Check the path." in said
+
+
+@pytest.mark.parametrize("command", [["info"], ["validate"], ["pack", "-o", "x"]])
+def test_what_is_refused(command: list[str], s3: Server, web: Server) -> None:
+    for server, url in ((s3, "s3://bucket/x.bag"), (web, f"{web.url}/x.bag")):
+        server.fails = lambda _: 403
+        code, said = run(*command, url)
+        assert code == 2
+        assert f"{url}: cannot be read: access is refused: " in said
+        assert "403" in said
+
+
+def test_without_credentials(s3: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    import s3fs
+
+    monkeypatch.delenv("AWS_ACCESS_KEY_ID")
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    s3fs.S3FileSystem.clear_instance_cache()
+    code, said = run("info", "s3://bucket/x.bag")
+    s3fs.S3FileSystem.clear_instance_cache()
+    assert code == 2
+    assert "access is refused: Unable to locate credentials" in said
+
+
+def test_a_server_that_is_not_there() -> None:
+    code, said = run("info", "http://127.0.0.1:9/x.bag")
+    assert code == 1
+    assert "http://127.0.0.1:9/x.bag: could not be read: " in said
+    assert "Check the network" in said
+
+
+@pytest.mark.parametrize("name", ["drive.bag", "drive.mcap", "drive.db3"])
+def test_a_server_without_ranges(name: str, tmp_path: Path) -> None:
+    with (tmp_path / name).open("wb") as stream:
+        stream.truncate(2**30)
+    with web_server(tmp_path, ranges=False) as web:
+        for look in (info, lambda url: mp4ds.pack(url, tmp_path / "x")):
+            with pytest.raises(SourceError, match=r"does not serve parts of files .* Download it"):
+                look(f"{web.url}/{name}")
+        assert web.sent < 2**26  # what is under way when the connection is closed
+
+
+@pytest.mark.parametrize("name", ["drive.bag", "drive.mcap"])
+@pytest.mark.parametrize("after", [3, 8, 20])
+def test_a_network_that_fails_is_no_damage(
+    name: str, after: int, large: Path, tmp_path: Path
+) -> None:
+    with web_server(large) as web:
+        web.fails = lambda _: 500 if len(web.requests) > after else None
+        with pytest.raises(RemoteError, match=r"could not be read: 500 Internal Server Error"):
+            mp4ds.pack(f"{web.url}/{name}", tmp_path / "dataset")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_network_that_fails_while_a_video_is_read(
+    packed_bag: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for after in range(2, 40, 3):
+        with web_server(packed_bag.parent) as web:
+            url = f"{web.url}/{packed_bag.name}"
+
+            def fails(_: Request, web: Server = web, after: int = after) -> int | None:
+                return 500 if len(web.requests) > after else None
+
+            web.fails = fails
+            with pytest.raises(RemoteError, match=r"could not be read"):
+                mp4ds.validate(url, deep=True)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_recording_that_changes(
+    tmp_path: Path, put: Put, stores: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_bag(tmp_path / "drive.bag", scene("mono8", frames=9))
+    url = put(tmp_path / "drive.bag")
+    failing = InlineEngine(lambda task: task == "00001-0")
+    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: failing)
+    with pytest.raises(PartsFailedError):
+        mp4ds.pack(url, tmp_path / "dataset", PackOptions(window=3))
+    going_on = InlineEngine()
+    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: going_on)
+    write_bag(tmp_path / "other.bag", scene("mono8", frames=9, seed=1))
+    stores.put(str(tmp_path / "other.bag"), url)
+    with pytest.raises(SourceError, match=r"has changed since its packing began"):
+        mp4ds.pack(url, tmp_path / "dataset", PackOptions(window=3))
+    put(tmp_path / "drive.bag")
+    mp4ds.pack(url, tmp_path / "dataset", PackOptions(window=3))
+    assert "00000-0" not in going_on.ran
+    assert "00001-0" in going_on.ran
+
+
+def test_secrets_are_not_told(tmp_path: Path, web: Server) -> None:
+    (tmp_path / "web" / "x.bag").write_bytes(b"nonsense")
+    url = f"{web.url}/x.bag?{SECRET}"
+    for fails in (lambda _: None, lambda _: 403, lambda _: 500):
+        web.fails = fails
+        _, said = run("info", url)
+        assert "x.bag" in said
+        assert "4711" not in said
+
+
+def test_the_query_goes_with_every_request(tmp_path: Path, web: Server) -> None:
+    write_mcap(tmp_path / "web" / "x.mcap", scene("mono8"))
+    assert info(f"{web.url}/x.mcap?{SECRET}").topics
+    assert {path.partition("?")[2] for _, path, _ in web.requests} == {SECRET}
+
+
+def test_salvage_is_done_here(tmp_path: Path, put: Put) -> None:
+    write_bag(tmp_path / "drive.bag", scene("mono8"))
+    with pytest.raises(SourceError, match=r"is not salvaged where it is\. Download it first"):
+        mp4ds.pack(put(tmp_path / "drive.bag"), tmp_path / "x", PackOptions(salvage=True))
+
+
+# ---------------------------------------------------------------- what is installed
+
+
+def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fsspec", None)
+    with pytest.raises(OptionError, match=r"Run: pip install 'mp4ds\[remote\]'"):
+        info("s3://bucket/drive.bag")
+
+
+@pytest.mark.parametrize(
+    ("url", "module", "remedy"),
+    [
+        ("s3://bucket/x.bag", "s3fs", r"pip install 'mp4ds\[remote\]'"),
+        ("https://host/x.bag", "fsspec.implementations.http", r"pip install 'mp4ds\[remote\]'"),
+        ("gs://bucket/x.bag", "gcsfs", "gcsfs"),
+    ],
+)
+def test_without_a_stores_package(
+    url: str, module: str, remedy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import fsspec
+
+    known: dict[str, type] = {}
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setattr(sys.modules[fsspec.get_filesystem_class.__module__], "_registry", known)
+    monkeypatch.setattr(sys.modules[fsspec.get_filesystem_class.__module__], "registry", known)
+    with pytest.raises(OptionError, match=remedy):
+        info(url)
+
+
+def test_an_unknown_scheme() -> None:
+    with pytest.raises(OptionError, match=r"abc:// is not known\. Use s3, gs, https"):
+        info("abc://bucket/x.bag")
+
+
+def test_a_store_of_another_kind(tmp_path: Path, compare: Compare) -> None:
+    import fsspec
+
+    write_mcap(tmp_path / "drive.mcap", scene("mono8"))
+    memory = fsspec.filesystem("memory")
+    memory.pipe_file("/drive.mcap", (tmp_path / "drive.mcap").read_bytes())
+    mp4ds.pack("memory://drive.mcap", tmp_path / "dataset")
+    assert compare([tmp_path / "drive.mcap"], unpacked(tmp_path, "mcap")) == []
+    memory.rm("/drive.mcap")
+
+
+def test_file_urls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_bag(tmp_path / "a drive.bag", scene("mono8"))
+    monkeypatch.setitem(sys.modules, "fsspec", None)
+    mp4ds.pack((tmp_path / "a drive.bag").as_uri(), (tmp_path / "dataset").as_uri())
+    assert mp4ds.validate((tmp_path / "dataset").as_uri(), deep=True) == []
+    assert "a drive.bag" in (tmp_path / "dataset" / "dataset.yaml").read_text()

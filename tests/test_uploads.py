@@ -1,0 +1,460 @@
+"""Datasets and recordings are made for URLs: whole, or visibly not, and never made twice."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mp4ds
+from in_parts import InlineEngine, facts
+from mp4ds.cli import app
+from mp4ds.errors import (
+    OptionError,
+    PartsFailedError,
+    RemoteError,
+    SourceError,
+    TargetError,
+    TargetExistsError,
+)
+from mp4ds.packing import PackOptions, PackProgress, pack_each, pack_share
+from mp4ds.remote import RemotePath
+from mp4ds.unpacking import UnpackOptions
+from mp4ds.uploads import Upload
+from remote_servers import Request, Server
+from remote_stores import Put, folder_url, put, s3, s3_running, stores
+from round_trips import TARGETS, Compare
+from sources import scene, write_bag
+
+__all__ = ["folder_url", "put", "s3", "s3_running", "stores"]
+
+FAST = PackOptions(codec="h264", preset="ultrafast")
+FILES = {"cam_image_raw.mp4", "cam_image_raw.yaml", "messages.mcap", "dataset.yaml"}
+
+
+@pytest.fixture(autouse=True)
+def staging(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The system's temporary folder for one test."""
+    folder = tmp_path / "staging"
+    folder.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    return folder
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    write_bag(tmp_path / "drive.bag", scene("bayer_rggb8", frames=9))
+    return tmp_path / "drive.bag"
+
+
+def left(staging: Path) -> list[str]:
+    """What is kept here for a later run."""
+    return sorted(
+        path.relative_to(staging).as_posix() for path in staging.rglob("*") if path.is_file()
+    )
+
+
+def there(stores: Any, url: str) -> set[str]:
+    """Names of the files at a URL."""
+    key = url.removeprefix("s3://")
+    stores.invalidate_cache()
+    return {path.removeprefix(key).strip("/") for path in stores.find(key)}
+
+
+def refusing(name: str, method: str = "PUT") -> Callable[[Request], int | None]:
+    """Refuses requests for files of a name."""
+    return lambda heard: 403 if heard.method == method and heard.path.endswith(name) else None
+
+
+def again(stores: Any, url: str, folder: Path, compare: Compare, source: Path) -> list[str]:
+    """Differences of a recording from what its dataset at a URL gives."""
+    stores.get(url, str(folder), recursive=True)
+    assert mp4ds.validate(folder, deep=True) == []
+    mp4ds.unpack(folder, "bag", folder.with_suffix(".bag"))
+    return compare([source], folder.with_suffix(".bag"))
+
+
+# ---------------------------------------------------------------- packs
+
+
+@pytest.mark.parametrize("window", [None, 3])
+def test_a_pack_is_uploaded_the_manifest_last(
+    window: int | None,
+    source: Path,
+    folder_url: str,
+    stores: Any,
+    s3: Server,
+    staging: Path,
+    tmp_path: Path,
+    compare: Compare,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    engine = InlineEngine()
+    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: engine)
+    url = f"{folder_url}/drive"
+    told: list[PackProgress] = []
+    summary = mp4ds.pack(source, url, replace(FAST, window=window), progress=told.append)
+    assert bool(engine.ran) == bool(window)
+    assert str(summary.dataset) == url
+    assert {str(state.dataset) for state in told} == {url}
+    assert "uploading" in {state.phase for state in told}
+    assert there(stores, url) == FILES
+    assert s3.put()[0] == ".mp4ds-upload"  # shows before the work that it can be uploaded
+    assert s3.put()[-1] == "dataset.yaml"
+    assert left(staging) == []
+    assert mp4ds.validate(url, deep=True) == []
+    assert again(stores, url, tmp_path / "back", compare, source) == []
+    here = mp4ds.pack(source, tmp_path / "here", replace(FAST, window=window))
+    assert facts(tmp_path / "here") == facts(tmp_path / "back")
+    assert replace(summary, dataset=here.dataset) == here
+
+
+def test_large_files_go_in_parts(
+    source: Path, folder_url: str, stores: Any, s3: Server, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_bytes(os.urandom(40_000_000))
+    target = RemotePath(f"{folder_url}/file")
+    assert target.upload(tmp_path / "file").stat().st_size == 40_000_000
+    assert s3.put().count("file") == 3
+    assert stores.cat(target.url) == (tmp_path / "file").read_bytes()
+
+
+def test_an_existing_dataset_is_kept(
+    source: Path, folder_url: str, stores: Any, s3: Server, staging: Path
+) -> None:
+    url = f"{folder_url}/drive"
+    mp4ds.pack(source, url, FAST)
+    s3.forget()
+    with pytest.raises(TargetExistsError, match=rf"{url}: exists already"):
+        mp4ds.pack(source, url, FAST)
+    assert s3.put() == []
+    assert there(stores, url) == FILES
+    assert left(staging) == []
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_what_mp4ds_did_not_write_is_kept(
+    force: bool, source: Path, folder_url: str, stores: Any, s3: Server
+) -> None:
+    stores.pipe_file(f"{folder_url}/drive/thesis.tex", b"years of work")
+    with pytest.raises(TargetError, match=r"exists"):
+        mp4ds.pack(source, f"{folder_url}/drive", replace(FAST, force=force))
+    assert there(stores, f"{folder_url}/drive") == {"thesis.tex"}
+
+
+def test_force_replaces_the_manifest_first(
+    source: Path, folder_url: str, stores: Any, s3: Server, tmp_path: Path
+) -> None:
+    url = f"{folder_url}/drive"
+    mp4ds.pack(source, url, FAST)
+    stores.pipe_file(f"{url}/old.mp4", b"of another pack")
+    stores.pipe_file(f"{url}2/cam.mp4", b"a neighbour")
+    s3.forget()
+    mp4ds.pack(source, url, replace(FAST, force=True, exclude=["/cam/*"]))
+    assert there(stores, url) == {"messages.mcap", "dataset.yaml"}
+    assert there(stores, f"{url}2") == {"cam.mp4"}
+    changes = [
+        (method, path.rpartition("/")[2])
+        for method, path, _ in s3.requests
+        if method in ("PUT", "DELETE")
+    ]
+    assert changes[1] == ("DELETE", "dataset.yaml")
+    assert changes[-2] == ("PUT", "dataset.yaml")
+    assert changes[-1] == ("DELETE", ".mp4ds-upload")
+    assert mp4ds.validate(url, deep=True) == []
+
+
+@pytest.mark.parametrize("name", ["cam_image_raw.mp4", "messages.mcap", "dataset.yaml"])
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_failed_upload_goes_on(
+    name: str,
+    replaced: bool,
+    source: Path,
+    folder_url: str,
+    stores: Any,
+    s3: Server,
+    staging: Path,
+    tmp_path: Path,
+    compare: Compare,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    url = f"{folder_url}/drive"
+    options = replace(FAST, force=replaced)
+    if replaced:
+        mp4ds.pack(source, url, replace(FAST, exclude=["/imu"]))
+    s3.forget()
+    s3.fails = refusing(name)
+    with pytest.raises(TargetError, match=r"run the same command again to go on") as failure:
+        mp4ds.pack(source, url, options)
+    assert f"{url}/{name}: cannot be uploaded: access is refused" in str(failure.value)
+    assert "dataset.yaml" not in there(stores, url)
+    done = set(s3.put()) - {name}
+    s3.forget()
+
+    monkeypatch.setattr("mp4ds.packing._pack_in_one_pass", None)  # it is not packed again
+    summary = mp4ds.pack(source, url, replace(options, force=False))
+    assert set(s3.put()) & FILES == FILES - done
+    assert there(stores, url) == FILES
+    assert left(staging) == []
+    assert again(stores, url, tmp_path / "back", compare, source) == []
+    monkeypatch.undo()
+    here = mp4ds.pack(source, tmp_path / "here", FAST)
+    assert replace(summary, dataset=here.dataset) == here
+
+
+def test_of_another_recording_nothing_is_taken(
+    source: Path, folder_url: str, stores: Any, s3: Server, tmp_path: Path, compare: Compare
+) -> None:
+    url = f"{folder_url}/drive"
+    s3.fails = refusing("messages.mcap")
+    with pytest.raises(TargetError):
+        mp4ds.pack(source, url, FAST)
+    s3.forget()
+    source.unlink()
+    write_bag(source, scene("mono16", frames=5))
+    mp4ds.pack(source, url, FAST)
+    assert again(stores, url, tmp_path / "back", compare, source) == []
+
+
+def test_a_file_that_was_changed_there_is_sent_again(
+    source: Path, folder_url: str, stores: Any, s3: Server, tmp_path: Path, compare: Compare
+) -> None:
+    url = f"{folder_url}/drive"
+    s3.fails = refusing("messages.mcap")
+    with pytest.raises(TargetError):
+        mp4ds.pack(source, url, FAST)
+    s3.forget()
+    stores.pipe_file(f"{url}/cam_image_raw.mp4", b"what is this?")
+    mp4ds.pack(source, url, FAST)
+    assert again(stores, url, tmp_path / "back", compare, source) == []
+
+
+def test_an_upload_whose_rest_is_lost_here_is_made_again(
+    source: Path, folder_url: str, stores: Any, s3: Server, staging: Path, tmp_path: Path
+) -> None:
+    """The mark tells that what is there is of us, and not whole."""
+    url = f"{folder_url}/drive"
+    s3.fails = refusing("dataset.yaml")
+    with pytest.raises(TargetError):
+        mp4ds.pack(source, url, FAST)
+    staging.rename(tmp_path / "lost")
+    staging.mkdir()
+    s3.forget()
+    mp4ds.pack(source, url, FAST)
+    assert there(stores, url) == FILES
+
+
+def test_what_is_uploaded_is_counted(
+    source: Path, folder_url: str, s3: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def short(self: Any, local: Path, path: Any) -> None:
+        self._fs.pipe_file(path.url, local.read_bytes()[:-1])
+
+    monkeypatch.setattr("mp4ds.remote.store.Store.put", short)
+    with pytest.raises(RemoteError, match=r"could not be uploaded: \d+ of \d+ bytes are there"):
+        mp4ds.pack(source, f"{folder_url}/drive", FAST)
+
+
+def test_a_store_that_refuses_is_told_before_the_work(
+    source: Path,
+    folder_url: str,
+    s3: Server,
+    staging: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("mp4ds.packing._plan", None)
+    s3.fails = lambda heard: 403 if heard.method == "PUT" else None
+    with pytest.raises(TargetError, match=r"cannot be uploaded: access is refused"):
+        mp4ds.pack(source, f"{folder_url}/drive", FAST)
+    s3.forget()
+    with pytest.raises(TargetError, match=r"cannot be uploaded: .*bucket does not exist"):
+        mp4ds.pack(source, "s3://nobodys-bucket/drive", FAST)
+    with pytest.raises(TargetError, match=r"is a whole bucket\. Name a folder in it"):
+        mp4ds.pack(source, "s3://bucket", FAST)
+    with pytest.raises(TargetError, match=r"takes no uploads"):
+        mp4ds.pack(source, "https://host/drive", FAST)
+    assert left(staging) == []
+
+
+def test_a_source_that_cannot_be_read_leaves_nothing(
+    tmp_path: Path, folder_url: str, stores: Any, s3: Server, staging: Path
+) -> None:
+    (tmp_path / "broken.bag").write_bytes(b"#ROSBAG V2.0\n broken")
+    for name in ("broken.bag", "none.bag"):
+        with pytest.raises(SourceError):
+            mp4ds.pack(tmp_path / name, f"{folder_url}/drive", FAST)
+    assert there(stores, folder_url) == set()
+    assert left(staging) == []
+
+
+def test_a_divided_pack_goes_on(
+    source: Path,
+    folder_url: str,
+    stores: Any,
+    s3: Server,
+    staging: Path,
+    tmp_path: Path,
+    compare: Compare,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    url, options = f"{folder_url}/drive", replace(FAST, window=3)
+    failing = InlineEngine(lambda task: task == "00001-0")
+    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: failing)
+    with pytest.raises(PartsFailedError):
+        mp4ds.pack(source, url, options)
+    assert there(stores, url) == set()
+    assert any("00000-0" in name for name in left(staging))
+    going_on = InlineEngine()
+    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: going_on)
+    mp4ds.pack(source, url, options)
+    assert "00000-0" not in going_on.ran
+    assert left(staging) == []
+    assert again(stores, url, tmp_path / "back", compare, source) == []
+
+
+def test_shares_meet_in_the_temporary_folder(
+    source: Path,
+    folder_url: str,
+    stores: Any,
+    s3: Server,
+    tmp_path: Path,
+    compare: Compare,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    url, options = f"{folder_url}/drive", replace(FAST, window=3)
+    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: InlineEngine())
+    for number in (1, 2):
+        pack_share(source, url, (number, 2), options)
+    mp4ds.pack(source, url, replace(options, join=True))
+    assert again(stores, url, tmp_path / "back", compare, source) == []
+
+
+def test_nothing_to_join(source: Path, folder_url: str, s3: Server, staging: Path) -> None:
+    with pytest.raises(OptionError, match=r"nothing to join"):
+        mp4ds.pack(source, f"{folder_url}/drive", replace(FAST, join=True))
+    assert left(staging) == []
+
+
+def test_one_dataset_each(
+    source: Path, folder_url: str, stores: Any, s3: Server, put: Put, tmp_path: Path
+) -> None:
+    write_bag(tmp_path / "other.bag", scene("mono8", frames=3))
+    urls = [put(source), put(tmp_path / "other.bag")]
+    summaries = pack_each(urls, f"{folder_url}/all/", FAST)
+    assert [str(summary.dataset) for summary in summaries] == [
+        f"{folder_url}/all/drive",
+        f"{folder_url}/all/other",
+    ]
+    assert pack_each(urls, f"{folder_url}/all/", FAST) == []
+    stores.put(str(source), urls[1])
+    with pytest.raises(TargetExistsError):
+        pack_each(urls, f"{folder_url}/all/", FAST)
+    assert mp4ds.validate(f"{folder_url}/all") == []
+
+
+def test_two_at_a_time(source: Path, folder_url: str, s3: Server) -> None:
+    upload = Upload(RemotePath(f"{folder_url}/drive"), last="dataset.yaml")
+    upload.folder.mkdir()
+    with (upload.folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(TargetError, match=r"another mp4ds is making it here"):
+            mp4ds.pack(source, f"{folder_url}/drive", FAST)
+
+
+def test_the_temporary_folder_is_ones_own(
+    source: Path, folder_url: str, s3: Server, staging: Path, tmp_path: Path
+) -> None:
+    (staging / f"mp4ds-{os.getuid()}").symlink_to(tmp_path)
+    with pytest.raises(TargetError, match=r"belongs to somebody else\. Name another .* TMPDIR"):
+        mp4ds.pack(source, f"{folder_url}/drive", FAST)
+
+
+# ---------------------------------------------------------------- unpacks
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_an_unpack_is_uploaded(
+    target: str,
+    packed_bag: Path,
+    folder_url: str,
+    stores: Any,
+    s3: Server,
+    staging: Path,
+    tmp_path: Path,
+    compare: Compare,
+) -> None:
+    to, storage = TARGETS[target]
+    name = "again" + {"bag": ".bag", "mcap": ".mcap"}.get(to, "")
+    url, options = f"{folder_url}/{name}", UnpackOptions(storage=storage)
+    summary = mp4ds.unpack(packed_bag, to, url, options)
+    assert str(summary.output) == url
+    assert left(staging) == []
+    here = mp4ds.unpack(packed_bag, to, tmp_path / name, options)
+    assert replace(summary, output=here.output) == here
+    if to == "rosbag2":
+        assert s3.put()[-1] == "metadata.yaml"
+    stores.get(url, str(tmp_path / f"back-{name}"), recursive=to == "rosbag2")
+    assert compare([tmp_path / name], tmp_path / f"back-{name}") == []
+    with pytest.raises(TargetExistsError):
+        mp4ds.unpack(packed_bag, to, url, options)
+    mp4ds.unpack(packed_bag, to, url, replace(options, force=True))
+    assert not any(path.endswith(".mp4ds-upload") for path in stores.find(folder_url[5:]))
+
+
+def test_images_are_uploaded(
+    packed_bag: Path, folder_url: str, stores: Any, s3: Server, tmp_path: Path
+) -> None:
+    url = f"{folder_url}/pictures"
+    s3.fails = refusing("5.png")
+    with pytest.raises(TargetError, match=r"run the same command again to go on"):
+        mp4ds.unpack(packed_bag, "images", url)
+    s3.forget()
+    mp4ds.unpack(packed_bag, "images", url)
+    assert "4.png" not in s3.put()
+    assert {"5.png", "7.png"} <= set(s3.put())
+    mp4ds.unpack(packed_bag, "images", tmp_path / "pictures")
+    here = {p.relative_to(tmp_path / "pictures").as_posix(): p.read_bytes() for p in
+            (tmp_path / "pictures").rglob("*.*")}  # fmt: skip
+    assert {name: stores.cat(f"{url}/{name}") for name in there(stores, url)} == here
+    with pytest.raises(TargetExistsError):
+        mp4ds.unpack(packed_bag, "images", url)
+    mp4ds.unpack(packed_bag, "images", url, UnpackOptions(force=True, image_format="jpeg"))
+    assert not any(name.endswith(".png") for name in there(stores, url))
+
+
+def test_from_a_url_to_a_url(
+    packed_bag: Path, put: Put, folder_url: str, stores: Any, tmp_path: Path, compare: Compare
+) -> None:
+    mp4ds.unpack(put(packed_bag), "bag", f"{folder_url}/again.bag")
+    stores.get(f"{folder_url}/again.bag", str(tmp_path / "again.bag"))
+    mp4ds.unpack(packed_bag, "bag", tmp_path / "here.bag")
+    assert compare([tmp_path / "here.bag"], tmp_path / "again.bag") == []
+
+
+# ---------------------------------------------------------------- the command line
+
+
+def test_the_command_line(source: Path, folder_url: str, put: Put, s3: Server) -> None:
+    from typer.testing import CliRunner
+
+    def run(*arguments: str) -> Any:
+        result = CliRunner().invoke(app, [*arguments, "--json"])
+        assert result.exit_code == 0, result.output
+        return json.loads(result.stdout)
+
+    recording, dataset = put(source), f"{folder_url}/dataset"
+    assert run("info", recording)["path"] == recording
+    packed = run("pack", recording, "-o", dataset, "--codec", "h264", "--preset", "ultrafast")
+    assert packed["dataset"] == dataset
+    assert run("info", dataset)["kind"] == "dataset"
+    assert run("info", dataset, "--intrinsics")["path"] == dataset
+    assert run("validate", dataset, "--deep") == {"path": dataset, "deep": True, "problems": []}
+    again = f"{folder_url}/again.bag"
+    assert run("unpack", dataset, "--to", "bag", "-o", again)["output"] == again
+    assert run("info", again)["topics"] == run("info", recording)["topics"]

@@ -1,0 +1,200 @@
+"""Packed in parts, a recording becomes what it becomes in one pass, but for more key frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+import mp4ds
+from coded_scenes import CODED
+from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
+from in_parts import InlineEngine, facts, leftovers
+from mp4ds.demo import demo
+from mp4ds.errors import OptionError
+from mp4ds.packing import PackOptions
+from mp4ds.packing.planning import TASK_BYTES
+from pictures import ENCODINGS, picture
+from round_trips import Compare, own_target, unpacked
+from scenes import Scene
+from sources import SOURCES, TRAITS, odd_scene, scene
+
+TOPIC = "/cam/image_raw"
+INDEXED = [
+    *("bag-none", "bag-lz4", "bag-bz2", "mcap-ros1-zstd", "mcap-ros2-lz4", "mcap-ros2-none"),
+    *("rosbag2-mcap-v9", "rosbag2-mcap-split"),
+]
+ONE_ENCODER = TASK_BYTES + 40 * 2**20
+"""Bytes that hold the encoder of either of the demo's cameras, not both."""
+
+
+@pytest.fixture(autouse=True)
+def engine(monkeypatch: pytest.MonkeyPatch) -> InlineEngine:
+    inline = InlineEngine()
+    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: inline)
+    return inline
+
+
+def compare_packs(
+    folder: Path,
+    source: str,
+    recorded: Scene,
+    compare: Compare,
+    engine: InlineEngine,
+    **options: Any,
+) -> None:
+    (folder / "source").mkdir()
+    paths = SOURCES[source](folder / "source", recorded)
+    whole = mp4ds.pack(paths, folder / "whole", PackOptions(**options))
+    assert engine.ran == []
+    parts = mp4ds.pack(paths, folder / "dataset", PackOptions(window=3, **options))
+    assert len([name for name in engine.ran if not name.startswith("source")]) > 1
+    assert mp4ds.validate(folder / "dataset", deep=True) == []
+    assert facts(folder / "dataset") == facts(folder / "whole")
+    assert leftovers(folder) == []
+    assert [(t.topic, t.messages, t.frames, t.raw_bytes, t.verbatim) for t in parts.topics] == [
+        (t.topic, t.messages, t.frames, t.raw_bytes, t.verbatim) for t in whole.topics
+    ]
+    assert (parts.left_out, parts.skipped) == (whole.left_out, whole.skipped)
+    assert compare(paths, unpacked(folder, own_target(source))) == []
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_every_encoding(
+    encoding: str, tmp_path: Path, compare: Compare, engine: InlineEngine
+) -> None:
+    source = INDEXED[ENCODINGS.index(encoding) % 3]
+    recorded = scene(encoding, frames=10, width=66, height=46)
+    compare_packs(tmp_path, source, recorded, compare, engine)
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_every_source(source: str, tmp_path: Path, compare: Compare, engine: InlineEngine) -> None:
+    recorded = scene("bayer_gbrg8", frames=10)
+    (tmp_path / "source").mkdir()
+    paths = SOURCES[source](tmp_path / "source", recorded)
+    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=3))
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare(paths, unpacked(tmp_path, own_target(source))) == []
+    assert leftovers(tmp_path) == []
+
+
+@pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-zstd"])
+@pytest.mark.parametrize("name", CODED)
+def test_coded_images(
+    name: str, source: str, tmp_path: Path, compare: Compare, engine: InlineEngine
+) -> None:
+    (tmp_path / "source").mkdir()
+    paths = SOURCES[source](tmp_path / "source", CODED[name]())
+    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=3))
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare(paths, unpacked(tmp_path, own_target(source))) == []
+
+
+@pytest.mark.parametrize("trait", TRAITS)
+def test_odd_messages(trait: str, tmp_path: Path, compare: Compare, engine: InlineEngine) -> None:
+    (tmp_path / "source").mkdir()
+    paths = SOURCES["mcap-ros2-zstd"](tmp_path / "source", odd_scene(trait))
+    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=3))
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare(paths, unpacked(tmp_path, "mcap")) == []
+
+
+@pytest.mark.parametrize("source", list(FOXGLOVE_SOURCES)[::2])
+@pytest.mark.parametrize("name", ["raw-rgb8", "raw-padded", "jpeg-cut-one", "video-h264-mid-gop"])
+def test_foxglove_messages(
+    name: str, source: str, tmp_path: Path, compare: Compare, engine: InlineEngine
+) -> None:
+    (tmp_path / "source").mkdir()
+    paths = FOXGLOVE_SOURCES[source](tmp_path / "source", FOXGLOVE[name]())
+    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=3))
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare(paths, unpacked(tmp_path, "mcap")) == []
+
+
+@pytest.mark.parametrize("codec", ["av1", "h264", "h265"])
+def test_a_lossy_profile(
+    codec: str, tmp_path: Path, compare: Compare, engine: InlineEngine
+) -> None:
+    """The parts are decoded alike; each begins with a key frame, and nothing else differs."""
+    options = {"quality": "crf=12", "codec": codec}
+    recorded = scene("rgb8", frames=10, width=96, height=64, noisy=False)
+    (tmp_path / "source").mkdir()
+    paths = SOURCES["bag-none"](tmp_path / "source", recorded)
+    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=3, **options))
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare(paths, unpacked(tmp_path, "bag"), ignore_pixels=[TOPIC]) == []
+    with mp4ds.open(tmp_path / "dataset") as dataset:
+        (stream,) = dataset.streams
+        assert len(stream) == 10
+        error = [
+            np.abs(
+                frame.data.astype(int) - picture("rgb8", frame=n, width=96, height=64, rng=None)
+            ).mean()
+            for n, frame in enumerate(stream)
+        ]
+    assert max(error) < 12
+
+
+@pytest.mark.parametrize("groups", [1, 2])
+def test_groups_of_cameras_and_one_without_images(
+    groups: int, tmp_path: Path, compare: Compare, engine: InlineEngine
+) -> None:
+    """Where the memory does not hold all encoders at once, cameras are packed apart."""
+    demo(tmp_path / "drive.bag", seconds=3)
+    memory = {1: None, 2: ONE_ENCODER}[groups]
+    mp4ds.pack(tmp_path / "drive.bag", tmp_path / "whole")
+    options = PackOptions(window=15, memory=memory)
+    mp4ds.pack(tmp_path / "drive.bag", tmp_path / "dataset", options)
+    parts = {name.partition("-")[2] for name in engine.ran if not name.startswith("source")}
+    assert parts == {str(number) for number in range(groups)}
+    assert facts(tmp_path / "dataset") == facts(tmp_path / "whole")
+    assert compare([tmp_path / "drive.bag"], unpacked(tmp_path, "bag")) == []
+
+
+def test_memory_for_less_than_one_encoder_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()  # the engine is to be the usual one
+    demo(tmp_path / "drive.bag", seconds=3)
+    with pytest.raises(OptionError, match=r"--memory of 50 MiB is too little: one encoder"):
+        mp4ds.pack(
+            tmp_path / "drive.bag", tmp_path / "d", PackOptions(window=15, memory=50 * 2**20)
+        )
+
+
+def test_channels_that_cannot_be_told_apart(
+    tmp_path: Path, compare: Compare, engine: InlineEngine
+) -> None:
+    """Two of the same topic, type and metadata are one: its messages are counted together."""
+    (tmp_path / "source").mkdir()
+    (source,) = SOURCES["mcap-ros2-zstd"](tmp_path / "source", scene("mono8", frames=11))
+    path = tmp_path / "source" / "twice.mcap"
+    with source.open("rb") as read, path.open("wb") as write:
+        writer = Writer(write, chunk_size=20_000)
+        writer.start("ros2", "")
+        ids: dict[tuple[str, int], int] = {}
+        for number, (schema, channel, message) in enumerate(make_reader(read).iter_messages()):
+            assert schema is not None
+            key = (channel.topic, number // 3 % 2)
+            if key not in ids:
+                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
+                ids[key] = writer.register_channel(
+                    channel.topic, channel.message_encoding, schema_id, channel.metadata
+                )
+            writer.add_message(
+                ids[key], message.log_time, message.data, message.publish_time, message.sequence
+            )
+        writer.finish()  # type: ignore[no-untyped-call]
+    assert len(ids) > len({topic for topic, _ in ids})
+    mp4ds.pack(path, tmp_path / "whole")
+    mp4ds.unpack(tmp_path / "whole", "mcap", tmp_path / "whole.mcap")
+    assert compare([path], tmp_path / "whole.mcap") == []
+    mp4ds.pack(path, tmp_path / "dataset", PackOptions(window=2))
+    assert len(engine.ran) > 4
+    assert facts(tmp_path / "dataset") == facts(tmp_path / "whole")
+    assert compare([path], unpacked(tmp_path, "mcap")) == []
