@@ -33,7 +33,8 @@ def s3_running() -> Iterator[tuple[Server, Any]]:
         patch.setenv("AWS_MAX_ATTEMPTS", "2")
         s3fs.S3FileSystem.clear_instance_cache()
         files = s3fs.S3FileSystem(use_listings_cache=False)
-        files.mkdir(BUCKET)
+        if not files.exists(BUCKET):  # one memory for all servers of a process
+            files.mkdir(BUCKET)
         yield server, files
         s3fs.S3FileSystem.clear_instance_cache()
     logging.disable(logging.NOTSET)

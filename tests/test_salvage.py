@@ -548,7 +548,9 @@ try:
         print(sum(1 for _ in reader.records()), len(reader.losses))
 except SourceError as error:
     print(0, 0, error)
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+# not ru_maxrss, which counts what the process was forked from
+status = Path("/proc/self/status").read_text().split()
+print(status[status.index("VmHWM:") + 1])
 """
 
 

@@ -10,7 +10,6 @@ import io
 import json
 import os
 import queue
-import resource
 import signal
 import sys
 import threading
@@ -180,7 +179,7 @@ def _outcome(tasks: Tasks, folder: str, name: str) -> dict[str, Any]:
     except (Mp4dsError, OSError) as error:
         tasks.close()  # it may be damaged where it was read ahead
         return {"error": (type(error).__name__, str(error)), "ready": True}
-    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    peak = _peak_bytes()
     return {
         "done": True,
         # what large encoders leave in pieces is given back by ending only
@@ -189,6 +188,15 @@ def _outcome(tasks: Tasks, folder: str, name: str) -> dict[str, Any]:
         "cpu_seconds": time.process_time() - used,
         "peak_bytes": peak,
     }
+
+
+def _peak_bytes() -> int:
+    """Most memory that this process had; 0 where the system does not tell."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        # not getrusage, which counts what the process was forked from
+        words = Path("/proc/self/status").read_text().split()
+        return 1024 * int(words[words.index("VmHWM:") + 1])
+    return 0
 
 
 def _main() -> None:

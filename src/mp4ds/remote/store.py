@@ -125,7 +125,10 @@ class Store:
                 if len(ranges) == 1:
                     found = [self._fs.cat_file(key, start=starts[0], end=ends[0])]
                 else:
-                    found = self._fs.cat_ranges([key] * len(ranges), starts, ends, on_error="raise")
+                    found = self._fs.cat_ranges([key] * len(ranges), starts, ends)
+                for error in found:
+                    if isinstance(error, BaseException):
+                        raise error
         except FileNotFoundError:
             raise _failure(path, "could not be read: it is gone") from None
         for (start, end), data in zip(ranges, found, strict=True):
