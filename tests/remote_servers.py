@@ -189,8 +189,11 @@ def web_server(folder: Path, *, ranges: bool = True) -> Iterator[Server]:
         def log_message(self, *_: Any) -> None:
             pass
 
-    running = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    running.daemon_threads = True
+    class Many(ThreadingHTTPServer):
+        daemon_threads = True
+        request_queue_size = 128
+
+    running = Many(("127.0.0.1", 0), Handler)
     thread = threading.Thread(target=running.serve_forever, daemon=True)
     thread.start()
     server.url = f"http://127.0.0.1:{running.server_port}"

@@ -414,7 +414,9 @@ def test_jpeg_files_that_are_transcoded(
     topic = image_topic(recorded)
     options = QUALITIES[quality] | {"transcode": True}
     done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", **options)
-    assert done.frames(topic) == (8, 8)
+    # the smaller of the two sizes is narrower than x265 is asked for
+    narrow = (name, quality) == ("jpeg-mixed-sizes", "crf-h265")
+    assert done.frames(topic) == (8, 6 if narrow else 8)
     with mp4ds.open(done.dataset) as dataset:
         assert {stream.sidecar.body for stream in dataset.streams} == {"jpeg"}
         assert {stream.sidecar.profile for stream in dataset.streams} == {

@@ -220,6 +220,8 @@ class McapReader:
         in_time_order = self._summary and self._summary.chunks.has_messages
         held = HoldBack() if in_time_order and not self._in_file_order else None
         declared = self._declared
+        if stream.size is not None:
+            stream.expect([(stream.tell(), stream.size)])
         read = 0
         while True:
             opcode, body = stream.next()

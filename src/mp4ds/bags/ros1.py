@@ -156,7 +156,7 @@ class Ros1Reader:
         times, chunks, offsets = (np.concatenate(column) for column in zip(*parts, strict=True))
         owners = np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.times) for p in parts])
         order = np.lexsort((offsets, chunks, times))
-        self._bag.expect(() if excerpt == EVERYTHING else _first_seen(chunks[order]))
+        self._bag.expect(_first_seen(chunks[order]))
         last = np.full(len(self._bag.chunk_infos), -1)
         last[chunks[order]] = np.arange(len(order))
         for start in range(0, len(order), 4096):

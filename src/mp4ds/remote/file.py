@@ -22,7 +22,7 @@ KEPT_BYTES = 32 * 2**20
 _IDLE_BYTES = 2**20
 _LEAST, _MOST = 2**17, 2**22  # read ahead: at first, and after a while of reading in order
 _FILL_BYTES = 2 * _MOST
-_BATCH_BYTES, _BATCH_RANGES = 2**23, 256
+_FIRST_BATCH_BYTES, _BATCH_BYTES, _BATCH_RANGES = 2**19, 2**23, 256
 _GAP = 2**16  # less costs less to fetch than to ask twice
 
 
@@ -159,7 +159,7 @@ class RemoteFile(io.RawIOBase):
         self._load([(start, min(stop, wanted))])
 
     def _load(self, ranges: Iterable[Range]) -> None:
-        pieces = list(_split(ranges))
+        pieces = list(_split(ranges, _MOST))
         for (start, _), data in zip(pieces, self._fetch(pieces), strict=True):
             self._segments.add(start, data)
 
@@ -203,11 +203,11 @@ class RemoteFile(io.RawIOBase):
             self._plan = None
 
 
-def _split(ranges: Iterable[Range]) -> Iterator[Range]:
-    """Ranges in pieces that are fetched side by side."""
+def _split(ranges: Iterable[Range], most: int) -> Iterator[Range]:
+    """Ranges in pieces of so many bytes at most."""
     for start, end in ranges:
-        for first in range(start, end, _MOST):
-            yield first, min(first + _MOST, end)
+        for first in range(start, end, most):
+            yield first, min(first + most, end)
 
 
 class _Plan:
@@ -252,16 +252,17 @@ def _holds(ranges: Sequence[Range], place: int) -> bool:
 
 
 def _batches(ranges: Iterable[Range]) -> Iterator[list[Range]]:
-    """Ranges to be fetched at once; those that lie close to each other as one."""
+    """Ranges to be fetched at once; those that lie close to each other as one.
+
+    The batches grow, since who reads a little may stop.
+    """
     batch: list[Range] = []
-    size = 0
-    for start, end in ranges:
+    size, most = 0, _FIRST_BATCH_BYTES
+    for start, end in _split(ranges, _MOST):
         length = end - start
-        if length > _BATCH_BYTES:
-            continue  # is read in order all the same
-        if batch and (size + length > _BATCH_BYTES or len(batch) == _BATCH_RANGES):
+        if batch and (size + length > most or len(batch) == _BATCH_RANGES):
             yield batch
-            batch, size = [], 0
+            batch, size, most = [], 0, min(2 * most, _BATCH_BYTES)
         if batch and 0 <= start - batch[-1][1] <= _GAP:
             size += start - batch[-1][1]
             batch[-1] = batch[-1][0], end

@@ -23,8 +23,8 @@ _NO_CREDENTIALS = "Credentials"  # in the names of what the libraries of stores 
 _NETWORK = "Check the network, and try again."
 _ACCESS = "Check the address and your credentials for it."
 _MAX_TEXT, _MAX_CAUSES = 300, 8
-# Many small ranges are asked for at once; botocore's own default is 10 connections.
-_S3_CONNECTIONS = 64
+# Many small ranges are asked for at once, on so many connections; botocore has 10 by itself.
+_AT_ONCE = 32
 # s3fs keeps ten parts of 50 MiB in memory unless told otherwise.
 _S3_UPLOAD = {"chunksize": 2**24, "max_concurrency": 4}
 
@@ -82,7 +82,7 @@ class Store:
             )
         options: dict[str, Any] = {}
         if self.scheme in _S3 and "config_kwargs" not in conf.get("s3", {}):
-            options["config_kwargs"] = {"max_pool_connections": _S3_CONNECTIONS}
+            options["config_kwargs"] = {"max_pool_connections": _AT_ONCE}
         try:
             self._fs: Any = url_to_fs(path.url, **options)[0]
         except ImportError as error:
@@ -90,7 +90,9 @@ class Store:
             remedy = f"Run: {INSTALL}." if self.scheme in _INSTALLED else f"{_text(error)}."
             raise OptionError(f"{problem}. {remedy}") from None
         except Exception as error:
-            raise _failure(path, f"could not be opened: {explained(error)[1]}", _ACCESS) from None
+            raise _remote_error(
+                path, f"could not be opened: {explained(error)[1]}", _ACCESS
+            ) from None
 
     def _key(self, path: Place) -> str:
         key: str = self._fs._strip_protocol(path.url)
@@ -125,16 +127,17 @@ class Store:
                 if len(ranges) == 1:
                     found = [self._fs.cat_file(key, start=starts[0], end=ends[0])]
                 else:
-                    found = self._fs.cat_ranges([key] * len(ranges), starts, ends)
+                    options = {"batch_size": _AT_ONCE} if self._fs.async_impl else {}
+                    found = self._fs.cat_ranges([key] * len(ranges), starts, ends, **options)
                 for error in found:
                     if isinstance(error, BaseException):
                         raise error
         except FileNotFoundError:
-            raise _failure(path, "could not be read: it is gone") from None
+            raise _remote_error(path, "could not be read: it is gone") from None
         for (start, end), data in zip(ranges, found, strict=True):
             if len(data) != end - start:
                 problem = f"{len(data)} bytes came of {end - start} from byte {start} on"
-                raise _failure(path, f"could not be read: {problem}", _NETWORK)
+                raise _remote_error(path, f"could not be read: {problem}", _NETWORK)
         return found
 
     def check_ranges(self, path: Place, size: int) -> None:
@@ -150,7 +153,7 @@ class Store:
             with _sentences(path):
                 self._read_last_byte(path, size)
         except FileNotFoundError:
-            raise _failure(path, "could not be read: it is gone") from None
+            raise _remote_error(path, "could not be read: it is gone") from None
 
     def _read_last_byte(self, path: Place, size: int) -> None:
         options = {"block_size": 1, "cache_type": "none", "size": size}
@@ -214,7 +217,7 @@ class Store:
             self._fs.rm_file(self._key(path))
 
 
-def _failure(path: Place, problem: str, remedy: str = "") -> RemoteError:
+def _remote_error(path: Place, problem: str, remedy: str = "") -> RemoteError:
     return RemoteError(cast(Path, path), problem, remedy)
 
 
@@ -241,7 +244,7 @@ def _sentences(path: Place, done: str = "read") -> Iterator[None]:
         what = "access is refused: " if verdict == "refused" else ""
         if verdict == "failed" or done == "fetched":  # the latter was allowed before
             done = "read" if done == "fetched" else done
-            raise _failure(path, f"could not be {done}: {what}{reason}", _NETWORK) from None
+            raise _remote_error(path, f"could not be {done}: {what}{reason}", _NETWORK) from None
         kind = SourceError if done == "read" else TargetError
         raise kind(cast(Path, path), f"cannot be {done}: {what}{reason}", _ACCESS) from None
 
