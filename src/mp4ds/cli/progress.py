@@ -13,7 +13,7 @@ On a terminal a live display; in a log file a line now and then, once a pack has
     ======================  ===============================================================
     ``time``                string, UTC, ISO 8601 with milliseconds
     ``dataset``             string, the folder being made
-    ``phase``               ``"planning"``, ``"packing"`` or ``"joining"``
+    ``phase``               ``"planning"``, ``"packing"``, ``"joining"`` or ``"uploading"``
     ``note``                string, what is being done now, or empty
     ``done``                number 0 to 1, share of this phase; null where nothing tells
     ``job_done``            number 0 to 1, share of the packing of all datasets; or null

@@ -64,7 +64,7 @@ class PackProgress:
 
     Attributes:
         dataset: What is being made.
-        phase: ``planning``, ``packing`` or ``joining``.
+        phase: ``planning``, ``packing``, ``joining`` or, for a URL, ``uploading``.
         done: Share of the work of this phase that is done, 0 to 1; None where nothing tells.
         bytes_read: Payload bytes of the messages packed so far.
         bytes_total: Bytes of the source files.

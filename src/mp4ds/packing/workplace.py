@@ -18,6 +18,7 @@ from mp4ds.errors import OptionError, TargetError, WriteError
 from mp4ds.outputs import as_write_error, sync, sync_folder, write_synced
 from mp4ds.packing.job import Job, Task, tools
 from mp4ds.packing.part import read_record
+from mp4ds.remote import location
 
 _JOB_NAME = "job.json"
 _ANEW = "Begin anew with --restart."
@@ -111,9 +112,8 @@ class Workplace:
             SourceError: The recording has changed.
         """
         if paths != job.paths:
-            raise OptionError(
-                f"{self.folder} holds an unfinished pack of {', '.join(job.paths)}. {_ANEW}"
-            )
+            theirs = ", ".join(str(location(path)) for path in job.paths)
+            raise OptionError(f"{self.folder} holds an unfinished pack of {theirs}. {_ANEW}")
         for name, value in options.items():
             if job.options.get(name) != value:
                 raise OptionError(

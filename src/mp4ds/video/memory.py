@@ -15,7 +15,9 @@ import av
 from mp4ds.video.codecs import Recipe
 
 _MB = 1_000_000
-_BASE = 4 * _MB  # code, tables and the mp4's index, which do not grow with the pictures
+# code, tables and the mp4's index, which do not grow with the pictures, but differ by some MB
+# between machines, which map more or less of a library at once
+_BASE = 8 * _MB
 _BORDER = 160  # columns, and rows, that borders and rounding add to a picture
 _PICTURE = 8  # bytes of a pixel: a picture and its conversions, where all are made yuv420p
 
