@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+
+from mp4ds.engine.memory import give_back
 
 _PATIENCE_SECONDS = 3.0
 _MIB = 2**20
@@ -106,15 +106,4 @@ def _call(function: Callable[..., None], task: tuple[str, ...], where: str) -> N
         kind = type(error).__name__
         raise TaskFailedError(kind, f"on worker {where}: {str(error) or kind}") from None
     finally:
-        _give_back()
-
-
-def _give_back() -> None:
-    """Give a task's memory back: with too much of it, a worker is paused and takes no more tasks.
-
-    Encoders in cycles of references wait for a collector that does not see how large they are,
-    and the C library keeps what is freed.
-    """
-    gc.collect()
-    with suppress(OSError, AttributeError):  # not the GNU one
-        ctypes.CDLL("libc.so.6").malloc_trim(0)
+        give_back()  # with too much of it, a worker is paused and takes no more tasks

@@ -20,6 +20,7 @@ from types import TracebackType
 from typing import Any
 
 from mp4ds.bags import BagReader
+from mp4ds.engine import give_back
 from mp4ds.errors import Mp4dsError
 from mp4ds.outputs import write_synced
 from mp4ds.packing.job import Job, Task, digest_source
@@ -179,23 +180,24 @@ def _outcome(tasks: Tasks, folder: str, name: str) -> dict[str, Any]:
     except (Mp4dsError, OSError) as error:
         tasks.close()  # it may be damaged where it was read ahead
         return {"error": (type(error).__name__, str(error)), "ready": True}
-    peak = _peak_bytes()
+    peak = _memory("VmHWM")
+    give_back()
     return {
         "done": True,
         # what large encoders leave in pieces is given back by ending only
-        "ready": peak < _KEPT_BYTES,
+        "ready": _memory("VmRSS") < _KEPT_BYTES,
         "seconds": time.monotonic() - begun,
         "cpu_seconds": time.process_time() - used,
         "peak_bytes": peak,
     }
 
 
-def _peak_bytes() -> int:
-    """Most memory that this process had; 0 where the system does not tell."""
+def _memory(name: str) -> int:
+    """A figure of this process's memory, in bytes; 0 where the system does not tell."""
     with contextlib.suppress(OSError, ValueError, IndexError):
         # not getrusage, which counts what the process was forked from
         words = Path("/proc/self/status").read_text().split()
-        return 1024 * int(words[words.index("VmHWM:") + 1])
+        return 1024 * int(words[words.index(f"{name}:") + 1])
     return 0
 
 
