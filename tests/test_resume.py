@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -74,6 +75,27 @@ def test_it_goes_on_from_the_last_finished_part(
     assert leftovers(tmp_path) == []
     assert facts(tmp_path / "dataset") == expected
     assert compare([source], unpacked(tmp_path, "bag")) == []
+
+
+class SlowToShow(InlineEngine):
+    """Whose last result is seen a while after its task is done, as on a shared file system."""
+
+    def run(self, tasks: Any, on_progress: Any) -> Any:
+        for outcome in super().run(tasks, on_progress):
+            folder, name = outcome.task
+            if outcome.task == tasks[-1]:
+                part = Path(folder) / "parts" / name
+                hidden = part.rename(part.with_name(f".{name}"))
+                threading.Timer(1.0, hidden.rename, (part,)).start()
+            yield outcome
+
+
+def test_a_result_that_is_seen_late_is_waited_for(
+    tmp_path: Path, source: Path, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use(monkeypatch, SlowToShow())
+    mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
+    assert facts(tmp_path / "dataset") == expected
 
 
 def test_keep_going_runs_all_others_and_names_what_failed(

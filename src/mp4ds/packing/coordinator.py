@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -32,6 +33,8 @@ from mp4ds.plan import Selection
 
 _LISTED = 10
 _JOINED_AT_ONCE = 4  # more would only wait for the disk
+_SEEN_SECONDS, _LOOK_SECONDS = 90.0, 1.0  # NFS keeps names and sizes for up to a minute
+_SHARED = "all machines must share the folder of the dataset"
 _KEPT = "interrupted; what is finished is kept: run the same command again to go on"
 
 
@@ -175,12 +178,12 @@ class Coordinator:
         outcomes = self._engine.run(tasks, self._heard)
         try:
             for outcome in outcomes:
-                run = self._take(outcome)
-                if run.failures and not self._keep_going:
+                folder = outcome.task[0]
+                waiting[folder] -= self._take(outcome)
+                if self._runs[folder].failures and not self._keep_going:
                     return
-                waiting[outcome.task[0]] -= outcome.error is None
-                if not waiting[outcome.task[0]]:
-                    yield run
+                if not waiting[folder]:
+                    yield self._runs[folder]
         finally:
             close: Any = getattr(outcomes, "close", None)
             if close is not None:
@@ -189,16 +192,20 @@ class Coordinator:
     def _heard(self, task: tuple[str, ...], told: dict[str, Any]) -> None:
         self._progress[task[0]].heard(task[1], told)
 
-    def _take(self, outcome: Outcome) -> Run:
+    def _take(self, outcome: Outcome) -> bool:
+        """Take notice of a task's end; whether its result is there."""
         folder, name = outcome.task
         run, progress = self._runs[folder], self._progress[folder]
-        if outcome.error is None:
-            self._tell_done(run, [run.job.task(name)], before=False)
+        error, task = outcome.error, run.job.task(name)
+        if error is None and not _is_seen(run, task):
+            error = ("TargetError", f"its result is not seen in {run.place.parts}; {_SHARED}")
+        if error is None:
+            self._tell_done(run, [task], before=False)
         else:
-            run.fail(name, *outcome.error)
+            run.fail(name, *error)
             progress.failed += 1
             progress.report(now=True)
-        return run
+        return error is None
 
     def _tell_done(self, run: Run, tasks: Sequence[Task], *, before: bool = True) -> None:
         progress = self._progress[str(run.place.folder)]
@@ -266,6 +273,15 @@ class Coordinator:
                 chain = task.name if task.solo else task.name.partition("-")[2]
                 assembler.add(Part.load(parts / task.name), chain)
             return assembler.finish(lambda name: progress.report("joining", name, now=True))
+
+
+def _is_seen(run: Run, task: Task) -> bool:
+    """Whether a result is there; a shared file system may show it only after a while."""
+    end = time.monotonic() + _SEEN_SECONDS
+    while not (seen := run.place.is_done(task)) and time.monotonic() < end:
+        list(run.place.parts.iterdir())  # which asks the server for its names anew
+        time.sleep(_LOOK_SECONDS)
+    return seen
 
 
 def _link(path: Path, new: Path) -> None:
