@@ -69,6 +69,37 @@ def brightness(path: str) -> list[tuple[int, float]]:
         return [(frame.stamp_ns, float(frame.data.mean())) for frame in stream]
 
 
+def batches(path: str) -> NDArray[Any]:
+    """Pixels, times and messages of a dataset, asked for in all ways."""
+    with mp4ds.open(path) as dataset:
+        sync: mp4ds.Sync = dataset.sync(["/left", "/right"], tolerance_ns=5_000_000)
+        pairs: NDArray[np.int64] = sync.indices
+        use(len(sync), sync.stamps[0], sync.topics[0].upper(), sync.unmatched["/left"].tolist())
+        frames: mp4ds.Frames = dataset["/left"]
+        height, width = frames.shape[:2]
+        out: NDArray[Any] = np.empty((len(pairs), height, width, 3), frames.dtype)
+        frames.read(pairs[:, 0], format="bgr", out=out)
+        small: list[mp4ds.Frame] = frames.get([3, -1, 3], format="gray", resize=0.5)
+        part = frames.read(range(4), crop=(0, 0, 64, 48), resize=(32, 24))
+        use(small[0].data, part.shape, frames.encoding.upper(), frames.topic, frames.log_times)
+        start: int = int(frames.stamps[0])
+        try:
+            frame: mp4ds.Frame = frames.at(start + 7, mode="before", tolerance_ns=10)
+            number: int = frames.index_at(frame.stamp_ns, mode="exact")
+            use(number)
+        except mp4ds.FrameNotFoundError as error:
+            nearest: int = error.nearest_ns
+            use(nearest)
+        use(*[frame.index for frame in frames.between(start, start + 10**9, format="rgb")])
+        for message in dataset.messages(["/imu"]):
+            found: mp4ds.RecordedMessage = message
+            use(found.topic, found.type_name, found.log_time_ns - found.publish_time_ns)
+            use(found.decoded.angular_velocity, len(found.raw))
+        videos: list[mp4ds.Video] = dataset.videos
+        use([video.topic for video in videos])
+        return out
+
+
 def guarded(path: str) -> int:
     """An exit code."""
     try:

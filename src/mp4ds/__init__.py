@@ -6,6 +6,7 @@ The public surface, and nothing else::
     mp4ds.unpack("drive", "bag", "again.bag")   and back
     mp4ds.validate("drive", deep=True)          every problem, or an empty list
     mp4ds.open("drive")["/camera/image_raw"][7].data
+    mp4ds.open("drive")["/camera/image_raw"].read([7, 3, 9], format="rgb", resize=0.5)
 
 Modules are imported when first used, so that ``import mp4ds`` is cheap.
 """
@@ -21,12 +22,13 @@ if TYPE_CHECKING:
     from typing import Any
 
     from mp4ds.checks import Problem, validate
-    from mp4ds.dataset import Dataset, Frame, Stream
+    from mp4ds.dataset import Dataset, Frame, Frames, Stream, Video
     from mp4ds.dataset import open_dataset as open
     from mp4ds.errors import (
         ClusterError,
         ConversionError,
         FormatError,
+        FrameNotFoundError,
         Mp4dsError,
         OptionError,
         PartsFailedError,
@@ -40,15 +42,18 @@ if TYPE_CHECKING:
         WriteError,
     )
     from mp4ds.packing import PackOptions, PackSummary, pack, pack_each, pack_share
+    from mp4ds.recorded import RecordedMessage
+    from mp4ds.sync import Sync
     from mp4ds.unpacking import UnpackOptions, UnpackSummary, unpack
 
 _HOMES = {
     "checks": ("Problem", "validate"),
-    "dataset": ("Dataset", "Frame", "Stream"),
+    "dataset": ("Dataset", "Frame", "Frames", "Stream", "Video"),
     "errors": (
         "ClusterError",
         "ConversionError",
         "FormatError",
+        "FrameNotFoundError",
         "Mp4dsError",
         "OptionError",
         "PartsFailedError",
@@ -62,6 +67,8 @@ _HOMES = {
         "WriteError",
     ),
     "packing": ("PackOptions", "PackSummary", "pack", "pack_each", "pack_share"),
+    "recorded": ("RecordedMessage",),
+    "sync": ("Sync",),
     "unpacking": ("UnpackOptions", "UnpackSummary", "unpack"),
 }
 
@@ -71,21 +78,26 @@ __all__ = [
     "Dataset",
     "FormatError",
     "Frame",
+    "FrameNotFoundError",
+    "Frames",
     "Mp4dsError",
     "OptionError",
     "PackOptions",
     "PackSummary",
     "PartsFailedError",
     "Problem",
+    "RecordedMessage",
     "RemoteError",
     "SourceError",
     "SourceNotFoundError",
     "Stream",
+    "Sync",
     "TargetError",
     "TargetExistsError",
     "UnpackOptions",
     "UnpackSummary",
     "VersionError",
+    "Video",
     "VideoError",
     "WriteError",
     "__version__",

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.mcap import McapReader
+from mp4ds.channels import ChannelGroup, ImageChannel, MessageSource, channel_groups
 from mp4ds.errors import FormatError, OptionError, SourceError, SourceNotFoundError
 from mp4ds.outputs import digest_file
-from mp4ds.records import Channel, Message, Record, Schema
+from mp4ds.recorded import RecordedMessage, as_recorded
+from mp4ds.records import Channel, Excerpt, Message, Record, Schema
 from mp4ds.remote import location
 from mp4ds.sidecar import (
     MANIFEST_NAME,
@@ -22,35 +26,26 @@ from mp4ds.sidecar import (
     Manifest,
     load_manifest,
 )
-from mp4ds.streams import Frame, Stream
-from mp4ds.streams.rebuild import DecodedColumns
+from mp4ds.streams import Frame, Frames, Stream, Video
+from mp4ds.sync import Sync, synchronize
 
-__all__ = ["Dataset", "Frame", "ImageChannel", "Stream", "open_dataset"]
+__all__ = ["Dataset", "Frame", "Frames", "ImageChannel", "Stream", "Video", "open_dataset"]
 
-MessageSource = Callable[[Channel], Iterator[tuple[int, Message]]]
-"""Gives messages of a channel, each with its place among the channel's messages."""
-
-
-@dataclass(frozen=True)
-class ImageChannel:
-    """A channel with images in videos.
-
-    Attributes:
-        channel: As in `Dataset.channels`.
-        streams: Its streams; each holds some of its messages.
-        recorded: Number of its messages that are in messages.mcap.
-    """
-
-    channel: Channel
-    streams: list[Stream]
-    recorded: int
+_VIDEOS = (".mp4", ".m4v", ".mov")
 
 
 class Dataset:
     """A folder that `mp4ds pack` made, or one video with its sidecar.
 
     ``dataset["/topic"]`` is a topic's stream, ``"/topic" in dataset`` tells whether there is
-    one, and iteration gives all streams.
+    one, and iteration gives all streams. Where a topic changes its size or encoding and so has
+    several, each is found by its file's name without ending.
+
+    Attributes:
+        path: The folder, or the video or sidecar.
+        manifest: Of the folder; None for one video.
+        streams: Its streams.
+        videos: Videos of others, which have no sidecar; see `mp4ds.open`.
 
     Args:
         path: The folder, a manifest, a sidecar, or a video beside its sidecar; or its URL.
@@ -84,14 +79,20 @@ class Dataset:
         self.streams: list[Stream] = [
             Stream(sidecar, jpeg_quality=jpeg_quality) for sidecar in sidecars
         ]
+        self.videos: list[Video] = []
+
+    @property
+    def _all(self) -> list[Stream]:
+        # a video of others has all of a stream but what its sidecar gives
+        return [*self.streams, *(cast(Stream, video) for video in self.videos)]
 
     @property
     def topics(self) -> list[str]:
         """Topics that have a stream."""
-        return list(dict.fromkeys(stream.topic for stream in self.streams))
+        return list(dict.fromkeys(stream.topic for stream in self._all))
 
     def __getitem__(self, topic: str) -> Stream:
-        found = [stream for stream in self.streams if topic in (stream.topic, stream.path.stem)]
+        found = [stream for stream in self._all if topic in (stream.topic, stream.path.stem)]
         if not found:
             known = ", ".join(self.topics) or "none"
             raise KeyError(f"{self.path} has no stream {topic!r}; there are: {known}")
@@ -104,13 +105,13 @@ class Dataset:
         return found[0]
 
     def __contains__(self, topic: object) -> bool:
-        return any(topic in (stream.topic, stream.path.stem) for stream in self.streams)
+        return any(topic in (stream.topic, stream.path.stem) for stream in self._all)
 
     def __iter__(self) -> Iterator[Stream]:
-        return iter(self.streams)
+        return iter(self._all)
 
     def __len__(self) -> int:
-        return len(self.streams)
+        return len(self._all)
 
     @property
     def profile(self) -> str:
@@ -182,23 +183,8 @@ class Dataset:
             return list(reader.channels)
 
     @cached_property
-    def _groups(self) -> list[_ChannelGroup]:
-        groups: dict[tuple[object, ...], _ChannelGroup] = {}
-        first_id = 1 + max((channel.id for channel in self._recorded), default=0)
-        for stream in self.streams:
-            images = _Part(stream.messages, stream.rebuilder.columns, stream)
-            sources = [(stream.sidecar.channel, images)]
-            info, columns = stream.sidecar.camera_info, stream.camera_info_columns
-            if info and columns:
-                sources.append((info.channel, _Part(stream.camera_info_messages, columns)))
-            for model, part in sources:
-                key = model.to_record(0).identity
-                if key not in groups:
-                    channel = model.to_record(first_id + len(groups))
-                    recorded = [c for c in self._recorded if c.identity == key]
-                    groups[key] = _ChannelGroup(channel, [], {c.id for c in recorded})
-                groups[key].parts.append(part)
-        return list(groups.values())
+    def _groups(self) -> list[ChannelGroup]:
+        return channel_groups(self.streams, self._recorded)
 
     @cached_property
     def _verbatim_channels(self) -> list[Channel]:
@@ -210,11 +196,91 @@ class Dataset:
         recorded = self._recorded_counts()
         found = []
         for group in self._groups:
-            streams = [part.stream for part in group.parts if part.stream is not None]
-            if streams:
+            if group.streams:
                 count = sum(recorded.get(key, 0) for key in group.recorded_ids)
-                found.append(ImageChannel(group.channel, streams, count))
+                found.append(ImageChannel(group.channel, group.streams, count))
         return found
+
+    def messages(self, topics: Sequence[str] | None = None) -> Iterator[RecordedMessage]:
+        """The messages that are no frames, by log time, each decoded when asked for.
+
+        Calibrations are among them. Images that no video could hold are, too, if their topic is
+        asked for.
+
+        Args:
+            topics: Only these topics; None for all.
+
+        Raises:
+            OptionError: There is no such topic.
+            FormatError: The dataset breaks a rule of the format.
+        """
+        if isinstance(topics, str):
+            raise OptionError(f"topics is a list of topics, such as [{topics!r}]")
+        known = list(dict.fromkeys(channel.topic for channel in self.channels))
+        unknown = [topic for topic in topics or () if topic not in known]
+        if unknown:
+            raise OptionError(
+                f"{self.path} has no topic {unknown[0]!r}; there are: {', '.join(known) or 'none'}"
+            )
+        wanted = None if topics is None else frozenset(topics)
+        return as_recorded(self._no_frames(wanted), self._messages_path or self.path)
+
+    def _no_frames(self, wanted: frozenset[str] | None) -> Iterator[Message]:
+        ids = {channel.id for channel in self._verbatim_channels}
+        calibrations = []
+        for group in self._groups:
+            if wanted is not None and group.channel.topic not in wanted:
+                continue
+            if not group.streams:
+                calibrations.append(self._group_messages(group, {}))
+            elif wanted is not None:
+                ids |= group.recorded_ids
+        return heapq.merge(self._recorded_in_time(ids, wanted), *calibrations, key=_time_of)
+
+    def _recorded_in_time(self, ids: set[int], topics: frozenset[str] | None) -> Iterator[Message]:
+        """Messages of some channels and topics in messages.mcap, by log time."""
+        if self._messages_path is None:
+            return
+        with McapReader(self._messages_path) as reader:
+            for record in reader.records(Excerpt(topics=topics, others=False)):
+                if isinstance(record, Message) and record.channel.id in ids:
+                    yield record
+
+    def sync(
+        self,
+        topics: Sequence[str] | None = None,
+        *,
+        tolerance_ns: int,
+        reference: str | None = None,
+    ) -> Sync:
+        """Frames of several topics that were taken at the same time, by their header stamps.
+
+        Args:
+            topics: Topics, or names of streams; None: all streams.
+            tolerance_ns: Most nanoseconds between a frame and that of the reference.
+            reference: One of the topics, with whose frames those of the others are matched;
+                None: the one with the fewest frames, of several the first.
+
+        Raises:
+            OptionError: There is no such topic, or one has several streams, or the tolerance is
+                negative.
+        """
+        if isinstance(topics, str):
+            raise OptionError(f"topics is a list of topics, such as [{topics!r}]")
+        if topics is None:
+            topics = [self._name(stream) for stream in self._all]
+        try:
+            stamps = {topic: self[topic].stamps for topic in topics}
+        except KeyError as error:
+            raise OptionError(str(error.args[0])) from None
+        if len(stamps) < len(topics):
+            raise OptionError(f"a topic stands twice among {', '.join(topics)}")
+        return synchronize(stamps, tolerance_ns=tolerance_ns, reference=reference)
+
+    def _name(self, stream: Stream) -> str:
+        """What gives just this stream: its topic, or the name of its file."""
+        alike = sum(stream.topic in (other.topic, other.path.stem) for other in self._all)
+        return stream.topic if alike == 1 else stream.path.stem
 
     def records(self, sources: Mapping[Path, MessageSource] | None = None) -> Iterator[Record]:
         """Everything that was recorded, merged by log time; each channel in its own order.
@@ -267,32 +333,15 @@ class Dataset:
                 yield record
 
     def _group_messages(
-        self, group: _ChannelGroup, sources: Mapping[Path, MessageSource]
+        self, group: ChannelGroup, sources: Mapping[Path, MessageSource]
     ) -> Iterator[Message]:
         """One channel's messages from all its places, in the channel's order."""
-        parts = [
-            sources.get(part.stream.path, part.messages) if part.stream else part.messages
-            for part in group.parts
-        ]
-        merged = heapq.merge(*(part(group.channel) for part in parts), key=lambda pair: pair[0])
         recorded = self._recorded_messages(group)
-        due = 0
-        for ordinal, message in merged:
-            while due < ordinal and self.manifest:  # a pair alone has only its own messages
-                verbatim = next(recorded, None)
-                if verbatim is None:
-                    raise FormatError(
-                        "messages-missing",
-                        self.path,
-                        f"message {due} of topic {group.channel.topic} is in no file",
-                    )
-                yield verbatim
-                due += 1
-            yield message
-            due += 1
-        yield from recorded
+        if self.manifest is None:  # a pair alone has only its own messages
+            return chain(group.messages(sources), recorded)
+        return group.merged(sources, recorded, str(self.path))
 
-    def _recorded_messages(self, group: _ChannelGroup) -> Iterator[Message]:
+    def _recorded_messages(self, group: ChannelGroup) -> Iterator[Message]:
         if not group.recorded_ids:
             return
         for record in self.recorded_records():
@@ -301,7 +350,7 @@ class Dataset:
 
     def close(self) -> None:
         """Close all videos."""
-        for stream in self.streams:
+        for stream in self._all:
             stream.close()
 
     def __enter__(self) -> Dataset:
@@ -311,32 +360,33 @@ class Dataset:
         self.close()
 
 
-@dataclass(frozen=True)
-class _Part:
-    """Messages of a channel that belong to one video: what makes them, and their columns.
-
-    Attributes:
-        stream: Whose images they are; None for calibrations.
-    """
-
-    messages: MessageSource
-    columns: DecodedColumns
-    stream: Stream | None = None
-
-
-@dataclass(frozen=True)
-class _ChannelGroup:
-    """A channel with messages in videos, and its channels in messages.mcap if any."""
-
-    channel: Channel
-    parts: list[_Part]
-    recorded_ids: set[int]
-
-
 def _time_of(record: Record) -> int:
     return getattr(record, "log_time", 0)
 
 
+class _VideoDataset(Dataset):
+    """One video of others."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.manifest = None
+        self.streams = []
+        self.videos = [Video(path)]
+
+    @property
+    def profile(self) -> str:
+        """Empty: there is no recording."""
+        return ""
+
+
 def open_dataset(path: Path | str) -> Dataset:
-    """Open a dataset, or one video with its sidecar. See `Dataset`."""
-    return Dataset(path)
+    """Open a dataset, or one video with its sidecar. See `Dataset`.
+
+    A video that has no sidecar and is in no dataset is opened, too: `Dataset.videos` then has
+    it, and its topic is the file's name without ending.
+    """
+    place = location(path)
+    if place.suffix.lower() not in _VIDEOS or not place.is_file():
+        return Dataset(place)
+    beside = (place.with_suffix(".yaml"), place.parent / MANIFEST_NAME)
+    return Dataset(place) if any(path.exists() for path in beside) else _VideoDataset(place)

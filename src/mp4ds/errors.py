@@ -8,6 +8,7 @@
     ├── TargetError (OSError)          2  an output that may not be written there
     │   └── TargetExistsError (FileExistsError)
     ├── OptionError (ValueError)       2  options that contradict or are unknown
+    ├── FrameNotFoundError (LookupError) 2  no frame has the time that was asked for
     ├── FormatError (ValueError)       1  a dataset that breaks a rule of the format
     │   ├── VersionError               1  written by a newer major version
     │   └── VideoError                 1  a video that cannot be decoded as its sidecar says
@@ -25,12 +26,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 
 class Mp4dsError(Exception):
     """Base of every error raised on purpose; ``str()`` is one clear sentence."""
 
     exit_code = 1
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # as it is: the classes cannot be made again from their sentence alone
+        return _restored, (type(self), self.args, vars(self))
+
+
+def _restored(kind: type[Mp4dsError], args: tuple[Any, ...], fields: dict[str, Any]) -> Mp4dsError:
+    """An error that comes from another process."""
+    error: Mp4dsError = (OSError if issubclass(kind, OSError) else Exception).__new__(kind)
+    error.args = args
+    vars(error).update(fields)
+    return error
 
 
 def _as_path(path: Path | str) -> Path:
@@ -81,6 +95,28 @@ class OptionError(Mp4dsError, ValueError):
     """An option is unknown, malformed, or contradicts another one."""
 
     exit_code = 2
+
+
+class FrameNotFoundError(Mp4dsError, LookupError):
+    """No frame of a topic has the time that was asked for.
+
+    Args:
+        topic: Topic of the frames.
+        stamp_ns: What was asked for, nanoseconds.
+        wanted: Which frame, such as "at or before"; a phrase.
+        nearest_ns: Stamp of the nearest frame there is, nanoseconds.
+    """
+
+    exit_code = 2
+
+    def __init__(self, topic: str, stamp_ns: int, wanted: str, nearest_ns: int) -> None:
+        self.topic = topic
+        self.stamp_ns = stamp_ns
+        self.nearest_ns = nearest_ns
+        super().__init__(
+            f"{topic} has no frame {wanted} {stamp_ns} ns; the nearest one is of {nearest_ns} ns, "
+            f"{abs(nearest_ns - stamp_ns)} ns {'later' if nearest_ns > stamp_ns else 'earlier'}."
+        )
 
 
 class FormatError(Mp4dsError, ValueError):

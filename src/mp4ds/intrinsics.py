@@ -19,14 +19,13 @@ from mp4ds.records import Channel, Message
 from mp4ds.remote import location
 from mp4ds.sidecar import MANIFEST_NAME
 from mp4ds.streams import Forms, Looker, Unsuited
+from mp4ds.streams.calibrations import Matrix, effective
 from mp4ds.streams.camera_info import fields_of
 from mp4ds.wire import CalibrationFields, CodedFields, is_calibration, is_camera
 from mp4ds.wire.transforms import Transform, TransformCollector
 
 MAX_LISTED = 1000
 """Calibrations of a camera that are listed; of a self-calibrating one there may be more."""
-
-Matrix = list[list[float]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,30 +121,6 @@ def intrinsics(path: Path | str) -> Intrinsics:
             return _of_dataset(dataset)
     with open_reader(path) as reader:
         return _of_recording(reader)
-
-
-def effective(calibration: CalibrationFields) -> tuple[Matrix, Matrix]:
-    """K and P for the images as they are, rather than for the full resolution.
-
-    The principal point moves by the offset of the region of interest, then all that is in pixels
-    is divided by the binning, as REP 104 has it and image_geometry's PinholeCameraModel does.
-
-    Args:
-        calibration: K and P of the full resolution, with ROI and binning.
-
-    Returns:
-        K, 3 x 3, and P, 3 x 4.
-    """
-    x_offset, y_offset, _, _ = calibration.roi
-    scales = [1.0 / max(1, binning) for binning in (calibration.binning_x, calibration.binning_y)]
-    matrices = []
-    for values in (calibration.k, calibration.p):
-        matrix = np.array(values).reshape(3, -1)
-        matrix[0, 2] -= x_offset
-        matrix[1, 2] -= y_offset
-        matrix[:2] *= np.array(scales)[:, None]
-        matrices.append(matrix.tolist())
-    return matrices[0], matrices[1]
 
 
 def _rows(values: Sequence[float]) -> Matrix:

@@ -112,9 +112,23 @@ def pack(
             help="Topics that belong together, where names and stamps do not tell.",
         ),
     ] = None,
+    purpose: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            "--for",
+            metavar="PURPOSE",
+            help="archive: smallest files. training: fastest random access.",
+        ),
+    ] = None,
     gop: Annotated[
-        int, typer.Option("--gop", min=1, max=100_000, help="Most frames between key frames.")
-    ] = 60,
+        Optional[int],  # noqa: UP045
+        typer.Option(
+            "--gop",
+            min=1,
+            max=100_000,
+            help="Most frames between key frames; 30 by default, 60 where lossy.",
+        ),
+    ] = None,
     window: Annotated[
         Optional[int],  # noqa: UP045
         typer.Option(
@@ -179,6 +193,7 @@ def pack(
             preset=preset,
             transcode=transcode,
             camera_info=camera_info or (),
+            purpose=purpose,
             gop=gop,
             window=window,
             jobs=jobs,

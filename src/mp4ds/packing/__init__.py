@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -187,7 +188,7 @@ def _checked(options: PackOptions) -> PackOptions:
             "is smaller than any video of its pixels."
         )
     check_codec(options.codec, options.preset, lossless=quality.lossless)
-    return options
+    return replace(options, purpose=None, gop=options.group_frames)
 
 
 def _plan(paths: Sequence[Path], target: Path, options: PackOptions, *, recordings: int = 1) -> Run:

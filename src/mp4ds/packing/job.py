@@ -250,6 +250,7 @@ def _task(item: Mapping[str, Any]) -> Task:
 def outcome_options(options: PackOptions) -> dict[str, Any]:
     """The options that decide what comes out, as JSON has them."""
     values = {name: getattr(options, name) for name in _OUTCOME_OPTIONS}
+    values["gop"] = options.group_frames
     return {
         name: list(value) if isinstance(value, (list, tuple)) else value
         for name, value in values.items()

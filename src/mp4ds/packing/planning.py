@@ -145,14 +145,14 @@ def plan_job(reader: BagReader, paths: Sequence[Path], options: PackOptions, mea
         quality=parse_quality(options.quality),
         codec=options.codec,
         preset=options.preset,
-        gop=options.gop,
+        gop=options.group_frames,
         threads=_side_by_side(reader, means)[1],
         transcode=options.transcode,
     )
     needed = _assumed_bytes(reader, topics, settings)
     if not topics.free:
         return _single(reader, paths, options, means, needed)
-    window = options.window or GOPS_PER_WINDOW * options.gop
+    window = options.window or GOPS_PER_WINDOW * options.group_frames
     times = reader.times()
     columns = [times[channel.id] for channel in topics.free if len(times.get(channel.id, ()))]
     spans = spans_of(cut_times(columns, window))

@@ -6,8 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from mp4ds.errors import OptionError
+from mp4ds.plan import parse_quality
 from mp4ds.records import Loss
-from mp4ds.video.codecs import DEFAULT_GOP
+from mp4ds.video.codecs import GOPS, LOSSLESS_GOP, LOSSY_GOP
 
 _MAX_REASONS = 10
 _OTHER = "other reasons"
@@ -25,8 +27,11 @@ class PackOptions:
         preset: The encoder's preset; None chooses.
         transcode: Encode JPEG topics anew, by `quality`, instead of copying their files.
         camera_info: Pairs ``IMAGE=INFO`` of topics that belong together, beyond what names tell.
-        gop: Most frames from one key frame to the next.
-        window: Frames of the busiest camera in each part that is packed apart; None: 10 `gop`.
+        purpose: ``archive``: few key frames, for the smallest files; ``training``: many, for the
+            fastest random access; None: in between.
+        gop: Most frames from one key frame to the next; None: by `purpose`.
+        window: Frames of the busiest camera in each part that is packed apart; None: 10 groups
+            of `gop`.
         jobs: Processes at a time, of a recording that is packed in parts, else streams encoded
             side by side; None for as many as keep all cores busy.
         memory: Bytes that may be used; None for half of the machine's.
@@ -46,7 +51,8 @@ class PackOptions:
     preset: str | None = None
     transcode: bool = False
     camera_info: Sequence[str] = ()
-    gop: int = DEFAULT_GOP
+    purpose: str | None = None
+    gop: int | None = None
     window: int | None = None
     jobs: int | None = None
     memory: int | None = None
@@ -56,6 +62,22 @@ class PackOptions:
     salvage: bool = False
     restart: bool = False
     force: bool = False
+
+    @property
+    def group_frames(self) -> int:
+        """Most frames from one key frame to the next.
+
+        Raises:
+            OptionError: `quality` or `purpose` is none.
+        """
+        lossless = parse_quality(self.quality).lossless
+        if self.purpose is not None and self.purpose not in GOPS:
+            raise OptionError(f"--for {self.purpose!r} is not one of {', '.join(GOPS)}.")
+        if self.purpose is not None and self.gop is not None:
+            raise OptionError("--for chooses what --gop says. Give one of them.")
+        if self.purpose is not None:
+            return GOPS[self.purpose]
+        return self.gop or (LOSSLESS_GOP if lossless else LOSSY_GOP)
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,15 @@ from __future__ import annotations
 from mp4ds.streams.bodies import MessageRebuilder
 from mp4ds.streams.camera_info import CameraInfoWriter
 from mp4ds.streams.columns import ColumnsWriter, Unsuited
+from mp4ds.streams.frames import Frame, Frames
 from mp4ds.streams.headers import Forms
 from mp4ds.streams.join import StreamJoin
 from mp4ds.streams.look import Looker, Seen, StreamKey, depends_on_others
 from mp4ds.streams.planning import needs_trial, plan_from_values, plan_to_values, plan_tracks
-from mp4ds.streams.reader import Frame, Stream
+from mp4ds.streams.reader import Stream
 from mp4ds.streams.rebuild import CameraInfoRebuilder
 from mp4ds.streams.tracks import PicturePlan, StreamSettings, TrackPlan
+from mp4ds.streams.video_file import Video
 from mp4ds.streams.writer import StreamWriter
 
 __all__ = [
@@ -20,6 +22,7 @@ __all__ = [
     "ColumnsWriter",
     "Forms",
     "Frame",
+    "Frames",
     "Looker",
     "MessageRebuilder",
     "PicturePlan",
@@ -31,6 +34,7 @@ __all__ = [
     "StreamWriter",
     "TrackPlan",
     "Unsuited",
+    "Video",
     "depends_on_others",
     "needs_trial",
     "plan_from_values",

@@ -60,8 +60,12 @@ class MessageRebuilder:
         image = self._sidecar.image
         shape = self._encoding.shape(image.width, image.height)
         out: Pixels = np.empty(shape, self._encoding.dtype)
-        self._layout.to_pixels(picture, out)
+        self.write_pixels(picture, out)
         return out
+
+    def write_pixels(self, picture: Picture, out: Pixels) -> None:
+        """Write the image's pixels into an array of the shape and type that `pixels` gives."""
+        self._layout.to_pixels(picture, out)
 
     def payload(self, index: int, picture: Picture) -> bytes | bytearray:
         """The message of a frame, verified against its digest where there is one.

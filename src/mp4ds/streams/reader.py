@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,38 +15,13 @@ from mp4ds.outputs import digest_file
 from mp4ds.records import Channel, Message
 from mp4ds.sidecar import Calibration, StreamSidecar, load_stream
 from mp4ds.streams.bodies import MessageRebuilder
+from mp4ds.streams.frames import Frames
 from mp4ds.streams.rebuild import CameraInfoRebuilder, DecodedColumns, message_at
-from mp4ds.video import PacketReader, VideoDecoder
+from mp4ds.video import FrameReader, PacketReader, VideoDecoder
 
 
-@dataclass(frozen=True)
-class Frame:
-    """One image of a stream.
-
-    Attributes:
-        data: Pixels in the encoding, shape as `mp4ds.layouts.Encoding.shape`, native byte order.
-        index: Number of the frame in its stream.
-        stamp_ns: Header stamp, nanoseconds.
-        log_time_ns: When it was recorded, nanoseconds.
-        frame_id: Coordinate frame.
-        encoding: ROS image encoding of `data`.
-        intrinsics: The calibration, or None where the recording has none.
-    """
-
-    data: Pixels
-    index: int
-    stamp_ns: int
-    log_time_ns: int
-    frame_id: str
-    encoding: str
-    intrinsics: Calibration | None
-
-
-class Stream:
-    """One camera topic (of one geometry), as a sequence of frames.
-
-    ``len(stream)``, ``stream[i]``, ``stream[-1]`` and iteration work as on a list; frames are
-    decoded when asked for. Not to be shared between threads or over a fork.
+class Stream(Frames):
+    """One camera topic (of one geometry), as a sequence of frames. See `Frames`.
 
     Args:
         path: The sidecar; the video is beside it.
@@ -59,10 +32,11 @@ class Stream:
     """
 
     def __init__(self, path: Path, *, jpeg_quality: int = 95) -> None:
+        super().__init__()
         self.path = path
         self._jpeg_quality = jpeg_quality
         self.sidecar: StreamSidecar = load_stream(path)
-        self._decoder: VideoDecoder | None = None
+        self._reader: FrameReader | None = None
 
     @property
     def topic(self) -> str:
@@ -98,6 +72,16 @@ class Stream:
     def log_times(self) -> NDArray[np.int64]:
         """Log times, nanoseconds, shape (frames,)."""
         return self.rebuilder.columns.log_time
+
+    @property
+    def encoding(self) -> str:
+        """ROS image encoding of the frames as recorded."""
+        return self.sidecar.image.encoding
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the images, pixels."""
+        return self.sidecar.image.width, self.sidecar.image.height
 
     @property
     def calibrations(self) -> Sequence[Calibration]:
@@ -145,38 +129,41 @@ class Stream:
     def __len__(self) -> int:
         return self.sidecar.frames
 
-    @overload
-    def __getitem__(self, index: int) -> Frame: ...
+    def pictures_of(self, indices: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+        """See `Frames.pictures_of`."""
+        if not len(indices):
+            return iter(())
+        if self._reader is None:
+            self._reader = self._open_reader()
+        return self._reader.pictures_of(indices)
 
-    @overload
-    def __getitem__(self, index: slice) -> list[Frame]: ...
+    def _pictures_apart(self, runs: Iterable[Sequence[int]]) -> Iterator[tuple[int, Picture]]:
+        with self._open_reader() as reader:
+            for run in runs:
+                yield from reader.pictures_of(run)
 
-    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        number = index + len(self) if index < 0 else index
-        if not 0 <= number < len(self):
-            raise IndexError(f"{self.topic} has {len(self)} frames, and no frame {index}")
-        if self._decoder is None:
-            self._decoder = self.open_video(sequential=False)
-        return self._frame(number, self._decoder.picture(number))
-
-    def __iter__(self) -> Iterator[Frame]:
-        with self.open_video(sequential=True) as decoder:
-            for index, picture in enumerate(decoder.pictures()):
-                yield self._frame(index, picture)
-
-    def _frame(self, index: int, picture: Picture) -> Frame:
-        columns = self.rebuilder.columns
-        return Frame(
-            data=self.rebuilder.pixels(picture),
-            index=index,
-            stamp_ns=int(columns.stamp[index]),
-            log_time_ns=int(columns.log_time[index]),
-            frame_id=self.sidecar.headers[int(columns.variant[index])].frame_id,
-            encoding=self.sidecar.image.encoding,
-            intrinsics=self.intrinsics_at(index),
+    def _open_reader(self) -> FrameReader:
+        video = self.sidecar.video
+        return FrameReader(
+            self.video_path,
+            codec=video.codec,
+            coded_size=(video.width, video.height),
+            frames=self.sidecar.frames,
+            picture_format=self.rebuilder.picture_format,
+            picture_size=self.rebuilder.picture_size,
+            matrix=video.matrix,
+            full_range=video.full_range,
         )
+
+    def _pictures(self) -> Iterator[Picture]:
+        with self.open_video(sequential=True) as decoder:
+            yield from decoder.pictures()
+
+    def _write_pixels(self, picture: Picture, out: Pixels) -> None:
+        self.rebuilder.write_pixels(picture, out)
+
+    def _frame_id(self, index: int) -> str:
+        return self.sidecar.headers[int(self.rebuilder.columns.variant[index])].frame_id
 
     def messages(self, channel: Channel) -> Iterator[tuple[int, Message]]:
         """The image messages, each with its place among the channel's messages.
@@ -247,6 +234,6 @@ class Stream:
 
     def close(self) -> None:
         """Close the video, if it is open."""
-        if self._decoder is not None:
-            self._decoder.close()
-            self._decoder = None
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None

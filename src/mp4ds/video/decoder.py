@@ -12,8 +12,8 @@ from av.error import FFmpegError
 
 from mp4ds.errors import VideoError
 from mp4ds.layouts import Picture
-from mp4ds.video.convert import Converter, frame_to_picture
 from mp4ds.video.media import Media
+from mp4ds.video.pictures import PictureMaker
 
 _CODEC_NAMES = {
     "h264": "h264",
@@ -61,10 +61,14 @@ class VideoDecoder:
     ) -> None:
         self._path = path
         self._frames = frames
-        self._coded_size = coded_size
-        self._picture_format = picture_format
-        self._picture_size = picture_size
-        self._converter = Converter(matrix, source_full_range=full_range)
+        self._maker = PictureMaker(
+            path,
+            coded_size=coded_size,
+            picture_format=picture_format,
+            picture_size=picture_size,
+            matrix=matrix,
+            full_range=full_range,
+        )
         self._ticks: np.ndarray[tuple[int], np.dtype[np.int64]] | None = None
         if not path.is_file():
             raise VideoError("file-missing", path, "does not exist")
@@ -77,6 +81,8 @@ class VideoDecoder:
             self._check(codec, coded_size)
             self._stream = self._container.streams.video[0]
             self._stream.thread_type = "AUTO" if sequential else "SLICE"
+            if not sequential:
+                self._stream.thread_count = 1  # threads inherited over a fork would never end
         except BaseException:
             self.close()
             raise
@@ -124,7 +130,7 @@ class VideoDecoder:
                 raise VideoError(
                     "frame-count", self._path, f"goes on after the {self._frames} frames due"
                 )
-            yield self._picture(frame)
+            yield self._maker.make(frame)
             number += 1
         if number != self._frames:
             raise VideoError(
@@ -145,7 +151,7 @@ class VideoDecoder:
         for frame in self._decodable():
             number = int(np.searchsorted(ticks, frame.pts)) if frame.pts is not None else -1
             if due <= number < self._frames and ticks[number] == frame.pts:
-                yield number, self._picture(frame)
+                yield number, self._maker.make(frame)
                 due = number + 1
 
     def picture(self, index: int) -> Picture:
@@ -163,7 +169,7 @@ class VideoDecoder:
             if frame.pts is not None and frame.pts >= tick:
                 if frame.pts > tick:
                     break
-                return self._picture(frame)
+                return self._maker.make(frame)
         raise VideoError("decode-failed", self._path, f"frame {index} was not found")
 
     def _seek(self, tick: int, index: int) -> None:
@@ -206,21 +212,6 @@ class VideoDecoder:
                 yield from (frame for frame in frames if not frame.is_corrupt)
         except (FFmpegError, OSError) as error:
             raise VideoError("decode-failed", self._path, f"cannot be read: {error}") from None
-
-    def _picture(self, frame: av.VideoFrame) -> Picture:
-        if frame.is_corrupt:
-            raise VideoError("decode-failed", self._path, "a frame is marked as corrupt")
-        if (frame.width, frame.height) != self._coded_size:
-            raise VideoError(
-                "geometry-mismatch",
-                self._path,
-                f"has a frame of {frame.width}x{frame.height} pixels among others of "
-                f"{self._coded_size[0]}x{self._coded_size[1]}",
-            )
-        width, height = self._picture_size
-        return frame_to_picture(
-            frame, self._picture_format, width, height, self._converter, str(self._path)
-        )
 
     def close(self) -> None:
         """Close the file."""

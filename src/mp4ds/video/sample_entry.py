@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 from dataclasses import dataclass
 from fractions import Fraction
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mp4ds.errors import VideoError
+from mp4ds.video.boxes import Box, DamagedBoxError, boxes, find_box
 
 _TO_DESCRIPTION = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
 _ENTRY_BYTES = 78  # of a video's sample entry, between its header and the boxes in it
@@ -39,10 +41,19 @@ class SampleEntry:
         return Fraction(across, down) if down else Fraction(0)
 
     @property
+    def width(self) -> int:
+        """Columns."""
+        return int.from_bytes(self.values[24:26], "big")
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return int.from_bytes(self.values[26:28], "big")
+
+    @property
     def size(self) -> str:
         """Width and height in pixels."""
-        width, height = struct.unpack_from(">HH", self.values, 24)
-        return f"{width}x{height}"
+        return f"{self.width}x{self.height}"
 
     def differences(self, other: SampleEntry) -> str:
         """What differs, in words; empty if nothing does."""
@@ -71,63 +82,44 @@ def read_sample_entry(path: Path) -> SampleEntry:
         raise VideoError("file-missing", path, "does not exist")
     with path.open("rb") as file:
         try:
-            return _parsed(_description(file, path.stat().st_size))
-        except (struct.error, ValueError) as error:
+            box = Box(b"", 0, path.stat().st_size)
+            for kind in _TO_DESCRIPTION:
+                box = find_box(file, kind, box.start, box.end, outermost=kind == b"moov")
+            return parse_descriptions(file, box)
+        except DamagedBoxError as error:
             raise VideoError(
                 "video-unreadable", path, f"has no description of one track: {error}"
             ) from None
 
 
-def _description(file: BinaryIO, length: int) -> bytes:
-    """The only entry of the first track's ``stsd``.
+def parse_descriptions(file: BinaryIO, stsd: Box) -> SampleEntry:
+    """The only entry of a track's ``stsd``.
+
+    Args:
+        file: Where it is; at most 1 MiB of it is read.
+        stsd: Its place there.
 
     Raises:
-        ValueError, struct.error: There is none.
+        DamagedBoxError: There is not just one, or it contradicts itself.
     """
-    start, end = 0, length
-    for kind in _TO_DESCRIPTION:
-        start, end = _find(file, kind, start, end)
-    if end - start > _LONGEST_ENTRY:
-        raise ValueError("it is too long")
-    file.seek(start)
-    data = file.read(end - start)
-    if struct.unpack_from(">I", data, 4) != (1,):
-        raise ValueError("there are several")
-    return data[8:]
-
-
-def _find(file: BinaryIO, wanted: bytes, start: int, end: int) -> tuple[int, int]:
-    """Where the contents of the first box of a kind begin and end."""
-    while start < end:
-        file.seek(start)
-        size, kind = struct.unpack(">I4s", file.read(8))
-        header = 8
-        if size == 1:
-            (size,) = struct.unpack(">Q", file.read(8))
-            header = 16
-        if size < header or start + size > end:
-            raise ValueError("a box is damaged")
-        if kind == wanted:
-            return start + header, start + size
-        start += size
-    raise ValueError(f"box {wanted.decode()} is missing")
-
-
-def _parsed(data: bytes) -> SampleEntry:
-    size, kind = struct.unpack_from(">I4s", data)
-    if not 8 + _ENTRY_BYTES <= size <= len(data):
-        raise ValueError("a box is damaged")
-    boxes, at, end = [], 8 + _ENTRY_BYTES, size
-    while at < end:
-        size, name = struct.unpack_from(">I4s", data, at)
-        if not 8 <= size <= end - at:
-            raise ValueError("a box is damaged")
-        if name != b"btrt":
-            body = data[at + 8 : at + size]
-            body = _without_rates(body) if name == b"esds" else body
-            boxes.append((name.decode("latin-1"), body))
-        at += size
-    return SampleEntry(kind.decode("latin-1"), data[8 : 8 + _ENTRY_BYTES], tuple(boxes))
+    if stsd.size > _LONGEST_ENTRY:
+        raise DamagedBoxError("it is too long")
+    file.seek(stsd.start)
+    data = file.read(stsd.size)
+    if data[4:8] != b"\0\0\0\1":
+        raise DamagedBoxError("there are several")
+    file = io.BytesIO(data)
+    entry = next(boxes(file, 8, len(data)), None)
+    if entry is None or entry.size < _ENTRY_BYTES:
+        raise DamagedBoxError("a box is damaged")
+    values_end = entry.start + _ENTRY_BYTES
+    parts = []
+    for box in boxes(file, values_end, entry.end):
+        if box.kind != b"btrt":
+            body = data[box.start : box.end]
+            body = _without_rates(body) if box.kind == b"esds" else body
+            parts.append((box.kind.decode("latin-1"), body))
+    return SampleEntry(entry.kind.decode("latin-1"), data[entry.start : values_end], tuple(parts))
 
 
 def _without_rates(esds: bytes) -> bytes:

@@ -1,0 +1,158 @@
+"""Messages as objects with fields, by the definitions that were recorded with them."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from rosbags.interfaces import Nodetype
+from rosbags.serde import SerdeError
+from rosbags.typesys import TypesysError
+from rosbags.typesys.msg import normalize_msgtype
+
+from mp4ds.bags.typedefs import fields_of, make_store, ros1_world, ros2_world, types_of
+from mp4ds.errors import OptionError
+from mp4ds.records import Channel
+from mp4ds.wire import WireError
+from mp4ds.wire.protobuf_objects import protobuf_decoder
+
+if TYPE_CHECKING:
+    from rosbags.interfaces.typing import Typesdict
+
+Decoder = Callable[[memoryview], Any]
+"""Makes an object of a payload.
+
+Raises:
+    WireError: The payload is not of the type that its channel tells.
+"""
+
+_DISTRIBUTION = "humble"  # whose standard types stand in for definitions that were not recorded
+_MAX_TAIL = 8  # bytes after a message, which ROS itself overlooks
+_ADVICE = "take its bytes instead, `RecordedMessage.raw`"
+_BAD_DEFINITION = (
+    TypesysError,
+    SerdeError,
+    SyntaxError,
+    RecursionError,
+    LookupError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    AssertionError,
+)
+
+
+def decoder_of(channel: Channel) -> Decoder:
+    """What makes objects of a channel's messages.
+
+    ROS 1 and ROS 2 give rosbags' objects, whose attributes are the fields; protobuf its own
+    messages; JSON what `json.loads` gives.
+
+    Raises:
+        OptionError: They cannot be decoded: for want of a definition, or of a decoder.
+    """
+    make = _DECODERS.get(channel.message_encoding)
+    if make is None:
+        known = ", ".join(_DECODERS)
+        raise _undecodable(
+            channel, f"they are {channel.message_encoding or 'of no known'} encoding, not {known}"
+        )
+    return make(channel)
+
+
+def _undecodable(channel: Channel, problem: str) -> OptionError:
+    return OptionError(f"messages of {channel.topic} cannot be decoded: {problem}; {_ADVICE}")
+
+
+def _ros(channel: Channel) -> Decoder:
+    schema = channel.schema
+    if schema is None or not schema.name:
+        raise _undecodable(channel, "the type of its messages is not known")
+    is_ros1 = channel.message_encoding == "ros1"
+    world = ros1_world() if is_ros1 else ros2_world(_DISTRIBUTION)
+    name = normalize_msgtype(schema.name)
+    try:
+        types = types_of(schema, world)
+        if _has_empty_items(types):
+            raise _undecodable(channel, f"{schema.name} has arrays of a type without fields")
+        store = make_store(types, world)
+        definition = store.get_msgdef(name)  # compiled now, to fail before any message
+    except OptionError:
+        raise
+    except _BAD_DEFINITION:
+        raise _undecodable(
+            channel, f"no definition of type {schema.name} is known, or it cannot be understood"
+        ) from None
+
+    def decode(payload: memoryview) -> Any:
+        start, read = 0, definition.deserialize_ros1
+        if not is_ros1:
+            if len(payload) < 4 or payload[0] != 0 or payload[1] > 1:
+                raise WireError(f"it is no {schema.name}")
+            start = 4
+            read = definition.deserialize_cdr_le if payload[1] else definition.deserialize_cdr_be
+        try:
+            message, end = read(payload[start:], 0, definition.cls, store)
+        except (SerdeError, AssertionError, struct.error, ValueError, LookupError, TypeError,
+                MemoryError):  # fmt: skip
+            raise WireError(f"it is no {schema.name}") from None
+        if len(payload) - start - end > _MAX_TAIL:
+            raise WireError(f"it is no {schema.name}")
+        return message
+
+    return decode
+
+
+def _has_empty_items(types: Typesdict) -> bool:
+    """Whether a payload of a few bytes could claim any number of items."""
+    empty: set[str] = set()
+
+    def is_empty(desc: Any) -> bool:
+        if desc[0] == Nodetype.NAME:
+            return desc[1] in empty
+        return bool(desc[0] == Nodetype.ARRAY) and (not desc[1][1] or is_empty(desc[1][0]))
+
+    found = True
+    while found:  # what is made of empty ones alone is empty, too
+        found = False
+        for name in types.keys() - empty:
+            if all(is_empty(desc) for _, desc in fields_of(types, name)):
+                empty.add(name)
+                found = True
+    return any(
+        desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) and is_empty(desc[1][0])
+        for name in types
+        for _, desc in fields_of(types, name)
+    )
+
+
+def _json(channel: Channel) -> Decoder:
+    def decode(payload: memoryview) -> Any:
+        try:
+            return json.loads(bytes(payload))
+        except (ValueError, RecursionError):
+            raise WireError("it is no JSON") from None
+
+    return decode
+
+
+def _protobuf(channel: Channel) -> Decoder:
+    schema = channel.schema
+    if schema is None or schema.encoding != "protobuf":
+        raise _undecodable(channel, "they are protobuf, and their definition is not known")
+    try:
+        decoder = protobuf_decoder(schema.name, schema.data)
+    except WireError as error:
+        raise _undecodable(channel, str(error)) from None
+
+    return lambda payload: decoder(bytes(payload))
+
+
+_DECODERS: Mapping[str, Callable[[Channel], Decoder]] = {
+    "ros1": _ros,
+    "cdr": _ros,
+    "json": _json,
+    "protobuf": _protobuf,
+}

@@ -1,0 +1,259 @@
+"""What coded frames of AV1 refer to.
+
+Sections are those of the AV1 Bitstream & Decoding Process Specification 1.0.0 with errata 1. A
+decoder keeps frames in eight slots. A frame header names the slots of the seven frames that
+pictures are predicted from, and whatever else a frame takes over from earlier ones
+(probabilities, motion, segments, film grain) is that of the frame in one of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from mp4ds.coded.av1 import Obu, obus
+from mp4ds.coded.base import BitReader
+from mp4ds.coded.coded_frame import CodedFrame, UnknownStructure
+
+_SEQUENCE_HEADER, _DELIMITER, _FRAME_HEADER, _TILE_GROUP, _METADATA, _FRAME = 1, 2, 3, 4, 5, 6
+_PADDING = 15
+_KEY, _INTER, _INTRA_ONLY, _SWITCH = range(4)
+_SLOTS = 8
+_ALL_SLOTS = 0xFF
+_CHOSEN = 2  # by each frame
+# what a frame header and a sequence header take at most, as far as they are read
+_HEADER_BYTES = 40
+_SEQUENCE_BYTES = 512
+
+
+@dataclass(frozen=True, slots=True)
+class _Sequence:
+    """What of a sequence header tells how frame headers are read (5.5.1)."""
+
+    still: bool
+    layers: int
+    id_bits: int
+    delta_id_bits: int
+    screen_content: int
+    integer_mv: int
+    order_bits: int
+
+
+def _parse_sequence(payload: bytes) -> _Sequence:
+    reader = BitReader(payload)
+    reader.bits(4)
+    still = reader.flag()
+    layers = 0
+    if still:
+        reader.bits(5)
+    else:
+        layers = _parse_operating_points(reader)
+    side_bits = reader.bits(4) + reader.bits(4) + 2
+    reader.bits(side_bits)
+    id_bits = delta_id_bits = 0
+    if not still and reader.flag():
+        delta_id_bits = reader.bits(4) + 2
+        id_bits = reader.bits(3) + delta_id_bits + 1
+    reader.bits(3)
+    screen_content = integer_mv = _CHOSEN
+    order_bits = 0
+    if not still:
+        reader.bits(4)
+        ordered = reader.flag()
+        if ordered:
+            reader.bits(2)
+        if not reader.flag():
+            screen_content = reader.bits(1)
+        if screen_content and not reader.flag():
+            integer_mv = reader.bits(1)
+        if ordered:
+            order_bits = reader.bits(3) + 1
+    return _Sequence(still, layers, id_bits, delta_id_bits, screen_content, integer_mv, order_bits)
+
+
+def _parse_operating_points(reader: BitReader) -> int:
+    """The layers that decoders take, those of the first operating point; 0: all there are.
+
+    Raises:
+        UnknownStructure: There is a model of the decoder, or several pictures at one time.
+    """
+    if reader.flag():
+        reader.bits(64)
+        if reader.flag():
+            reader.ue()
+        if reader.flag():
+            raise UnknownStructure("its AV1 tells the times of a decoder")
+    display_delay = reader.flag()
+    layers: list[int] = []
+    for _ in range(reader.bits(5) + 1):
+        layers.append(reader.bits(12))
+        if reader.bits(5) > 7:
+            reader.flag()
+        if display_delay and reader.flag():
+            reader.bits(4)
+    if layers[0] and layers[0] >> 8 != 1:
+        raise UnknownStructure("its AV1 has spatial layers")
+    return layers[0]
+
+
+class _Header(NamedTuple):
+    """What of a frame header tells of references.
+
+    Attributes:
+        kind: `frame_type`; None if it only shows a frame.
+        shown: Whether a picture comes out.
+        used: Slots of the frames that it needs.
+        filled: Slots that hold it afterwards, as bits.
+    """
+
+    kind: int | None
+    shown: bool
+    used: Iterable[int]
+    filled: int
+
+
+def _parse_header(payload: bytes, sequence: _Sequence) -> _Header:
+    """Read an uncompressed header up to the slots that it uses (5.9.2)."""
+    if sequence.still:
+        return _Header(_KEY, shown=True, used=(), filled=_ALL_SLOTS)
+    reader = BitReader(payload)
+    if reader.flag():
+        return _Header(None, shown=True, used=(reader.bits(3),), filled=0)
+    kind = reader.bits(2)
+    shown = reader.flag()
+    if not shown:
+        reader.flag()
+    if kind == _KEY and shown:
+        return _Header(kind, shown, used=(), filled=_ALL_SLOTS)
+    intra = kind in (_KEY, _INTRA_ONLY)
+    resilient = kind == _SWITCH or reader.flag()
+    reader.flag()
+    screen_content = sequence.screen_content
+    if screen_content == _CHOSEN:
+        screen_content = reader.bits(1)
+    if screen_content and sequence.integer_mv == _CHOSEN:
+        reader.flag()
+    # the frame's id, whether it has a size of its own, and its place in the order shown
+    reader.bits(sequence.id_bits + (kind != _SWITCH) + sequence.order_bits)
+    if not (intra or resilient):
+        reader.bits(3)
+    filled = _ALL_SLOTS if kind == _SWITCH else reader.bits(_SLOTS)
+    if intra:
+        return _Header(kind, shown, used=(), filled=filled)
+    if resilient:
+        reader.bits(_SLOTS * sequence.order_bits)
+    if sequence.order_bits and reader.flag():
+        # its slots are chosen by the order of the frames in all of them (7.8)
+        return _Header(kind, shown, used=range(_SLOTS), filled=filled)
+    used = set()
+    for _ in range(7):
+        used.add(reader.bits(3))
+        reader.bits(sequence.delta_id_bits)
+    return _Header(kind, shown, used, filled)
+
+
+class Av1References:
+    """The references of an AV1 stream; see `mp4ds.coded.references.ReferenceParser`."""
+
+    def __init__(self, configuration: bytes) -> None:
+        self._sequence: _Sequence | None = None
+        self._sequence_bytes = b""
+        self._changed = False  # since the last key frame
+        self._number = 0  # of the next coded frame
+        self._start = 0  # number of the key frame where decoding began
+        self._slots: list[tuple[int, int | None]] = []  # number and kind; none before a key frame
+        for obu in obus(configuration[4:]):
+            if obu.kind == _SEQUENCE_HEADER:
+                self._take_sequence(configuration[4 + obu.payload : 4 + obu.end])
+
+    def forget(self) -> None:
+        """Wait for a key frame."""
+        self._slots = []
+
+    def packet(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
+        """The coded frames of a temporal unit."""
+        frames: list[CodedFrame] = []
+        begin = -1  # of the sequence header before the first frame
+        open_header = False
+        for obu in obus(data):
+            kind = obu.kind
+            if kind in (_FRAME, _FRAME_HEADER):
+                if open_header:
+                    raise UnknownStructure("its AV1 has a frame without tiles")
+                frame = self._frame(data, obu, key=key and not frames)
+                if begin >= 0 and not frame.references:
+                    frame = CodedFrame(begin, frame.end, (), frame.shown, existing=False)
+                begin = -1
+                frames.append(frame)
+                open_header = kind == _FRAME_HEADER and not frame.existing
+            elif kind == _TILE_GROUP:
+                if not frames or frames[-1].existing:
+                    raise UnknownStructure("its AV1 has tiles without a frame")
+                last = frames[-1]
+                frames[-1] = CodedFrame(
+                    last.start, obu.end, last.references, last.shown, existing=False
+                )
+                open_header = False
+            elif kind == _SEQUENCE_HEADER:
+                self._take_sequence(bytes(data[obu.payload : obu.end]))
+                begin = obu.start
+            elif kind not in (_METADATA, _PADDING, _DELIMITER):
+                raise UnknownStructure(f"it has an AV1 unit of the kind {kind}")
+        if not frames or open_header:
+            raise UnknownStructure("it holds no whole picture")
+        return frames
+
+    def _take_sequence(self, payload: bytes) -> None:
+        if payload != self._sequence_bytes:
+            self._sequence, self._sequence_bytes = None, b""
+            self._sequence = _parse_sequence(payload[:_SEQUENCE_BYTES])
+            self._sequence_bytes = payload
+            self._changed = True
+
+    def _frame(self, data: memoryview, obu: Obu, *, key: bool) -> CodedFrame:
+        sequence = self._sequence
+        if sequence is None:
+            raise UnknownStructure("its sequence header was not sent before it")
+        if data[obu.start] & 4:
+            _check_layer(data[obu.start + 1], sequence.layers)
+        payload = bytes(data[obu.payload : min(obu.end, obu.payload + _HEADER_BYTES)])
+        header = _parse_header(payload, sequence)
+        number = self._number
+        begins = header.kind == _KEY and header.shown
+        if begins:
+            self._start = number
+            self._changed = False
+            self._slots = [(number, _KEY)] * _SLOTS
+        elif key:
+            raise UnknownStructure("it is marked as a key frame and does not begin with one")
+        elif not self._slots:
+            raise UnknownStructure("it comes before the first key frame")
+        elif self._changed:
+            raise UnknownStructure("its sequence header changes between key frames")
+        self._number += 1
+        references = () if begins else self._references(header, number)
+        return CodedFrame(obu.start, obu.end, references, header.shown, header.kind is None)
+
+    def _references(self, header: _Header, number: int) -> tuple[int, ...]:
+        """The distances of what a frame needs, after which it is in its slots."""
+        kind, filled = header.kind, header.filled
+        if kind is None:
+            (slot,) = header.used
+            # a key frame that is shown only now fills all slots, as if it came now (7.21)
+            if self._slots[slot][1] == _KEY:
+                kind, filled = _KEY, _ALL_SLOTS
+        needed = {self._slots[slot][0] for slot in header.used}
+        if not needed:
+            needed = {self._start}  # it needs no other frame, and yet is no place to begin
+        for slot in range(_SLOTS):
+            if filled >> slot & 1:
+                self._slots[slot] = (number, kind)
+        return tuple(number - n for n in sorted(needed, reverse=True))
+
+
+def _check_layer(extension: int, layers: int) -> None:
+    """Refuse a frame that decoders leave out, or show with another (5.3.3)."""
+    temporal, spatial = extension >> 5, extension >> 3 & 3
+    if spatial or (layers and not layers >> temporal & 1):
+        raise UnknownStructure("its AV1 has layers that decoders leave out")

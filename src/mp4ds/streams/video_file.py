@@ -1,0 +1,106 @@
+"""A video of others, which has no sidecar, as a sequence of frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.layouts import Picture, Pixels
+from mp4ds.sidecar import Calibration
+from mp4ds.streams.frames import Frames
+from mp4ds.video import VideoFile
+
+
+class Video(Frames):
+    """The frames of an mp4 that has no sidecar. See `Frames`.
+
+    Its topic is the file's name without ending. Frames are ``rgb8``, as the video's colours are
+    tagged, in the orientation in which they are coded; stamps are the presentation times, the
+    first one's usually 0.
+
+    Args:
+        path: The video.
+
+    Raises:
+        VideoError: It cannot be read, or has not one video track.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+        self._file: VideoFile | None = VideoFile(path)
+        self._size = self._file.size
+        self._times = self._file.times
+
+    @property
+    def topic(self) -> str:
+        """The file's name without ending."""
+        return self.path.stem
+
+    @property
+    def video_path(self) -> Path:
+        """The video."""
+        return self.path
+
+    @property
+    def stamps(self) -> NDArray[np.int64]:
+        """Presentation times, nanoseconds, shape (frames,)."""
+        return self._times
+
+    @property
+    def log_times(self) -> NDArray[np.int64]:
+        """Presentation times, nanoseconds, shape (frames,)."""
+        return self._times
+
+    @property
+    def encoding(self) -> str:
+        """``rgb8``."""
+        return "rgb8"
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the frames, pixels."""
+        return self._size
+
+    def intrinsics_at(self, index: int) -> Calibration | None:
+        """None: a video has no calibration.
+
+        Args:
+            index: 0 <= index < frames.
+        """
+        return None
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def pictures_of(self, indices: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+        """See `Frames.pictures_of`."""
+        for index in indices:
+            if self._file is None:
+                self._file = VideoFile(self.path)
+            yield index, self._file.picture(index)
+
+    def _pictures_apart(self, runs: Iterable[Sequence[int]]) -> Iterator[tuple[int, Picture]]:
+        with VideoFile(self.path) as file:
+            for index in chain.from_iterable(runs):
+                yield index, file.picture(index)
+
+    def _pictures(self) -> Iterator[Picture]:
+        with VideoFile(self.path) as file:
+            yield from map(file.picture, range(len(self)))
+
+    def _write_pixels(self, picture: Picture, out: Pixels) -> None:
+        np.copyto(out, picture[0])
+
+    def _frame_id(self, index: int) -> str:
+        return ""
+
+    def close(self) -> None:
+        """Close the video, if it is open."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None

@@ -1,0 +1,19 @@
+"""Frames of datasets as samples for PyTorch.
+
+`FrameDataset` gives samples by number, in any order; `FrameStream` reads recordings from
+beginning to end, shuffled by windows. Both are made for a ``torch.utils.data.DataLoader`` with
+workers: docs/training.md shows how. Needs ``pip install 'mp4ds[torch]'``.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+if find_spec("torch") is None:
+    raise ImportError("mp4ds.torch needs PyTorch. Install it with: pip install 'mp4ds[torch]'")
+
+from mp4ds.torch.dataset import FrameDataset
+from mp4ds.torch.errors import SampleError
+from mp4ds.torch.stream import FrameStream
+
+__all__ = ["FrameDataset", "FrameStream", "SampleError"]

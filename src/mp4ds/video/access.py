@@ -1,0 +1,338 @@
+"""Frames of a video by number: a decoder is given only what they need.
+
+To show a frame, a decoder needs the key frame before it and the frames that it refers to, over as
+many steps as it takes. All others in between are left out (`mp4ds.video.chains`); what comes out
+is the same. Where nothing is known of the references, `VideoDecoder` seeks as usual.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import av
+import numpy as np
+from av.error import FFmpegError
+
+from mp4ds.coded.references import UnknownStructure
+from mp4ds.errors import VideoError
+from mp4ds.layouts import Picture
+from mp4ds.video.chains import Chains, Group
+from mp4ds.video.decoder import VideoDecoder
+from mp4ds.video.pictures import PictureMaker
+from mp4ds.video.samples import SampleTable, Unindexed, read_sample_table
+
+_DECODERS = {
+    "h264": "h264",
+    "h265": "hevc",
+    "av1": "libdav1d",
+    "vp9": "vp9",
+    "ffv1": "ffv1",
+    "mjpeg": "mjpeg",
+}
+_ENTRIES = {  # codecs by the four letters of their sample entry
+    **dict.fromkeys(("avc1", "avc3"), "h264"),
+    **dict.fromkeys(("hvc1", "hev1"), "h265"),
+    "av01": "av1",
+    "vp09": "vp9",
+    "FFV1": "ffv1",
+    **dict.fromkeys(("mp4v", "jpeg"), "mjpeg"),
+}
+
+
+class FrameAccess:
+    """Random access to the frames of one mp4. A context manager.
+
+    Not to be shared between threads or over a fork.
+
+    Args:
+        path: The video.
+        codec: Name in the registry.
+        frames: Number of frames that are due; None where only the video tells.
+        maker: Makes pictures of its frames.
+        threads: Of the decoder. One takes the least CPU time; with more, one frame comes sooner.
+
+    Raises:
+        UnknownStructure: Its frames cannot be had one by one.
+        VideoError: ``video-unreadable`` or ``frame-count``.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        codec: str,
+        frames: int | None,
+        maker: PictureMaker,
+        threads: int = 1,
+    ) -> None:
+        self._path = path
+        self._codec = codec
+        self._maker = maker
+        self._threads = threads
+        self._file: BinaryIO = path.open("rb")
+        try:
+            self.table = self._read_table(frames)
+            self._chains = Chains(self.table, codec, self._packet)
+        except BaseException:
+            self._file.close()
+            raise
+        self._numbers = np.empty_like(self.table.order)
+        self._numbers[self.table.order] = np.arange(len(self.table.order))
+        self._context: Any = None
+        self._session: _Session | None = None
+
+    def _read_table(self, frames: int | None) -> SampleTable:
+        try:
+            table = read_sample_table(self._file, self._path.stat().st_size, str(self._path))
+        except Unindexed as error:
+            raise UnknownStructure(f"its index is not read: {error}") from None
+        if _ENTRIES.get(table.codec) != self._codec:
+            raise UnknownStructure(f"its track is {table.codec!r}")
+        if frames is not None and len(table.order) != frames:
+            raise VideoError(
+                "frame-count", self._path, f"has {len(table.order)} frames, {frames} are due"
+            )
+        if (table.width, table.height) != self._maker.coded_size:
+            raise UnknownStructure("its frames have another size")
+        if len(table.order) != len(table.sizes) or not table.sync[:1].all():
+            raise UnknownStructure(
+                "it has frames that are not shown, or begins without a key frame"
+            )
+        return table
+
+    def pictures_of(self, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+        """Pictures of some frames, each with its number.
+
+        Args:
+            numbers: 0 <= number < frames, increasing.
+
+        Yields:
+            Views that hold until the next one is asked for.
+
+        Raises:
+            UnknownStructure: What the frames refer to is not known; nothing was given of those that
+                follow.
+            VideoError: ``decode-failed``, naming the frame.
+        """
+        samples = self.table.order[np.asarray(numbers, np.int64)].tolist()
+        for wanted in self._chains.split(samples) if samples else ():
+            yield from self._of_group(wanted)
+
+    def _of_group(self, wanted: list[int]) -> Iterator[tuple[int, Picture]]:
+        group = self._chains.group(wanted[0], max(wanted))
+        chain = group.chain(wanted)
+        shown = {group.shows[sample - group.first] for sample in wanted}
+        if self._session is None or not self._session.goes_on(group, chain, shown):
+            self._begin(group)
+        due = {sample: int(self._numbers[sample]) for sample in wanted}
+        try:
+            for frame in self._decoded(chain):
+                if frame.is_corrupt:
+                    self._context = self._session = None
+                    raise self._damage(due, "is marked as corrupt")
+                number = due.pop(frame.pts, None) if frame.pts is not None else None
+                if number is not None:
+                    yield number, self._maker.make(frame, number)
+                if not due:
+                    return
+        except FFmpegError as error:
+            self._context = self._session = None
+            raise self._damage(due, f"cannot be decoded: {error}") from None
+        raise self._damage(due, "was not found")
+
+    def _damage(self, due: Mapping[int, int], what: str) -> VideoError:
+        return VideoError("decode-failed", self._path, f"frame {min(due.values())} {what}")
+
+    def _decoded(self, chain: list[int]) -> Iterator[av.VideoFrame]:
+        session = self._session
+        if session is None:
+            return
+        sample, packet = -1, b""
+        for number in chain:
+            if number in session.fed:
+                continue
+            piece = session.group.pieces[number]
+            if piece.sample != sample:
+                sample, packet = piece.sample, self._packet(piece.sample)
+            is_whole = (piece.start, piece.end) == (0, len(packet))
+            data = av.Packet(packet if is_whole else packet[piece.start : piece.end])
+            data.pts = data.dts = sample
+            session.fed.add(number)
+            session.last = number
+            yield from self._context.decode(data)
+        # some decoders hold frames back; once they gave them they take nothing more
+        self._session = None
+        yield from self._context.decode(None)
+
+    def _begin(self, group: Group) -> None:
+        if self._context is None:
+            self._context = self._new_context()
+        else:
+            self._context.flush_buffers()
+        self._session = _Session(group)
+
+    def _new_context(self) -> Any:
+        context: Any = av.CodecContext.create(_DECODERS[self._codec], "r")
+        if self.table.configuration:
+            context.extradata = self.table.configuration
+        context.width, context.height = self.table.width, self.table.height
+        context.thread_count = self._threads
+        context.thread_type = "SLICE"
+        # concealed damage would depend on which frames were decoded before
+        context.options = {"err_detect": "explode"}
+        if self._codec == "av1":
+            context.options = {"max_frame_delay": "1"}
+        return context
+
+    def _packet(self, sample: int) -> bytes:
+        self._file.seek(int(self.table.places[sample]))
+        size = int(self.table.sizes[sample])
+        packet = self._file.read(size)
+        if len(packet) != size:
+            number = int(self._numbers[sample])
+            raise VideoError("decode-failed", self._path, f"ends before frame {number}")
+        return packet
+
+    def close(self) -> None:
+        """Close the file."""
+        self._context = self._session = None
+        self._file.close()
+
+    def __enter__(self) -> FrameAccess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class FrameReader:
+    """Frames of one mp4 by number, at the least cost that its codec allows. A context manager.
+
+    Not to be shared between threads or over a fork.
+
+    Args:
+        path: The video.
+        codec: Name in the registry.
+        coded_size: Width and height of the coded pictures.
+        frames: Number of frames that are due.
+        picture_format: Pixel format of the pictures wanted.
+        picture_size: Width and height of the pictures wanted.
+        matrix: Matrix coefficients of the video's colours; None where the video itself tells.
+        full_range: Whether its samples use their full range, unless the video itself tells.
+
+    Raises:
+        VideoError: As for `VideoDecoder`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        codec: str,
+        coded_size: tuple[int, int],
+        frames: int,
+        picture_format: str,
+        picture_size: tuple[int, int],
+        matrix: str | None,
+        full_range: bool,
+    ) -> None:
+        maker = PictureMaker(
+            path,
+            coded_size=coded_size,
+            picture_format=picture_format,
+            picture_size=picture_size,
+            matrix=matrix,
+            full_range=full_range,
+        )
+        self._open_decoder = partial(
+            VideoDecoder,
+            path,
+            codec=codec,
+            coded_size=coded_size,
+            frames=frames,
+            picture_format=picture_format,
+            picture_size=picture_size,
+            matrix=matrix,
+            full_range=full_range,
+            sequential=False,
+        )
+        self._access: FrameAccess | None = None
+        self._decoder: VideoDecoder | None = None
+        try:
+            self._access = FrameAccess(path, codec=codec, frames=frames, maker=maker)
+        except (
+            UnknownStructure,
+            VideoError,
+            OSError,
+        ):  # ffmpeg reads more, and tells what it does not
+            self._decoder = self._open_decoder()
+
+    def pictures_of(self, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+        """Pictures of some frames, each with its number.
+
+        Args:
+            numbers: 0 <= number < frames, increasing.
+
+        Yields:
+            Views that hold until the next one is asked for.
+
+        Raises:
+            VideoError: One cannot be decoded.
+        """
+        done = 0
+        if self._access is not None:
+            try:
+                for pair in self._access.pictures_of(numbers):
+                    done += 1
+                    yield pair
+                return
+            except UnknownStructure:
+                self._access.close()
+                self._access = None
+        if self._decoder is None:
+            self._decoder = self._open_decoder()
+        for number in numbers[done:]:
+            yield number, self._decoder.picture(number)
+
+    def close(self) -> None:
+        """Close the file."""
+        for part in (self._access, self._decoder):
+            if part is not None:
+                part.close()
+
+    def __enter__(self) -> FrameReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+@dataclass(slots=True)
+class _Session:
+    """A decoder's way through a group.
+
+    Attributes:
+        group: Which it is.
+        fed: Numbers of the pieces that it was given.
+        last: The last of them.
+    """
+
+    group: Group
+    fed: set[int] = field(default_factory=set)
+    last: int = -1
+
+    def goes_on(self, group: Group, chain: list[int], shown: set[int]) -> bool:
+        """Whether all that is still needed comes after what it was given.
+
+        Args:
+            group: The group of what is wanted.
+            chain: Numbers of the pieces that are needed.
+            shown: Those of them that make pictures come out: a picture comes out once.
+        """
+        if group is not self.group or not self.fed.isdisjoint(shown):
+            return False
+        return all(number > self.last for number in chain if number not in self.fed)

@@ -1,0 +1,131 @@
+"""Which coded frames a decoder needs for a frame, so that it gets no others."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from mp4ds.coded.references import ReferenceParser
+from mp4ds.video.samples import SampleTable
+
+_KEPT_FRAMES = 50_000  # coded frames whose references are kept in memory
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A coded frame: a part of a packet that a decoder is to be given.
+
+    Attributes:
+        sample: Number of the packet.
+        start: Offset in it.
+        end: Offset after it.
+        needs: Numbers in its group of the pieces that it refers to.
+    """
+
+    sample: int
+    start: int
+    end: int
+    needs: tuple[int, ...]
+
+
+@dataclass(slots=True)
+class Group:
+    """The coded frames from a key frame to the next, as far as they are known.
+
+    Attributes:
+        first: Number of the key frame's packet.
+        end: Number of the next group's.
+        pieces: In the order coded.
+        shows: For each packet known the number of the piece that makes its picture come out.
+    """
+
+    first: int
+    end: int
+    parser: ReferenceParser
+    pieces: list[Piece] = field(default_factory=list)
+    shows: list[int] = field(default_factory=list)
+
+    def chain(self, samples: Iterable[int]) -> list[int]:
+        """Numbers of the pieces that show the pictures of packets, and of all that these need."""
+        pending = [self.shows[sample - self.first] for sample in samples]
+        found = set(pending)
+        while pending:
+            for number in self.pieces[pending.pop()].needs:
+                if number not in found:
+                    found.add(number)
+                    pending.append(number)
+        return sorted(found)
+
+
+class Chains:
+    """The groups of a video; what is in one is found out when it is first needed.
+
+    Args:
+        table: The video's index.
+        codec: Name in the registry.
+        read: Gives a packet by its number.
+
+    Raises:
+        UnknownStructure: Nothing is known of the references of the codec.
+    """
+
+    def __init__(self, table: SampleTable, codec: str, read: Callable[[int], bytes]) -> None:
+        self._table = table
+        self._codec = codec
+        self._read = read
+        self._keys = np.flatnonzero(table.sync)
+        self._groups: OrderedDict[int, Group] = OrderedDict()
+        ReferenceParser(codec, table.configuration)
+
+    def group(self, sample: int, last: int) -> Group:
+        """The group that a packet is in, known up to another one of it.
+
+        Raises:
+            UnknownStructure: What its frames refer to is not known.
+        """
+        place = int(np.searchsorted(self._keys, sample, side="right")) - 1
+        group = self._groups.get(place)
+        if group is None:
+            group = self._begin(place)
+            self._groups[place] = group
+        self._groups.move_to_end(place)
+        while group.first + len(group.shows) <= last:
+            self._add(group, group.first + len(group.shows))
+        self._forget()
+        return group
+
+    def split(self, samples: list[int]) -> Iterator[list[int]]:
+        """Packets by the groups that they are in; those of a group must follow each other."""
+        places = np.searchsorted(self._keys, np.array(samples, np.int64), side="right")
+        bounds = [0, *(np.flatnonzero(np.diff(places)) + 1).tolist(), len(samples)]
+        for start, end in pairwise(bounds):
+            yield samples[start:end]
+
+    def _begin(self, place: int) -> Group:
+        count = len(self._table.sizes)
+        following = self._keys[place + 1] if place + 1 < len(self._keys) else count
+        first = int(self._keys[place]) if place >= 0 else 0
+        parser = ReferenceParser(self._codec, self._table.configuration)
+        return Group(first, int(following), parser)
+
+    def _add(self, group: Group, sample: int) -> None:
+        frames = group.parser.packet(self._read(sample), key=sample == group.first)
+        shown = -1
+        for frame in frames:
+            number = len(group.pieces)
+            needs = tuple(number - distance for distance in frame.references)
+            group.pieces.append(Piece(sample, frame.start, frame.end, needs))
+            if frame.shown:
+                shown = number
+        group.shows.append(shown)
+
+    def _forget(self) -> None:
+        while (
+            len(self._groups) > 1
+            and sum(len(group.pieces) for group in self._groups.values()) > _KEPT_FRAMES
+        ):
+            self._groups.popitem(last=False)

@@ -1,0 +1,204 @@
+"""Videos of others, of which nothing is known but what they tell themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from av.error import FFmpegError
+from numpy.typing import NDArray
+
+from mp4ds.errors import VideoError
+from mp4ds.layouts import MAX_SIDE, Picture
+from mp4ds.video.convert import Converter, frame_to_picture
+from mp4ds.video.media import Media
+from mp4ds.video.samples import Unindexed, read_sample_table
+
+_SECOND = 1_000_000_000
+_LATEST = 2**63 // _SECOND - 1  # seconds
+_TRIES = 3
+
+
+class VideoFile:
+    """One mp4 with one video track, of any codec that is known here. A context manager.
+
+    Args:
+        path: The video.
+
+    Attributes:
+        size: Width and height of its frames, as coded.
+        times: Presentation times, nanoseconds, rounded down, int64, shape (frames,), in order.
+
+    Raises:
+        VideoError: It cannot be read, or is no such video.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._converter = Converter(None)
+        self._frames: Iterator[av.VideoFrame] = iter(())
+        self._last: int | None = None
+        if not path.is_file():
+            raise VideoError("file-missing", path, "does not exist")
+        try:
+            self._media = Media(path)
+        except (FFmpegError, OSError) as error:
+            raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
+        try:
+            self._stream = self._video_track()
+            context: Any = self._stream.codec_context
+            self.size: tuple[int, int] = context.width, context.height
+            if not 1 <= min(self.size) <= max(self.size) <= MAX_SIDE:
+                width, height = self.size
+                raise VideoError("video-unreadable", path, f"has frames of {width}x{height} pixels")
+            self._stream.thread_count = 1  # threads inherited over a fork would never end
+            self._ticks, self._keys = self._read_ticks()
+            if not len(self._ticks):
+                raise VideoError("video-unreadable", path, "has no frames")
+            self.times = self._nanoseconds()
+        except BaseException:
+            self.close()
+            raise
+
+    def _video_track(self) -> Any:
+        container = self._media.container
+        if "mp4" not in container.format.name.split(","):
+            raise VideoError(
+                "video-unreadable", self._path, f"is a {container.format.name} file, not an mp4"
+            )
+        tracks = container.streams.video
+        if len(tracks) != 1:
+            raise VideoError(
+                "video-unreadable", self._path, f"has {len(tracks)} video tracks, not one"
+            )
+        if tracks[0].codec_context is None or tracks[0].codec_context.codec is None:
+            raise VideoError("video-unreadable", self._path, "has a video track of no known codec")
+        return tracks[0]
+
+    def _read_ticks(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Ticks at which frames are shown, and those of frames at which decoding can begin."""
+        try:
+            with self._path.open("rb") as file:
+                table = read_sample_table(file, self._path.stat().st_size, str(self._path))
+        except Unindexed:
+            return self._read_packets()
+        except OSError as error:
+            raise VideoError("video-unreadable", self._path, f"cannot be read: {error}") from None
+        ticks = table.presentation[table.order]
+        return ticks, np.sort(table.presentation[table.sync])
+
+    def _read_packets(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """As `_read_ticks`, from the packets, all of which are read."""
+        ticks, keys = [], []
+        try:
+            for packet in self._media.container.demux(self._stream):
+                if packet.pts is None:
+                    continue
+                if packet.is_keyframe:
+                    keys.append(packet.pts)
+                if not packet.is_discard:
+                    ticks.append(packet.pts)
+        except (FFmpegError, OSError) as error:
+            raise VideoError("video-unreadable", self._path, f"cannot be read: {error}") from None
+        return np.sort(np.array(ticks, np.int64)), np.sort(np.array(keys, np.int64))
+
+    def _nanoseconds(self) -> NDArray[np.int64]:
+        base = self._stream.time_base
+        latest = np.abs(self._ticks[[0, -1]]).max()
+        if latest * base >= _LATEST or base.numerator != 1:
+            raise VideoError("video-unreadable", self._path, "has times beyond 64 bits")
+        whole, part = np.divmod(self._ticks, base.denominator)
+        times: NDArray[np.int64] = whole * _SECOND + part * _SECOND // base.denominator
+        return times
+
+    def picture(self, index: int) -> Picture:
+        """One frame as RGB, 8 bits; the next ones are decoded on, others from their key frame.
+
+        Args:
+            index: 0 <= index < frames.
+
+        Returns:
+            One array of shape (H, W, 3), which holds until the next one is asked for.
+
+        Raises:
+            VideoError: It cannot be decoded.
+        """
+        tick = int(self._ticks[index])
+        group = self._group(tick)
+        if (
+            self._last is None
+            or index <= self._last
+            or group != self._group(self._tick(self._last))
+        ):
+            self._seek(group, index)
+        self._last = None
+        frame = self._next_at(tick, index)
+        for _ in range(_TRIES):
+            if frame is not None or group < 0:
+                break
+            # sought by decoding time, which may have led to a later key frame
+            group -= 1
+            self._seek(group, index)
+            frame = self._next_at(tick, index)
+        if frame is None:
+            raise VideoError("decode-failed", self._path, f"frame {index} was not found")
+        picture = self._picture(frame, index)
+        self._last = index
+        return picture
+
+    def _tick(self, index: int) -> int:
+        return int(self._ticks[index])
+
+    def _group(self, tick: int) -> int:
+        """Number of the last key frame that is shown by then; -1 if none is."""
+        return int(np.searchsorted(self._keys, tick, side="right")) - 1
+
+    def _seek(self, group: int, index: int) -> None:
+        container = self._media.container
+        try:
+            container.seek(
+                int(self._keys[group] if group >= 0 else self._ticks[0]), stream=self._stream
+            )
+            self._frames = container.decode(self._stream)
+        except (FFmpegError, OSError) as error:
+            raise VideoError(
+                "decode-failed", self._path, f"frame {index} cannot be sought: {error}"
+            ) from None
+
+    def _next_at(self, tick: int, index: int) -> av.VideoFrame | None:
+        try:
+            for frame in self._frames:
+                if frame.pts is not None and frame.pts >= tick:
+                    return frame if frame.pts == tick else None
+        except (FFmpegError, OSError) as error:
+            raise VideoError(
+                "decode-failed", self._path, f"frame {index} cannot be decoded: {error}"
+            ) from None
+        return None
+
+    def _picture(self, frame: av.VideoFrame, index: int) -> Picture:
+        if frame.is_corrupt:
+            raise VideoError("decode-failed", self._path, f"frame {index} is marked as corrupt")
+        if (frame.width, frame.height) != self.size:
+            width, height = self.size
+            raise VideoError(
+                "geometry-mismatch",
+                self._path,
+                f"frame {index} has {frame.width}x{frame.height} pixels among others of "
+                f"{width}x{height}",
+            )
+        place = str(self._path)
+        return frame_to_picture(frame, "rgb24", *self.size, self._converter, place)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._media.close()
+
+    def __enter__(self) -> VideoFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

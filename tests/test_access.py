@@ -1,0 +1,200 @@
+"""Frames by number, of which only the chains are decoded: the same as of a whole decode."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mp4ds.coded.references import UnknownStructure
+from mp4ds.errors import VideoError
+from mp4ds.video.access import FrameAccess
+from test_references import (
+    FRAMES,
+    HEIGHT,
+    RECIPES,
+    REFUSED,
+    WIDTH,
+    Recipe,
+    encoded_file,
+    samples,
+    svt,
+    x264,
+)
+
+ALIKE = ("svt-super-resolution", "svt-resized")  # have frames of several sizes
+
+
+class Samples:
+    """Gives the samples of frames in the place of pictures."""
+
+    coded_size = WIDTH, HEIGHT
+
+    def make(self, frame: Any, number: int | None = None) -> Any:
+        assert number is not None
+        return samples(frame)
+
+
+def opened(path: Path, recipe: Recipe) -> FrameAccess:
+    maker: Any = Samples()
+    return FrameAccess(path, codec=recipe.codec, frames=FRAMES, maker=maker)
+
+
+def written(folder: Path, recipe: Recipe) -> Path:
+    path = folder / "v.mp4"
+    path.write_bytes(encoded_file(recipe))
+    return path
+
+
+def whole(path: Path) -> list[bytes]:
+    """The samples of all frames, decoded one after the other."""
+    with av.open(str(path)) as container:
+        return [samples(frame) for frame in container.decode(video=0)]
+
+
+def patterns(count: int) -> Iterator[list[int]]:
+    """What users ask for, one after the other: single frames, windows, batches, all."""
+    rng = random.Random(3)
+    yield from ([rng.randrange(count)] for _ in range(12))
+    yield from ([number] for number in range(8, 20))
+    for _ in range(6):
+        first = rng.randrange(count - 5)
+        yield list(range(first, first + 5))
+        yield sorted(rng.sample(range(count), 9))
+    yield list(range(count))
+    yield [count - 1]
+    yield [0]
+
+
+@pytest.mark.parametrize("name", [name for name in RECIPES if name not in ALIKE])
+def test_it_is_the_same_frame(name: str, tmp_path: Path) -> None:
+    recipe = RECIPES[name]
+    path = written(tmp_path, recipe)
+    expected = whole(path)
+    assert len(expected) == FRAMES
+    with opened(path, recipe) as access:
+        for numbers in patterns(FRAMES):
+            found = list(access.pictures_of(numbers))
+            assert [number for number, _ in found] == numbers
+            for number, picture in found:
+                assert picture == expected[number], (numbers, number)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    requests=st.lists(st.sets(st.integers(0, FRAMES - 1), min_size=1), max_size=6), data=st.data()
+)
+@pytest.mark.parametrize("name", ["svt-6", "x264-b3-normal-ref4-w1", "x264-lossless-gray"])
+def test_any_requests(
+    name: str, requests: list[set[int]], data: Any, tmp_path_factory: Any
+) -> None:
+    recipe = RECIPES[name]
+    path = written(tmp_path_factory.mktemp("any"), recipe)
+    expected = whole(path)
+    with opened(path, recipe) as access:
+        for numbers in map(sorted, requests):
+            taken = data.draw(st.integers(0, len(numbers)))  # some are left off in the middle
+            pictures = access.pictures_of(numbers)
+            for number in numbers[:taken]:
+                assert next(pictures) == (number, expected[number])
+
+
+def read_last(path: Path, recipe: Recipe) -> None:
+    with opened(path, recipe) as access:
+        list(access.pictures_of([FRAMES - 1]))
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_unknown_structures_are_refused(name: str, tmp_path: Path) -> None:
+    path = written(tmp_path, REFUSED[name])
+    with pytest.raises(UnknownStructure):
+        read_last(path, REFUSED[name])
+
+
+class Counting(FrameAccess):
+    """Counts the packets that are read."""
+
+    reads = 0
+
+    def _packet(self, sample: int) -> bytes:
+        self.reads += 1
+        return super()._packet(sample)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "most"),
+    [(svt(10, gop=45), 14), (x264("bframes=7:b-adapt=0:b-pyramid=none:keyint=45", gop=45), 10)],
+    ids=["av1", "h264"],
+)
+def test_frames_that_are_not_needed_are_not_decoded(
+    recipe: Recipe, most: int, tmp_path: Path
+) -> None:
+    maker: Any = Samples()
+    path = written(tmp_path, recipe)
+    access = Counting(path, codec=recipe.codec, frames=FRAMES, maker=maker)
+    list(access.pictures_of([FRAMES - 2]))  # what the frames refer to is known from now on
+    access.reads = 0
+    list(access.pictures_of([FRAMES - 3]))
+    assert 1 < access.reads <= most
+    access.close()
+
+
+def damaged(data: bytes, *, places: Iterator[int]) -> bytes:
+    changed = bytearray(data)
+    for place in places:
+        changed[place] ^= 0xFF
+    return bytes(changed)
+
+
+def test_a_damaged_packet_is_told_with_its_frame(tmp_path: Path) -> None:
+    recipe = RECIPES["ffv1"]  # which has checksums
+    path = written(tmp_path, recipe)
+    expected = whole(path)
+    with opened(path, recipe) as access:
+        first, size = int(access.table.places[21]), int(access.table.sizes[21])
+    path.write_bytes(
+        damaged(path.read_bytes(), places=iter(range(first + size // 2, first + size)))
+    )
+    with opened(path, recipe) as access:
+        with pytest.raises(VideoError, match=r"v\.mp4.* frame 24 "):
+            list(access.pictures_of([24]))
+        # what does not need it is still there
+        assert list(access.pictures_of([20])) == [(20, expected[20])]
+
+
+def test_a_file_that_was_cut_short_meanwhile(tmp_path: Path) -> None:
+    recipe = RECIPES["svt-8"]
+    path = written(tmp_path, recipe)
+    access = opened(path, recipe)
+    with path.open("r+b") as file:
+        file.truncate(int(access.table.places[21]))
+    with pytest.raises(VideoError, match=r"ends before frame 2"):
+        list(access.pictures_of([25]))
+    assert [number for number, _ in access.pictures_of([5])] == [5]
+    access.close()
+
+
+@pytest.mark.parametrize("cut", [0, 40, 400])
+def test_what_is_no_video(cut: int, tmp_path: Path) -> None:
+    path = tmp_path / "v.mp4"
+    path.write_bytes(encoded_file(RECIPES["svt-8"])[:cut])
+    with pytest.raises((VideoError, UnknownStructure)):
+        opened(path, RECIPES["svt-8"])
+
+
+def test_it_counts_the_frames(tmp_path: Path) -> None:
+    maker: Any = Samples()
+    with pytest.raises(VideoError, match=rf"has {FRAMES} frames, 3 are due"):
+        FrameAccess(written(tmp_path, RECIPES["svt-8"]), codec="av1", frames=3, maker=maker)
+
+
+def test_another_codec_is_refused(tmp_path: Path) -> None:
+    maker: Any = Samples()
+    with pytest.raises(UnknownStructure):
+        FrameAccess(written(tmp_path, RECIPES["svt-8"]), codec="h264", frames=FRAMES, maker=maker)

@@ -1,0 +1,734 @@
+"""Frames as samples for PyTorch: in this process, in workers, in order and at random."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import os
+import pickle
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mp4ds
+from mp4ds.demo import demo
+from mp4ds.packing import PackOptions
+from mp4ds.streams import Stream
+from scenes import PERIOD, Scene, odd_scene, scene
+from sources import SOURCES
+from test_examples import ROOT, run
+
+torch = pytest.importorskip("torch")
+
+from torch.utils.data import DataLoader, Subset  # noqa: E402
+
+from mp4ds.torch import FrameDataset, FrameStream, SampleError  # noqa: E402
+from mp4ds.torch.windows import rows_of, windows  # noqa: E402
+
+LEFT, RIGHT = BOTH = ["/left/image_raw", "/right/image_raw"]
+FRAMES, GOP = 24, 6
+LOST = 7  # a frame of the right camera that was not recorded
+
+pytestmark = pytest.mark.filterwarnings(
+    # Python's and torch's words about the fork, which these tests want
+    "ignore:.*fork.*:DeprecationWarning",
+    "ignore:This process .* is multi-threaded:DeprecationWarning",
+)
+
+
+def camera(topic: str, encoding: str, seed: int, lost: int | None = None) -> Scene:
+    """A camera of its own name, maybe with a frame that was lost."""
+    made = scene(encoding, frames=FRAMES, seed=seed, with_info=False)
+    images = [m for m in made.messages if m.topic == "/cam/image_raw"]
+    return Scene([dataclasses.replace(m, topic=topic) for n, m in enumerate(images) if n != lost])
+
+
+def packed(folder: Path, *cameras: Scene) -> Path:
+    """A dataset of cameras."""
+    folder.mkdir()
+    messages = sorted((m for made in cameras for m in made.messages), key=lambda m: m.log_time)
+    sources = SOURCES["mcap-ros2-none"](folder, Scene(messages))
+    mp4ds.pack(sources, folder / "drive", PackOptions(codec="h264", gop=GOP))
+    return folder / "drive"
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Three recordings of two cameras; not to be changed."""
+    folder = tmp_path_factory.mktemp("drives")
+    return [
+        packed(
+            folder / str(n),
+            camera(LEFT, "rgb8", 2 * n),
+            camera(RIGHT, "rgb8", 2 * n + 1, lost=LOST),
+        )
+        for n in range(3)
+    ]
+
+
+@pytest.fixture(scope="module")
+def grey(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A camera of 16 bits."""
+    return packed(tmp_path_factory.mktemp("grey") / "grey", camera(LEFT, "mono16", 0))
+
+
+def frames_of(drive: Path, topic: str) -> list[mp4ds.Frame]:
+    with mp4ds.open(drive) as dataset:
+        return list(dataset[topic])
+
+
+def first(frame: mp4ds.Frame) -> Any:
+    """Channels first."""
+    return torch.from_numpy(np.ascontiguousarray(frame.data)).permute(2, 0, 1)
+
+
+def matched(drive: Path) -> list[tuple[mp4ds.Frame, mp4ds.Frame]]:
+    """Frames of both cameras that belong together, as the scene was made."""
+    right = frames_of(drive, RIGHT)
+    left = [frame for n, frame in enumerate(frames_of(drive, LEFT)) if n != LOST]
+    return list(zip(left, right, strict=True))
+
+
+# ---------------------------------------------------------------- one camera
+
+
+def test_a_sample_is_the_frame_of_its_number(drives: list[Path]) -> None:
+    dataset = FrameDataset(drives[0], topics=[LEFT])
+    frames = frames_of(drives[0], LEFT)
+    assert len(dataset) == len(frames) == FRAMES
+    for number in [0, 13, FRAMES - 1, -1, -FRAMES]:
+        sample, frame = dataset[number], frames[number]
+        assert list(sample) == [LEFT, f"{LEFT}_is_pad", "stamp_ns", "index", "dataset"]
+        assert torch.equal(sample[LEFT], first(frame))
+        assert sample[LEFT].dtype == torch.uint8
+        assert sample[f"{LEFT}_is_pad"].tolist() == [False]
+        assert (sample["stamp_ns"], sample["index"]) == (frame.stamp_ns, frame.index)
+        assert sample["dataset"] == 0
+    for number in (FRAMES, -FRAMES - 1):
+        with pytest.raises(IndexError, match=f"{FRAMES} samples, and none of number {number}"):
+            dataset[number]
+
+
+def test_channels_first_is_a_view(drives: list[Path]) -> None:
+    image = FrameDataset(drives[0], topics=[LEFT])[3][LEFT]
+    assert image.shape == (3, 48, 64)
+    assert image.permute(1, 2, 0).is_contiguous()
+    last = FrameDataset(drives[0], topics=[LEFT], channels_first=False)[3][LEFT]
+    assert torch.equal(last, image.permute(1, 2, 0))
+
+
+def test_floats_are_fractions(drives: list[Path], grey: Path) -> None:
+    bytes_ = FrameDataset(drives[0], topics=[LEFT])[5][LEFT]
+    floats = FrameDataset(drives[0], topics=[LEFT], dtype="float32")[5][LEFT]
+    assert floats.dtype == torch.float32
+    assert torch.equal(floats, bytes_.to(torch.float32) / 255)
+    (wide,) = FrameDataset(grey, dtype="float32", format="gray")[5][LEFT]
+    data = frames_of(grey, LEFT)[5].data
+    assert torch.equal(wide, torch.from_numpy(data.astype(np.float32) / np.float32(65535)))
+    (native,) = FrameDataset(grey, dtype="float32", format="native")[5][LEFT]
+    assert np.array_equal(native.numpy(), data), "native values keep their numbers"
+
+
+def test_bits_beyond_bytes_are_kept(grey: Path) -> None:
+    (image,) = FrameDataset(grey, format="native")[5][LEFT]
+    assert image.dtype == torch.uint16
+    assert np.array_equal(image.numpy(), frames_of(grey, LEFT)[5].data)
+    with pytest.raises(mp4ds.OptionError, match=f"{LEFT}: has frames of uint16, not uint8"):
+        FrameDataset(grey, format="native", dtype="uint8")[5]
+
+
+def test_views_of_frames(drives: list[Path]) -> None:
+    with mp4ds.open(drives[0]) as drive:
+        options: dict[str, Any] = {"crop": (8, 4, 32, 24), "resize": (16, 12)}
+        expected = drive[LEFT].read([9], format="bgr", **options)[0]
+        half = drive[RIGHT].read([9 - 1], format="gray", resize=0.5)[0]
+    left = FrameDataset(drives[0], topics=[LEFT], format="bgr", **options)[9][LEFT]
+    assert np.array_equal(left.permute(1, 2, 0).numpy(), expected)
+    both = FrameDataset(
+        drives[0],
+        format={LEFT: "bgr", RIGHT: "gray"},
+        resize={LEFT: (16, 12), RIGHT: 0.5},
+        crop={LEFT: (8, 4, 32, 24)},
+    )[9 - 1]
+    assert torch.equal(both[LEFT], left)
+    assert np.array_equal(both[RIGHT][0].numpy(), half)
+
+
+def test_a_transform_makes_the_sample(drives: list[Path]) -> None:
+    dataset = FrameDataset(drives[0], topics=[LEFT], transform=lambda s: (s["index"], s[LEFT][0]))
+    number, red = dataset[4]
+    assert number == 4
+    assert np.array_equal(red.numpy(), frames_of(drives[0], LEFT)[4].data[..., 0])
+
+
+def test_a_video_without_sidecar(drives: list[Path], tmp_path: Path) -> None:
+    shutil.copy(drives[0] / "left_image_raw.mp4", tmp_path / "clip.mp4")
+    frames = frames_of(tmp_path / "clip.mp4", "clip")
+    for dataset in (FrameDataset(tmp_path / "clip.mp4"), FrameStream(tmp_path / "clip.mp4")):
+        seen = {sample["index"]: sample for sample in dataset}
+        assert len(seen) == FRAMES
+        for number, sample in seen.items():
+            assert torch.equal(sample["clip"], first(frames[number]))
+            assert sample["stamp_ns"] == frames[number].stamp_ns
+
+
+# ---------------------------------------------------------------- many at a time
+
+
+def test_many_samples_are_read_at_once(drives: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[list[int]] = []
+    read = Stream.read
+
+    def counted(self: Stream, indices: Any, **options: Any) -> Any:
+        calls.append(list(indices))
+        return read(self, indices, **options)
+
+    monkeypatch.setattr(Stream, "read", counted)
+    wanted = [20, 3, 3, -1, 0]
+    samples = FrameDataset(drives[0], topics=[LEFT]).__getitems__(wanted)
+    frames = frames_of(drives[0], LEFT)
+    assert len(calls) == 1
+    for number, sample in zip(wanted, samples, strict=True):
+        assert torch.equal(sample[LEFT], first(frames[number]))
+    samples[1][LEFT].zero_()
+    assert torch.equal(samples[2][LEFT], first(frames[3])), "samples share no memory"
+
+
+def test_several_datasets_follow_each_other(drives: list[Path]) -> None:
+    dataset = FrameDataset(drives, topics=[LEFT])
+    assert dataset.lengths == [FRAMES] * 3
+    assert dataset.paths == list(map(str, drives))
+    wanted = [2 * FRAMES, FRAMES - 1, FRAMES, 0, 3 * FRAMES - 1]
+    for number, sample in zip(wanted, dataset.__getitems__(wanted), strict=True):
+        recording, row = divmod(number, FRAMES)
+        assert (sample["index"], sample["dataset"]) == (number, recording)
+        assert torch.equal(sample[LEFT], first(frames_of(drives[recording], LEFT)[row]))
+
+
+def test_one_camera_is_opened_lazily(drives: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("opened")
+
+    monkeypatch.setattr(Stream, "__init__", refuse)
+    assert len(FrameDataset(drives, topics=[LEFT])) == 3 * FRAMES
+    assert FrameStream(drives, topics=[LEFT]).samples == 3 * FRAMES
+
+
+def open_videos() -> int:
+    links = (os.path.realpath(link) for link in Path("/proc/self/fd").iterdir())
+    return sum(link.endswith(".mp4") for link in links)
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc")
+def test_few_videos_are_open(drives: list[Path]) -> None:
+    before = open_videos()
+    dataset = FrameDataset(drives, topics=BOTH, cache_files=2)
+    for _ in range(2):
+        dataset.__getitems__(list(range(0, len(dataset), 5)))
+        assert open_videos() - before == 2
+    dataset.close()
+    assert open_videos() == before
+    assert dataset[0][LEFT].shape == (3, 48, 64), "opened again"
+    dataset.close()
+
+
+# ---------------------------------------------------------------- offsets
+
+
+def test_offsets_in_frames(drives: list[Path]) -> None:
+    dataset = FrameDataset(drives[:2], topics=[LEFT], offsets=(-2, 0, 1))
+    frames = frames_of(drives[1], LEFT)
+    for row, wanted, padded in [
+        (0, [0, 0, 1], [True, False, False]),
+        (1, [0, 1, 2], [True, False, False]),
+        (9, [7, 9, 10], [False] * 3),
+        (FRAMES - 1, [FRAMES - 3, FRAMES - 1, FRAMES - 1], [False, False, True]),
+    ]:
+        sample = dataset[FRAMES + row]
+        assert torch.equal(sample[LEFT], torch.stack([first(frames[n]) for n in wanted]))
+        assert sample[f"{LEFT}_is_pad"].tolist() == padded
+        assert sample["stamp_ns"] == frames[row].stamp_ns
+
+
+def test_offsets_in_seconds(drives: list[Path]) -> None:
+    """To the nearest frame; where one was lost, what is nearest is padding."""
+    frames = frames_of(drives[0], RIGHT)
+    dataset = FrameDataset(
+        drives[0], topics=[RIGHT], offsets=(-0.1, 0, 0.035), offsets_in="seconds"
+    )
+    stamps = np.array([frame.stamp_ns for frame in frames])
+    for row in range(len(frames)):
+        times = stamps[row] + np.array([-100_000_000, 0, 35_000_000])
+        away = np.abs(stamps - times[:, None])
+        sample = dataset[row]
+        expected = [first(frames[n]) for n in away.argmin(axis=1)]
+        assert torch.equal(sample[RIGHT], torch.stack(expected))
+        missing = away.min(axis=1) > PERIOD / 2 + 10_000
+        assert sample[f"{RIGHT}_is_pad"].tolist() == missing.tolist()
+    assert dataset[LOST + 2][f"{RIGHT}_is_pad"].tolist() == [True, False, False]
+    assert dataset[LOST - 1][f"{RIGHT}_is_pad"].tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize(("tolerance", "padded"), [(0, True), (10**9, False)])
+def test_a_tolerance_decides_what_is_padding(
+    drives: list[Path], tolerance: int, padded: bool
+) -> None:
+    dataset = FrameDataset(
+        *(drives[0],),
+        topics=[LEFT],
+        offsets=(0.03, 0),
+        offsets_in="seconds",
+        tolerance_ns=tolerance,
+    )
+    assert dataset[5][f"{LEFT}_is_pad"].tolist() == [padded, False]
+
+
+@pytest.mark.parametrize("trait", ["stamp-repeated", "stamp-backward", "stamp-zero"])
+def test_odd_stamps(tmp_path: Path, trait: str) -> None:
+    """Of equally near frames the earlier one, of equal stamps the first; itself without offset."""
+    sources = SOURCES["mcap-ros2-none"](tmp_path, odd_scene(trait))
+    mp4ds.pack(sources, tmp_path / "drive")
+    frames = frames_of(tmp_path / "drive", "/odd/image")
+    stamps = [frame.stamp_ns for frame in frames]
+    dataset = FrameDataset(
+        tmp_path / "drive", format="native", offsets=(-0.05, 0, 0.034), offsets_in="seconds"
+    )
+    for row in range(len(frames)):
+        wanted = []
+        for step in (-50_000_000, 0, 34_000_000):
+            away = [(abs(s - stamps[row] - step), s, n) for n, s in enumerate(stamps)]
+            wanted.append(min(away)[2] if step else row)
+        images = dataset[row]["/odd/image"][:, 0]
+        assert np.array_equal(images.numpy(), np.stack([frames[n].data for n in wanted]))
+
+
+# ---------------------------------------------------------------- several cameras
+
+
+def test_cameras_are_matched(drives: list[Path]) -> None:
+    dataset = FrameDataset(drives[0], topics=BOTH)
+    pairs = matched(drives[0])
+    assert dataset.topics == tuple(BOTH)
+    assert sorted(FrameDataset(drives[0]).topics) == BOTH
+    assert len(dataset) == len(pairs) == FRAMES - 1
+    for sample, (left, right) in zip(dataset.__getitems__(range(len(dataset))), pairs, strict=True):
+        assert torch.equal(sample[LEFT], first(left))
+        assert torch.equal(sample[RIGHT], first(right))
+        assert sample["stamp_ns"] == left.stamp_ns
+    (unmatched,) = dataset.unmatched
+    assert {topic: found.tolist() for topic, found in unmatched.items()} == {
+        LEFT: [LOST],
+        RIGHT: [],
+    }
+
+
+def test_windows_of_several_cameras(drives: list[Path]) -> None:
+    """Offsets in frames go from match to match."""
+    sample = FrameDataset(drives[0], topics=BOTH, offsets=(-1, 0))[LOST]
+    before, now = matched(drives[0])[LOST - 1 : LOST + 1]
+    for place, topic in enumerate(BOTH):
+        expected = torch.stack([first(before[place]), first(now[place])])
+        assert torch.equal(sample[topic], expected)
+        assert sample[f"{topic}_is_pad"].tolist() == [False, False]
+
+
+def test_nothing_matches(tmp_path: Path) -> None:
+    late = camera(RIGHT, "rgb8", 1)
+    late.messages = [
+        dataclasses.replace(
+            m,
+            values=m.values
+            | {"header": m.values["header"] | {"stamp": m.values["header"]["stamp"] + 10**12}},
+        )
+        for m in late.messages
+    ]
+    drive = packed(tmp_path / "a", camera(LEFT, "rgb8", 0), late)
+    with pytest.raises(mp4ds.OptionError, match=f"no frames of {LEFT}, {RIGHT} .*20000000 ns"):
+        FrameDataset(drive, topics=BOTH)
+
+
+# ---------------------------------------------------------------- options
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"topics": ["/up"]}, "has no stream '/up'; there are: /"),
+        ({"topics": []}, "no topics were chosen"),
+        ({"topics": LEFT}, "topics is a list"),
+        ({"topics": [LEFT, LEFT]}, "/left/image_raw stands twice"),
+        ({"offsets": ()}, "offsets is empty"),
+        ({"offsets": (0.5,)}, "in frames are whole numbers"),
+        ({"offsets_in": "minutes"}, "offsets_in is 'minutes'"),
+        ({"offsets": (float("nan"),), "offsets_in": "seconds"}, "at most 1e9"),
+        ({"tolerance_ns": 5}, 'belongs to offsets_in="seconds"'),
+        ({"tolerance_ns": -5, "offsets_in": "seconds"}, "tolerance_ns is -5"),
+        ({"sync_tolerance_ns": -1}, "sync_tolerance_ns is -1"),
+        ({"format": "hsv"}, "format is 'hsv', and not one of native, rgb, bgr, gray"),
+        ({"format": {"/up": "rgb"}}, "format is given for '/up'"),
+        ({"dtype": "float16"}, "dtype is 'float16'"),
+        ({"backend": "other"}, "backend is 'other'"),
+        ({"device": "cuda"}, "needs backend='torchcodec'"),
+        ({"backend": "torchcodec", "format": "gray"}, "gives format='rgb' without resize"),
+        ({"cache_files": 0}, "cache_files is 0"),
+    ],
+)
+def test_wrong_options(drives: list[Path], options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(mp4ds.OptionError) as caught:
+        FrameDataset(drives[0], **options)
+    assert sentence in str(caught.value)
+
+
+def test_wrong_options_of_streams(drives: list[Path]) -> None:
+    for options, sentence in [
+        ({"window": 0}, "window is 0"),
+        ({"world_size": 0}, "world_size is 0"),
+        ({"rank": 2, "world_size": 2}, "rank is 2, and must be less"),
+        ({"buffer": -1}, "buffer is -1"),
+        ({"cache_files": 1}, "cache_files is 1, and must be at least 2"),
+    ]:
+        with pytest.raises(mp4ds.OptionError, match=sentence):
+            FrameStream(drives[0], **options)
+    with pytest.raises(mp4ds.OptionError, match="epoch is -1"):
+        FrameStream(drives[0]).set_epoch(-1)
+
+
+def test_no_datasets(tmp_path: Path) -> None:
+    with pytest.raises(mp4ds.OptionError, match="list of paths is empty"):
+        FrameDataset([])
+    with pytest.raises(mp4ds.SourceNotFoundError):
+        FrameDataset(tmp_path / "none")
+
+
+def test_without_torch() -> None:
+    code = "import sys; sys.modules['torch'] = None; import mp4ds.torch"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "ImportError: mp4ds.torch needs PyTorch" in done.stderr
+
+
+# ---------------------------------------------------------------- workers
+
+WORKERS = [(0, None), (2, "fork"), (2, "spawn")]
+
+
+def loader(dataset: Any, workers: int, method: str | None, **options: Any) -> Any:
+    return DataLoader(
+        dataset, num_workers=workers, multiprocessing_context=method, timeout=60 * bool(workers),
+        **options,
+    )  # fmt: skip
+
+
+def failure(batches: Any) -> Exception:
+    """What ends an epoch; without tracebacks, which would keep the workers."""
+    try:
+        list(batches)
+    except Exception as error:
+        error.__cause__ = error.__context__ = None
+        return error.with_traceback(None)
+    raise AssertionError("nothing failed")
+
+
+@pytest.mark.parametrize(("workers", "method"), WORKERS)
+def test_an_epoch(drives: list[Path], workers: int, method: str | None) -> None:
+    """Also where the dataset was in use before the workers were started."""
+    dataset = FrameDataset(drives[:2], topics=BOTH, offsets=(-1, 0))
+    dataset.__getitems__([0, 30])
+    expected = dataset.__getitems__(range(len(dataset)))
+    seen = []
+    for batch in loader(dataset, workers, method, batch_size=7, shuffle=True):
+        for place, number in enumerate(batch["index"].tolist()):
+            seen.append(number)
+            for key in (LEFT, RIGHT, f"{LEFT}_is_pad", f"{RIGHT}_is_pad"):
+                assert torch.equal(batch[key][place], expected[number][key])
+            assert int(batch["stamp_ns"][place]) == expected[number]["stamp_ns"]
+    assert sorted(seen) == list(range(len(dataset)))
+    assert batch["stamp_ns"].dtype == torch.int64
+    assert torch.equal(dataset[3][LEFT], expected[3][LEFT]), "and in the parent afterwards"
+
+
+def test_a_copy_has_no_open_videos(drives: list[Path]) -> None:
+    dataset = FrameDataset(drives[0])
+    sample = dataset[6]
+    data = pickle.dumps(dataset)
+    assert len(data) < 4096
+    again = pickle.loads(data)
+    assert len(again._reader.cameras) == 0
+    assert torch.equal(again[6][RIGHT], sample[RIGHT])
+
+
+def test_a_forked_child_opens_its_own(drives: list[Path]) -> None:
+    """And ends, though the parent's decoders have threads that the child has not."""
+    dataset = FrameDataset(drives[0])
+    sample = dataset[6]
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            signal.alarm(60)
+            if torch.equal(dataset[6][LEFT], sample[LEFT]):
+                dataset.close()
+                status = 0
+        finally:
+            os._exit(status)
+    assert os.waitpid(child, 0)[1] == 0
+    assert torch.equal(dataset[6][LEFT], sample[LEFT])
+
+
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+def test_what_was_dropped_does_not_stop_workers(drives: list[Path]) -> None:
+    """A worker that collects the parent's garbage must not wait for threads of its decoders."""
+    dropped: list[Any] = [FrameDataset(drives[0], topics=BOTH), mp4ds.open(drives[0])]
+    dropped[0][0], dropped[1][LEFT][0]
+    dropped.append(dropped)  # so that it waits for the garbage collector
+    del dropped
+    dataset = FrameDataset(drives[0], topics=BOTH, transform=Collector())
+    assert len(list(loader(Subset(dataset, [0, 9]), 1, "fork"))) == 2
+    gc.collect()
+
+
+class Collector:
+    """Collects garbage."""
+
+    def __call__(self, sample: dict[str, Any]) -> dict[str, Any]:
+        gc.collect()
+        return sample
+
+
+class Killer:
+    """Kills the worker in which it runs."""
+
+    def __call__(self, sample: dict[str, Any]) -> dict[str, Any]:
+        if sample["index"] == 5:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return sample
+
+
+def test_a_killed_worker_is_an_error(drives: list[Path]) -> None:
+    dataset = FrameDataset(drives[0], topics=[LEFT], transform=Killer())
+    error = failure(loader(dataset, 2, "fork", batch_size=2))
+    assert isinstance(error, RuntimeError)
+    assert re.search(r"worker.*(killed|exited)", str(error))
+
+
+# ---------------------------------------------------------------- damage
+
+
+@pytest.fixture
+def damaged(drives: list[Path], tmp_path: Path) -> Path:
+    """A dataset with zeros in a frame of the right camera."""
+    drive = tmp_path / "drive"
+    shutil.copytree(drives[0], drive)
+    (video,) = drive.glob("right*.mp4")
+    data = bytearray(video.read_bytes())
+    from mp4ds.video.samples import read_sample_table
+
+    with video.open("rb") as file:
+        table = read_sample_table(file, len(data), "")
+    start, size = int(table.places[BROKEN]), int(table.sizes[BROKEN])
+    data[start : start + size] = bytes(size)
+    video.write_bytes(data)
+    return drive
+
+
+BROKEN = 2 * GOP
+
+
+@pytest.mark.parametrize(("workers", "method"), WORKERS[:2])
+def test_damage_is_named(damaged: Path, workers: int, method: str | None) -> None:
+    dataset = FrameDataset(damaged, topics=[RIGHT])
+    assert dataset[0][RIGHT].shape == (3, 48, 64)
+    error = failure(loader(dataset, workers, method, batch_size=8))
+    last = str(error).strip().splitlines()[-1]
+    assert f"{damaged}, topic {RIGHT}, frame {BROKEN}: " in last
+    assert last.endswith("[decode-failed].")
+    assert isinstance(error, SampleError)
+    assert isinstance(error, mp4ds.Mp4dsError)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        mp4ds.SourceError("drive", "is odd", "Fix it."),
+        mp4ds.SourceNotFoundError("drive"),
+        mp4ds.TargetError("drive", "is odd"),
+        mp4ds.TargetExistsError("drive"),
+        mp4ds.OptionError("is odd"),
+        mp4ds.VersionError("drive", "9.0", "1.0"),
+        mp4ds.VideoError("decode-failed", "drive", "is odd"),
+        mp4ds.ConversionError("/topic", "is odd"),
+        mp4ds.WriteError("drive", OSError(28, "No space left on device")),
+        mp4ds.PartsFailedError("drive", [("0001", "is odd")], 3, 2),
+        mp4ds.ClusterError("tcp://host", "is odd", "Fix it."),
+        mp4ds.RemoteError("drive", "is odd"),
+        SampleError("is odd"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_errors_come_through_processes(error: mp4ds.Mp4dsError) -> None:
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is type(error)
+    assert str(again) == str(error)
+    assert vars(again) == vars(error)
+
+
+def test_a_missing_video_is_named(damaged: Path) -> None:
+    (video,) = damaged.glob("right*.mp4")
+    video.unlink()
+    with pytest.raises(SampleError, match=f"^{damaged}, topic {RIGHT}.*{video.name}.*file-missing"):
+        FrameDataset(damaged, topics=[RIGHT])[0]
+    with pytest.raises(SampleError, match=f"^{damaged}, topic {RIGHT}.*{video.name}"):
+        next(iter(FrameStream(damaged, topics=[RIGHT])))
+
+
+def test_a_wrong_count_is_named(damaged: Path) -> None:
+    manifest = damaged / "dataset.yaml"
+    text = manifest.read_text()
+    lines = [line for line in text.splitlines() if not line.startswith("checksum")]
+    manifest.write_text("\n".join(lines).replace(f"frames: {FRAMES}", "frames: 9") + "\n")
+    with pytest.raises(SampleError, match=f"topic {LEFT}: .*has {FRAMES} frames where 9 are due"):
+        FrameDataset(damaged, topics=[LEFT])[0]
+
+
+# ---------------------------------------------------------------- streams
+
+
+def indices(samples: Any) -> list[int]:
+    return [int(sample["index"]) for sample in samples]
+
+
+def test_a_stream_in_order(drives: list[Path]) -> None:
+    """The same samples as by number."""
+    stream = FrameStream(drives[:2], topics=BOTH, shuffle=False, window=5)
+    dataset = FrameDataset(drives[:2], topics=BOTH)
+    samples = list(stream)
+    assert indices(samples) == list(range(len(dataset))) == list(range(stream.samples))
+    for sample, other in zip(samples, dataset.__getitems__(range(len(dataset))), strict=True):
+        assert list(sample) == list(other)
+        for key, value in sample.items():
+            assert torch.equal(torch.as_tensor(value), torch.as_tensor(other[key]))
+
+
+def test_windows_begin_with_key_frames(drives: list[Path]) -> None:
+    stream = FrameStream(drives, topics=[LEFT], window=GOP, seed=3)
+    numbers = indices(stream)
+    assert sorted(numbers) == list(range(3 * FRAMES))
+    starts = [b for a, b in zip([-2, *numbers], numbers, strict=False) if b != a + 1]
+    assert all(start % GOP == 0 for start in starts)
+    assert len(starts) > 3
+
+
+def test_epochs_differ_and_repeat(drives: list[Path]) -> None:
+    def order(epoch: int, **options: Any) -> list[int]:
+        stream = FrameStream(drives, topics=[LEFT], window=GOP, **options)
+        stream.set_epoch(epoch)
+        return indices(stream)
+
+    assert order(0) == order(0) != order(1)
+    assert order(0) != order(0, seed=1)
+    mixed = order(0, buffer=20)
+    assert mixed == order(0, buffer=20) != order(0)
+    assert sorted(mixed) == sorted(order(0))
+
+
+@pytest.mark.parametrize(
+    ("workers", "method", "ranks"), [(0, None, 3), (2, "fork", 2), (1, "spawn", 1)]
+)
+def test_ranks_and_workers_share_an_epoch(
+    drives: list[Path], workers: int, method: str | None, ranks: int
+) -> None:
+    seen: list[int] = []
+    for rank in range(ranks):
+        stream = FrameStream(drives, topics=[LEFT], window=GOP, rank=rank, world_size=ranks)
+        for batch in loader(stream, workers, method, batch_size=4):
+            seen += batch["index"].tolist()
+    assert sorted(seen) == list(range(3 * FRAMES))
+
+
+def test_workers_that_stay_learn_of_the_epoch(drives: list[Path]) -> None:
+    stream = FrameStream(drives, topics=[LEFT], window=GOP)
+    batches = loader(stream, 1, "fork", batch_size=None, persistent_workers=True)
+    orders = []
+    for epoch in (0, 1, 0):
+        stream.set_epoch(epoch)
+        orders.append(indices(batches))
+    assert orders[0] == orders[2] != orders[1]
+
+
+def test_a_kept_sample_does_not_keep_others(drives: list[Path]) -> None:
+    """So the memory of a buffer is that of its samples."""
+    for sample in FrameStream(drives[0], topics=[LEFT], buffer=4):
+        image = sample[LEFT]
+        assert image.untyped_storage().nbytes() == image.numel()
+        assert image.permute(1, 2, 0).is_contiguous()
+
+
+@pytest.mark.parametrize("length", [1, 4, 7, 100])
+@pytest.mark.parametrize("keys", [[0], [0, 1, 2, 3], [0, 6, 12, 18], [0, 5, 6, 20], []])
+def test_windows_are_a_partition(drives: list[Path], length: int, keys: list[int]) -> None:
+    for topics in ([LEFT], BOTH):
+        collection = FrameDataset(drives[:2], topics=topics)._collection
+        found: list[list[int]] = [[], []]
+        for number, window in windows(collection, length).tolist():
+            rows = rows_of(collection.recordings[number], window, length, np.array(keys))
+            found[number] += rows.tolist()
+        assert found == [list(range(recording.rows)) for recording in collection.recordings]
+
+
+# ---------------------------------------------------------------- torchcodec
+
+
+@pytest.fixture
+def torchcodec() -> None:
+    try:
+        import torchcodec.decoders  # noqa: F401
+    except (ImportError, OSError, RuntimeError) as error:
+        pytest.skip(f"torchcodec cannot be used: {error}")
+
+
+@pytest.mark.usefixtures("torchcodec")
+def test_torchcodec_gives_the_same_frames(drives: list[Path]) -> None:
+    """The right ones, in colours that are nearly the same."""
+    options: dict[str, Any] = {"topics": BOTH, "offsets": (0, -2), "crop": (8, 4, 32, 24)}
+    ours = FrameDataset(drives[0], **options)
+    theirs = FrameDataset(drives[0], **options, backend="torchcodec")
+    wanted = [11, 2, 22, 2]
+    for a, b in zip(ours.__getitems__(wanted), theirs.__getitems__(wanted), strict=True):
+        assert (a["stamp_ns"], a["index"]) == (b["stamp_ns"], b["index"])
+        for topic in BOTH:
+            assert a[topic].shape == b[topic].shape
+            away = (a[topic].int() - b[topic].int()).abs()
+            assert away.float().mean() < 1
+
+
+@pytest.mark.usefixtures("torchcodec")
+def test_torchcodec_refuses_what_it_would_show_wrongly(tmp_path: Path) -> None:
+    drive = packed(tmp_path / "a", camera(LEFT, "bayer_rggb8", 0))
+    with pytest.raises(mp4ds.OptionError, match=r"bayer_rggb8 images .* layout mosaic8"):
+        FrameDataset(drive, backend="torchcodec")[0]
+
+
+# ---------------------------------------------------------------- example and tutorial
+
+
+def test_the_example_learns(drives: list[Path]) -> None:
+    out = run(sys.executable, str(ROOT / "examples/train.py"), str(drives[0]), "3", cwd=ROOT)
+    errors = [float(line.split("error ")[1].split(",")[0]) for line in out.splitlines()[1:]]
+    assert len(errors) == 3
+    assert errors[2] < errors[0]
+
+
+def test_the_tutorial_runs(tmp_path: Path) -> None:
+    demo(tmp_path / "demo.bag", seconds=1.2)
+    for name in ("drive", "drive2"):
+        mp4ds.pack(tmp_path / "demo.bag", tmp_path / name)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/training.md").read_text(), re.DOTALL)
+    assert len(blocks) >= 6
+    out = run(sys.executable, "-W", "error", "-c", "\n".join(blocks), cwd=tmp_path)
+    assert out.splitlines()[0] == "36 [18, 18]"
