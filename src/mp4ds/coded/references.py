@@ -47,7 +47,10 @@ class ReferenceParser:
         make = _PARSERS.get(codec)
         if make is None:
             raise UnknownStructure(f"what frames of the codec {codec[:40]!r} refer to is not known")
-        self._parser = make(bytes(configuration))
+        try:
+            self._parser = make(bytes(configuration))
+        except Refused as error:
+            raise UnknownStructure(str(error)) from None
 
     def packet(self, data: bytes | memoryview, *, key: bool) -> list[CodedFrame]:
         """The coded frames of the next packet, in the order coded.

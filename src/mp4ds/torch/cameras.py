@@ -72,7 +72,7 @@ class Camera:
         self.source = source
         self._view = view
         self._pictures = pictures
-        self.stream = open_source(source)
+        self.stream = open_source(source, fast_colour=pictures.fast_colour)
         if len(self.stream) != source.frames:
             raise FormatError(
                 "frame-count",

@@ -45,6 +45,7 @@ class Pictures:
         views: What of each camera, in the order of the topics.
         dtype: ``native``, ``uint8`` or ``float32``.
         channels_first: (C, H, W) instead of (H, W, C).
+        fast_colour: See `mp4ds.Dataset`.
         backend: Who decodes.
         device: Where the tensors are.
     """
@@ -52,6 +53,7 @@ class Pictures:
     views: tuple[View, ...]
     dtype: str
     channels_first: bool
+    fast_colour: bool
     backend: str
     device: str
 
@@ -96,6 +98,7 @@ def pictures_from(
     crop: Crop | Mapping[str, Crop] | None,
     dtype: str,
     channels_first: bool,
+    fast_colour: bool,
     backend: str,
     device: str,
 ) -> Pictures:
@@ -121,7 +124,7 @@ def pictures_from(
                 raise OptionError(
                     "backend='torchcodec' gives format='rgb' without resize; use a transform."
                 )
-    return Pictures(views, dtype, channels_first, backend, device)
+    return Pictures(views, dtype, channels_first, fast_colour, backend, device)
 
 
 def _one_of(name: str, value: str, known: Sequence[str]) -> None:

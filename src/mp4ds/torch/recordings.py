@@ -131,14 +131,20 @@ class Collection:
         return Recording(str(path), chosen, sync.indices, sync.unmatched)
 
 
-def open_source(source: Source) -> Stream | Video:
+def open_source(source: Source, *, fast_colour: bool = False) -> Stream | Video:
     """The stream or video of a camera; others of its dataset are not touched.
+
+    Args:
+        source: Which.
+        fast_colour: See `mp4ds.Dataset`.
 
     Raises:
         FormatError: It breaks a rule of the format.
     """
     path = location(source.place)
-    return Stream(path) if path.suffix == ".yaml" else open_dataset(path).videos[0]
+    if path.suffix == ".yaml":
+        return Stream(path, fast_colour=fast_colour)
+    return open_dataset(path, fast_colour=fast_colour).videos[0]
 
 
 def _sources(path: Path | str) -> list[Source]:

@@ -49,6 +49,7 @@ class FrameStream(IterableDataset):
         rank: Number of this process of a distributed training.
         world_size: How many there are.
         cache_files: Videos that are open at most; one for each camera at least.
+        fast_colour: See `mp4ds.Dataset`.
         backend: Who decodes.
         device: Where.
 
@@ -77,6 +78,7 @@ class FrameStream(IterableDataset):
         rank: int = 0,
         world_size: int = 1,
         cache_files: int = 16,
+        fast_colour: bool = False,
         backend: Backend = "mp4ds",
         device: str = "cpu",
     ) -> None:
@@ -94,6 +96,7 @@ class FrameStream(IterableDataset):
             crop=crop,
             dtype=dtype,
             channels_first=channels_first,
+            fast_colour=fast_colour,
             backend=backend,
             device=device,
         )

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from mp4ds.video.access import FrameReader
 from mp4ds.video.codecs import Recipe, check_codec, recipe_for
 from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.encoder import VideoEncoder, tool_versions
-from mp4ds.video.file import VideoFile
+from mp4ds.video.file import VideoFile, open_file_frames
 from mp4ds.video.images import ImageFile
 from mp4ds.video.join import SegmentsDifferError, join_segments
 from mp4ds.video.jpeg import JpegDecoder
 from mp4ds.video.memory import encoder_bytes
 from mp4ds.video.packets import PacketReader, PacketWriter
+from mp4ds.video.reader import FrameReader, open_frames
 from mp4ds.video.rendering import Renderer, encoding_as, shown_format
 from mp4ds.video.sample_entry import read_sample_entry
 from mp4ds.video.trial import Choice, choose
@@ -34,6 +34,8 @@ __all__ = [
     "encoder_bytes",
     "encoding_as",
     "join_segments",
+    "open_file_frames",
+    "open_frames",
     "read_sample_entry",
     "recipe_for",
     "shown_format",

@@ -2,14 +2,13 @@
 
 To show a frame, a decoder needs the key frame before it and the frames that it refers to, over as
 many steps as it takes. All others in between are left out (`mp4ds.video.chains`); what comes out
-is the same. Where nothing is known of the references, `VideoDecoder` seeks as usual.
+is the same. Where nothing is known of the references, `mp4ds.video.reader` decodes them all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -21,7 +20,6 @@ from mp4ds.coded.references import UnknownStructure
 from mp4ds.errors import VideoError
 from mp4ds.layouts import Picture
 from mp4ds.video.chains import Chains, Group
-from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.pictures import PictureMaker
 from mp4ds.video.samples import SampleTable, Unindexed, read_sample_table
 
@@ -33,7 +31,7 @@ _DECODERS = {
     "ffv1": "ffv1",
     "mjpeg": "mjpeg",
 }
-_ENTRIES = {  # codecs by the four letters of their sample entry
+CODECS_OF_ENTRIES = {  # codecs by the four letters of their sample entry
     **dict.fromkeys(("avc1", "avc3"), "h264"),
     **dict.fromkeys(("hvc1", "hev1"), "h265"),
     "av01": "av1",
@@ -90,7 +88,7 @@ class FrameAccess:
             table = read_sample_table(self._file, self._path.stat().st_size, str(self._path))
         except Unindexed as error:
             raise UnknownStructure(f"its index is not read: {error}") from None
-        if _ENTRIES.get(table.codec) != self._codec:
+        if CODECS_OF_ENTRIES.get(table.codec) != self._codec:
             raise UnknownStructure(f"its track is {table.codec!r}")
         if frames is not None and len(table.order) != frames:
             raise VideoError(
@@ -203,108 +201,6 @@ class FrameAccess:
         self._file.close()
 
     def __enter__(self) -> FrameAccess:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-class FrameReader:
-    """Frames of one mp4 by number, at the least cost that its codec allows. A context manager.
-
-    Not to be shared between threads or over a fork.
-
-    Args:
-        path: The video.
-        codec: Name in the registry.
-        coded_size: Width and height of the coded pictures.
-        frames: Number of frames that are due.
-        picture_format: Pixel format of the pictures wanted.
-        picture_size: Width and height of the pictures wanted.
-        matrix: Matrix coefficients of the video's colours; None where the video itself tells.
-        full_range: Whether its samples use their full range, unless the video itself tells.
-
-    Raises:
-        VideoError: As for `VideoDecoder`.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        *,
-        codec: str,
-        coded_size: tuple[int, int],
-        frames: int,
-        picture_format: str,
-        picture_size: tuple[int, int],
-        matrix: str | None,
-        full_range: bool,
-    ) -> None:
-        maker = PictureMaker(
-            path,
-            coded_size=coded_size,
-            picture_format=picture_format,
-            picture_size=picture_size,
-            matrix=matrix,
-            full_range=full_range,
-        )
-        self._open_decoder = partial(
-            VideoDecoder,
-            path,
-            codec=codec,
-            coded_size=coded_size,
-            frames=frames,
-            picture_format=picture_format,
-            picture_size=picture_size,
-            matrix=matrix,
-            full_range=full_range,
-            sequential=False,
-        )
-        self._access: FrameAccess | None = None
-        self._decoder: VideoDecoder | None = None
-        try:
-            self._access = FrameAccess(path, codec=codec, frames=frames, maker=maker)
-        except (
-            UnknownStructure,
-            VideoError,
-            OSError,
-        ):  # ffmpeg reads more, and tells what it does not
-            self._decoder = self._open_decoder()
-
-    def pictures_of(self, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
-        """Pictures of some frames, each with its number.
-
-        Args:
-            numbers: 0 <= number < frames, increasing.
-
-        Yields:
-            Views that hold until the next one is asked for.
-
-        Raises:
-            VideoError: One cannot be decoded.
-        """
-        done = 0
-        if self._access is not None:
-            try:
-                for pair in self._access.pictures_of(numbers):
-                    done += 1
-                    yield pair
-                return
-            except UnknownStructure:
-                self._access.close()
-                self._access = None
-        if self._decoder is None:
-            self._decoder = self._open_decoder()
-        for number in numbers[done:]:
-            yield number, self._decoder.picture(number)
-
-    def close(self) -> None:
-        """Close the file."""
-        for part in (self._access, self._decoder):
-            if part is not None:
-                part.close()
-
-    def __enter__(self) -> FrameReader:
         return self
 
     def __exit__(self, *_: object) -> None:

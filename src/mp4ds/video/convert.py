@@ -21,6 +21,7 @@ _BT709, _FULL_RANGE = 1, 2  # in a frame's tags (H.273; ffmpeg's AVColorRange)
 # libswscale's flags: bicubic, full chroma in and out, accurate rounding, the same everywhere.
 # As numbers, since older PyAV has no names for them.
 _BICUBIC, _FULL_CHROMA, _ACCURATE, _BITEXACT = 0x4, 0x2000 | 0x4000, 0x40000, 0x80000
+_BILINEAR = 0x2
 _INTERPOLATION = _BICUBIC | _FULL_CHROMA | _ACCURATE | _BITEXACT
 _MATRICES = {"bt709": Colorspace.ITU709, "smpte170m": Colorspace.ITU601}
 
@@ -41,9 +42,19 @@ class Converter:
         matrix: Between RGB and YUV, by ffmpeg's name: ours is bt709, JPEG files have smpte170m.
             None: what each frame is tagged with.
         source_full_range: Whether the frames to convert use the full range.
+        fast: Take halved chroma as it is, several times as fast as interpolating it. Of camera
+            images this is 48 to 49 dB like the other, and 0.9 dB less like the original.
     """
 
-    def __init__(self, matrix: str | None = "bt709", *, source_full_range: bool = True) -> None:
+    def __init__(
+        self,
+        matrix: str | None = "bt709",
+        *,
+        source_full_range: bool = True,
+        fast: bool = False,
+    ) -> None:
+        self._interpolation = _BILINEAR if fast else _INTERPOLATION
+        self._via_planes = () if fast else _VIA_PLANES
         self._is_tagged = matrix is None
         self._matrix = _MATRICES.get(matrix or "", Colorspace.ITU709)
         self._source_range = ColorRange.JPEG if source_full_range else ColorRange.MPEG
@@ -57,7 +68,7 @@ class Converter:
             self._matrix = Colorspace.ITU709 if frame.colorspace == _BT709 else Colorspace.ITU601
             is_full = frame.color_range == _FULL_RANGE or frame.format.name.startswith("yuvj")
             self._source_range = ColorRange.JPEG if is_full else ColorRange.MPEG
-        if pixel_format in _VIA_PLANES and not frame.format.is_rgb:
+        if pixel_format in self._via_planes and not frame.format.is_rgb:
             # the same samples in a third of the time: libswscale makes planes with SIMD
             planes = self._reformat(self._to_planes, frame, "gbrp")
             return self._reformat(self._reformatter, planes, pixel_format)
@@ -73,7 +84,7 @@ class Converter:
             dst_colorspace=self._matrix,
             src_color_range=self._source_range,
             dst_color_range=ColorRange.JPEG,
-            interpolation=_INTERPOLATION,
+            interpolation=self._interpolation,
             threads=1,  # a pool inherited over fork would never end
         )
 

@@ -15,7 +15,7 @@ from mp4ds.layouts import Picture
 from mp4ds.video.media import Media
 from mp4ds.video.pictures import PictureMaker
 
-_CODEC_NAMES = {
+CODEC_NAMES = {
     "h264": "h264",
     "h265": "hevc",
     "av1": "av1",
@@ -41,6 +41,7 @@ class VideoDecoder:
         matrix: Matrix coefficients of the video's colours; None where the video itself tells.
         full_range: Whether its samples use their full range, unless the video itself tells.
         sequential: Decode with all cores, for reading in order.
+        fast_colour: See `Converter`.
 
     Raises:
         VideoError: ``video-unreadable``, ``codec-mismatch`` or ``geometry-mismatch``.
@@ -58,6 +59,7 @@ class VideoDecoder:
         matrix: str | None = "bt709",
         full_range: bool = True,
         sequential: bool = True,
+        fast_colour: bool = False,
     ) -> None:
         self._path = path
         self._frames = frames
@@ -68,6 +70,7 @@ class VideoDecoder:
             picture_size=picture_size,
             matrix=matrix,
             full_range=full_range,
+            fast_colour=fast_colour,
         )
         self._ticks: np.ndarray[tuple[int], np.dtype[np.int64]] | None = None
         if not path.is_file():
@@ -97,7 +100,7 @@ class VideoDecoder:
         context: Any = self._container.streams.video[0].codec_context
         if context is None or context.codec is None:
             raise VideoError("video-unreadable", self._path, "has a video track of no known codec")
-        expected = _CODEC_NAMES.get(codec)
+        expected = CODEC_NAMES.get(codec)
         found = context.codec.canonical_name
         if expected is None or found != expected:
             raise VideoError(

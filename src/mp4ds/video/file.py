@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 
 from mp4ds.errors import VideoError
 from mp4ds.layouts import MAX_SIDE, Picture
-from mp4ds.video.convert import Converter, frame_to_picture
+from mp4ds.video.access import FrameAccess
+from mp4ds.video.decoder import CODEC_NAMES
 from mp4ds.video.media import Media
+from mp4ds.video.pictures import PictureMaker
+from mp4ds.video.reader import FrameReader
 from mp4ds.video.samples import Unindexed, read_sample_table
 
 _SECOND = 1_000_000_000
@@ -27,8 +30,10 @@ class VideoFile:
 
     Args:
         path: The video.
+        fast_colour: See `Converter`.
 
     Attributes:
+        codec: Name in the registry, or ffmpeg's.
         size: Width and height of its frames, as coded.
         times: Presentation times, nanoseconds, rounded down, int64, shape (frames,), in order.
 
@@ -36,9 +41,8 @@ class VideoFile:
         VideoError: It cannot be read, or is no such video.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, fast_colour: bool = False) -> None:
         self._path = path
-        self._converter = Converter(None)
         self._frames: Iterator[av.VideoFrame] = iter(())
         self._last: int | None = None
         if not path.is_file():
@@ -51,10 +55,13 @@ class VideoFile:
             self._stream = self._video_track()
             context: Any = self._stream.codec_context
             self.size: tuple[int, int] = context.width, context.height
+            name = context.codec.canonical_name
+            self.codec = next((key for key, value in CODEC_NAMES.items() if value == name), name)
             if not 1 <= min(self.size) <= max(self.size) <= MAX_SIDE:
                 width, height = self.size
                 raise VideoError("video-unreadable", path, f"has frames of {width}x{height} pixels")
             self._stream.thread_count = 1  # threads inherited over a fork would never end
+            self._maker = _maker_of(path, self.size, fast_colour)
             self._ticks, self._keys = self._read_ticks()
             if not len(self._ticks):
                 raise VideoError("video-unreadable", path, "has no frames")
@@ -145,7 +152,7 @@ class VideoFile:
             frame = self._next_at(tick, index)
         if frame is None:
             raise VideoError("decode-failed", self._path, f"frame {index} was not found")
-        picture = self._picture(frame, index)
+        picture = self._maker.make(frame, index)
         self._last = index
         return picture
 
@@ -179,20 +186,6 @@ class VideoFile:
             ) from None
         return None
 
-    def _picture(self, frame: av.VideoFrame, index: int) -> Picture:
-        if frame.is_corrupt:
-            raise VideoError("decode-failed", self._path, f"frame {index} is marked as corrupt")
-        if (frame.width, frame.height) != self.size:
-            width, height = self.size
-            raise VideoError(
-                "geometry-mismatch",
-                self._path,
-                f"frame {index} has {frame.width}x{frame.height} pixels among others of "
-                f"{width}x{height}",
-            )
-        place = str(self._path)
-        return frame_to_picture(frame, "rgb24", *self.size, self._converter, place)
-
     def close(self) -> None:
         """Close the file."""
         self._media.close()
@@ -202,3 +195,38 @@ class VideoFile:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def open_file_frames(
+    path: Path, *, codec: str, size: tuple[int, int], frames: int, fast_colour: bool
+) -> FrameReader:
+    """The frames of a video of others by number, as RGB of 8 bits.
+
+    Args:
+        path: The video.
+        codec: As `VideoFile` tells it.
+        size: As `VideoFile` tells it.
+        frames: How many there are.
+        fast_colour: See `Converter`.
+
+    Raises:
+        VideoError: It cannot be read.
+    """
+    return FrameReader(
+        lambda: FrameAccess(
+            path, codec=codec, frames=frames, maker=_maker_of(path, size, fast_colour)
+        ),
+        lambda: VideoFile(path, fast_colour=fast_colour),
+    )
+
+
+def _maker_of(path: Path, size: tuple[int, int], fast_colour: bool) -> PictureMaker:
+    return PictureMaker(
+        path,
+        coded_size=size,
+        picture_format="rgb24",
+        picture_size=size,
+        matrix=None,
+        full_range=False,
+        fast_colour=fast_colour,
+    )

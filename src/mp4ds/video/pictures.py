@@ -21,6 +21,7 @@ class PictureMaker:
         picture_size: Width and height of the pictures wanted.
         matrix: Matrix coefficients of the video's colours; None where the video itself tells.
         full_range: Whether its samples use their full range, unless the video itself tells.
+        fast_colour: See `Converter`.
     """
 
     def __init__(
@@ -32,12 +33,13 @@ class PictureMaker:
         picture_size: tuple[int, int],
         matrix: str | None,
         full_range: bool,
+        fast_colour: bool = False,
     ) -> None:
         self._path = path
         self.coded_size = coded_size
         self._picture_format = picture_format
         self._picture_size = picture_size
-        self._converter = Converter(matrix, source_full_range=full_range)
+        self._converter = Converter(matrix, source_full_range=full_range, fast=fast_colour)
 
     def make(self, frame: av.VideoFrame, number: int | None = None) -> Picture:
         """The picture in a frame; views of it where possible.
