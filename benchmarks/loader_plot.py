@@ -24,7 +24,7 @@ def draw(curves: Mapping[str, Sequence[Point]], path: Path) -> None:
     colors = {reader: f"C{number % 10}" for number, reader in enumerate(readers)}
     figure, axes = pyplot.subplots(figsize=(10, 6))
     for name, points in curves.items():
-        ours = _reader(name) == "mp4ds"
+        ours = _reader(name).startswith("mp4ds")
         axes.plot(
             [point[0] for point in points],
             [point[1] for point in points],
@@ -49,4 +49,4 @@ def draw(curves: Mapping[str, Sequence[Point]], path: Path) -> None:
 
 def _reader(name: str) -> str:
     codec, _, reader = name.partition(", ")
-    return reader if codec in ("av1", "h264", "png", "jpeg") or reader == "mp4ds" else name
+    return reader if codec in ("av1", "h264", "png", "jpeg") or reader.startswith("mp4ds") else name

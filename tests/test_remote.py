@@ -595,3 +595,22 @@ def test_file_urls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     mp4ds.pack((tmp_path / "a drive.bag").as_uri(), (tmp_path / "dataset").as_uri())
     assert mp4ds.validate((tmp_path / "dataset").as_uri(), deep=True) == []
     assert "a drive.bag" in (tmp_path / "dataset" / "dataset.yaml").read_text()
+
+
+def test_a_frame_costs_its_group_of_pictures(tmp_path: Path) -> None:
+    """One of 12 groups of some 250 kB, and the index."""
+    (tmp_path / "source").mkdir()
+    source = scene("mono8", frames=48, width=320, height=240)
+    (path,) = SOURCES["mcap-ros2-none"](tmp_path / "source", source)
+    mp4ds.pack(path, tmp_path / "drive", PackOptions(codec="h264", gop=4))
+    with web_server(tmp_path) as web, mp4ds.open(f"{web.url}/drive") as dataset:
+        stream = dataset[TOPIC]
+        name = f"drive/{stream.video_path.name}"
+        with mp4ds.open(tmp_path / "drive") as here:
+            expected = [here[TOPIC][number].data for number in (25, 26)]
+        size = (tmp_path / name).stat().st_size
+        assert np.array_equal(stream[25].data, expected[0])
+        first = covered(web.fetched(name))
+        assert first < 0.25 * size
+        assert np.array_equal(stream[26].data, expected[1])  # goes on from there
+        assert covered(web.fetched(name)) - first < 0.05 * size

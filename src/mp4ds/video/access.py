@@ -7,7 +7,7 @@ is the same. Where nothing is known of the references, `mp4ds.video.reader` deco
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -19,6 +19,7 @@ from av.error import FFmpegError
 from mp4ds.coded.references import UnknownStructure
 from mp4ds.errors import VideoError
 from mp4ds.layouts import Picture
+from mp4ds.remote import expect
 from mp4ds.video.chains import Chains, Group
 from mp4ds.video.pictures import PictureMaker
 from mp4ds.video.samples import SampleTable, Unindexed, read_sample_table
@@ -121,6 +122,7 @@ class FrameAccess:
             yield from self._of_group(wanted)
 
     def _of_group(self, wanted: list[int]) -> Iterator[tuple[int, Picture]]:
+        self._announce(self._chains.unknown(wanted[0], max(wanted)))
         group = self._chains.group(wanted[0], max(wanted))
         chain = group.chain(wanted)
         shown = {group.shows[sample - group.first] for sample in wanted}
@@ -149,10 +151,10 @@ class FrameAccess:
         session = self._session
         if session is None:
             return
+        missing = [number for number in chain if number not in session.fed]
+        self._announce(dict.fromkeys(session.group.pieces[number].sample for number in missing))
         sample, packet = -1, b""
-        for number in chain:
-            if number in session.fed:
-                continue
+        for number in missing:
             piece = session.group.pieces[number]
             if piece.sample != sample:
                 sample, packet = piece.sample, self._packet(piece.sample)
@@ -185,6 +187,13 @@ class FrameAccess:
         if self._codec == "av1":
             context.options = {"max_frame_delay": "1"}
         return context
+
+    def _announce(self, samples: Iterable[int]) -> None:
+        """Tell a remote file which packets are read next, and that no others are."""
+        places, sizes = self.table.places, self.table.sizes
+        ranges = [(int(places[s]), int(places[s] + sizes[s])) for s in samples]
+        if ranges:
+            expect(self._file, ranges)
 
     def _packet(self, sample: int) -> bytes:
         self._file.seek(int(self.table.places[sample]))

@@ -87,7 +87,7 @@ class Chains:
         Raises:
             UnknownStructure: What its frames refer to is not known.
         """
-        place = int(np.searchsorted(self._keys, sample, side="right")) - 1
+        place = self._place(sample)
         group = self._groups.get(place)
         if group is None:
             group = self._begin(place)
@@ -97,6 +97,19 @@ class Chains:
             self._add(group, group.first + len(group.shows))
         self._forget()
         return group
+
+    def unknown(self, sample: int, last: int) -> range:
+        """Numbers of the packets that `group` would have to read."""
+        place = self._place(sample)
+        group = self._groups.get(place)
+        first = self._first(place) if group is None else group.first + len(group.shows)
+        return range(first, last + 1)
+
+    def _place(self, sample: int) -> int:
+        return int(np.searchsorted(self._keys, sample, side="right")) - 1
+
+    def _first(self, place: int) -> int:
+        return int(self._keys[place]) if place >= 0 else 0
 
     def split(self, samples: list[int]) -> Iterator[list[int]]:
         """Packets by the groups that they are in; those of a group must follow each other."""
@@ -108,9 +121,8 @@ class Chains:
     def _begin(self, place: int) -> Group:
         count = len(self._table.sizes)
         following = self._keys[place + 1] if place + 1 < len(self._keys) else count
-        first = int(self._keys[place]) if place >= 0 else 0
         parser = ReferenceParser(self._codec, self._table.configuration)
-        return Group(first, int(following), parser)
+        return Group(self._first(place), int(following), parser)
 
     def _add(self, group: Group, sample: int) -> None:
         frames = group.parser.packet(self._read(sample), key=sample == group.first)
