@@ -20,12 +20,7 @@ from mp4ds.outputs import digest_file
 from mp4ds.recorded import RecordedMessage, as_recorded
 from mp4ds.records import Channel, Excerpt, Message, Record, Schema
 from mp4ds.remote import location
-from mp4ds.sidecar import (
-    MANIFEST_NAME,
-    MESSAGES_NAME,
-    Manifest,
-    load_manifest,
-)
+from mp4ds.sidecar import MANIFEST_NAME, MESSAGES_NAME, Manifest, load_manifest
 from mp4ds.streams import Frame, Frames, Stream, Video
 from mp4ds.sync import Sync, synchronize
 

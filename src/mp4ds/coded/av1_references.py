@@ -252,6 +252,31 @@ class Av1References:
         return tuple(number - n for n in sorted(needed, reverse=True))
 
 
+def split_temporal_unit(data: bytes | memoryview) -> list[tuple[int, int, int]]:
+    """Where the coded frames of a temporal unit are, of which `Av1References` knows what they need.
+
+    Returns:
+        For each frame the start of the sequence header before it, its own where there is none,
+        its own start, and its end. A key frame is decoded with its sequence header.
+
+    Raises:
+        Refused: The OBUs do not add up, or begin with tiles.
+    """
+    frames: list[tuple[int, int, int]] = []
+    header = -1
+    for obu in obus(data):
+        if obu.kind == _SEQUENCE_HEADER:
+            header = obu.start
+        elif obu.kind in (_FRAME, _FRAME_HEADER):
+            frames.append((obu.start if header < 0 else header, obu.start, obu.end))
+            header = -1
+        elif obu.kind == _TILE_GROUP:
+            if not frames:
+                raise UnknownStructure("its AV1 has tiles without a frame")
+            frames[-1] = (*frames[-1][:2], obu.end)
+    return frames
+
+
 def _check_layer(extension: int, layers: int) -> None:
     """Refuse a frame that decoders leave out, or show with another (5.3.3)."""
     temporal, spatial = extension >> 5, extension >> 3 & 3

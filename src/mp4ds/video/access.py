@@ -16,11 +16,15 @@ import av
 import numpy as np
 from av.error import FFmpegError
 
+from mp4ds.coded import Refused
 from mp4ds.coded.references import UnknownStructure
-from mp4ds.errors import VideoError
+from mp4ds.coded.structure import Structures
+from mp4ds.errors import FormatError, VideoError
 from mp4ds.layouts import Picture
 from mp4ds.remote import expect
-from mp4ds.video.chains import Chains, Group
+from mp4ds.sidecar import References
+from mp4ds.video.chains import Chains, Group, Piece
+from mp4ds.video.digest import packets_of_groups
 from mp4ds.video.pictures import PictureMaker
 from mp4ds.video.samples import SampleTable, Unindexed, read_sample_table
 
@@ -53,10 +57,12 @@ class FrameAccess:
         frames: Number of frames that are due; None where only the video tells.
         maker: Makes pictures of its frames.
         threads: Of the decoder. One takes the least CPU time; with more, one frame comes sooner.
+        references: What the sidecar says of them, so that no packets are read to find out.
 
     Raises:
         UnknownStructure: Its frames cannot be had one by one.
         VideoError: ``video-unreadable`` or ``frame-count``.
+        FormatError: ``references-invalid``: what the sidecar says does not fit the video.
     """
 
     def __init__(
@@ -67,6 +73,7 @@ class FrameAccess:
         frames: int | None,
         maker: PictureMaker,
         threads: int = 1,
+        references: References | None = None,
     ) -> None:
         self._path = path
         self._codec = codec
@@ -75,7 +82,8 @@ class FrameAccess:
         self._file: BinaryIO = path.open("rb")
         try:
             self.table = self._read_table(frames)
-            self._chains = Chains(self.table, codec, self._packet)
+            recorded = self._recorded(references) if references else None
+            self._chains = Chains(self.table, codec, self._packet, recorded)
         except BaseException:
             self._file.close()
             raise
@@ -103,6 +111,17 @@ class FrameAccess:
             )
         return table
 
+    def _recorded(self, references: References) -> Structures:
+        try:
+            return references.decode(packets_of_groups(self.table))
+        except ValueError as error:
+            raise self._unfit(error) from None
+
+    def _unfit(self, error: ValueError) -> FormatError:
+        return FormatError(
+            "references-invalid", self._path, f"is not what its sidecar's references {error}"
+        )
+
     def pictures_of(self, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
         """Pictures of some frames, each with its number.
 
@@ -116,6 +135,7 @@ class FrameAccess:
             UnknownStructure: What the frames refer to is not known; nothing was given of those that
                 follow.
             VideoError: ``decode-failed``, naming the frame.
+            FormatError: ``references-invalid``.
         """
         samples = self.table.order[np.asarray(numbers, np.int64)].tolist()
         for wanted in self._chains.split(samples) if samples else ():
@@ -123,7 +143,7 @@ class FrameAccess:
 
     def _of_group(self, wanted: list[int]) -> Iterator[tuple[int, Picture]]:
         self._announce(self._chains.unknown(wanted[0], max(wanted)))
-        group = self._chains.group(wanted[0], max(wanted))
+        group = self._group(wanted)
         chain = group.chain(wanted)
         shown = {group.shows[sample - group.first] for sample in wanted}
         if self._session is None or not self._session.goes_on(group, chain, shown):
@@ -144,6 +164,14 @@ class FrameAccess:
             raise self._damage(due, f"cannot be decoded: {error}") from None
         raise self._damage(due, "was not found")
 
+    def _group(self, wanted: list[int]) -> Group:
+        try:
+            return self._chains.group(wanted[0], max(wanted))
+        except UnknownStructure:
+            raise
+        except ValueError as error:
+            raise self._unfit(error) from None
+
     def _damage(self, due: Mapping[int, int], what: str) -> VideoError:
         return VideoError("decode-failed", self._path, f"frame {min(due.values())} {what}")
 
@@ -158,8 +186,7 @@ class FrameAccess:
             piece = session.group.pieces[number]
             if piece.sample != sample:
                 sample, packet = piece.sample, self._packet(piece.sample)
-            is_whole = (piece.start, piece.end) == (0, len(packet))
-            data = av.Packet(packet if is_whole else packet[piece.start : piece.end])
+            data = av.Packet(self._cut(session.group, piece, packet))
             data.pts = data.dts = sample
             session.fed.add(number)
             session.last = number
@@ -167,6 +194,15 @@ class FrameAccess:
         # some decoders hold frames back; once they gave them they take nothing more
         self._session = None
         yield from self._context.decode(None)
+
+    def _cut(self, group: Group, piece: Piece, packet: bytes) -> bytes:
+        try:
+            return self._chains.cut(group, piece, packet)
+        except Refused as error:
+            number = int(self._numbers[piece.sample])
+            raise VideoError(
+                "decode-failed", self._path, f"frame {number} is damaged: {error}"
+            ) from None
 
     def _begin(self, group: Group) -> None:
         if self._context is None:

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from mp4ds.coded.references import ReferenceParser
+from mp4ds.coded.structure import Structures, frame_bytes, read_structure
 from mp4ds.video.samples import SampleTable
 
 _KEPT_FRAMES = 50_000  # coded frames whose references are kept in memory
@@ -21,15 +22,15 @@ class Piece:
 
     Attributes:
         sample: Number of the packet.
-        start: Offset in it.
-        end: Offset after it.
+        part: Number of the coded frame in it.
         needs: Numbers in its group of the pieces that it refers to.
+        span: Its first byte in the packet and the one after its last; None until it is read.
     """
 
     sample: int
-    start: int
-    end: int
+    part: int
     needs: tuple[int, ...]
+    span: tuple[int, int] | None
 
 
 @dataclass(slots=True)
@@ -39,13 +40,14 @@ class Group:
     Attributes:
         first: Number of the key frame's packet.
         end: Number of the next group's.
+        parser: Of its packets; None where all is known without.
         pieces: In the order coded.
         shows: For each packet known the number of the piece that makes its picture come out.
     """
 
     first: int
     end: int
-    parser: ReferenceParser
+    parser: ReferenceParser | None
     pieces: list[Piece] = field(default_factory=list)
     shows: list[int] = field(default_factory=list)
 
@@ -68,15 +70,23 @@ class Chains:
         table: The video's index.
         codec: Name in the registry.
         read: Gives a packet by its number.
+        recorded: What the frames refer to, where that was written down; it fits the index.
 
     Raises:
         UnknownStructure: Nothing is known of the references of the codec.
     """
 
-    def __init__(self, table: SampleTable, codec: str, read: Callable[[int], bytes]) -> None:
+    def __init__(
+        self,
+        table: SampleTable,
+        codec: str,
+        read: Callable[[int], bytes],
+        recorded: Structures | None = None,
+    ) -> None:
         self._table = table
         self._codec = codec
         self._read = read
+        self._recorded = recorded
         self._keys = np.flatnonzero(table.sync)
         self._groups: OrderedDict[int, Group] = OrderedDict()
         ReferenceParser(codec, table.configuration)
@@ -86,6 +96,7 @@ class Chains:
 
         Raises:
             UnknownStructure: What its frames refer to is not known.
+            ValueError: What was written down of it contradicts itself.
         """
         place = self._place(sample)
         group = self._groups.get(place)
@@ -93,13 +104,29 @@ class Chains:
             group = self._begin(place)
             self._groups[place] = group
         self._groups.move_to_end(place)
-        while group.first + len(group.shows) <= last:
-            self._add(group, group.first + len(group.shows))
+        if group.parser is not None:
+            self._parse(group, group.parser, last)
         self._forget()
         return group
 
+    def cut(self, group: Group, piece: Piece, packet: bytes) -> bytes:
+        """The bytes of a piece out of its packet.
+
+        Raises:
+            Refused: It does not hold the coded frames that were written down of it.
+        """
+        if piece.span is not None:
+            start, end = piece.span
+            return packet if (start, end) == (0, len(packet)) else packet[start:end]
+        last = group.pieces[group.shows[piece.sample - group.first]]
+        return frame_bytes(
+            self._codec, packet, part=piece.part, parts=last.part + 1, key=not piece.needs
+        )
+
     def unknown(self, sample: int, last: int) -> range:
         """Numbers of the packets that `group` would have to read."""
+        if self._recorded is not None:
+            return range(0)
         place = self._place(sample)
         group = self._groups.get(place)
         first = self._first(place) if group is None else group.first + len(group.shows)
@@ -121,19 +148,28 @@ class Chains:
     def _begin(self, place: int) -> Group:
         count = len(self._table.sizes)
         following = self._keys[place + 1] if place + 1 < len(self._keys) else count
-        parser = ReferenceParser(self._codec, self._table.configuration)
-        return Group(self._first(place), int(following), parser)
+        group = Group(self._first(place), int(following), None)
+        if self._recorded is None:
+            group.parser = ReferenceParser(self._codec, self._table.configuration)
+            return group
+        text = self._recorded.texts[int(self._recorded.groups[place])]
+        for sample, frames in enumerate(read_structure(text), group.first):
+            for part, needs in enumerate(frames):
+                group.pieces.append(Piece(sample, part, needs, None))
+            group.shows.append(len(group.pieces) - 1)
+        return group
 
-    def _add(self, group: Group, sample: int) -> None:
-        frames = group.parser.packet(self._read(sample), key=sample == group.first)
-        shown = -1
-        for frame in frames:
-            number = len(group.pieces)
-            needs = tuple(number - distance for distance in frame.references)
-            group.pieces.append(Piece(sample, frame.start, frame.end, needs))
-            if frame.shown:
-                shown = number
-        group.shows.append(shown)
+    def _parse(self, group: Group, parser: ReferenceParser, last: int) -> None:
+        for sample in range(group.first + len(group.shows), last + 1):
+            frames = parser.packet(self._read(sample), key=sample == group.first)
+            shown = -1
+            for part, frame in enumerate(frames):
+                number = len(group.pieces)
+                needs = tuple(number - distance for distance in frame.references)
+                group.pieces.append(Piece(sample, part, needs, (frame.start, frame.end)))
+                if frame.shown:
+                    shown = number
+            group.shows.append(shown)
 
     def _forget(self) -> None:
         while (
