@@ -143,6 +143,7 @@ def packet() -> Document:
     ]
     kept = ("file", "layout", "codec", "width", "height", "size", "sha256")
     document["video"] = {key: document["video"][key] for key in kept}
+    document["video"]["references"] = {"structures": ["k 1 2", "k"], "groups": column()}
     document["columns"]["pts"] = {"start": 0, "step": 3003, "values": "0 -1\n"}
     return document
 
@@ -442,6 +443,10 @@ REFUSED: dict[str, list[tuple[str, Any]]] = {
           for value in (2**63, -(2**63) - 1, 0.0, "0", None, ...)),
         *(("video.codec", value) for value in ("hevc", "png", "H264", "", None, ...)),
         *(("video.pixel_format", value) for value in ("yuvj420p", "", 5, "gray")),
+        *(("video.references.structures.1", value)
+          for value in ("", "1", "k 0", "k  1", "k 1 ", "k+", "k 1\n", 1, None)),
+        *(("video.references.structures", value) for value in ([], "k", ["k"] * 257, None, ...)),
+        *(("video.references.groups", value) for value in ([0, 0], "0*2", None, ...)),
         ("video.codec", "ffv1"),
         *(("body", value) for value in ("pixels", "png", "rvl", "jpeg", ...)),
         *(("video.parameters", value) for value in ({"bits": 12, "shift": 0}, [], 5)),

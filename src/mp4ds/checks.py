@@ -30,6 +30,7 @@ from mp4ds.sidecar import (
     schema_text,
 )
 from mp4ds.sidecar.io import model_for, model_problems
+from mp4ds.streams.facts import wrong_facts
 
 
 @dataclass(frozen=True)
@@ -245,20 +246,13 @@ def _validate_stream(path: Path, deep: bool, report: Callable[[str], None]) -> l
 def _check_video_file(
     stream: Stream, deep: bool, report: Callable[[str], None]
 ) -> Iterator[Problem]:
-    video, path = stream.sidecar.video, stream.video_path
+    path = stream.video_path
     if not path.is_file():
         return  # reported when it is opened
-    size = path.stat().st_size
-    if video.size is not None and size != video.size:
-        yield Problem(
-            "size-mismatch", str(path), f"has {size} bytes where its sidecar says {video.size}"
-        )
-    elif deep and video.sha256 is not None:
+    if deep:
         report(f"hashing {path.name}")
-        if digest_file(path)[1] != video.sha256:
-            yield Problem(
-                "hash-mismatch", str(path), "does not have the SHA-256 that its sidecar says"
-            )
+    for error in wrong_facts(path, stream.sidecar.video, deep=deep):
+        yield Problem(error.code, error.place, error.problem)
 
 
 def _check_frames(stream: Stream, report: Callable[[str], None]) -> Iterator[Problem]:

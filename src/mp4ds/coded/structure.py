@@ -9,6 +9,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,10 @@ Needs = tuple[int, ...]
 """Numbers of the coded frames that one refers to, counted from its key frame."""
 
 
+class StructureError(ValueError):
+    """A structure contradicts itself; the text says how."""
+
+
 @dataclass(frozen=True, eq=False)
 class Structures:
     """The structures of a video's groups of pictures.
@@ -52,6 +57,24 @@ class Structures:
     texts: Sequence[str]
     groups: NDArray[np.int64]
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether every frame needs the one before it, so that none can be left out."""
+        return all(
+            frame.startswith("1,") or frame == "1"
+            for text in self.texts
+            for frame in text.replace("+", " ").split(" ")[1:]
+        )
+
+    def check(self) -> None:
+        """Refuse a structure that contradicts itself.
+
+        Raises:
+            StructureError: One does; see `read_structure`.
+        """
+        for text in self.texts:
+            read_structure(text)
+
     def mismatch(self, packets: NDArray[np.int64]) -> str:
         """Why these are not the structures of a video, in words; empty if they may be.
 
@@ -59,15 +82,17 @@ class Structures:
             packets: Of each group, shape (groups,).
         """
         if len(self.groups) != len(packets):
-            return f"are of {len(self.groups)} groups of pictures where there are {len(packets)}"
+            return (
+                f"they are of {len(self.groups)} groups of pictures, of which it has {len(packets)}"
+            )
         if len(self.groups) and not 0 <= self.groups.min() <= self.groups.max() < len(self.texts):
-            return "name a structure that is not there"
+            return "they name a structure that is not there"
         due = np.array([text.count(" ") + 1 for text in self.texts], np.int64)[self.groups]
         wrong = np.flatnonzero(due != packets)
         if len(wrong):
             first = int(wrong[0])
             return (
-                f"have {due[first]} packets in group of pictures {first}, "
+                f"they are of {due[first]} packets in group of pictures {first}, "
                 f"which has {packets[first]}"
             )
         return ""
@@ -80,7 +105,7 @@ def read_structure(text: str) -> list[list[Needs]]:
         text: Matches `STRUCTURE_PATTERN`.
 
     Raises:
-        ValueError: A frame needs one before the key frame, or distances do not increase.
+        StructureError: A frame needs one before the key frame, or distances do not increase.
     """
     packets: list[list[Needs]] = []
     number = 0
@@ -88,10 +113,10 @@ def read_structure(text: str) -> list[list[Needs]]:
         frames: list[Needs] = []
         for frame in packet.split("+"):
             distances = () if frame == _KEY else tuple(map(int, frame.split(",")))
-            if any(one >= other for one, other in zip(distances, distances[1:], strict=False)):
-                raise ValueError(f"the distances {frame[:40]} do not increase")
+            if any(one >= other for one, other in pairwise(distances)):
+                raise StructureError(f"the distances {frame[:40]} do not increase")
             if distances and distances[-1] > number:
-                raise ValueError(
+                raise StructureError(
                     f"packet {len(packets)} refers to {distances[-1]} frames back, "
                     f"before the key frame"
                 )
@@ -126,7 +151,6 @@ class StructureRecorder:
         self._codec = codec
         self._configuration = configuration
         self._is_known = codec in RECORDED_CODECS
-        self._saves = False
         self._parser: ReferenceParser | None = None
         self._packets: list[str] = []
         self._chars = 0
@@ -153,7 +177,6 @@ class StructureRecorder:
         except UnknownStructure:
             self._give_up()
             return
-        self._saves |= any(1 not in f.references for f in frames[1 if key else 0 :])
         self._packets.append(text)
         self._chars += len(text) + 1
         if self._chars > MAX_STRUCTURE_CHARS:
@@ -176,14 +199,14 @@ class StructureRecorder:
         """What was found.
 
         Returns:
-            None where the references of a frame are not known, where the structures are too many
-            or too long, and where every frame needs all those before it, so that nothing is gained.
+            None where the references of a frame are not known, or the structures are too many or
+            too long.
         """
         try:
             self._end_group()
         except UnknownStructure:
             self._give_up()
-        if not (self._is_known and self._saves and self._groups):
+        if not (self._is_known and self._groups):
             return None
         return Structures(tuple(self._numbers), np.array(self._groups, np.int64))
 

@@ -90,6 +90,15 @@ class Segments:
             self._data.move_to_end(start)
             return start, data
 
+    def hold(self, start: int, end: int) -> bool:
+        """Whether all bytes of a range are kept."""
+        while start < end:
+            found = self.at(start)
+            if found is None:
+                return False
+            start = found[0] + len(found[1])
+        return True
+
     def next_start(self, place: int, default: int) -> int:
         """Where the next kept bytes begin after a place."""
         with self._lock:
@@ -123,7 +132,8 @@ class RemoteFile(io.RawIOBase):
     def expect(self, ranges: Iterable[Range]) -> None:
         """See `mp4ds.remote.expect`; replaces what was announced before."""
         self._drop_plan()
-        self._plan = _Plan(ranges, self._load)
+        missing = (span for span in ranges if not self._segments.hold(*span))
+        self._plan = _Plan(missing, self._load)
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Read so many bytes, or all that are left."""

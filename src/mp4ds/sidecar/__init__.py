@@ -36,6 +36,7 @@ from mp4ds.sidecar.models import (
     StreamSidecar,
     Video,
 )
+from mp4ds.sidecar.references import References
 
 __all__ = [
     "FORMAT_VERSION",
@@ -55,6 +56,7 @@ __all__ = [
     "LossEntry",
     "Manifest",
     "PngFile",
+    "References",
     "Roi",
     "SchemaModel",
     "Source",

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mp4ds.sidecar.fields import Int64, Model
-from mp4ds.stamps import decode_column, encode_column
+from mp4ds.stamps import decode_column
 
 
 class Column(Model):

@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from mp4ds.coded import PACKET_CODECS, PNG_ENCODINGS
+from mp4ds.coded.structure import RECORDED_CODECS, SPLIT_CODECS
 from mp4ds.layouts import (
     ENCODINGS,
     LAYOUTS,
@@ -42,6 +43,7 @@ from mp4ds.sidecar.fields import (
     Version,
     decode_base64,
 )
+from mp4ds.sidecar.references import References
 from mp4ds.wire import WIRES
 
 _GREY_OR_COLOUR = frozenset({"mono8", "rgb8"})
@@ -238,6 +240,9 @@ class Video(Model):
     options: dict[str, str] = Field(default_factory=dict, description="The encoder's options.")
     size: Size | None = Field(None, description="Bytes.")
     sha256: Sha256 | None = Field(None, description="Of the file.")
+    references: References | None = Field(
+        None, description="What its frames refer to; absent: the packets tell."
+    )
 
     @property
     def matrix(self) -> str | None:
@@ -260,7 +265,15 @@ class Video(Model):
         if self.pixel_format not in (*PIXEL_FORMATS, None):
             known = ", ".join(PIXEL_FORMATS)
             raise ValueError(f"pixel format {self.pixel_format!r} is not one of {known}")
+        if self.references is not None:
+            self._check_references(self.references)
         return self
+
+    def _check_references(self, references: References) -> None:
+        if self.codec not in RECORDED_CODECS:
+            raise ValueError(f"a video of codec {self.codec} has no references")
+        if references.split and self.codec not in SPLIT_CODECS:
+            raise ValueError(f"a packet of codec {self.codec} holds one frame")
 
 
 class Roi(Model):

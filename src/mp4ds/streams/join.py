@@ -9,7 +9,6 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.outputs import digest_file
 from mp4ds.sidecar import (
     Calibration,
     CameraInfo,
@@ -21,10 +20,10 @@ from mp4ds.sidecar import (
 from mp4ds.sidecar.fields import MAX_CAMERA_INFOS, MAX_FRAMES, MAX_VARIANTS
 from mp4ds.stamps import PresentationClock
 from mp4ds.streams.columns import columns_model, digests_model
+from mp4ds.streams.facts import FACTS, video_facts
 from mp4ds.video import join_segments, read_sample_entry
 
 _ModelT = TypeVar("_ModelT")
-_FACTS = ("file", "size", "sha256")  # of a video; all else says how it was made
 
 
 class StreamJoin:
@@ -108,8 +107,7 @@ class StreamJoin:
         path = folder / f"{stem}.mp4"
         columns = self._columns.to_model()
         join_segments(self._videos, self._columns.ticks(), path)
-        size, sha256 = digest_file(path)
-        facts = {"file": path.name, "size": size, "sha256": sha256}
+        facts = video_facts(path, self._first.video.codec)
         return self._first.model_copy(
             update={
                 "frames": len(self._columns),
@@ -140,7 +138,7 @@ class StreamJoin:
 
 def _identity(sidecar: StreamSidecar) -> tuple[object, ...]:
     """What all segments of a stream have in common."""
-    video = sidecar.video.model_dump(exclude=set(_FACTS))
+    video = sidecar.video.model_dump(exclude=set(FACTS))
     return (
         *(sidecar.profile, sidecar.stamps, sidecar.channel, sidecar.wire, sidecar.body),
         *(sidecar.image, video, sidecar.digests is None),

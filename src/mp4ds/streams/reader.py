@@ -162,6 +162,7 @@ class Stream(Frames):
             matrix=video.matrix,
             full_range=video.full_range,
             fast_colour=self._fast_colour,
+            references=video.references,
         )
 
     def _pictures(self) -> Iterator[Picture]:

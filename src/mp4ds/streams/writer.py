@@ -10,7 +10,6 @@ from pathlib import Path
 import xxhash
 
 from mp4ds.coded import PngRecipe, zlib_fingerprint
-from mp4ds.outputs import digest_file
 from mp4ds.records import Channel, Message
 from mp4ds.sidecar import (
     CameraInfo,
@@ -25,6 +24,7 @@ from mp4ds.sidecar.fields import FORMAT_VERSION, MAX_FRAMES
 from mp4ds.sidecar.models import PngFile
 from mp4ds.stamps import PresentationClock
 from mp4ds.streams.columns import ColumnsWriter, Unsuited, digests_model
+from mp4ds.streams.facts import video_facts
 from mp4ds.streams.headers import Heads
 from mp4ds.streams.look import Seen
 from mp4ds.streams.tracks import StreamSettings, TrackPlan
@@ -124,7 +124,6 @@ class StreamWriter:
             OSError: The disk refused.
         """
         self._track.close()
-        size, sha256 = digest_file(self.video_path)
         key = self._key
         sidecar = StreamSidecar(
             mp4ds=FORMAT_VERSION,
@@ -142,15 +141,18 @@ class StreamWriter:
                 is_bigendian=key.is_bigendian,
             ),
             headers=self._heads.items,
-            video=Video(
-                file=self.video_path.name, **self._track.describe(), size=size, sha256=sha256
-            ),
+            video=self._video(),
             camera_info=self.camera_info,
             columns=self._columns.to_model(),
             digests=digests_model(self._digests) if self._plan.exact else None,
         )
         self.sidecar_path.write_bytes(dump_document(sidecar))
         return sidecar
+
+    def _video(self) -> Video:
+        made = self._track.describe()
+        facts = video_facts(self.video_path, made["codec"])
+        return Video.model_validate({**made, **facts})
 
     def abandon(self) -> None:
         """Stop writing; the caller removes the files."""

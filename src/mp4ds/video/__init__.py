@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from mp4ds.video.codecs import Recipe, check_codec, recipe_for
 from mp4ds.video.decoder import VideoDecoder
+from mp4ds.video.digest import VideoDigest, digest_video, packets_in_groups
 from mp4ds.video.encoder import VideoEncoder, tool_versions
 from mp4ds.video.file import VideoFile, open_file_frames
 from mp4ds.video.images import ImageFile
@@ -27,15 +28,18 @@ __all__ = [
     "Renderer",
     "SegmentsDifferError",
     "VideoDecoder",
+    "VideoDigest",
     "VideoEncoder",
     "VideoFile",
     "check_codec",
     "choose",
+    "digest_video",
     "encoder_bytes",
     "encoding_as",
     "join_segments",
     "open_file_frames",
     "open_frames",
+    "packets_in_groups",
     "read_sample_entry",
     "recipe_for",
     "shown_format",

@@ -18,7 +18,7 @@ from av.error import FFmpegError
 
 from mp4ds.coded import Refused
 from mp4ds.coded.references import UnknownStructure
-from mp4ds.coded.structure import Structures
+from mp4ds.coded.structure import StructureError, Structures
 from mp4ds.errors import FormatError, VideoError
 from mp4ds.layouts import Picture
 from mp4ds.remote import expect
@@ -119,7 +119,7 @@ class FrameAccess:
 
     def _unfit(self, error: ValueError) -> FormatError:
         return FormatError(
-            "references-invalid", self._path, f"is not what its sidecar's references {error}"
+            "references-invalid", self._path, f"does not fit the references in its sidecar: {error}"
         )
 
     def pictures_of(self, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
@@ -167,9 +167,7 @@ class FrameAccess:
     def _group(self, wanted: list[int]) -> Group:
         try:
             return self._chains.group(wanted[0], max(wanted))
-        except UnknownStructure:
-            raise
-        except ValueError as error:
+        except StructureError as error:
             raise self._unfit(error) from None
 
     def _damage(self, due: Mapping[int, int], what: str) -> VideoError:
@@ -216,6 +214,8 @@ class FrameAccess:
         if self.table.configuration:
             context.extradata = self.table.configuration
         context.width, context.height = self.table.width, self.table.height
+        if self.table.colour:
+            self.table.colour.apply(context)
         context.thread_count = self._threads
         context.thread_type = "SLICE"
         # concealed damage would depend on which frames were decoded before

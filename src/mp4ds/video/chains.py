@@ -96,7 +96,7 @@ class Chains:
 
         Raises:
             UnknownStructure: What its frames refer to is not known.
-            ValueError: What was written down of it contradicts itself.
+            StructureError: What was written down of it contradicts itself.
         """
         place = self._place(sample)
         group = self._groups.get(place)

@@ -26,7 +26,7 @@ class VideoDigest:
     Attributes:
         size: Bytes.
         sha256: Hexadecimal.
-        structures: What its frames refer to, where that is known and worth telling.
+        structures: What its frames refer to, where that is known.
     """
 
     size: int
@@ -61,6 +61,18 @@ def digest_video(path: Path, codec: str) -> VideoDigest:
                 recorder.add(data, key=bool(table.sync[number]))
                 number += 1
     return VideoDigest(size, digest.hexdigest(), recorder.finish())
+
+
+def packets_in_groups(path: Path) -> NDArray[np.int64]:
+    """How many packets each group of pictures of a video has, shape (groups,).
+
+    Raises:
+        VideoError: Its index is damaged.
+        Unindexed: Its index is not read.
+        OSError: It cannot be read.
+    """
+    with path.open("rb") as file:
+        return packets_of_groups(read_sample_table(file, path.stat().st_size, str(path)))
 
 
 def packets_of_groups(table: SampleTable) -> NDArray[np.int64]:

@@ -9,6 +9,7 @@ from typing import Protocol
 from mp4ds.coded.references import UnknownStructure
 from mp4ds.errors import VideoError
 from mp4ds.layouts import Picture
+from mp4ds.sidecar import References
 from mp4ds.video.access import FrameAccess
 from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.pictures import PictureMaker
@@ -99,11 +100,15 @@ def open_frames(
     matrix: str | None,
     full_range: bool,
     fast_colour: bool = False,
+    references: References | None = None,
 ) -> FrameReader:
     """The frames of a video of which all is known that `VideoDecoder` asks for.
 
+    `references` is what its sidecar tells of what its frames refer to.
+
     Raises:
         VideoError: As for `VideoDecoder`.
+        FormatError: ``references-invalid``: they do not fit the video.
     """
 
     def open_access() -> FrameAccess:
@@ -116,7 +121,7 @@ def open_frames(
             full_range=full_range,
             fast_colour=fast_colour,
         )
-        return FrameAccess(path, codec=codec, frames=frames, maker=maker)
+        return FrameAccess(path, codec=codec, frames=frames, maker=maker, references=references)
 
     def open_decoder() -> VideoDecoder:
         return VideoDecoder(

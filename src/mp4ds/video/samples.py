@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import VideoError
 from mp4ds.video.boxes import Box, DamagedBoxError, boxes
 from mp4ds.video.sample_entry import SampleEntry, parse_descriptions
+from mp4ds.video.track_colour import TrackColour, track_colour
 
 Integers = NDArray[np.int64]
 
@@ -54,6 +55,7 @@ class SampleTable:
             ``vp09``, ``FFV1``, ``mp4v``, ...
         width: Columns, as the sample entry says.
         height: Rows, as the sample entry says.
+        colour: What the track says of its colours, if anything.
         configuration: Contents of avcC, hvcC, av1C, vpcC or glbl; empty if there is none.
         timescale: Ticks per second.
         places: Byte of the file where each sample begins, in decoding order. All arrays but
@@ -69,6 +71,7 @@ class SampleTable:
     codec: str
     width: int
     height: int
+    colour: TrackColour | None
     configuration: bytes
     timescale: int
     places: Integers
@@ -218,6 +221,7 @@ def _parse_track(movie: _Movie, track: Box, file_size: int) -> SampleTable:
         codec=entry.codec,
         width=entry.width,
         height=entry.height,
+        colour=track_colour(entry),
         configuration=_configuration(entry),
         timescale=timescale,
         places=places,

@@ -1,0 +1,475 @@
+"""What sidecars tell of references: the chains that the packets tell, and no others are read."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from contextlib import closing
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mp4ds
+from in_parts import InlineEngine
+from mp4ds import yamlio
+from mp4ds.coded import structure
+from mp4ds.coded.coded_frame import CodedFrame
+from mp4ds.coded.references import UnknownStructure
+from mp4ds.coded.structure import (
+    RECORDED_CODECS,
+    StructureRecorder,
+    Structures,
+    frame_bytes,
+    read_structure,
+    write_packet,
+)
+from mp4ds.errors import FormatError, VideoError
+from mp4ds.sidecar import References, load_stream
+from mp4ds.streams import Stream
+from mp4ds.streams.facts import video_facts
+from mp4ds.video import digest_video
+from mp4ds.video.chains import Chains
+from mp4ds.video.digest import packets_of_groups
+from mp4ds.video.samples import SampleTable, read_sample_table
+from remote_servers import web_server
+from sources import SOURCES, scene
+from test_access import Counting, Samples, written
+from test_references import FRAMES, RECIPES, REFUSED, svt
+
+TOPIC = "/cam/image_raw"
+HIERARCHICAL = svt(10, gop=20)
+
+Pieces = list[tuple[int, bytes]]
+
+
+def index(path: Path) -> SampleTable:
+    with path.open("rb") as file:
+        return read_sample_table(file, path.stat().st_size, str(path))
+
+
+def chains_of(path: Path, codec: str, recorded: Structures | None) -> list[Pieces]:
+    """For every packet the bytes that a decoder is given to show its picture."""
+    table, data = index(path), path.read_bytes()
+
+    def read(sample: int) -> bytes:
+        return data[table.places[sample] :][: table.sizes[sample]]
+
+    chains = Chains(table, codec, read, recorded)
+    found = []
+    for sample in range(len(table.sizes)):
+        group = chains.group(sample, sample)
+        pieces = [group.pieces[number] for number in group.chain([sample])]
+        found.append([(p.sample, chains.cut(group, p, read(p.sample))) for p in pieces])
+    return found
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_recorded_and_parsed_chains_are_the_same(name: str, tmp_path: Path) -> None:
+    recipe = RECIPES[name]
+    path = written(tmp_path, recipe)
+    data = path.read_bytes()
+    found = digest_video(path, recipe.codec)
+    assert (found.size, found.sha256) == (len(data), hashlib.sha256(data).hexdigest())
+    assert (found.structures is not None) == (recipe.codec in RECORDED_CODECS)
+    if found.structures is not None:
+        packets = packets_of_groups(index(path))
+        assert packets.sum() == FRAMES
+        again = References.from_structures(found.structures).decode(packets)
+        assert list(again.texts) == list(found.structures.texts)
+        again.check()
+        expected = chains_of(path, recipe.codec, None)
+        assert chains_of(path, recipe.codec, again) == expected
+        parts = [len(read_structure(again.texts[g])[0]) for g in again.groups]
+        assert parts == [1] * len(parts)  # a key frame's packet
+        before = [
+            count
+            for number in again.groups
+            for count in accumulate(map(len, read_structure(again.texts[number])))
+        ]
+        is_plain = [len(chain) for chain in expected] == before
+        assert (video_facts(path, recipe.codec)["references"] is None) == again.is_plain
+        assert again.is_plain == is_plain
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_unknown_structures_are_not_recorded(name: str, tmp_path: Path) -> None:
+    path = written(tmp_path, REFUSED[name])
+    assert digest_video(path, REFUSED[name].codec).structures is None
+
+
+def test_what_is_no_video_is_hashed(tmp_path: Path) -> None:
+    path = tmp_path / "v.mp4"
+    path.write_bytes(b"\0\0\0\x08moov" * 3)
+    found = digest_video(path, "av1")
+    assert (found.size, found.structures) == (24, None)
+    assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_no_packet_is_read_but_those_of_the_chain(tmp_path: Path) -> None:
+    path = written(tmp_path, HIERARCHICAL)
+    references = video_facts(path, "av1")["references"]
+    chains = chains_of(path, "av1", None)
+    maker: Any = Samples()
+    for number in range(FRAMES):
+        pictures = []
+        for told in (references, None):
+            access = Counting(path, codec="av1", frames=FRAMES, maker=maker, references=told)
+            pictures.append(list(access.pictures_of([number])))
+            if told is not None:
+                assert access.reads == len({sample for sample, _ in chains[number]})
+            access.close()
+        assert pictures[0] == pictures[1]
+
+
+# ---------------------------------------------------------------- structures
+
+
+def frame(*references: int, shown: bool = True) -> CodedFrame:
+    return CodedFrame(0, 1, references, shown=shown, existing=False)
+
+
+@pytest.mark.parametrize(
+    ("frames", "text"),
+    [
+        ([frame()], "k"),
+        ([frame(1, 12)], "1,12"),
+        ([frame(4, shown=False), frame(shown=False), frame(1, 2)], "4+k+1,2"),
+    ],
+)
+def test_a_packet(frames: list[CodedFrame], text: str) -> None:
+    assert write_packet(frames) == text
+
+
+@pytest.mark.parametrize(
+    "frames", [[], [frame(shown=False)], [frame(), frame(1)], [frame(), frame(1, shown=False)]]
+)
+def test_a_packet_shows_its_last_frame(frames: list[CodedFrame]) -> None:
+    with pytest.raises(UnknownStructure):
+        write_packet(frames)
+
+
+def test_needs_are_counted_from_the_key_frame() -> None:
+    assert read_structure("k 1+2+1,3 1 k+2,4") == [[()], [(0,), (0,), (2, 0)], [(3,)], [(), (4, 2)]]
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("k 2", "packet 1 refers to 2 frames back, before the key frame"),
+        ("k 1 1+4", "packet 2 refers to 4"),
+        ("k 1 1,1", "do not increase"),
+        ("k 1 2,1", "do not increase"),
+    ],
+)
+def test_structures_that_contradict_themselves(text: str, problem: str) -> None:
+    with pytest.raises(ValueError, match=problem):
+        read_structure(text)
+
+
+@pytest.mark.parametrize(
+    ("texts", "plain"),
+    [(["k 1 1,2"], True), (["k"], True), (["k 1", "k 1 2"], False), (["k 1+2+1"], False),
+     (["k 1 12"], False), (["k 1 k"], False)],
+)  # fmt: skip
+def test_where_every_frame_needs_the_one_before(texts: list[str], plain: bool) -> None:
+    assert Structures(texts, np.zeros(1, np.int64)).is_plain == plain
+
+
+@pytest.mark.parametrize(
+    ("bound", "most"), [("MAX_STRUCTURES", 1), ("MAX_STRUCTURE_CHARS", 40), ("MAX_CHARS", 90)]
+)
+def test_too_many_structures_are_not_recorded(
+    bound: str, most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = written(tmp_path, HIERARCHICAL)
+    assert digest_video(path, "av1").structures is not None
+    monkeypatch.setattr(structure, bound, most)
+    assert digest_video(path, "av1").structures is None
+
+
+def test_recording_begins_at_a_key_frame() -> None:
+    recorder = StructureRecorder("h264", b"")
+    assert recorder.finish() is None
+    recorder.add(b"", key=False)
+    assert recorder.finish() is None
+
+
+def test_a_packet_with_other_frames_than_told(tmp_path: Path) -> None:
+    path = written(tmp_path, HIERARCHICAL)
+    table = index(path)
+    second = path.read_bytes()[table.places[1] :][: table.sizes[1]]
+    count = len(read_structure(digest_video(path, "av1").structures.texts[0])[1])  # type: ignore[union-attr]
+    assert count > 1
+    pieces = [
+        frame_bytes("av1", second, part=part, parts=count, key=False) for part in range(count)
+    ]
+    assert b"".join(pieces) == second
+    with pytest.raises(UnknownStructure, match=f"holds {count} coded frames, 1 are due"):
+        frame_bytes("av1", second, part=0, parts=1, key=False)
+
+
+# ---------------------------------------------------------------- in sidecars
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of lossy AV1, of four groups of pictures, with its sidecar."""
+    folder = tmp_path_factory.mktemp("packed")
+    recorded = scene("rgb8", frames=50, width=96, height=64)
+    (path,) = SOURCES["mcap-ros2-none"](folder, recorded)
+    mp4ds.pack(path, folder / "d", mp4ds.PackOptions(quality="visual", codec="av1", gop=16))
+    return folder / "d"
+
+
+def stream_of(dataset: Path) -> Path:
+    return dataset / "cam_image_raw.yaml"
+
+
+def test_a_dataset_with_references(packed: Path) -> None:
+    sidecar = load_stream(stream_of(packed))
+    references = sidecar.video.references
+    assert references is not None
+    assert references.groups.decode(4).tolist() == [0, 0, 0, 1]
+    assert references.split
+    assert mp4ds.validate(packed, deep=True) == []
+
+
+@pytest.mark.parametrize("encoding", ["mono8", "rgb8", "16UC1"])
+def test_lossless_streams_have_nothing_to_tell(encoding: str, tmp_path: Path) -> None:
+    (path,) = SOURCES["mcap-ros2-none"](tmp_path, scene(encoding, frames=12))
+    mp4ds.pack(path, tmp_path / "d")
+    assert load_stream(stream_of(tmp_path / "d")).video.references is None
+
+
+def test_joined_parts_tell_what_the_joined_packets_tell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine = InlineEngine()
+    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: engine)
+    recorded = scene("rgb8", frames=40, width=96, height=64)
+    (path,) = SOURCES["mcap-ros2-none"](tmp_path, recorded)
+    options = mp4ds.PackOptions(quality="visual", codec="av1", gop=8, window=4)
+    mp4ds.pack(path, tmp_path / "d", options)
+    assert len(engine.ran) > 2
+    video = load_stream(stream_of(tmp_path / "d")).video
+    assert video.references is not None
+    assert video.references == video_facts(tmp_path / "d" / video.file, "av1")["references"]
+    assert mp4ds.validate(tmp_path / "d", deep=True) == []
+
+
+Change = Callable[[dict[str, Any]], None]
+
+
+def edited(packed: Path, folder: Path, change: Change) -> Path:
+    """The sidecar with other references, beside its video."""
+    document = yamlio.load(stream_of(packed).read_bytes(), "here")
+    change(document["video"])
+    path = folder / "cam_image_raw.yaml"
+    path.write_bytes(yamlio.dump(document))
+    (folder / "cam_image_raw.mp4").write_bytes((packed / "cam_image_raw.mp4").read_bytes())
+    return path
+
+
+def setting(structures: list[str] | None = None, groups: list[int] | None = None) -> Change:
+    def change(video: dict[str, Any]) -> None:
+        references = video["references"]
+        if structures is not None:
+            references["structures"] = structures
+        if groups is not None:
+            residuals = " ".join(str(b - a) for a, b in pairwise(groups))
+            references["groups"] = {"start": groups[0], "step": 0, "values": f"{residuals}\n"}
+
+    return change
+
+
+def replacing(old: str, new: str) -> Change:
+    def change(video: dict[str, Any]) -> None:
+        structures = video["references"]["structures"]
+        assert old in structures[0]
+        structures[0] = structures[0].replace(old, new, 1)
+
+    return change
+
+
+def without(video: dict[str, Any]) -> None:
+    del video["references"]
+
+
+def test_without_them_all_is_the_same(packed: Path, tmp_path: Path) -> None:
+    path = edited(packed, tmp_path, without)
+    assert mp4ds.validate(path, deep=True) == []
+    with mp4ds.open(packed) as dataset, mp4ds.open(path) as other:
+        (one,), (two,) = dataset.streams, other.streams
+        every = [frame.data for frame in one]
+        for number in (49, 3, 17, 16, 30):
+            assert np.array_equal(one[number].data, every[number])
+            assert np.array_equal(two[number].data, every[number])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "1", "k  1", "k 1 ", " k", "k 0", "k 01", "k 1,", "k +1", "k -1", "k 1234567"),
+        *("k\n1", "K 1", "k 1;1", "k 1\n", "k \u0661"),
+    ],
+)
+def test_what_is_no_structure(text: str, packed: Path, tmp_path: Path) -> None:
+    path = edited(packed, tmp_path, setting([text, "k"]))
+    assert {problem.code for problem in mp4ds.validate(path)} <= {"schema-invalid", "model-invalid"}
+    assert mp4ds.validate(path)
+    with pytest.raises(FormatError):
+        Stream(path)
+
+
+@pytest.mark.parametrize(
+    ("structures", "code"),
+    [
+        ([], "schema-invalid"),
+        (["k"] * 257, "schema-invalid"),
+        (["k" + " 1" * 2**15], "schema-invalid"),
+        (["k" + " 1" * (2**15 - 1)] * 17, "model-invalid"),
+    ],
+)
+def test_too_much(structures: list[str], code: str, packed: Path, tmp_path: Path) -> None:
+    path = edited(packed, tmp_path, setting(structures))
+    assert [problem.code for problem in mp4ds.validate(path)] == [code]
+
+
+@pytest.mark.parametrize(
+    ("changed", "problem"),
+    [
+        ({"codec": "h264"}, "a packet of codec h264 holds one frame"),
+        ({"codec": "ffv1"}, "a video of codec ffv1 has no references"),
+    ],
+)
+def test_references_of_another_codec(
+    changed: dict[str, Any], problem: str, packed: Path, tmp_path: Path
+) -> None:
+    path = edited(packed, tmp_path, lambda video: video.update(changed))
+    (found,) = mp4ds.validate(path)
+    assert (found.code, problem in found.message) == ("model-invalid", True)
+
+
+PLAIN = "k" + " 1" * 15
+MISFITS: dict[str, tuple[Change, str]] = {
+    "too-few-groups": (setting(groups=[0, 0, 1]), "column of groups"),
+    "too-many-groups": (setting(groups=[0, 0, 0, 0, 1]), "column of groups"),
+    "no-such-structure": (setting(groups=[0, 0, 0, 2]), "a structure that is not there"),
+    "negative": (setting(groups=[0, 0, 0, -1]), "a structure that is not there"),
+    "swapped": (setting(groups=[1, 0, 0, 1]), "2 packets in group of pictures 0, which has 16"),
+    "packet-missing": (setting([PLAIN[:-2], "k 1"]), "15 packets in group of pictures 0"),
+    "packet-more": (setting([PLAIN + " 1", "k 1"]), "17 packets in group of pictures 0"),
+}
+
+
+@pytest.mark.parametrize("name", MISFITS)
+def test_references_of_another_video(name: str, packed: Path, tmp_path: Path) -> None:
+    change, problem = MISFITS[name]
+    path = edited(packed, tmp_path, change)
+    (found,) = mp4ds.validate(path)
+    assert found.code == "references-invalid"
+    assert problem in found.message
+    with closing(Stream(path)) as stream, pytest.raises(FormatError, match=problem) as raised:
+        stream.get([3])
+    assert raised.value.code == "references-invalid"
+
+
+@pytest.mark.parametrize(
+    "change", [replacing("k 1", "k 2"), replacing("+1,2,", "+2,1,")], ids=["before", "order"]
+)
+def test_distances_that_contradict_themselves(change: Change, packed: Path, tmp_path: Path) -> None:
+    path = edited(packed, tmp_path, change)
+    assert [problem.code for problem in mp4ds.validate(path)] == ["references-invalid"]
+    with closing(Stream(path)) as stream:
+        with pytest.raises(FormatError, match="does not fit the references") as raised:
+            stream.get([3])
+        assert raised.value.code == "references-invalid"
+        assert stream.get([49])[0].index == 49  # of another group
+
+
+def with_a_frame_less(video: dict[str, Any]) -> None:
+    structures = video["references"]["structures"]
+    packets = structures[0].split(" ")
+    last = max(number for number, packet in enumerate(packets) if "+" in packet)
+    packets[last] = packets[last].rpartition("+")[0]
+    structures[0] = " ".join([*packets[: last + 1], *["1"] * len(packets[last + 1 :])])
+
+
+LIES: dict[str, Change] = {
+    "plain": setting([PLAIN, "k 1"]),
+    "all-key": setting(["k" + " k" * 15, "k k"]),
+    "more-frames": replacing("k 1", "k 1+1"),
+    "fewer-frames": with_a_frame_less,
+    "too-little": replacing("+1,2", "+2"),
+    "too-much": replacing(" 2 ", " 1,2 "),
+    "many": setting(["+".join(["k"] + ["1"] * 9000) + PLAIN[1:], "k 1"]),
+}
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_lies_are_found_and_do_no_harm(name: str, packed: Path, tmp_path: Path) -> None:
+    path = edited(packed, tmp_path, LIES[name])
+    assert mp4ds.validate(path) == []
+    (found,) = mp4ds.validate(path, deep=True)
+    assert found.code == "references-invalid"
+    assert "group of pictures 0 tell others" in found.message
+    codes, right = set(), 0
+    with closing(Stream(path)) as stream:
+        every = [frame.data for frame in stream]
+        for number in range(48):
+            try:
+                (one,) = stream.get([number])
+            except VideoError as error:
+                codes.add(error.code)
+            else:
+                assert one.data.shape == every[number].shape
+                right += np.array_equal(one.data, every[number])
+    assert codes <= {"decode-failed"}
+    assert right == 48 or name != "too-much"
+    assert right < 48 or name not in ("all-key", "more-frames", "fewer-frames", "many")
+
+
+def test_damage_is_told_as_such(packed: Path, tmp_path: Path) -> None:
+    path = edited(packed, tmp_path, lambda _: None)
+    table = index(path.with_suffix(".mp4"))
+    data = bytearray(path.with_suffix(".mp4").read_bytes())
+    data[table.places[17]] ^= 0x80
+    path.with_suffix(".mp4").write_bytes(data)
+    codes = [problem.code for problem in mp4ds.validate(path, deep=True)]
+    assert codes[0] == "hash-mismatch"
+    assert "references-invalid" not in codes
+    with (
+        closing(Stream(path)) as stream,
+        pytest.raises(FormatError, match=r"frame 17 is damaged") as raised,
+    ):
+        stream.get([17])
+    assert raised.value.code == "decode-failed"
+
+
+# ---------------------------------------------------------------- at URLs
+
+
+def test_what_is_fetched_of_a_remote_video(tmp_path: Path) -> None:
+    """One frame of a group of 60: a fraction of what has to be fetched without references."""
+    recorded = scene("mono8", frames=64, width=640, height=480)
+    (path,) = SOURCES["mcap-ros2-none"](tmp_path, recorded)
+    options = mp4ds.PackOptions(quality="crf=2", codec="av1", gop=60)
+    mp4ds.pack(path, tmp_path / "with", options)
+    (tmp_path / "without").mkdir()
+    edited(tmp_path / "with", tmp_path / "without", without)
+    fetched: dict[str, int] = {}
+    pictures = []
+    with web_server(tmp_path) as server:
+        for name in ("with", "without"):
+            server.forget()
+            with mp4ds.open(f"{server.url}/{name}/cam_image_raw.yaml") as dataset:
+                pictures.append(dataset.streams[0].get([59])[0].data)
+            ranges = server.fetched("cam_image_raw.mp4")
+            fetched[name] = sum(end - start for start, end in ranges)
+    assert np.array_equal(*pictures)
+    assert fetched["with"] < 0.65 * fetched["without"]
+    table = index(tmp_path / "with" / "cam_image_raw.mp4")
+    assert fetched["without"] < 1.1 * table.sizes[:60].sum()  # nothing is fetched twice

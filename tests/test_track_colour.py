@@ -1,0 +1,125 @@
+"""Colours that only the track tells: a decoder without the container gives the same frames."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+from conftest import real
+from mp4ds.streams.video_file import Video
+from mp4ds.video import read_sample_entry
+from mp4ds.video.access import FrameAccess
+from mp4ds.video.sample_entry import SampleEntry
+from mp4ds.video.track_colour import TrackColour, track_colour
+from test_access import opened
+from test_references import FRAMES, HEIGHT, RECIPES, WIDTH, encoded_file
+
+NAMES = ("x264-b0-none-ref4-w2", "x265-b0", "svt-8", "vp9", "ffv1", "mjpeg")
+BT709, BT601 = (1, 1, 1), (6, 6, 6)
+Tags = tuple[int, int, str]
+
+
+def tagged(data: bytes, colour: tuple[int, int, int], colour_range: int) -> bytes:
+    """The packets of a video in a track that tells of colours."""
+    file = io.BytesIO()
+    with av.open(io.BytesIO(data)) as source, av.open(file, "w", format="mp4") as target:
+        template = source.streams.video[0]
+        stream: Any = target.add_stream_from_template(template, opaque=True)
+        context = stream.codec_context
+        context.color_primaries, context.color_trc, context.colorspace = colour
+        context.color_range = colour_range
+        for packet in source.demux(template):
+            if packet.dts is not None:
+                packet.stream = stream
+                target.mux(packet)
+    return file.getvalue()
+
+
+def tags(frame: Any) -> Tags:
+    return frame.colorspace, frame.color_range, frame.format.name
+
+
+class Tagged:
+    """Gives the tags of frames in the place of pictures."""
+
+    coded_size = WIDTH, HEIGHT
+
+    def make(self, frame: Any, number: int | None = None) -> Any:
+        del number
+        return tags(frame)
+
+
+@pytest.mark.parametrize("colour_range", [1, 2])
+@pytest.mark.parametrize("colour", [BT709, BT601])
+@pytest.mark.parametrize("name", NAMES)
+def test_decoders_know_what_the_track_says(
+    name: str, colour: tuple[int, int, int], colour_range: int, tmp_path: Path
+) -> None:
+    recipe = RECIPES[name]
+    path = tmp_path / "v.mp4"
+    path.write_bytes(tagged(encoded_file(recipe), colour, colour_range))
+    assert track_colour(read_sample_entry(path)) == TrackColour(*colour, colour_range == 2)
+    with av.open(str(path)) as container:
+        expected = [tags(frame) for frame in container.decode(video=0)]
+    if name in ("ffv1", NAMES[0]):  # whose packets say nothing
+        assert expected[0][:2] == (colour[2], colour_range)
+    maker: Any = Tagged()
+    with FrameAccess(path, codec=recipe.codec, frames=FRAMES, maker=maker) as access:
+        assert [found for _, found in access.pictures_of(range(FRAMES))] == expected
+    video = Video(path)
+    every = [frame.data for frame in video]
+    assert np.array_equal(video.read([7, 30]), [every[7], every[30]])
+    video.close()
+
+
+def test_a_track_without_colours(tmp_path: Path) -> None:
+    path = tmp_path / "v.mp4"
+    path.write_bytes(encoded_file(RECIPES["ffv1"]))
+    assert track_colour(read_sample_entry(path)) is None
+    with opened(path, RECIPES["ffv1"]) as access:
+        assert access.table.colour is None
+
+
+def test_a_real_one() -> None:
+    path = real("video/bt709_full_range.mp4")
+    colour = track_colour(read_sample_entry(path))
+    video = Video(path)
+    every = [frame.data for frame in video]
+    numbers = [len(every) - 1, 0, len(every) // 2]
+    assert np.array_equal(video.read(numbers), [every[number] for number in numbers])
+    video.close()
+    assert colour == TrackColour(1, 1, 1, full_range=True)
+
+
+def entry(*boxes: tuple[str, bytes]) -> SampleEntry:
+    return SampleEntry("avc1", bytes(78), boxes)
+
+
+def colr(kind: bytes, *numbers: int, flags: bytes = b"") -> tuple[str, bytes]:
+    return "colr", kind + b"".join(number.to_bytes(2, "big") for number in numbers) + flags
+
+
+@pytest.mark.parametrize(
+    ("boxes", "expected"),
+    [
+        ([], None),
+        ([("avcC", bytes(20))], None),
+        ([colr(b"nclx", 9, 16, 9, flags=b"\x80")], TrackColour(9, 16, 9, True)),
+        ([colr(b"nclx", 9, 16, 9, flags=b"\x7f")], TrackColour(9, 16, 9, False)),
+        ([colr(b"nclx", 9, 16, 9)], TrackColour(9, 16, 9, None)),
+        ([colr(b"nclc", 1, 1, 6, flags=b"\x80")], TrackColour(1, 1, 6, None)),
+        ([colr(b"nclx", 65535, 255, 99, flags=b"\0")], TrackColour(2, 2, 2, False)),
+        ([colr(b"nclx", 1, 1)], None),
+        ([("colr", b"")], None),
+        ([("colr", b"prof" + bytes(200))], None),
+        ([colr(b"nclc", 1, 1, 1), ("colr", b"prof" + bytes(200))], TrackColour(1, 1, 1, None)),
+        ([colr(b"nclc", 1, 1, 1), colr(b"nclc", 6, 6, 6)], TrackColour(6, 6, 6, None)),
+    ],
+)
+def test_boxes(boxes: list[tuple[str, bytes]], expected: TrackColour | None) -> None:
+    assert track_colour(entry(*boxes)) == expected
