@@ -8,6 +8,7 @@ the streams of cameras it nearly always does.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 
 from mp4ds.coded import h264, h265
@@ -34,7 +35,7 @@ def _units(data: memoryview) -> Iterator[memoryview]:
     raise UnknownStructure(f"it holds more than {MAX_UNITS} NAL units")
 
 
-class _Chain:
+class _Chain(ABC):
     """Each picture refers to the last one before it that any may refer to."""
 
     def __init__(self) -> None:
@@ -75,8 +76,8 @@ class _Chain:
             self._checked.clear()
         self._checked.add(unit)
 
-    def _check_parameters(self, unit: bytes) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def _check_parameters(self, unit: bytes) -> None: ...
 
 
 class H264References(_Chain):

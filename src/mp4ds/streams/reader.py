@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,19 +121,23 @@ class Stream(Frames):
         Raises:
             VideoError: The video cannot be read, or is not what the sidecar says.
         """
-        video = self.sidecar.video
         return VideoDecoder(
-            self.video_path,
-            codec=video.codec,
-            coded_size=(video.width, video.height),
-            frames=self.sidecar.frames,
-            picture_format=self.rebuilder.picture_format,
-            picture_size=self.rebuilder.picture_size,
-            matrix=video.matrix,
-            full_range=video.full_range,
-            sequential=sequential,
-            fast_colour=fast_colour,
+            self.video_path, **self._promises, sequential=sequential, fast_colour=fast_colour
         )
+
+    @property
+    def _promises(self) -> dict[str, Any]:
+        """What the sidecar says of the video, as those that decode it ask for it."""
+        video = self.sidecar.video
+        return {
+            "codec": video.codec,
+            "coded_size": (video.width, video.height),
+            "frames": self.sidecar.frames,
+            "picture_format": self.rebuilder.picture_format,
+            "picture_size": self.rebuilder.picture_size,
+            "matrix": video.matrix,
+            "full_range": video.full_range,
+        }
 
     def __len__(self) -> int:
         return self.sidecar.frames
@@ -151,18 +156,11 @@ class Stream(Frames):
                 yield from reader.pictures_of(run)
 
     def _open_reader(self) -> FrameReader:
-        video = self.sidecar.video
         return open_frames(
             self.video_path,
-            codec=video.codec,
-            coded_size=(video.width, video.height),
-            frames=self.sidecar.frames,
-            picture_format=self.rebuilder.picture_format,
-            picture_size=self.rebuilder.picture_size,
-            matrix=video.matrix,
-            full_range=video.full_range,
+            **self._promises,
             fast_colour=self._fast_colour,
-            references=video.references,
+            references=self.sidecar.video.references,
         )
 
     def _pictures(self) -> Iterator[Picture]:
