@@ -54,6 +54,10 @@ _SAMPLES = {
 _COLOURS = {"mono": 1, "rgb": 3, "bgr": 3, "rgba": 4, "bgra": 4}
 
 
+# libswscale: bicubic, accurate rounding, full chroma in and out; older PyAV has no names for them
+CAREFUL: Any = 0x4 | 0x40000 | 0x2000 | 0x4000
+
+
 def sample_format(encoding: str) -> tuple[np.dtype[Any], int]:
     """Native type of a sample, and samples per pixel; 1 for planar YUV."""
     if match := re.fullmatch(r"(\d+[USF])C(\d)", encoding):

@@ -15,7 +15,6 @@ import av
 import cv2
 import numpy as np
 import pytest
-from av.video.reformatter import Interpolation
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
@@ -24,7 +23,7 @@ from coded_scenes import CODED
 from definitions import PICTURES
 from mp4ds.packing import PackOptions
 from mp4ds.unpacking import UnpackOptions
-from pictures import pixels
+from pictures import CAREFUL, pixels
 from sources import (
     COMMON,
     ENCODINGS,
@@ -222,9 +221,7 @@ def test_frames_of_jpeg_files(name: str, tmp_path: Path) -> None:
 
 def as_rgb(frame: av.VideoFrame) -> np.ndarray[Any, Any]:
     """Converted with care; by default, PyAV takes the nearest sample of chroma."""
-    flags = Interpolation.BICUBIC | Interpolation.ACCURATE_RND
-    flags |= Interpolation.FULL_CHR_H_INT | Interpolation.FULL_CHR_H_INP
-    rgb = frame.reformat(format="rgb24", src_colorspace="itu601", interpolation=flags)
+    rgb = frame.reformat(format="rgb24", src_colorspace="itu601", interpolation=CAREFUL)
     return rgb.to_ndarray()
 
 

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from av.video.reformatter import ColorRange, Interpolation
+from av.video.reformatter import ColorRange
 from numpy.typing import NDArray
 
 import mp4ds
@@ -28,6 +28,7 @@ from coded_scenes import CODED
 from definitions import PICTURES
 from mp4ds.packing import PackOptions
 from mp4ds.video import VideoDecoder
+from pictures import CAREFUL
 from scenes import Record, Scene
 from sources import SOURCES, scene
 
@@ -197,15 +198,13 @@ def without_site(planes: tuple[NDArray[np.uint8], ...]) -> NDArray[np.uint8]:
     """Planes of BT.601, limited range, as RGB; the frame does not say where its chroma is."""
     stacked = np.concatenate([plane.ravel() for plane in planes]).reshape(-1, WIDTH)
     frame = av.VideoFrame.from_ndarray(stacked, format="yuv420p")
-    flags = Interpolation.BICUBIC | Interpolation.FULL_CHR_H_INT | Interpolation.FULL_CHR_H_INP
-    flags |= Interpolation.ACCURATE_RND
     rgb = frame.reformat(
         format="rgb24",
         src_colorspace="itu601",
         dst_colorspace="itu601",
         src_color_range=ColorRange.MPEG,
         dst_color_range=ColorRange.JPEG,
-        interpolation=flags,
+        interpolation=CAREFUL,
     )
     return rgb.to_ndarray()
 

@@ -10,17 +10,14 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
 
 import mp4ds
 from conftest import real
-from pictures import picture
+from pictures import CAREFUL, picture
 from sources import SOURCES, scene
 
 FRAMES = 40
-CARE = Interpolation.BICUBIC | Interpolation.ACCURATE_RND
-CARE |= Interpolation.FULL_CHR_H_INT | Interpolation.FULL_CHR_H_INP
 TICKS = np.cumsum([0, *(1001 * (1 + n % 3) for n in range(FRAMES - 1))])  # of 1/30000 s
 
 KINDS: dict[str, tuple[str, str, dict[str, str], bool]] = {
@@ -70,7 +67,7 @@ def decoded(path: Path) -> tuple[list[int], list[NDArray[Any]]]:
             assert frame.time_base is not None
             times.append(int(frame.pts * frame.time_base * 10**9))
             matrix = "itu709" if frame.colorspace == 1 else "itu601"
-            rgb = frame.reformat(format="rgb24", src_colorspace=matrix, interpolation=CARE)
+            rgb = frame.reformat(format="rgb24", src_colorspace=matrix, interpolation=CAREFUL)
             pixels.append(rgb.to_ndarray())
     return times, pixels
 
