@@ -9,19 +9,20 @@ from __future__ import annotations
 
 import base64
 import re
-import struct
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from rosbags.serde import SerdeError
-from rosbags.typesys import TypesysError
 from rosbags.typesys.msg import denormalize_msgtype, normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from mp4ds.bags.typedefs import (
+    BAD_DEFINITION,
+    BAD_PAYLOAD,
     HEADER,
+    MAX_TAIL,
     fields_of,
     make_store,
     ros1_world,
@@ -56,28 +57,7 @@ LATCHED_QOS = """\
 
 _ROS1 = "ros1:"  # begins the keys that keep a ROS 1 connection header in ROS 2 metadata
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
-_MAX_TAIL = 8  # bytes after a message; after more, the definition is that of another type
 _REMEDY = "Exclude the topic with --exclude, or unpack to mcap, which keeps it as it is."
-_BAD_DEFINITION = (
-    TypesysError,
-    SerdeError,
-    SyntaxError,
-    RecursionError,
-    LookupError,
-    ValueError,
-    TypeError,
-    AttributeError,
-    AssertionError,
-)
-_BAD_PAYLOAD = (
-    SerdeError,
-    AssertionError,
-    struct.error,
-    ValueError,
-    LookupError,
-    TypeError,
-    MemoryError,
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +128,7 @@ class Converter:
         plan = self._plan(channel)
         try:
             return self._convert(plan, memoryview(data))
-        except _BAD_PAYLOAD:
+        except BAD_PAYLOAD:
             problem = f"a message does not parse as {channel.type_name}"
             raise ConversionError(channel.topic, problem, _REMEDY) from None
 
@@ -164,7 +144,7 @@ class Converter:
         try:
             store = make_store(types_of(schema, self._ros1), self._ros1)
             definition, digest = store.generate_msgdef(normalize_msgtype(schema.name), 1)
-        except _BAD_DEFINITION:
+        except BAD_DEFINITION:
             return channel
         if not schema.data:
             schema = Schema(schema.name, self._ros1.schema_encoding, definition.encode())
@@ -189,7 +169,7 @@ class Converter:
                 missing = schema.name if is_own else error.args[0]
                 problem = f"no definition of type {missing} is known"
                 raise ConversionError(channel.topic, problem, _REMEDY) from None
-            except _BAD_DEFINITION:
+            except BAD_DEFINITION:
                 problem = f"the definition of type {channel.type_name} cannot be understood"
                 raise ConversionError(channel.topic, problem, _REMEDY) from None
         return self._plans[schema]
@@ -223,7 +203,7 @@ class Converter:
         except (SerdeError, AssertionError):
             # ROS itself overlooks bytes after a message, such as RealSense cameras' bags hold.
             end = _end(plan, raw, to_ros1=to_ros1)
-            if not (0 < len(raw) - end <= _MAX_TAIL and fields_of(plan.types, name)):
+            if not (0 < len(raw) - end <= MAX_TAIL and fields_of(plan.types, name)):
                 raise
             converted = convert(raw[:end], name)
             self._omitted["messages with bytes after their end, which were left out"] += 1
@@ -247,7 +227,7 @@ class Converter:
             types = types_of(schema, self._ros1)
             if not same_wire(plan.types, plan.name, types, normalize_msgtype(name)):
                 return None
-        except _BAD_DEFINITION:
+        except BAD_DEFINITION:
             return None
         return replace(channel, message_encoding="ros1", schema=schema, metadata=known)
 

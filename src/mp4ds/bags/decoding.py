@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from rosbags.interfaces import Nodetype
-from rosbags.serde import SerdeError
-from rosbags.typesys import TypesysError
 from rosbags.typesys.msg import normalize_msgtype
 
-from mp4ds.bags.typedefs import fields_of, make_store, ros1_world, ros2_world, types_of
+from mp4ds.bags.typedefs import (
+    BAD_DEFINITION,
+    BAD_PAYLOAD,
+    MAX_TAIL,
+    fields_of,
+    make_store,
+    ros1_world,
+    ros2_world,
+    types_of,
+)
 from mp4ds.errors import OptionError
 from mp4ds.records import Channel
 from mp4ds.wire import WireError
@@ -29,19 +35,7 @@ Raises:
 """
 
 _DISTRIBUTION = "humble"  # whose standard types stand in for definitions that were not recorded
-_MAX_TAIL = 8  # bytes after a message, which ROS itself overlooks
 _ADVICE = "take its bytes instead, `RecordedMessage.raw`"
-_BAD_DEFINITION = (
-    TypesysError,
-    SerdeError,
-    SyntaxError,
-    RecursionError,
-    LookupError,
-    ValueError,
-    TypeError,
-    AttributeError,
-    AssertionError,
-)
 
 
 def decoder_of(channel: Channel) -> Decoder:
@@ -81,7 +75,7 @@ def _ros(channel: Channel) -> Decoder:
         definition = store.get_msgdef(name)  # compiled now, to fail before any message
     except OptionError:
         raise
-    except _BAD_DEFINITION:
+    except BAD_DEFINITION:
         raise _undecodable(
             channel, f"no definition of type {schema.name} is known, or it cannot be understood"
         ) from None
@@ -95,10 +89,9 @@ def _ros(channel: Channel) -> Decoder:
             read = definition.deserialize_cdr_le if payload[1] else definition.deserialize_cdr_be
         try:
             message, end = read(payload[start:], 0, definition.cls, store)
-        except (SerdeError, AssertionError, struct.error, ValueError, LookupError, TypeError,
-                MemoryError):  # fmt: skip
+        except BAD_PAYLOAD:
             raise WireError(f"it is no {schema.name}") from None
-        if len(payload) - start - end > _MAX_TAIL:
+        if len(payload) - start - end > MAX_TAIL:
             raise WireError(f"it is no {schema.name}")
         return message
 

@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import re
+import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.serde import SerdeError
+from rosbags.typesys import (
+    Stores,
+    TypesysError,
+    get_types_from_idl,
+    get_types_from_msg,
+    get_typestore,
+)
 from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
@@ -18,6 +26,33 @@ if TYPE_CHECKING:
     from rosbags.interfaces.typing import Fielddefs, FieldDesc, Typesdict
 
 HEADER = "std_msgs/msg/Header"
+
+BAD_DEFINITION = (
+    TypesysError,
+    SerdeError,
+    SyntaxError,
+    RecursionError,
+    LookupError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    AssertionError,
+)
+"""What rosbags raises for a definition that it cannot use."""
+
+BAD_PAYLOAD = (
+    SerdeError,
+    AssertionError,
+    struct.error,
+    ValueError,
+    LookupError,
+    TypeError,
+    MemoryError,
+)
+"""What rosbags raises for a payload that is not of its type."""
+
+MAX_TAIL = 8
+"""Bytes after a message that ROS overlooks; after more, the definition is that of another type."""
 BUILTIN = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 _FILLER = "structure_needs_at_least_one_member"  # what empty messages hold in ROS 2
