@@ -18,7 +18,7 @@ import dask
 import pytest
 
 import cluster_tasks
-from clusters import RealCluster, wait_until
+from clusters import RealCluster, Relay, wait_until
 from mp4ds.engine import Engine, Outcome
 from mp4ds.engine import cluster_access as access
 from mp4ds.engine.cluster import ClusterEngine
@@ -226,6 +226,19 @@ def test_a_lost_scheduler_is_an_error_and_the_next_one_goes_on(tmp_path: Path) -
         assert not errors(run(engine, tasks_in(tmp_path, *names)))
     assert results(tmp_path).keys() >= set(names)
     assert all((tmp_path / name).stat().st_mtime_ns == kept[name] for name in kept)
+
+
+def test_a_broken_connection_is_made_again(cluster: RealCluster, tmp_path: Path) -> None:
+    names = numbered(8)
+    with Relay(cluster.address) as relay:
+        engine = ClusterEngine(cluster_tasks.write, relay.address, task_bytes=MIB)
+        outcomes = engine.run(tasks_in(tmp_path, *names), lambda *_: None)
+        done = [next(outcomes)]
+        relay.break_connections()
+        done += outcomes
+    assert sorted(outcome.task[1] for outcome in done) == names
+    assert not any(outcome.error for outcome in done)
+    assert results(tmp_path) == {name: cluster_tasks.result(name) for name in names}
 
 
 def test_a_cluster_without_workers_is_given_up(tmp_path: Path) -> None:

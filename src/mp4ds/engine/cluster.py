@@ -7,6 +7,7 @@ of a dead worker to others. Only strings pass through it.
 from __future__ import annotations
 
 import queue
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 _POLL_SECONDS = 1.0
+_MAX_DROPS = 3
 _MIB = 2**20
 
 
@@ -26,8 +28,9 @@ class ClusterEngine:
     """Runs each task on a worker of a Dask cluster. See `Engine`.
 
     A task whose worker dies is run on another one, as often as the scheduler's
-    ``distributed.scheduler.allowed-failures`` says; one that raises is not run again. What a
-    task tells while it runs is not heard.
+    ``distributed.scheduler.allowed-failures`` says; one that raises is not run again. Tasks that
+    the scheduler drops, as it does when the connection breaks, are handed out again. What a task
+    tells while it runs is not heard.
 
     Args:
         function: Called with the strings of a task; workers import it by its name.
@@ -70,19 +73,24 @@ class ClusterEngine:
     def _run(
         self, client: Client, watch: Watch, tasks: Sequence[tuple[str, ...]]
     ) -> Iterator[Outcome]:
-        futures = client.map(
-            attempt,
-            list(tasks),
-            function=self._function,
-            task_bytes=self._task_bytes,
-            key=f"mp4ds-{self._function.__name__}",
-            pure=False,  # another run of the same tasks shares nothing with this one
-        )
-        waiting = {future.key: (task, future) for task, future in zip(tasks, futures, strict=True)}
+        waiting: dict[str, tuple[tuple[str, ...], Future]] = {}
         heard: queue.SimpleQueue[Future] = queue.SimpleQueue()
-        for future in futures:
-            future.add_done_callback(heard.put)
-        del futures, future  # the scheduler forgets what nobody holds
+        drops: Counter[tuple[str, ...]] = Counter()
+
+        def hand_out(some: Sequence[tuple[str, ...]]) -> None:
+            futures = client.map(
+                attempt,
+                list(some),
+                function=self._function,
+                task_bytes=self._task_bytes,
+                key=f"mp4ds-{self._function.__name__}",
+                pure=False,  # another run of the same tasks shares nothing with this one
+            )
+            for task, future in zip(some, futures, strict=True):
+                waiting[future.key] = (task, future)
+                future.add_done_callback(heard.put)
+
+        hand_out(tasks)
         try:
             while waiting:
                 watch.look()
@@ -91,24 +99,27 @@ class ClusterEngine:
                 except queue.Empty:
                     continue
                 task, _ = waiting.pop(ended.key)
-                outcome = self._outcome(task, ended, watch)
-                del ended, _
-                yield outcome
+                outcome = self._outcome(task, ended)
+                del ended, _  # the scheduler forgets what nobody holds
+                if outcome is not None:
+                    yield outcome
+                    continue
+                drops[task] += 1
+                if drops[task] > _MAX_DROPS:
+                    raise watch.lost()
+                watch.wait_until_connected()
+                hand_out([task])
         finally:
             if waiting and client.status == "running":
                 with suppress(OSError):
                     client.cancel([future for _, future in waiting.values()])
 
-    def _outcome(self, task: tuple[str, ...], future: Future, watch: Watch) -> Outcome:
-        """What became of a task.
-
-        Raises:
-            ClusterError: Nobody knows.
-        """
+    def _outcome(self, task: tuple[str, ...], future: Future) -> Outcome | None:
+        """What became of a task; None where the scheduler has dropped it and nobody knows."""
         if future.status == "finished":
             return Outcome(task)
         if future.status != "error":
-            raise watch.lost()
+            return None
         error = future.exception()
         if isinstance(error, TaskFailedError):
             return Outcome(task, (error.kind, error.sentence))

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 LOCAL = "local"
 _SCHEMES = ("tcp", "tls")
 _CONNECT_SECONDS = 15.0
+_CONNECT_POLL_SECONDS = 0.1
+_ENDED = ("closing", "closed")
 _LOOK_SECONDS = 5.0
 _WORKER_SECONDS = 5 * 60.0
 _BATCH_WORKER_SECONDS = 12 * 3600.0
@@ -62,14 +64,16 @@ class Watch:
         if now < self._next:
             return
         self._next = now + _LOOK_SECONDS
-        if self._client.status != "running":
+        if self._client.status in _ENDED:
             raise self.lost()
+        if self._client.status != "running":
+            return  # it connects again, or gives up
         if self._refill is not None:
             self._refill()
         try:
             has_workers = bool(self._client.nthreads())
         except OSError:
-            raise self.lost() from None
+            has_workers = False  # that is not known
         if has_workers:
             self._empty_since = None
         elif self._empty_since is None:
@@ -80,6 +84,17 @@ class Watch:
                 f"has had no worker for {self._patience:g} s",
                 f"Start some, or see why they ended. {_GO_ON}",
             )
+
+    def wait_until_connected(self) -> None:
+        """Wait for a client that connects again.
+
+        Raises:
+            ClusterError: The scheduler is lost.
+        """
+        while self._client.status != "running":
+            if self._client.status in _ENDED:
+                raise self.lost()
+            time.sleep(_CONNECT_POLL_SECONDS)
 
     def lost(self) -> ClusterError:
         """What to raise when the scheduler does not know the tasks any more."""
