@@ -104,6 +104,12 @@ SCENES = {
     "stereo": _Scene("images/image_pipeline_wide_stereo_pgm/left*.pgm", ("rgb8",)),
     "openisp": _Scene("images/openISP_bayer_rggb12_1920x1080.raw", ("bayer_rggb16",)),
 }
+MOVING = {
+    **{name: SCENES[name] for name in ("cups", "cars", "people")},
+    "lane": _Scene("video/carnd_solidWhiteRight.mp4"),  # 960x540, from a car
+    "arm": _Scene("video/lerobot_aloha_insertion_human_yuv444.mp4"),  # 640x480, over a table
+}
+"""The scenes that are videos, for lossy codecs."""
 DEMO = "demo"
 GRADIENT, WIDE = "gradient", "wide"
 """Made of a camera's pictures: 16SC1 and 16UC1 (see depth_clips.py)."""
@@ -331,7 +337,7 @@ def _rgb_frames(spec: ClipSpec) -> Iterator[Signal]:
         frames = _demo_frames(spec.frames)
     else:
         scene = "cups" if spec.scene in (GRADIENT, WIDE) else spec.scene
-        frames = _video_frames(folder / SCENES[scene].pattern)
+        frames = _video_frames(folder / {**SCENES, **MOVING}[scene].pattern)
     for frame in frames:
         yield _fit(frame, spec.size)
 

@@ -23,6 +23,19 @@ def real(name: str) -> Path:
     return path
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that keep to times: they run apart, one process for each network."""
+    for item in items:
+        network = ""
+        if "roscore" in getattr(item, "fixturenames", ()):
+            network = "ros1"
+        elif item.path.stem in ("test_publish_dds", "test_publish_ros2"):
+            network = "dds"
+        if network:
+            item.add_marker(pytest.mark.network)
+            item.add_marker(pytest.mark.xdist_group(network))
+
+
 @pytest.fixture
 def compare() -> Callable[..., list[str]]:
     """The independent comparison of two recordings."""

@@ -30,7 +30,6 @@ Array = NDArray[Any]
 CAMERAS = (IMAGE, COMPRESSED, PACKET, RAW_IMAGE, CODED_IMAGE, CODED_VIDEO)
 # libswscale's flags: bicubic, full chroma in and out, accurate rounding, bit-exact
 SMOOTH = 0x4 | 0x2000 | 0x4000 | 0x40000 | 0x80000
-_FFMPEG_NAMES = {"h265": "hevc"}
 
 
 @dataclass(frozen=True)
@@ -141,12 +140,17 @@ def truth(records: Sequence[Record]) -> list[Array]:
         return [_in_rgb_order(pixels(r.values), r.values["encoding"]) for r in records]
     told = records[0].values.get("format") or records[0].values.get("encoding")
     if records[0].msgtype in (CODED_VIDEO, PACKET):
-        names = {"libx264": "h264", "libx265": "hevc", "libsvtav1": "av1", "av1": "libdav1d"}
-        name = told.partition(";")[0].partition("_")[0]
-        return decoded(names.get(name, _FFMPEG_NAMES.get(name, name)), _data(records))
+        return decoded(_decoder_of(told), _data(records))
     if "compressedDepth" in told:
         return [_depth(record.values["data"], told) for record in records]
     return [file_picture(data) for data in _data(records)]
+
+
+def _decoder_of(told: str) -> str:
+    """The decoder for what a message calls its codec, or the encoder that made it."""
+    names = {"libx264": "h264", "libx265": "hevc", "h265": "hevc", "av1": "libdav1d"}
+    name = told.partition(";")[0].partition("_")[0]
+    return {"libsvtav1": "av1"}.get(name, names.get(name, name))
 
 
 def _data(records: Sequence[Record]) -> list[bytes]:
@@ -207,9 +211,9 @@ def shown(messages: Sequence[Read]) -> list[Array]:
     data = [message.value.data.tobytes() for message in messages]
     if name == COMPRESSED:
         return [file_picture(file) for file in data]
-    assert name == CODED_VIDEO
-    codec = messages[0].value.format
-    return decoded({"h265": "hevc", "av1": "libdav1d"}.get(codec, codec), data)
+    assert name in (CODED_VIDEO, PACKET)
+    value = messages[0].value
+    return decoded(_decoder_of(value.format if name == CODED_VIDEO else value.encoding), data)
 
 
 def subscribed(told: str, data: bytes) -> tuple[str, Array]:

@@ -876,6 +876,33 @@ BAD_OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
         ("unpack", "DATASET", "--to", "bag", "--images", "gif", "-o", "OUT"),
         "raw, jpeg, png, compressed-video",
     ),
+    **{
+        f"resize {value}": (("unpack", "DATASET", "--to", "mcap", "--resize", value), "--resize")
+        for value in (
+            "",
+            "0",
+            "-1",
+            "640x",
+            "640x480x3",
+            "0x9",
+            "nan",
+            "inf",
+            "1e9",
+            "big",
+            "99999x9",
+        )
+    },
+    **{
+        f"max-rate {value}": (("unpack", "DATASET", "--to", "mcap", "--max-rate", value), "Hz")
+        for value in ("0", "-3", "nan", "inf")
+    },
+    **{
+        f"fewer packets {kind}": (
+            ("unpack", "DATASET", "--to", "mcap", "--images", kind, "--every", "2"),
+            "raw, jpeg or png",
+        )
+        for kind in ("compressed-video", "ffmpeg")
+    },
     "images-twice": (
         ("unpack", "DATASET", "--to", "images", "--images", "raw", "-o", "OUT"),
         "--image-format",
@@ -922,6 +949,8 @@ def test_a_preset_that_is_wrong(codec: str, small_bag: Path, tmp_path: Path) -> 
         ("pack", "BAG", "-o", "OUT", "--jobs", "0"),
         ("pack", "BAG", "-o", "OUT", "--fast"),
         ("unpack", "DATASET"),
+        ("unpack", "DATASET", "--to", "mcap", "--every", "0"),
+        ("unpack", "DATASET", "--to", "mcap", "--every", "1.5"),
         ("demo", "OUT.bag", "--seconds", "0"),
         ("demo", "OUT.bag", "--seconds", "nan"),
         ("sell", "BAG"),

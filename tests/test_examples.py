@@ -97,7 +97,13 @@ def test_readme_python(demo_dataset: Path, tmp_path: Path) -> None:
     run(sys.executable, "-c", code, cwd=tmp_path)
 
 
-@pytest.mark.parametrize("command", ["pack", "unpack", "validate", "info", "demo"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        *("pack", "unpack", "play", "evaluate", "report", "frames", "validate", "info"),
+        *("conformance-dump", "demo"),
+    ],
+)
 def test_every_command_is_in_the_readme_and_helps(command: str) -> None:
     assert f"`mp4ds {command}" in (ROOT / "README.md").read_text()
     assert "Usage" in run(sys.executable, "-m", "mp4ds", command, "--help", cwd=ROOT)

@@ -33,7 +33,7 @@ from mp4ds.coded import CodedPicture, PictureParser, Refused, annexb, av1, body_
 from mp4ds.errors import VideoError
 from mp4ds.stamps import MAX_GAP_NS, NS_PER_TICK
 from mp4ds.video import PacketReader, PacketWriter, VideoEncoder, recipe_for
-from mp4ds.video.packets import annexb_packets
+from mp4ds.video.stand_alone import StandAlonePackets
 from test_coded_pictures import packets_of
 
 STEP = 33_333
@@ -243,7 +243,7 @@ def test_parameters_that_were_sent_before(codec: str, tmp_path: Path) -> None:
     with av.open(str(path)) as container:
         assert sum(1 for _ in container.decode(video=0)) == 8
     key = next(n for n, picture in enumerate(pictures) if n and picture.keyframe)
-    assert decodes(codec, list(annexb_packets(path, codec))[key:]) == 8 - key
+    assert decodes(codec, standing_alone(path, codec)[key:]) == 8 - key
 
 
 # ---------------------------------------------------------------- refusals and faults
@@ -413,17 +413,22 @@ def test_files_are_closed(video: Path, recwarn: pytest.WarningsRecorder) -> None
 # ---------------------------------------------------------------- standing alone
 
 
+def standing_alone(path: Path, codec: str) -> list[bytes]:
+    with StandAlonePackets(path, codec=codec) as packets:
+        return list(packets.packets())
+
+
 @pytest.mark.parametrize("name", IN_ORDER)
 def test_packets_stand_alone(name: str, tmp_path: Path) -> None:
     codec, path = ENCODINGS[name].codec, tmp_path / "a.mp4"
     packets = encode(ENCODINGS[name])
     write(path, codec, [packet.data for packet in packets])
-    alone = list(annexb_packets(path, codec))
+    given = standing_alone(path, codec)
     keys = [number for number, packet in enumerate(packets) if packet.keyframe]
     for key in keys:
-        assert decodes(codec, alone[key:]) == len(packets) - key
+        assert decodes(codec, given[key:]) == len(packets) - key
     parser = PictureParser(codec)
-    assert [parser.parse(body).keyframe for body in alone] == [
+    assert [parser.parse(body).keyframe for body in given] == [
         packet.keyframe or codec in ("mjpeg", "png") for packet in packets
     ]
 
@@ -440,7 +445,7 @@ def test_our_videos_stand_alone(codec: str, tmp_path: Path) -> None:
     for number, picture in enumerate(scene(10)):
         encoder.write((picture,), number * STEP)
     encoder.close()
-    packets = list(annexb_packets(path, codec))
+    packets = standing_alone(path, codec)
     with PacketReader(path, codec=codec, frames=10, coded_size=SIZE) as reader:
         keys = [index for index, key in enumerate(reader.keyframes) if key]
     assert len(keys) > 1
@@ -473,7 +478,7 @@ def test_lossless_video_as_packets(tmp_path: Path) -> None:
             frame = av.VideoFrame.from_ndarray(picture[..., 0].copy(), format="gray")
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-    assert len(list(annexb_packets(path, "ffv1"))) == 3
+    assert len(standing_alone(path, "ffv1")) == 3
 
 
 def test_damaged_parameters(tmp_path: Path) -> None:
@@ -483,7 +488,7 @@ def test_damaged_parameters(tmp_path: Path) -> None:
     data[data.index(b"avcC") + 8] = 0xFD  # lengths of two bytes
     path.write_bytes(data)
     with pytest.raises(VideoError) as caught:
-        list(annexb_packets(path, "h264"))
+        standing_alone(path, "h264")
     assert caught.value.code in ("decode-failed", "video-unreadable")
 
 

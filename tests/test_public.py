@@ -30,7 +30,10 @@ NAMES = [
     "PackOptions",
     "PackSummary",
     "PartsFailedError",
+    "PlayOptions",
+    "PlaySummary",
     "Problem",
+    "PublishError",
     "RecordedMessage",
     "RemoteError",
     "SourceError",
@@ -50,6 +53,7 @@ NAMES = [
     "pack",
     "pack_each",
     "pack_share",
+    "play",
     "unpack",
     "validate",
 ]
@@ -115,6 +119,7 @@ def test_every_error_is_public() -> None:
         ("ClusterError", ConnectionError, 1),
         ("RemoteError", Exception, 1),
         ("PartsFailedError", Exception, 1),
+        ("PublishError", OSError, 1),
         ("Mp4dsError", Exception, 1),
     ],
 )
@@ -178,7 +183,7 @@ def test_all_is_documented(name: str) -> None:
             assert known, f"{name}({parameter.name})"
 
 
-@pytest.mark.parametrize("name", ["open", "pack", "unpack", "validate"])
+@pytest.mark.parametrize("name", ["open", "pack", "play", "unpack", "validate"])
 def test_the_functions_are_annotated(name: str) -> None:
     function = getattr(mp4ds, name)
     signature = inspect.signature(function)

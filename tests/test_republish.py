@@ -23,7 +23,7 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED, MakeScene
-from definitions import CODED_VIDEO, COMPRESSED, IMAGE
+from definitions import CODED_VIDEO, COMPRESSED, IMAGE, PACKET
 from encoders import cv, nal_units
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.errors import ConversionError, FormatError, OptionError
@@ -49,12 +49,19 @@ from scenes import Record, Scene, instant, scene, together, typestore
 from sources import SOURCES
 
 TARGETS = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap"}
-TYPES = {"raw": IMAGE, "jpeg": COMPRESSED, "png": COMPRESSED, "compressed-video": CODED_VIDEO}
+TYPES = {
+    "raw": IMAGE,
+    "jpeg": COMPRESSED,
+    "png": COMPRESSED,
+    "compressed-video": CODED_VIDEO,
+    "ffmpeg": PACKET,
+}
 ALREADY = {
     "raw": "they are raw images already",
     "jpeg": "they are JPEG files already",
     "png": "they are PNG files already",
     "compressed-video": "they are CompressedVideo already",
+    "ffmpeg": "they are FFMPEGPackets already",
 }
 NO_CODEC = "CompressedVideo has the codecs h264, h265, av1, vp9, and this video is {}"
 
@@ -221,6 +228,18 @@ FOXGLOVE_FATES: dict[str, dict[str, str]] = {
     "foxglove-video-av1": VIDEO,
     "foxglove-video-vp9": VIDEO,
 }
+
+
+def fate_of(fates: dict[str, str], name: str, kind: str, to: str = "") -> str:
+    """What is to become of a scene; FFMPEGPackets are as CompressedVideo but for their type."""
+    if kind != "ffmpeg":
+        return fates[kind]
+    if name.startswith("ffmpeg") and to == "mcap":  # the other targets are of the other ROS
+        return ALREADY["ffmpeg"]
+    fate = fates["compressed-video"].replace("CompressedVideo has", "FFMPEGPacket has")
+    return "given" if fate == ALREADY["compressed-video"] else fate
+
+
 SOURCE_OF = {"bag": "mcap-ros2-zstd", "rosbag2": "bag-lz4", "mcap": "rosbag2-sqlite3-v9"}
 """Targets, each with a source of another format."""
 
@@ -286,7 +305,7 @@ def in_turn(*tables: Sequence[str]) -> list[Any]:
 def test_every_camera_as_every_kind(packed: Pack, name: str, kind: str, to: str) -> None:
     made = packed(name, SOURCE_OF[to])
     summary, messages = made.unpack(to, kind)
-    check(made, summary, messages, name, kind, to, FATES[name][kind])
+    check(made, summary, messages, name, kind, to, fate_of(FATES[name], name, kind, to))
 
 
 FOXGLOVE_TARGETS = [
@@ -302,7 +321,7 @@ def test_foxglove_cameras_as_every_kind(
 ) -> None:
     source, to = source_and_target.split()
     made = packed(name, f"mcap-{source}")
-    fate = FOXGLOVE_FATES[name][kind]
+    fate = fate_of(FOXGLOVE_FATES[name], name, kind)
     if fate != "given" and to != "mcap":
         with pytest.raises(ConversionError, match=made.topic):
             made.unpack(to, kind, topics=[made.topic])
@@ -316,7 +335,7 @@ def test_foxglove_cameras_as_every_kind(
 def test_foxglove_cameras_of_ros2(packed: Pack, name: str, kind: str) -> None:
     made = packed(name, "mcap-foxglove-ros2")
     summary, messages = made.unpack("bag", kind)
-    fate = FOXGLOVE_FATES[name][kind]
+    fate = fate_of(FOXGLOVE_FATES[name], name, kind)
     if (name, kind) == ("foxglove-video-h264", "compressed-video"):
         fate = ALREADY[kind]
     check(made, summary, messages, name, kind, "bag", fate)
@@ -783,14 +802,21 @@ MD5SUMS = {
     "raw": "060021388200f6f0f447d0fcd9c64743",  # as ROS 1 has them
     "jpeg": "8f7a12909da2c9d3332d540a0977563f",
     "compressed-video": md5sum("time timestamp\nstring frame_id\nuint8[] data\nstring format"),
+    "ffmpeg": md5sum(
+        "2176decaecbce78abc3b96ef049fabed header\nuint8[] data\nint32 img_width\n"
+        "int32 img_height\nstring encoding\nuint64 pts\nuint8 flags"
+    ),
 }
+CHANGES = [
+    ("jpeg-rgb", "raw"),
+    ("raw-mono8", "jpeg"),
+    ("raw-mono8", "compressed-video"),
+    ("raw-mono8", "ffmpeg"),
+]
 
 
 @pytest.mark.parametrize("source", ["bag-none", "mcap-ros1-zstd", "mcap-ros2-zstd"])
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [("jpeg-rgb", "raw"), ("raw-mono8", "jpeg"), ("raw-mono8", "compressed-video")],
-)
+@pytest.mark.parametrize(("name", "kind"), CHANGES)
 def test_channels_of_ros1(packed: Pack, name: str, kind: str, source: str) -> None:
     made = packed(name, source)
     for to in ("bag", "mcap") if source != "mcap-ros2-zstd" else ("bag",):
@@ -809,10 +835,7 @@ def test_channels_of_ros1(packed: Pack, name: str, kind: str, source: str) -> No
 
 
 @pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-zstd"])
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [("jpeg-rgb", "raw"), ("raw-mono8", "jpeg"), ("raw-mono8", "compressed-video")],
-)
+@pytest.mark.parametrize(("name", "kind"), CHANGES)
 def test_channels_of_ros2(packed: Pack, name: str, kind: str, source: str) -> None:
     made = packed(name, source)
     to = "rosbag2" if source == "bag-none" else "mcap"
@@ -953,8 +976,8 @@ def test_topics_are_those_of_image_transport(
 
 
 def test_no_topic_is_taken_twice() -> None:
-    free = FreeTopics(["/a", "/b", "/b_compressed_video"], "compressed-video")
-    taken = [free.take(topic) for topic in ("/a", "/a", "/b", "/c", "/c")]
+    free = FreeTopics(["/a", "/b", "/b_compressed_video"])
+    taken = [free.take(topic, "compressed-video") for topic in ("/a", "/a", "/b", "/c", "/c")]
     assert taken == [
         "/a_compressed_video",
         "/a_compressed_video_compressed_video",

@@ -81,7 +81,11 @@ HOMES = {
     "google": ("wire",),
     "typer": ("cli",),
     "rich": ("cli",),
-    "yaml": ("yamlio.py", "bags"),
+    "rospy": ("publishers",),
+    "rclpy": ("publishers",),
+    "cyclonedds": ("publishers",),
+    "foxglove": ("publishers",),
+    "yaml": ("yamlio.py", "bags", "publishers"),
     "pydantic": ("sidecar", "checks.py"),
     "jsonschema": ("checks.py",),
 }

@@ -48,6 +48,15 @@ def unpack(dataset: str | Path) -> Path:
     return summary.output
 
 
+def play(dataset: str | Path) -> float:
+    """Seconds that the clock stood still."""
+    options = mp4ds.PlayOptions(to="ros1", rate=0.5, clock=100.0, topics=["/cam*"], every=2)
+    summary: mp4ds.PlaySummary = mp4ds.play([dataset, str(dataset)], options, progress=use)
+    counts: dict[str, int] = summary.messages
+    use(counts, summary.stopped, summary.thinned, summary.as_recorded)
+    return summary.slowed_s
+
+
 def problems(dataset: Path) -> list[str]:
     """Codes of all problems."""
     found: list[mp4ds.Problem] = mp4ds.validate(dataset, deep=True, progress=use)

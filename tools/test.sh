@@ -7,4 +7,5 @@ cd "$(dirname "$0")/.."
 .venv/bin/ruff check .
 .venv/bin/ruff format --check .
 .venv/bin/mypy
-exec .venv/bin/pytest -n auto "$@"
+.venv/bin/pytest -n auto -m "not network" "$@"
+exec .venv/bin/pytest -n 2 --dist loadgroup -m network "$@"

@@ -4,6 +4,7 @@ The public surface, and nothing else::
 
     mp4ds.pack("drive.bag", "drive")            a recording into a dataset
     mp4ds.unpack("drive", "bag", "again.bag")   and back
+    mp4ds.play("drive")                         as if it were the recording: ROS 1, ROS 2, Foxglove
     mp4ds.validate("drive", deep=True)          every problem, or an empty list
     mp4ds.open("drive")["/camera/image_raw"][7].data
     mp4ds.open("drive")["/camera/image_raw"].read([7, 3, 9], format="rgb", resize=0.5)
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
         Mp4dsError,
         OptionError,
         PartsFailedError,
+        PublishError,
         RemoteError,
         SourceError,
         SourceNotFoundError,
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
         WriteError,
     )
     from mp4ds.packing import PackOptions, PackSummary, pack, pack_each, pack_share
+    from mp4ds.playing import PlayOptions, PlaySummary, play
     from mp4ds.recorded import RecordedMessage
     from mp4ds.sync import Sync
     from mp4ds.unpacking import UnpackOptions, UnpackSummary, unpack
@@ -57,6 +60,7 @@ _HOMES = {
         "Mp4dsError",
         "OptionError",
         "PartsFailedError",
+        "PublishError",
         "RemoteError",
         "SourceError",
         "SourceNotFoundError",
@@ -67,6 +71,7 @@ _HOMES = {
         "WriteError",
     ),
     "packing": ("PackOptions", "PackSummary", "pack", "pack_each", "pack_share"),
+    "playing": ("PlayOptions", "PlaySummary", "play"),
     "recorded": ("RecordedMessage",),
     "sync": ("Sync",),
     "unpacking": ("UnpackOptions", "UnpackSummary", "unpack"),
@@ -85,7 +90,10 @@ __all__ = [
     "PackOptions",
     "PackSummary",
     "PartsFailedError",
+    "PlayOptions",
+    "PlaySummary",
     "Problem",
+    "PublishError",
     "RecordedMessage",
     "RemoteError",
     "SourceError",
@@ -105,6 +113,7 @@ __all__ = [
     "pack",
     "pack_each",
     "pack_share",
+    "play",
     "unpack",
     "validate",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import chain
@@ -13,15 +13,24 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.mcap import McapReader
-from mp4ds.channels import ChannelGroup, ImageChannel, MessageSource, channel_groups
-from mp4ds.errors import FormatError, OptionError, SourceError, SourceNotFoundError
-from mp4ds.outputs import digest_file
-from mp4ds.recorded import RecordedMessage, as_recorded
+from mp4ds.channels import (
+    Ahead,
+    ChannelGroup,
+    ImageChannel,
+    MessageSource,
+    PartKey,
+    Reading,
+    channel_groups,
+    log_times,
+    when_asked,
+)
+from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
+from mp4ds.recorded import MessagesFile, RecordedMessage, as_recorded
 from mp4ds.records import Channel, Excerpt, Message, Record, Schema
 from mp4ds.remote import location
 from mp4ds.sidecar import MANIFEST_NAME, MESSAGES_NAME, Manifest, load_manifest
 from mp4ds.streams import Frame, Frames, Stream, Video
+from mp4ds.streams.choices import Choice, everything, last_of, since
 from mp4ds.sync import Sync, synchronize
 
 __all__ = ["Dataset", "Frame", "Frames", "ImageChannel", "Stream", "Video", "open_dataset"]
@@ -126,28 +135,18 @@ class Dataset:
         return [*self._verbatim_channels, *(group.channel for group in self._groups)]
 
     @cached_property
+    def _file(self) -> MessagesFile:
+        return MessagesFile(self.path / MESSAGES_NAME if self.manifest else None)
+
+    @property
     def unused_schemas(self) -> list[Schema]:
         """Definitions of the recording that no channel refers to."""
-        if self._messages_path is None:
-            return []
-        with McapReader(self._messages_path) as reader:
-            return list(reader.unused_schemas)
-
-    @cached_property
-    def _messages_path(self) -> Path | None:
-        return self.path / MESSAGES_NAME if self.manifest else None
+        return self._file.unused_schemas
 
     @property
     def recorded_count(self) -> int | None:
         """Messages in messages.mcap as far as its index tells."""
-        return sum(self._recorded_counts().values())
-
-    def _recorded_counts(self) -> dict[int, int]:
-        """Messages in messages.mcap by channel id."""
-        if self._messages_path is None:
-            return {}
-        with McapReader(self._messages_path) as reader:
-            return {key: item.count for key, item in reader.stats().items()}
+        return sum(self._file.counts().values())
 
     def verify_messages(self) -> None:
         """Compare messages.mcap with its SHA-256: not all that it holds has a checksum of its own.
@@ -155,45 +154,25 @@ class Dataset:
         Raises:
             FormatError: ``file-missing`` or ``hash-mismatch``.
         """
-        if self._messages_path is None or self.manifest is None:
-            return
-        if not self._messages_path.is_file():
-            raise FormatError("file-missing", self._messages_path, "does not exist")
-        entry = next((item for item in self.manifest.files if item.name == MESSAGES_NAME), None)
-        if entry is None or digest_file(self._messages_path)[1] != entry.sha256:
-            raise FormatError(
-                "hash-mismatch",
-                self._messages_path,
-                "does not have the SHA-256 that the manifest says",
-            )
+        if self.manifest:
+            self._file.verify(self.manifest)
 
     def recorded_records(self) -> Iterator[Record]:
         """Everything in messages.mcap, in file order."""
-        if self._messages_path is not None:
-            with McapReader(self._messages_path, in_file_order=True) as reader:
-                yield from reader.records()
-
-    @cached_property
-    def _recorded(self) -> list[Channel]:
-        if self._messages_path is None:
-            return []
-        if not self._messages_path.is_file():
-            raise FormatError("file-missing", self._messages_path, "does not exist")
-        with McapReader(self._messages_path) as reader:
-            return list(reader.channels)
+        return self._file.in_file_order()
 
     @cached_property
     def _groups(self) -> list[ChannelGroup]:
-        return channel_groups(self.streams, self._recorded)
+        return channel_groups(self.streams, self._file.channels)
 
     @cached_property
     def _verbatim_channels(self) -> list[Channel]:
         split = {channel_id for group in self._groups for channel_id in group.recorded_ids}
-        return [channel for channel in self._recorded if channel.id not in split]
+        return [channel for channel in self._file.channels if channel.id not in split]
 
     def image_channels(self) -> list[ImageChannel]:
         """The channels that have images in videos."""
-        recorded = self._recorded_counts()
+        recorded = self._file.counts()
         found = []
         for group in self._groups:
             if group.streams:
@@ -223,7 +202,7 @@ class Dataset:
                 f"{self.path} has no topic {unknown[0]!r}; there are: {', '.join(known) or 'none'}"
             )
         wanted = None if topics is None else frozenset(topics)
-        return as_recorded(self._no_frames(wanted), self._messages_path or self.path)
+        return as_recorded(self._no_frames(wanted), self._file.path or self.path)
 
     def _no_frames(self, wanted: frozenset[str] | None) -> Iterator[Message]:
         ids = {channel.id for channel in self._verbatim_channels}
@@ -232,19 +211,12 @@ class Dataset:
             if wanted is not None and group.channel.topic not in wanted:
                 continue
             if not group.streams:
-                calibrations.append(self._group_messages(group, {}))
+                calibrations.append(self._group_messages(group, Reading()))
             elif wanted is not None:
                 ids |= group.recorded_ids
-        return heapq.merge(self._recorded_in_time(ids, wanted), *calibrations, key=_time_of)
-
-    def _recorded_in_time(self, ids: set[int], topics: frozenset[str] | None) -> Iterator[Message]:
-        """Messages of some channels and topics in messages.mcap, by log time."""
-        if self._messages_path is None:
-            return
-        with McapReader(self._messages_path) as reader:
-            for record in reader.records(Excerpt(topics=topics, others=False)):
-                if isinstance(record, Message) and record.channel.id in ids:
-                    yield record
+        found = self._file.in_time(Excerpt(topics=wanted))
+        recorded = (message for message in found if message.channel.id in ids)
+        return heapq.merge(recorded, *calibrations, key=_time_of)
 
     def sync(
         self,
@@ -282,71 +254,100 @@ class Dataset:
         alike = sum(stream.topic in (other.topic, other.path.stem) for other in self._all)
         return stream.topic if alike == 1 else stream.path.stem
 
-    def records(self, sources: Mapping[Path, MessageSource] | None = None) -> Iterator[Record]:
+    def records(
+        self,
+        sources: Mapping[PartKey, MessageSource] | None = None,
+        *,
+        start: int | None = None,
+        choose: Choice = everything,
+        topics: Collection[str] | None = None,
+        ahead: Ahead = when_asked,
+    ) -> Iterator[Record]:
         """Everything that was recorded, merged by log time; each channel in its own order.
 
+        From a time on, a channel's messages that are in messages.mcap are merged with those of
+        its videos by log time. There are only messages then, and what lies before the key frame
+        of the first one of a video is not decoded. Where some messages are left out, videos are
+        not compared with their SHA-256, while messages still are with their digests.
+
         Args:
-            sources: What gives the messages of a stream, by the path of its sidecar; those of
-                the others are as recorded.
+            sources: What gives the messages of a video or its calibrations; all others are as
+                recorded.
+            start: The first log time, nanoseconds; None for everything.
+            choose: Which messages of videos, and of their calibrations, are wanted. Packets
+                that refer to others come with those between two that are wanted.
+            topics: Only these topics; None for all.
+            ahead: Wraps what gives the messages of each video and calibration, and of
+                messages.mcap, so that each may be read by a thread of its own. A dataset is not
+                to be read twice at a time by such threads.
 
         Raises:
             FormatError: A frame does not decode, or a message does not match its digest.
         """
-        groups = (self._group_messages(group, sources or {}) for group in self._groups)
-        return heapq.merge(self._verbatim_records(), *groups, key=_time_of)
+        choice = choose if start is None else since(start, choose)
+        reading = Reading(sources or {}, choice, ahead)
+        groups = [item for item in self._groups if topics is None or item.channel.topic in topics]
+        if start is not None:
+            excerpt = Excerpt(start=start, topics=None if topics is None else frozenset(topics))
+            recorded = ahead(self._recorded_in(excerpt))
+            parts = [part for group in groups for part in group.parts_of(reading)]
+            return heapq.merge(recorded, *parts, key=_time_of)
+        channels = (self._group_messages(group, reading) for group in groups)
+        return heapq.merge(ahead(self._verbatim_records(topics)), *channels, key=_time_of)
+
+    def last_before(self, time_ns: int, channels: Collection[Channel]) -> list[Message]:
+        """The last message of some channels before a log time, of those that have one.
+
+        Args:
+            time_ns: Nanoseconds.
+            channels: Of `channels`.
+        """
+        found: dict[int, Message] = {}
+        topics = frozenset(channel.topic for channel in channels)
+        for message in self._recorded_in(Excerpt(end=time_ns, topics=topics)):
+            found[message.channel.id] = message
+        reading = Reading(choice=last_of(time_ns))
+        for group in self._groups:
+            for message in group.messages(reading) if group.channel.topic in topics else ():
+                other = found.get(message.channel.id)
+                if other is None or other.log_time <= message.log_time:
+                    found[message.channel.id] = message
+        return [found[channel.id] for channel in channels if channel.id in found]
 
     def times(self) -> dict[int, NDArray[np.int64]]:
         """Sorted log times of every message, nanoseconds, by channel id; decodes no frame."""
-        found: dict[int, list[NDArray[np.int64]]] = {}
-        if self._messages_path is not None:
-            with McapReader(self._messages_path) as reader:
-                found = {key: [times] for key, times in reader.times().items()}
-        for group in self._groups:
-            recorded = [found.pop(key)[0] for key in group.recorded_ids if key in found]
-            found[group.channel.id] = [
-                *recorded,
-                *(part.columns.log_time for part in group.parts),
-            ]
-        return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items() if arrays}
+        return log_times(self._groups, self._file.times())
 
     def gaps(self) -> Iterator[tuple[str, str]]:
-        """Topics of which the columns say that messages are missing, and what is missing.
-
-        The places that a channel's columns leave free are those of its messages in
-        messages.mcap, so these must be as many.
-        """
-        if self._messages_path is None:
+        """Topics of which the columns say that messages are missing, and what is missing."""
+        if self.manifest is None:
             return
-        recorded = self._recorded_counts()
+        recorded = self._file.counts()
         for group in self._groups:
-            places = np.concatenate([part.columns.ordinal for part in group.parts])
-            total = len(places) + sum(recorded.get(key, 0) for key in group.recorded_ids)
-            if len(np.unique(places)) < len(places):
-                yield group.channel.topic, "two messages have the same place"
-            elif places.max() >= total:
-                yield group.channel.topic, f"has {total} messages and one of number {places.max()}"
+            gap = group.gap(sum(recorded.get(key, 0) for key in group.recorded_ids))
+            if gap:
+                yield group.channel.topic, gap
 
-    def _verbatim_records(self) -> Iterator[Record]:
-        wanted = {channel.id for channel in self._verbatim_channels}
+    def _verbatim_records(self, topics: Collection[str] | None) -> Iterator[Record]:
+        channels = self._verbatim_channels
+        wanted = {item.id for item in channels if topics is None or item.topic in topics}
         for record in self.recorded_records():
             if not isinstance(record, Message) or record.channel.id in wanted:
                 yield record
 
-    def _group_messages(
-        self, group: ChannelGroup, sources: Mapping[Path, MessageSource]
-    ) -> Iterator[Message]:
-        """One channel's messages from all its places, in the channel's order."""
-        recorded = self._recorded_messages(group)
-        if self.manifest is None:  # a pair alone has only its own messages
-            return chain(group.messages(sources), recorded)
-        return group.merged(sources, recorded, str(self.path))
+    def _recorded_in(self, excerpt: Excerpt) -> Iterator[Message]:
+        """Messages in messages.mcap, by log time, on the channels that they belong to."""
+        owners = {key: group.channel for group in self._groups for key in group.recorded_ids}
+        for message in self._file.in_time(excerpt):
+            owner = owners.get(message.channel.id)
+            yield replace(message, channel=owner) if owner else message
 
-    def _recorded_messages(self, group: ChannelGroup) -> Iterator[Message]:
-        if not group.recorded_ids:
-            return
-        for record in self.recorded_records():
-            if isinstance(record, Message) and record.channel.id in group.recorded_ids:
-                yield replace(record, channel=group.channel)
+    def _group_messages(self, group: ChannelGroup, reading: Reading) -> Iterator[Message]:
+        """One channel's messages from all its places, in the channel's order."""
+        recorded = reading.ahead(group.found_in(self.recorded_records()))
+        if self.manifest is None:  # a pair alone has only its own messages
+            return chain(group.messages(reading), recorded)
+        return group.merged(reading, recorded, str(self.path))
 
     def close(self) -> None:
         """Close all videos."""

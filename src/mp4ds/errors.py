@@ -16,7 +16,8 @@
     ├── WriteError (OSError)           1  the disk refused while writing
     ├── PartsFailedError               1  parts of a pack failed, the others are kept
     ├── ClusterError (ConnectionError) 1  a cluster that does not answer, or was lost
-    └── RemoteError                    1  a store or web server that fails
+    ├── RemoteError                    1  a store or web server that fails
+    └── PublishError (OSError)         1  ROS or another receiver that is not there, or was lost
 
 The classes build their sentence from their fields: what, where, and what to do.
 The exit code is the one that the command line ends with.
@@ -226,3 +227,16 @@ class RemoteError(Mp4dsError):
     def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
         self.path = _as_path(path)
         super().__init__(f"{path}: {problem}." + (f" {remedy}" if remedy else ""))
+
+
+class PublishError(Mp4dsError, OSError):
+    """Messages cannot be published: a master or client library is missing, or was lost.
+
+    Args:
+        where: A topic, or the address of what does not answer.
+        problem: What is wrong and what to do, without a full stop.
+    """
+
+    def __init__(self, where: str, problem: str) -> None:
+        self.where = where
+        super().__init__(f"{where}: {problem}.")

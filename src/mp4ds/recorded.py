@@ -1,16 +1,102 @@
-"""Messages of a recording that are no frames, to be looked at."""
+"""messages.mcap of a dataset, and messages of a recording to be looked at."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from mp4ds.errors import SourceError
-from mp4ds.records import Channel, Message
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.bags.mcap import McapReader
+from mp4ds.errors import FormatError, SourceError
+from mp4ds.outputs import digest_file
+from mp4ds.records import Channel, Excerpt, Message, Record, Schema
+from mp4ds.sidecar import MESSAGES_NAME, Manifest
 from mp4ds.wire import WireError
+
+
+class MessagesFile:
+    """messages.mcap of a dataset; of one video with its sidecar, which has none, empty.
+
+    Args:
+        path: The file; None where there is none.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self.path = path
+
+    def verify(self, manifest: Manifest) -> None:
+        """Compare it with its SHA-256: not all that it holds has a checksum of its own.
+
+        Raises:
+            FormatError: ``file-missing`` or ``hash-mismatch``.
+        """
+        if self.path is None:
+            return
+        self._check_there(self.path)
+        entry = next((item for item in manifest.files if item.name == MESSAGES_NAME), None)
+        if entry is None or digest_file(self.path)[1] != entry.sha256:
+            raise FormatError(
+                "hash-mismatch", self.path, "does not have the SHA-256 that the manifest says"
+            )
+
+    @staticmethod
+    def _check_there(path: Path) -> None:
+        if not path.is_file():
+            raise FormatError("file-missing", path, "does not exist")
+
+    @cached_property
+    def channels(self) -> list[Channel]:
+        """Its channels.
+
+        Raises:
+            FormatError: ``file-missing``.
+        """
+        if self.path is None:
+            return []
+        self._check_there(self.path)
+        with McapReader(self.path) as reader:
+            return list(reader.channels)
+
+    @cached_property
+    def unused_schemas(self) -> list[Schema]:
+        """Definitions that no channel refers to."""
+        if self.path is None:
+            return []
+        with McapReader(self.path) as reader:
+            return list(reader.unused_schemas)
+
+    def counts(self) -> dict[int, int]:
+        """Messages by channel id, as far as its index tells."""
+        if self.path is None:
+            return {}
+        with McapReader(self.path) as reader:
+            return {key: item.count for key, item in reader.stats().items()}
+
+    def times(self) -> Mapping[int, NDArray[np.int64]]:
+        """Sorted log times, nanoseconds, by channel id."""
+        if self.path is None:
+            return {}
+        with McapReader(self.path) as reader:
+            return reader.times()
+
+    def in_file_order(self) -> Iterator[Record]:
+        """All that is in it, as it stands there."""
+        if self.path is not None:
+            with McapReader(self.path, in_file_order=True) as reader:
+                yield from reader.records()
+
+    def in_time(self, excerpt: Excerpt) -> Iterator[Message]:
+        """The messages of an excerpt, by log time."""
+        if self.path is not None:
+            with McapReader(self.path) as reader:
+                for record in reader.records(replace(excerpt, others=False)):
+                    if isinstance(record, Message):
+                        yield record
 
 
 @dataclass(frozen=True)

@@ -234,7 +234,7 @@ class Converter:
     def _ros1_channel(self, channel: Channel, plan: _Plan) -> Channel:
         qos = channel.metadata.get("offered_qos_profiles", "")
         metadata = {"md5sum": plan.digest}
-        if _is_latched(qos):
+        if is_latched(channel):
             metadata["latching"] = "1"
         elif qos:
             self._omitted["QoS profiles of topics, which ROS 1 has not"] += 1
@@ -242,9 +242,8 @@ class Converter:
 
 
 def _ros2_channel(channel: Channel, plan: _Plan) -> Channel:
-    latched = channel.metadata.get("latching", "").lower() in ("1", "true")
     metadata = {
-        "offered_qos_profiles": LATCHED_QOS if latched else "",
+        "offered_qos_profiles": LATCHED_QOS if is_latched(channel) else "",
         "topic_type_hash": plan.digest,
         **{_ROS1 + key: value for key, value in channel.metadata.items()},
         _ROS1 + "type": channel.type_name,
@@ -258,8 +257,11 @@ def _ros2_channel(channel: Channel, plan: _Plan) -> Channel:
     return replace(channel, message_encoding="cdr", schema=plan.schema, metadata=metadata)
 
 
-def _is_latched(qos: str) -> bool:
-    """Whether all of a topic's QoS profiles, a YAML text, say transient local."""
+def is_latched(channel: Channel) -> bool:
+    """Whether those that subscribe late get the last message: latching, or transient local."""
+    if channel.metadata.get("latching", "").lower() in ("1", "true"):
+        return True
+    qos = channel.metadata.get("offered_qos_profiles", "")
     found = re.findall(r"durability[\"']?\s*:\s*[\"']?(\w+)", qos)
     return bool(found) and set(found) <= {"1", "transient_local"}
 

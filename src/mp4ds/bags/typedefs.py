@@ -169,6 +169,39 @@ def same_wire(left: Typesdict, left_name: str, right: Typesdict, right_name: str
     return True
 
 
+@dataclass(frozen=True, slots=True)
+class FieldShape:
+    """What a field holds.
+
+    Attributes:
+        base: A basic type such as ``uint8`` or ``string``; empty for a message.
+        message: Name of the message type; empty for a basic type.
+        text_bound: Most characters of a string; 0 for any number.
+        length: Elements of an array of fixed length; None for anything else.
+        bound: Most elements of a sequence, 0 for any number; None for anything else.
+    """
+
+    base: str
+    message: str
+    text_bound: int
+    length: int | None
+    bound: int | None
+
+
+def field_shape(desc: FieldDesc) -> FieldShape:
+    """What a field of `fields_of` holds."""
+    length, bound = None, None
+    if desc[0] == Nodetype.ARRAY:
+        desc, length = desc[1]
+    elif desc[0] == Nodetype.SEQUENCE:
+        desc, bound = desc[1]
+    if desc[0] == Nodetype.NAME:
+        return FieldShape("", str(desc[1]), 0, length, bound)
+    if desc[0] == Nodetype.BASE:
+        return FieldShape(str(desc[1][0]), "", int(desc[1][1] or 0), length, bound)
+    raise ValueError("an array of arrays")
+
+
 def _shape(desc: FieldDesc) -> tuple[int, int, str, str]:
     """Kind, length of an array, base type, name of a message type; bounds do not matter."""
     kind, count = Nodetype.BASE, 0

@@ -6,21 +6,21 @@ options are wrong; 130 interrupted.
 
 from __future__ import annotations
 
-import errno
 import os
 import signal
 import sys
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, Optional
+from typing import Annotated, NoReturn, Optional
 
 import typer
 
 from mp4ds._version import __version__
-from mp4ds.cli.arguments import parse_share, parse_size
+from mp4ds.cli.arguments import parse_resize, parse_share, parse_size, spelled
+from mp4ds.cli.conformance import conformance_dump
+from mp4ds.cli.evaluate import evaluate
+from mp4ds.cli.failures import told_errors
 from mp4ds.cli.output import (
     print_info,
     print_json,
@@ -31,11 +31,10 @@ from mp4ds.cli.output import (
     status_line,
     unpack_progress,
 )
+from mp4ds.cli.play import play
 from mp4ds.cli.progress import pack_progress
-from mp4ds.errors import Mp4dsError, OptionError
-
-_AGAIN = "run the same command again to go on"
-_BAD_PATH = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EACCES, errno.EINVAL)
+from mp4ds.cli.report import frames, report
+from mp4ds.errors import OptionError
 
 app = typer.Typer(
     name="mp4ds",
@@ -184,7 +183,7 @@ def pack(
     from mp4ds.packing import pack as run
 
     summaries: list[PackSummary] = []
-    with _errors(as_json), pack_progress(as_json, whole=not shard) as progress:
+    with told_errors(as_json), pack_progress(as_json, whole=not shard) as progress:
         options = PackOptions(
             topics=topics or (),
             exclude=exclude or (),
@@ -242,12 +241,24 @@ def unpack(
         typer.Option(
             "--images",
             metavar="KIND",
-            help="Give all cameras as raw, jpeg, png or compressed-video; as recorded by default.",
+            help="Give all cameras as raw, jpeg, png, compressed-video or ffmpeg; as recorded by "
+            "default.",
         ),
     ] = None,
     jpeg_quality: Annotated[
         int, typer.Option("--jpeg-quality", min=1, max=100, help="Of JPEG files that are made.")
     ] = 95,
+    resize: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--resize", metavar="0.5|WxH", help="Smaller images, calibrations to match."),
+    ] = None,
+    every: Annotated[
+        int, typer.Option("--every", min=1, metavar="N", help="Every Nth frame only.")
+    ] = 1,
+    max_rate: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option("--max-rate", metavar="HZ", help="So many frames a second at most."),
+    ] = None,
     topics: TopicsOption = None,
     exclude: ExcludeOption = None,
     force: ForceFlag = False,
@@ -260,21 +271,31 @@ def unpack(
     from mp4ds.unpacking import UnpackOptions
     from mp4ds.unpacking import unpack as run
 
-    options = UnpackOptions(
-        storage=storage,
-        topics=topics or (),
-        exclude=exclude or (),
-        image_format=image_format,
-        images=images,
-        jpeg_quality=jpeg_quality,
-        force=force,
-    )
-    with _errors(as_json), unpack_progress(as_json) as progress:
+    with told_errors(as_json), unpack_progress(as_json) as progress:
+        options = UnpackOptions(
+            storage=storage,
+            topics=topics or (),
+            exclude=exclude or (),
+            image_format=image_format,
+            images=images,
+            jpeg_quality=jpeg_quality,
+            resize=parse_resize(resize) if resize is not None else None,
+            every=every,
+            max_rate=max_rate,
+            force=force,
+        )
         summary = run(dataset, to, output, options, progress=progress)
     if as_json:
         print_json(summary)
         return
     print_unpack(summary, "images" if to == "images" else "messages")
+
+
+app.command()(play)
+app.command()(report)
+app.command()(frames)
+app.command()(evaluate)
+app.command()(conformance_dump)
 
 
 @app.command()
@@ -289,7 +310,7 @@ def validate(
     from mp4ds.checks import validate as run
     from mp4ds.remote import location
 
-    with _errors(as_json), status_line(as_json) as report:
+    with told_errors(as_json), status_line(as_json) as report:
         where = location(path)
         problems = run(where, deep=deep, progress=report)
     if as_json:
@@ -316,7 +337,7 @@ def info(
         return
     from mp4ds.info import info as run
 
-    with _errors(as_json):
+    with told_errors(as_json):
         result = run(path)
     if as_json:
         print_json(result)
@@ -328,7 +349,7 @@ def _print_intrinsics(path: str, as_json: bool) -> None:
     from mp4ds.cli.calibrations import print_intrinsics
     from mp4ds.intrinsics import intrinsics as run
 
-    with _errors(as_json), status_line(as_json, "reading"):
+    with told_errors(as_json), status_line(as_json, "reading"):
         result = run(path)
     if as_json:
         print_json(result)
@@ -346,7 +367,7 @@ def demo(
     """Make a small recording: two cameras (Bayer and rgb), calibrations, imu and tf."""
     from mp4ds.demo import demo as run
 
-    with _errors(as_json):
+    with told_errors(as_json):
         messages = run(output, seconds=seconds, force=force)
     if as_json:
         print_json({"output": output, "messages": messages})
@@ -368,31 +389,5 @@ def main() -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal may lack a topic's letters
-    app()
+    app(args=spelled(sys.argv[1:]))
     sys.exit(0)
-
-
-@contextmanager
-def _errors(as_json: bool) -> Iterator[None]:
-    """Turn errors raised on purpose into one sentence and an exit code."""
-    try:
-        yield
-    except KeyboardInterrupt as interrupt:
-        _fail(str(interrupt) or "interrupted; nothing unfinished was left behind", 130, as_json)
-    except SystemExit as ended:  # by SIGTERM
-        _fail("ended; what is finished of a pack in parts is kept: " + _AGAIN, ended.code, as_json)
-    except Mp4dsError as error:
-        _fail(str(error), error.exit_code, as_json)
-    except OSError as error:
-        # a path that the system itself refuses, wherever it was met
-        code = 2 if error.errno in _BAD_PATH else 1
-        _fail(f"{error.filename or 'a file'}: {error.strerror or error}", code, as_json)
-    except MemoryError:
-        _fail("out of memory; try fewer --jobs", 1, as_json)
-
-
-def _fail(message: str, code: Any, as_json: bool) -> NoReturn:
-    if as_json:
-        print_json({"error": message, "exit_code": code})
-    print(f"mp4ds: {shown(message)}", file=sys.stderr)
-    raise typer.Exit(code)

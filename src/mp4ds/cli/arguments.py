@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 from mp4ds.errors import OptionError
 
@@ -32,3 +33,40 @@ def parse_share(text: str) -> tuple[int, int]:
     if not match or not 1 <= int(match[1]) <= int(match[2]):
         raise OptionError(f"--shard {text!r} is not I/N, such as 3/16, with I from 1 to N.")
     return int(match[1]), int(match[2])
+
+
+def spelled(arguments: Sequence[str]) -> list[str]:
+    """Arguments of the command line, ``play --clock 50`` with its rate as an option of its own.
+
+    ``--clock`` is a flag of `rosbag play` and takes a number, if there is one, from users of
+    ``ros2 bag play``.
+    """
+    if arguments[:1] != ["play"]:
+        return [*arguments]
+    made: list[str] = []
+    for argument in arguments:
+        name, has_value, value = argument.partition("=")
+        if name == "--clock" and has_value:
+            made += ["--clock", "--hz", value]
+        elif made[-1:] == ["--clock"] and re.fullmatch(r"[0-9]+(\.[0-9]+)?", argument):
+            made += ["--hz", argument]
+        else:
+            made.append(argument)
+    return made
+
+
+def parse_resize(text: str) -> float | tuple[int, int]:
+    """A factor, or width and height, of ``0.5`` or ``640x480``.
+
+    Raises:
+        OptionError: It is neither.
+    """
+    match = re.fullmatch(r"([0-9]{1,6})x([0-9]{1,6})", text.strip().lower())
+    if match:
+        return int(match[1]), int(match[2])
+    try:
+        return float(text)
+    except ValueError:
+        raise OptionError(
+            f"--resize {text!r} is no size. Give a factor such as 0.5, or WxH such as 640x480."
+        ) from None

@@ -104,7 +104,7 @@ def size_text(count: float) -> str:
     return f"{count:.2f} TB"
 
 
-def _print_table(columns: list[tuple[str, str]], rows: list[list[str]]) -> None:
+def print_table(columns: list[tuple[str, str]], rows: list[list[str]]) -> None:
     """Print a table; a column is right-aligned, or folds where the screen is too narrow."""
     from rich.console import Console
     from rich.table import Table
@@ -125,7 +125,7 @@ def _print_table(columns: list[tuple[str, str]], rows: list[list[str]]) -> None:
 
 def print_pack(summary: PackSummary) -> None:
     """Print what became of each topic."""
-    _print_table(_PACK_COLUMNS, [_pack_row(topic) for topic in summary.topics])
+    print_table(_PACK_COLUMNS, [_pack_row(topic) for topic in summary.topics])
     for topic in summary.topics:
         for reason, (count, first) in topic.verbatim.items():
             say(
@@ -188,6 +188,8 @@ def print_unpack(summary: UnpackSummary, noun: str) -> None:
     for topic, reasons in summary.as_recorded.items():
         for reason, count in reasons.items():
             say(f"{topic}: {count} messages as recorded: {reason}")
+    for topic, count in summary.thinned.items():
+        say(f"{topic}: {count} messages left out")
     if summary.converted:
         say(f"converted between ROS 1 and ROS 2: {', '.join(summary.converted)}")
     for what, count in summary.omitted.items():
@@ -219,7 +221,7 @@ def print_info(result: Info) -> None:
             f"{start:%Y-%m-%d %H:%M:%S} UTC, {(result.end - result.start) / 1e9:.2f} s, "
             f"{sum(topic.messages for topic in result.topics)} messages"
         )
-    _print_table(_INFO_COLUMNS, [_info_row(topic) for topic in result.topics])
+    print_table(_INFO_COLUMNS, [_info_row(topic) for topic in result.topics])
     for note in result.notes:
         say(note)
 

@@ -1,9 +1,10 @@
-"""Images in another form than recorded: raw, as JPEG or PNG files, or as packets of video."""
+"""Images in another form than recorded: raw, as files, or as packets of video; smaller, fewer."""
 
 from __future__ import annotations
 
-from mp4ds.republish.pictures import files_of, holds_files
-from mp4ds.republish.republisher import Republished, Republisher
+from mp4ds.republish.pictures import image_files
+from mp4ds.republish.reduction import Reduction
+from mp4ds.republish.republisher import Republished, Republisher, check_kind
 from mp4ds.republish.topics import KINDS
 
-__all__ = ["KINDS", "Republished", "Republisher", "files_of", "holds_files"]
+__all__ = ["KINDS", "Reduction", "Republished", "Republisher", "check_kind", "image_files"]

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-KINDS = ("raw", "jpeg", "png", "compressed-video")
+KINDS = ("raw", "jpeg", "png", "compressed-video", "ffmpeg")
 """What images can be given as."""
 
-_SUFFIXES = {"jpeg": "compressed", "png": "compressed", "compressed-video": "compressed_video"}
+_SUFFIXES = {
+    "jpeg": "compressed",
+    "png": "compressed",
+    "compressed-video": "compressed_video",
+    "ffmpeg": "ffmpeg",
+}
 _TRANSPORTS = ("compressed", "compressedDepth", "ffmpeg", "foxglove", "compressed_video")
 _FAMILIES = {
     "Image": "raw",
@@ -16,7 +21,13 @@ _FAMILIES = {
     "CompressedVideo": "video",
     "FFMPEGPacket": "video",
 }
-_FAMILY_OF_KIND = {"raw": "raw", "jpeg": "file", "png": "file", "compressed-video": "video"}
+_FAMILY_OF_KIND = {
+    "raw": "raw",
+    "jpeg": "file",
+    "png": "file",
+    "compressed-video": "video",
+    "ffmpeg": "video",
+}
 
 
 def republished_topic(topic: str, type_name: str, kind: str) -> str:
@@ -45,16 +56,14 @@ class FreeTopics:
 
     Args:
         taken: Topics that are there anyway.
-        kind: One of `KINDS`.
     """
 
-    def __init__(self, taken: Iterable[str], kind: str) -> None:
+    def __init__(self, taken: Iterable[str]) -> None:
         self._taken = set(taken)
-        self._ending = "_" + kind.replace("-", "_")
 
-    def take(self, topic: str) -> str:
-        """The topic, or one made of it where it is taken."""
+    def take(self, topic: str, kind: str) -> str:
+        """The topic, or one made of it and its kind, one of `KINDS`, where it is taken."""
         while topic in self._taken:
-            topic += self._ending
+            topic += "_" + kind.replace("-", "_")
         self._taken.add(topic)
         return topic

@@ -1,18 +1,21 @@
 """The message types of republished images: definitions, channels, serialized messages.
 
-The types are those of sensor_msgs, and Foxglove's schema CompressedVideo
-(docs.foxglove.dev, "CompressedVideo").
+The types are those of sensor_msgs, Foxglove's schema CompressedVideo (docs.foxglove.dev,
+"CompressedVideo"), and FFMPEGPacket of ffmpeg_image_transport_msgs, which is another one in ROS 1
+(daniilidis-group) than in ROS 2 (ros-misc-utilities).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.typedefs import World, make_store, ros1_world, ros2_world, types_of
 from mp4ds.records import Channel, Schema
-from mp4ds.wire import CodedFields, Fields, Slots, Template, WireError, form_of
-from mp4ds.wire.cursor import Writer
+from mp4ds.republish import packets
+from mp4ds.republish.packets import VideoFields
+from mp4ds.wire import Fields, Slots, Template, WireError, form_of
 from mp4ds.wire.forms import NS
 
 _DISTRIBUTION = "humble"
@@ -21,14 +24,21 @@ _TYPES = {
     "jpeg": "sensor_msgs/msg/CompressedImage",
     "png": "sensor_msgs/msg/CompressedImage",
     "compressed-video": "foxglove_msgs/msg/CompressedVideo",
+    "ffmpeg": "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
 }
-_VIDEO_DEFINITION = """\
-{time} timestamp
-string frame_id
-uint8[] data
-string format
-"""
-_TIMES = {"ros1": "time", "cdr": "builtin_interfaces/Time"}
+_VIDEO = "string frame_id\nuint8[] data\nstring format\n"
+_DEFINITIONS = {  # of the types that are not among the standard ones
+    ("compressed-video", "ros1"): f"time timestamp\n{_VIDEO}",
+    ("compressed-video", "cdr"): f"builtin_interfaces/Time timestamp\n{_VIDEO}",
+    ("ffmpeg", "ros1"): (
+        "Header header\nuint8[] data\nint32 img_width\nint32 img_height\nstring encoding\n"
+        "uint64 pts\nuint8 flags\n"
+    ),
+    ("ffmpeg", "cdr"): (
+        "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\n"
+        "uint8 flags\nbool is_bigendian\nuint8[] data\n"
+    ),
+}
 _WIRES = {"ros1": "ros1", "cdr": "cdr-le"}
 _HASHES = {"ros1": "md5sum", "cdr": "topic_type_hash"}
 _DEFINITION = "message_definition"
@@ -95,35 +105,49 @@ class Types:
             known, md5sum = self._defined("ros1")
             values = (known.name, md5sum, known.data.decode())
             kept |= dict(zip((_REMEMBERED + key for key in _OF_TYPE), values, strict=True))
-        made = Channel(channel_id, topic, encoding, schema, kept)
-        return self._converter.channel(made)
+        made = self._converter.channel(Channel(channel_id, topic, encoding, schema, kept))
+        if self._kind != "ffmpeg" or encoding == self.encoding:
+            return made
+        schema, digest = self._defined(self.encoding)  # the other ROS has another type
+        return replace(
+            made, schema=schema, metadata={**made.metadata, _HASHES[self.encoding]: digest}
+        )
 
     def _defined(self, encoding: str) -> tuple[Schema, str]:
         """The type's definition, and its md5sum or hash."""
         name, world = _TYPES[self._kind], self._worlds[encoding]
-        text = ""
-        if self._kind == "compressed-video":
-            text = _VIDEO_DEFINITION.format(time=_TIMES[encoding])
+        text = _DEFINITIONS.get((self._kind, encoding), "")
         schema = Schema(name, world.schema_encoding if text else "", text.encode())
         return _generated(schema, world)
 
     def message(
-        self, slots: Slots, frame_id: str, fields: Fields, body: bytes | memoryview
+        self,
+        slots: Slots,
+        frame_id: str,
+        fields: Fields | VideoFields,
+        body: bytes | memoryview,
+        *,
+        is_key: bool = False,
     ) -> bytes:
         """A message.
 
         Args:
-            slots: Stamp, and the sequence number that ROS 1 has.
+            slots: Stamp, the sequence number that ROS 1 has, and the presentation time of
+                packets.
             frame_id: Coordinate frame.
             fields: Of the image.
             body: Its pixels, file or packet.
+            is_key: For a packet, whether decoding can begin with it.
 
         Raises:
             WireError: The stamp or a number has no place in the serialization.
         """
-        slots = Slots(_wrapped(slots.stamp, signed=self.encoding == "cdr"), slots.seq)
-        if isinstance(fields, CodedFields) and self._kind == "compressed-video":
-            return _video_message(self.encoding, slots, frame_id, fields.format, body)
+        stamp = _wrapped(slots.stamp, signed=self.encoding == "cdr")
+        slots = Slots(stamp, slots.seq, slots.pts)
+        if isinstance(fields, VideoFields):
+            if self._kind == "ffmpeg":
+                return packets.ffmpeg_message(self.encoding, slots, frame_id, fields, body, is_key)
+            return packets.video_message(self.encoding, slots, frame_id, fields.codec, body)
         head, tail = self._template(frame_id, fields).around(slots, len(body))
         return b"".join((head, body, tail))
 
@@ -160,22 +184,3 @@ def _wrapped(stamp: int, *, signed: bool) -> int:
         if signed and seconds >= 2**31:
             seconds -= 2**32
     return seconds * NS + nanoseconds
-
-
-def _video_message(
-    encoding: str, slots: Slots, frame_id: str, video_format: str, body: bytes | memoryview
-) -> bytes:
-    """A CompressedVideo: what follows the data is aligned in CDR."""
-    is_cdr = encoding == "cdr"
-    seconds, nanoseconds = divmod(slots.stamp, NS)
-    head = Writer(b"\0\1\0\0" if is_cdr else b"", "<", aligned=is_cdr)
-    if not (-(2**31) if is_cdr else 0) <= seconds < (2**31 if is_cdr else 2**32):
-        raise WireError("its stamp is beyond what ROS has bits for")
-    head.put("i" if is_cdr else "I", seconds)
-    head.put("I", nanoseconds)
-    head.string(frame_id, terminated=is_cdr)
-    head.put("I", len(body))
-    tail = Writer(b"", "<", aligned=False)
-    tail.string(video_format, terminated=is_cdr)
-    gap = bytes(-len(body) % 4 if is_cdr else 0)
-    return b"".join((head.getvalue(), body, gap, tail.getvalue()))

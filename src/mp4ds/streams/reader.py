@@ -16,6 +16,7 @@ from mp4ds.outputs import digest_file
 from mp4ds.records import Channel, Message
 from mp4ds.sidecar import Calibration, StreamSidecar, load_stream
 from mp4ds.streams.bodies import MessageRebuilder
+from mp4ds.streams.choices import Choice, everything, unbroken
 from mp4ds.streams.frames import Frames
 from mp4ds.streams.rebuild import CameraInfoRebuilder, DecodedColumns, message_at
 from mp4ds.video import FrameReader, PacketReader, VideoDecoder, open_frames
@@ -173,28 +174,41 @@ class Stream(Frames):
     def _frame_id(self, index: int) -> str:
         return self.sidecar.headers[int(self.rebuilder.columns.variant[index])].frame_id
 
-    def messages(self, channel: Channel) -> Iterator[tuple[int, Message]]:
+    def messages(
+        self, channel: Channel, choice: Choice = everything
+    ) -> Iterator[tuple[int, Message]]:
         """The image messages, each with its place among the channel's messages.
 
         Args:
             channel: The channel to make them on.
+            choice: Which are wanted; see `numbered_makers`. The video is compared with its
+                SHA-256 only where all are.
 
         Raises:
             FormatError: A frame does not decode, or a message does not match its digest.
         """
-        rebuilder = self.rebuilder
-        if self.sidecar.digests is None:
+        columns = self.rebuilder.columns
+        if self.sidecar.digests is None and choice is everything:
             self.verify_video()
-        for index, payload in enumerate(self.payloads()):
-            ordinal = int(rebuilder.columns.ordinal[index])
-            yield ordinal, message_at(rebuilder.columns, index, channel, payload)
+        for index, make in self.numbered_makers(choice):
+            yield int(columns.ordinal[index]), message_at(columns, index, channel, make())
 
-    def payloads(self) -> Iterator[bytes | bytearray]:
-        """The payloads of all messages, in order; see `messages`."""
-        return (make() for make in self.makers())
+    def payloads(self, choice: Choice = everything) -> Iterator[bytes | bytearray]:
+        """The payloads of messages, in order; see `messages`."""
+        return (make() for make in self.makers(choice))
 
-    def makers(self) -> Iterator[Callable[[], bytes | bytearray]]:
-        """For each message what makes its payload, to be called before the next one is taken.
+    def makers(self, choice: Choice = everything) -> Iterator[Callable[[], bytes | bytearray]]:
+        """As `numbered_makers`, without the numbers."""
+        return (make for _, make in self.numbered_makers(choice))
+
+    def numbered_makers(
+        self, choice: Choice = everything
+    ) -> Iterator[tuple[int, Callable[[], bytes | bytearray]]]:
+        """For each message its number, and what makes its payload before the next one is taken.
+
+        Args:
+            choice: Which are wanted. Packets of a video that refer to others are of no use
+                without them: those between two that are wanted come, too.
 
         Raises:
             FormatError: A frame cannot be read; the makers raise what else is wrong with one.
@@ -208,12 +222,32 @@ class Stream(Frames):
                 frames=self.sidecar.frames,
                 coded_size=(video.width, video.height),
             ) as reader:
-                for index, packet in enumerate(reader.packets()):
-                    yield partial(rebuilder.packet_payload, index, packet)
+                for index in unbroken(choice(rebuilder.columns), reader.key_numbers):
+                    yield index, partial(rebuilder.packet_payload, index, reader.packet(index))
             return
         with self.open_video(sequential=True) as decoder:
-            for index, picture in enumerate(decoder.pictures()):
-                yield partial(rebuilder.payload, index, picture)
+            for index, picture in self.pictures_in_order(decoder, choice):
+                yield index, partial(rebuilder.payload, index, picture)
+
+    def pictures_in_order(
+        self, decoder: VideoDecoder, choice: Choice = everything
+    ) -> Iterator[tuple[int, Picture]]:
+        """Pictures that are wanted, each with its number.
+
+        Args:
+            decoder: Of `open_video`.
+            choice: Which are wanted. Where all are, the video must not go on after them.
+
+        Yields:
+            Views that hold until the next one is asked for.
+
+        Raises:
+            VideoError: See `VideoDecoder.pictures`.
+        """
+        if choice is everything:
+            yield from enumerate(decoder.pictures())
+        else:
+            yield from decoder.pictures_at(choice(self.rebuilder.columns))
 
     def verify_video(self) -> None:
         """Compare the video with its SHA-256, for where no digest of a message tells damage.
@@ -236,9 +270,18 @@ class Stream(Frames):
         """The columns of the CameraInfo messages, if there are any."""
         return self._info.columns if self._info else None
 
-    def camera_info_messages(self, channel: Channel) -> Iterator[tuple[int, Message]]:
-        """The CameraInfo messages, each with its place among the channel's messages."""
-        return self._info.messages(channel) if self._info else iter(())
+    def camera_info_messages(
+        self, channel: Channel, choice: Choice = everything
+    ) -> Iterator[tuple[int, Message]]:
+        """The CameraInfo messages, each with its place among the channel's messages.
+
+        Args:
+            channel: The channel to make them on.
+            choice: Which are wanted.
+        """
+        if self._info is None:
+            return iter(())
+        return self._info.messages(channel, choice(self._info.columns))
 
     def close(self) -> None:
         """Close the video, if it is open."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -147,7 +147,6 @@ class CameraInfoRebuilder:
     """
 
     def __init__(self, camera_info: CameraInfo, place: str) -> None:
-        self._count = camera_info.messages
         place = f"{place} at camera_info"
         if camera_info.columns is None:
             raise FormatError("column-invalid", place, "has no columns")
@@ -167,10 +166,15 @@ class CameraInfoRebuilder:
         ]
         check_slots(self.columns, self._templates, place)
 
-    def messages(self, channel: Channel) -> Iterator[tuple[int, Message]]:
-        """Ordinal and message of each."""
+    def messages(self, channel: Channel, indices: Iterable[int]) -> Iterator[tuple[int, Message]]:
+        """Ordinal and message of each one that is wanted.
+
+        Args:
+            channel: The channel to make them on.
+            indices: Their numbers.
+        """
         columns = self.columns
-        for index in range(self._count):
+        for index in indices:
             template = self._templates[int(columns.variant[index])]
             payload = b"".join(template.around(columns.slots(index), 0))
             yield int(columns.ordinal[index]), message_at(columns, index, channel, payload)

@@ -94,7 +94,7 @@ def view_of(
     width, height = image_size
     part = _part(topic, image_size, crop) if crop is not None else (0, 0, width, height)
     cut = part[2:]
-    size = _size(topic, cut, resize) if resize is not None else cut
+    size = size_after(topic, cut, resize) if resize is not None else cut
     is_whole = cut == size == (width, height)
     given = encoding
     if format != "native" or not is_whole:
@@ -123,7 +123,17 @@ def _part(topic: str, image_size: _Size, crop: Sequence[int]) -> _Part:
     return x, y, columns, rows
 
 
-def _size(topic: str, cut: _Size, resize: float | Sequence[int]) -> _Size:
+def size_after(topic: str, cut: _Size, resize: float | Sequence[int]) -> _Size:
+    """Width and height of frames that are resized.
+
+    Args:
+        topic: For errors.
+        cut: Their width and height before.
+        resize: A factor, or width and height.
+
+    Raises:
+        OptionError: There is no such size.
+    """
     problem = f"frames of {topic} cannot be resized to {resize!r}"
     advice = "use a factor such as 0.5, or (width, height) in pixels"
     if isinstance(resize, bool):

@@ -4,84 +4,31 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from mp4ds._version import __version__
 from mp4ds.bags import BagWriter, open_writer
 from mp4ds.bags.convert import Converter
-from mp4ds.dataset import Dataset
+from mp4ds.dataset import Dataset, Stream
 from mp4ds.errors import FormatError, OptionError, WriteError
 from mp4ds.outputs import digest_file, staged
 from mp4ds.plan import FileNames, Selection
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord
 from mp4ds.remote import RemotePath, location, remote
-from mp4ds.republish import KINDS, Republished, Republisher
+from mp4ds.republish import KINDS, Reduction, Republished, Republisher, check_kind
 from mp4ds.sidecar import MANIFEST_NAME
 from mp4ds.unpacking.images import write_images
+from mp4ds.unpacking.options import UnpackOptions, UnpackProgress, UnpackSummary
 from mp4ds.uploads import Upload
+
+__all__ = ["UnpackOptions", "UnpackProgress", "UnpackSummary", "default_output", "unpack"]
 
 TARGETS = ("bag", "rosbag2", "mcap", "images")
 _SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
 _WORLDS = {"bag": "ros1", "rosbag2": "ros2"}
 _OURS = "mp4ds:"  # metadata records by which a dataset remembers what a rosbag2 folder said
-
-
-@dataclass(frozen=True)
-class UnpackOptions:
-    """How to unpack.
-
-    Attributes:
-        storage: ``sqlite3`` or ``mcap``, for rosbag2; None for what the source had.
-        topics: Globs of the topics to unpack; empty for all.
-        exclude: Globs of topics to leave out.
-        image_format: ``png`` or ``jpeg``, for images.
-        images: How camera messages are given: one of `mp4ds.republish.KINDS`, or None for as
-            they were recorded.
-        jpeg_quality: Of JPEG files that are made, 1 to 100.
-        force: Replace an existing target.
-    """
-
-    storage: str | None = None
-    topics: Sequence[str] = ()
-    exclude: Sequence[str] = ()
-    image_format: str = "png"
-    images: str | None = None
-    jpeg_quality: int = 95
-    force: bool = False
-
-
-@dataclass(frozen=True)
-class UnpackProgress:
-    """Where an unpack stands: messages written, and how many there are (0: not known)."""
-
-    messages: int
-    messages_total: int
-
-
-@dataclass(frozen=True)
-class UnpackSummary:
-    """What an unpack did.
-
-    Attributes:
-        output: The recording or folder made.
-        messages: Messages written, by topic.
-        converted: Types converted between ROS 1 and ROS 2, by topic.
-        omitted: What the target cannot hold and was left out: a phrase -> how many.
-        left_out: Topics left out on request.
-        republished: What became of the topics whose images are given in another form.
-        as_recorded: Where another form was asked for, the camera topics of which messages stay
-            as recorded: reason -> how many.
-    """
-
-    output: Path
-    messages: dict[str, int] = field(default_factory=dict)
-    converted: list[str] = field(default_factory=list)
-    omitted: dict[str, int] = field(default_factory=dict)
-    left_out: list[str] = field(default_factory=list)
-    republished: dict[str, Republished] = field(default_factory=dict)
-    as_recorded: dict[str, dict[str, int]] = field(default_factory=dict)
 
 
 def unpack(
@@ -156,6 +103,7 @@ def _check(to: str, options: UnpackOptions) -> None:
         raise OptionError(f"--images {options.images!r} is not known. Use {', '.join(KINDS)}.")
     if options.images and to == "images":
         raise OptionError("--images goes with a recording; with --to images, use --image-format.")
+    check_kind(options.images, options.reduction)
     if not 1 <= options.jpeg_quality <= 100:
         raise OptionError(f"--jpeg-quality {options.jpeg_quality} is not from 1 to 100.")
 
@@ -253,6 +201,8 @@ def _unpack_recording(
                 done += 1
                 if progress and done % 16 == 0:
                     progress(UnpackProgress(done, total))
+        if republisher:
+            found += sum(republisher.thinned.values())
         if dataset.manifest and found != total:
             raise FormatError(
                 "message-count",
@@ -264,6 +214,7 @@ def _unpack_recording(
         omitted += Counter(republisher.omitted)
         summary.republished.update(republisher.republished)
         summary.as_recorded.update(republisher.as_recorded)
+        summary.thinned.update(republisher.thinned)
     summary.omitted.update(omitted)
     return summary
 
@@ -271,7 +222,8 @@ def _unpack_recording(
 def _republisher(
     dataset: Dataset, to: str, options: UnpackOptions, selected: Selection
 ) -> Republisher | None:
-    if options.images is None:
+    reduction = options.reduction
+    if options.images is None and reduction == Reduction():
         return None
     world = _WORLDS.get(to) or ("ros1" if dataset.profile == "ros1" else "ros2")
     return Republisher(
@@ -280,6 +232,7 @@ def _republisher(
         encoding="ros1" if world == "ros1" else "cdr",
         selected=selected,
         jpeg_quality=options.jpeg_quality,
+        reduction=reduction,
     )
 
 
@@ -376,20 +329,36 @@ def _unpack_images(
     path.mkdir()
     names = FileNames()
     streams = [stream for stream in dataset.streams if selected(stream.topic)]
-    total = sum(map(len, streams))
-    done = 0
-    for stream in streams:
+    reduction = options.reduction
+    counts = [_given(stream, reduction, summary) for stream in streams]
+    total, done = sum(counts), 0
+    for stream, count in zip(streams, counts, strict=True):
         stream.verify_video()
         stem, _ = names.name_for(stream.topic)
         folder = path / stem
         folder.mkdir()
         for _ in write_images(
-            stream, folder, image_format=options.image_format, jpeg_quality=options.jpeg_quality
+            stream,
+            folder,
+            image_format=options.image_format,
+            jpeg_quality=options.jpeg_quality,
+            reduction=reduction,
         ):
             done += 1
             if progress:
                 progress(UnpackProgress(done, total))
-        summary.messages[stream.topic] = summary.messages.get(stream.topic, 0) + len(stream)
+        summary.messages[stream.topic] = summary.messages.get(stream.topic, 0) + count
     others = {channel.topic for channel in dataset.channels} - set(summary.messages)
     summary.left_out.extend(sorted(others))
     return summary
+
+
+def _given(stream: Stream, reduction: Reduction, summary: UnpackSummary) -> int:
+    """How many frames of a stream are given; tells of those that are left out."""
+    count = len(stream)
+    if reduction.leaves_out:
+        count = int(reduction.kept(stream.rebuilder.columns).sum())
+        if count < len(stream):
+            thinned = summary.thinned.get(stream.topic, 0) + len(stream) - count
+            summary.thinned[stream.topic] = thinned
+    return count

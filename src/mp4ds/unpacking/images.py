@@ -7,20 +7,20 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mp4ds.dataset import Stream
-from mp4ds.republish import files_of, holds_files
-from mp4ds.video import ImageFile
+from mp4ds.republish import Reduction, image_files
 
 
 def write_images(
-    stream: Stream, folder: Path, *, image_format: str, jpeg_quality: int
+    stream: Stream, folder: Path, *, image_format: str, jpeg_quality: int, reduction: Reduction
 ) -> Iterator[None]:
-    """Write one file per frame, and stamps.csv that tells the times of each.
+    """Write one file per frame, called by its number, and stamps.csv that tells the times of each.
 
     Args:
         stream: The stream.
         folder: Where to write; empty.
         image_format: ``png`` or ``jpeg``.
         jpeg_quality: Of JPEG files that are made, 1 to 100.
+        reduction: How much smaller or fewer they are.
 
     Yields:
         After each file.
@@ -31,17 +31,10 @@ def write_images(
     with (folder / "stamps.csv").open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["file", "stamp_ns", "log_time_ns", "frame_id"])
-        for index, data in enumerate(_files(stream, image_format, jpeg_quality)):
+        files = image_files(stream, image_format, reduction, jpeg_quality=jpeg_quality)
+        for index, data in files:
             name = f"{index:0{digits}d}.{suffix}"
             (folder / name).write_bytes(data)
             frame_id = headers[int(columns.variant[index])].frame_id
             rows.writerow([name, int(columns.stamp[index]), int(columns.log_time[index]), frame_id])
             yield
-
-
-def _files(stream: Stream, image_format: str, jpeg_quality: int) -> Iterator[bytes | memoryview]:
-    """The recorded JPEG files where these are wanted, else files of the frames."""
-    if image_format == "jpeg" and holds_files(stream.sidecar, "jpeg"):
-        return files_of(stream)
-    writer = ImageFile(stream.sidecar.image.encoding, image_format, quality=jpeg_quality)
-    return (writer.encode(frame.data) for frame in stream)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterable, Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ CODEC_NAMES = {
     "ffv1": "ffv1",
     "mjpeg": "mjpeg",
 }
+_MOST_THREADS = 16  # that ffmpeg chooses of itself
 
 
 class VideoDecoder:
@@ -140,22 +143,54 @@ class VideoDecoder:
                 "frame-count", self._path, f"ends after {number} of {self._frames} frames"
             )
 
-    def numbered_pictures(self) -> Iterator[tuple[int, Picture]]:
-        """The pictures that decode, each with its frame's number, for what others encoded.
+    def pictures_at(self, indices: Iterable[int]) -> Iterator[tuple[int, Picture]]:
+        """Some pictures, each with its frame's number, as views that hold until the next one.
 
-        Where a packet was lost before it was recorded, those that refer to it do not decode.
+        Decoding begins at the key frame before the first one. Frames in between are decoded, and
+        left out at key frames that are far enough ahead; they are not made into pictures.
+
+        Args:
+            indices: 0 <= index < frames, increasing. The next one is asked for only when the
+                picture before was done with.
 
         Raises:
-            VideoError: As `pictures`, but not for pictures that do not decode.
+            VideoError: ``decode-failed`` with the frame's number, or ``frame-count``.
         """
-        ticks = self._presentation_ticks()
-        self._seek(0, 0)
-        due = 0
-        for frame in self._decodable():
-            number = int(np.searchsorted(ticks, frame.pts)) if frame.pts is not None else -1
-            if due <= number < self._frames and ticks[number] == frame.pts:
-                yield number, self._maker.make(frame)
-                due = number + 1
+        for index, frame in self._chosen(indices, self._decoded):
+            if frame is None:
+                raise VideoError("decode-failed", self._path, f"frame {index} was not found")
+            yield index, self._maker.make(frame)
+
+    def decodable_pictures(self, indices: Iterable[int]) -> Iterator[tuple[int, Picture | None]]:
+        """As `pictures_at`, for what others encoded: None for a picture that does not decode.
+
+        Where a packet was lost before it was recorded, those that refer to it do not decode.
+        """
+        for index, frame in self._chosen(indices, lambda _: self._decodable()):
+            yield index, None if frame is None else self._maker.make(frame)
+
+    def _chosen(
+        self, indices: Iterable[int], decode: Callable[[int], Iterator[av.VideoFrame]]
+    ) -> Iterator[tuple[int, av.VideoFrame | None]]:
+        """The frames of some numbers; None for one that does not come out."""
+        ticks, keys = self._presentation_ticks(), self._key_numbers
+        in_flight = min(os.cpu_count() or 1, _MOST_THREADS) + 1
+        frames: Iterator[av.VideoFrame] = iter(())
+        frame: av.VideoFrame | None = None
+        due = -in_flight - 1
+        for index in indices:
+            at = int(np.searchsorted(keys, index, side="right"))
+            key = int(keys[at - 1]) if at else 0
+            if key > due + in_flight:  # the decoder has begun the frames up to there
+                self._seek(int(ticks[index]), index)
+                frames, frame = decode(key), None
+            tick = int(ticks[index])
+            while frame is None or frame.pts is None or frame.pts < tick:
+                frame = next(frames, None)
+                if frame is None:
+                    break
+            due = index + 1
+            yield index, frame if frame is not None and frame.pts == tick else None
 
     def picture(self, index: int) -> Picture:
         """One picture, by seeking to the key frame before it.
@@ -193,6 +228,10 @@ class VideoDecoder:
                 )
             self._ticks = np.sort(np.array(ticks, dtype=np.int64))
         return self._ticks
+
+    @cached_property
+    def _key_numbers(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+        return np.flatnonzero([entry.is_keyframe for entry in self._stream.index_entries])
 
     def _decoded(self, first: int) -> Iterator[av.VideoFrame]:
         number = first

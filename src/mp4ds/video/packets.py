@@ -18,7 +18,6 @@ import av
 from av.error import FFmpegError
 
 from mp4ds.coded import PACKET_CODECS, Refused, annexb, av1, h264, h265
-from mp4ds.coded.configuration import parameter_units
 from mp4ds.coded.packets import plain_body
 from mp4ds.errors import VideoError
 from mp4ds.stamps import TIMESCALE
@@ -228,6 +227,7 @@ class PacketReader:
         sizes: Bytes of each packet.
         keyframes: For each packet whether decoding can begin there, as 0 or 1.
         extradata: What the track says about the codec: avcC, hvcC or av1C.
+        pixel_format: Of its pictures as ffmpeg calls it; empty where not known.
 
     Raises:
         VideoError: ``file-missing``, ``video-unreadable``, ``codec-mismatch``,
@@ -255,6 +255,7 @@ class PacketReader:
             stream = container.streams.video[0]
             context: Any = stream.codec_context
             self.extradata: bytes = bytes(context.extradata or b"")
+            self.pixel_format: str = context.pix_fmt or ""
             entries = stream.index_entries
             if not len(entries):
                 raise VideoError("frame-count", path, "has no frames")
@@ -309,6 +310,11 @@ class PacketReader:
     def __len__(self) -> int:
         return len(self.sizes)
 
+    @property
+    def key_numbers(self) -> list[int]:
+        """Numbers of the packets at which decoding can begin, increasing."""
+        return [number for number, is_key in enumerate(self.keyframes) if is_key]
+
     def packet(self, index: int) -> bytes:
         """One packet.
 
@@ -341,42 +347,3 @@ class PacketReader:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def annexb_packets(path: Path, codec: str) -> Iterator[bytes]:
-    """The packets of a video as they stand alone, for whoever decodes without the mp4.
-
-    H.264 and H.265 come as Annex B with start codes of four bytes, AV1 as temporal units that
-    begin with a delimiter; all with the parameters of the stream before each key frame. VP9
-    packets and images come as they are.
-
-    Args:
-        path: A video without B-frames, such as all that mp4ds writes.
-        codec: Name in the registry.
-
-    Raises:
-        VideoError: As `PacketReader`, or the codec's parameters are damaged.
-    """
-    with PacketReader(path, codec=codec) as reader:
-        try:
-            parameters = parameter_units(codec, reader.extradata)
-            for index, packet in enumerate(reader.packets()):
-                key = bool(reader.keyframes[index])
-                if codec in _UNITS:
-                    yield _stand_alone(codec, packet, parameters if key else [])
-                elif codec == "av1":
-                    needed = parameters if key and not av1.sequence_header(packet) else []
-                    yield b"".join((av1.DELIMITER, *needed, packet))
-                else:
-                    yield packet
-        except Refused as error:
-            raise VideoError("decode-failed", path, f"has a packet of which {error}") from None
-
-
-def _stand_alone(codec: str, packet: bytes, parameters: list[bytes]) -> bytes:
-    module = _UNITS[codec]
-    units = annexb.split_length_prefixed(packet)
-    if parameters and not module.has_parameters(units):
-        at = 1 if units and module.unit_type(units[0]) == module.AUD else 0
-        units[at:at] = parameters
-    return annexb.join_plain(units)

@@ -1,0 +1,132 @@
+"""What ``mp4ds evaluate`` prints."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mp4ds.cli.output import print_table, say, size_text
+
+if TYPE_CHECKING:
+    from mp4ds.evaluating import CameraEvaluation, Cell, Evaluation
+
+_CELLS = [
+    (name, "right")
+    for name in (
+        *("codec", "preset", "crf", "kbit/s", "B/frame", "fps", "CPU s", "decoded/CPU s"),
+        *("VMAF", "harmonic", "5 %", "least", "PSNR Y", "SSIM", "whole", "time"),
+    )
+]
+_RATES = [
+    (name, "right")
+    for name in (
+        *("Hz", "frames", "codec", "preset", "crf", "score", "ceiling"),
+        *("B/frame", "ms/frame", "kbit/s"),
+    )
+]
+_STORAGE = [("stored as", "fold"), ("B/frame", "right"), ("size", "right"), ("days", "right"),
+            ("CPU days", "right")]  # fmt: skip
+
+
+def print_evaluation(result: Evaluation) -> None:
+    """Print what was found."""
+    for camera in result.cameras:
+        _print_camera(camera)
+    for topic, reason in result.left_out.items():
+        say(f"{topic}: left out: {reason}")
+    if len(result.cameras) > 1:
+        for item in result.recommended:
+            say(f"{item.why} for all cameras: {item.options} (at least {item.score:.2f})")
+        if not result.recommended:
+            say("no setting reaches the targets of all cameras")
+    known = f", {result.known} known from before" if result.known else ""
+    say(f"{result.output}/index.html: {result.tried} settings tried{known}")
+
+
+def _print_camera(camera: CameraEvaluation) -> None:
+    rate = f" at {camera.rate:.2f} Hz" if camera.rate else ""
+    say(
+        f"{camera.topic}: {camera.encoding} {camera.size[0]}x{camera.size[1]}{rate}; clip of "
+        f"{camera.frames} frames from {camera.start:.2f} s on, of {camera.source_frames}"
+    )
+    print_table(_CELLS, [_cell_row(cell) for cell in camera.cells])
+    ceiling = ", ".join(f"{name} {value.mean:.2f}" for name, value in camera.ceiling.items())
+    say(f"ceiling, the clip beside itself: {ceiling}")
+    if camera.rates:
+        print_table(_RATES, _rate_rows(camera))
+    if camera.storage and camera.data_set:
+        data_set = camera.data_set
+        say(
+            f"{data_set.streams} cameras for {data_set.hours:g} hours at {data_set.rate:.2f} Hz, "
+            f"{data_set.frames:.0f} frames:"
+        )
+        print_table(_STORAGE, _storage_rows(camera))
+    for note in camera.notes:
+        say(f"note: {note}")
+    for item in camera.recommended:
+        say(f"{item.why}: {item.options} ({camera.target.metric} {item.score:.2f})")
+
+
+def _score(cell: Cell, metric: str, statistic: str, digits: int) -> str:
+    summary = cell.scores.get(metric)
+    return "" if summary is None else f"{getattr(summary, statistic):.{digits}f}"
+
+
+def _cell_row(cell: Cell) -> list[str]:
+    setting = cell.setting
+    return [
+        setting.codec,
+        setting.preset,
+        str(setting.crf),
+        f"{cell.kbps:.0f}",
+        f"{cell.frame_bytes:.0f}",
+        f"{cell.encode_fps:.1f}",
+        f"{cell.encode_cpu_seconds:.2f}",
+        f"{cell.decode_fps:.0f}",
+        *(
+            _score(cell, "vmaf", statistic, 2)
+            for statistic in ("mean", "harmonic_mean", "percentile_5", "minimum")
+        ),
+        _score(cell, "psnr_y", "mean", 2),
+        _score(cell, "ssim", "mean", 4),
+        size_text(cell.whole_bytes),
+        time_text(cell.whole_seconds),
+    ]
+
+
+def _rate_rows(camera: CameraEvaluation) -> list[list[str]]:
+    return [
+        [
+            f"{row.rate:g}",
+            str(row.frames),
+            row.setting.codec,
+            row.setting.preset,
+            str(row.setting.crf),
+            f"{row.score:.2f}" + ("" if row.reached else " (not reached)"),
+            f"{row.ceiling:.2f}",
+            f"{row.frame_bytes:.0f}",
+            f"{row.frame_seconds * 1000:.1f}",
+            f"{row.kbps:.0f}",
+        ]
+        for row in camera.rates
+    ]
+
+
+def _storage_rows(camera: CameraEvaluation) -> list[list[str]]:
+    return [
+        [
+            row.form,
+            f"{row.frame_bytes:.0f}",
+            f"{row.gigabytes:.1f} GB",
+            "" if row.days is None else f"{row.days:.2f}",
+            "" if row.cpu_days is None else f"{row.cpu_days:.2f}",
+        ]
+        for row in camera.storage
+    ]
+
+
+def time_text(seconds: float) -> str:
+    """A time in the unit that suits it."""
+    for limit, unit, size in ((120, "s", 1), (7200, "min", 60), (172_800, "h", 3600)):
+        if seconds < limit:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds / 86_400:.1f} days"

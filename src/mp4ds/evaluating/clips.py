@@ -1,0 +1,293 @@
+"""A clip of a camera: chosen, demosaiced, and kept as the encoder is given it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import xxhash
+from numpy.typing import NDArray
+
+from mp4ds.errors import SourceError
+from mp4ds.evaluating.options import EvaluateOptions
+from mp4ds.evaluating.sources import Camera, Shot
+from mp4ds.layouts import ENCODINGS, Layout, layout_for
+from mp4ds.outputs import write_synced
+from mp4ds.stamps import NS_PER_TICK, PresentationClock
+from mp4ds.video.planes import PlaneMaker, Planes
+
+_SECOND = 1_000_000_000
+_DETAIL = (128, 96)  # columns and rows that are shown beside each other
+_MOST_PIXELS = 16  # samples: of less no scores are made
+
+
+class Unfit(Exception):  # noqa: N818 - no error: the camera is left out, and why is told
+    """A camera whose images no lossy codec is for; says why."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Frames of a camera as the encoder is given them, in a file beside.
+
+    Attributes:
+        topic: Of the camera.
+        encoding: ROS encoding of its images.
+        picture_format: Pixel format of their pictures, which tells how they are tagged.
+        image_size: Width and height of an image.
+        width: Columns of a frame, even.
+        height: Rows of a frame, even.
+        ticks: When each frame is shown, as in a packed video.
+        rate: Frames per second of the camera, or of the clip where it has fewer.
+        digest: Of the frames and ticks.
+        detail: x, y, width and height of the part that is shown.
+        detail_frame: Number of the frame that is shown.
+        start: Log time of the first frame, seconds from the camera's first one.
+        source_frames: Images of the camera in all.
+        other_frames: Images between that are of another size or encoding, or unreadable.
+    """
+
+    topic: str
+    encoding: str
+    picture_format: str
+    image_size: tuple[int, int]
+    width: int
+    height: int
+    ticks: tuple[int, ...]
+    rate: float | None
+    digest: str
+    detail: tuple[int, int, int, int]
+    detail_frame: int
+    start: float
+    source_frames: int
+    other_frames: int
+
+    @property
+    def frames(self) -> int:
+        """Frames of the clip."""
+        return len(self.ticks)
+
+    @property
+    def raw_bytes(self) -> int:
+        """Bytes of an image as recorded, without padding."""
+        encoding = ENCODINGS[self.encoding]
+        width, height = self.image_size
+        return int(encoding.size(width * encoding.pixel_bytes, height))
+
+
+def clip_to_json(clip: Clip) -> str:
+    """A clip but for its frames, as text."""
+    return json.dumps(asdict(clip))
+
+
+def clip_from_json(text: str) -> Clip:
+    """What `clip_to_json` was given."""
+    values = json.loads(text)
+    for name in ("image_size", "ticks", "detail"):
+        values[name] = tuple(values[name])
+    return Clip(**values)
+
+
+# ---------------------------------------------------------------- which frames
+
+
+def chosen(times: NDArray[np.int64], origin: int, options: EvaluateOptions) -> list[int]:
+    """The images of a representative clip, or of that which was asked for.
+
+    Args:
+        times: Of a camera's images, nanoseconds, sorted.
+        origin: Log time at which the source begins, nanoseconds.
+        options: Of the evaluation.
+
+    Raises:
+        Unfit: There are none.
+    """
+    count = len(times)
+    if options.start is None and options.duration is None:
+        first = max(0, (count - options.frames) // 2)
+        return list(range(first, min(count, first + options.frames)))
+    if options.start is None:
+        middle = (int(times[0]) + int(times[-1])) // 2
+        begin = middle - round((options.duration or 0) * _SECOND / 2)
+    else:
+        begin = origin + round(options.start * _SECOND)
+    first = int(np.searchsorted(times, begin))
+    last = first + options.frames
+    if options.duration is not None:
+        last = int(np.searchsorted(times, begin + round(options.duration * _SECOND)))
+    found = list(range(first, min(count, last)))
+    if not found:
+        raise Unfit("has no images in the time that was asked for")
+    return found
+
+
+def chosen_at_rate(times: NDArray[np.int64], rate: float, frames: int) -> list[int]:
+    """Images from the middle of a camera's time, at fewer per second than it took.
+
+    Args:
+        times: Nanoseconds, sorted, at least one.
+        rate: Per second.
+        frames: How many at most.
+    """
+    period = _SECOND / rate
+    start, end = int(times[0]), int(times[-1])
+    count = min(frames, int((end - start) / period) + 1)
+    begin = (start + end - (count - 1) * period) / 2
+    due = begin + period * np.arange(count)
+    after = np.clip(np.searchsorted(times, due), 1, max(1, len(times) - 1))
+    after = np.minimum(after, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = np.where(due - times[before] <= times[after] - due, before, after)
+    return [int(index) for index in np.unique(nearer)]
+
+
+# ---------------------------------------------------------------- the frames
+
+
+def make_clip(camera: Camera, indices: list[int], rate: float | None, path: Path) -> Clip:
+    """Read frames, and write them as planes, one after the other.
+
+    Args:
+        camera: Whose images to take.
+        indices: Numbers of the images, increasing.
+        rate: Frames per second.
+        path: The file to make of the planes; beside it the clip is described.
+
+    Raises:
+        Unfit: The camera's images are of no use.
+        SourceError: The source is damaged.
+        OSError: The disk refused.
+    """
+    digest = xxhash.xxh3_128()
+    clock = PresentationClock()
+    ticks: list[int] = []
+    first: Shot | None = None
+    middle: Planes | None = None
+    others = 0
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with part.open("wb") as file:
+            for shot in camera.read(indices):
+                if first is None:
+                    layout = _layout_of(shot)
+                    first, maker = shot, PlaneMaker(layout.pixel_format)
+                if _kind(shot) != _kind(first):
+                    others += 1
+                    continue
+                planes = maker.make(layout.to_picture(shot.pixels))
+                for plane in planes:
+                    file.write(plane.data)
+                    digest.update(plane.data)
+                ticks.append(clock.tick(shot.stamp, shot.log_time))
+                if len(ticks) <= max(1, len(indices) // 2):
+                    middle, number = planes, len(ticks) - 1
+        if first is None or middle is None:
+            raise Unfit("has no images that can be read in the time of its clip")
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    digest.update(json.dumps(ticks).encode())
+    height, width = middle[0].shape
+    clip = Clip(
+        topic=camera.topic,
+        encoding=first.encoding,
+        picture_format=layout.pixel_format,
+        image_size=(first.width, first.height),
+        width=width,
+        height=height,
+        ticks=tuple(ticks),
+        rate=rate,
+        digest=digest.hexdigest(),
+        detail=_detail(middle[0]),
+        detail_frame=number,
+        start=(int(camera.times[indices[0]]) - int(camera.times[0])) / _SECOND,
+        source_frames=len(camera.times),
+        other_frames=len(indices) - len(ticks),
+    )
+    write_synced(path.with_suffix(".json"), clip_to_json(clip).encode())
+    return clip
+
+
+def _kind(shot: Shot) -> tuple[str, int, int]:
+    return shot.encoding, shot.width, shot.height
+
+
+def _layout_of(shot: Shot) -> Layout:
+    encoding = ENCODINGS[shot.encoding]
+    if encoding.lossy is None:
+        raise Unfit(
+            f"has {encoding.name} images, which are no light of 8 bits: mp4ds pack keeps them "
+            "lossless"
+        )
+    if min(shot.width, shot.height) < _MOST_PIXELS:
+        raise Unfit(f"has images of {shot.width}x{shot.height}, too small to be scored")
+    return layout_for(encoding, lossless=False)
+
+
+def _detail(luma: NDArray[np.uint8]) -> tuple[int, int, int, int]:
+    """The part of a frame with most detail, at an even place."""
+    rows, columns = luma.shape
+    width, height = min(_DETAIL[0], columns), min(_DETAIL[1], rows)
+    best, place = -1.0, (0, 0)
+    for top in range(0, rows - height + 1, max(2, height // 4 * 2)):
+        for left in range(0, columns - width + 1, max(2, width // 4 * 2)):
+            part = luma[top : top + height, left : left + width].astype(np.int32)
+            # roots of the gradients: a broad texture counts more than one sharp edge
+            score = float(
+                np.sqrt(np.abs(np.diff(part, axis=0))).mean()
+                + np.sqrt(np.abs(np.diff(part, axis=1))).mean()
+            )
+            if score > best:
+                best, place = score, (left, top)
+    return place[0], place[1], width // 2 * 2, height // 2 * 2
+
+
+class ClipFile:
+    """The frames of a clip.
+
+    Args:
+        path: The file that `make_clip` made.
+
+    Raises:
+        SourceError: It is not whole.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.clip = clip_from_json(path.with_suffix(".json").read_text())
+        clip = self.clip
+        self._luma = clip.width * clip.height
+        size = self._luma * 3 // 2
+        if path.stat().st_size != size * clip.frames:
+            raise SourceError(path, "is not whole", "Remove the folder and evaluate again.")
+        self._frames = np.memmap(path, np.uint8, "r", shape=(clip.frames, size))
+
+    def __iter__(self) -> Iterator[Planes]:
+        return map(self.planes, range(self.clip.frames))
+
+    def planes(self, number: int) -> Planes:
+        """The planes of one frame, as views."""
+        width, height, luma = self.clip.width, self.clip.height, self._luma
+        frame = np.asarray(self._frames[number])
+        return (
+            frame[:luma].reshape(height, width),
+            frame[luma : luma * 5 // 4].reshape(height // 2, width // 2),
+            frame[luma * 5 // 4 :].reshape(height // 2, width // 2),
+        )
+
+
+def detail_of(planes: Planes, clip: Clip) -> Planes:
+    """The part of a frame that is shown."""
+    x, y, width, height = clip.detail
+    luma = planes[0][y : y + height, x : x + width]
+    u, v = (plane[y // 2 : (y + height) // 2, x // 2 : (x + width) // 2] for plane in planes[1:])
+    return luma, u, v
+
+
+def clip_seconds(clip: Clip) -> float:
+    """How long the clip is shown, its last frame as long as the others."""
+    if clip.frames < 2:
+        return 1 / (clip.rate or 1.0)
+    ticks_per_second = _SECOND / NS_PER_TICK
+    return (clip.ticks[-1] - clip.ticks[0]) / ticks_per_second * clip.frames / (clip.frames - 1)

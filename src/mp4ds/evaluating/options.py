@@ -1,0 +1,257 @@
+"""What an evaluation is asked for, and the grid of settings that it comes to."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from mp4ds.errors import OptionError
+from mp4ds.plan import visual_setting
+from mp4ds.scoring import METRICS
+from mp4ds.video import check_codec
+from mp4ds.video.codecs import LOSSY_GOP
+
+CODEC_NAMES = {"svtav1": "av1", "x264": "h264", "x265": "h265"}
+"""Names of the encoders -> of the codecs, as `mp4ds pack` takes them."""
+
+MAX_CRF = {"av1": 63, "h264": 51, "h265": 51}
+"""The largest crf of each codec."""
+
+_DEFAULT_PRESETS = {"av1": ("6", "8"), "h264": ("medium",), "h265": ("medium",)}
+_MOST_CELLS = 10_000
+_CRF = re.compile(r"([0-9]{1,2})(?::([0-9]{1,2})(?::([0-9]{1,2}))?)?")
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """How a clip is encoded, in the words of ``mp4ds pack``.
+
+    Attributes:
+        codec: ``av1``, ``h264`` or ``h265``.
+        preset: Of its encoder.
+        crf: Constant rate factor.
+        gop: Most frames between key frames.
+    """
+
+    codec: str
+    preset: str
+    crf: int
+    gop: int = LOSSY_GOP
+
+    @property
+    def name(self) -> str:
+        """Short, and different for each of a grid."""
+        return f"{self.codec} {self.preset} crf {self.crf}"
+
+    @property
+    def pack_options(self) -> str:
+        """The options of ``mp4ds pack`` that encode so."""
+        gop = f" --gop {self.gop}" if self.gop != LOSSY_GOP else ""
+        return f"--quality crf={self.crf} --codec {self.codec} --preset {self.preset}{gop}"
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """The score that a setting is to reach.
+
+    Attributes:
+        metric: One of `mp4ds.scoring.METRICS`.
+        score: What its mean over the frames is to be.
+    """
+
+    metric: str = "vmaf"
+    score: float = 99.5
+
+    def __str__(self) -> str:
+        return f"{self.metric}={self.score:g}"
+
+
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """How to evaluate.
+
+    Attributes:
+        codecs: ``svtav1``, ``x264`` and ``x265``, or as ``mp4ds pack`` calls them.
+        crf: Values, and ranges ``FIRST:LAST`` or ``FIRST:LAST:STEP`` with the last one in them.
+        presets: Each is tried with the codecs that have it; none: usual ones of each codec.
+        topics: Globs of the cameras; empty for all.
+        exclude: Globs of cameras to leave out.
+        start: Seconds from the beginning at which the clips begin; None: so that they are in
+            the middle.
+        duration: Seconds of the clips; None: as many as `frames` last.
+        frames: Frames of a clip, where there is no `duration`.
+        fps: Frames per second of a folder of images.
+        gop: Most frames between key frames.
+        threads: Of an encoder; None for all cores, shared among the jobs.
+        jobs: Settings that are tried at a time. Times are those of an idle machine with 1 only.
+        target: The score to reach.
+        rates: Frames per second at which to look for the crf that reaches the target.
+        streams: Cameras of a data set of which to tell the size.
+        hours: How long they record.
+    """
+
+    codecs: Sequence[str] = ("svtav1", "x264", "x265")
+    crf: Sequence[str] = ("16:25:3",)
+    presets: Sequence[str] = ()
+    topics: Sequence[str] = ()
+    exclude: Sequence[str] = ()
+    start: float | None = None
+    duration: float | None = None
+    frames: int = 150
+    fps: float = 30.0
+    gop: int = LOSSY_GOP
+    threads: int | None = None
+    jobs: int = 1
+    target: Target = field(default_factory=Target)
+    rates: Sequence[float] = ()
+    streams: int | None = None
+    hours: float | None = None
+
+    @property
+    def encoder_threads(self) -> int:
+        """Threads of an encoder."""
+        return self.threads or max(1, (os.cpu_count() or 1) // self.jobs)
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """What is tried.
+
+    Attributes:
+        presets: Of each codec, in the order that was asked for.
+        crfs: Increasing.
+        gop: Most frames between key frames.
+    """
+
+    presets: dict[str, tuple[str, ...]]
+    crfs: tuple[int, ...]
+    gop: int
+
+    def settings(self) -> list[Setting]:
+        """All of them; a codec is not tried with a crf that it does not have."""
+        return [
+            Setting(codec, preset, crf, self.gop)
+            for codec, presets in self.presets.items()
+            for preset in presets
+            for crf in self.crfs
+            if crf <= MAX_CRF[codec]
+        ]
+
+
+def grid_of(options: EvaluateOptions) -> Grid:
+    """The grid that was asked for.
+
+    Raises:
+        OptionError: There is no such codec, preset or crf, or too many of them.
+    """
+    codecs = list(dict.fromkeys(map(_codec, options.codecs)))
+    if not codecs:
+        raise OptionError("--codecs names none.")
+    grid = Grid(_presets(codecs, options.presets), parse_crfs(options.crf), options.gop)
+    if not 0 < len(grid.settings()) <= _MOST_CELLS:
+        raise OptionError(
+            f"{len(grid.settings())} settings are to be tried; give --codecs, --presets and --crf "
+            f"that make 1 to {_MOST_CELLS}."
+        )
+    return grid
+
+
+def _codec(name: str) -> str:
+    codec = CODEC_NAMES.get(name, name)
+    if codec not in MAX_CRF:
+        known = ", ".join(f"{encoder} ({codec})" for encoder, codec in CODEC_NAMES.items())
+        raise OptionError(f"--codecs {name!r} is not one of {known}.")
+    return codec
+
+
+def _presets(codecs: Sequence[str], asked: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    found: dict[str, tuple[str, ...]] = {}
+    for codec in codecs:
+        own = tuple(dict.fromkeys(preset for preset in asked if _has(codec, preset)))
+        found[codec] = own or _DEFAULT_PRESETS[codec]
+    for preset in asked:
+        if not any(preset in own for own in found.values()):
+            raise OptionError(f"--presets {preset!r} is none of {', '.join(codecs)}.")
+    return found
+
+
+def _has(codec: str, preset: str) -> bool:
+    try:
+        check_codec(codec, preset, lossless=False)
+    except OptionError:
+        return False
+    return True
+
+
+def parse_crfs(texts: Sequence[str]) -> tuple[int, ...]:
+    """The values of ``18``, ``16:25`` and ``16:25:3``.
+
+    Raises:
+        OptionError: One is none of these.
+    """
+    found: set[int] = set()
+    for text in texts:
+        match = _CRF.fullmatch(text.strip())
+        first, last, step = (int(word) if word else None for word in match.groups()) if match else (
+            None, None, None
+        )  # fmt: skip
+        if first is None or step == 0:
+            raise OptionError(f"--crf {text!r} is none. Give one such as 18, 16:25 or 16:25:3.")
+        found.update(range(first, (first if last is None else last) + 1, step or 1))
+    if not found or min(found) < 1 or max(found) > max(MAX_CRF.values()):
+        raise OptionError(
+            f"--crf {', '.join(texts)} has values beyond 1 to {max(MAX_CRF.values())}."
+        )
+    return tuple(sorted(found))
+
+
+def parse_target(text: str) -> Target:
+    """The target of ``vmaf=99.5``, ``psnr_y=42`` or ``ssim=0.98``; a number alone is of VMAF.
+
+    Raises:
+        OptionError: It is none.
+    """
+    metric, has_metric, score = text.rpartition("=")
+    metric = metric if has_metric else "vmaf"
+    try:
+        value = float(score)
+    except ValueError:
+        value = -1.0
+    if metric not in METRICS or not 0 < value <= 100:
+        raise OptionError(
+            f"--target {text!r} is none. Give METRIC=SCORE, such as vmaf=99.5; there are "
+            f"{', '.join(METRICS)}."
+        )
+    return Target(metric, value)
+
+
+def check_options(options: EvaluateOptions) -> None:
+    """Refuse numbers that make no sense.
+
+    Raises:
+        OptionError: Names one.
+    """
+    positive = {
+        "--duration": options.duration,
+        "--frames": options.frames,
+        "--fps": options.fps,
+        "--gop": options.gop,
+        "--threads": options.threads,
+        "--jobs": options.jobs,
+        "--streams": options.streams,
+        "--hours": options.hours,
+    }
+    rates = [("--rates", rate) for rate in options.rates]
+    for name, value in [*positive.items(), *rates]:
+        if value is not None and not 0 < value < float("inf"):
+            raise OptionError(f"{name} {value:g} is not above 0.")
+    if options.start is not None and not 0 <= options.start < float("inf"):
+        raise OptionError(f"--start {options.start:g} is not a number of seconds.")
+
+
+def first_guess(codec: str, rate: float | None) -> int:
+    """A crf to begin the search for a target with."""
+    crf, _ = visual_setting(rate)
+    return crf if codec == "av1" else crf - 2

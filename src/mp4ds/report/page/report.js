@@ -1,0 +1,371 @@
+/* Puts the page together. data.js and the columns of each camera call in here. */
+"use strict";
+var mp4dsReport = (() => {
+  const COLOURS = ["#3b82f6", "#f97316", "#10b981", "#a855f7", "#ef4444", "#14b8a6", "#eab308", "#ec4899"];
+  const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8];
+  const {element} = mp4dsTables, find = id => document.getElementById(id);
+  const report = {plots: {}};
+  let data, player, view, timeline;
+  report.ready = new Promise((resolve, reject) => { report.done = resolve; report.failed = reject; });
+  report.ready.catch(error => {
+    find("message").textContent = `This page cannot be shown: ${error.message}`;
+    find("message").hidden = false;
+  });
+
+  // ------------------------------------------------------------ cameras
+
+  function cameraPanel(facts, number) {
+    const colour = COLOURS[number % COLOURS.length];
+    const video = facts.video ? element("video", {preload: "auto", playsinline: "", "aria-label": facts.name}) : null;
+    if (video) video.muted = true;
+    const canvas = element("canvas"), notice = element("div", {class: "nothing", text: facts.video ? "" : `No picture: ${facts.note}`});
+    notice.hidden = Boolean(facts.video);
+    const fit = element("div", {class: "fit"}, [...(video ? [video] : []), canvas, notice]);
+    fit.style.aspectRatio = `${facts.width / facts.shown[0]} / ${facts.height / facts.shown[1]}`;
+    fit.style.maxWidth = `${62 * facts.width / facts.height}vh`;
+    const values = {}, readout = element("dl", {class: "readout"});
+    for (const [key, name] of [["frame", "Frame"], ["stamp", "Stamp"], ["delay", "Delay"], ["log", "Recorded"]]) {
+      values[key] = element("dd");
+      readout.append(element("dt", {text: name}), values[key]);
+    }
+    const dot = element("span", {class: "dot"});
+    dot.style.background = colour;
+    const head = element("header", {title: "Steps follow this camera"}, [dot, element("h3", {text: facts.name}),
+      element("span", {class: "kind", text: `${facts.encoding} ${facts.width}×${facts.height} · ${facts.codec} ${facts.profile}`})]);
+    if (facts.proxy) head.append(element("span", {class: "badge", text: "proxy", title: facts.note}));
+    const stage = element("div", {class: "stage"}, [fit]);
+    const panel = element("article", {class: "camera"}, [head, stage, readout]);
+    if (facts.caption) panel.append(element("div", {class: "caption", text: `Shown ${facts.caption}`}));
+    find("cameras").append(panel);
+    const camera = new mp4dsPlayer.Camera(facts, number, {video, canvas, notice, panel, stage, values, colour, isSeen: true, onShown: told});
+    head.addEventListener("click", () => lead(camera));
+    return camera;
+  }
+
+  /** Another frame of a camera is on the screen. */
+  function told(camera) {
+    const n = camera.shown, {values} = camera;
+    values.frame.textContent = `${n} of ${camera.frames}`;
+    values.stamp.textContent = mp4dsTables.stampText(camera.stamp[n]);
+    values.stamp.title = mp4dsTables.dateText(camera.stamp[n]);
+    values.log.textContent = mp4dsTables.stampText(camera.logTime[n]);
+    values.log.title = mp4dsTables.dateText(camera.logTime[n]);
+    values.delay.textContent = `${mp4dsPlots.numberText(Number(camera.logTime[n] - camera.stamp[n]) / 1e6)} ms`;
+    drawGrid(camera);
+  }
+
+  function drawGrid(camera) {
+    let current = null;
+    for (const item of camera.facts.calibrations) if (item.from_frame <= Math.max(0, camera.shown)) current = item;
+    const key = find("grid").checked && current ? `${camera.facts.calibrations.indexOf(current)} ${camera.canvas.clientWidth}` : "";
+    if (camera.gridKey === key) return;
+    camera.gridKey = key;
+    const [context, width, height] = mp4dsPlots.prepare(camera.canvas);
+    if (!key || !current.overlay || current.overlay.problem) return;
+    const [w, h] = [width * camera.facts.shown[0], height * camera.facts.shown[1]], {lines, axes, center} = current.overlay;
+    for (const [widthOf, colour] of [[3, "rgb(0 0 0 / 45%)"], [1.2, "#ffd24a"]]) {
+      lines.forEach((line, number) => {
+        context.lineWidth = widthOf * (axes.includes(number) ? 1.7 : 1);
+        context.strokeStyle = colour;
+        context.beginPath();
+        for (let i = 0; i < line.length; i += 2) context[i ? "lineTo" : "moveTo"](line[i] * w, line[i + 1] * h);
+        context.stroke();
+      });
+    }
+    context.strokeStyle = "#ff5a5a";
+    context.lineWidth = 2;
+    context.beginPath();
+    context.arc(center[0] * w, center[1] * h, 6, 0, 7);
+    context.stroke();
+  }
+
+  function lead(camera) {
+    player.lead = camera;
+    find("lead").value = String(camera.number);
+    for (const each of player.cameras) each.panel.classList.toggle("lead", each === camera && player.cameras.length > 1);
+  }
+
+  // ------------------------------------------------------------ time line
+
+  class Timeline {
+    constructor(canvas) {
+      this.canvas = canvas;
+      view.listeners.push(() => this.request());
+      const timeAt = event => {
+        const box = canvas.getBoundingClientRect();
+        return view.from + Math.max(0, Math.min(1, (event.clientX - box.left) / box.width)) * (view.to - view.from);
+      };
+      let isDown = false, wasPlaying = false;
+      canvas.addEventListener("pointerdown", event => {
+        isDown = true;
+        wasPlaying = player.isPlaying;
+        player.pause();
+        canvas.setPointerCapture(event.pointerId);
+        player.go(timeAt(event));
+      });
+      canvas.addEventListener("pointermove", event => { if (isDown) player.go(timeAt(event)); });
+      canvas.addEventListener("pointerup", () => { isDown = false; if (wasPlaying) player.play(); });
+      canvas.addEventListener("dblclick", () => view.all());
+      canvas.addEventListener("wheel", event => {
+        event.preventDefault();
+        const span = view.to - view.from;
+        if (event.shiftKey || Math.abs(event.deltaX) > Math.abs(event.deltaY)) view.set(view.from + span * (event.deltaX || event.deltaY) / 1000, view.to + span * (event.deltaX || event.deltaY) / 1000);
+        else view.zoom(timeAt(event), Math.exp(event.deltaY / 300));
+      }, {passive: false});
+    }
+
+    request() {
+      if (this.pending) return;
+      this.pending = requestAnimationFrame(() => { this.pending = 0; this.draw(); });
+    }
+
+    /** The lanes change with the view alone; the line of the time moves over them. */
+    draw() {
+      const lanes = player.cameras.length, row = lanes > 8 ? 5 : 8, top = 18;
+      const [context, width, height] = mp4dsPlots.prepare(this.canvas, top + lanes * row + 4), colours = mp4dsPlots.theme();
+      const xOf = time => (time - view.from) / (view.to - view.from || 1) * width;
+      const marks = mp4dsPlots.ticks(view.from / 1e9, view.to / 1e9, width / 110), digits = mp4dsPlots.digitsOf(marks);
+      context.fillStyle = colours.text;
+      context.strokeStyle = colours.line;
+      context.textBaseline = "middle";
+      for (const mark of marks) {
+        const x = xOf(mark * 1e9), text = mp4dsPlots.timeText(mark, digits);
+        context.textAlign = x < 24 ? "left" : x > width - 24 ? "right" : "center";
+        context.fillText(text, x, 7);
+        context.beginPath(); context.moveTo(x, top - 3); context.lineTo(x, height); context.stroke();
+      }
+      player.cameras.forEach((camera, lane) => { if (camera.position) this.lane(context, camera, top + lane * row, row - 2, width, colours); });
+      const x = xOf(player.time);
+      context.fillStyle = colours.accent;
+      context.fillRect(x - 1, 0, 2, height);
+      context.beginPath(); context.arc(x, 5, 5, 0, 7); context.fill();
+    }
+
+    lane(context, camera, y, height, width, colours) {
+      const span = (view.to - view.from) / width, reach = Math.max(1.5 * camera.usual, span);
+      context.fillStyle = camera.colour;
+      let first = mp4dsColumns.lastAtMost(camera.position, view.from) + 1, from = -1;
+      const missing = [];
+      for (let px = 0; px <= width; px++) {
+        const time = view.from + (px + 1) * span, n = mp4dsColumns.lastAtMost(camera.position, time);
+        const isThere = px < width && n >= 0 && time - camera.position[n] <= reach;
+        if (isThere && from < 0) from = px;
+        if (!isThere && from >= 0) { context.fillRect(from, y, px - from, height); from = -1; }
+        if (n + 1 > first) { if (camera.lost.reduction.range(first, n + 1)[1] > 0) missing.push(px); first = n + 1; }
+      }
+      context.fillStyle = colours.warn;
+      for (const px of missing) context.fillRect(px, y, 1, height);
+    }
+  }
+
+  // ------------------------------------------------------------ plots
+
+  function plotPanel(title) {
+    const canvas = element("canvas"), value = element("span", {class: "value"});
+    const head = element("header", {}, [element("h3", {text: title}), value]);
+    find("plots").append(element("div", {class: "plot"}, [head, canvas]));
+    return {canvas, value, head};
+  }
+
+  function timePlot(name, title, unit, {stems = false} = {}) {
+    const {canvas, value, head} = plotPanel(title);
+    const plot = new mp4dsPlots.TimePlot(canvas, value, view, {unit, stems, onTime: time => player.go(time)});
+    if (!stems) {
+      const button = element("button", {type: "button", text: "full range", "aria-pressed": "false"});
+      button.addEventListener("click", () => {
+        plot.isFull = !plot.isFull;
+        button.setAttribute("aria-pressed", String(plot.isFull));
+        button.textContent = plot.isFull ? "usual range" : "full range";
+        plot.request();
+      });
+      head.append(button);
+    }
+    return report.plots[name] = plot;
+  }
+
+  function addPlots() {
+    const cameras = player.cameras.filter(camera => camera.position), shown = camera => () => camera.isSeen;
+    const add = (plot, camera, y) => plot.add({name: camera.facts.name, colour: camera.colour, x: camera.position, y, shown: shown(camera)});
+    const interval = timePlot("interval", "Interval between frames", "ms");
+    const {canvas, value} = plotPanel("Jitter: interval less its median");
+    const jitter = report.plots.jitter = new mp4dsPlots.Histogram(canvas, value, {unit: "ms"});
+    const lost = timePlot("lost", "Lost frames (up), repeated or backward (down)", "frames", {stems: true});
+    const delay = timePlot("delay", "Record time less header stamp", "ms");
+    for (const camera of cameras) {
+      add(interval, camera, camera.interval);
+      const median = camera.facts.timing.median_ms || 0;
+      jitter.add({name: camera.facts.name, colour: camera.colour, y: camera.interval.map(value => value - median), shown: shown(camera)});
+      add(lost, camera, camera.lost.values);
+      add(delay, camera, mp4dsColumns.delays(camera.logTime, camera.stamp));
+    }
+    if (cameras.length > 1) {
+      const [reference, ...others] = cameras, offset = timePlot("offset", `Offset to ${reference.facts.name}`, "ms");
+      for (const camera of others) add(offset, camera, mp4dsColumns.offsets(camera.stamp, reference.stamp));
+    }
+    const measures = new Set(cameras.flatMap(camera => Object.keys(camera.scores)));
+    for (const measure of measures) {
+      const plot = timePlot(`score ${measure}`, measure, "");
+      for (const camera of cameras) if (camera.scores[measure]) add(plot, camera, camera.scores[measure]);
+    }
+    for (const plot of Object.values(report.plots)) plot.request();
+  }
+
+  function addLegend() {
+    for (const camera of player.cameras) {
+      const box = element("input", {type: "checkbox"}), dot = element("span", {class: "dot"});
+      box.checked = true;
+      dot.style.background = camera.colour;
+      box.addEventListener("change", () => {
+        camera.isSeen = box.checked;
+        for (const plot of Object.values(report.plots)) plot.request();
+      });
+      find("legend").append(element("label", {}, [box, dot, element("span", {text: camera.facts.name})]));
+    }
+    find("legend").hidden = player.cameras.length < 2;
+  }
+
+  // ------------------------------------------------------------ controls
+
+  function refresh() {
+    const base = BigInt(data.base), seconds = player.time / 1e9;
+    find("clock").textContent = `${seconds.toFixed(6)} s   ${mp4dsTables.dateText(base + BigInt(Math.round(player.time)))}`;
+    const play = find("play");
+    play.classList.toggle("playing", player.isPlaying);
+    play.setAttribute("aria-label", player.isPlaying ? "Pause" : "Play");
+    for (const camera of player.cameras) {
+      if (!camera.position) continue;
+      const isAbsent = player.time < camera.position[0] - 2 * camera.usual || player.time > camera.position.at(-1) + 2 * camera.usual;
+      camera.stage.classList.toggle("absent", isAbsent);
+    }
+    if (player.isPlaying && player.time > view.to) view.set(player.time, player.time + view.to - view.from);
+    const line = find("timeline");
+    line.setAttribute("aria-valuemax", String(player.end / 1e9));
+    line.setAttribute("aria-valuenow", seconds.toFixed(3));
+    for (const plot of Object.values(report.plots)) if ("now" in plot) { plot.now = player.time; plot.request(); }
+    timeline.request();
+  }
+
+  /** Nanoseconds from the start for what a user wrote: seconds from there, or ns since 1970. */
+  function timeOf(text) {
+    const clean = text.trim();
+    if (/^\d{12,19}$/.test(clean)) return Number(BigInt(clean) - BigInt(data.base));
+    if (/^\d{9,11}\.\d{1,9}$/.test(clean)) {
+      const [whole, part] = clean.split(".");
+      return Number(BigInt(whole) * 1000000000n + BigInt(part.padEnd(9, "0")) - BigInt(data.base));
+    }
+    const seconds = Number(clean.replace(/\s*s$/, ""));
+    return clean && Number.isFinite(seconds) ? seconds * 1e9 : null;
+  }
+
+  function addControls() {
+    for (const speed of SPEEDS) find("speed").append(element("option", {value: speed, text: `${speed} ×`}));
+    find("speed").value = "1";
+    find("speed").addEventListener("change", event => { player.speed = Number(event.target.value); });
+    for (const camera of player.cameras) find("lead").append(element("option", {value: camera.number, text: camera.facts.name}));
+    find("lead").addEventListener("change", event => lead(player.cameras[Number(event.target.value)]));
+    if (player.cameras.length) lead(player.cameras[0]);
+    find("play").addEventListener("click", () => player.toggle());
+    find("back").addEventListener("click", () => player.step(-1));
+    find("forward").addEventListener("click", () => player.step(1));
+    find("grid").addEventListener("change", () => player.cameras.forEach(drawGrid));
+    find("grid").disabled = !data.cameras.some(camera => camera.calibrations.some(item => item.overlay && !item.overlay.problem));
+    find("goto").addEventListener("submit", event => {
+      event.preventDefault();
+      const time = timeOf(find("goto-time").value);
+      if (time === null) return;
+      player.pause();
+      player.go(time);
+      if (player.time < view.from || player.time > view.to) view.all();
+    });
+    document.addEventListener("keydown", event => {
+      if (event.target.closest("input[type=text], select") || event.ctrlKey || event.metaKey || event.altKey) return;
+      const far = event.shiftKey ? 10 : 1;
+      const actions = {" ": () => player.toggle(), ArrowLeft: () => player.step(-far), ArrowRight: () => player.step(far),
+        Home: () => player.go(0), End: () => player.go(player.end), g: () => find("grid").click()};
+      const action = actions[event.key];
+      if (!action) return;
+      event.preventDefault();
+      action();
+    });
+    const redraw = () => {
+      for (const plot of Object.values(report.plots)) plot.request();
+      for (const camera of player.cameras) { camera.gridKey = null; drawGrid(camera); }
+      timeline.request();
+    };
+    addEventListener("resize", redraw);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+  }
+
+  // ------------------------------------------------------------ loading
+
+  const waiting = new Map();
+
+  /** The columns of a camera, called by report/columns-N.js. */
+  report.columns = (number, columns) => waiting.get(number)(columns);
+
+  function load(camera) {
+    return new Promise((resolve, reject) => {
+      waiting.set(camera.number, packed => {
+        const count = packed.frames, base = BigInt(data.base);
+        const stamp = mp4dsColumns.decode(packed.stamp, count), logTime = mp4dsColumns.decode(packed.log_time, count);
+        const interval = mp4dsColumns.intervals(stamp), lost = mp4dsColumns.lost(interval, camera.facts.timing.median_ms);
+        const scores = {};
+        for (const [name, text] of Object.entries(packed.scores)) scores[name] = mp4dsColumns.decodeFloats(text);
+        camera.take({
+          stamp, logTime, interval, scores, lost: {values: lost, reduction: new mp4dsPlots.Reduction(lost)},
+          position: mp4dsColumns.positions(data.axis === "stamp" ? stamp : logTime, base),
+          ticks: packed.ticks ? Float64Array.from(mp4dsColumns.decode(packed.ticks, count), Number) : null,
+        });
+        resolve();
+      });
+      const script = element("script", {src: camera.facts.columns});
+      script.addEventListener("error", () => reject(new Error(`${camera.facts.columns} is missing`)));
+      document.head.append(script);
+    });
+  }
+
+  async function start() {
+    document.title = `${data.name} - mp4ds report`;
+    find("name").textContent = data.name;
+    find("footer").textContent = `mp4ds ${data.version}. Cameras are shown together by their ${data.axis === "stamp" ? "header stamps" : "record times"}.`;
+    const count = data.cameras.length;
+    find("cameras").style.setProperty("--columns", String(count <= 1 ? 1 : count <= 4 ? 2 : 3));
+    const cameras = data.cameras.map(cameraPanel);
+    player = report.player = new mp4dsPlayer.Player(cameras, 0);
+    await Promise.all(cameras.map(load));
+    player.end = Math.max(0, ...cameras.map(camera => camera.position.at(-1)));
+    view = report.view = new mp4dsPlots.View(player.end);
+    timeline = new Timeline(find("timeline"));
+    const facts = data.summary;
+    find("subtitle").textContent = [facts.start_text, facts.format && `from ${facts.format}`, (facts.sources || []).slice(0, 4).join(", ")].filter(Boolean).join(" · ");
+    const length = facts.start ? Number(BigInt(facts.end) - BigInt(facts.start)) / 1e9 : player.end / 1e9;
+    mp4dsTables.summary(find("summary"), data, length);
+    find("timing-hint").textContent = mp4dsTables.timing(find("timing"), data);
+    mp4dsTables.topics(find("topics"), data);
+    find("calibration-section").hidden = !mp4dsTables.calibrations(find("calibrations"), data);
+    find("transform-section").hidden = !mp4dsTables.transforms(find("transforms"), data);
+    find("notes").replaceChildren(...data.notes.map(text => element("li", {text})));
+    find("note-section").hidden = !data.notes.length;
+    addControls();
+    addLegend();
+    addPlots();
+    player.listeners.push(refresh);
+    const asked = /^#t=(.+)$/.exec(decodeURIComponent(location.hash));
+    player.go((asked && timeOf(asked[1])) || 0);
+  }
+
+  /** What the page is about, called by report/data.js. */
+  report.dataset = facts => {
+    data = report.data = facts;
+    start().then(report.done, report.failed);
+  };
+
+  /** Resolves when every camera shows the frame that it should. */
+  report.settled = async () => {
+    await report.ready;
+    for (let tries = 0; tries < 600 && !player.isSettled; tries++) await new Promise(resolve => setTimeout(resolve, 25));
+    return player.isSettled;
+  };
+
+  return report;
+})();

@@ -1,0 +1,133 @@
+/* Tables and texts. What a recording says is only ever set as text. */
+"use strict";
+var mp4dsTables = (() => {
+  const {numberText} = mp4dsPlots;
+
+  function element(name, options = {}, children = []) {
+    const made = document.createElement(name);
+    for (const [key, value] of Object.entries(options)) {
+      if (key === "class") made.className = value;
+      else if (key === "text") made.textContent = value;
+      else made.setAttribute(key, value);
+    }
+    made.append(...children);
+    return made;
+  }
+
+  function bytesText(count) {
+    if (count === null || count === undefined) return "";
+    for (const unit of ["B", "kB", "MB", "GB"]) {
+      if (count < 1000) return unit === "B" ? `${count} B` : `${count.toFixed(1)} ${unit}`;
+      count /= 1000;
+    }
+    return `${count.toFixed(2)} TB`;
+  }
+
+  const optional = (value, digits) => value === null || value === undefined ? "" : value.toFixed(digits);
+  const grouped = value => value === null || value === undefined ? "" : value.toLocaleString("en");
+
+  /** Nanoseconds since 1970 (BigInt) as seconds with all nine digits. */
+  function stampText(time) {
+    const size = time < 0n ? -time : time;
+    return `${time < 0n ? "-" : ""}${size / 1000000000n}.${String(size % 1000000000n).padStart(9, "0")}`;
+  }
+
+  /** Nanoseconds since 1970 as date and time in UTC; empty beyond the calendar. */
+  function dateText(time) {
+    let whole = time / 1000000000n, part = time % 1000000000n;
+    if (part < 0n) { part += 1000000000n; whole -= 1n; }
+    const date = new Date(Number(whole) * 1000);
+    if (Number.isNaN(date.getTime())) return "";
+    return `${date.toISOString().slice(0, -5).replace("T", " ")}.${String(part).padStart(9, "0")} UTC`;
+  }
+
+  function table(place, head, rows) {
+    const cell = (kind, text, {number, bad, long} = {}) => {
+      const classes = [number && "number", bad && "bad", long && "long"].filter(Boolean).join(" ");
+      return element(kind, {text, ...(classes && {class: classes})});
+    };
+    place.replaceChildren(
+      element("thead", {}, [element("tr", {}, head.map(([text, options]) => cell("th", text, options)))]),
+      element("tbody", {}, rows.map(row => element("tr", {}, row.map((value, i) => {
+        const [text, more] = Array.isArray(value) ? value : [value, {}];
+        return cell("td", text, {...head[i][1], ...more});
+      })))));
+  }
+
+  function summary(place, data, seconds) {
+    const facts = data.summary, shown = [];
+    const add = (name, value) => { if (value) shown.push(element("div", {}, [element("dt", {text: name}), element("dd", {text: value})])); };
+    add("Length", mp4dsPlots.timeText(seconds, 1));
+    add("Cameras", String(data.cameras.length));
+    add("Topics", grouped(facts.topics));
+    add("Messages", grouped(facts.messages));
+    if (facts.bytes) {
+      add("Recording", bytesText(facts.source_bytes));
+      add("Dataset", bytesText(facts.bytes));
+      add("Ratio", facts.source_bytes ? `${(facts.source_bytes / facts.bytes).toFixed(2)} ×` : "");
+    }
+    add("Profile", facts.profile);
+    place.replaceChildren(...shown);
+  }
+
+  const NUMBER = {number: true};
+
+  function timing(place, data) {
+    const reference = data.cameras.length > 1 ? data.cameras[0].name : "";
+    const head = [["Camera", {long: true}], ["Frames", NUMBER], ["Rate, Hz", NUMBER], ["Interval, ms", NUMBER], ["Jitter, ms", NUMBER],
+      ["99 % within", NUMBER], ["Longest, ms", NUMBER], ["Lost", NUMBER], ["Repeated", NUMBER], ["Backward", NUMBER],
+      ["seq missing", NUMBER], ["Record − stamp, ms", NUMBER]];
+    if (reference) head.push(["Offset, ms", NUMBER]);
+    table(place, head, data.cameras.map(camera => {
+      const t = camera.timing, count = (value, more = "") => [grouped(value) + more, {bad: value > 0}];
+      const row = [camera.name, grouped(t.frames), optional(t.rate_hz, 2), optional(t.median_ms, 3), optional(t.jitter_ms, 3), optional(t.p99_ms, 3),
+        optional(t.longest_ms, 1), count(t.lost, t.gaps ? ` in ${grouped(t.gaps)} gaps` : ""), count(t.repeated), count(t.backward), t.seq_missing === null ? "" : count(t.seq_missing),
+        `${numberText(t.delay_median_ms)} (${numberText(t.delay_least_ms)} to ${numberText(t.delay_most_ms)})`];
+      const offset = camera.offset;
+      if (reference) row.push(offset ? `${numberText(offset.median_ms)} (99 % within ${numberText(offset.p99_ms)})` : "reference");
+      return row;
+    }));
+    return "Interval is the median between header stamps, jitter the standard deviation. An interval of more than 1.5 medians counts as lost frames; "
+      + "repeated frames have the stamp of the one before."
+      + (reference ? ` Offset is each frame's stamp less that of the nearest frame of ${reference}.` : "");
+  }
+
+  function topics(place, data) {
+    const head = [["Topic", {long: true}], ["Type", {long: true}], ["Messages", NUMBER], ["Rate, Hz", NUMBER], ["Recorded", NUMBER], ["Stored", NUMBER],
+      ["Ratio", NUMBER], ["In", {long: true}]];
+    table(place, head, data.topics.map(row => [row.topic, row.type_name, grouped(row.messages), optional(row.rate_hz, 2), bytesText(row.recorded_bytes),
+      bytesText(row.stored_bytes), optional(row.ratio, 2), row.stored]));
+  }
+
+  function calibrations(place, data) {
+    const rowsOf = (values, step) => values.map((value, i) => `${i % step ? ", " : i ? "\n     " : ""}${numberOf(value)}`).join("");
+    const numberOf = value => String(Number(value.toPrecision(10)));
+    const made = [];
+    for (const camera of data.cameras) {
+      for (const item of camera.calibrations.slice(0, 8)) {
+        const size = `${item.width}x${item.height}`, from = item.from_frame ? `from frame ${item.from_frame} on` : "from the start";
+        const lines = [`K  = ${rowsOf(item.k, 3)}`, `D  = ${item.d.map(numberOf).join(", ")}`, `R  = ${rowsOf(item.r, 3)}`, `P  = ${rowsOf(item.p, 4)}`];
+        if (item.binning_x || item.binning_y) lines.push(`binning ${item.binning_x} x ${item.binning_y}`);
+        if (item.roi) lines.push(`ROI ${item.roi.width}x${item.roi.height} at ${item.roi.x_offset}, ${item.roi.y_offset}`);
+        if (item.overlay && item.overlay.problem) lines.push(`no grid: ${item.overlay.problem}`);
+        made.push(element("div", {class: "calibration"}, [
+          element("h3", {text: camera.name}),
+          element("p", {class: "muted", text: `${item.distortion_model || "no model"}, ${size}, frame ${item.frame_id || "without a name"}, ${from}`}),
+          element("p", {class: "muted", text: camera.calibration_topic}), element("pre", {text: lines.join("\n")})]));
+      }
+      const more = camera.calibrations.length - 8 + camera.calibrations_more;
+      if (more > 0) made.push(element("p", {class: "muted", text: `${camera.name}: ${more} changes more; mp4ds info --intrinsics lists them`}));
+    }
+    place.replaceChildren(...made);
+    return made.length > 0;
+  }
+
+  function transforms(place, data) {
+    const head = [["Parent", {long: true}], ["Child", {long: true}], ["x, y, z, m", NUMBER], ["Rotation x, y, z, w", NUMBER]];
+    const texts = values => values.map(value => value.toFixed(4)).join(", ");
+    table(place, head, data.transforms.map(item => [item.parent, item.child, texts(item.translation), texts(item.rotation)]));
+    return data.transforms.length > 0;
+  }
+
+  return {element, bytesText, stampText, dateText, summary, timing, topics, calibrations, transforms};
+})();

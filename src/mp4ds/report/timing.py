@@ -1,0 +1,160 @@
+"""What the times of frames tell: intervals, frames lost and repeated, offsets; numpy only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Integers = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+_MS = 1e6  # nanoseconds
+_LOST_FROM = 1.5  # median intervals without a frame
+_WIDER = 2  # times the span of the log times, beyond which stamps are of several clocks
+_SLACK_NS = 10 * 10**9
+
+
+@dataclass(frozen=True)
+class Timing:
+    """The times of one camera in figures. Milliseconds, None where there are too few frames.
+
+    Attributes:
+        frames: Number of frames.
+        rate_hz: Mean rate by the median interval.
+        median_ms: Median of the intervals between stamps that advance.
+        jitter_ms: Standard deviation of the intervals.
+        p99_ms: 99th percentile of how far an interval is from the median.
+        longest_ms: Longest interval.
+        lost: Frames missing by the stamps: see `lost_frames`.
+        gaps: Places where they are missing.
+        repeated: Frames with the stamp of the one before.
+        backward: Frames with an earlier stamp than the one before.
+        seq_missing: Numbers that the header's `seq` leaves out; None where there is no `seq`.
+        delay_median_ms: Median of log time minus stamp.
+        delay_least_ms: Least of them.
+        delay_most_ms: Most of them.
+    """
+
+    frames: int
+    rate_hz: float | None
+    median_ms: float | None
+    jitter_ms: float | None
+    p99_ms: float | None
+    longest_ms: float | None
+    lost: int
+    gaps: int
+    repeated: int
+    backward: int
+    seq_missing: int | None
+    delay_median_ms: float
+    delay_least_ms: float
+    delay_most_ms: float
+
+
+def differences(later: Integers, earlier: Integers) -> Floats:
+    """Differences of times in nanoseconds; exact below 2^53, and right in size beyond 2^63."""
+    with np.errstate(over="ignore"):
+        exact = later - earlier
+    rough: Floats = later.astype(np.float64) - earlier.astype(np.float64)
+    return np.where(np.abs(rough) < 2.0**62, exact.astype(np.float64), rough)
+
+
+def intervals(stamps: Integers) -> Floats:
+    """Nanoseconds from each frame to the next, shape (frames - 1,)."""
+    return differences(stamps[1:], stamps[:-1])
+
+
+def usual_interval(steps: Floats) -> float | None:
+    """Median of the intervals that advance, nanoseconds; None where none does."""
+    advancing = steps[steps > 0]
+    return float(np.median(advancing)) if len(advancing) else None
+
+
+def lost_frames(steps: Floats) -> Integers:
+    """How many frames seem to be missing in each interval.
+
+    An interval of more than 1.5 times the median is taken for as many as fit into it, rounded.
+    """
+    usual = usual_interval(steps)
+    if usual is None:
+        return np.zeros(len(steps), np.int64)
+    missing = np.floor(steps / usual + 0.5) - 1
+    missing[steps <= _LOST_FROM * usual] = 0
+    whole: Integers = np.minimum(missing, 2.0**53).astype(np.int64)
+    return whole
+
+
+def timing_of(stamps: Integers, log_times: Integers, seq: Integers | None) -> Timing:
+    """The figures of one camera.
+
+    Args:
+        stamps: Header stamps, nanoseconds, at least one.
+        log_times: Log times, nanoseconds.
+        seq: Numbers in the headers, or None.
+    """
+    steps = intervals(stamps)
+    usual = usual_interval(steps)
+    lost = lost_frames(steps)
+    delays = differences(log_times, stamps) / _MS
+    return Timing(
+        frames=len(stamps),
+        rate_hz=1e9 / usual if usual else None,
+        median_ms=usual / _MS if usual else None,
+        jitter_ms=float(steps.std()) / _MS if len(steps) else None,
+        p99_ms=float(np.percentile(np.abs(steps - usual), 99)) / _MS if usual else None,
+        longest_ms=float(steps.max()) / _MS if len(steps) else None,
+        lost=sum(lost[lost > 0].tolist()),
+        gaps=int((lost > 0).sum()),
+        repeated=int((steps == 0).sum()),
+        backward=int((steps < 0).sum()),
+        seq_missing=None if seq is None else _missing_numbers(seq),
+        delay_median_ms=float(np.median(delays)),
+        delay_least_ms=float(delays.min()),
+        delay_most_ms=float(delays.max()),
+    )
+
+
+def _missing_numbers(seq: Integers) -> int:
+    steps = np.diff(seq)
+    return sum((steps[steps > 1] - 1).tolist())
+
+
+def nearest_offsets(stamps: Integers, reference: Integers) -> Floats:
+    """How much later each frame is than the reference's frame that is nearest, nanoseconds.
+
+    Args:
+        stamps: Of a camera.
+        reference: Of the camera that it is compared with, at least one; in any order.
+    """
+    ordered = np.sort(reference)
+    after = np.minimum(np.searchsorted(ordered, stamps, side="left"), len(ordered) - 1)
+    before = np.maximum(after - 1, 0)
+    to_after = differences(stamps, ordered[after])
+    to_before = differences(stamps, ordered[before])
+    return np.where(np.abs(to_before) <= np.abs(to_after), to_before, to_after)
+
+
+def axis_of(cameras: Sequence[Mapping[str, Integers]]) -> str:
+    """By which times all cameras are shown together: ``stamp`` or ``log_time``.
+
+    Stamps, where those of every camera mostly advance, and they are all of one clock.
+
+    Args:
+        cameras: Columns ``stamp`` and ``log_time`` of each.
+    """
+    for columns in cameras:
+        steps = intervals(columns["stamp"])
+        if 2 * int((steps > 0).sum()) < len(steps):
+            return "log_time"
+    spans = {name: _span([columns[name] for columns in cameras]) for name in ("stamp", "log_time")}
+    is_one_clock = spans["stamp"] <= _WIDER * spans["log_time"] + _SLACK_NS
+    return "stamp" if is_one_clock else "log_time"
+
+
+def _span(columns: Sequence[Integers]) -> int:
+    if not columns:
+        return 0
+    return max(int(c.max()) for c in columns) - min(int(c.min()) for c in columns)

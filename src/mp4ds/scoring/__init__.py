@@ -1,0 +1,29 @@
+"""How much decoded frames differ from their originals: VMAF, PSNR and SSIM of each frame.
+
+PSNR and SSIM are computed here. VMAF is computed by libvmaf within an ffmpeg, which is run as a
+process: the optional package imageio-ffmpeg brings one, or one on the PATH is taken.
+"""
+
+from __future__ import annotations
+
+from mp4ds.scoring.errors import ScoringError
+from mp4ds.scoring.ffmpeg import VMAF_MODEL, Ffmpeg, find_ffmpeg
+from mp4ds.scoring.measures import MAX_PSNR, psnr, ssim
+from mp4ds.scoring.scorer import Scorer, YuvFrame
+from mp4ds.scoring.scores import METRICS, Scores, Summary, summary_of
+
+__all__ = [
+    "MAX_PSNR",
+    "METRICS",
+    "VMAF_MODEL",
+    "Ffmpeg",
+    "Scorer",
+    "Scores",
+    "ScoringError",
+    "Summary",
+    "YuvFrame",
+    "find_ffmpeg",
+    "psnr",
+    "ssim",
+    "summary_of",
+]

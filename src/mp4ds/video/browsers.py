@@ -1,0 +1,48 @@
+"""What web browsers play."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from av.error import FFmpegError
+
+from mp4ds.errors import VideoError
+from mp4ds.video.media import Media
+
+_YUV420 = frozenset({"yuv420p", "yuvj420p", "gray"})
+_PLAYED = {
+    "h264": _YUV420,
+    "av1": _YUV420 | {"yuv420p10le", "gray10le"},
+    "vp9": frozenset({"yuv420p"}),
+}
+
+
+def why_not_in_browsers(path: Path) -> str:
+    """Why no browser plays a video; empty if those that have its codec do.
+
+    Args:
+        path: An mp4.
+
+    Raises:
+        VideoError: It cannot be read.
+    """
+    if not path.is_file():
+        raise VideoError("file-missing", path, "does not exist")
+    try:
+        media = Media(path)
+    except (FFmpegError, OSError) as error:
+        raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
+    try:
+        tracks = media.container.streams.video
+        context: Any = tracks[0].codec_context if tracks else None
+        if context is None or context.codec is None:
+            raise VideoError("video-unreadable", path, "has no video track of a known codec")
+        name, pixel_format = context.codec.canonical_name, context.pix_fmt
+    finally:
+        media.close()
+    if name not in _PLAYED:
+        return f"no browser plays {name}"
+    if pixel_format not in _PLAYED[name]:
+        return f"no browser plays {name} of the pixel format {pixel_format}"
+    return ""

@@ -1,0 +1,157 @@
+"""Drawings of lines, dots and words, as SVG and as PNG."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from xml.sax.saxutils import escape
+
+_TEXT_SIZE = 12
+_SCALE = 2  # of a PNG
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line through points, in pixels from the top left.
+
+    Attributes:
+        points: At least two.
+        color: As ``#rrggbb``.
+        width: Pixels.
+        dashed: Whether it is interrupted.
+    """
+
+    points: Sequence[tuple[float, float]]
+    color: str
+    width: float = 1.0
+    dashed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Dot:
+    """A disc.
+
+    Attributes:
+        place: Of its middle, pixels.
+        color: As ``#rrggbb``.
+        radius: Pixels.
+        tip: What an SVG tells of it.
+    """
+
+    place: tuple[float, float]
+    color: str
+    radius: float = 4.0
+    tip: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """Words.
+
+    Attributes:
+        place: Pixels; their height is in the middle of it.
+        words: One line.
+        anchor: ``start``, ``middle`` or ``end``: which part of them is there.
+        color: As ``#rrggbb``.
+    """
+
+    place: tuple[float, float]
+    words: str
+    anchor: str = "start"
+    color: str = "#333333"
+
+
+Shape = Line | Dot | Text
+
+
+def svg_of(shapes: Sequence[Shape], size: tuple[int, int]) -> str:
+    """The drawing as an SVG element.
+
+    Args:
+        shapes: What is drawn later covers what is drawn before.
+        size: Width and height, pixels.
+    """
+    width, height = size
+    parts = "\n".join(map(_svg_shape, shapes))
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
+        f'viewBox="0 0 {width} {height}" font-family="sans-serif" font-size="{_TEXT_SIZE}">\n'
+        f'<rect width="{width}" height="{height}" fill="#ffffff"/>\n{parts}\n</svg>\n'
+    )
+
+
+def _svg_shape(shape: Shape) -> str:
+    if isinstance(shape, Line):
+        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in shape.points)
+        dashes = ' stroke-dasharray="5 4"' if shape.dashed else ""
+        return (
+            f'<polyline points="{points}" fill="none" stroke="{shape.color}" '
+            f'stroke-width="{shape.width:g}"{dashes}/>'
+        )
+    x, y = shape.place
+    if isinstance(shape, Dot):
+        tip = f"<title>{escape(shape.tip)}</title>" if shape.tip else ""
+        return (
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{shape.radius:g}" fill="{shape.color}">'
+            f"{tip}</circle>"
+        )
+    return (
+        f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{shape.anchor}" '
+        f'dominant-baseline="central" fill="{shape.color}">{escape(shape.words)}</text>'
+    )
+
+
+def png_of(shapes: Sequence[Shape], size: tuple[int, int]) -> bytes:
+    """The drawing as a PNG file of twice its size.
+
+    Args:
+        shapes: What is drawn later covers what is drawn before.
+        size: Width and height, pixels.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    image = Image.new("RGB", (size[0] * _SCALE, size[1] * _SCALE), "#ffffff")
+    pen = ImageDraw.Draw(image)
+    font = ImageFont.load_default(_TEXT_SIZE * _SCALE)
+    for shape in shapes:
+        if isinstance(shape, Line):
+            width = max(1, round(shape.width * _SCALE))
+            for begin, end in _strokes(shape):
+                pen.line((*begin, *end), shape.color, width)
+            continue
+        x, y = (side * _SCALE for side in shape.place)
+        if isinstance(shape, Dot):
+            r = shape.radius * _SCALE
+            pen.ellipse((x - r, y - r, x + r, y + r), shape.color)
+        else:
+            anchor = {"start": "lm", "middle": "mm", "end": "rm"}[shape.anchor]
+            pen.text((x, y), shape.words, shape.color, font, anchor)
+    file = io.BytesIO()
+    image.save(file, "PNG", optimize=True)
+    return file.getvalue()
+
+
+def _strokes(line: Line) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+    """Straight pieces of a line, in pixels of a PNG."""
+    points = [(x * _SCALE, y * _SCALE) for x, y in line.points]
+    pieces = list(pairwise(points))
+    if not line.dashed:
+        return pieces
+    dash, gap = 5.0 * _SCALE, 4.0 * _SCALE
+    strokes = []
+    for (x0, y0), (x1, y1) in pieces:
+        length = ((x1 - x0) ** 2 + (y1 - y0) ** 2) ** 0.5
+        at = 0.0
+        while at < length:
+            end = min(at + dash, length)
+            a, b = at / length, end / length
+            strokes.append(
+                (
+                    (x0 + a * (x1 - x0), y0 + a * (y1 - y0)),
+                    (x0 + b * (x1 - x0), y0 + b * (y1 - y0)),
+                )
+            )
+            at += dash + gap
+    return strokes

@@ -1,0 +1,303 @@
+"""A process of its own in DDS, as a robot's would be: it subscribes, publishes and calls services.
+
+It shares no code with the package; its types are declared by hand. Commands come as lines of JSON
+on stdin, and each is answered by a line on stdout.
+"""
+
+import base64
+import json
+import sys
+import time
+from dataclasses import dataclass
+from typing import Any
+
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+from cyclonedds.core import Policy, Qos
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import array, float64, int32, int64, sequence, uint8, uint32, uint64
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+
+
+def raw(kind: Any) -> Any:
+    """A type whose messages keep the bytes that they came as."""
+    parse = kind.deserialize
+
+    def deserialize(cls: Any, data: bytes, *args: Any, **options: Any) -> Any:
+        message = parse(data, *args, **options) if cls.is_parsed else cls.__new__(cls)
+        message.raw = bytes(data)
+        return message
+
+    kind.deserialize = classmethod(deserialize)
+    kind.is_parsed = True
+    return kind
+
+
+@dataclass
+class Time(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
+    sec: int32
+    nanosec: uint32
+
+
+@dataclass
+class Header(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
+    stamp: Time
+    frame_id: str
+
+
+@dataclass
+class String(IdlStruct, typename="std_msgs.msg.dds_.String_"):
+    data: str
+
+
+@dataclass
+class Clock(IdlStruct, typename="rosgraph_msgs.msg.dds_.Clock_"):
+    clock: Time
+
+
+@dataclass
+class Image(IdlStruct, typename="sensor_msgs.msg.dds_.Image_"):
+    header: Header
+    height: uint32
+    width: uint32
+    encoding: str
+    is_bigendian: uint8
+    step: uint32
+    data: sequence[uint8]
+
+
+@dataclass
+class CompressedImage(IdlStruct, typename="sensor_msgs.msg.dds_.CompressedImage_"):
+    header: Header
+    format: str
+    data: sequence[uint8]
+
+
+@dataclass
+class Vector3(IdlStruct, typename="geometry_msgs.msg.dds_.Vector3_"):
+    x: float64
+    y: float64
+    z: float64
+
+
+@dataclass
+class Quaternion(IdlStruct, typename="geometry_msgs.msg.dds_.Quaternion_"):
+    x: float64
+    y: float64
+    z: float64
+    w: float64
+
+
+@dataclass
+class Imu(IdlStruct, typename="sensor_msgs.msg.dds_.Imu_"):
+    header: Header
+    orientation: Quaternion
+    orientation_covariance: array[float64, 9]
+    angular_velocity: Vector3
+    angular_velocity_covariance: array[float64, 9]
+    linear_acceleration: Vector3
+    linear_acceleration_covariance: array[float64, 9]
+
+
+@dataclass
+class Transform(IdlStruct, typename="geometry_msgs.msg.dds_.Transform_"):
+    translation: Vector3
+    rotation: Quaternion
+
+
+@dataclass
+class TransformStamped(IdlStruct, typename="geometry_msgs.msg.dds_.TransformStamped_"):
+    header: Header
+    child_frame_id: str
+    transform: Transform
+
+
+@dataclass
+class TFMessage(IdlStruct, typename="tf2_msgs.msg.dds_.TFMessage_"):
+    transforms: sequence[TransformStamped]
+
+
+TYPES: dict[str, Any] = {
+    "std_msgs/msg/Header": raw(Header),
+    "std_msgs/msg/String": raw(String),
+    "rosgraph_msgs/msg/Clock": raw(Clock),
+    "sensor_msgs/msg/Image": raw(Image),
+    "sensor_msgs/msg/CompressedImage": raw(CompressedImage),
+    "sensor_msgs/msg/Imu": raw(Imu),
+    "tf2_msgs/msg/TFMessage": raw(TFMessage),
+}
+_FIELDS = {
+    "Empty": {"structure_needs_at_least_one_member": uint8},
+    "success": {"success": bool},
+}
+SERVICES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "Pause": (_FIELDS["Empty"], _FIELDS["Empty"]),
+    "Resume": (_FIELDS["Empty"], _FIELDS["Empty"]),
+    "TogglePaused": (_FIELDS["Empty"], _FIELDS["Empty"]),
+    "IsPaused": (_FIELDS["Empty"], {"paused": bool}),
+    "GetRate": (_FIELDS["Empty"], {"rate": float64}),
+    "SetRate": ({"rate": float64}, _FIELDS["success"]),
+    "PlayNext": (_FIELDS["Empty"], _FIELDS["success"]),
+    "Burst": ({"num_messages": uint64}, {"actually_burst": uint64}),
+    "Seek": ({"time": Time}, _FIELDS["success"]),
+    "Stop": (_FIELDS["Empty"], _FIELDS["Empty"]),
+}
+
+
+class Peer:
+    def __init__(self, domain: int) -> None:
+        self._participant = DomainParticipant(domain)
+        self._readers: dict[str, Any] = {}
+        self._writers: dict[str, Any] = {}
+        self._seen: dict[str, list[Any]] = {}
+        self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+
+    def subscribe(self, topic: str, kind: str, *, parsed: bool = True, **qos: Any) -> bool:
+        """Subscribe with a type that was declared by hand; large ones are slow to parse."""
+        TYPES[kind].is_parsed = parsed
+        dds = Topic(self._participant, topic, TYPES[kind])
+        self._readers[topic] = DataReader(self._participant, dds, qos=_qos(**qos))
+        self._seen[topic] = []
+        return True
+
+    def received(self, topic: str, count: int, seconds: float = 30.0) -> list[Any]:
+        """Messages so far, when there are as many as asked for or time is up."""
+        reader, seen = self._readers[topic], self._seen[topic]
+        end = time.monotonic() + seconds
+        while True:
+            for sample in reader.take(1000):
+                if sample.sample_info.valid_data:
+                    fields = _plain(sample) if type(sample).is_parsed else None
+                    seen.append([base64.b64encode(sample.raw).decode(), fields])
+            if len(seen) >= count or time.monotonic() > end:
+                return seen
+            time.sleep(0.005)
+
+    def forget(self, topic: str) -> bool:
+        """Forget what was received so far."""
+        self._seen[topic].clear()
+        return True
+
+    def connected(self, topic: str, count: int, seconds: float = 30.0) -> int:
+        """How many publishers a subscription has, waiting for as many as asked for."""
+        end = time.monotonic() + seconds
+        while True:
+            found = len(self._readers[topic].get_matched_publications())
+            if found == count or time.monotonic() > end:
+                return found
+            time.sleep(0.005)
+
+    def count_bytes(self, topic: str, count: int, seconds: float) -> list[int]:
+        """Sizes of messages, for large ones."""
+        sizes: list[int] = []
+        end = time.monotonic() + seconds
+        while len(sizes) < count and time.monotonic() < end:
+            sizes += [len(sample.raw) for sample in self._readers[topic].take(1000)]
+            time.sleep(0.002)
+        return sizes
+
+    def publications(self, topic: str, seconds: float = 30.0) -> list[Any]:
+        """What a publisher tells of itself."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            found = [one for one in self._publications.read(1000) if one.topic_name == topic]
+            if found:
+                return [_told(one) for one in found]
+            time.sleep(0.005)
+        return []
+
+    def publish(self, topic: str, kind: str, message: str, **qos: Any) -> bool:
+        """Publish a message, CDR in base64, when there is a subscriber."""
+        if topic not in self._writers:
+            dds = Topic(self._participant, topic, TYPES[kind])
+            self._writers[topic] = DataWriter(self._participant, dds, qos=_qos(**qos))
+            end = time.monotonic() + 30
+            while not self._writers[topic].matched_sub and time.monotonic() < end:
+                time.sleep(0.005)
+            time.sleep(0.3)  # the other side has to find this one, too
+        writer = self._writers[topic]
+        writer.write(TYPES[kind].deserialize(base64.b64decode(message)))
+        return True
+
+    def call(self, name: str, kind: str, request: list[Any]) -> Any:
+        """Call a service as rmw_cyclonedds does; returns the fields of the reply."""
+        asked, replied = SERVICES[kind]
+        client = f"clientid={name}.1;".encode()
+        out = self._service(f"{kind}_Request_", asked)
+        back = self._service(f"{kind}_Response_", replied)
+        qos = Qos(Policy.Userdata(client), base=_qos(reliable=True))
+        writer = DataWriter(
+            self._participant, Topic(self._participant, f"rq{name}Request", out), qos=qos
+        )
+        reader = DataReader(
+            self._participant, Topic(self._participant, f"rr{name}Reply", back), qos=qos
+        )
+        end = time.monotonic() + 30
+        while time.monotonic() < end:
+            if writer.get_matched_subscriptions() and reader.get_matched_publications():
+                break
+            time.sleep(0.005)
+        fields = [Time(*value) if isinstance(value, list) else value for value in request]
+        writer.write(out(0x1234, 77, *(fields or [0])))
+        while time.monotonic() < end:
+            for reply in reader.take(10):
+                if reply.sample_info.valid_data and reply.client_guid == 0x1234:
+                    return [reply.sequence_number, {key: getattr(reply, key) for key in replied}]
+            time.sleep(0.005)
+        return None
+
+    def _service(self, name: str, fields: dict[str, Any]) -> Any:
+        from cyclonedds.idl import make_idl_struct
+
+        header = {"client_guid": uint64, "sequence_number": int64}
+        typename = f"rosbag2_interfaces.srv.dds_.{name}"
+        return make_idl_struct(name, typename, {**header, **fields})
+
+
+def _qos(*, reliable: bool = True, latched: bool = False, depth: int = 1000) -> Qos:
+    return Qos(
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+        Policy.Reliability.Reliable(10**9) if reliable else Policy.Reliability.BestEffort,
+        Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
+        Policy.History.KeepLast(depth),
+    )
+
+
+def _told(endpoint: Any) -> dict[str, Any]:
+    qos = endpoint.qos
+    deadline = qos[Policy.Deadline].deadline if Policy.Deadline in qos else None
+    return {
+        "type": endpoint.type_name,
+        "user_data": qos[Policy.Userdata].data.decode() if Policy.Userdata in qos else "",
+        "reliable": Policy.Reliability.BestEffort not in qos,
+        "latched": Policy.Durability.TransientLocal in qos,
+        "deadline": deadline,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Fields as lists, large arrays by their sum."""
+    if isinstance(value, IdlStruct):
+        return [_plain(getattr(value, name)) for name in type(value).__annotations__]
+    if isinstance(value, (list, tuple, bytes)):
+        return sum(value) if len(value) > 20 else [_plain(item) for item in value]
+    return value
+
+
+def _say(value: Any) -> None:
+    sys.stdout.write(json.dumps(value) + "\n")
+    sys.stdout.flush()
+
+
+def main() -> None:
+    peer = Peer(int(sys.argv[1]))
+    _say("ready")
+    for line in sys.stdin:
+        command, arguments, options = json.loads(line)
+        _say(getattr(peer, command)(*arguments, **options))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,156 @@
+"""A publisher that keeps what it is given, and datasets to be played."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mp4ds.bags import open_reader, open_writer
+from mp4ds.bags.definitions import ros1_channel
+from mp4ds.records import Channel, Message
+from mp4ds.wire import ImageFields, Slots, form_of
+
+
+@dataclass
+class Sent:
+    """One thing that was published: a message, or a time of /clock."""
+
+    topic: str
+    payload: bytes
+    time_ns: int
+    at: float
+    channel: Channel | None = None
+
+
+@dataclass
+class RecordingPublisher:
+    """Keeps everything; counts as having a subscriber everywhere."""
+
+    world: str | None = None
+    address: str = "nowhere"
+    wants_clock: bool = False
+    is_alive: bool = True
+    busy_s: float = 0.0
+    advertised: list[Channel] = field(default_factory=list)
+    sent: list[Sent] = field(default_factory=list)
+    clocks: list[Sent] = field(default_factory=list)
+    on_time: Callable[[int], None] | None = None
+    on_message: Callable[[], None] | None = None
+    controls: Any = None
+    subscriber_count: int = 1
+    on_sent: Callable[[Sent], None] | None = None
+
+    def advertise(self, channel: Channel) -> None:
+        self.advertised.append(channel)
+
+    def publish(self, channel: Channel, payload: bytes | memoryview, time_ns: int) -> None:
+        if not any(channel is item for item in self.advertised):
+            raise LookupError(f"{channel.topic} was not advertised")
+        if self.busy_s:
+            time.sleep(self.busy_s)
+        sent = Sent(channel.topic, bytes(payload), time_ns, time.monotonic(), channel)
+        self.sent.append(sent)
+        if self.on_sent:
+            self.on_sent(sent)
+
+    def clock(self, time_ns: int) -> None:
+        self.clocks.append(Sent("/clock", b"", time_ns, time.monotonic()))
+
+    def subscribers(self, _: Channel) -> int:
+        return self.subscriber_count
+
+    def follow_clock(self, on_time: Callable[[int], None]) -> None:
+        self.on_time = on_time
+
+    def listen(self, _: str, on_message: Callable[[], None]) -> None:
+        self.on_message = on_message
+
+    def serve(self, controls: Any) -> None:
+        self.controls = controls
+
+    def close(self) -> None:
+        self.is_alive = False
+
+    def __enter__(self) -> RecordingPublisher:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+START = 1_700_000_000 * 10**9
+STEP = 50_000_000  # between frames, ns
+MS = 1_000_000
+
+
+def make_drive(path: Path, *, frames: int = 20, topic: str = "/camera", late: int = 0) -> Path:
+    """A ROS 1 bag: a grey camera at 20 Hz, tf at 40 Hz, static transforms of two callers.
+
+    Args:
+        path: The .bag to make.
+        frames: Of the camera.
+        topic: Where the camera is.
+        late: Nanoseconds by which all is later.
+    """
+    channels = {
+        "image": ros1_channel(0, f"{topic}/image_raw", "sensor_msgs/Image", "/driver"),
+        "tf": ros1_channel(1, "/tf", "tf2_msgs/TFMessage", "/odometry"),
+    }
+    for number, caller in ((2, "/base"), (3, "/arm")):
+        channel = ros1_channel(number, "/tf_static", "tf2_msgs/TFMessage", caller)
+        channels[caller] = replace(channel, metadata={**channel.metadata, "latching": "1"})
+    rows: list[tuple[int, str, bytes]] = []
+    for seq in range(frames):
+        stamp = START + late + seq * STEP
+        rows.append((stamp + 5 * MS, "image", image(seq, stamp)))
+        rows += [
+            (stamp + shift, "tf", transform("odom", stamp + shift)) for shift in (0, STEP // 2)
+        ]
+    rows += [(START + late + MS, caller, transform(caller, START)) for caller in ("/base", "/arm")]
+    with open_writer(path, "bag", name=path.name, profile="ros1", library="", storage="") as writer:
+        for channel in channels.values():
+            writer.add_channel(channel)
+        for log_time, name, payload in sorted(rows, key=lambda row: row[0]):
+            writer.write(Message(channels[name], log_time, log_time, 0, payload))
+    return path
+
+
+def image(seq: int, stamp: int) -> bytes:
+    """A grey image of 160 x 120 in the serialization of ROS 1, which shows its number."""
+    rows, columns = np.mgrid[0:120, 0:160]
+    pixels = (128 + 90 * np.sin((rows + 3 * seq) / 20) * np.cos(columns / 30)).astype(np.uint8)
+    pixels += np.random.default_rng(seq).integers(0, 3, pixels.shape, np.uint8)
+    form = form_of("ros1", "sensor_msgs/Image", b"")
+    blank = form.plain("camera", ImageFields("mono8", 160, 120, 160, 0)) or b""
+    head, tail = form.template(blank).around(Slots(stamp, seq), pixels.size)
+    return head + pixels.tobytes() + tail
+
+
+def transform(child: str, stamp: int) -> bytes:
+    """A TFMessage of one transform in the serialization of ROS 1."""
+    name = child.encode()
+    return (
+        struct.pack("<I", 1)
+        + struct.pack("<IIII4s", 0, *divmod(stamp, 10**9), 4, b"base")
+        + struct.pack(f"<I{len(name)}s", len(name), name)
+        + struct.pack("<7d", 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)
+    )
+
+
+Recorded = tuple[str, bytes, int]
+
+
+def recorded(path: Path) -> list[Recorded]:
+    """Topic, payload and log time of every message of a recording, in its order."""
+    with open_reader(path) as reader:
+        return [
+            (record.channel.topic, bytes(record.data), record.log_time)
+            for record in reader.records()
+            if isinstance(record, Message)
+        ]

@@ -1,0 +1,154 @@
+"""Publishes what is in a recording through mp4ds, as it is told in JSON.
+
+    ros1_driver.py RECORDING [OPTIONS]
+
+OPTIONS are those of `RospyPublisher` in JSON. Each line of the input is a call of a method of
+`Driver` with its arguments, each line of the output what it returns.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from mp4ds.bags.formats import open_reader
+from mp4ds.errors import Mp4dsError
+from mp4ds.publishers.ros1 import RospyPublisher
+from mp4ds.records import Channel, Message
+
+
+def say(what: Any) -> None:
+    sys.stdout.write(json.dumps(what) + "\n")  # at once: threads say things too
+    sys.stdout.flush()
+
+
+class Standing:
+    """A player that only says what it was told."""
+
+    def __init__(self) -> None:
+        self.is_paused = False
+
+    def pause(self) -> None:
+        self.is_paused = True
+
+    def resume(self) -> None:
+        self.is_paused = False
+
+
+class Driver:
+    """Publishes what is in a recording."""
+
+    def __init__(self, path: str, options: dict[str, Any]) -> None:
+        with open_reader(Path(path)) as reader:
+            records = list(reader.records())
+        self.messages = [
+            Message(r.channel, r.log_time, r.publish_time, r.sequence, bytes(r.data))
+            for r in records
+            if isinstance(r, Message)
+        ]
+        self.channels: list[Channel] = []
+        for message in self.messages:
+            if not any(message.channel is channel for channel in self.channels):
+                self.channels.append(message.channel)
+        self.player = Standing()
+        self.publisher = RospyPublisher(**options)
+
+    def node(self) -> str:
+        import rospy
+
+        return str(rospy.get_name())
+
+    def advertise(self) -> int:
+        for channel in self.channels:
+            self.publisher.advertise(channel)
+        return len(self.channels)
+
+    def advertise_one(self, index: int) -> None:
+        self.publisher.advertise(self.channels[index])
+
+    def topics(self) -> list[str]:
+        return [channel.topic for channel in self.channels]
+
+    def subscribers(self) -> list[int]:
+        return [self.publisher.subscribers(channel) for channel in self.channels]
+
+    def await_subscribers(self, count: int) -> bool:
+        """Wait until each channel has so many."""
+        deadline = time.monotonic() + 120
+        while any(found < count for found in self.subscribers()):
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.01)
+        return True
+
+    def publish(self, first: int = 0, last: int | None = None, rounds: int = 1) -> float:
+        """Publish messages as fast as can be; returns the seconds that the slowest one took."""
+        slowest = 0.0
+        for _ in range(rounds):
+            for message in self.messages[first:last]:
+                before = time.monotonic()
+                data = memoryview(message.data)
+                self.publisher.publish(message.channel, data, message.log_time)
+                slowest = max(slowest, time.monotonic() - before)
+        return slowest
+
+    def dropped(self) -> int:
+        return self.publisher.dropped
+
+    def clock(self, *times: int) -> int:
+        for time_ns in times:
+            self.publisher.clock(time_ns)
+            time.sleep(0.02)
+        return len(times)
+
+    def follow_clock(self) -> None:
+        self.publisher.follow_clock(lambda time_ns: say(["clock", time_ns]))
+
+    def listen(self, topic: str) -> None:
+        self.publisher.listen(topic, lambda: say(["heard", topic]))
+
+    def serve(self) -> None:
+        self.publisher.serve(self.player)  # type: ignore[arg-type]
+
+    def is_paused(self) -> bool:
+        return self.player.is_paused
+
+    def wants_clock(self) -> bool:
+        return self.publisher.wants_clock
+
+    def is_alive(self) -> bool:
+        return self.publisher.is_alive
+
+    def close(self) -> float:
+        """Close; returns the seconds that it took."""
+        before = time.monotonic()
+        self.publisher.close()
+        self.publisher.close()
+        return time.monotonic() - before
+
+
+def main() -> None:
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # with rospy's farewell to the master
+    started = time.monotonic()
+    try:
+        driver = Driver(sys.argv[1], json.loads(sys.argv[2]))
+    except Mp4dsError as error:
+        say([type(error).__name__, str(error), time.monotonic() - started])
+        return
+    say("ready")
+    for line in sys.stdin:
+        method, *arguments = json.loads(line)
+        try:
+            say(getattr(driver, method)(*arguments))
+        except Mp4dsError as error:
+            say([type(error).__name__, str(error)])
+        if method == "close":
+            return
+
+
+if __name__ == "__main__":
+    main()

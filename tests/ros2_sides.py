@@ -1,0 +1,182 @@
+"""Both ways into ROS 2 behind one face: DDS with a peer process, and rclpy with a peer node."""
+
+from __future__ import annotations
+
+import base64
+import json
+import random
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rosbags.convert.converter import default_message
+from rosbags.typesys import Stores, get_typestore
+
+import fake_rclpy
+from mp4ds.records import Channel, Schema
+
+LOOPBACK = (
+    '<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/></Interfaces>'
+    "<AllowMulticast>false</AllowMulticast></General><Discovery>"
+    '<ParticipantIndex>auto</ParticipantIndex><Peers><Peer address="127.0.0.1"/></Peers>'
+    "</Discovery></Domain></CycloneDDS>"
+)
+STORE = get_typestore(Stores.ROS2_JAZZY)
+KINDS = (
+    "std_msgs/msg/Header",
+    "std_msgs/msg/String",
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/CompressedImage",
+    "sensor_msgs/msg/Imu",
+    "tf2_msgs/msg/TFMessage",
+)
+
+
+def channel(topic: str, kind: str, *, qos: str = "", encoding: str = "ros2msg") -> Channel:
+    """A channel as a recording has it."""
+    definition = STORE.generate_msgdef(kind, ros_version=2)[0] if encoding == "ros2msg" else ""
+    schema = Schema(kind, encoding, definition.encode())
+    return Channel(1, topic, "cdr", schema, {"offered_qos_profiles": qos})
+
+
+def message(kind: str, number: int, *, little_endian: bool = True) -> bytes:
+    """A message that is told from others by its number."""
+    value = default_message(STORE, kind)
+    if kind == "std_msgs/msg/String":
+        value.data = f"message {number}"
+    elif kind == "std_msgs/msg/Header":
+        value.frame_id, value.stamp.sec = f"frame {number}", number
+    elif kind == "tf2_msgs/msg/TFMessage":
+        part = default_message(STORE, "geometry_msgs/msg/TransformStamped")
+        part.header.stamp.sec, part.child_frame_id = number, "camera"
+        value.transforms = [part]
+    else:
+        value.header.stamp.sec, value.header.frame_id = number, f"frame {number}"
+    return bytes(STORE.serialize_cdr(value, kind, little_endian=little_endian))
+
+
+def padded(payload: bytes) -> bytes:
+    """As DDS delivers it: a multiple of 4 bytes."""
+    return payload.ljust((len(payload) + 3) // 4 * 4, b"\0")
+
+
+def until(condition: Callable[[], Any]) -> bool:
+    """Wait for something that happens soon, on a busy machine later; returns whether it did."""
+    end = time.monotonic() + 30
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.005)
+    return bool(condition())
+
+
+def connect(side: Side, publisher: Any, recorded: Channel, **options: Any) -> None:
+    """Subscribe, and send messages until they arrive: from then on each one does.
+
+    Two participants of DDS find each other in several steps, and each side knows only its own.
+    """
+    topic, kind = recorded.topic, recorded.type_name
+    publisher.advertise(recorded)
+    side.peer.subscribe(topic, kind, **options)
+    sent: list[bytes] = []
+
+    def arrives() -> bool:
+        sent.append(message(kind, 1000 + len(sent)))
+        publisher.publish(recorded, sent[-1], 0)
+        return bool(side.peer.received(topic, 1, 0.5))
+
+    assert until(arrives)
+    assert until(lambda: padded(sent[-1]) in map(padded, side.peer.received(topic, 1)))
+    side.peer.forget(topic)
+
+
+class DdsPeer:
+    """A process that subscribes, publishes and calls, without a line of the package."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+
+    def ask(self, command: str, *arguments: Any, **options: Any) -> Any:
+        assert self._process.stdin
+        assert self._process.stdout
+        self._process.stdin.write(json.dumps([command, arguments, options]) + "\n")
+        self._process.stdin.flush()
+        return json.loads(self._process.stdout.readline())
+
+    def subscribe(self, topic: str, kind: str, **options: Any) -> None:
+        self.ask("subscribe", f"rt{topic}", kind, **options)
+
+    def received(self, topic: str, count: int, seconds: float = 30.0) -> list[bytes]:
+        return [base64.b64decode(raw) for raw, _ in self.fields(topic, count, seconds)]
+
+    def fields(self, topic: str, count: int, seconds: float = 30.0) -> Any:
+        return self.ask("received", f"rt{topic}", count, seconds)
+
+    def forget(self, topic: str) -> None:
+        self.ask("forget", f"rt{topic}")
+
+    def connected(self, topic: str, count: int) -> int:
+        return int(self.ask("connected", f"rt{topic}", count))
+
+    def publish(self, topic: str, kind: str, payload: bytes, **options: Any) -> None:
+        self.ask("publish", f"rt{topic}", kind, base64.b64encode(payload).decode(), **options)
+
+    def call(self, name: str, kind: str, request: dict[str, Any]) -> dict[str, Any]:
+        values = [
+            [value.sec, value.nanosec] if hasattr(value, "sec") else value
+            for value in request.values()
+        ]
+        number, fields = self.ask("call", name, kind, values)
+        assert number == 77
+        fields.pop("structure_needs_at_least_one_member", None)
+        return dict(fields)
+
+
+class Side:
+    """One way into ROS 2: how a publisher is made, and who is on the other side."""
+
+    def __init__(self, kind: Any, options: dict[str, Any], peer: Any) -> None:
+        self._kind, self.options, self.peer = kind, options, peer
+
+    def open(self, **options: Any) -> Any:
+        return self._kind(**self.options, **options)
+
+
+@contextmanager
+def dds_side(monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
+    """Cyclone DDS on loopback, in a domain where no other test is."""
+    pytest.importorskip("cyclonedds")
+    from mp4ds.publishers.dds import DdsPublisher
+
+    domain = random.SystemRandom().randrange(200)
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    for name in ("ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
+        monkeypatch.delenv(name, raising=False)
+    process = subprocess.Popen(
+        [sys.executable, str(Path(__file__).with_name("dds_peer.py")), str(domain)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    with process:
+        assert process.stdout
+        assert json.loads(process.stdout.readline()) == "ready"
+        yield Side(DdsPublisher, {"domain": domain}, DdsPeer(process))
+        assert process.stdin
+        process.stdin.close()
+        process.wait(30)
+
+
+@contextmanager
+def rclpy_side(monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
+    """rclpy as it would be with a ROS 2 that is sourced."""
+    from mp4ds.publishers.ros2 import RclpyPublisher
+
+    bus = fake_rclpy.install(monkeypatch)
+    yield Side(RclpyPublisher, {}, fake_rclpy.FakePeer(bus))
+
+
+SIDES = {"dds": dds_side, "rclpy": rclpy_side}

@@ -1,0 +1,783 @@
+"""`mp4ds evaluate`: that its figures are those of a pack, and that it goes on where it was left."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import mp4ds
+from coded_scenes import CODED, VERBATIM
+from mp4ds.demo import demo
+from mp4ds.errors import OptionError, SourceError, TargetError
+from mp4ds.evaluating import (
+    EvaluateOptions,
+    EvaluateProgress,
+    Evaluation,
+    Setting,
+    Target,
+    evaluate,
+    parse_target,
+)
+from mp4ds.evaluating.clips import (
+    Clip,
+    ClipFile,
+    Unfit,
+    chosen,
+    chosen_at_rate,
+    make_clip,
+)
+from mp4ds.evaluating.options import MAX_CRF, grid_of, parse_crfs
+from mp4ds.evaluating.results import Cell
+from mp4ds.evaluating.search import largest_crf
+from mp4ds.evaluating.sources import open_source
+from mp4ds.evaluating.tables import pareto, reachable_score, recommend
+from mp4ds.layouts import ENCODINGS as ENCODING_TABLE
+from mp4ds.packing import PackOptions
+from mp4ds.scoring import ScoringError, Summary
+from mp4ds.unpacking import UnpackOptions
+from mp4ds.video.planes import PacketSizes, packet_sizes
+from scenes import PERIOD, TRAITS, Scene, odd_scene
+from sources import ENCODINGS, SOURCES, scene, write_bag
+
+ROOT = Path(__file__).parents[1]
+TOPIC = "/cam/image_raw"
+QUICK = EvaluateOptions(
+    codecs=["x264"], presets=["ultrafast"], crf=["24"], frames=10, target=Target("psnr_y", 20),
+    threads=1,
+)  # fmt: skip
+
+needs_vmaf = pytest.mark.skipif(
+    importlib.util.find_spec("imageio_ffmpeg") is None, reason="needs imageio-ffmpeg"
+)
+
+
+def camera_scene(encoding: str, *, width: int = 96, frames: int = 10) -> Scene:
+    return scene(encoding, frames=frames, width=width, height=64)
+
+
+def recording(folder: Path, encoding: str = "rgb8", source: str = "bag-none", **size: Any) -> Path:
+    (folder / "source").mkdir()
+    return SOURCES[source](folder / "source", camera_scene(encoding, **size))[0]
+
+
+# ---------------------------------------------------------------- options
+
+
+@pytest.mark.parametrize(
+    ("texts", "values"),
+    [
+        (["18"], (18,)),
+        (["16:25"], tuple(range(16, 26))),
+        (["16:25:3"], (16, 19, 22, 25)),
+        (["30", "20:22", "21"], (20, 21, 22, 30)),
+        (["63"], (63,)),
+    ],
+)
+def test_crfs(texts: list[str], values: tuple[int, ...]) -> None:
+    assert parse_crfs(texts) == values
+
+
+@pytest.mark.parametrize("text", ["", "a", "16:", "25:16", "0", "64", "16:25:0", "-3", "16-25"])
+def test_no_crfs(text: str) -> None:
+    with pytest.raises(OptionError, match="--crf"):
+        parse_crfs([text])
+
+
+def test_targets() -> None:
+    assert parse_target("99") == Target("vmaf", 99)
+    assert str(parse_target("psnr_y=42.5")) == "psnr_y=42.5"
+    for text in ("", "vmaf", "vmaf=", "=3", "psnr=40", "vmaf=0", "vmaf=101", "vmaf=nan"):
+        with pytest.raises(OptionError, match="--target"):
+            parse_target(text)
+
+
+def test_presets_go_to_the_codecs_that_have_them() -> None:
+    options = EvaluateOptions(codecs=["svtav1", "h264", "x265"], presets=["8", "fast"], crf=["20"])
+    settings = grid_of(options).settings()
+    assert [(item.codec, item.preset) for item in settings] == [
+        ("av1", "8"), ("h264", "fast"), ("h265", "fast"),
+    ]  # fmt: skip
+    without = grid_of(EvaluateOptions(crf=["20"])).settings()
+    assert {item.codec for item in without} == set(MAX_CRF)
+
+
+def test_a_codec_has_only_its_crfs() -> None:
+    settings = grid_of(EvaluateOptions(crf=["50:60"], presets=["8", "fast"])).settings()
+    assert max(item.crf for item in settings if item.codec == "av1") == 60
+    assert max(item.crf for item in settings if item.codec == "h264") == 51
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"codecs": ["vp9"]}, "--codecs 'vp9'"),
+        ({"codecs": []}, "--codecs"),
+        ({"presets": ["fastest"]}, "--presets 'fastest'"),
+        ({"codecs": ["x264"], "crf": ["60"]}, "0 settings"),
+        ({"frames": 0}, "--frames 0"),
+        ({"rates": [-1.0]}, "--rates -1"),
+        ({"duration": float("nan")}, "--duration"),
+        ({"start": -1.0}, "--start -1"),
+        ({"hours": 0.0}, "--hours 0"),
+    ],
+)
+def test_options_that_are_wrong(changed: dict[str, Any], said: str, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=said):
+        evaluate(tmp_path, replace(QUICK, **changed), output=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+# ---------------------------------------------------------------- which frames
+
+
+def at_hertz(hertz: float, count: int) -> np.ndarray[Any, np.dtype[np.int64]]:
+    return 5_000_000_000 + (np.arange(count) * 1e9 / hertz).astype(np.int64)
+
+
+def test_clips_are_from_the_middle() -> None:
+    options = EvaluateOptions(frames=10)
+    assert chosen(at_hertz(10, 100), 0, options) == list(range(45, 55))
+    assert chosen(at_hertz(10, 6), 0, options) == list(range(6))
+
+
+def test_clips_of_a_time() -> None:
+    times, origin = at_hertz(10, 100), 4_500_000_000
+    given = EvaluateOptions(start=1.5, duration=0.75)
+    assert chosen(times, origin, given) == list(range(10, 18))
+    assert chosen(times, origin, replace(given, duration=None, frames=3)) == [10, 11, 12]
+    middle = chosen(times, origin, replace(given, start=None))
+    assert len(middle) in (7, 8)
+    assert abs(np.mean(middle) - 49.5) < 1
+    assert chosen(times, origin, replace(given, start=0.0)) == [0, 1, 2]
+    for start in (11.0, 1e9):
+        with pytest.raises(Unfit, match="no images in the time"):
+            chosen(times, origin, replace(given, start=start))
+
+
+@pytest.mark.parametrize("rate", [0.7, 2, 5, 7.5, 10])
+def test_clips_of_fewer_frames_a_second(rate: float) -> None:
+    times = at_hertz(10, 200)
+    found = chosen_at_rate(times, rate, 12)
+    assert len(found) == min(12, int(20 * rate) + 1)
+    steps = np.diff(times[found]) / 1e9
+    assert np.abs(steps - 1 / rate).max() <= 0.1 + 1e-9  # the nearest of those that there are
+    assert abs(np.mean(found) - 99.5) <= 1
+    assert found == sorted(set(found))
+
+
+# ---------------------------------------------------------------- search, recommendation
+
+
+@pytest.mark.parametrize("largest", [51, 63])
+@pytest.mark.parametrize("curve", [1.0, 2.0, 0.3])
+def test_the_search_finds_the_largest_crf(largest: int, curve: float) -> None:
+    def score(crf: int) -> float:
+        return float(100 - 40 * (crf / largest) ** curve)
+
+    tried = []
+    for due in range(1, largest + 1):
+        for guess in (1, 18, largest):
+            found, reached, count = largest_crf(score, score(due), guess=guess, largest=largest)
+            assert (found, reached) == (due, True)
+            tried.append(count)
+    assert max(tried) <= 14
+    assert np.mean(tried) < 8  # of guesses far away, too
+
+
+def test_the_search_ends_where_nothing_reaches_the_target() -> None:
+    assert largest_crf(lambda crf: 90 - crf, 95, guess=20, largest=63)[:2] == (1, False)
+    assert largest_crf(lambda _: 99.0, 95, guess=20, largest=63)[:2] == (63, True)
+    assert largest_crf(lambda _: 95.0, 95, guess=1, largest=1)[:2] == (1, True)
+
+
+def test_the_search_ends_where_scores_do_not_fall_steadily() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        scores = 100 - np.arange(64) / 3 + rng.normal(0, 2, 64)
+        found, reached, _ = largest_crf(
+            lambda crf, scores=scores: float(scores[crf]), 92, guess=18, largest=63
+        )  # fmt: skip
+        assert not reached or scores[found] >= 92
+
+
+def cell(crf: int, score: float, size: float, cpu: float, preset: str = "fast") -> Cell:
+    summary = Summary(score, score, score, score)
+    return Cell(
+        Setting("h264", preset, crf), 2 * cpu, cpu, 100, 1, size, size, 1, {"vmaf": summary},
+        "none.png", 1, 1,
+    )  # fmt: skip
+
+
+def test_the_smallest_and_the_fastest_that_reach_the_target_are_recommended() -> None:
+    cells = [
+        cell(10, 99.9, 90, 9), cell(20, 99.6, 50, 8), cell(20, 99.55, 70, 2, "veryfast"),
+        cell(30, 99.4, 20, 1),
+    ]  # fmt: skip
+    smallest, fastest = recommend([(cells, 99.5)], Target())
+    assert (smallest.why, smallest.setting) == ("smallest", cells[1].setting)
+    assert (fastest.why, fastest.setting) == ("fastest", cells[2].setting)
+    assert smallest.options == "--quality crf=20 --codec h264 --preset fast"
+    assert recommend([(cells, 99.95)], Target()) == []
+    other = [replace(item, scores={"vmaf": Summary(99, 99, 99, 99)}) for item in cells]
+    other[0] = cells[0]
+    both = recommend([(cells, 99.5), (other, 99.5)], Target())
+    assert {item.setting for item in both} == {cells[0].setting}
+
+
+def test_the_target_keeps_from_the_ceiling() -> None:
+    assert reachable_score(Target("vmaf", 99.5), 99.9) == 99.5
+    assert reachable_score(Target("vmaf", 99.5), 99.65) == pytest.approx(99.45)
+    assert reachable_score(Target("psnr_y", 42), 60) == 42
+
+
+def test_the_front_has_what_nothing_is_better_than() -> None:
+    cells = [cell(1, 90, 5, 1), cell(2, 95, 5, 1), cell(3, 80, 1, 1), cell(4, 94, 9, 1)]
+    assert pareto(cells, [item.kbps for item in cells], Target()) == [2, 1]
+
+
+def test_a_frame_of_a_long_video_is_reckoned_without_the_key_frames_of_a_clip() -> None:
+    sizes = PacketSizes(keys=(1000, 1200), others=(100,) * 8)
+    assert sizes.total == 3000
+    assert sizes.frame_bytes(60) == pytest.approx((1100 + 59 * 100) / 60)
+    assert sizes.frame_bytes(1) == 1100
+    assert PacketSizes((500,), ()).frame_bytes(60) == 500
+
+
+# ---------------------------------------------------------------- every kind of source
+
+
+def of_dataset(folder: Path, bag: Path) -> Path:
+    mp4ds.pack(bag, folder / "drive")
+    return folder / "drive"
+
+
+def of_lossy_dataset(folder: Path, bag: Path) -> Path:
+    mp4ds.pack(bag, folder / "drive", PackOptions(quality="crf=10", codec="h264"))
+    return folder / "drive"
+
+
+def of_video(folder: Path, bag: Path) -> Path:
+    video = next(of_lossy_dataset(folder, bag).glob("*.mp4"))
+    shutil.copy(video, folder / "alone.mp4")
+    return folder / "alone.mp4"
+
+
+def of_images(folder: Path, bag: Path) -> Path:
+    mp4ds.unpack(
+        of_dataset(folder, bag), "images", folder / "images", UnpackOptions(image_format="png")
+    )
+    return folder / "images" / "cam_image_raw"
+
+
+KINDS: dict[str, Callable[[Path, Path], Path]] = {
+    "dataset": of_dataset,
+    "lossy": of_lossy_dataset,
+    "video": of_video,
+    "images": of_images,
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_was_made_of_a_recording(kind: str, tmp_path: Path) -> None:
+    source = KINDS[kind](tmp_path, recording(tmp_path))
+    found = evaluate(source, replace(QUICK, fps=1e9 / PERIOD), output=tmp_path / "out")
+    (camera,) = found.cameras
+    assert camera.size == (96, 64)
+    assert camera.frames == camera.source_frames == 10
+    assert camera.rate == pytest.approx(30, rel=0.02)
+    assert len(camera.cells) == 1
+    assert 25 < camera.cells[0].scores["psnr_y"].mean < 60
+
+
+@pytest.mark.parametrize("source", ["bag-split", "rosbag2-sqlite3-v9", "mcap-unindexed"])
+def test_recordings(source: str, tmp_path: Path) -> None:
+    path = recording(tmp_path, "bayer_grbg8", source)
+    (camera,) = evaluate(path, QUICK, output=tmp_path / "out").cameras
+    assert (camera.topic, camera.encoding) == (TOPIC, "bayer_grbg8")
+    assert camera.raw_bytes == 96 * 64
+
+
+@pytest.mark.parametrize(
+    "encoding", ["mono8", "bgr8", "bayer_rggb8", "yuv422", "yuv422_yuy2", "nv12", "8UC3"]
+)
+def test_the_videos_are_those_of_a_pack(encoding: str, tmp_path: Path) -> None:
+    """To the byte of their packets: a recommendation can be packed with."""
+    path = recording(tmp_path, encoding)
+    found = evaluate(path, QUICK, output=tmp_path / "out")
+    (tried,) = found.cameras[0].cells
+    mp4ds.pack(
+        path,
+        tmp_path / "drive",
+        PackOptions(quality="crf=24", codec="h264", preset="ultrafast", jobs=1),
+    )
+    assert packet_sizes(tmp_path / "drive" / "cam_image_raw.mp4").total == tried.size
+
+
+@pytest.mark.parametrize("codec", ["svtav1", "x265"])
+def test_the_videos_are_those_of_a_pack_by_codec(codec: str, tmp_path: Path) -> None:
+    path = recording(tmp_path, "rgb8")
+    preset = {"svtav1": "12", "x265": "ultrafast"}[codec]
+    options = replace(QUICK, codecs=[codec], presets=[preset])
+    (tried,) = evaluate(path, options, output=tmp_path / "out").cameras[0].cells
+    setting = tried.setting
+    mp4ds.pack(
+        path,
+        tmp_path / "drive",
+        PackOptions(quality="crf=24", codec=setting.codec, preset=setting.preset, jobs=1),
+    )
+    assert packet_sizes(tmp_path / "drive" / "cam_image_raw.mp4").total == tried.size
+
+
+@pytest.mark.parametrize("encoding", ["16UC1", "mono16", "32FC1", "rgba8"])
+def test_cameras_that_are_no_light_are_left_out(encoding: str, tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=f"{TOPIC} has {encoding} images"):
+        evaluate(recording(tmp_path, encoding), QUICK, output=tmp_path / "out")
+
+
+def test_odd_sides(tmp_path: Path) -> None:
+    (camera,) = evaluate(
+        recording(tmp_path, "rgb8", width=97), QUICK, output=tmp_path / "out"
+    ).cameras
+    assert camera.size == (97, 64)
+
+
+def test_a_setting_that_cannot_be_tried_is_told(tmp_path: Path) -> None:
+    options = replace(QUICK, codecs=["x264", "x265"])
+    (camera,) = evaluate(
+        recording(tmp_path, "rgb8", width=48), options, output=tmp_path / "out"
+    ).cameras
+    assert [item.setting.codec for item in camera.cells] == ["h264"]
+    assert any("h265 ultrafast crf 24" in note and "48x64" in note for note in camera.notes)
+
+
+def test_topics_are_chosen(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="matches no topic"):
+        evaluate(recording(tmp_path), replace(QUICK, topics=["/none"]), output=tmp_path / "out")
+    with pytest.raises(SourceError, match="no camera"):
+        evaluate(
+            tmp_path / "source" / "drive.bag",
+            replace(QUICK, exclude=["*"]),
+            output=tmp_path / "out",
+        )
+
+
+def test_images_that_are_none(tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    (images / "0.png").write_bytes(b"no image")
+    with pytest.raises(SourceError, match=r"0\.png"):
+        evaluate(images, QUICK, output=tmp_path / "out")
+    Image.fromarray(np.zeros((64, 64), np.uint16)).save(images / "0.png")
+    with pytest.raises(SourceError, match="8 bits"):
+        evaluate(images, QUICK, output=tmp_path / "out")
+    shutil.rmtree(images)
+    with pytest.raises(SourceError, match="no such file"):
+        evaluate(images, QUICK, output=tmp_path / "out")
+
+
+def clips_of(path: Path, folder: Path) -> tuple[dict[str, Clip | str], dict[str, str]]:
+    """The clips of all cameras, or why there is none; and which were left out before."""
+    found: dict[str, Clip | str] = {}
+    with open_source(path, fps=30) as source:
+        for number, camera in enumerate(source.cameras):
+            indices = chosen(camera.times, int(camera.times[0]), EvaluateOptions())
+            try:
+                file = folder / f"{number}.yuv"
+                found[camera.topic] = make_clip(camera, indices, camera.rate, file)
+            except Unfit as reason:
+                found[camera.topic] = str(reason)
+        return found, source.left_out
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_every_encoding_is_tried_or_told(encoding: str, tmp_path: Path) -> None:
+    ((_, found),) = clips_of(recording(tmp_path, encoding), tmp_path)[0].items()
+    if isinstance(found, str):
+        assert f"has {encoding} images" in found
+        assert ENCODING_TABLE[encoding].lossy is None
+        return
+    assert ENCODING_TABLE[encoding].lossy is not None
+    assert (found.frames, found.other_frames) == (10, 0)
+    frames = list(ClipFile(tmp_path / "0.yuv"))
+    assert [plane.shape for plane in frames[0]] == [(64, 96), (32, 48), (32, 48)]
+    assert len({plane.tobytes() for plane, _, _ in frames}) == 10
+
+
+@pytest.mark.parametrize("name", CODED)
+def test_every_coded_image_is_tried_or_told(name: str, tmp_path: Path) -> None:
+    write_bag(tmp_path / "drive.bag", CODED[name]())
+    clips, left_out = clips_of(tmp_path / "drive.bag", tmp_path)
+    said = [item for item in clips.values() if isinstance(item, str)]
+    said += left_out.values()
+    made = [item for item in clips.values() if isinstance(item, Clip)]
+    assert len(made) + len(said) == 1
+    kind = name.split("-")[0]
+    if name in VERBATIM or kind == "depth" or name in ("png-16-bit-cv2", "png-rgba-cv2"):
+        assert said
+    if kind == "video":
+        assert "video packets" in said[0]
+    if kind == "jpeg" and name not in VERBATIM:
+        assert made[0].frames + made[0].other_frames == 10
+
+
+@pytest.mark.parametrize("trait", TRAITS)
+def test_every_oddity_is_tried_or_told(trait: str, tmp_path: Path) -> None:
+    write_bag(tmp_path / "drive.bag", odd_scene(trait))
+    ((_, found),) = clips_of(tmp_path / "drive.bag", tmp_path)[0].items()
+    if isinstance(found, Clip):
+        assert found.frames + found.other_frames == 8
+        assert list(found.ticks) == sorted(set(found.ticks))
+    else:
+        assert found.startswith("has no images") or "too small" in found
+
+
+def test_jpeg_files_are_packed_anew(tmp_path: Path) -> None:
+    path = tmp_path / "drive.bag"
+    write_bag(path, CODED["jpeg-420"]())
+    (camera,) = evaluate(path, QUICK, output=tmp_path / "out").cameras
+    assert any("--transcode" in note for note in camera.notes)
+    options = PackOptions(
+        quality="crf=24", codec="h264", preset="ultrafast", jobs=1, transcode=True
+    )  # fmt: skip
+    mp4ds.pack(path, tmp_path / "drive", options)
+    (video,) = (tmp_path / "drive").glob("*.mp4")
+    assert packet_sizes(video).total == camera.cells[0].size
+
+
+# ---------------------------------------------------------------- the demo, looked over
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("evaluated") / "demo.bag"
+    demo(path, seconds=0.8)
+    return path
+
+
+WHOLE = EvaluateOptions(
+    codecs=["svtav1", "x264"], presets=["12", "ultrafast"], crf=["8", "40"], frames=12,
+    target=Target("vmaf", 95), streams=9, hours=10, rates=[5, 100],
+    topics=["/left/*"], threads=1,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def whole(bag: Path) -> Evaluation:
+    if importlib.util.find_spec("imageio_ffmpeg") is None:
+        pytest.skip("needs imageio-ffmpeg")
+    return evaluate(bag, WHOLE, output=bag.parent / "out")
+
+
+def test_figures_are_sound(whole: Evaluation) -> None:
+    (camera,) = whole.cameras
+    assert [item.setting.name for item in camera.cells] == [
+        "av1 12 crf 8", "av1 12 crf 40", "h264 ultrafast crf 8", "h264 ultrafast crf 40",
+    ]  # fmt: skip
+    for good, bad in (camera.cells[:2], camera.cells[2:]):
+        assert good.size > bad.size
+        assert good.kbps > bad.kbps
+        for metric in ("vmaf", "psnr_y", "ssim"):
+            assert good.scores[metric].mean > bad.scores[metric].mean
+            assert good.scores[metric].mean < camera.ceiling[metric].mean
+    for item in camera.cells:
+        vmaf = item.scores["vmaf"]
+        assert vmaf.minimum <= vmaf.percentile_5 <= vmaf.mean
+        assert vmaf.minimum <= vmaf.harmonic_mean <= vmaf.mean
+        assert item.encode_cpu_seconds > 0
+        assert item.encode_seconds > 0
+        assert item.kbps == pytest.approx(item.frame_bytes * 8 * 15 / 1000, rel=0.02)
+        assert item.whole_bytes == pytest.approx(item.frame_bytes * 12)
+
+
+def test_the_recommendation_reaches_the_target(whole: Evaluation) -> None:
+    (camera,) = whole.cameras
+    assert [item.why for item in camera.recommended] == ["smallest", "fastest"]
+    assert camera.reachable == 95
+    for item in camera.recommended:
+        assert item.score >= 95
+        assert item.setting.crf == 8
+
+
+def test_the_data_set_is_reckoned(whole: Evaluation) -> None:
+    (camera,) = whole.cameras
+    rows = {row.form: row for row in camera.storage}
+    assert list(rows)[:5] == ["raw", "YUV 4:4:4", "RGB", "JPEG 90", "JPEG 75"]
+    assert camera.rate is not None
+    frames = 9 * 10 * 3600 * camera.rate
+    assert rows["raw"].frame_bytes == 480 * 360
+    assert rows["RGB"].frame_bytes == 3 * 480 * 360
+    assert rows["RGB"].gigabytes == pytest.approx(frames * 3 * 480 * 360 / 1e9)
+    assert rows["JPEG 75"].frame_bytes < rows["JPEG 90"].frame_bytes < rows["raw"].frame_bytes
+    ours = rows[camera.recommended[0].setting.name]
+    shown = next(i for i in camera.cells if i.setting == camera.recommended[0].setting)
+    assert ours.cpu_days == pytest.approx(shown.encode_cpu_seconds / 12 * frames / 86_400)
+
+
+def test_rates_are_searched(whole: Evaluation) -> None:
+    (camera,) = whole.cameras
+    (row,) = camera.rates
+    assert (row.rate, row.setting.codec, row.setting.preset) == (5, "av1", "12")
+    assert 3 <= row.frames <= 4
+    assert row.reached
+    assert 95 <= row.score < 99.8
+    assert row.setting.crf > 8
+    assert any("100 images per second" in note for note in camera.notes)
+
+
+def test_files(whole: Evaluation) -> None:
+    folder, (camera,) = whole.output, whole.cameras
+    lines = list(csv.DictReader((folder / "evaluation.csv").read_text().splitlines()))
+    assert len(lines) == len(camera.cells)
+    for line, item in zip(lines, camera.cells, strict=True):
+        assert (line["codec"], int(line["crf"])) == (item.setting.codec, item.setting.crf)
+        assert float(line["vmaf_mean"]) == pytest.approx(item.scores["vmaf"].mean, abs=1e-5)
+        assert float(line["kbps"]) == pytest.approx(item.kbps, abs=1e-5)
+    values = json.loads((folder / "evaluation.json").read_text())
+    assert values["options"]["frames"] == 12
+    assert len(values["cameras"][0]["cells"]) == len(camera.cells)
+    for kind in ("bitrate", "time"):
+        name = f"left_image_raw-{kind}"
+        root = ET.fromstring((folder / "plots" / f"{name}.svg").read_text())
+        assert len(root.findall(".//{*}circle/{*}title")) == len(camera.cells)
+        with Image.open(folder / "plots" / f"{name}.png") as image:
+            assert image.size == (1280, 840)
+    with Image.open(folder / camera.ground_truth) as image:
+        assert image.size == (256, 192)
+        truth = np.asarray(image, np.float64)
+    near, far = (
+        np.abs(np.asarray(Image.open(folder / item.picture), np.float64) - truth).mean()
+        for item in camera.cells[2:]
+    )
+    assert 0 < near < far
+    assert not (folder / "work").exists()
+
+
+class Page(HTMLParser):
+    """What a page refers to, and whether its elements are closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.references: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.references += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.references += [value or "" for name, value in attrs if name in ("src", "href")]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def test_the_page_needs_nothing_else(whole: Evaluation) -> None:
+    text = (whole.output / "index.html").read_text()
+    found = Page(text)
+    assert found.open == []
+    pictures = 1 + len(whole.cameras[0].cells)
+    assert len(found.references) == pictures
+    assert all(item.startswith("data:image/png;base64,") for item in found.references)
+    assert text.count("<svg ") == 2
+    assert "http" not in text.replace("http://www.w3.org/2000/svg", "")
+
+
+# ---------------------------------------------------------------- going on
+
+
+def test_the_same_again_tries_nothing(whole: Evaluation, bag: Path) -> None:
+    again = evaluate(bag, WHOLE, output=whole.output)
+    assert (again.tried, again.known) == (0, whole.tried)
+    assert again.cameras == whole.cameras
+
+
+def test_a_larger_grid_tries_what_is_new(tmp_path: Path) -> None:
+    path = recording(tmp_path)
+    first = evaluate(path, QUICK, output=tmp_path / "out")
+    assert (first.tried, first.known) == (2, 0)
+    more = evaluate(path, replace(QUICK, crf=["24", "30"]), output=tmp_path / "out")
+    assert (more.tried, more.known) == (1, 2)
+    assert more.cameras[0].cells[0] == first.cameras[0].cells[0]
+    other = evaluate(path, replace(QUICK, frames=8), output=tmp_path / "out")
+    assert (other.tried, other.known) == (2, 0)
+
+
+def test_a_damaged_result_is_made_again(tmp_path: Path) -> None:
+    path = recording(tmp_path)
+    first = evaluate(path, QUICK, output=tmp_path / "out")
+    results = sorted((tmp_path / "out" / "cells").iterdir())
+    results[0].write_text("{}")
+    results[1].write_text("[1")
+    again = evaluate(path, QUICK, output=tmp_path / "out")
+    assert (again.tried, again.known) == (2, 0)
+    assert again.cameras[0].cells[0].size == first.cameras[0].cells[0].size
+
+
+def test_an_interrupted_one_goes_on(tmp_path: Path) -> None:
+    path = recording(tmp_path)
+    options = replace(QUICK, crf=["20", "30", "40"])
+
+    def interrupt(state: EvaluateProgress) -> None:
+        if state.done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(path, options, output=tmp_path / "out", progress=interrupt)
+    assert not (tmp_path / "out" / "work").exists()
+    assert not (tmp_path / "out" / "index.html").exists()
+    again = evaluate(path, options, output=tmp_path / "out")
+    assert (again.tried, again.known) == (1, 3)  # the ceiling is known, too
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_killed_one_goes_on(number: signal.Signals, tmp_path: Path) -> None:
+    path, out = recording(tmp_path), tmp_path / "out"
+    command = [
+        *(sys.executable, "-m", "mp4ds", "evaluate", str(path), "-o", str(out)),
+        *("--codecs", "x264", "--presets", "ultrafast", "--crf", "20:51", "--frames", "10"),
+        *("--threads", "1", "--target", "psnr_y=20"),
+    ]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert wait_for(lambda: len(list(out.glob("cells/*.json"))) >= 2)
+        os.kill(process.pid, number)
+        _, said = process.communicate(timeout=60)
+    assert wait_for(lambda: not any(str(out) in line for line in command_lines()))
+    if number == signal.SIGINT:
+        assert process.returncode == 130
+        assert "run the same command again" in said
+    known = len(list(out.glob("cells/*.json")))
+    again = evaluate(path, replace(QUICK, crf=["20:22"]), output=out)
+    assert again.known >= min(known, 2)
+    assert again.tried + again.known == 4
+
+
+def wait_for(condition: Callable[[], bool]) -> bool:
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        if condition():
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def command_lines() -> list[str]:
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            found.append(path.read_bytes().replace(b"\0", b" ").decode(errors="replace"))
+        except OSError:
+            continue
+    return found
+
+
+# ---------------------------------------------------------------- what goes wrong
+
+
+def test_a_folder_of_others_is_not_written_to(tmp_path: Path) -> None:
+    path = recording(tmp_path)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    for output in (tmp_path / "mine", path, tmp_path / "none" / "out"):
+        with pytest.raises(TargetError):
+            evaluate(path, QUICK, output=output)
+    assert [item.name for item in (tmp_path / "mine").iterdir()] == ["notes.txt"]
+
+
+def no_ffmpeg() -> None:
+    raise ScoringError("VMAF needs an ffmpeg with libvmaf.")
+
+
+def test_without_libvmaf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mp4ds.evaluating.find_ffmpeg", no_ffmpeg)
+    path = recording(tmp_path)
+    with pytest.raises(ScoringError, match="--target psnr_y"):
+        evaluate(path, replace(QUICK, target=Target()), output=tmp_path / "out")
+    found = evaluate(path, QUICK, output=tmp_path / "out")
+    (camera,) = found.cameras
+    assert set(camera.cells[0].scores) == {"psnr_y", "psnr_cb", "psnr_cr", "ssim"}
+    assert camera.recommended
+    assert found.versions["vmaf"] == "none"
+
+
+def test_where_nothing_reaches_the_target(tmp_path: Path) -> None:
+    options = replace(QUICK, target=Target("psnr_y", 59))
+    (camera,) = evaluate(recording(tmp_path), options, output=tmp_path / "out").cameras
+    assert camera.recommended == []
+    assert any("no setting reaches psnr_y 59.00" in note for note in camera.notes)
+
+
+# ---------------------------------------------------------------- command line, documents
+
+
+def run(*command: str, cwd: Path, code: int = 0) -> str:
+    bin_folder = str(Path(sys.executable).parent)
+    done = subprocess.run(
+        command, cwd=cwd, capture_output=True, text=True, timeout=600, check=False,
+        env={**os.environ, "PATH": f"{bin_folder}:{os.environ['PATH']}"},
+    )  # fmt: skip
+    assert done.returncode == code, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stdout + done.stderr
+
+
+def test_the_command_line(tmp_path: Path) -> None:
+    path = recording(tmp_path)
+    plain = ("--codecs", "x264", "--presets", "ultrafast", "--frames", "10", "--crf", "24")
+    given = ("mp4ds", "evaluate", str(path), *plain, "--target", "psnr_y=20")
+    out = run(*given, cwd=tmp_path)
+    assert re.search(r"h264 +ultrafast +24 ", out)
+    assert "smallest: --quality crf=24 --codec h264 --preset ultrafast" in out
+    assert (tmp_path / "drive_evaluation" / "index.html").is_file()
+    values = json.loads(run(*given, "--json", cwd=tmp_path))
+    assert values["known"] == 2
+    for wrong in (("--crf", "x"), ("--rates", "a,b"), ("--target", "x=1"), ("--codecs", "vp9")):
+        out = run(*given, *wrong, cwd=tmp_path, code=2)
+        assert out.startswith(f"mp4ds: {wrong[0]}")
+
+
+def commands_in(name: str) -> list[str]:
+    text = (ROOT / "docs" / name).read_text()
+    blocks = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
+    return [line for block in blocks for line in block.splitlines() if line.startswith("mp4ds ")]
+
+
+@needs_vmaf
+def test_the_commands_of_the_page(tmp_path: Path) -> None:
+    lines = commands_in("evaluate.md")
+    assert sum(line.startswith("mp4ds evaluate ") for line in lines) == 4
+    for line in lines:
+        run("bash", "-c", line, cwd=tmp_path)
+    (code,) = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "evaluate.md").read_text(), re.DOTALL
+    )
+    assert run(sys.executable, "-c", code, cwd=tmp_path).count("av1 12 crf 24") == 2
+
+
+@needs_vmaf
+def test_the_commands_of_the_paper_are_understood(tmp_path: Path) -> None:
+    lines = commands_in("paper.md")
+    assert len(lines) == 3
+    for line in lines:
+        out = run("bash", "-c", line, cwd=tmp_path, code=2)
+        assert out == "mp4ds: drive.bag: no such file or folder. Check the path.\n"

@@ -1,0 +1,422 @@
+"""Keys of a real (pseudo) terminal control the player, and the terminal is given back."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import termios
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mp4ds.cli.keys import Keyboard, Keys
+
+WAIT_S = 20.0
+ESC = b"\x1b"
+
+
+class RecordedControls:
+    """A player that keeps what it was asked for."""
+
+    def __init__(self) -> None:
+        self.is_paused = False
+        self.rate = 1.0
+        self.calls: list[str] = []
+
+    def pause(self) -> None:
+        raise NotImplementedError
+
+    def resume(self) -> None:
+        raise NotImplementedError
+
+    def toggle_paused(self) -> None:
+        self.calls.append("toggle_paused")
+
+    def set_rate(self, rate: float) -> bool:
+        self.calls.append("set_rate")
+        self.rate = rate
+        return True
+
+    def play_next(self) -> bool:
+        self.calls.append("play_next")
+        return True
+
+    def step_back(self) -> bool:
+        self.calls.append("step_back")
+        return True
+
+    def burst(self, messages: int) -> int:
+        raise NotImplementedError
+
+    def seek(self, time_ns: int) -> bool:
+        raise NotImplementedError
+
+    def stop(self) -> None:
+        raise NotImplementedError
+
+
+@dataclass
+class Terminal:
+    """A terminal: what types and shows, and what the program has."""
+
+    hand: int
+    fd: int
+
+    def type(self, keys: bytes) -> None:
+        os.write(self.hand, keys)
+
+    @property
+    def attributes(self) -> list[Any]:
+        return termios.tcgetattr(self.fd)
+
+    @property
+    def gives_keys(self) -> bool:
+        return not self.attributes[3] & (termios.ICANON | termios.ECHO)
+
+
+@pytest.fixture
+def terminal() -> Iterator[Terminal]:
+    hand, fd = os.openpty()
+    yield Terminal(hand, fd)
+    for descriptor in {hand, fd}:
+        os.close(descriptor)
+
+
+def wait(is_so: Callable[[], bool]) -> None:
+    end = time.monotonic() + WAIT_S
+    while not is_so():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+# ---------------------------------------------------------------- keys
+
+
+KEYS = {
+    "space": (b" ", "toggle_paused", 1.0),
+    "right": (ESC + b"[C", "play_next", 1.0),
+    "right-application": (ESC + b"OC", "play_next", 1.0),
+    "s": (b"s", "play_next", 1.0),
+    "left": (ESC + b"[D", "step_back", 1.0),
+    "b": (b"b", "step_back", 1.0),
+    "up": (ESC + b"[A", "set_rate", 1.1),
+    "down": (ESC + b"[B", "set_rate", 0.909090909),
+}
+IGNORED = {
+    "letters": b"xqt\n\t",
+    "shifted": b"SB",
+    "function": ESC + b"OP" + ESC + b"[15~",
+    "home": ESC + b"[H",
+    "delete": ESC + b"[3~",
+    "control-right": ESC + b"[1;5C",
+    "escape": ESC + ESC,
+    "letter-of-europe": "é€".encode(),
+    "long": ESC + b"[" + b"1;" * 5000 + b"C",
+}
+
+
+@pytest.mark.parametrize("name", KEYS)
+def test_each_key(name: str, terminal: Terminal) -> None:
+    typed, call, rate = KEYS[name]
+    controls = RecordedControls()
+    with Keyboard(controls, fd=terminal.fd):
+        terminal.type(typed)
+        wait(lambda: bool(controls.calls))
+    assert controls.calls == [call]
+    assert controls.rate == rate
+
+
+@pytest.mark.parametrize("name", KEYS)
+def test_a_key_that_comes_byte_by_byte(name: str, terminal: Terminal) -> None:
+    typed, call, _ = KEYS[name]
+    controls = RecordedControls()
+    with Keyboard(controls, fd=terminal.fd):
+        for n in range(len(typed)):
+            assert not controls.calls
+            terminal.type(typed[n : n + 1])
+            time.sleep(0.03)
+        wait(lambda: bool(controls.calls))
+    assert controls.calls == [call]
+
+
+@pytest.mark.parametrize("name", IGNORED)
+def test_other_keys_are_ignored(name: str, terminal: Terminal) -> None:
+    controls = RecordedControls()
+    with Keyboard(controls, fd=terminal.fd):
+        for n in range(0, len(IGNORED[name]), 1000):
+            terminal.type(IGNORED[name][n : n + 1000])
+            time.sleep(0.02)
+        terminal.type(b" ")
+        wait(lambda: bool(controls.calls))
+    assert controls.calls == ["toggle_paused"]
+
+
+def test_many_keys_at_once(terminal: Terminal) -> None:
+    controls = RecordedControls()
+    typed = b"".join(keys for keys, _, _ in KEYS.values()) * 100
+    expected = [call for _, call, _ in KEYS.values()] * 100
+    with Keyboard(controls, fd=terminal.fd):
+        terminal.type(typed)
+        wait(lambda: len(controls.calls) >= len(expected))
+    assert controls.calls == expected
+
+
+def test_faster_and_slower_cancel(terminal: Terminal) -> None:
+    controls = RecordedControls()
+    with Keyboard(controls, fd=terminal.fd):
+        terminal.type((ESC + b"[A") * 5)
+        wait(lambda: len(controls.calls) == 5)
+        assert controls.rate == pytest.approx(1.1**5)
+        terminal.type((ESC + b"[B") * 5)
+        wait(lambda: len(controls.calls) == 10)
+    assert controls.rate == pytest.approx(1, abs=1e-8)
+
+
+def test_more_keys(terminal: Terminal) -> None:
+    controls = RecordedControls()
+    extra = {"q": lambda: controls.calls.append("q"), "left": lambda: controls.calls.append("no")}
+    with Keyboard(controls, extra, fd=terminal.fd):
+        terminal.type(b"q" + ESC + b"[D" + b"b")
+        wait(lambda: len(controls.calls) == 3)
+    assert controls.calls == ["q", "no", "step_back"]
+
+
+@pytest.mark.parametrize("size", range(1, 6))
+def test_keys_wherever_they_are_cut(size: int) -> None:
+    typed = b" " + ESC + b"[C" + ESC + b"[1;2A" + ESC + b"s" + ESC + ESC + b"OB" + b"\xc3\xa9b"
+    keys = Keys()
+    found = [key for n in range(0, len(typed), size) for key in keys.feed(typed[n : n + size])]
+    assert found == [" ", "right", "s", "down", "b"]
+
+
+# ---------------------------------------------------------------- the terminal is given back
+
+
+def test_the_terminal_is_as_it_was_after_the_end(terminal: Terminal) -> None:
+    before = terminal.attributes
+    handlers = {n: signal.getsignal(n) for n in signal.valid_signals()}
+    with Keyboard(RecordedControls(), fd=terminal.fd):
+        assert terminal.gives_keys
+        assert terminal.attributes[3] & termios.ISIG
+    assert terminal.attributes == before
+    assert {n: signal.getsignal(n) for n in signal.valid_signals()} == handlers
+    assert "keys" not in [thread.name for thread in threading.enumerate()]
+
+
+def test_the_terminal_is_as_it_was_after_an_exception(terminal: Terminal) -> None:
+    before = terminal.attributes
+
+    def fail() -> None:
+        with Keyboard(RecordedControls(), fd=terminal.fd):
+            assert terminal.gives_keys
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert terminal.attributes == before
+
+
+def test_it_works_outside_of_the_main_thread(terminal: Terminal) -> None:
+    before, controls = terminal.attributes, RecordedControls()
+
+    def use() -> None:
+        with Keyboard(controls, fd=terminal.fd):
+            terminal.type(b" ")
+            wait(lambda: bool(controls.calls))
+
+    thread = threading.Thread(target=use)
+    thread.start()
+    thread.join()
+    assert controls.calls == ["toggle_paused"]
+    assert terminal.attributes == before
+
+
+def test_the_terminal_goes_away() -> None:
+    hand, fd = os.openpty()
+    with Keyboard(RecordedControls(), fd=fd):
+        os.close(hand)
+        wait(lambda: "keys" not in [thread.name for thread in threading.enumerate()])
+    os.close(fd)
+
+
+def test_what_is_no_terminal_is_left_alone(tmp_path: Path) -> None:
+    controls = RecordedControls()
+    reading, writing = os.pipe()
+    os.write(writing, b"  ")
+    with Keyboard(controls, fd=reading):
+        assert "keys" not in [thread.name for thread in threading.enumerate()]
+        time.sleep(0.05)
+    assert os.read(reading, 10) == b"  "
+    os.close(reading)
+    os.close(writing)
+    assert not controls.calls
+
+
+@pytest.mark.parametrize("stdin", [None, "closed"])
+def test_no_standard_input(
+    stdin: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    file = (tmp_path / "stdin").open("w+")
+    file.close()
+    monkeypatch.setattr(sys, "stdin", file if stdin else None)
+    with Keyboard(RecordedControls()):
+        assert "keys" not in [thread.name for thread in threading.enumerate()]
+
+
+# ---------------------------------------------------------------- signals, in a session of its own
+
+
+PLAYER = """
+import sys, time
+from mp4ds.cli.keys import Keyboard
+class Player:
+    rate = 1.0
+    def toggle_paused(self): print("toggled", flush=True)
+    def play_next(self): return True
+    def step_back(self): return True
+    def set_rate(self, rate): return True
+with Keyboard(Player()):
+    print("entered", flush=True)
+    while True:
+        time.sleep(0.05)
+"""
+
+# a shell in the small: the player is its job, in the foreground of the terminal, and both
+# tell by lines on standard error what happens
+SHELL = """
+import fcntl, os, resource, signal, sys, termios
+resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+signal.signal(signal.SIGTTOU, signal.SIG_IGN)
+def say(text): os.write(2, (text + "\\n").encode())
+job = os.fork()
+if job == 0:
+    os.setpgid(0, 0)
+    os.tcsetpgrp(0, os.getpid())
+    signal.signal(signal.SIGTTOU, signal.SIG_DFL)
+    os.dup2(2, 1)
+    os.execv(sys.executable, [sys.executable, "-c", sys.argv[1]])
+say(f"job {job}")
+while True:
+    _, status = os.waitpid(job, os.WUNTRACED)
+    os.tcsetpgrp(0, os.getpgrp())
+    if not os.WIFSTOPPED(status):
+        say(f"ended {os.waitstatus_to_exitcode(status)}")
+        break
+    say("stopped")
+    while (command := sys.stdin.readline().strip()) in ("bg", "fg"):
+        if command == "fg":
+            os.tcsetpgrp(0, job)
+        os.kill(job, signal.SIGCONT)
+        say(command)
+        if command == "fg":
+            break
+"""
+
+
+class Session:
+    """A shell with one job on a terminal."""
+
+    def __init__(self, terminal: Terminal) -> None:
+        self._shell = subprocess.Popen(
+            [sys.executable, "-c", SHELL, PLAYER],
+            stdin=terminal.fd,
+            stderr=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            start_new_session=True,
+            text=True,
+        )
+        self._lines: list[str] = []
+        self._thread = threading.Thread(target=self._listen)
+        self._thread.start()
+        self.expect("job")
+        self.job = int(self._lines[0].split()[1])
+
+    def _listen(self) -> None:
+        assert self._shell.stderr is not None
+        self._lines.extend(iter(self._shell.stderr.readline, ""))
+
+    def expect(self, line: str, times: int = 1) -> None:
+        wait(lambda: sum(told.startswith(line) for told in self.lines) >= times)
+
+    @property
+    def lines(self) -> list[str]:
+        return [*self._lines]
+
+    def close(self) -> None:
+        self._shell.kill()
+        self._shell.wait()
+        self._thread.join()
+        assert self._shell.stderr is not None
+        self._shell.stderr.close()
+
+
+@pytest.fixture
+def session(terminal: Terminal) -> Iterator[Session]:
+    made = Session(terminal)
+    yield made
+    if not any(line.startswith("ended") for line in made.lines):
+        os.kill(made.job, signal.SIGKILL)
+    made.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT])
+def test_the_terminal_is_as_it_was_after_a_signal(
+    number: signal.Signals, terminal: Terminal, session: Session
+) -> None:
+    session.expect("entered")
+    before = [*terminal.attributes]
+    before[3] |= termios.ICANON | termios.ECHO
+    assert terminal.gives_keys
+    os.kill(session.job, number)
+    session.expect("ended")
+    assert f"ended {-number}\n" in session.lines
+    assert terminal.attributes[3] == before[3]
+
+
+def test_ctrl_c_is_typed(terminal: Terminal, session: Session) -> None:
+    session.expect("entered")
+    terminal.type(b"\x03")
+    session.expect(f"ended {-signal.SIGINT}")
+    assert not terminal.gives_keys
+
+
+def test_ctrl_z_gives_the_terminal_back_and_fg_takes_it(
+    terminal: Terminal, session: Session
+) -> None:
+    session.expect("entered")
+    for n in range(1, 3):
+        terminal.type(b" ")
+        session.expect("toggled", 2 * n - 1)
+        terminal.type(b"\x1a")
+        session.expect("stopped", n)
+        assert not terminal.gives_keys
+        terminal.type(b"fg\n")
+        session.expect("fg", n)
+        wait(lambda: terminal.gives_keys)
+        terminal.type(b" ")
+        session.expect("toggled", 2 * n)
+
+
+def test_in_the_background_the_terminal_is_left_alone(terminal: Terminal, session: Session) -> None:
+    session.expect("entered")
+    terminal.type(b"\x1a")
+    session.expect("stopped")
+    terminal.type(b"bg\n")
+    session.expect("bg")
+    time.sleep(0.6)
+    assert not terminal.gives_keys
+    # it was not stopped again, since it did not touch the terminal
+    assert Path(f"/proc/{session.job}/stat").read_text().split()[2] in "SR"
+    terminal.type(b"fg\n")
+    session.expect("fg")
+    wait(lambda: terminal.gives_keys)
+    terminal.type(b" ")
+    session.expect("toggled")

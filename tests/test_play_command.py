@@ -1,0 +1,212 @@
+"""`mp4ds play` as users run it: its keys on a terminal, its signals, its exit codes, its words."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+import mp4ds
+from mp4ds.cli.arguments import spelled
+from mp4ds.playing import PlayOptions, open_player
+from player_scenes import RecordingPublisher, make_drive, recorded
+
+WAIT_S = 40.0
+pytest.importorskip("foxglove")
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("drive")
+    mp4ds.pack(make_drive(folder / "drive.bag"), folder / "drive")
+    return folder / "drive"
+
+
+def command(*arguments: str | Path) -> list[str]:
+    return [sys.executable, "-m", "mp4ds", "play", *map(str, arguments)]
+
+
+FOXGLOVE = ("--foxglove", "--port", "0")
+
+
+def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command(*arguments),
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        stdin=subprocess.DEVNULL,
+    )
+
+
+class Terminal:
+    """A command on a pseudo-terminal."""
+
+    def __init__(self, *arguments: str | Path) -> None:
+        self._master, slave = pty.openpty()
+        os.set_blocking(self._master, False)
+        self.process = subprocess.Popen(
+            command(*arguments), stdin=slave, stdout=slave, stderr=slave, start_new_session=True
+        )
+        os.close(slave)
+        self.text = ""
+
+    def read(self) -> str:
+        while True:
+            try:
+                data = os.read(self._master, 65536)
+            except OSError:
+                return self.text
+            if not data:
+                return self.text
+            self.text += data.decode(errors="replace")
+
+    def until(self, pattern: str) -> re.Match[str]:
+        """Wait for words that come after those waited for before."""
+        end = time.monotonic() + WAIT_S
+        while not (found := re.search(pattern, self.read())):
+            assert time.monotonic() < end, self.text[-2000:]
+            time.sleep(0.02)
+        self.text = self.text[found.end() :]
+        return found
+
+    def press(self, keys: bytes) -> None:
+        os.write(self._master, keys)
+
+    def end(self) -> int:
+        code = self.process.wait(WAIT_S)
+        self.read()
+        return code
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        os.close(self._master)
+
+
+@contextmanager
+def terminal(*arguments: str | Path) -> Iterator[Terminal]:
+    made = Terminal(*arguments)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def test_plays_and_tells(drive: Path) -> None:
+    done = run(drive, *FOXGLOVE, "-r", "5", "--json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["messages"] == {"/tf": 40, "/tf_static": 2, "/camera/image_raw": 20}
+    assert not result["stopped"]
+    assert re.search(r"publishing to ws://127.0.0.1:\d+", done.stderr)
+
+
+def test_keys(drive: Path) -> None:
+    with terminal(drive, *FOXGLOVE, "--pause", "--topics", "/camera/*") as shown:
+        shown.until("1x paused · 0 messages")
+        shown.press(b"\x1b[C")
+        shown.until("1 messages")
+        shown.press(b"s\x1b[C")
+        shown.until("3 messages")
+        shown.press(b"\x1b[D")  # back: the second frame once more
+        shown.until(r"0\.1 of .* 4 messages")
+        shown.press(b"\x1b[A")
+        shown.until(r"1\.1x paused")
+        shown.press(b"\x1b[B\x1b[B")
+        shown.until(r"0\.909\d*x paused")
+        shown.press(b" ")
+        assert shown.end() == 0
+        # 4 while it stood, then the third frame and all that follow
+        assert "22 messages in" in shown.text
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals(drive: Path, number: signal.Signals) -> None:
+    with terminal(drive, *FOXGLOVE, "-r", "0.2") as shown:
+        shown.until(r"0\.2x playing · [1-9]")
+        os.kill(shown.process.pid, number)
+        assert shown.end() == 128 + number
+        assert "stopped before the end" in shown.text
+        assert "Traceback" not in shown.text
+
+
+def test_the_clock_rate_may_follow_the_option() -> None:
+    assert spelled(["play", "--clock", "50", "drive"]) == ["play", "--clock", "--hz", "50", "drive"]
+    assert spelled(["play", "--clock=50"]) == ["play", "--clock", "--hz", "50"]
+    assert spelled(["play", "--clock", "drive"]) == ["play", "--clock", "drive"]
+    assert spelled(["pack", "--clock", "50"]) == ["pack", "--clock", "50"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["{}", "--ros1", "--ros2"], 2, "--ros1 contradicts --ros2"),
+        (["{}", "--foxglove", "--rate", "0"], 2, "--rate 0 is not above 0"),
+        (["{}", "--foxglove", "--topics", "/none"], 2, "matches no topic"),
+        (["{}", "--foxglove", "--qos-profile-overrides-path", "x"], 2, "goes with --ros2"),
+        (["{}", "--foxglove", "--resize", "big"], 2, "--resize 'big' is no size"),
+        (["{}/none", "--foxglove"], 2, "none"),
+        (["{}", "--foxglove", "--lock-step", "/odom"], 2, "--foxglove"),
+        (["{}", "--foxglove", "--follow-clock"], 2, "--foxglove"),
+    ],
+)
+def test_errors_are_sentences(drive: Path, arguments: list[str], code: int, words: str) -> None:
+    done = run(*(argument.format(drive) for argument in arguments), "--port", "0")
+    assert done.returncode == code, done.stderr
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_nothing_sourced(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ROS_VERSION", raising=False)
+    monkeypatch.setattr("mp4ds.publishers.find_spec", lambda _: None)
+    with (
+        pytest.raises(mp4ds.PublishError, match="no ROS is sourced"),
+        open_player(drive, PlayOptions()),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("version", "modules", "kind"),
+    [
+        ("1", [], "ros1"),
+        ("2", [], "ros2"),
+        ("", ["rospy"], "ros1"),
+        ("", ["rclpy", "rospy"], "ros2"),
+        ("", ["cyclonedds"], "ros2"),
+    ],
+)
+def test_what_is_sourced(
+    version: str, modules: list[str], kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mp4ds.publishers import sourced
+
+    monkeypatch.setenv("ROS_VERSION", version)
+    monkeypatch.setattr(
+        "mp4ds.publishers.find_spec", lambda name: object() if name in modules else None
+    )
+    assert sourced() == kind
+
+
+def test_the_library_plays_as_the_command_does(drive: Path) -> None:
+    publisher = RecordingPublisher(world="ros1")
+    with open_player(str(drive), PlayOptions(rate=4.0), publisher=publisher) as player:
+        summary = player.run()
+    assert [sent.payload for sent in publisher.sent] == [
+        payload for _, payload, _ in recorded(drive.with_suffix(".bag"))
+    ]
+    assert isinstance(summary, mp4ds.PlaySummary)

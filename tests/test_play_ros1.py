@@ -1,0 +1,241 @@
+"""`mp4ds play --ros1` into a real master, beside ROS 1's own player of the same recording."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import signal
+import struct
+import subprocess
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rosbags.rosbag1 import Reader as BagReader
+
+import mp4ds
+from conftest import real
+from player_scenes import MS, START, STEP, make_drive
+from roscore import PLAY, RECORD, Core, Process, python, wait_until
+from roscore import _core as _core
+from roscore import roscore as roscore
+
+NS = 10**9
+Digests = Mapping[str, Sequence[str]]
+
+
+def mp4ds_play(dataset: Path, *options: str) -> list[str]:
+    return python("mp4ds", "play", str(dataset), "--ros1", *options)
+
+
+def packed(bag: Path, folder: Path) -> Path:
+    mp4ds.pack([bag], folder / bag.stem)
+    return folder / bag.stem
+
+
+def digests(bag: Path) -> Digests:
+    """Digests of the messages of a bag by topic, read by rosbags."""
+    found = defaultdict(list)
+    with BagReader(bag) as reader:
+        for connection, _, data in reader.messages():
+            found["/" + connection.topic.lstrip("/")].append(hashlib.sha256(data).hexdigest())
+    return dict(found)
+
+
+def by_topic(told: Iterable[Mapping[str, Any]]) -> Digests:
+    found = defaultdict(list)
+    for message in told:
+        found[message["topic"]].append(message["digest"])
+    return dict(found)
+
+
+def published(core: Core, command: list[str], topics: Iterable[str], count: int) -> list[Digests]:
+    """What rospy and ROS 1's recorder get from a player."""
+    receiver = core.receiver(*topics)
+    bag = core.folder / f"{time.monotonic_ns()}.bag"
+    recorder = core.start(RECORD, "-O", str(bag), *topics)
+    try:
+        wait_until(lambda: any("record" in node for node in core.nodes()))
+        code, _, errors = core.run(*command)
+        assert code == 0, errors
+        assert all(line.startswith("mp4ds: ") for line in errors.splitlines())
+        told = receiver.take(count)
+        assert receiver.silence() == []
+    finally:
+        recorder.send_signal(signal.SIGINT)
+        recorder.wait(60)
+        receiver.end()
+    return [by_topic(told), digests(bag)]
+
+
+@pytest.mark.parametrize(
+    ("name", "pace"),
+    [
+        ("roboto_tiny_dvs", ["--immediate"]),
+        ("librealsense_depth_color", ["--immediate"]),
+        ("ecto_ros_camera_info", ["--immediate"]),
+        ("youliangtan_object_pose", ["--rate", "6"]),
+    ],
+)
+def test_as_rosbag_play(roscore: Core, tmp_path: Path, name: str, pace: list[str]) -> None:
+    bag = real(f"bags/{name}.bag")
+    dataset = packed(bag, tmp_path)
+    # names that ROS 1 cannot have end rosbag play, and every node has a /rosout of its own
+    is_played = re.compile(r"/(?!rosout$)[\w/]+").fullmatch
+    recorded = {topic: sent for topic, sent in digests(bag).items() if is_played(topic)}
+    count = sum(map(len, recorded.values()))
+    ours = mp4ds_play(dataset, "--delay", "4", *pace)
+    ours += [word for topic in recorded for word in ("--topics", topic)]
+    # with its queue of 100, rosbag play loses messages where a subscriber is slow
+    theirs = [PLAY, "--quiet", "--queue", "100000", "--delay", "4", *pace]
+    theirs += ["--bags", str(bag), "--topics", *recorded]
+    for command in (ours, theirs):
+        by_rospy, by_recorder = published(roscore, command, recorded, count)
+        assert by_rospy == recorded
+        assert by_recorder == recorded
+
+
+# ---------------------------------------------------------------- clocks
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    """A second of a camera at 20 Hz, packed; the bag lies beside it."""
+    return packed(make_drive(tmp_path / "drive.bag"), tmp_path)
+
+
+CAMERA = "/camera/image_raw"
+
+
+def stamps(told: Iterable[Mapping[str, Any]]) -> list[int]:
+    """Stamps of messages that begin with a header, nanoseconds."""
+    found = (struct.unpack_from("<III", bytes.fromhex(m["start"])) for m in told)
+    return [seconds * NS + nanoseconds for _, seconds, nanoseconds in found]
+
+
+def test_clock(roscore: Core, drive: Path) -> None:
+    receiver = roscore.receiver("/clock")
+    code, output, _ = roscore.run(*mp4ds_play(drive, "--clock", "--delay", "1", "--json"))
+    assert code == 0
+    assert json.loads(output)["messages"][CAMERA] == 20
+    told = receiver.silence(1)
+    times = []
+    for message in told:
+        seconds, nanoseconds = struct.unpack("<II", bytes.fromhex(message["start"]))
+        times.append(seconds * NS + nanoseconds)
+    assert times == sorted(times)
+    assert START <= times[0] <= times[-1] <= START + 20 * STEP + 5 * MS
+    # 20 with messages, and as many of 100 more as a busy machine finds the time for
+    assert len(times) > 30
+
+
+@pytest.mark.parametrize("leader", ["rosbag", "mp4ds"])
+def test_two_players_in_step(roscore: Core, tmp_path: Path, leader: str) -> None:
+    """The leader goes on for longer: rosbag play's last /clock is before its last message."""
+    bag = make_drive(tmp_path / "first.bag", frames=25)
+    first = packed(bag, tmp_path)
+    second = packed(make_drive(tmp_path / "second.bag", topic="/second", frames=20), tmp_path)
+    receiver = roscore.receiver(CAMERA, "/second/image_raw")
+    assert roscore.run("rosparam", "set", "/use_sim_time", "true")[0] == 0
+    follower = roscore.start(*mp4ds_play(second, "--topics", "/second/*"))
+    try:
+        wait_until(lambda: "/second/image_raw" in roscore.run("rostopic", "list")[1])
+        assert receiver.silence(2) == []  # nobody has begun
+        options = ("--clock", "--delay", "1", "--topics", CAMERA)
+        if leader == "mp4ds":
+            command = mp4ds_play(first, *options)
+        else:
+            command = [PLAY, "--quiet", "--bags", str(bag), *options]
+        assert roscore.run(*command)[0] == 0
+        told = receiver.take(45)
+        assert follower.wait(60) == 0  # it ends soon after the leader
+    finally:
+        if follower.poll() is None:
+            follower.terminate()
+        follower.wait(60)
+        roscore.run("rosparam", "delete", "/use_sim_time")
+    arrivals: dict[int, list[float]] = defaultdict(list)
+    for message, stamp in zip(told, stamps(told), strict=True):
+        arrivals[stamp].append(message["arrival"])
+    assert [len(times) for times in arrivals.values()] == [2] * 20 + [1] * 5
+    # on an idle machine it is a millisecond
+    apart = sorted(max(times) - min(times) for times in arrivals.values() if len(times) == 2)
+    assert apart[10] < 0.5
+
+
+# ---------------------------------------------------------------- latching, and remote control
+
+
+def test_latched_before_the_start(roscore: Core, drive: Path) -> None:
+    """The last of each caller comes first, as from ``rosbag play -s``."""
+    bag = drive.parent / "drive.bag"
+    theirs = [PLAY, "--quiet", "--delay", "1", "--start", "0.5", str(bag)]
+    found = []
+    for command in (mp4ds_play(drive, "--delay", "1", "--start", "0.5"), theirs):
+        receiver = roscore.receiver("/tf_static")
+        assert roscore.run(*command)[0] == 0
+        told = receiver.take(2)
+        assert receiver.silence() == []
+        assert {message["latching"] for message in told} == {"1"}
+        found.append({message["digest"] for message in told})
+        receiver.end()
+    assert found[0] == found[1]
+    assert len(found[0]) == 2
+
+
+@contextmanager
+def playing(core: Core, dataset: Path) -> Iterator[tuple[subprocess.Popen[str], Process, str]]:
+    """A player that begins again and again, who receives it, and its node's name."""
+    before = set(core.nodes())
+    receiver = core.receiver(CAMERA)
+    player = core.start(*mp4ds_play(dataset, "--loop"))
+    try:
+        receiver.next()
+        (node,) = (name for name in core.nodes() if name not in before and "mp4ds_play" in name)
+        yield player, receiver, node
+    finally:
+        if player.poll() is None:
+            player.terminate()
+        player.wait(60)
+
+
+def test_pause_service(roscore: Core, drive: Path) -> None:
+    with playing(roscore, drive) as (_, receiver, node):
+        for wanted, told in (("true", "paused"), ("false", "resumed")):
+            _, output, _ = roscore.run("rosservice", "call", f"{node}/pause_playback", wanted)
+            assert f"Playback is now {told}" in output
+            receiver.silence()
+            if wanted == "true":
+                assert receiver.silence(1) == []
+            else:
+                receiver.take(30)
+
+
+def test_ends_with_its_node(roscore: Core, drive: Path) -> None:
+    with playing(roscore, drive) as (player, _, node):
+        assert roscore.run("rosnode", "kill", node)[0] == 0
+        assert player.wait(60) == 0
+    assert node not in roscore.nodes()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals(roscore: Core, drive: Path, number: signal.Signals) -> None:
+    with playing(roscore, drive) as (player, _, node):
+        player.send_signal(number)
+        assert player.wait(60) == 128 + number
+    assert node not in roscore.nodes()  # it has signed off
+
+
+def test_no_master(roscore: Core, drive: Path) -> None:
+    before = time.monotonic()
+    uri = "http://127.0.0.1:9/"
+    code, _, errors = roscore.run(*mp4ds_play(drive), ROS_MASTER_URI=uri)
+    assert code == 1
+    assert re.search(rf"{uri}: no ROS master answers there", errors.replace("\n", " "))
+    assert "Traceback" not in errors
+    assert time.monotonic() - before < 20

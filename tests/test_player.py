@@ -1,0 +1,538 @@
+"""The player: what is published when, and what its controls do."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mp4ds
+from mp4ds.errors import FormatError, OptionError
+from mp4ds.playing import Player, PlayOptions, PlaySummary, open_player
+from player_scenes import MS, START, Recorded, RecordingPublisher, make_drive, recorded
+
+FIRST = START
+CAMERA = "/camera/image_raw"
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Recorded]]:
+    """A dataset, and the messages of its recording."""
+    folder = tmp_path_factory.mktemp("drive")
+    bag = make_drive(folder / "drive.bag")
+    mp4ds.pack(bag, folder / "drive")
+    return folder / "drive", recorded(bag)
+
+
+def published(publisher: RecordingPublisher) -> list[Recorded]:
+    return [(sent.topic, sent.payload, sent.time_ns) for sent in publisher.sent]
+
+
+def run(dataset: Path | list[Path], **options: Any) -> tuple[RecordingPublisher, PlaySummary]:
+    publisher = RecordingPublisher(world="ros1")
+    with open_player(dataset, PlayOptions(**options), publisher=publisher) as player:
+        return publisher, player.run()
+
+
+@contextmanager
+def running(
+    dataset: Path, publisher: RecordingPublisher | None = None, **options: Any
+) -> Iterator[tuple[Player, RecordingPublisher]]:
+    """A player that runs in a thread, stopped at the end."""
+    publisher = publisher or RecordingPublisher(world="ros1")
+    failures: list[BaseException] = []
+    with open_player(dataset, PlayOptions(**options), publisher=publisher) as player:
+
+        def work() -> None:
+            try:
+                player.run()
+            except BaseException as error:
+                failures.append(error)
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        try:
+            yield player, publisher
+        finally:
+            player.stop()
+            thread.join(20)
+    assert not thread.is_alive()
+    assert not failures
+
+
+def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it does not come"
+        time.sleep(0.002)
+
+
+# ---------------------------------------------------------------- what is published
+
+
+def test_everything_is_published_in_order(drive: tuple[Path, list[Recorded]]) -> None:
+    publisher, summary = run(drive[0], rate=5.0)
+    assert published(publisher) == drive[1]
+    assert sum(summary.messages.values()) == len(drive[1])
+    assert summary.messages[CAMERA] == 20
+    assert not summary.stopped
+
+
+@pytest.mark.parametrize("rate", [0.5, 2.0, 8.0])
+def test_times_are_kept(drive: tuple[Path, list[Recorded]], rate: float) -> None:
+    publisher, summary = run(drive[0], rate=rate, duration=0.5)
+    first, last = publisher.sent[0], publisher.sent[-1]
+    due = (last.time_ns - first.time_ns) / rate / 1e9
+    assert due <= (last.at - first.at) + 0.02
+    assert last.at - first.at < due + summary.slowed_s + 0.5
+    for sent in publisher.sent:  # never before its time
+        assert sent.at - first.at > (sent.time_ns - first.time_ns) / rate / 1e9 - 0.02
+
+
+def test_immediate_does_not_wait(drive: tuple[Path, list[Recorded]]) -> None:
+    publisher, _ = run(drive[0], immediate=True, rate=0.001)
+    assert published(publisher) == drive[1]
+
+
+def test_a_part_of_it(drive: tuple[Path, list[Recorded]]) -> None:
+    publisher, _ = run(drive[0], immediate=True, start_offset=0.3, duration=0.4)
+    begin = FIRST + 300 * MS
+    expected = [item for item in drive[1] if begin <= item[2] <= begin + 400 * MS]
+    latched = [item for item in published(publisher) if item[0] == "/tf_static"]
+    others = [item for item in published(publisher) if item[0] != "/tf_static"]
+    assert others == expected
+    assert {item[1] for item in latched} == {
+        item[1] for item in drive[1] if item[0] == "/tf_static"
+    }
+    assert [item[0] for item in published(publisher)[:2]] == ["/tf_static"] * 2
+
+
+def test_what_begins_at_the_beginning_has_nothing_twice(
+    drive: tuple[Path, list[Recorded]],
+) -> None:
+    publisher, _ = run(drive[0], immediate=True)
+    assert sum(item[0] == "/tf_static" for item in published(publisher)) == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "topics"),
+    [
+        ({"topics": ["/tf*"]}, {"/tf", "/tf_static"}),
+        ({"exclude": ["/tf*"]}, {CAMERA}),
+        ({"regex": "^/tf$"}, {"/tf"}),
+        ({"regex": "static", "topics": [CAMERA]}, {"/tf_static", CAMERA}),
+        ({"regex": "tf", "exclude": ["/tf"]}, {"/tf_static"}),
+        ({"topics": ["/tf"], "remap": ["/tf:=/moved"]}, {"/moved"}),
+        ({"topics": ["/tf", CAMERA], "remap": ["tf:=/moved"], "prefix": "/robot"},
+         {"/moved", "/robot/camera/image_raw"}),
+    ],
+)  # fmt: skip
+def test_topics(
+    drive: tuple[Path, list[Recorded]], options: dict[str, Any], topics: set[str]
+) -> None:
+    publisher, summary = run(drive[0], immediate=True, **options)
+    assert {sent.topic for sent in publisher.sent} == topics
+    assert {channel.topic for channel in publisher.advertised} == topics
+    assert set(summary.messages) == topics
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"topics": ["/none"]}, "--topics '/none' matches no topic"),
+        ({"regex": "none"}, "--regex 'none' matches no topic"),
+        ({"regex": "("}, "no regular expression"),
+        ({"remap": ["/tf"]}, "is no rule"),
+        ({"remap": ["/none:=/other"]}, "there is no such topic"),
+        ({"rate": 0.0}, "--rate 0"),
+        ({"rate": float("nan")}, "--rate nan"),
+        ({"start_offset": -1.0}, "--start-offset -1"),
+        ({"start_offset": 100.0}, "after the end"),
+        ({"duration": float("inf")}, "--duration inf"),
+        ({"clock": 0.0}, "--clock 0"),
+        ({"publish_as": "jpg"}, "--publish-as 'jpg'"),
+        ({"restamp": "then"}, "--restamp 'then'"),
+        ({"read_ahead": 0}, "--read-ahead 0"),
+        ({"follow_clock": True, "clock": 10.0}, "--clock contradicts --follow-clock"),
+        ({"follow_clock": True, "rate": 2.0}, "--rate contradicts --follow-clock"),
+    ],
+)
+def test_wrong_options(
+    drive: tuple[Path, list[Recorded]], options: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(OptionError, match=words.replace("(", r"\(")):
+        run(drive[0], **options)
+
+
+def test_several_datasets_on_one_clock(drive: tuple[Path, list[Recorded]], tmp_path: Path) -> None:
+    bag = make_drive(tmp_path / "other.bag", topic="/rear", late=10 * MS, frames=10)
+    mp4ds.pack(bag, tmp_path / "other")
+    publisher, _ = run([drive[0], tmp_path / "other"], immediate=True)
+    times = [sent.time_ns for sent in publisher.sent]
+    assert times == sorted(times)
+    assert sorted(published(publisher)) == sorted(drive[1] + recorded(bag))
+
+
+def test_loop(drive: tuple[Path, list[Recorded]]) -> None:
+    publisher = RecordingPublisher(world="ros1")
+    with running(drive[0], publisher, immediate=True, loop=True):
+        until(lambda: len(publisher.sent) > 3 * len(drive[1]))
+    assert published(publisher)[: 3 * len(drive[1])] == 3 * drive[1]
+
+
+def test_a_damaged_video_ends_it(drive: tuple[Path, list[Recorded]], tmp_path: Path) -> None:
+    import shutil
+
+    shutil.copytree(drive[0], tmp_path / "damaged")
+    video = next((tmp_path / "damaged").glob("*.mp4"))
+    data = bytearray(video.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 200] = bytes(200)
+    video.write_bytes(data)
+    with pytest.raises(FormatError, match=r"camera_image_raw|/camera/image_raw"):
+        run(tmp_path / "damaged", immediate=True)
+
+
+def test_nothing_runs_after_the_end(drive: tuple[Path, list[Recorded]]) -> None:
+    before = threading.active_count()
+    run(drive[0], immediate=True)
+    with running(drive[0]) as (_, publisher):
+        until(lambda: len(publisher.sent) > 3)
+    assert threading.active_count() == before
+
+
+def test_it_ends_when_the_receiving_side_is_shut_down(
+    drive: tuple[Path, list[Recorded]],
+) -> None:
+    publisher = RecordingPublisher(world="ros1")
+    publisher.on_sent = lambda sent: setattr(publisher, "is_alive", len(publisher.sent) < 5)
+    with open_player(drive[0], PlayOptions(), publisher=publisher) as player:
+        assert player.run().stopped
+    assert len(publisher.sent) == 5
+
+
+# ---------------------------------------------------------------- clock
+
+
+def test_clock_never_runs_back_or_ahead(drive: tuple[Path, list[Recorded]]) -> None:
+    publisher = RecordingPublisher(world="ros1")
+    order: list[tuple[str, int]] = []
+    publisher.on_sent = lambda sent: order.append(("message", sent.time_ns))
+    real_clock = publisher.clock
+    publisher.clock = lambda time_ns: (order.append(("clock", time_ns)), real_clock(time_ns))[1]  # type: ignore[method-assign]
+    options = PlayOptions(clock=200.0, rate=2.0)
+    with open_player(drive[0], options, publisher=publisher) as player:
+        summary = player.run()
+    clocks = [time_ns for kind, time_ns in order if kind == "clock"]
+    assert clocks == sorted(clocks)
+    messages = [time_ns for kind, time_ns in order if kind == "message"]
+    assert set(messages) <= set(clocks)  # one with each message ...
+    ticks = len(clocks) - len(messages)
+    assert ticks > 20  # ... and others between
+    now = 0
+    for kind, time_ns in order:
+        if kind == "clock":
+            now = time_ns
+        else:
+            assert time_ns == now  # no message is published at another time than /clock tells
+    assert summary.messages[CAMERA] == 20
+
+
+def test_a_recorded_clock_is_not_published_beside_ours(tmp_path: Path) -> None:
+    from mp4ds.bags import open_writer
+    from mp4ds.bags.definitions import ros1_channel
+    from mp4ds.records import Message
+
+    source = recorded(make_drive(tmp_path / "plain.bag", frames=8))
+    clock = ros1_channel(0, "/clock", "rosgraph_msgs/Clock", "/player")
+    image = ros1_channel(1, CAMERA, "sensor_msgs/Image", "/driver")
+    with open_writer(
+        tmp_path / "c.bag", "bag", name="c.bag", profile="ros1", library="", storage=""
+    ) as writer:
+        writer.add_channel(clock)
+        writer.add_channel(image)
+        for topic, payload, log_time in source:
+            if topic == CAMERA:
+                writer.write(Message(clock, log_time, log_time, 0, bytes(8)))
+                writer.write(Message(image, log_time, log_time, 0, payload))
+    mp4ds.pack(tmp_path / "c.bag", tmp_path / "c")
+    publisher, _ = run(tmp_path / "c", immediate=True)
+    assert sum(sent.topic == "/clock" for sent in publisher.sent) == 8
+    publisher, _ = run(tmp_path / "c", immediate=True, clock=10.0)
+    assert not any(sent.topic == "/clock" for sent in publisher.sent)
+    assert len(publisher.clocks) >= 8
+
+
+def test_follows_a_clock(drive: tuple[Path, list[Recorded]]) -> None:
+    with running(drive[0], follow_clock=True) as (_, publisher):
+        until(lambda: publisher.on_time)
+        assert publisher.on_time is not None
+        time.sleep(0.3)
+        assert not publisher.sent
+        for shift in range(0, 501, 10):
+            publisher.on_time(FIRST + shift * MS)
+        expected = [
+            item for item in drive[1] if item[2] <= FIRST + 510 * MS
+        ]  # a step after the last
+        until(lambda: len(publisher.sent) == len(expected))
+        time.sleep(0.2)
+        assert published(publisher) == expected
+
+
+def test_follows_a_clock_that_jumps_back(drive: tuple[Path, list[Recorded]]) -> None:
+    with running(drive[0], follow_clock=True) as (_, publisher):
+        until(lambda: publisher.on_time)
+        assert publisher.on_time is not None
+        for shift in range(0, 2001, 10):
+            publisher.on_time(FIRST + shift * MS)
+        until(lambda: len(publisher.sent) == len(drive[1]))
+        publisher.on_time(FIRST)
+        time.sleep(0.3)
+        for shift in range(0, 301, 10):
+            publisher.on_time(FIRST + shift * MS)
+        again = [item for item in drive[1] if item[2] <= FIRST + 310 * MS]
+        until(lambda: len(publisher.sent) == len(drive[1]) + len(again))
+        assert published(publisher) == drive[1] + again
+
+
+def test_follows_a_clock_that_is_in_the_middle(drive: tuple[Path, list[Recorded]]) -> None:
+    with running(drive[0], follow_clock=True) as (_, publisher):
+        until(lambda: publisher.on_time)
+        assert publisher.on_time is not None
+        publisher.on_time(FIRST + 700 * MS)
+        until(lambda: len(publisher.sent) >= 2)
+        for shift in range(700, 2001, 10):
+            publisher.on_time(FIRST + shift * MS)
+        expected = [item for item in drive[1] if item[2] >= FIRST + 700 * MS]
+        until(lambda: len(publisher.sent) == len(expected) + 2)
+        assert published(publisher)[2:] == expected
+
+
+# ---------------------------------------------------------------- controls
+
+
+def test_pause_and_steps(drive: tuple[Path, list[Recorded]]) -> None:
+    with running(drive[0], paused=True) as (player, publisher):
+        time.sleep(0.5)
+        assert player.is_paused
+        assert not publisher.sent
+        for count in (1, 2, 3):
+            assert player.play_next()
+            until(lambda count=count: len(publisher.sent) == count)
+        assert player.burst(5) == 5
+        until(lambda: len(publisher.sent) == 8)
+        time.sleep(0.1)
+        assert published(publisher) == drive[1][:8]
+        player.resume()
+        assert not player.play_next()  # only while it stands still
+        until(lambda: len(publisher.sent) == len(drive[1]))
+    assert published(publisher) == drive[1]
+
+
+def test_pause_holds_the_clock(drive: tuple[Path, list[Recorded]]) -> None:
+    with running(drive[0], clock=100.0) as (player, publisher):
+        until(lambda: len(publisher.sent) > 10)
+        player.pause()
+        time.sleep(0.05)
+        count, ticks = len(publisher.sent), len(publisher.clocks)
+        time.sleep(0.3)
+        assert len(publisher.sent) == count
+        assert len(publisher.clocks) > ticks + 5
+        assert len({clock.time_ns for clock in publisher.clocks[ticks:]}) == 1
+        player.toggle_paused()
+        until(lambda: len(publisher.sent) == len(drive[1]))
+    times = [clock.time_ns for clock in publisher.clocks]
+    assert times == sorted(times)
+
+
+def test_step_back(drive: tuple[Path, list[Recorded]]) -> None:
+    with running(drive[0], paused=True, topics=[CAMERA]) as (player, publisher):
+        frames = [item for item in drive[1] if item[0] == CAMERA]
+        assert not player.step_back()
+        assert player.burst(5) == 5
+        until(lambda: len(publisher.sent) == 5)
+        assert player.step_back()
+        until(lambda: len(publisher.sent) == 6)
+        assert player.step_back()
+        until(lambda: len(publisher.sent) == 7)
+        assert player.play_next()
+        until(lambda: len(publisher.sent) == 8)
+    assert published(publisher)[5:] == [frames[3], frames[2], frames[3]]
+
+
+def test_seek(drive: tuple[Path, list[Recorded]]) -> None:
+    with running(drive[0], paused=True, topics=[CAMERA]) as (player, publisher):
+        frames = [item for item in drive[1] if item[0] == CAMERA]
+        assert not player.seek(FIRST - 10**9)
+        for number in (12, 3, 19):
+            count = len(publisher.sent)
+            assert player.seek(frames[number][2])
+            assert player.play_next()
+            until(lambda count=count: len(publisher.sent) > count)
+            assert published(publisher)[-1] == frames[number]
+
+
+def test_seek_goes_on_from_there(drive: tuple[Path, list[Recorded]]) -> None:
+    with running(drive[0], topics=[CAMERA], rate=0.05) as (player, publisher):
+        frames = [item for item in drive[1] if item[0] == CAMERA]
+        until(lambda: publisher.sent)
+        assert player.seek(frames[15][2])
+        until(lambda: len(publisher.sent) == 2)
+        player.set_rate(50.0)
+        until(lambda: len(publisher.sent) == 6)
+    assert published(publisher) == [frames[0], *frames[15:]]
+
+
+def test_rate_changes(drive: tuple[Path, list[Recorded]]) -> None:
+    with running(drive[0], rate=0.01) as (player, publisher):
+        until(lambda: publisher.sent)
+        assert player.rate == 0.01
+        assert not player.set_rate(0.0)
+        assert not player.set_rate(float("inf"))
+        assert player.set_rate(100.0)
+        until(lambda: len(publisher.sent) == len(drive[1]))
+    assert published(publisher) == drive[1]
+
+
+def test_stop(drive: tuple[Path, list[Recorded]]) -> None:
+    with running(drive[0], rate=0.01) as (player, publisher):
+        until(lambda: publisher.sent)
+        player.stop()
+    assert len(publisher.sent) < len(drive[1])
+
+
+def test_controls_are_served(drive: tuple[Path, list[Recorded]]) -> None:
+    publisher, _ = run(drive[0], immediate=True)
+    assert isinstance(publisher.controls, Player)
+
+
+def test_waits_for_subscribers(drive: tuple[Path, list[Recorded]]) -> None:
+    publisher = RecordingPublisher(world="ros1", subscriber_count=0)
+    with running(drive[0], publisher, immediate=True, wait_for_subscribers=True):
+        time.sleep(0.5)
+        assert not publisher.sent
+        publisher.subscriber_count = 1
+        until(lambda: len(publisher.sent) == len(drive[1]))
+
+
+def test_delay(drive: tuple[Path, list[Recorded]]) -> None:
+    began = time.monotonic()
+    publisher, _ = run(drive[0], immediate=True, delay=0.7)
+    assert publisher.sent[0].at - began > 0.7
+
+
+# ---------------------------------------------------------------- lock-step, late frames, stamps
+
+
+def test_lock_step(drive: tuple[Path, list[Recorded]]) -> None:
+    with running(drive[0], lock_step="/done", rate=100.0) as (_, publisher):
+
+        def count() -> int:
+            return sum(sent.topic == CAMERA for sent in publisher.sent)
+
+        for number in range(1, 6):
+            until(lambda number=number: count() == number)
+            time.sleep(0.05)
+            assert count() == number
+            assert publisher.on_message is not None
+            publisher.on_message()
+    times = [sent.time_ns for sent in publisher.sent]
+    assert times == sorted(times)
+
+
+def test_a_slow_receiver_slows_the_clock(drive: tuple[Path, list[Recorded]]) -> None:
+    publisher = RecordingPublisher(world="ros1", busy_s=0.02)
+    options = PlayOptions(rate=4.0, clock=50.0)
+    with open_player(drive[0], options, publisher=publisher) as player:
+        summary = player.run()
+    assert published(publisher) == drive[1]
+    assert summary.slowed_s > 0.3
+    assert summary.dropped == 0
+
+
+def test_late_frames_are_dropped_and_counted(drive: tuple[Path, list[Recorded]]) -> None:
+    publisher = RecordingPublisher(world="ros1", busy_s=0.02)
+    options = PlayOptions(rate=4.0, drop=True, read_ahead=1)
+    with open_player(drive[0], options, publisher=publisher) as player:
+        summary = player.run()
+    others = [item for item in drive[1] if item[0] != CAMERA]
+    assert [item for item in published(publisher) if item[0] != CAMERA] == others
+    assert summary.slowed_s == 0
+    assert summary.messages[CAMERA] + summary.dropped == 20
+
+
+def test_restamp(drive: tuple[Path, list[Recorded]]) -> None:
+    now = time.time_ns()
+    publisher, _ = run(drive[0], rate=10.0, restamp="now")
+    expected = {(topic, log_time): payload for topic, payload, log_time in drive[1]}
+    stamps: dict[int, int] = {}
+    for sent in publisher.sent:
+        before = expected[sent.topic, sent.time_ns]
+        place = 4 if sent.topic == CAMERA else 8
+        if sent.topic == "/tf_static":
+            continue
+        old, new = (
+            int.from_bytes(data[place : place + 4], "little") * 10**9
+            + int.from_bytes(data[place + 4 : place + 8], "little")
+            for data in (before, sent.payload)
+        )
+        assert now - 10**9 < new < time.time_ns() + 10**9
+        assert sent.payload[:place] == before[:place]
+        assert sent.payload[place + 8 :] == before[place + 8 :]
+        stamps[old] = new
+    ordered = sorted(stamps)
+    gaps = [stamps[b] - stamps[a] for a, b in pairwise(ordered)]
+    assert all(gap > 0 for gap in gaps)
+    assert sum(gaps) == pytest.approx((ordered[-1] - ordered[0]) / 10, rel=0.5)
+
+
+def test_publishing_as_ros2(drive: tuple[Path, list[Recorded]]) -> None:
+    publisher = RecordingPublisher(world="ros2")
+    with open_player(drive[0], PlayOptions(immediate=True), publisher=publisher) as player:
+        player.run()
+    assert {channel.message_encoding for channel in publisher.advertised} == {"cdr"}
+    assert len(publisher.sent) == len(drive[1])
+    assert all(sent.payload[:2] == b"\0\1" for sent in publisher.sent)
+
+
+def test_publishing_as_jpeg(drive: tuple[Path, list[Recorded]]) -> None:
+    publisher, _ = run(drive[0], immediate=True, publish_as="compressed")
+    files = [sent for sent in publisher.sent if sent.topic == f"{CAMERA}/compressed"]
+    assert len(files) == 20
+    assert all(b"\xff\xd8" in sent.payload[:80] for sent in files)
+    assert [sent.time_ns for sent in files] == [item[2] for item in drive[1] if item[0] == CAMERA]
+
+
+@pytest.mark.parametrize(
+    ("options", "frames"), [({"every": 3}, 7), ({"max_rate": 10.0}, 10), ({"resize": 0.5}, 20)]
+)
+def test_lower_quality_on_purpose(
+    drive: tuple[Path, list[Recorded]], options: dict[str, Any], frames: int
+) -> None:
+    publisher, summary = run(drive[0], immediate=True, **options)
+    images = [sent for sent in publisher.sent if sent.topic == CAMERA]
+    assert len(images) == frames
+    assert summary.thinned == ({CAMERA: 20 - frames} if frames < 20 else {})
+    others = [item for item in drive[1] if item[0] != CAMERA]
+    assert [item for item in published(publisher) if item[0] != CAMERA] == others
+    if "resize" not in options:
+        assert set(published(publisher)) <= set(drive[1])
+    else:
+        with mp4ds.open(drive[0]) as dataset:
+            small = dataset[CAMERA].get(range(20), resize=0.5)
+        assert [sent.payload[-80 * 60 :] for sent in images] == [
+            frame.data.tobytes() for frame in small
+        ]
+
+
+def test_fewer_frames_from_a_place_on(drive: tuple[Path, list[Recorded]]) -> None:
+    whole, _ = run(drive[0], immediate=True, topics=[CAMERA], every=4)
+    part, _ = run(drive[0], immediate=True, topics=[CAMERA], every=4, start_offset=0.5)
+    assert published(part) == published(whole)[-len(part.sent) :]
+    assert 0 < len(part.sent) < len(whole.sent)

@@ -1,0 +1,492 @@
+"""What holds for publishing in ROS 2 both over DDS and by rclpy; and quality of service."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+import fake_rclpy
+from mp4ds.bags.convert import LATCHED_QOS
+from mp4ds.errors import ConversionError, OptionError, PublishError
+from mp4ds.publishers.qos import Qos, load_overrides, offered_qos, recorded_qos
+from mp4ds.publishers.ros2 import RclpyPublisher
+from mp4ds.records import Channel, Schema
+from ros2_sides import KINDS, SIDES, Side, channel, connect, message, padded, until
+
+STRING = "std_msgs/msg/String"
+
+
+@pytest.fixture(params=SIDES)
+def side(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
+    with SIDES[request.param](monkeypatch) as found:
+        yield found
+
+
+class Player:
+    """Controls that note what was asked of them."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Any, ...]] = []
+        self.is_paused = True
+        self.rate = 2.5
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        def noted(*arguments: Any) -> Any:
+            self.asked.append((name, *arguments))
+            return 3 if name == "burst" else True
+
+        return noted
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_message_arrives_in_order(side: Side, kind: str) -> None:
+    recorded = channel("/robot/topic", kind)
+    sent = [message(kind, number) for number in range(20)]
+    with side.open() as publisher:
+        publisher.advertise(recorded)
+        assert publisher.subscribers(recorded) == 0
+        connect(side, publisher, recorded)
+        assert until(lambda: publisher.subscribers(recorded) == 1)
+        for number, payload in enumerate(sent):
+            publisher.publish(recorded, memoryview(payload) if number % 2 else payload, number)
+        got = side.peer.received("/robot/topic", 20)
+    assert [padded(payload) for payload in got] == [padded(payload) for payload in sent]
+
+
+def test_latched_messages_reach_late_subscribers_from_each_publisher(side: Side) -> None:
+    left, right = (channel("/tf_static", STRING, qos=LATCHED_QOS) for _ in range(2))
+    with side.open() as publisher:
+        for recorded, number in ((left, 1), (left, 2), (right, 3)):
+            publisher.advertise(recorded)
+            publisher.publish(recorded, message(STRING, number), number)
+        side.peer.subscribe("/tf_static", STRING, latched=True)
+        got = side.peer.received("/tf_static", 2)
+        expected = [padded(message(STRING, number)) for number in (2, 3)]
+        assert sorted(padded(payload) for payload in got) == expected
+
+
+def test_channels_of_a_topic_share_a_publisher(side: Side) -> None:
+    first, second = channel("/tf", STRING), channel("/tf", STRING)
+    with side.open() as publisher:
+        publisher.advertise(second)
+        connect(side, publisher, first)
+        assert side.peer.connected("/tf", 1) == 1
+        publisher.publish(first, message(STRING, 1), 0)
+        publisher.publish(second, message(STRING, 2), 0)
+        assert len(side.peer.received("/tf", 2)) == 2
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_best_effort_is_only_for_best_effort(side: Side, reliable: bool) -> None:
+    recorded = channel("/camera", STRING)
+    best_effort = {"/camera": Qos(reliability="best_effort")}
+    with side.open(overrides=best_effort) as publisher:
+        publisher.advertise(recorded)
+        side.peer.subscribe("/camera", STRING, reliable=reliable)
+        other = channel("/other", STRING)
+        publisher.advertise(other)
+        side.peer.subscribe("/other", STRING, reliable=reliable)
+        assert until(lambda: publisher.subscribers(other) == 1)
+        assert until(lambda: publisher.subscribers(recorded) == (0 if reliable else 1))
+        if not reliable:
+
+            def arrives() -> bool:
+                publisher.publish(recorded, message(STRING, 1), 0)
+                return bool(side.peer.received("/camera", 1, 0.1))
+
+            assert until(arrives)
+
+
+def test_the_clock_is_that_of_ros(side: Side) -> None:
+    times = [1_700_000_000_000_000_000 + 25_000_000 * number for number in range(40)]
+    with side.open() as publisher:
+        publisher.clock(0)
+        side.peer.subscribe("/clock", "rosgraph_msgs/msg/Clock", reliable=False)
+        assert side.peer.connected("/clock", 1) == 1
+        got: list[bytes] = []
+
+        def heard() -> bool:
+            publisher.clock(0)
+            got[:] = side.peer.received("/clock", 1, 0.02)
+            return bool(got)
+
+        assert until(heard)  # best effort: whoever is connected on one side may not be on both
+        before = len(got)
+        for time_ns in times:
+            publisher.clock(time_ns)
+            time.sleep(0.002)
+        got = side.peer.received("/clock", before + len(times), 2)
+    told = [
+        int.from_bytes(raw[4:8], "little") * 10**9 + int.from_bytes(raw[8:12], "little")
+        for raw in got
+    ]
+    assert told == sorted(told)
+    assert told[-1] == times[-1]
+    assert [one for one in told if one] == times
+
+
+def test_the_clock_of_others_is_followed(side: Side) -> None:
+    heard: list[int] = []
+    with side.open() as publisher:
+        publisher.follow_clock(heard.append)
+        for sec in (1, 2):
+            payload = b"\0\1\0\0" + sec.to_bytes(4, "little") + (7).to_bytes(4, "little")
+            told = sec * 10**9 + 7
+
+            def arrives(payload: bytes = payload, told: int = told) -> bool:
+                kind = "rosgraph_msgs/msg/Clock"
+                side.peer.publish("/clock", kind, payload, reliable=False)
+                return told in heard
+
+            assert until(arrives)
+    assert heard == sorted(heard)
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+@pytest.mark.parametrize("kind", [STRING, "sensor_msgs/msg/Imu"])
+def test_topics_of_others_are_heard_whatever_their_type(
+    side: Side, kind: str, reliable: bool
+) -> None:
+    count = threading.Semaphore(0)
+    with side.open() as publisher:
+        publisher.listen("/trigger", count.release)
+        for number in range(3):
+            side.peer.publish("/trigger", kind, message(kind, number), reliable=reliable)
+        for _ in range(3):
+            assert count.acquire(timeout=30)
+        assert not count.acquire(timeout=0.1)
+
+
+def test_a_topic_to_listen_to_has_to_have_a_name(side: Side) -> None:
+    with side.open() as publisher, pytest.raises(OptionError, match="no topic name"):
+        publisher.listen("/no topic", lambda: None)
+
+
+CALLS: dict[str, tuple[str, dict[str, Any], tuple[Any, ...] | None, dict[str, Any]]] = {
+    "pause": ("Pause", {}, ("pause",), {}),
+    "resume": ("Resume", {}, ("resume",), {}),
+    "toggle_paused": ("TogglePaused", {}, ("toggle_paused",), {}),
+    "is_paused": ("IsPaused", {}, None, {"paused": True}),
+    "get_rate": ("GetRate", {}, None, {"rate": 2.5}),
+    "set_rate": ("SetRate", {"rate": 0.5}, ("set_rate", 0.5), {"success": True}),
+    "play_next": ("PlayNext", {}, ("play_next",), {"success": True}),
+    "burst": ("Burst", {"num_messages": 9}, ("burst", 9), {"actually_burst": 3}),
+    "seek": (
+        "Seek",
+        {"time": SimpleNamespace(sec=5, nanosec=6)},
+        ("seek", 5_000_000_006),
+        {"success": True},
+    ),
+    "stop": ("Stop", {}, ("stop",), {}),
+}
+
+
+def test_the_services_are_those_of_rosbag2(side: Side) -> None:
+    player = Player()
+    with side.open() as publisher:
+        publisher.serve(player)
+        for name, (kind, request, _, reply) in CALLS.items():
+            assert side.peer.call(f"/rosbag2_player/{name}", kind, request) == reply
+    assert player.asked == [asked for _, _, asked, _ in CALLS.values() if asked]
+
+
+def test_services_belong_to_the_node(side: Side) -> None:
+    with side.open(node="other") as publisher:
+        publisher.serve(Player())
+        assert side.peer.call("/other/get_rate", "GetRate", {}) == {"rate": 2.5}
+
+
+def test_who_is_closed_is_gone(side: Side) -> None:
+    recorded = channel("/topic", STRING)
+    with side.open() as publisher:
+        publisher.advertise(recorded)
+        publisher.listen("/silent", lambda: None)
+        side.peer.subscribe("/topic", STRING)
+        assert side.peer.connected("/topic", 1) == 1
+        assert publisher.is_alive
+        assert not publisher.wants_clock
+    assert not publisher.is_alive
+    assert side.peer.connected("/topic", 0) == 0
+    publisher.close()
+
+
+@pytest.mark.parametrize(
+    ("recorded", "says"),
+    [
+        (Channel(1, "/x", "ros1", Schema("std_msgs/String", "ros1msg", b""), {}), "ros1"),
+        (Channel(1, "/x", "", None, {}), "no known encoding"),
+        (Channel(1, "/x y", "cdr", Schema(STRING, "", b""), {}), "such names"),
+        (Channel(1, "/x", "cdr", Schema("nonsense", "", b""), {}), "nonsense"),
+        (Channel(1, "/x", "cdr", None, {}), "''"),
+    ],
+)
+def test_what_ros2_cannot_have_is_told(side: Side, recorded: Channel, says: str) -> None:
+    with side.open() as publisher, pytest.raises(ConversionError, match=says) as told:
+        publisher.advertise(recorded)
+    assert recorded.topic in str(told.value)
+
+
+@pytest.fixture
+def bus(monkeypatch: pytest.MonkeyPatch) -> fake_rclpy.Bus:
+    return fake_rclpy.install(monkeypatch)
+
+
+def test_rclpy_has_to_have_the_type(bus: fake_rclpy.Bus) -> None:
+    with RclpyPublisher() as publisher, pytest.raises(ConversionError, match="not installed"):
+        publisher.advertise(channel("/x", "sensor_msgs/msg/JointState"))
+
+
+def test_rclpy_tells_of_a_topic_whose_type_it_has_not(bus: fake_rclpy.Bus) -> None:
+    peer = fake_rclpy.FakePeer(bus)
+    bus.kinds["own/msg/Own"] = SimpleNamespace(type_name="own/msg/Own")
+    peer.advertise("/own", "own/msg/Own")
+    del bus.kinds["own/msg/Own"]
+    with RclpyPublisher() as publisher:
+        publisher.listen("/own", lambda: None)
+        assert until(lambda: bus.errors)
+    assert "'own/msg/Own' is not installed" in bus.errors[0]
+
+
+def test_rclpy_reads_a_big_endian_clock(bus: fake_rclpy.Bus) -> None:
+    heard: list[int] = []
+    payload = b"\0\0\0\0" + (5).to_bytes(4, "big") + (6).to_bytes(4, "big")
+    with RclpyPublisher() as publisher:
+        publisher.follow_clock(heard.append)
+        fake_rclpy.FakePeer(bus).publish("/clock", "rosgraph_msgs/msg/Clock", payload)
+        assert until(lambda: heard)
+    assert heard == [5_000_000_006]
+
+
+def test_rclpy_gets_the_whole_quality_of_service(bus: fake_rclpy.Bus) -> None:
+    qos = Qos(
+        history="keep_all",
+        depth=4,
+        reliability="best_effort",
+        durability="transient_local",
+        deadline_ns=1,
+        lifespan_ns=2,
+        liveliness="manual_by_topic",
+        lease_ns=3,
+        avoid_ros_namespace_conventions=True,
+    )
+    with RclpyPublisher(overrides={"/x": qos}) as publisher:
+        publisher.advertise(channel("/x", STRING))
+        got = bus.publishers[0].qos
+    assert (got.history.name, got.depth) == ("KEEP_ALL", 4)
+    assert (got.reliability.name, got.durability.name) == ("BEST_EFFORT", "TRANSIENT_LOCAL")
+    assert (got.deadline.nanoseconds, got.lifespan.nanoseconds) == (1, 2)
+    assert got.liveliness.name == "MANUAL_BY_TOPIC"
+    assert got.liveliness_lease_duration.nanoseconds == 3
+    assert got.avoid_ros_namespace_conventions
+
+
+def test_rclpy_passes_messages_on_as_they_are(bus: fake_rclpy.Bus) -> None:
+    recorded = channel("/x", STRING)
+    payload = message(STRING, 1, little_endian=False)[:-1]
+    peer = fake_rclpy.FakePeer(bus)
+    with RclpyPublisher() as publisher:
+        publisher.advertise(recorded)
+        peer.subscribe("/x", STRING)
+        publisher.publish(recorded, payload, 0)
+    assert peer.received("/x", 1) == [payload]
+
+
+def test_rclpy_may_be_shut_down_from_outside(bus: fake_rclpy.Bus) -> None:
+    with RclpyPublisher() as publisher:
+        publisher.advertise(channel("/x", STRING))
+        bus.publishers[0].node.context.try_shutdown()
+        assert not publisher.is_alive
+
+
+def test_services_may_be_missing_in_a_ros(
+    bus: fake_rclpy.Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "rosbag2_interfaces.srv", None)
+    with RclpyPublisher() as publisher:
+        publisher.serve(Player())
+    assert not bus.services
+
+
+def test_without_a_ros_that_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    with pytest.raises(PublishError, match="source a ROS 2"):
+        RclpyPublisher()
+
+
+INFINITE = (
+    {"sec": 9223372036, "nsec": 854775807},
+    {"sec": 2147483647, "nsec": 4294967295},
+    {"sec": 2147483647, "nsec": 2147483647},
+)
+
+
+def profile(style: str, infinity: dict[str, int], **other: Any) -> str:
+    """A recorded profile, as numbers before version 9 of the metadata, then as names."""
+    policies: dict[str, Any] = {
+        "history": 3 if style == "numbers" else "unknown",
+        "depth": 0,
+        "reliability": 2 if style == "numbers" else "best_effort",
+        "durability": 2 if style == "numbers" else "volatile",
+        "deadline": infinity,
+        "lifespan": infinity,
+        "liveliness": 1 if style == "numbers" else "automatic",
+        "liveliness_lease_duration": infinity,
+        "avoid_ros_namespace_conventions": "false",
+        **other,
+    }
+    lines = []
+    for key, value in policies.items():
+        if isinstance(value, dict):
+            lines += [f"  {key}:", *(f"    {part}: {number}" for part, number in value.items())]
+        else:
+            lines.append(f"  {key}: {value}")
+    return "-" + "\n".join(lines)[1:]
+
+
+@pytest.mark.parametrize("style", ["numbers", "names"])
+@pytest.mark.parametrize("infinity", [*INFINITE, {"sec": 0, "nsec": 0}])
+def test_recorded_profiles_are_read(style: str, infinity: dict[str, int]) -> None:
+    assert recorded_qos(profile(style, infinity)) == (Qos(reliability="best_effort"),)
+
+
+def test_policies_with_a_limit_are_read() -> None:
+    text = profile(
+        "names",
+        INFINITE[0],
+        deadline={"sec": 1, "nsec": 5},
+        lifespan={"sec": 0, "nsec": 7},
+        liveliness="manual_by_topic",
+        liveliness_lease_duration={"sec": 3, "nsec": 0},
+        avoid_ros_namespace_conventions="true",
+    )
+    assert recorded_qos(text) == (
+        Qos(
+            reliability="best_effort",
+            deadline_ns=1_000_000_005,
+            lifespan_ns=7,
+            liveliness="manual_by_topic",
+            lease_ns=3_000_000_000,
+            avoid_ros_namespace_conventions=True,
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "[]", "nonsense", "- 1", "{", "- reliability: [1]\n  depth: many\n  deadline: 3", "- {}"],
+)
+def test_profiles_that_say_nothing_are_the_default(text: str) -> None:
+    assert offered_qos(channel("/x", STRING, qos=text), {}) == Qos()
+
+
+@pytest.mark.parametrize(
+    ("profiles", "expected"),
+    [
+        ([{}], Qos(reliability="best_effort")),
+        ([{}, {"lifespan": {"sec": 1, "nsec": 0}}], Qos(reliability="best_effort")),
+        ([{}, {"reliability": "reliable"}], Qos()),
+        ([{}, {"durability": "transient_local"}], Qos()),
+        ([{}, {"deadline": {"sec": 1, "nsec": 0}}], Qos()),
+        ([{"history": "keep_last", "depth": 1}], Qos(reliability="best_effort")),
+        ([{"history": "keep_all"}], Qos(reliability="best_effort")),
+        (
+            [{"history": "keep_last", "depth": 2, "durability": "transient_local"}],
+            Qos(reliability="best_effort", durability="transient_local", depth=2),
+        ),
+        (
+            [{"history": "keep_last", "depth": 10**30, "durability": "transient_local"}],
+            Qos(reliability="best_effort", durability="transient_local"),
+        ),
+    ],
+)
+def test_the_player_offers_what_all_recorded_publishers_did(
+    profiles: list[dict[str, Any]], expected: Qos
+) -> None:
+    text = "\n".join(profile("names", INFINITE[0], **other) for other in profiles)
+    recorded = channel("/x", STRING, qos=text)
+    assert offered_qos(recorded, {}) == expected
+    assert offered_qos(recorded, {"/other": Qos(depth=7)}) == expected
+    assert offered_qos(recorded, {"/x": Qos(depth=7)}) == Qos(depth=7)
+
+
+def test_latching_of_ros1_is_kept() -> None:
+    expected = replace(Qos(), depth=1, durability="transient_local")
+    assert offered_qos(channel("/x", STRING, qos=LATCHED_QOS), {}) == expected
+
+
+def test_overrides_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "qos.yaml"
+    path.write_text(
+        "/test_topic:\n"
+        "  history: keep_all\n  depth: 0\n  reliability: reliable\n"
+        "  durability: transient_local\n  deadline:\n    # unspecified\n    sec: 0\n    nsec: 0\n"
+        "  lifespan:\n    sec: 1\n    nsec: 5\n  liveliness: manual_by_topic\n"
+        "  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
+        "  avoid_ros_namespace_conventions: true\n"
+        "/other:\n  reliability: best_effort\n"
+    )
+    assert load_overrides(path) == {
+        "/test_topic": Qos(
+            history="keep_all",
+            depth=1,
+            durability="transient_local",
+            lifespan_ns=1_000_000_005,
+            liveliness="manual_by_topic",
+            avoid_ros_namespace_conventions=True,
+        ),
+        "/other": Qos(reliability="best_effort"),
+    }
+
+
+def test_an_empty_file_overrides_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "qos.yaml"
+    path.write_text("# nothing yet\n")
+    assert load_overrides(path) == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("- 1", "no map of topics"),
+        ("{", "not valid YAML"),
+        ("a: &a [*a]", "a: is no QoS profile"),
+        ("1: {depth: 1}", "1 is no topic name"),
+        ("/x: 1", "/x: is no QoS profile"),
+        ("/x: {depth: -1}", "depth: -1 is no whole number"),
+        ("/x: {depth: true}", "depth: True is no whole number"),
+        ("/x: {dept: 1}", "dept: is no QoS policy. Use history"),
+        ("/x: {reliability: mostly}", "'mostly' is not known. Use reliable, best_effort"),
+        ("/x: {reliability: [1]}", "is not known"),
+        ("/x: {deadline: {sec: 1}}", "deadline: is no duration"),
+        ("/x: {deadline: {sec: -1, nsec: 0}}", "whole numbers from 0"),
+        ("/x: {deadline: {sec: 1.5, nsec: 0}}", "whole numbers from 0"),
+        ("/x: {avoid_ros_namespace_conventions: 1}", "neither true nor false"),
+        ("[" * 5000, "not valid YAML"),
+    ],
+)
+def test_bad_overrides_are_told(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "qos.yaml"
+    path.write_text(text)
+    with pytest.raises(OptionError) as told:
+        load_overrides(path)
+    assert says in str(told.value)
+    assert str(path) in str(told.value)
+
+
+def test_a_file_of_overrides_that_is_none_is_told(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="cannot be read"):
+        load_overrides(tmp_path / "missing.yaml")
+    (tmp_path / "image.png").write_bytes(b"\x89PNG\r\n\x1a\n\0\0")
+    with pytest.raises(OptionError, match="not valid YAML"):
+        load_overrides(tmp_path / "image.png")
+    (tmp_path / "large.yaml").write_bytes(b"#" * (2**20 + 1))
+    with pytest.raises(OptionError, match="too large"):
+        load_overrides(tmp_path / "large.yaml")

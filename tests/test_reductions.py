@@ -1,0 +1,562 @@
+"""Smaller and fewer images: ``unpack --resize``, ``--every`` and ``--max-rate``."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import mp4ds
+from coded_scenes import CODED, MakeScene
+from definitions import COMPRESSED, IMAGE, INFO
+from foxglove_scenes import FOXGLOVE
+from mp4ds.dataset import Dataset
+from mp4ds.errors import FormatError, OptionError
+from mp4ds.packing import PackOptions
+from mp4ds.records import Message
+from mp4ds.republish import Reduction, Republisher
+from mp4ds.republish.reduction import at_most, times_of
+from mp4ds.sidecar import MANIFEST_NAME
+from mp4ds.streams.rebuild import DecodedColumns
+from mp4ds.unpacking import UnpackOptions
+from pictures import picture, pixels
+from republished import CAMERAS, Read, file_picture, psnr, read
+from scenes import Record, Scene, odd_scene, scene
+from test_republish import Packed, on, still
+
+TOPIC = "/cam/image_raw"
+RAW = [
+    *("mono8", "8UC1", "rgb8", "bgr8", "rgba8", "bgra8", "8UC3", "mono16", "16UC1", "rgb16"),
+    *("bayer_rggb8", "bayer_grbg16", "yuv422", "nv21", "8SC1", "32FC1", "64FC1"),
+]
+SCENES: dict[str, MakeScene | Callable[[], Scene]] = {
+    **{f"raw-{name}": partial(scene, name) for name in RAW},
+    "raw-padded": partial(scene, "mono8", pad=5),
+    "raw-big-endian": partial(scene, "mono16", big_endian=True),
+    **CODED,
+}
+RESIZED = [
+    *(f"raw-{name}" for name in RAW),
+    *("raw-padded", "raw-big-endian", "jpeg-rgb", "jpeg-gray", "jpeg-progressive"),
+    *("png-rgba-cv2", "png-gray-cv2", "png-16-bit-pillow", "depth-16UC1-png", "depth-16UC1-rvl"),
+    *("depth-32FC1-png", "video-h264", "video-h265", "video-av1", "video-vp9", "ffmpeg-libx264"),
+]
+SIZES: list[Any] = [0.5, (40, 30), (100, 20)]
+TARGETS = ["bag", "rosbag2", "mcap"]
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Packed]]:
+    """Packs a scene once: its name, and that of the source."""
+    found: dict[tuple[str, str], Packed] = {}
+
+    def pack(name: str, source: str = "mcap-ros2-zstd") -> Packed:
+        if (name, source) not in found:
+            folder = tmp_path_factory.mktemp("packed")
+            found[name, source] = Packed(folder, SCENES[name](), source)
+        return found[name, source]
+
+    yield pack
+    found.clear()
+
+
+def image_of(message: Read) -> NDArray[Any]:
+    """The pixels in the order in which the message has them; those of a file as OpenCV has them."""
+    if message.type_name == IMAGE:
+        return pixels(vars(message.value))
+    image = cv2.imdecode(message.value.data, cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return image
+
+
+def rows(messages: Iterable[Read]) -> list[tuple[Any, ...]]:
+    """All of the messages, to be compared."""
+    return [
+        (m.topic, m.type_name, m.log_time, m.publish_time, m.sequence, m.payload, m.metadata)
+        for m in messages
+    ]
+
+
+def frames_of(made: Packed, resize: Any, topic: str | None = None) -> list[mp4ds.Frame]:
+    """What the library gives for the frames of the same size."""
+    with mp4ds.open(made.folder / "dataset") as dataset:
+        stream = dataset[topic or made.topic]
+        colour = "bayer" in stream.encoding or stream.encoding in ("yuv422", "nv21")
+        return stream.get(range(len(stream)), resize=resize, format="rgb" if colour else "native")
+
+
+# ---------------------------------------------------------------- smaller
+
+
+@pytest.mark.parametrize(
+    ("name", "to", "resize"),
+    [
+        (name, TARGETS[number % 3], SIZES[number % len(SIZES)] if number % 2 else 0.5)
+        for number, name in enumerate(RESIZED)
+    ],
+)
+def test_images_are_those_of_the_frames(
+    packed: Callable[..., Packed], name: str, to: str, resize: Any
+) -> None:
+    made = packed(name)
+    frames = frames_of(made, resize)
+    summary, messages = made.unpack(to, None, resize=resize)
+    assert summary.as_recorded == {}
+    assert summary.thinned == {}
+    found = [message for message in messages if message.type_name in CAMERAS]
+    is_moved = name.startswith(("video", "ffmpeg", "depth"))
+    assert bool(summary.republished) == is_moved
+    assert ({message.topic for message in found} == {made.topic}) != is_moved
+    assert len(found) == len(made.cameras) == len(frames)
+    for message, frame, record in zip(found, frames, made.cameras, strict=True):
+        header = record.values.get("header") or {"stamp": record.values["timestamp"]}
+        assert message.stamp == header["stamp"]
+        assert message.log_time == record.log_time
+        image = image_of(message)
+        if message.type_name == IMAGE:
+            check_raw(name, message, image, frame)
+        elif name.startswith("jpeg"):
+            assert message.value.format == record.values["format"]
+            data = frame.data if frame.data.ndim == 2 else frame.data[..., ::-1]
+            assert image.shape == data.shape
+            assert psnr(image, data) > 38
+        else:
+            assert bytes(message.value.data[1:4]) == b"PNG"
+            order = [2, 1, 0, 3][: image.shape[2]] if image.ndim == 3 else []
+            assert np.array_equal(image[..., order] if order else image, frame.data)
+
+
+def check_raw(name: str, message: Read, image: NDArray[Any], frame: mp4ds.Frame) -> None:
+    value = message.value
+    assert (value.height, value.width) == frame.data.shape[:2]
+    assert value.is_bigendian == 0
+    assert value.step == frame.data[0].nbytes or name == "depth-32FC1-png"
+    if name != "depth-32FC1-png":  # whose frames are inverse depths
+        assert value.encoding == frame.encoding
+        assert image.dtype == frame.data.dtype
+        assert np.array_equal(image, frame.data, equal_nan=image.dtype.kind == "f")
+    else:
+        assert value.encoding == "32FC1"
+        assert image.shape == frame.data.shape
+        assert np.array_equal(np.isnan(image), frame.data == 0)
+
+
+@pytest.mark.parametrize("kind", ["raw", "jpeg", "png"])
+@pytest.mark.parametrize("name", ["raw-rgb8", "raw-bayer_rggb8", "jpeg-rgb", "video-h264"])
+def test_smaller_images_of_another_kind(
+    packed: Callable[..., Packed], name: str, kind: str
+) -> None:
+    made = packed(name)
+    summary, messages = made.unpack("mcap", kind, resize=0.5)
+    type_name = IMAGE if kind == "raw" else COMPRESSED
+    found = [message for message in messages if message.type_name == type_name]
+    assert len(found) == len(made.cameras)
+    assert summary.as_recorded == {}
+    for message, frame in zip(found, frames_of(made, 0.5), strict=True):
+        image = image_of(message)
+        data = frame.data if kind == "raw" else frame.data[..., ::-1]
+        if kind == "jpeg":
+            assert psnr(image, data) > 30
+        else:
+            assert np.array_equal(image, data)
+
+
+def test_a_mosaic_in_a_png_file_becomes_colours(tmp_path: Path) -> None:
+    """A file that shows one says so in its format alone."""
+    made = Packed(tmp_path, still("bayer_rggb8", "bayer_rggb8; png compressed "), "bag-none")
+    summary, messages = made.unpack("bag", None, resize=0.5)
+    found = [message for message in messages if message.type_name == COMPRESSED]
+    assert summary.as_recorded == {}
+    assert {message.value.format for message in found} == {"rgb8; png compressed bgr8"}
+    colour = picture("rgb8", frame=0, width=64, height=48, rng=None)
+    small = cv2.resize(colour, (32, 24), interpolation=cv2.INTER_AREA)
+    for message in found:
+        assert psnr(file_picture(message.value.data.tobytes()), small) > 25
+
+
+@pytest.mark.parametrize("resize", [1.0, (64, 48)])
+def test_the_same_size_stays_as_recorded(packed: Callable[..., Packed], resize: Any) -> None:
+    for name in ("raw-padded", "jpeg-rgb", "video-h264"):
+        made = packed(name)
+        plain = made.unpack("mcap", None)[1]
+        assert rows(made.unpack("mcap", None, resize=resize)[1]) == rows(plain)
+
+
+@pytest.mark.parametrize("name", ["raw-mono8", "jpeg-rgb", "video-h264"])
+@pytest.mark.parametrize("to", TARGETS)
+def test_calibrations_are_made_to_match(packed: Callable[..., Packed], name: str, to: str) -> None:
+    made = packed(name)
+    messages = made.unpack(to, None, resize=(40, 30))[1]
+    found = [message.value for message in messages if message.type_name == INFO]
+    frames = frames_of(made, (40, 30))
+    assert len(found) == len(frames)
+    for value, frame in zip(found, frames, strict=True):
+        upper = to == "bag"
+        k, p, d = (getattr(value, key.upper() if upper else key) for key in "kpd")
+        assert (value.width, value.height) == (40, 30)
+        assert frame.intrinsics is not None
+        assert np.allclose(k, frame.intrinsics.k)
+        assert np.allclose(p, frame.intrinsics.p)
+        assert np.allclose(d, frame.intrinsics.d)
+        assert np.isclose(k[0], 0.9 * 64 * 40 / 64)
+        assert np.isclose(k[2], 64 / 2 * 40 / 64 - 0.5)
+        assert np.isclose(k[4], 0.9 * 64 * 30 / 48)
+        assert (value.binning_x, value.binning_y, value.roi.width) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("source", ["protobuf", "json", "flatbuffer"])
+def test_cameras_of_foxglove(source: str, tmp_path: Path) -> None:
+    """Their smaller images are ROS messages; their calibrations stay and are told."""
+    for name in ("raw-rgb8", "jpeg-rgb", "video-h264"):
+        made = Packed(tmp_path / name, FOXGLOVE[name](), f"mcap-{source}")
+        with mp4ds.open(made.folder / "dataset") as dataset:
+            infos = [s.sidecar.camera_info for s in dataset.streams if s.sidecar.camera_info]
+            counts = {info.channel.topic: info.messages for info in infos if info.messages}
+        summary, messages = made.unpack("mcap", None, resize=0.5)
+        assert {topic: sum(r.values()) for topic, r in summary.as_recorded.items()} == counts
+        topic = summary.republished[made.topic].topic
+        found = [message for message in messages if message.topic == topic]
+        for message, frame in zip(found, frames_of(made, 0.5), strict=True):
+            image = image_of(message)
+            if name == "jpeg-rgb":
+                assert psnr(image, frame.data[..., ::-1]) > 38
+            else:
+                assert np.array_equal(image, frame.data)
+
+
+def test_other_topics_stay(packed: Callable[..., Packed]) -> None:
+    made = packed("raw-mono8")
+    options: dict[str, Any] = {"resize": 0.5, "every": 3, "max_rate": 9.0}
+    plain, less = (made.unpack("mcap", None, **how)[1] for how in ({}, options))
+    others = [[m for m in found if not m.topic.startswith("/cam")] for found in (plain, less)]
+    assert rows(others[0]) == rows(others[1])
+    assert len(less) < len(plain)
+
+
+def test_what_no_video_holds_is_told(tmp_path: Path) -> None:
+    made = Packed(tmp_path, odd_scene("data-empty"), "mcap-ros2-zstd")
+    summary, messages = made.unpack("mcap", None, resize=0.5, every=2)
+    with mp4ds.open(made.folder / "dataset") as dataset:
+        assert dataset.manifest is not None
+        verbatim = {entry.reason: entry.messages for entry in dataset.manifest.verbatim}
+    expected = {f"stored as it was: {reason}": count for reason, count in verbatim.items()}
+    assert summary.as_recorded == {"/odd/image": expected}
+    (count,) = expected.values()
+    sizes = Counter(m.value.width for m in messages if m.type_name == IMAGE)
+    assert sizes == {32: count, 16: (8 - count + 1) // 2}
+    assert summary.thinned == {"/odd/image": (8 - count) // 2}
+
+
+# ---------------------------------------------------------------- fewer
+
+
+AS_RECORDED = ["raw-mono8", "raw-padded", "jpeg-rgb", "png-rgba-cv2", "depth-32FC1-rvl"]
+
+
+@pytest.mark.parametrize("name", [*AS_RECORDED, "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"])
+@pytest.mark.parametrize("every", [2, 3, 100])
+def test_fewer_messages_are_as_recorded(
+    packed: Callable[..., Packed], name: str, every: int
+) -> None:
+    made = packed(name)
+    plain = made.unpack("mcap", None)[1]
+    summary, less = made.unpack("mcap", None, every=every)
+    stamps = {record.values["header"]["stamp"] for record in made.cameras[::every]}
+    paired = [m for m in plain if m.type_name in (*CAMERAS, INFO) and m.stamp not in stamps]
+    left_out = {id(message) for message in paired}
+    assert rows(less) == rows(message for message in plain if id(message) not in left_out)
+    assert summary.thinned == Counter(message.topic for message in paired)
+    assert summary.as_recorded == {}
+    assert summary.republished == {}
+
+
+@pytest.mark.parametrize(("rate", "kept"), [(1000.0, 8), (30.0, 8), (15.0, 4), (10.0, 3), (0.1, 1)])
+def test_a_rate(packed: Callable[..., Packed], rate: float, kept: int) -> None:
+    """Of a camera of 30 Hz whose stamps jitter."""
+    made = packed("raw-mono8")
+    summary, messages = made.unpack("mcap", None, max_rate=rate)
+    found = [message for message in messages if message.type_name == IMAGE]
+    assert len(found) == kept
+    assert [m.type_name for m in messages].count(INFO) == kept
+    assert summary.thinned == ({TOPIC: 8 - kept, "/cam/camera_info": 8 - kept} if kept < 8 else {})
+
+
+@pytest.mark.parametrize("name", ["video-h264", "video-vp9", "ffmpeg-libx264"])
+def test_packets_that_refer_to_others_stay(packed: Callable[..., Packed], name: str) -> None:
+    made = packed(name)
+    summary, messages = made.unpack("mcap", None, every=2)
+    assert rows(messages) == rows(made.unpack("mcap", None)[1])
+    reason = (
+        "packets of a video refer to each other, so that none can be left out; give another form"
+    )
+    assert summary.as_recorded == {made.topic: {reason: len(made.cameras)}}
+    assert summary.thinned == {}
+    summary, messages = made.unpack("mcap", "raw", every=2)
+    found = [message for message in messages if message.type_name == IMAGE]
+    assert len(found) == len(made.cameras) / 2
+    for message, frame in zip(found, frames_of(made, None)[::2], strict=True):
+        assert np.array_equal(image_of(message), frame.data)
+
+
+def test_packets_that_are_all_key_frames(tmp_path: Path) -> None:
+    one = CODED["video-h264"](frames=1)
+    (key,) = (record for record in one.messages if record.topic == "/cam/video")
+    period = 33_000_000
+    records = [
+        Record(
+            key.topic,
+            key.msgtype,
+            key.log_time + n * period,
+            {**key.values, "timestamp": key.values["timestamp"] + n * period},
+        )
+        for n in range(6)
+    ]
+    made = Packed(tmp_path, Scene(records), "mcap-ros2-zstd")
+    plain = made.unpack("mcap", None)[1]
+    assert rows(made.unpack("mcap", None, every=2)[1]) == rows(plain[::2])
+
+
+def test_calibrations_whose_stamps_no_image_has(tmp_path: Path) -> None:
+    made = scene("mono8", frames=9)
+    records = []
+    for record in made.messages:
+        records.append(record)
+        if record.msgtype == INFO:
+            values = dict(record.values)
+            values["header"] = {**values["header"], "stamp": values["header"]["stamp"] + 5}
+            records.append(Record(record.topic, INFO, record.log_time + 7, values))
+    packed_ = Packed(tmp_path, Scene(records), "mcap-ros2-zstd")
+    summary, messages = packed_.unpack("mcap", None, every=3)
+    assert [m.type_name for m in messages].count(INFO) == 9 + 3
+    assert summary.thinned == {TOPIC: 6, "/cam/camera_info": 6}
+
+
+def test_every_stream_by_itself(tmp_path: Path) -> None:
+    """A topic that changes its size, and a second camera; with calibrations that are not asked."""
+    second = on("/other/image_raw", scene("rgb8", frames=5))
+    changing = odd_scene("size-change", frames=9)
+    messages = sorted([*second.messages, *changing.messages], key=lambda record: record.log_time)
+    made = Packed(tmp_path, Scene(messages), "bag-none")
+    summary, found = made.unpack("bag", None, every=2, exclude=["/chatter"])
+    assert summary.thinned == {"/odd/image": 4, "/other/image_raw": 2}
+    heights = [message.value.height for message in found if message.topic == "/odd/image"]
+    assert heights == [24, 24, 12, 12, 12]
+
+
+def test_calibrations_stay_where_images_are_not_wanted(packed: Callable[..., Packed]) -> None:
+    made = packed("raw-mono8")
+    summary, messages = made.unpack("mcap", None, every=2, resize=0.5, exclude=[TOPIC])
+    plain = made.unpack("mcap", None, exclude=[TOPIC])[1]
+    assert rows(messages) == rows(plain)
+    assert summary.thinned == {}
+    summary, messages = made.unpack("mcap", None, every=2, exclude=["/cam/camera_info"])
+    assert summary.thinned == {TOPIC: 4}
+
+
+@pytest.mark.parametrize("how", [{"every": 2}, {"resize": 0.5}, {"every": 2, "resize": 0.5}])
+def test_damage_is_found(how: dict[str, Any], tmp_path: Path) -> None:
+    """The whole video is compared with its hash where messages have no digests; all are counted."""
+    options = PackOptions(quality="visual")
+    made = Packed(tmp_path, scene("rgb8"), "mcap-ros2-zstd", options)
+    video = next((tmp_path / "dataset").glob("*.mp4"))
+    whole = video.read_bytes()
+    video.write_bytes(whole + b"\0\0\0\x08free")
+    with pytest.raises(FormatError) as caught:
+        made.unpack("mcap", None, **how)
+    assert caught.value.code == "hash-mismatch"
+    video.write_bytes(whole)
+    manifest = tmp_path / "dataset" / MANIFEST_NAME
+    text = manifest.read_text("utf-8")
+    with mp4ds.open(tmp_path / "dataset") as dataset:
+        assert dataset.manifest is not None
+        count = dataset.manifest.messages
+    assert f"messages: {count}\n" in text
+    changed = text.replace(f"messages: {count}\n", f"messages: {count + 1}\n")
+    manifest.write_text(changed.partition("checksum:")[0], "utf-8")
+    with pytest.raises(FormatError) as caught:
+        made.unpack("mcap", None, **how)
+    assert caught.value.code == "message-count"
+
+
+# ---------------------------------------------------------------- from a place on
+
+
+@pytest.mark.parametrize("kind", [None, "raw", "jpeg"])
+def test_reduced_messages_from_a_time_on(packed: Callable[..., Packed], kind: str | None) -> None:
+    made = packed("raw-mono8")
+    with Dataset(made.folder / "dataset") as dataset:
+        republisher = Republisher(
+            dataset,
+            kind,
+            encoding="cdr",
+            selected=lambda topic: True,
+            jpeg_quality=95,
+            reduction=Reduction(0.5, 2),
+        )
+        whole = messages_of(dataset, republisher, None)
+        start = whole[len(whole) // 2][1]
+        wanted = [item for item in whole if item[1] >= start]
+        assert Counter(messages_of(dataset, republisher, start)) == Counter(wanted)
+        made_ids = {item.id for item in republisher.channels}
+        assert {item.id for item in dataset.channels if republisher.makes(item)} == set()
+        assert all(republisher.makes(item) for item in republisher.channels)
+        assert bool(made_ids) == (kind == "jpeg")
+
+
+def messages_of(
+    dataset: Dataset, republisher: Republisher, start: int | None
+) -> list[tuple[str, int, bytes]]:
+    records = dataset.records(republisher.sources, start=start)
+    return [
+        (record.channel.topic, record.log_time, bytes(record.data))
+        for record in records
+        if isinstance(record, Message)
+    ]
+
+
+# ---------------------------------------------------------------- image files
+
+
+@pytest.mark.parametrize("image_format", ["png", "jpeg"])
+@pytest.mark.parametrize("name", ["raw-rgb8", "raw-bayer_rggb8", "jpeg-rgb", "video-h264"])
+def test_folders_of_images(
+    packed: Callable[..., Packed], name: str, image_format: str, tmp_path: Path
+) -> None:
+    made = packed(name)
+    options = UnpackOptions(image_format=image_format, resize=0.5, every=3, force=True)
+    summary = mp4ds.unpack(made.folder / "dataset", "images", tmp_path / "out", options)
+    numbers = list(range(0, len(made.cameras), 3))
+    assert summary.messages == {made.topic: len(numbers)}
+    assert summary.thinned == {made.topic: len(made.cameras) - len(numbers)}
+    (folder,) = (tmp_path / "out").iterdir()
+    with (folder / "stamps.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["file"].partition(".")[0]) for row in rows] == numbers
+    frames = frames_of(made, 0.5)
+    for row, number in zip(rows, numbers, strict=True):
+        assert int(row["stamp_ns"]) == frames[number].stamp_ns
+        image = file_picture((folder / row["file"]).read_bytes())
+        if image_format == "png":
+            assert np.array_equal(image, frames[number].data)
+        else:
+            assert psnr(image, frames[number].data) > 30
+
+
+# ---------------------------------------------------------------- rates
+
+
+def camera(rate: float, frames: int = 600, jitter: int = 0, seed: int = 0) -> NDArray[np.int64]:
+    rng = np.random.default_rng(seed)
+    times = 10**18 + np.round(np.arange(frames) * 1e9 / rate).astype(np.int64)
+    return times + rng.integers(-jitter, jitter + 1, frames)
+
+
+@pytest.mark.parametrize("jitter", [0, 1_000, 1_000_000, 7_000_000])
+@pytest.mark.parametrize("rate", [10.0, 15.0, 29.97, 30.0, 60.0])
+def test_a_camera_of_the_rate_loses_nothing(rate: float, jitter: int) -> None:
+    for seed in range(20):
+        times = camera(rate, jitter=round(min(jitter, 0.2e9 / rate)), seed=seed)
+        assert at_most(rate, times).all()
+        assert at_most(2 * rate, times).all()
+
+
+@pytest.mark.parametrize("jitter", [0, 3_000_000])
+@pytest.mark.parametrize("part", [1, 2, 3, 4, 5, 7, 30])
+def test_parts_of_a_rate(part: int, jitter: int) -> None:
+    """Frames at equal distances, whatever the jitter."""
+    kept = np.flatnonzero(at_most(30 / part, camera(30.0, jitter=jitter)))
+    assert kept.tolist() == list(range(0, 600, part))
+
+
+@pytest.mark.parametrize("jitter", [0, 3_000_000])
+@pytest.mark.parametrize("rate", [1.0, 7.0, 12.5, 20.0, 24.0, 29.0])
+def test_any_rate_holds_on_the_average(rate: float, jitter: int) -> None:
+    times = camera(30.0, jitter=jitter)
+    count = int(at_most(rate, times).sum())
+    assert count == pytest.approx(rate * 20, abs=2)
+
+
+def test_gaps_and_clocks_that_are_set_back() -> None:
+    first = camera(30.0, 30)
+    later = camera(30.0, 30) + 3_600 * 10**9 + 12_345_678
+    for times in (np.concatenate([first, later]), np.concatenate([later, first])):
+        kept = np.flatnonzero(at_most(10.0, times))
+        assert kept.tolist() == list(range(0, 60, 3))
+    assert at_most(10.0, np.array([5, 5, 5, 5])).tolist() == [True, False, False, False]
+    assert at_most(10.0, np.array([5])).tolist() == [True]
+
+
+@pytest.mark.parametrize("stamps", ["zero", "backward", "sound", "doubled"])
+def test_times_are_stamps_or_log_times(stamps: str) -> None:
+    log = camera(30.0, 10)
+    stamp = {
+        "zero": np.zeros(10, np.int64),
+        "backward": log[::-1].copy(),
+        "sound": log - 5,
+        "doubled": np.repeat(log[::3], 3)[:10],
+    }[stamps]
+    zeros = np.zeros(10, np.int64)
+    columns = DecodedColumns(log, log, zeros, stamp, None, None, zeros, np.arange(10))
+    assert times_of(columns) is (stamp if stamps == "sound" else log)
+
+
+# ---------------------------------------------------------------- options
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        *({"resize": value} for value in (0, -1.0, float("nan"), float("inf"), True, "0.5", 1e9)),
+        *(
+            {"resize": value}
+            for value in ((0, 1), (1,), (1, 2, 3), (1.5, 2), (True, 2), (10**6, 1))
+        ),
+        *({"every": value} for value in (0, -1, 1.5, True, "2", None)),
+        *({"max_rate": value} for value in (0, -1.0, float("nan"), float("inf"), True, "3")),
+    ],
+    ids=repr,
+)
+def test_what_is_no_reduction(options: dict[str, Any]) -> None:
+    with pytest.raises(OptionError, match=r"--(resize|every|max-rate) .* use "):
+        Reduction(**options)
+
+
+@pytest.mark.parametrize("options", [{"resize": 0.5}, {"every": 2}, {"max_rate": 3.0}], ids=repr)
+@pytest.mark.parametrize("kind", ["compressed-video", "ffmpeg"])
+def test_video_is_given_as_it_is(
+    packed: Callable[..., Packed], kind: str, options: dict[str, Any]
+) -> None:
+    with pytest.raises(OptionError, match="Use raw, jpeg or png"):
+        packed("raw-mono8").unpack("mcap", kind, **options)
+
+
+def test_a_size_beyond_what_images_have(packed: Callable[..., Packed], tmp_path: Path) -> None:
+    dataset = packed("raw-mono8").folder / "dataset"
+    with pytest.raises(OptionError, match="cannot be resized to 16000"):
+        mp4ds.unpack(dataset, "mcap", tmp_path / "x.mcap", UnpackOptions(resize=16000.0))
+    assert not (tmp_path / "x.mcap").exists()
+
+
+def test_the_command_line(packed: Callable[..., Packed], tmp_path: Path) -> None:
+    dataset = packed("raw-mono8").folder / "dataset"
+    command = [sys.executable, "-m", "mp4ds", "unpack", str(dataset), "--to", "mcap"]
+    command += ["--resize", "32x24", "--every", "2", "--max-rate", "1000"]
+    output = tmp_path / "a.mcap"
+    done = subprocess.run([*command, "-o", str(output)], capture_output=True, text=True, check=True)
+    assert f"{TOPIC}: 4 messages left out" in done.stdout.splitlines()
+    images = [message.value for message in read(output) if message.type_name == IMAGE]
+    assert [(value.width, value.height) for value in images] == [(32, 24)] * 4
+    again = [*command, "-o", str(tmp_path / "b.mcap"), "--json"]
+    done = subprocess.run(again, capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout)["thinned"] == {TOPIC: 4, "/cam/camera_info": 4}

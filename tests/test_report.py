@@ -1,0 +1,807 @@
+"""The report: its figures and columns, its proxies, and what it may replace."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import http.client
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import mp4ds
+from coded_scenes import CODED
+from mp4ds.errors import OptionError, SourceError, TargetError, TargetExistsError
+from mp4ds.report import ReportOptions, report
+from mp4ds.report.cameras import Camera
+from mp4ds.report.grid import overlay_of
+from mp4ds.report.looks import Look, pictures_in_order
+from mp4ds.report.packed import pack_column
+from mp4ds.report.page import as_script, utc_text
+from mp4ds.report.proxies import proxy_size
+from mp4ds.report.server import ReportServer, byte_range
+from mp4ds.report.timing import axis_of, lost_frames, nearest_offsets, timing_of
+from mp4ds.sidecar import Calibration, Roi
+from report_scenes import (
+    COLOUR,
+    DEPTH,
+    FRAMES,
+    HEIGHT,
+    LATE,
+    LOST,
+    REPEATED,
+    WIDTH,
+    blocks,
+    pack_cameras,
+    two_cameras,
+)
+from sources import COMMON, ENCODINGS, Scene, scene
+
+INT64 = np.iinfo(np.int64)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset without a report; not to be changed."""
+    return pack_cameras(tmp_path_factory.mktemp("report"), two_cameras())
+
+
+@pytest.fixture
+def copy(drive: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(drive, tmp_path / "drive"))
+
+
+def data_of(folder: Path) -> dict[str, Any]:
+    """What data.js hands to the page."""
+    text = (folder / "report" / "data.js").read_text()
+    match = re.fullmatch(r"/\* made by mp4ds report \*/\nmp4dsReport\.dataset\((.*)\);\n", text)
+    assert match
+    return dict(json.loads(match[1]))
+
+
+def columns_of(folder: Path, number: int) -> dict[str, Any]:
+    """What columns-N.js hands to the page."""
+    text = (folder / "report" / f"columns-{number}.js").read_text()
+    match = re.fullmatch(rf"mp4dsReport\.columns\({number}, (.*)\);\n", text)
+    assert match
+    return dict(json.loads(match[1]))
+
+
+def unpacked(packed: dict[str, str], count: int) -> list[int]:
+    """A column, by the words of `pack_column` and Python's integers."""
+    residuals, number, shift = [], 0, 0
+    for byte in base64.b64decode(packed["values"]):
+        number |= (byte & 127) << shift
+        shift += 7
+        if byte < 128:
+            residuals.append(-(number + 1) // 2 if number % 2 else number // 2)
+            number = shift = 0
+    assert len(residuals) == count - 1
+    values = [int(packed["start"])]
+    for residual in residuals:
+        value = values[-1] + int(packed["step"]) + residual
+        values.append((value + 2**63) % 2**64 - 2**63)
+    return values
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.glob("*.*")}
+
+
+# ---------------------------------------------------------------- columns and figures
+
+COLUMNS = {
+    "one": [7],
+    "none": [0, 0, 0],
+    "regular": [1_700_000_000_000_000_000 + n * 33_333_333 for n in range(50)],
+    "backward": [5, 4, 3, 10**18, -(10**18), 0],
+    "extremes": [INT64.min, INT64.max, INT64.min, 0, INT64.max, INT64.max, -1],
+    "widths": [sum(1 << 7 * k for k in range(n % 9)) * (-1) ** n for n in range(60)],
+}
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+def test_columns_come_back(name: str) -> None:
+    values = COLUMNS[name]
+    assert unpacked(pack_column(np.array(values, np.int64)), len(values)) == values
+
+
+def test_two_hours_at_60_hz_are_small_and_quick() -> None:
+    rng = np.random.default_rng(3)
+    stamps = 1_700_000_000 * 10**9 + np.arange(432_000) * 16_666_667
+    stamps = stamps + rng.integers(-200_000, 200_000, len(stamps))
+    logs = stamps + rng.integers(2_000_000, 9_000_000, len(stamps))
+    ticks = (stamps - stamps[0]) // 1000
+    start = time.process_time()
+    packed = [pack_column(column) for column in (stamps, logs, ticks)]
+    timing_of(stamps, logs, None)
+    nearest_offsets(stamps, logs)
+    assert time.process_time() - start < 5
+    assert sum(len(column["values"]) for column in packed) < 6_000_000
+    found = base64.b64decode(packed[0]["values"])
+    assert sum(byte < 128 for byte in found) == 432_000 - 1
+
+
+def test_figures_of_a_camera() -> None:
+    steps = [20, 21, 19, 20, 61, 20, 0, 20, -5, 20]
+    stamps = np.cumsum([1_000, *steps]) * 1_000_000
+    seq = np.array([0, 1, 2, 3, 4, 7, 8, 9, 10, 11, 12])
+    timing = timing_of(stamps, stamps + 4_500_000, seq)
+    assert (timing.frames, timing.lost, timing.gaps) == (11, 2, 1)
+    assert (timing.repeated, timing.backward, timing.seq_missing) == (1, 1, 2)
+    assert (timing.median_ms, timing.rate_hz, timing.longest_ms) == (20, 50, 61)
+    assert timing.jitter_ms == pytest.approx(np.std(steps))
+    assert (timing.delay_median_ms, timing.delay_least_ms, timing.delay_most_ms) == (4.5, 4.5, 4.5)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "rate"), [([5], None), ([5, 5, 5], None), ([9, 8, 7], None), ([0, 10**9], 1.0)]
+)
+def test_figures_where_there_are_none(stamps: list[int], rate: float | None) -> None:
+    column = np.array(stamps, np.int64)
+    timing = timing_of(column, column, None)
+    assert (timing.rate_hz, timing.lost, timing.seq_missing) == (rate, 0, None)
+
+
+@pytest.mark.filterwarnings("error")
+def test_figures_of_impossible_stamps() -> None:
+    stamps = np.array([INT64.min, INT64.max, 0, INT64.max, INT64.min], np.int64)
+    timing = timing_of(stamps, stamps[::-1].copy(), None)
+    assert timing.backward == 2
+    assert timing.longest_ms == pytest.approx(2**64 / 1e6)
+
+
+def test_lost_frames_by_the_rule() -> None:
+    steps = np.array([10, 10, 10, 15, 15.1, 24.9, 25, 10, 100, 10, 0, -30, 10], float)
+    assert lost_frames(steps).tolist() == [0, 0, 0, 0, 1, 1, 2, 0, 9, 0, 0, 0, 0]
+    assert not len(lost_frames(np.empty(0)))
+
+
+def test_offsets_to_the_nearest_frame() -> None:
+    rng = np.random.default_rng(1)
+    own = rng.integers(0, 1000, 200) + 10**18
+    other = rng.integers(0, 1000, 50) + 10**18
+    found = nearest_offsets(own, other)
+    for stamp, offset in zip(own.tolist(), found.tolist(), strict=True):
+        assert abs(offset) == min(abs(stamp - value) for value in other.tolist())
+        assert stamp - int(offset) in other
+
+
+def test_the_axis_is_that_of_the_stamps_where_they_are_of_one_clock() -> None:
+    times = np.arange(100) * 10**8 + 10**18
+    sound = {"stamp": times, "log_time": times + 5}
+    assert axis_of([sound, sound]) == "stamp"
+    assert axis_of([]) == "stamp"
+    assert axis_of([sound, {"stamp": times * 0, "log_time": times}]) == "log_time"
+    assert axis_of([sound, {"stamp": times - 10**17, "log_time": times}]) == "log_time"
+    outlier = times.copy()
+    outlier[50] = 0
+    assert axis_of([{"stamp": outlier, "log_time": times}]) == "log_time"
+
+
+# ---------------------------------------------------------------- calibrations
+
+
+def calibration(model: str, d: list[float], **values: Any) -> Calibration:
+    k = [500.0, 0, 300.0, 0, 480.0, 250.0, 0, 0, 1]
+    p = [450.0, 0, 310.0, 0, 0, 450.0, 240.0, 0, 0, 0, 1, 0]
+    given = {"frame_id": "c", "width": 640, "height": 480, "k": k, "p": p, "r": [1.0] * 9}
+    return Calibration(**{**given, "distortion_model": model, "d": d, **values})
+
+
+LENSES = {
+    "none": calibration("plumb_bob", [0.0] * 5),
+    "barrel": calibration("plumb_bob", [-0.31, 0.09, -0.001, 0.002, 0.0]),
+    "rational": calibration("rational_polynomial", [0.3, 0.2, 1e-3, 1e-3, 0.1, 0.5, 0.3, 0.05]),
+    "prism": calibration("plumb_bob", [0.1, 0, 0, 0, 0, 0, 0, 0, 1e-3, 2e-3, 1e-3, 0.0]),
+    "fisheye": calibration("equidistant", [-0.02, 0.01, -0.003, 0.0005]),
+}
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_the_grid_is_straight_without_distortion(name: str) -> None:
+    """By OpenCV, which takes the distortion of each point away."""
+    lens = LENSES[name]
+    overlay = overlay_of(lens, (640, 480), "/cam/image_raw")
+    assert not overlay.problem
+    assert len(overlay.lines) > 20
+    assert len(overlay.axes) == 2
+    k, d = np.array(lens.k).reshape(3, 3), np.array(lens.d)
+    for line in overlay.lines:
+        points = np.array(line).reshape(-1, 1, 2) * (640, 480) - 0.5
+        if name == "fisheye":
+            found = cv2.fisheye.undistortPoints(points, k, d)
+        else:
+            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-9)
+            found = cv2.undistortPoints(points, k, d, None, None, None, criteria)
+        assert found.reshape(-1, 2).std(axis=0).min() < 2e-4
+
+
+def test_the_grid_of_rectified_images_is_that_of_p() -> None:
+    overlay = overlay_of(LENSES["barrel"], (640, 480), "/cam/image_rect_color")
+    assert overlay.center == pytest.approx([310.5 / 640, 240.5 / 480], abs=1e-4)
+    assert all(len(set(line[0::2])) == 1 or len(set(line[1::2])) == 1 for line in overlay.lines)
+
+
+@pytest.mark.parametrize(
+    ("lens", "size", "problem"),
+    [
+        (calibration("plumb_bob", [], k=[0.0] * 9), (640, 480), "not calibrated"),
+        (calibration("plumb_bob", [0.1]), (320, 240), "640x480, these are 320x240"),
+        (calibration("my lens", [0.1]), (640, 480), "'my lens'"),
+        (calibration("plumb_bob", [0.0] * 12 + [0.1]), (640, 480), "tilted"),
+    ],
+)
+def test_there_is_no_grid_without_a_reason(
+    lens: Calibration, size: tuple[int, int], problem: str
+) -> None:
+    overlay = overlay_of(lens, size, "/cam/image_raw")
+    assert problem in overlay.problem
+    assert not overlay.lines
+
+
+def test_the_grid_of_a_part_of_the_sensor() -> None:
+    roi = Roi(x_offset=100, y_offset=50, width=400, height=300, do_rectify=0)
+    lens = calibration("plumb_bob", [-0.2], binning_x=2, binning_y=2, roi=roi)
+    overlay = overlay_of(lens, (200, 150), "/cam/image_raw")
+    assert overlay.center == pytest.approx([(100 + 0.5) / 200, (100 + 0.5) / 150], abs=1e-4)
+
+
+@pytest.mark.parametrize("value", [1e-300, 1e300, 1e18])
+def test_a_grid_of_impossible_numbers_is_bounded(value: float) -> None:
+    lens = calibration("plumb_bob", [value, -value], k=[value, 0, value, 0, value, value, 0, 0, 1])
+    overlay = overlay_of(lens, (640, 480), "/cam/image_raw")
+    assert sum(map(len, overlay.lines)) < 100_000
+    json.loads(as_script(overlay.lines))
+
+
+# ---------------------------------------------------------------- the page's files
+
+
+def test_the_report_of_a_dataset(copy: Path) -> None:
+    before = digests(copy)
+    summary = report(copy)
+    assert [(c.topic, c.plays) for c in summary.cameras] == [(DEPTH, "proxy"), (COLOUR, "video")]
+    assert "ffv1" in summary.cameras[0].note
+    assert summary.problems == []
+    assert summary.index == copy / "index.html"
+    assert mp4ds.validate(copy, deep=True) == []
+    assert {name: digest for name, digest in digests(copy).items() if name in before} == before
+    assert sorted(p.name for p in copy.iterdir() if p.name not in before) == [
+        "index.html",
+        "report",
+    ]
+    data = data_of(copy)
+    with mp4ds.open(copy) as dataset:
+        for number, camera in enumerate(data["cameras"]):
+            stream, columns = dataset[camera["name"]], columns_of(copy, number)
+            count = columns["frames"]
+            assert count == len(stream) == camera["frames"]
+            assert unpacked(columns["stamp"], count) == stream.stamps.tolist()
+            assert unpacked(columns["log_time"], count) == stream.log_times.tolist()
+            with av.open(str(stream.video_path)) as container:
+                ticks = [p.pts for p in container.demux(video=0) if p.pts is not None]
+            assert unpacked(columns["ticks"], count) == ticks
+    depth, colour = data["cameras"]
+    assert (depth["timing"]["lost"], depth["timing"]["repeated"]) == (1 + 1, 1)
+    assert (colour["timing"]["lost"], colour["timing"]["repeated"]) == (0, 0)
+    assert abs(colour["offset"]["median_ms"]) == pytest.approx(LATE / 1e6, abs=0.3)
+    assert len(colour["calibrations"]) == 1
+    assert colour["calibrations"][0]["overlay"]["lines"]
+
+
+def test_topics_and_their_sizes(copy: Path) -> None:
+    report(copy)
+    with mp4ds.open(copy) as dataset:
+        expected: dict[str, int] = {}
+        for record in dataset.records():
+            if hasattr(record, "data"):
+                topic = record.channel.topic
+                expected[topic] = expected.get(topic, 0) + len(record.data)
+        times = {c.topic: dataset.times()[c.id] for c in dataset.channels if c.topic == "/tf"}
+    rows = {row["topic"]: row for row in data_of(copy)["topics"]}
+    assert set(rows) >= {COLOUR, DEPTH, "/imu", "/tf", "/chatter", "/front/camera_info"}
+    assert rows["/imu"]["recorded_bytes"] == expected["/imu"]
+    assert rows["/chatter"]["messages"] == FRAMES
+    assert rows["/tf"]["rate_hz"] == pytest.approx(
+        (FRAMES - 1) * 1e9 / (times["/tf"][-1] - times["/tf"][0])
+    )
+    assert rows[COLOUR]["recorded_bytes"] == FRAMES * WIDTH * HEIGHT * 3
+    stored = sum((copy / f"front_image_raw.{end}").stat().st_size for end in ("mp4", "yaml"))
+    assert rows[COLOUR]["stored_bytes"] == stored
+    assert rows[COLOUR]["ratio"] == pytest.approx(FRAMES * WIDTH * HEIGHT * 3 / stored)
+    assert rows["/front/camera_info"]["stored"] == "front_image_raw.yaml"
+
+
+def test_a_second_report_takes_the_proxies_of_the_first(copy: Path) -> None:
+    report(copy)
+    proxy = copy / "report" / "proxies" / "depth_image_raw.mp4"
+    first = proxy.stat()
+    again = report(copy)
+    assert (proxy.stat().st_ino, proxy.stat().st_mtime_ns) == (first.st_ino, first.st_mtime_ns)
+    assert again.cameras[0].plays == "proxy"
+    assert "in colours" in data_of(copy)["cameras"][0]["caption"]
+    report(copy, ReportOptions(proxy_width=64))
+    with mp4ds.open(proxy) as opened:
+        assert opened.videos[0].image_size == (64, 44)
+    none = report(copy, ReportOptions(proxies="none"))
+    assert [camera.plays for camera in none.cameras] == ["nothing", "video"]
+    assert not proxy.exists()
+
+
+def test_all_get_proxies_where_asked(copy: Path) -> None:
+    summary = report(copy, ReportOptions(proxies="all"))
+    assert [camera.plays for camera in summary.cameras] == ["proxy", "proxy"]
+
+
+def test_a_report_elsewhere_plays_the_videos_where_they_are(copy: Path, tmp_path: Path) -> None:
+    odd = tmp_path / "a #1 100% ü?"
+    odd.mkdir()
+    before = digests(copy)
+    summary = report(copy, ReportOptions(output=odd / "page"))
+    assert digests(copy) == before
+    assert not (copy / "report").exists()
+    assert summary.index == odd / "page" / "index.html"
+    urls = [camera["video"] for camera in data_of(odd / "page")["cameras"]]
+    assert urls == ["report/proxies/depth_image_raw.mp4", "../../drive/front_image_raw.mp4"]
+    back = report(odd / "page" / ".." / ".." / "drive", ReportOptions(output=tmp_path / "x"))
+    assert back.start == "/x/index.html"
+    moved = shutil.move(copy, odd / "dri:ve")
+    report(moved, ReportOptions(output=tmp_path / "y"))
+    url = data_of(tmp_path / "y")["cameras"][1]["video"]
+    assert url == "../a%20%231%20100%25%20%C3%BC%3F/dri%3Ave/front_image_raw.mp4"
+
+
+def test_a_pair_alone_needs_a_place(copy: Path, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="--output"):
+        report(copy / "front_image_raw.mp4")
+    summary = report(copy / "front_image_raw.mp4", ReportOptions(output=tmp_path / "pair"))
+    assert [camera.topic for camera in summary.cameras] == [COLOUR]
+
+
+def test_tiles_are_played_where_no_proxies_are_wanted(packed_bag: Path, tmp_path: Path) -> None:
+    output = tmp_path / "page"
+    summary = report(packed_bag, ReportOptions(output=output, proxies="none"))
+    (camera,) = summary.cameras
+    assert (camera.plays, camera.note) == ("video", "its picture is not the image (layout mosaic8)")
+    (facts,) = data_of(output)["cameras"]
+    assert facts["calibrations"][0]["overlay"]["problem"] == "what is played is not the image"
+    assert facts["shown"] == [1, 1]
+
+
+def test_a_remote_dataset_is_refused(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mp4ds.report.remote", lambda path: path)
+    with pytest.raises(SourceError, match="not on this machine"):
+        report(copy, ReportOptions(output=copy.parent / "page"))
+    assert not (copy.parent / "page").exists()
+
+
+def test_what_is_no_report_stays(copy: Path) -> None:
+    (copy / "index.html").write_text("<h1>mine</h1>")
+    with pytest.raises(TargetExistsError, match=r"index\.html"):
+        report(copy)
+    assert not (copy / "report").exists()
+    report(copy, ReportOptions(force=True))
+    assert "mp4ds report" in (copy / "index.html").read_text()
+    shutil.rmtree(copy / "report")
+    (copy / "report").mkdir()
+    (copy / "report" / "thesis.tex").write_text("mine")
+    with pytest.raises(TargetError, match="not something that mp4ds wrote"):
+        report(copy, ReportOptions(force=True))
+    assert (copy / "report" / "thesis.tex").read_text() == "mine"
+
+
+def test_a_failure_leaves_what_was_there(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    report(copy)
+    before = sorted(p.relative_to(copy) for p in copy.rglob("*"))
+
+    def fail(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mp4ds.report.write_folder", fail)
+    with pytest.raises(KeyboardInterrupt):
+        report(copy)
+    assert sorted(p.relative_to(copy) for p in copy.rglob("*")) == before
+    with pytest.raises(KeyboardInterrupt):
+        report(copy, ReportOptions(output=copy.parent / "other"))
+    assert not (copy.parent / "other").exists()
+
+
+def test_a_damaged_video_is_told_and_the_rest_is_shown(copy: Path) -> None:
+    video = copy / "depth_image_raw.mp4"
+    data = bytearray(video.read_bytes())
+    data[60 : len(data) // 2] = bytes(len(data) // 2 - 60)
+    video.write_bytes(data)
+    (copy / "messages.mcap").unlink()
+    summary = report(copy)
+    assert [camera.plays for camera in summary.cameras] == ["nothing", "video"]
+    assert len(summary.problems) == 2
+    data = data_of(copy)
+    assert summary.problems[0] in data["notes"]
+    assert data["cameras"][0]["note"] == summary.problems[0]
+    assert data["topics"] == []
+    assert not list((copy / "report").rglob("*.mp4"))
+
+
+def test_hostile_names_are_only_text(tmp_path: Path) -> None:
+    names = ("/a</script><script>alert(1)</script>", "/b\u2028\u2029'\"\\<!--")
+    dataset = pack_cameras(tmp_path, two_cameras(second="mono8", names=names))
+    report(dataset)
+    assert sorted(camera["name"] for camera in data_of(dataset)["cameras"]) == sorted(names)
+    for path in (dataset / "report").glob("*.js"):
+        if path.name.startswith(("data", "columns-")):
+            text = path.read_bytes()
+            assert text.isascii()
+            assert b"<" not in text.removeprefix(b"/* made by mp4ds report */")
+    page = (dataset / "index.html").read_text()
+    assert "alert" not in page
+
+
+def test_scripts_hold_any_value() -> None:
+    value = {"a": [float("nan"), float("inf"), -0.5, 2**70, None, True, "</script>\u2028"]}
+    text = as_script(value)
+    assert text.isascii()
+    assert "<" not in text
+    assert json.loads(text) == {"a": [None, None, -0.5, 2**70, None, True, "</script>\u2028"]}
+
+
+def test_no_code_of_the_page_makes_elements_of_text() -> None:
+    folder = Path(sys.modules["mp4ds.report"].__file__ or "").parent / "page"
+    code = "".join(path.read_text() for path in folder.glob("*.js"))
+    forbidden = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b|new Function"
+    assert len(code) > 10_000
+    assert not re.search(forbidden, code)
+    everything = code + (folder / "index.html").read_text() + (folder / "report.css").read_text()
+    assert not re.search(r"https?://", everything)
+
+
+@pytest.mark.parametrize("time_ns", [INT64.min, INT64.max, 0, -1])
+def test_any_time_has_a_text(time_ns: int) -> None:
+    assert "UTC" in utc_text(time_ns) or abs(time_ns) > 10**12
+
+
+# ---------------------------------------------------------------- proxies
+
+SOME = {*COMMON, "rgb16", "yuyv", "nv12", "8UC2", "32FC1", "64FC3", "bgra8", "bayer_gbrg16"}
+
+
+@pytest.mark.parametrize(
+    "encoding",
+    [name if name in SOME else pytest.param(name, marks=pytest.mark.slow) for name in ENCODINGS],
+)
+def test_every_encoding_gets_a_proxy(encoding: str, tmp_path: Path) -> None:
+    made = scene(encoding, frames=5, width=80, height=50, with_info=False)
+    dataset = pack_cameras(tmp_path, made, quality="lossless")
+    report(dataset, ReportOptions(proxies="all", proxy_width=64))
+    assert_proxy_shows(dataset, 64)
+
+
+CODED_KINDS = [
+    "jpeg-rgb",
+    "video-h265",
+    "video-vp9",
+    "video-h264-mid-gop",
+    "png-rgba-cv2",
+    "depth-16UC1-rvl",
+]
+
+
+@pytest.mark.parametrize("kind", CODED_KINDS)
+def test_coded_images_get_a_proxy(kind: str, tmp_path: Path) -> None:
+    made = CODED[kind](frames=8, width=96, height=66)
+    dataset = pack_cameras(tmp_path, made, quality="lossless")
+    report(dataset, ReportOptions(proxies="all", proxy_width=96))
+    assert_proxy_shows(dataset, 96)
+
+
+def assert_proxy_shows(dataset: Path, width: int) -> None:
+    """The proxy has every frame at its time, and looks like it."""
+    with mp4ds.open(dataset) as opened:
+        (stream,) = opened.streams
+        proxy = dataset / "report" / "proxies" / f"{stream.path.stem}.mp4"
+        size = proxy_size(stream.image_size, width)
+        with mp4ds.open(proxy) as video, av.open(str(stream.video_path)) as container:
+            (shown,) = video.videos
+            ticks = [p.pts for p in container.demux(video=0) if p.pts is not None]
+            assert (shown.stamps // 1000).tolist() == ticks
+            assert shown.image_size == size
+            look = Look(stream, size)
+            for index, pixels in pictures_in_order(stream):
+                if pixels is not None:
+                    found = blocks(shown[index].data)
+                    assert np.abs(found - blocks(look.picture(pixels))).mean() < 8
+
+
+@pytest.mark.parametrize(
+    ("image", "width", "size"),
+    [
+        ((1920, 1080), 640, (640, 360)),
+        ((64, 48), 640, (64, 48)),
+        ((65, 49), 640, (64, 48)),
+        ((2, 2), 640, (32, 32)),
+        ((16384, 1), 640, (640, 32)),
+    ],
+)
+def test_sizes_of_proxies(image: tuple[int, int], width: int, size: tuple[int, int]) -> None:
+    assert proxy_size(image, width) == size
+
+
+def test_depth_gets_colours_where_it_has_values(drive: Path) -> None:
+    with mp4ds.open(drive) as dataset:
+        stream = dataset[DEPTH]
+        pixels = stream[3].data
+        look = Look(stream, stream.image_size)
+        picture = look.picture(pixels)
+        assert (picture[pixels == 0] == 0).all()
+        assert picture[pixels != 0].max(axis=-1).min() > 50
+        low, high = map(float, re.findall(r"[0-9.e+]+", look.caption.partition(":")[2]))
+        assert pixels.min() <= low < high <= 65535
+
+
+# ---------------------------------------------------------------- scores
+
+
+def write_scores(path: Path, value: Any) -> Path:
+    path.write_text(json.dumps(value))
+    return path
+
+
+def test_scores_are_plotted(copy: Path, tmp_path: Path) -> None:
+    given: list[float | None] = [90 + n / 7 for n in range(FRAMES)]
+    given[3] = None
+    scores = write_scores(tmp_path / "scores.json", {COLOUR: {"vmaf": given}})
+    report(copy, ReportOptions(scores=scores))
+    packed = columns_of(copy, 1)["scores"]["vmaf"]
+    found = np.frombuffer(base64.b64decode(packed), "<f4")
+    assert np.isnan(found[3])
+    expected = [np.nan if value is None else value for value in given]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("value", "problem"),
+    [
+        ({"/nowhere": {"vmaf": []}}, "none of"),
+        ({COLOUR: {"vmaf": [1.0]}}, "one for each frame"),
+        ({COLOUR: {"vmaf": ["1"] * FRAMES}}, "not of the form"),
+        ({COLOUR: [1.0] * FRAMES}, "not of the form"),
+        ([], "not of the form"),
+    ],
+)
+def test_wrong_scores_are_refused(value: Any, problem: str, copy: Path, tmp_path: Path) -> None:
+    scores = write_scores(tmp_path / "scores.json", value)
+    with pytest.raises(OptionError, match=problem):
+        report(copy, ReportOptions(scores=scores))
+    assert not (copy / "report").exists()
+
+
+# ---------------------------------------------------------------- options
+
+
+@pytest.mark.parametrize("options", [{"proxies": "some"}, {"proxy_width": 10}])
+def test_wrong_options_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(OptionError, match="--prox"):
+        ReportOptions(**options)
+
+
+def test_datasets_without_cameras_have_a_page(tmp_path: Path) -> None:
+    made = scene("mono8", frames=4)
+    others = Scene([m for m in made.messages if not m.topic.startswith("/cam")])
+    dataset = pack_cameras(tmp_path, others)
+    assert report(dataset).cameras == []
+    assert data_of(dataset)["cameras"] == []
+
+
+def test_a_topic_of_two_sizes_has_two_cameras(tmp_path: Path) -> None:
+    later = scene("mono8", frames=4, width=80)
+    shifted = [replace(m, log_time=m.log_time + 10**9) for m in later.messages]
+    made = Scene([*scene("mono8", frames=4).messages, *shifted])
+    dataset = pack_cameras(tmp_path, made)
+    names = [camera.topic for camera in report(dataset).cameras]
+    assert names == ["/cam/image_raw (cam_image_raw)", "/cam/image_raw (cam_image_raw-2)"]
+
+
+# ---------------------------------------------------------------- the server
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[ReportServer]:
+    (tmp_path / "a b.mp4").write_bytes(bytes(range(256)) * 4)
+    (tmp_path / "index.html").write_text("page")
+    (tmp_path / "secret").write_text("secret")
+    files = {"/d/a b.mp4": tmp_path / "a b.mp4", "/index.html": tmp_path / "index.html"}
+    files["/gone"] = tmp_path / "gone"
+    with ReportServer(files, "/index.html") as made:
+        thread = threading.Thread(target=made.serve)
+        thread.start()
+        yield made
+        made.stop()
+        thread.join()
+
+
+def ask(
+    server: ReportServer, path: str, method: str = "GET", **headers: str
+) -> tuple[int, dict[str, str], bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
+    try:
+        connection.request(method, path, headers=headers)
+        answer = connection.getresponse()
+        return answer.status, dict(answer.getheaders()), answer.read()
+    finally:
+        connection.close()
+
+
+@pytest.mark.parametrize(
+    ("asked", "start", "end"),
+    [
+        ("bytes=0-", 0, 1024),
+        ("bytes=10-19", 10, 20),
+        ("bytes=1000-5000", 1000, 1024),
+        ("bytes=-24", 1000, 1024),
+        ("bytes=-9999", 0, 1024),
+    ],
+)
+def test_byte_ranges(server: ReportServer, asked: str, start: int, end: int) -> None:
+    status, headers, body = ask(server, "/d/a%20b.mp4", Range=asked)
+    assert status == 206
+    assert headers["Content-Range"] == f"bytes {start}-{end - 1}/1024"
+    assert headers["Content-Type"] == "video/mp4"
+    assert body == (bytes(range(256)) * 4)[start:end]
+
+
+@pytest.mark.parametrize("asked", ["bytes=1024-", "bytes=5-2", "bytes=-0"])
+def test_ranges_that_are_not_there(server: ReportServer, asked: str) -> None:
+    status, headers, body = ask(server, "/d/a%20b.mp4", Range=asked)
+    assert (status, body) == (416, b"")
+    assert headers["Content-Range"] == "bytes */1024"
+
+
+@pytest.mark.parametrize("asked", ["bytes=-", "lines=1-2", "bytes=1-2,5-6", "bytes=a-b", "x" * 999])
+def test_other_ranges_give_all(asked: str) -> None:
+    assert byte_range(asked, 7) == (0, 7)
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/secret", "/../secret", "/d/../secret", "/%2e%2e/secret", "/d/", "/gone"]
+)
+def test_nothing_else_is_served(server: ReportServer, path: str) -> None:
+    status, _, body = ask(server, path)
+    assert (status, body) == (404, b"")
+
+
+def test_whole_files_and_heads(server: ReportServer) -> None:
+    status, headers, body = ask(server, "/index.html?x=1")
+    assert (status, body, headers["Accept-Ranges"]) == (200, b"page", "bytes")
+    status, headers, body = ask(server, "/d/a%20b.mp4", "HEAD")
+    assert (status, body, headers["Content-Length"]) == (200, b"", "1024")
+    assert ask(server, "/index.html", "POST")[0] == 501
+
+
+def test_other_sites_get_nothing(server: ReportServer) -> None:
+    assert ask(server, "/index.html", Host=f"evil.example:{server.port}")[0] == 403
+    assert ask(server, "/index.html", Host=f"localhost:{server.port}")[0] == 200
+
+
+def test_a_port_that_is_taken(server: ReportServer) -> None:
+    with pytest.raises(OptionError, match=f"--port {server.port}"):
+        ReportServer({}, "/", port=server.port)
+
+
+# ---------------------------------------------------------------- the command
+
+
+def command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "mp4ds", *arguments]
+
+
+def test_the_command(copy: Path) -> None:
+    done = subprocess.run(command("report", str(copy)), capture_output=True, text=True, check=True)
+    assert f"{COLOUR}: plays its own video" in done.stdout
+    assert f"{DEPTH}: plays a proxy: no browser plays ffv1" in done.stdout
+    assert str(copy / "index.html") in done.stdout
+    (copy / "front_image_raw.mp4").unlink()
+    told = subprocess.run(
+        command("report", str(copy), "--json"), capture_output=True, text=True, check=False
+    )
+    assert told.returncode == 1
+    assert "front_image_raw.mp4" in json.loads(told.stdout)["problems"][0]
+
+
+def test_serving_until_interrupted(copy: Path) -> None:
+    process = subprocess.Popen(
+        command("report", str(copy), "--serve", "--output", str(copy.parent / "out put")),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+    try:
+        assert process.stdout
+        line = ""
+        while "127.0.0.1" not in line:
+            line = process.stdout.readline()
+            assert line, process.stderr.read() if process.stderr else ""
+        match = re.match(r"http://127\.0\.0\.1:(\d+)(/\S+)", line)
+        assert match
+        assert match[2] == "/out%20put/index.html"
+        connection = http.client.HTTPConnection("127.0.0.1", int(match[1]), timeout=20)
+        for path in (match[2], "/out%20put/report/data.js", "/drive/front_image_raw.mp4"):
+            connection.request("GET", path)
+            answer = connection.getresponse()
+            assert answer.status == 200
+            assert answer.read()
+        connection.close()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 130
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_what_a_camera_tells_of_its_calibrations(drive: Path) -> None:
+    with mp4ds.open(drive) as dataset:
+        facts = Camera(dataset[COLOUR], COLOUR).facts(0, None)
+    (listed,) = facts["calibrations"]
+    assert listed["from_frame"] == 0
+    assert listed["distortion_model"] == "plumb_bob"
+    assert facts["calibration_topic"] == "/front/camera_info"
+
+
+def matching(picture: NDArray[Any], pictures: list[NDArray[Any]]) -> int:
+    """Number of the picture that is most like one."""
+    return int(np.argmin([np.abs(blocks(picture) - blocks(other)).mean() for other in pictures]))
+
+
+def test_the_scene_is_as_it_says(drive: Path) -> None:
+    """What the other tests rely on: frames that differ, and times with what they look for."""
+    with mp4ds.open(drive) as dataset:
+        pictures = [frame.data for frame in dataset[COLOUR].get(range(FRAMES), format="rgb")]
+        stamps = dataset[DEPTH].stamps
+    assert [matching(picture, pictures) for picture in pictures] == list(range(FRAMES))
+    assert len(stamps) == FRAMES - 1
+    assert np.flatnonzero(np.diff(stamps) == 0).tolist() == [REPEATED - 2]
+    assert int(np.argmax(np.diff(stamps)[: LOST + 1])) == LOST - 1
+
+
+def test_the_commands_of_its_page(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "report.md").read_text()
+    lines = [
+        line.replace("demo demo.bag", "demo demo.bag --seconds 1.7")
+        for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+        for line in block.splitlines()
+    ]
+    assert len(lines) == 8
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    script = "\n".join(["set -e", *lines])
+    done = subprocess.run(
+        ["bash", "-c", script],
+        cwd=tmp_path,
+        env={**os.environ, "PATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    shown = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert re.search(r"index\.html \[\('/left/image_raw', '(video|nothing)'\), \(", shown.stdout)
+    for name in ("still.png", "sheet.jpg", "mosaic.png", "page/index.html"):
+        assert (tmp_path / name).stat().st_size > 1000

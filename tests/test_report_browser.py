@@ -1,0 +1,516 @@
+"""The report in headless Chromium, from the disk: what it shows, plays and plots."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import mp4ds
+from chromium import Tab, chromium
+from conftest import real
+from mp4ds.report import ReportOptions, report
+from mp4ds.report.looks import Look
+from mp4ds.report.packed import pack_column
+from mp4ds.report.page import as_script
+from mp4ds.report.server import ReportServer
+from mp4ds.report.timing import intervals, lost_frames, nearest_offsets
+from report_scenes import (
+    COLOUR,
+    DEPTH,
+    FRAMES,
+    HEIGHT,
+    REPEATED,
+    WIDTH,
+    blocks,
+    pack_cameras,
+    two_cameras,
+)
+
+pytestmark = pytest.mark.browser
+
+READY = "typeof mp4dsReport === 'object' && mp4dsReport.ready.then(() => true)"
+SETTLED = "mp4dsReport.settled()"
+CAMERAS = (DEPTH, COLOUR)  # in the order of the page
+INT64 = np.iinfo(np.int64)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset with its report; not to be changed."""
+    folder = pack_cameras(tmp_path_factory.mktemp("shown"), two_cameras())
+    report(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+    with chromium(tmp_path_factory.mktemp("profile")) as tab:
+        yield tab
+
+
+def show(browser: Tab, url: str) -> Tab:
+    browser.problems.clear()
+    browser.requests.clear()
+    browser.open("about:blank", ready="true")
+    browser.open(url, ready=READY)
+    assert browser.evaluate(SETTLED)
+    return browser
+
+
+@pytest.fixture
+def page(browser: Tab, drive: Path) -> Tab:
+    """The page as it is opened from the disk, at its first frame."""
+    return show(browser, (drive / "index.html").as_uri())
+
+
+class Recorded:
+    """What the page is compared with."""
+
+    def __init__(self, drive: Path) -> None:
+        with mp4ds.open(drive) as dataset:
+            self.stamps = [dataset[topic].stamps.copy() for topic in CAMERAS]
+            self.logs = [dataset[topic].log_times.copy() for topic in CAMERAS]
+            depth, colour = (dataset[topic] for topic in CAMERAS)
+            look = Look(depth, depth.image_size)
+            self.pictures = [
+                [look.picture(frame.data) for frame in depth],
+                [frame.data for frame in colour.get(range(len(colour)), format="rgb")],
+            ]
+        self.base = min(int(stamps[0]) for stamps in self.stamps)
+
+    def frame_at(self, camera: int, time: float) -> int:
+        """The last frame whose stamp is not later, of stamps that never fall."""
+        at = np.maximum.accumulate(self.stamps[camera] - self.base)
+        return max(0, int(np.searchsorted(at, time, side="right")) - 1)
+
+
+@pytest.fixture(scope="module")
+def recorded(drive: Path) -> Recorded:
+    return Recorded(drive)
+
+
+def shown_number(page: Tab, recorded: Recorded, camera: int) -> int:
+    """The frame whose decoded pixels are those on the screen."""
+    picture = blocks(page.picture(f".camera:nth-child({camera + 1}) video"))
+    distances = [np.abs(picture - blocks(other)).mean() for other in recorded.pictures[camera]]
+    assert min(distances) < 6
+    return int(np.argmin(distances))
+
+
+def readout(page: Tab, camera: int) -> dict[str, str]:
+    """What is written under a camera."""
+    found = page.evaluate(
+        f"Object.fromEntries(Object.entries(mp4dsReport.player.cameras[{camera}].values)"
+        ".map(([key, value]) => [key, value.textContent]))"
+    )
+    return dict(found)
+
+
+def text_of(stamp: int) -> str:
+    return f"{stamp // 10**9}.{stamp % 10**9:09}"
+
+
+def assert_shows(page: Tab, recorded: Recorded, camera: int, number: int) -> None:
+    assert page.evaluate(SETTLED)
+    values = readout(page, camera)
+    assert values["frame"] == f"{number} of {len(recorded.stamps[camera])}"
+    assert values["stamp"] == text_of(int(recorded.stamps[camera][number]))
+    assert values["log"] == text_of(int(recorded.logs[camera][number]))
+    assert shown_number(page, recorded, camera) == number
+
+
+# ---------------------------------------------------------------- frames
+
+
+def test_it_opens_from_the_disk_and_asks_no_network(page: Tab, recorded: Recorded) -> None:
+    for camera in (0, 1):
+        assert_shows(page, recorded, camera, 0)
+    assert page.problems == []
+    assert page.requests
+    assert all(url.startswith(("file:", "data:", "about:")) for url in page.requests)
+    assert page.evaluate("document.title") == "drive - mp4ds report"
+
+
+@pytest.mark.parametrize("seconds", [0.5, 0.01, 0.9, 0.41, 0.65, 0.966])
+def test_a_time_is_shown_as_the_right_frames(seconds: float, page: Tab, recorded: Recorded) -> None:
+    page.evaluate(f"mp4dsReport.player.go({seconds * 1e9})")
+    for camera in (0, 1):
+        assert_shows(page, recorded, camera, recorded.frame_at(camera, seconds * 1e9))
+
+
+def test_every_frame_is_found_by_its_number(page: Tab, recorded: Recorded) -> None:
+    for number in range(FRAMES - 1, -1, -1):
+        time = f"mp4dsReport.player.cameras[1].position[{number}]"
+        page.evaluate(f"mp4dsReport.player.go({time})")
+        assert page.evaluate(SETTLED)
+        assert readout(page, 1)["stamp"] == text_of(int(recorded.stamps[1][number]))
+        assert shown_number(page, recorded, 1) == number
+
+
+def test_steps_by_keys_follow_one_camera(page: Tab, recorded: Recorded) -> None:
+    page.evaluate("document.querySelectorAll('.camera header')[1].click()")
+    for _ in range(3):
+        page.press("ArrowRight")
+    assert_shows(page, recorded, 1, 3)
+    assert_shows(page, recorded, 0, recorded.frame_at(0, recorded.stamps[1][3] - recorded.base))
+    page.press("ArrowLeft")
+    assert_shows(page, recorded, 1, 2)
+    page.press("End")
+    assert_shows(page, recorded, 0, FRAMES - 2)
+    page.press("Home")
+    assert_shows(page, recorded, 1, 0)
+    page.press("ArrowLeft")
+    assert_shows(page, recorded, 1, 0)
+
+
+def test_a_repeated_stamp_is_a_step_of_its_own(page: Tab, recorded: Recorded) -> None:
+    first = REPEATED - 2
+    assert recorded.stamps[0][first] == recorded.stamps[0][first + 1]
+    page.evaluate(f"mp4dsReport.player.go(mp4dsReport.player.cameras[0].position[{first - 1}])")
+    for number in (first, first + 1, first + 2):
+        page.press("ArrowRight")
+        assert_shows(page, recorded, 0, number)
+    page.press("ArrowLeft")
+    assert_shows(page, recorded, 0, first + 1)
+    page.press("ArrowLeft")
+    assert_shows(page, recorded, 0, first)
+
+
+def test_scrubbing_on_the_time_line(page: Tab, recorded: Recorded) -> None:
+    page.evaluate("document.querySelector('#timeline').scrollIntoView({block: 'center'})")
+    box = page.evaluate("document.querySelector('#timeline').getBoundingClientRect().toJSON()")
+    end = page.evaluate("mp4dsReport.player.end")
+    y = box["y"] + box["height"] / 2
+    page.mouse("mousePressed", box["x"] + 0.1 * box["width"], y)
+    for part in (0.2, 0.5, 0.9, 0.7):
+        page.mouse("mouseMoved", box["x"] + part * box["width"], y)
+    page.mouse("mouseReleased", box["x"] + 0.7 * box["width"], y)
+    time = page.evaluate("mp4dsReport.player.time")
+    assert time == pytest.approx(0.7 * end, abs=end / box["width"])
+    for camera in (0, 1):
+        assert_shows(page, recorded, camera, recorded.frame_at(camera, time))
+
+
+@pytest.mark.parametrize("kind", ["seconds", "decimal", "nanoseconds"])
+def test_going_to_a_time_that_is_typed(kind: str, page: Tab, recorded: Recorded) -> None:
+    stamp = int(recorded.stamps[1][17])
+    texts = {"seconds": repr((stamp - recorded.base) / 1e9 + 1e-8), "decimal": text_of(stamp)}
+    page.evaluate(
+        f"document.querySelector('#goto-time').value = {texts.get(kind, str(stamp))!r};"
+        "document.querySelector('#goto').requestSubmit()"
+    )
+    assert_shows(page, recorded, 1, 17)
+
+
+@pytest.mark.parametrize("speed", [0.5, 1, 2])
+def test_cameras_play_in_step(speed: float, page: Tab, recorded: Recorded) -> None:
+    page.evaluate(f"mp4dsReport.player.speed = {speed}; mp4dsReport.player.time = 0")
+    page.press(" ", text=" ")
+    state = (
+        "(p => ({time: p.time, playing: p.isPlaying, shown: p.cameras.map(c => c.shown),"
+        " due: p.cameras.map(c => c.frameAt(p.time))}))(mp4dsReport.player)"
+    )
+    seen = []
+    end = time.monotonic() + 30
+    while time.monotonic() < end:
+        found = page.evaluate(state)
+        seen.append(found)
+        if found["time"] > 0.75e9 or not found["playing"]:
+            break
+        time.sleep(0.03)
+    assert seen[-1]["time"] > 0.75e9
+    times = [found["time"] for found in seen]
+    assert times == sorted(times)
+    # a picture is on the screen a little after the clock says so, by the machine's load
+    late = [abs(a - b) for found in seen for a, b in zip(found["shown"], found["due"], strict=True)]
+    assert np.median(late) <= 6 * max(1, speed)
+    if seen[-1]["playing"]:
+        page.press(" ", text=" ")
+    stopped = page.evaluate("mp4dsReport.player.time")
+    for camera in (0, 1):
+        assert_shows(page, recorded, camera, recorded.frame_at(camera, stopped))
+
+
+def test_playing_ends_at_the_end(page: Tab, recorded: Recorded) -> None:
+    page.evaluate("mp4dsReport.player.go(mp4dsReport.player.end - 2e8); mp4dsReport.player.play()")
+    end = time.monotonic() + 30
+    while page.evaluate("mp4dsReport.player.isPlaying") and time.monotonic() < end:
+        time.sleep(0.05)
+    assert page.evaluate("mp4dsReport.player.time === mp4dsReport.player.end")
+    assert_shows(page, recorded, 0, FRAMES - 2)
+    assert_shows(page, recorded, 1, recorded.frame_at(1, page.evaluate("mp4dsReport.player.end")))
+
+
+REAL = {
+    "bags/roboto_tiny_dvs.bag": 2,
+    "bags/librealsense_depth_color.bag": 2,
+    "bags/fiducials_aruco_marker_raspicam.bag": 1,
+}
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_every_frame_of_real_recordings(name: str, browser: Tab, tmp_path: Path) -> None:
+    mp4ds.pack(real(name), tmp_path / "real")
+    summary = report(tmp_path / "real")
+    assert summary.problems == []
+    page = show(browser, summary.index.as_uri())
+    assert page.problems == []
+    assert page.evaluate("mp4dsReport.player.cameras.length") == REAL[name]
+    with mp4ds.open(tmp_path / "real") as dataset:
+        for camera in range(REAL[name]):
+            own = f"mp4dsReport.player.cameras[{camera}]"
+            stream = dataset[page.evaluate(f"{own}.facts.name")]
+            look = Look(stream, stream.image_size)
+            for number in range(len(stream)):
+                page.evaluate(f"mp4dsReport.player.go({own}.position[{number}], {own}, {number})")
+                assert page.evaluate(SETTLED)
+                assert readout(page, camera)["stamp"] == text_of(int(stream.stamps[number]))
+                seen = blocks(page.picture(f".camera:nth-child({camera + 1}) video"))
+                expected = blocks(look.picture(stream[number].data))
+                assert np.abs(seen - expected).mean() < 6
+
+
+# ---------------------------------------------------------------- plots
+
+
+def series(page: Tab, plot: str, number: int = 0) -> NDArray[np.float64]:
+    """What a plot draws: NaN where there is nothing."""
+    found = page.evaluate(f"Array.from(mp4dsReport.plots[{plot!r}].series[{number}].y)")
+    return np.array([np.nan if value is None else value for value in found], np.float64)
+
+
+def test_plots_have_the_numbers_of_the_columns(page: Tab, recorded: Recorded) -> None:
+    for camera in (0, 1):
+        steps = intervals(recorded.stamps[camera])
+        found = series(page, "interval", camera)
+        assert np.isnan(found[0])
+        np.testing.assert_allclose(found[1:], steps / 1e6, rtol=1e-12)
+        lost = np.where(steps > 0, lost_frames(steps), -1)
+        assert series(page, "lost", camera).tolist() == [0, *lost.tolist()]
+        delay = (recorded.logs[camera] - recorded.stamps[camera]) / 1e6
+        np.testing.assert_allclose(series(page, "delay", camera), delay, rtol=1e-12)
+    offsets = nearest_offsets(recorded.stamps[1], recorded.stamps[0]) / 1e6
+    np.testing.assert_allclose(series(page, "offset"), offsets, rtol=1e-12)
+
+
+def test_the_jitter_is_that_of_the_columns(page: Tab, recorded: Recorded) -> None:
+    page.evaluate("mp4dsReport.plots.jitter.count()")
+    reach = page.evaluate("mp4dsReport.plots.jitter.reach")
+    for camera in (0, 1):
+        steps = intervals(recorded.stamps[camera])
+        jitter = (steps - np.median(steps[steps > 0])) / 1e6
+        counts, _ = np.histogram(jitter, bins=61, range=(-reach, reach))
+        shares = page.evaluate(f"Array.from(mp4dsReport.plots.jitter.series[{camera}].shares)")
+        assert np.abs(np.array(shares) - 100 * counts / len(jitter)).sum() < 1e-6 + 200 / len(
+            jitter
+        )
+
+
+def test_the_figures_of_the_table(page: Tab, recorded: Recorded) -> None:
+    rows = page.evaluate(
+        "[...document.querySelectorAll('#timing tbody tr')]"
+        ".map(row => [...row.cells].map(cell => cell.textContent))"
+    )
+    for row, stamps in zip(rows, recorded.stamps, strict=True):
+        steps = intervals(stamps) / 1e6
+        assert row[1] == str(len(stamps))
+        assert row[3] == f"{np.median(steps[steps > 0]):.3f}"
+        assert row[4] == f"{steps.std():.3f}"
+        lost = lost_frames(steps)
+        assert row[7] == (f"{lost.sum()} in {(lost > 0).sum()} gaps" if lost.any() else "0")
+        assert row[8] == str((steps == 0).sum())
+
+
+def test_reductions_are_least_and_most(page: Tab) -> None:
+    rng = np.random.default_rng(5)
+    values = np.round(rng.normal(size=5000), 6)
+    ranges = [sorted(rng.integers(0, 5001, 2).tolist()) for _ in range(200)]
+    ranges += [[0, 5000], [31, 33], [32, 64], [7, 7], [4999, 5000], [1024, 2048]]
+    found = page.evaluate(
+        f"(values => {{ const all = new mp4dsPlots.Reduction(Float64Array.from(values));"
+        f" return {ranges}.map(([a, b]) => all.range(a, b)); }})({values.tolist()})"
+    )
+    for (first, end), [least, most] in zip(ranges, found, strict=True):
+        if first == end:
+            assert (least, most) == (None, None)  # infinities
+        else:
+            assert least == values[first:end].min()
+            assert most == values[first:end].max()
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [INT64.min, INT64.max, 0, INT64.max, INT64.min, -1, 1],
+        [10**18 + n * 16_666_667 + (n * n % 1000) for n in range(100)],
+        [sum(1 << 7 * k for k in range(n % 9)) * (-1) ** n for n in range(60)],
+        [3],
+    ],
+)
+def test_columns_come_back_in_the_page(values: list[int], page: Tab) -> None:
+    packed = json.dumps(pack_column(np.array(values, np.int64)))
+    found = page.evaluate(f"Array.from(mp4dsColumns.decode({packed}, {len(values)}), String)")
+    assert [int(value) for value in found] == values
+
+
+def test_dragging_over_a_plot_zooms(page: Tab) -> None:
+    page.evaluate("document.querySelector('.plot canvas').scrollIntoView({block: 'center'})")
+    box = page.evaluate("document.querySelector('.plot canvas').getBoundingClientRect().toJSON()")
+    y = box["y"] + 60
+    left, right = box["x"] + 58, box["x"] + box["width"] - 8
+    page.mouse("mousePressed", left + 0.25 * (right - left), y)
+    page.mouse("mouseMoved", left + 0.4 * (right - left), y)
+    page.mouse("mouseMoved", left + 0.5 * (right - left), y)
+    page.mouse("mouseReleased", left + 0.5 * (right - left), y)
+    view = page.evaluate("[mp4dsReport.view.from, mp4dsReport.view.to, mp4dsReport.view.end]")
+    assert view[0] / view[2] == pytest.approx(0.25, abs=0.01)
+    assert view[1] / view[2] == pytest.approx(0.5, abs=0.01)
+
+
+def test_the_calibration_grid_is_drawn(page: Tab) -> None:
+    canvas = "document.querySelectorAll('.camera canvas')[1]"
+    painted = (
+        f"(c => c.getContext('2d').getImageData(0, 0, c.width, c.height).data"
+        f".reduce((sum, value, i) => sum + (i % 4 === 3 && value > 0), 0))({canvas})"
+    )
+    assert page.evaluate(painted) == 0
+    page.press("g")
+    assert page.evaluate(painted) > 500
+    page.press("g")
+    assert page.evaluate(painted) == 0
+
+
+# ---------------------------------------------------------------- sizes, names and troubles
+
+
+@pytest.mark.parametrize("width", [1280, 1920, 420])
+def test_the_page_fits_the_window(width: int, browser: Tab, drive: Path) -> None:
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+    browser.command("Emulation.setDeviceMetricsOverride", **size)
+    try:
+        show(browser, (drive / "index.html").as_uri())
+        assert browser.evaluate("document.documentElement.scrollWidth") <= width
+        assert browser.evaluate("document.querySelector('video').clientWidth") > 0.4 * width / 2
+        ratio = browser.evaluate(
+            "(v => v.clientWidth / v.clientHeight)(document.querySelector('video'))"
+        )
+        assert ratio == pytest.approx(WIDTH / HEIGHT, rel=0.02)
+    finally:
+        browser.command("Emulation.clearDeviceMetricsOverride")
+
+
+def test_two_hours_at_60_hz(browser: Tab, drive: Path, tmp_path: Path) -> None:
+    """432,000 frames in the columns of both cameras: shown, zoomed and stepped at once."""
+    copy = Path(shutil.copytree(drive, tmp_path / "long"))
+    count = 432_000
+    rng = np.random.default_rng(3)
+    stamps = 1_700_000_000 * 10**9 + np.arange(count) * 16_666_667
+    stamps += rng.integers(-200_000, 200_000, count)
+    columns = {"frames": count, "scores": {}}
+    columns |= {"stamp": pack_column(stamps), "log_time": pack_column(stamps + 5_000_000)}
+    for number in (0, 1):
+        script = f"mp4dsReport.columns({number}, {as_script(columns)});"
+        (copy / "report" / f"columns-{number}.js").write_text(script)
+    assert sum(path.stat().st_size for path in (copy / "report").glob("*.js")) < 12_000_000
+    data = copy / "report" / "data.js"
+    text = data.read_text()
+    base = json.loads(text[text.index("(") + 1 : -3])["base"]
+    data.write_text(text.replace(f'"base":"{base}"', f'"base":"{int(stamps[0])}"'))
+    start = time.monotonic()
+    show(browser, (copy / "index.html").as_uri())
+    assert time.monotonic() - start < 20
+    spent = browser.evaluate(
+        "(() => { const start = performance.now(), {view, plots, player} = mp4dsReport;"
+        " for (let n = 0; n < 10; n++) { view.zoom(player.end / 3, 0.5); "
+        " for (const plot of Object.values(plots)) plot.draw(); }"
+        " return performance.now() - start; })()"
+    )
+    assert spent < 10_000
+    at = 300_007
+    browser.evaluate(f"mp4dsReport.player.go(mp4dsReport.player.cameras[1].position[{at}])")
+    found = browser.evaluate(
+        "String(mp4dsReport.player.cameras[1].stamp[mp4dsReport.player.cameras[1].shown])"
+    )
+    assert int(found) == stamps[at]
+    least, most = browser.evaluate(
+        f"mp4dsReport.plots.interval.series[1].reduction.range(1000, {at})"
+    )
+    steps = np.diff(stamps)[999 : at - 1] / 1e6
+    assert (least, most) == pytest.approx((steps.min(), steps.max()), rel=1e-12)
+
+
+def test_hostile_names_run_nothing(browser: Tab, tmp_path: Path) -> None:
+    names = (
+        "/a</script><script>window.evil=1</script>",
+        "/b<img src=x onerror=window.evil=1>\u2028'\"",
+    )
+    folder = tmp_path / "<b>&amp;'\" #%41"
+    folder.mkdir()
+    dataset = pack_cameras(folder, two_cameras(second="mono8", names=names))
+    report(dataset)
+    show(browser, (dataset / "index.html").as_uri())
+    heads = browser.evaluate("[...document.querySelectorAll('.camera h3')].map(h => h.textContent)")
+    assert heads == list(names)
+    assert browser.evaluate("window.evil === undefined && !document.querySelector('main img')")
+    assert browser.problems == []
+
+
+def test_a_server_shows_the_same(
+    browser: Tab, drive: Path, recorded: Recorded, tmp_path: Path
+) -> None:
+    summary = report(drive, ReportOptions(output=tmp_path / "else where"))
+    with ReportServer(summary.files, summary.start) as server:
+        thread = threading.Thread(target=server.serve)
+        thread.start()
+        try:
+            page = show(browser, server.url)
+            page.evaluate("mp4dsReport.player.go(7e8)")
+            for camera in (0, 1):
+                assert_shows(page, recorded, camera, recorded.frame_at(camera, 7e8))
+            assert page.problems == []
+            page.open("about:blank", ready="true")
+        finally:
+            server.stop()
+            thread.join()
+
+
+def test_troubles_are_told(browser: Tab, drive: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(drive, tmp_path / "copy"))
+    report(copy, ReportOptions(proxies="none"))
+    (copy / "front_image_raw.mp4").write_bytes(b"no video at all")
+    show(browser, (copy / "index.html").as_uri())
+    notices = "[...document.querySelectorAll('.nothing')].map(n => n.hidden ? '' : n.textContent)"
+    end = time.monotonic() + 20
+    while not all(browser.evaluate(notices)) and time.monotonic() < end:
+        time.sleep(0.05)
+    depth, colour = browser.evaluate(notices)
+    assert depth == "No picture: no browser plays ffv1"
+    assert colour.startswith("This browser cannot play front_image_raw.mp4")
+    browser.evaluate("mp4dsReport.player.go(5e8)")
+    assert browser.evaluate(SETTLED)
+    assert browser.evaluate("mp4dsReport.player.cameras[0].shown") > 5
+    (copy / "report" / "columns-0.js").unlink()
+    browser.open("about:blank", ready="true")
+    told = "document.querySelector('#message') && !document.querySelector('#message').hidden"
+    browser.open((copy / "index.html").as_uri(), ready=told)
+    assert "columns-0.js is missing" in browser.evaluate(
+        "document.querySelector('#message').textContent"
+    )
+
+
+def test_a_page_without_cameras(browser: Tab, tmp_path: Path) -> None:
+    made = two_cameras()
+    made.messages = [message for message in made.messages if "image" not in message.topic]
+    dataset = pack_cameras(tmp_path, made)
+    report(dataset)
+    show(browser, (dataset / "index.html").as_uri())
+    assert browser.problems == []
+    assert "/imu" in browser.evaluate("document.querySelector('#topics').textContent")

