@@ -36,6 +36,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group(network))
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_call() -> None:
+    """Leave real time.
+
+    SVT-AV1, opened by PyAV itself as root, takes the thread there, and what a test starts from it
+    would hold up all others.
+    """
+    if hasattr(os, "sched_setscheduler"):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 @pytest.fixture
 def compare() -> Callable[..., list[str]]:
     """The independent comparison of two recordings."""

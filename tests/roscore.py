@@ -50,16 +50,6 @@ def wait_until(true: Callable[[], bool], seconds: float = SECONDS) -> None:
         time.sleep(0.02)
 
 
-def be_ordinary() -> None:
-    """Leave real time, and with it what is started from now on.
-
-    An encoder of SVT-AV1 that is run as root takes its thread there; a process that then waits in a
-    loop, as rospy's do when they end, holds up all others.
-    """
-    if os.sched_getscheduler(0) != os.SCHED_OTHER:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-
-
 def python(*arguments: str) -> list[str]:
     """The command of a script or module for the Python of the tests, which finds rospy too."""
     return [sys.executable, "-c", _PYTHON, *arguments]
@@ -72,7 +62,6 @@ class Process:
     """A process that says things in lines of JSON and is told others."""
 
     def __init__(self, command: list[str], environment: dict[str, str]) -> None:
-        be_ordinary()
         self.popen = subprocess.Popen(
             command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
@@ -171,7 +160,6 @@ class Core:
             **home,
             **address,
         }
-        be_ordinary()
         command = ["/usr/bin/rosmaster", "--core", "-p", str(port)]
         with (folder / "master.log").open("w") as log:
             self._master = subprocess.Popen(
@@ -183,7 +171,6 @@ class Core:
 
     def run(self, *command: str, **environment: str) -> tuple[int, str, str]:
         """Run a program beside the master; returns exit code, output and errors."""
-        be_ordinary()
         done = subprocess.run(
             [*self._prefix, *command],
             env={**self.environment, **environment},
@@ -196,7 +183,6 @@ class Core:
 
     def start(self, *command: str) -> subprocess.Popen[str]:
         """Start a program beside the master, the output of which goes into the folder."""
-        be_ordinary()
         with (self.folder / f"{Path(command[0]).name}.log").open("a") as log:
             return subprocess.Popen(
                 [*self._prefix, *command],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import json
+import os
 import random
 import shutil
 import subprocess
@@ -474,6 +475,26 @@ def test_any_rate_and_a_single_frame(rate: float | None, tmp_path: Path) -> None
         encoder.close()
         told = {"codec": codec, "coded_size": (64, 48), "frames": 1, "picture_format": "gray"}
         assert len(decode(tmp_path / "v.mp4", {**told, "picture_size": (64, 48)})) == 1
+
+
+def scheduling() -> list[int]:
+    """The scheduling classes of the threads of this process."""
+    return [os.sched_getscheduler(int(p.name)) for p in Path("/proc/self/task").iterdir()]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="a matter of Linux")
+def test_encoders_leave_the_machine_to_others(tmp_path: Path) -> None:
+    before = scheduling()
+    assert set(before) == {os.SCHED_OTHER}
+    encoder = VideoEncoder(
+        tmp_path / "v.mp4", recipe_for("gray", lossless=False, codec="av1", crf=30),
+        picture_format="gray", width=64, height=48, gop=60, threads=2, rate=30.0,
+    )  # fmt: skip
+    assert len(scheduling()) > len(before)
+    assert set(scheduling()) == {os.SCHED_OTHER}
+    encoder.write((np.zeros((48, 64), np.uint8),), 0)
+    encoder.close()
+    assert set(scheduling()) == {os.SCHED_OTHER}
 
 
 # ---------------------------------------------------------------- what is refused

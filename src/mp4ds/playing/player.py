@@ -52,6 +52,7 @@ class Player:
         self._end = timeline.end_ns if end is None else min(end, timeline.end_ns)
         self._changed = threading.Condition(threading.RLock())
         self._playback: Playback | None = None
+        self._read_ns: int | None = None  # where the playback begins, before it is used
         self._is_paused = self._options.paused
         self._is_stopped = False
         self._is_over = False
@@ -179,19 +180,15 @@ class Player:
         with quick_switches():
             try:
                 self._begin()
-                while not self._is_stopped:
-                    if not self._publisher.is_alive:
-                        self._is_stopped = True
-                        break
-                    if not self._advance():
-                        break
+                while self._publisher.is_alive and not self._is_stopped and self._advance():
+                    pass
             finally:
                 self._is_over = True
                 if self._playback is not None:
                     self._playback.close()
         self._report(is_last=True)
         self._done.seconds = time.monotonic() - began
-        self._done.stopped = self._is_stopped
+        self._done.stopped = self._is_stopped or not self._publisher.is_alive
         self._done.as_recorded = self._timeline.as_recorded
         self._done.thinned = self._timeline.thinned
         return self._done
@@ -207,6 +204,7 @@ class Player:
             self._publisher.follow_clock(self._on_clock)
         if self._ticks.is_wanted:
             self._publisher.clock(self._start)  # advertised before the first message
+        self._read_from(self._start)  # frames are made while it waits
         self._wait(_SETTLE_S + self._options.delay_s, "waiting")
         while self._options.wait_for_subscribers and not self._is_stopped:
             if all(self._publisher.subscribers(item) > 0 for item in self._timeline.channels):
@@ -237,7 +235,8 @@ class Player:
                 if self._ticks.is_due():
                     self._publisher.clock(self._time())
                 self._report(state)
-                if self._is_deserted():
+                is_awaited = self._options.loop or self._is_paused
+                if self._followed.silent_s > _FOLLOW_END_S and not is_awaited:
                     self._is_stopped = True
                 elif self._target is None:
                     self._changed.wait(min(seconds, self._ticks.seconds_left, _WAKE_S))
@@ -266,12 +265,6 @@ class Player:
             return self._followed.seconds_until(due.time_ns), f"{state} /clock"
         return self._until_due(due), "playing"
 
-    def _is_deserted(self) -> bool:
-        """Whether who leads by /clock is gone, and is not waited for."""
-        return (
-            not (self._options.loop or self._is_paused) and self._followed.silent_s > _FOLLOW_END_S
-        )
-
     def _until_due(self, due: Due) -> float:
         if not self._pace.is_running:
             self._pace.run()
@@ -298,8 +291,9 @@ class Player:
 
     def _jump(self, time_ns: int) -> None:
         """Go on at a time of the recording."""
-        if self._playback is not None:
-            self._playback.close()
+        if self._read_ns != time_ns:
+            self._read_from(time_ns)
+        self._read_ns = None
         with self._changed:
             self._replies, self._last_frame, self._reached = 1, None, time_ns
             self._pace.stand()
@@ -307,9 +301,14 @@ class Player:
         if time_ns > self._timeline.start_ns:
             for due in self._timeline.latched(time_ns):
                 self._send(due, time_ns)
+
+    def _read_from(self, time_ns: int) -> None:
+        if self._playback is not None:
+            self._playback.close()
         self._playback = self._timeline.play(
             time_ns, is_late=self._is_late, on_ready=self._on_ready
         )
+        self._read_ns = time_ns
 
     def _at_end(self) -> bool:
         """Begin again, or wait for who does; returns whether it goes on."""

@@ -16,6 +16,7 @@ from mp4ds.layouts import Picture
 from mp4ds.stamps import TIMESCALE
 from mp4ds.video.codecs import Recipe
 from mp4ds.video.convert import Converter, picture_to_frame
+from mp4ds.video.scheduling import ordinary_scheduling
 
 _TIME_BASE = Fraction(1, TIMESCALE)
 _MATRICES = {"gbr": 0, "bt709": 1, "smpte170m": 6}  # as H.273 numbers them
@@ -94,8 +95,7 @@ class VideoEncoder:
         stream.time_base = _TIME_BASE
         context = stream.codec_context
         context.time_base = _TIME_BASE
-        configure(context, self.recipe, self.width, self.height, threads=threads)
-        context.open()
+        open_encoder(context, self.recipe, self.width, self.height, threads=threads)
         self._stream = stream
 
     def write(self, picture: Picture, tick: int) -> None:
@@ -150,8 +150,8 @@ def color_range(recipe: Recipe) -> int:
     return 2 if recipe.full_range else 1
 
 
-def configure(context: Any, recipe: Recipe, width: int, height: int, *, threads: int) -> None:
-    """Tell an encoder what it is to make; its options were given before.
+def open_encoder(context: Any, recipe: Recipe, width: int, height: int, *, threads: int) -> None:
+    """Tell an encoder what it is to make, and open it; its options were given before.
 
     Args:
         context: PyAV's context of the encoder, not open yet.
@@ -161,6 +161,7 @@ def configure(context: Any, recipe: Recipe, width: int, height: int, *, threads:
         threads: Threads of the encoder.
 
     Raises:
+        FFmpegError: The encoder does not take such pictures.
         ValueError: The encoder would damage such pictures.
     """
     if recipe.encoder == "libx265" and width < _NARROW:
@@ -182,6 +183,8 @@ def configure(context: Any, recipe: Recipe, width: int, height: int, *, threads:
         # it would write its threads and the processor beside the parameter sets
         parameters = f"{context.options['x265-params']}:info=0"
         context.options = {**context.options, "x265-params": parameters}
+    with ordinary_scheduling():
+        context.open()
 
 
 def tool_versions() -> Mapping[str, str]:

@@ -15,7 +15,7 @@ from mp4ds.errors import OptionError
 from mp4ds.layouts import MAX_SIDE, Encoding, Layout, Parameters, Picture, Pixels, fit
 from mp4ds.video.codecs import Recipe, codecs_to_try, recipe_for
 from mp4ds.video.convert import Converter, picture_to_frame
-from mp4ds.video.encoder import EncoderRefusedError, coded_size, color_range, configure
+from mp4ds.video.encoder import EncoderRefusedError, coded_size, color_range, open_encoder
 
 NEAR = 1.02
 """A candidate that stands earlier is taken if it is larger by no more than this."""
@@ -83,8 +83,7 @@ def _packets(
     context.time_base = Fraction(1, 30)
     context.framerate = Fraction(30)
     try:
-        configure(context, recipe, width, height, threads=threads)
-        context.open()
+        open_encoder(context, recipe, width, height, threads=threads)
         for number, picture in enumerate(pictures):
             frame = picture_to_frame(picture, picture_format, recipe.pixel_format, converter)
             frame.pts = number
