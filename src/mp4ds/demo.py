@@ -21,7 +21,7 @@ from mp4ds.bags.definitions import ros1_channel
 from mp4ds.errors import OptionError
 from mp4ds.outputs import staged
 from mp4ds.records import Channel, Message
-from mp4ds.wire import CalibrationFields, Fields, ImageFields, Slots, form_of
+from mp4ds.wire import CalibrationFields, Fields, ImageFields, Slots, plain_message
 
 START_NS = 1_712_647_128_027_473_200
 WIDTH, HEIGHT = 480, 360
@@ -130,11 +130,7 @@ def _image(camera: _Camera, seq: int, stamp: int) -> bytes:
 
 
 def _ros1(type_name: str, frame_id: str, fields: Fields, slots: Slots, body: bytes = b"") -> bytes:
-    """A message in the serialization of ROS 1."""
-    form = form_of("ros1", type_name, b"")
-    blank = form.plain(frame_id, fields) or b""
-    head, tail = form.template(blank).around(slots, len(body))
-    return head + body + tail
+    return plain_message("ros1", type_name, frame_id, fields, slots, body)
 
 
 def _view(camera: _Camera, time: float) -> NDArray[np.float32]:

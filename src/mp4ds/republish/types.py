@@ -15,7 +15,7 @@ from mp4ds.bags.typedefs import World, make_store, ros1_world, ros2_world, types
 from mp4ds.records import Channel, Schema
 from mp4ds.republish import packets
 from mp4ds.republish.packets import VideoFields
-from mp4ds.wire import Fields, Slots, Template, WireError, form_of
+from mp4ds.wire import Fields, Slots, plain_message
 from mp4ds.wire.forms import NS
 
 _DISTRIBUTION = "humble"
@@ -148,15 +148,8 @@ class Types:
             if self._kind == "ffmpeg":
                 return packets.ffmpeg_message(self.encoding, slots, frame_id, fields, body, is_key)
             return packets.video_message(self.encoding, slots, frame_id, fields.codec, body)
-        head, tail = self._template(frame_id, fields).around(slots, len(body))
-        return b"".join((head, body, tail))
-
-    def _template(self, frame_id: str, fields: Fields) -> Template:
-        form = form_of(_WIRES[self.encoding], _TYPES[self._kind], b"")
-        blank = form.plain(frame_id, fields)
-        if blank is None:
-            raise WireError(f"{_TYPES[self._kind]} has no plain form")
-        return form.template(blank)
+        wire, name = _WIRES[self.encoding], _TYPES[self._kind]
+        return plain_message(wire, name, frame_id, fields, slots, body)
 
 
 def _is_kept(key: str) -> bool:

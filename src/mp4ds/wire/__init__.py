@@ -7,7 +7,15 @@ caller, so nothing here needs to be trusted (spec/index.md, "Exactness").
 
 from __future__ import annotations
 
-from mp4ds.wire.formats import WIRES, form_of, is_calibration, is_camera, kind_of, wire_of
+from mp4ds.wire.formats import (
+    WIRES,
+    form_of,
+    is_calibration,
+    is_camera,
+    kind_of,
+    plain_message,
+    wire_of,
+)
 from mp4ds.wire.forms import (
     CalibrationFields,
     CodedFields,
@@ -36,6 +44,7 @@ __all__ = [
     "is_calibration",
     "is_camera",
     "kind_of",
+    "plain_message",
     "prove",
     "wire_of",
 ]

@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from mp4ds.records import Channel
-from mp4ds.wire.forms import CalibrationFields, CodedFields, Fields, Form, ImageFields, WireError
+from mp4ds.wire.forms import (
+    CalibrationFields,
+    CodedFields,
+    Fields,
+    Form,
+    ImageFields,
+    Slots,
+    WireError,
+)
 from mp4ds.wire.ros import LAYOUTS, RosForm, RosWire
 
 _ROS = {
@@ -111,6 +119,30 @@ def form_of(wire: str, type_name: str, schema: bytes) -> Form:
     if wire not in _ROS or name not in LAYOUTS:
         raise WireError(f"type {type_name!r} is not modelled")
     return RosForm(_ROS[wire], name)
+
+
+def plain_message(
+    wire: str, type_name: str, frame_id: str, fields: Fields, slots: Slots, body: bytes | memoryview
+) -> bytes:
+    """A camera message as a plain serializer of ROS writes it.
+
+    Args:
+        wire: One of ROS.
+        type_name: As either ROS spells it.
+        frame_id: Coordinate frame.
+        fields: What it says.
+        slots: Its times.
+        body: Pixels or coded picture; empty for a calibration.
+
+    Raises:
+        WireError: The type has no plain form, or a value no place in it.
+    """
+    form = form_of(wire, type_name, b"")
+    blank = form.plain(frame_id, fields)
+    if blank is None:
+        raise WireError(f"{type_name} has no plain form")
+    head, tail = form.template(blank).around(slots, len(body))
+    return b"".join((head, body, tail))
 
 
 def _ros_type(name: str) -> str:
