@@ -25,6 +25,7 @@ NAMES = [
     "Frame",
     "FrameNotFoundError",
     "Frames",
+    "ImageFolder",
     "Mp4dsError",
     "OptionError",
     "PackOptions",
@@ -49,6 +50,7 @@ NAMES = [
     "VideoError",
     "WriteError",
     "__version__",
+    "import_ros_mp4",
     "open",
     "pack",
     "pack_each",
@@ -183,7 +185,7 @@ def test_all_is_documented(name: str) -> None:
             assert known, f"{name}({parameter.name})"
 
 
-@pytest.mark.parametrize("name", ["open", "pack", "play", "unpack", "validate"])
+@pytest.mark.parametrize("name", ["import_ros_mp4", "open", "pack", "play", "unpack", "validate"])
 def test_the_functions_are_annotated(name: str) -> None:
     function = getattr(mp4ds, name)
     signature = inspect.signature(function)

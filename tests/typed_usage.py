@@ -33,6 +33,14 @@ def pack(source: Path, dataset: str) -> dict[str, tuple[int, int]]:
     return {topic.topic: (topic.messages, topic.frames) for topic in summary.topics}
 
 
+def imports(folder: Path) -> list[str]:
+    """Topics of a folder of images, and of a pair of the paper's tool."""
+    plain = mp4ds.ImageFolder(layout="plain", rate="20", topic="/cam/image_raw")
+    images: mp4ds.PackSummary = mp4ds.pack(folder, "images", mp4ds.PackOptions(images=plain))
+    pair: mp4ds.PackSummary = mp4ds.import_ros_mp4("a.mp4", Path("a.yaml"), "pair", force=True)
+    return [topic.topic for summary in (images, pair) for topic in summary.topics]
+
+
 def unpack(dataset: str | Path) -> Path:
     """The recording made."""
     options = mp4ds.UnpackOptions(storage="mcap", force=True)

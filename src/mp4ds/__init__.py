@@ -4,6 +4,7 @@ The public surface, and nothing else::
 
     mp4ds.pack("drive.bag", "drive")            a recording into a dataset
     mp4ds.unpack("drive", "bag", "again.bag")   and back
+    mp4ds.import_ros_mp4("a.mp4", "a.yaml", "a")   a dataset of the paper's tool as it is
     mp4ds.play("drive")                         as if it were the recording: ROS 1, ROS 2, Foxglove
     mp4ds.validate("drive", deep=True)          every problem, or an empty list
     mp4ds.open("drive")["/camera/image_raw"][7].data
@@ -43,7 +44,15 @@ if TYPE_CHECKING:
         VideoError,
         WriteError,
     )
-    from mp4ds.packing import PackOptions, PackSummary, pack, pack_each, pack_share
+    from mp4ds.importing import ImageFolder
+    from mp4ds.packing import (
+        PackOptions,
+        PackSummary,
+        import_ros_mp4,
+        pack,
+        pack_each,
+        pack_share,
+    )
     from mp4ds.playing import PlayOptions, PlaySummary, play
     from mp4ds.recorded import RecordedMessage
     from mp4ds.sync import Sync
@@ -70,7 +79,8 @@ _HOMES = {
         "VideoError",
         "WriteError",
     ),
-    "packing": ("PackOptions", "PackSummary", "pack", "pack_each", "pack_share"),
+    "importing": ("ImageFolder",),
+    "packing": ("PackOptions", "PackSummary", "import_ros_mp4", "pack", "pack_each", "pack_share"),
     "playing": ("PlayOptions", "PlaySummary", "play"),
     "recorded": ("RecordedMessage",),
     "sync": ("Sync",),
@@ -85,6 +95,7 @@ __all__ = [
     "Frame",
     "FrameNotFoundError",
     "Frames",
+    "ImageFolder",
     "Mp4dsError",
     "OptionError",
     "PackOptions",
@@ -109,6 +120,7 @@ __all__ = [
     "VideoError",
     "WriteError",
     "__version__",
+    "import_ros_mp4",
     "open",
     "pack",
     "pack_each",

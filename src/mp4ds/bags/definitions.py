@@ -1,12 +1,14 @@
-"""Standard ROS 1 message definitions, for recordings that are made and not read."""
+"""Standard message definitions, for recordings that are made and not read."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from mp4ds.bags.convert import LATCHED_QOS
 from mp4ds.records import Channel, Schema
 
 
@@ -28,6 +30,35 @@ def ros1_channel(channel_id: int, topic: str, type_name: str, callerid: str) -> 
         Schema(type_name, "ros1msg", definition.encode()),
         {"md5sum": md5sum, "callerid": callerid},
     )
+
+
+def ros2_channel(channel_id: int, topic: str, type_name: str) -> Channel:
+    """A channel of a standard ROS 2 type, with its definition and type hash.
+
+    Args:
+        channel_id: Unique in the recording.
+        topic: Topic name.
+        type_name: Such as ``sensor_msgs/msg/Image``.
+    """
+    store = _ros2_store()
+    definition, _ = store.generate_msgdef(type_name, ros_version=2)
+    return Channel(
+        channel_id,
+        topic,
+        "cdr",
+        Schema(type_name, "ros2msg", definition.encode()),
+        {"offered_qos_profiles": "", "topic_type_hash": store.hash_rihs01(type_name)},
+    )
+
+
+def latched(channel: Channel) -> Channel:
+    """The same ROS 2 channel, which gives those that subscribe late its last message."""
+    return replace(channel, metadata={**channel.metadata, "offered_qos_profiles": LATCHED_QOS})
+
+
+@lru_cache(maxsize=1)
+def _ros2_store() -> Typestore:
+    return get_typestore(Stores.ROS2_HUMBLE)
 
 
 @lru_cache(maxsize=1)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mp4ds.errors import SourceError
+from mp4ds.source_files import is_folder, source_digest, source_name, source_size
 
 _BLOCK = 2**20
 
@@ -15,7 +16,8 @@ _BLOCK = 2**20
 class SourceHasher:
     """SHA-256 of the source files, taken while they are read, behind the reader.
 
-    The bytes are then still in the system's cache: the disk is read once.
+    The bytes are then still in the system's cache: the disk is read once. A folder is hashed when
+    the reader is past its bytes.
 
     Args:
         path: The recording; a folder's name is put before those of its files.
@@ -25,6 +27,7 @@ class SourceHasher:
     def __init__(self, path: Path, files: Sequence[Path]) -> None:
         self._folder = path if path.is_dir() else None
         self._files = list(files)
+        self._sizes = {path: source_size(path) for path in files if is_folder(path)}
         self._position = 0
         self._number = 0
         self._offset = 0
@@ -39,14 +42,21 @@ class SourceHasher:
         """
         while self._number < len(self._files) and (position is None or self._position < position):
             path = self._files[self._number]
+            end = self._position + self._sizes.get(path, 0)
+            if position is not None and position < end:
+                return
             try:
+                if path in self._sizes:
+                    self._finish(path, *source_digest(path))
+                    self._position = end
+                    continue
                 with path.open("rb") as stream:
                     stream.seek(self._offset)
                     at_end = self._hash_file(stream, position)
             except OSError as error:
                 raise SourceError(path, f"cannot be read: {error.strerror}") from None
             if at_end:
-                self._finish_file(path)
+                self._finish(path, self._offset, self._hash.hexdigest())
 
     def _hash_file(self, stream: BinaryIO, position: int | None) -> bool:
         while position is None or self._position < position:
@@ -58,10 +68,8 @@ class SourceHasher:
             self._position += len(block)
         return False
 
-    def _finish_file(self, path: Path) -> None:
-        inside = self._folder is not None and path.parent == self._folder
-        name = f"{path.parent.name}/{path.name}" if inside else path.name
-        self.digests.append((name, self._offset, self._hash.hexdigest()))
+    def _finish(self, path: Path, size: int, sha256: str) -> None:
+        self.digests.append((source_name(path, self._folder), size, sha256))
         self._hash = hashlib.sha256()
         self._offset = 0
         self._number += 1

@@ -21,6 +21,7 @@ from mp4ds.cli.arguments import parse_resize, parse_share, parse_size, spelled
 from mp4ds.cli.conformance import conformance_dump
 from mp4ds.cli.evaluate import evaluate
 from mp4ds.cli.failures import told_errors
+from mp4ds.cli.imports import imports
 from mp4ds.cli.output import (
     print_info,
     print_json,
@@ -291,6 +292,7 @@ def unpack(
     print_unpack(summary, "images" if to == "images" else "messages")
 
 
+app.add_typer(imports)
 app.command()(play)
 app.command()(report)
 app.command()(frames)

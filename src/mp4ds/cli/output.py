@@ -135,7 +135,7 @@ def print_pack(summary: PackSummary) -> None:
         for note in topic.notes:
             say(f"{topic.topic}: {note}")
     for what, count in summary.skipped.items():
-        say(f"not packed, as no dataset can hold it: {count} {what}")
+        say(f"not packed as it was: {count} {what}")
     if summary.left_out:
         say(f"left out: {', '.join(summary.left_out)}")
     for loss in summary.losses[:_LOSSES_SHOWN]:

@@ -12,14 +12,15 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from mp4ds.bags import open_sources
 from mp4ds.engine import Engine, ProcessEngine
 from mp4ds.errors import FormatError, OptionError, SourceError, TargetExistsError, WriteError
 from mp4ds.outputs import check_target, staged
 from mp4ds.packing.coordinator import Coordinator, Run, claimed
-from mp4ds.packing.job import outcome_options
+from mp4ds.packing.job import open_recording, outcome_options
+from mp4ds.packing.manifest import is_dataset
 from mp4ds.packing.planning import Means, plan_job
 from mp4ds.packing.report import PackOptions, PackProgress, PackSummary, TopicSummary
+from mp4ds.packing.ros_mp4 import import_ros_mp4
 from mp4ds.packing.single import pack_in_one_pass
 from mp4ds.packing.uploading import pack_to_store, shared_folder
 from mp4ds.packing.work import command
@@ -27,6 +28,7 @@ from mp4ds.packing.workplace import Workplace
 from mp4ds.plan import parse_quality
 from mp4ds.remote import RemotePath, location, remote
 from mp4ds.sidecar import MANIFEST_NAME, load_manifest
+from mp4ds.source_files import source_size
 from mp4ds.video import check_codec
 
 __all__ = [
@@ -34,6 +36,7 @@ __all__ = [
     "PackProgress",
     "PackSummary",
     "TopicSummary",
+    "import_ros_mp4",
     "is_dataset",
     "pack",
     "pack_each",
@@ -53,7 +56,8 @@ def pack(
     """Pack a recording into a dataset.
 
     Args:
-        sources: A bag, rosbag2 folder or MCAP file, or several that belong together; or URLs.
+        sources: A bag, rosbag2 folder or MCAP file, or several that belong together; or URLs. A
+            folder of images where the options have `images`.
         dataset: The folder to make, or its URL.
         options: How; the default loses nothing.
         progress: Called several times a second.
@@ -150,22 +154,22 @@ def pack_each(
         return [
             _pack([source], target, chosen, progress)
             for target, source in targets.items()
-            if chosen.force or not _is_packed(source, target)
+            if chosen.force or not _is_packed(source, target, chosen)
         ]
     parent.mkdir(exist_ok=True)
     runs = []
     for target, source in targets.items():
-        if chosen.force or not _is_packed(source, target):
+        if chosen.force or not _is_packed(source, target, chosen):
             runs.append(_plan([source], target, chosen, recordings=len(targets)))
     return _pack_runs(runs, chosen, progress)
 
 
-def _is_packed(source: Path, target: Path) -> bool:
+def _is_packed(source: Path, target: Path, options: PackOptions) -> bool:
     """Whether a dataset of a recording is there already."""
     if not (target / MANIFEST_NAME).exists() if remote(target) else not os.path.lexists(target):
         return False
-    with open_sources([source]) as reader:
-        sizes = sorted(path.stat().st_size for path in reader.files)
+    with open_recording([source], images=options.images) as reader:
+        sizes = sorted(map(source_size, reader.files))
     try:
         manifest = load_manifest(target / MANIFEST_NAME)
     except FormatError:
@@ -188,7 +192,8 @@ def _checked(options: PackOptions) -> PackOptions:
             "is smaller than any video of its pixels."
         )
     check_codec(options.codec, options.preset, lossless=quality.lossless)
-    return replace(options, purpose=None, gop=options.group_frames)
+    images = options.images.absolute() if options.images else None
+    return replace(options, purpose=None, gop=options.group_frames, images=images)
 
 
 def _plan(paths: Sequence[Path], target: Path, options: PackOptions, *, recordings: int = 1) -> Run:
@@ -202,7 +207,7 @@ def _plan(paths: Sequence[Path], target: Path, options: PackOptions, *, recordin
         raise OptionError(
             f"There is nothing to join: {place.folder} holds no pack. Run the shards first."
         )
-    with open_sources(paths, salvage=options.salvage) as reader:
+    with open_recording(paths, salvage=options.salvage, images=options.images) as reader:
         job = plan_job(reader, paths, options, Means.of(options).for_one_of(recordings))
     return Run(job, place, paths, target, options.force, is_new=True)
 
@@ -272,8 +277,3 @@ def _absolute(path: Path | str) -> Path:
     if remote(found):
         return found
     return Path(os.path.abspath(found))  # noqa: PTH100 - keeps links, unlike resolve()
-
-
-def is_dataset(path: Path) -> bool:
-    """Whether a folder is one that pack made, or empty, and may be replaced when asked."""
-    return path.is_dir() and ((path / MANIFEST_NAME).is_file() or not any(path.iterdir()))

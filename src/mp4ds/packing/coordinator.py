@@ -22,7 +22,7 @@ from mp4ds.errors import (
 )
 from mp4ds.outputs import move_into_place, sync
 from mp4ds.packing.assemble import Assembler
-from mp4ds.packing.job import Job, Task, absolute, source_name
+from mp4ds.packing.job import Job, Task, absolute
 from mp4ds.packing.manifest import folder_size, summarize, write_manifest
 from mp4ds.packing.part import RECORD_NAME, Part, read_record
 from mp4ds.packing.progress import JobProgress, Report
@@ -30,6 +30,7 @@ from mp4ds.packing.report import PackSummary
 from mp4ds.packing.spans import share
 from mp4ds.packing.workplace import Workplace
 from mp4ds.plan import Selection
+from mp4ds.source_files import source_name
 
 _LISTED = 10
 _JOINED_AT_ONCE = 4  # more would only wait for the disk

@@ -11,8 +11,8 @@ import xxhash
 
 from mp4ds._version import __version__
 from mp4ds.bags import BagReader, open_sources
-from mp4ds.errors import SourceError
-from mp4ds.outputs import digest_file
+from mp4ds.errors import OptionError, SourceError
+from mp4ds.importing import ImageFolder, open_images
 from mp4ds.packing.kept import dump_kept, load_kept
 from mp4ds.packing.packer import PartSettings
 from mp4ds.packing.report import PackOptions
@@ -20,13 +20,14 @@ from mp4ds.packing.survey import Survey
 from mp4ds.plan import Selection, parse_quality
 from mp4ds.records import Excerpt
 from mp4ds.remote import location, remote, spelled
+from mp4ds.source_files import is_folder, members, source_digest
 from mp4ds.streams import StreamSettings
 from mp4ds.video import tool_versions
 
 _SAMPLE = 2**16
 _OUTCOME_OPTIONS = (
     *("topics", "exclude", "quality", "codec", "preset", "transcode", "camera_info"),
-    *("gop", "window", "salvage"),
+    *("gop", "window", "salvage", "images"),
 )
 
 
@@ -38,8 +39,8 @@ class SourceState:
         path: Absolute, or a URL.
         size: Bytes.
         modified_ns: When it was written, as the file system tells; 0 at a URL.
-        sample: XXH64 of its first and last bytes; at a URL, what the store says of its content,
-            such as an ETag, where it says anything.
+        sample: XXH64 of its first and last bytes, or of the names, sizes and times in a folder; at
+            a URL, what the store says of its content, such as an ETag, where it says anything.
     """
 
     path: str
@@ -55,6 +56,8 @@ class SourceState:
             SourceError: It cannot be read.
         """
         try:
+            if is_folder(path):
+                return cls._of_folder(path)
             stat = path.stat()
             found = remote(path)
             if found and found.tag:
@@ -67,6 +70,16 @@ class SourceState:
         except OSError as error:
             raise SourceError(path, f"cannot be read: {error.strerror}") from None
         return cls(spelled(path), stat.st_size, stat.st_mtime_ns, digest.hexdigest())
+
+    @classmethod
+    def _of_folder(cls, folder: Path) -> SourceState:
+        stats = {path.name: path.stat() for path in members(folder)}
+        digest = xxhash.xxh64()
+        for name, stat in stats.items():
+            digest.update(f"{name}\0{stat.st_size}\0{stat.st_mtime_ns}\n".encode(errors="replace"))
+        size = sum(stat.st_size for stat in stats.values())
+        latest = max((stat.st_mtime_ns for stat in stats.values()), default=0)
+        return cls(spelled(folder), size, latest, digest.hexdigest())
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +205,12 @@ class Job:
     def open(self) -> BagReader:
         """The recording."""
         paths = [location(path) for path in self.paths]
-        return open_sources(paths, salvage=bool(self.options["salvage"]))
+        images = self.options["images"]
+        return open_recording(
+            paths,
+            salvage=bool(self.options["salvage"]),
+            images=None if images is None else ImageFolder(**images),
+        )
 
     def check_sources(self) -> None:
         """Refuse a recording that is not what it was when the job was planned.
@@ -236,6 +254,29 @@ class Job:
         return Survey(pairs=self.survey.pairs) if task.solo else self.survey
 
 
+def open_recording(
+    paths: Sequence[Path], *, salvage: bool = False, images: ImageFolder | None = None
+) -> BagReader:
+    """Open what is to be packed.
+
+    Args:
+        paths: Recordings that belong together, or a folder of images.
+        salvage: Read what can be read of damaged recordings.
+        images: How the folder of images is read; None for recordings.
+
+    Raises:
+        SourceError: It cannot be read.
+        OptionError: The options do not suit it.
+    """
+    if images is None:
+        return open_sources(paths, salvage=salvage)
+    if salvage:
+        raise OptionError("--salvage goes with recordings, not with a folder of images.")
+    if len(paths) != 1:
+        raise OptionError(f"One folder of images is read at a time, and {len(paths)} were given.")
+    return open_images(paths[0], images)
+
+
 def _task(item: Mapping[str, Any]) -> Task:
     topics = item["topics"]
     return Task(
@@ -251,6 +292,7 @@ def outcome_options(options: PackOptions) -> dict[str, Any]:
     """The options that decide what comes out, as JSON has them."""
     values = {name: getattr(options, name) for name in _OUTCOME_OPTIONS}
     values["gop"] = options.group_frames
+    values["images"] = None if options.images is None else asdict(options.images)
     return {
         name: list(value) if isinstance(value, (list, tuple)) else value
         for name, value in values.items()
@@ -267,12 +309,6 @@ def absolute(paths: Sequence[Path]) -> list[str]:
     return [spelled(path) for path in paths]
 
 
-def source_name(path: Path, folder: Path | None) -> str:
-    """Name of a recording's file in a manifest: with its folder's, where that was given."""
-    inside = folder is not None and path.parent == folder
-    return f"{path.parent.name}/{path.name}" if inside else path.name
-
-
 def digest_source(source: SourceState) -> Sequence[object]:
     """Size and SHA-256 of a recording's file.
 
@@ -281,6 +317,6 @@ def digest_source(source: SourceState) -> Sequence[object]:
     """
     path = location(source.path)
     try:
-        return digest_file(path)
+        return source_digest(path)
     except OSError as error:
         raise SourceError(path, f"cannot be read: {error.strerror}") from None

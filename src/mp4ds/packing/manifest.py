@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Protocol
 
 from mp4ds._version import __version__
 from mp4ds.bags import BagReader, BagWriter
+from mp4ds.bags.protocols import Format
 from mp4ds.coded import zlib_build
 from mp4ds.outputs import digest_file
 from mp4ds.packing.part import Part
@@ -28,6 +30,25 @@ from mp4ds.sidecar import (
 )
 from mp4ds.video import tool_versions
 from mp4ds.wire.transforms import TransformCollector
+
+
+class Recorded(Protocol):
+    """What a manifest tells of a recording. See `BagReader`."""
+
+    @property
+    def format(self) -> Format:
+        """``bag``, ``rosbag2`` or ``mcap``."""
+        ...
+
+    @property
+    def profile(self) -> str:
+        """``ros1``, ``ros2`` or any other MCAP profile; empty for none."""
+        ...
+
+    @property
+    def library(self) -> str:
+        """The MCAP header's library string; empty for other formats."""
+        ...
 
 
 def declare_rest(
@@ -63,13 +84,13 @@ def _channels_of(part: Part) -> set[tuple[object, ...]]:
 
 
 def write_manifest(
-    part: Part, reader: BagReader, sources: Sequence[tuple[str, int, str]], profile: str
+    part: Part, recording: Recorded, sources: Sequence[tuple[str, int, str]], profile: str
 ) -> None:
     """Write the manifest of a whole recording: the dataset is complete then.
 
     Args:
         part: All that was packed.
-        reader: The recording.
+        recording: The recording.
         sources: Name, size in bytes and SHA-256 of its files.
         profile: What was asked for.
     """
@@ -86,9 +107,9 @@ def write_manifest(
         mp4ds=FORMAT_VERSION,
         kind="dataset",
         profile=profile,
-        format=reader.format,
-        recording_profile=reader.profile,
-        library=reader.library,
+        format=recording.format,
+        recording_profile=recording.profile,
+        library=recording.library,
         sources=[Source(name=name, size=size, sha256=sha256) for name, size, sha256 in sources],
         messages=sum(topic.messages for topic in part.topics.values()),
         losses=[LossEntry.from_record(loss) for loss in part.losses],
@@ -161,3 +182,8 @@ def summarize(part: Part, target: Path, source_bytes: int) -> PackSummary:
 def folder_size(folder: Path) -> int:
     """Bytes of the files in a folder."""
     return sum(path.stat().st_size for path in folder.iterdir())
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a folder is one that pack made, or empty, and may be replaced when asked."""
+    return path.is_dir() and ((path / MANIFEST_NAME).is_file() or not any(path.iterdir()))

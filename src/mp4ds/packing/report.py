@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mp4ds.errors import OptionError
+from mp4ds.importing.options import ImageFolder
 from mp4ds.plan import parse_quality
 from mp4ds.records import Loss
 from mp4ds.video.codecs import GOPS, LOSSLESS_GOP, LOSSY_GOP
@@ -42,6 +43,7 @@ class PackOptions:
         salvage: Pack what can be read of a damaged recording.
         restart: Begin anew where an unfinished pack was left.
         force: Replace an existing dataset.
+        images: How a folder of images is read as a recording; None for recordings.
     """
 
     topics: Sequence[str] = ()
@@ -62,6 +64,7 @@ class PackOptions:
     salvage: bool = False
     restart: bool = False
     force: bool = False
+    images: ImageFolder | None = None
 
     @property
     def group_frames(self) -> int:

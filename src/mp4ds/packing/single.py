@@ -12,6 +12,7 @@ from mp4ds.packing.manifest import folder_size, summarize, write_manifest
 from mp4ds.packing.packer import Packer
 from mp4ds.packing.part import Part
 from mp4ds.packing.report import PackProgress, PackSummary
+from mp4ds.source_files import source_size
 from mp4ds.wire import is_camera
 
 _REPORT_SECONDS = 0.1
@@ -38,7 +39,7 @@ def pack_in_one_pass(
         OSError: The disk refused.
     """
     hasher = SourceHasher(reader.path, reader.files)
-    total = sum(path.stat().st_size for path in reader.files)
+    total = sum(map(source_size, reader.files))
     stats = reader.stats()
     counts: dict[str, int | None] = {}
     for channel in filter(is_camera, reader.channels):

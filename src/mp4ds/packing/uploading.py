@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from mp4ds.errors import SourceNotFoundError
-from mp4ds.packing.job import SourceState, outcome_options, tools
+from mp4ds.packing.job import SourceState, open_recording, outcome_options, tools
 from mp4ds.packing.report import PackOptions, PackProgress, PackSummary, TopicSummary
 from mp4ds.remote import RemotePath
 from mp4ds.sidecar import MANIFEST_NAME
@@ -69,13 +69,18 @@ def _order(paths: Sequence[Path], options: PackOptions) -> dict[str, Any]:
     return {
         "paths": [str(path) for path in paths],
         "sources": [
-            asdict(SourceState.of(file)) | {"path": str(file)}
-            for path in paths
-            for file in _files(path)
+            asdict(SourceState.of(file)) | {"path": str(file)} for file in _files_of(paths, options)
         ],
         "options": outcome_options(options),
         "tools": tools(),
     }
+
+
+def _files_of(paths: Sequence[Path], options: PackOptions) -> list[Path]:
+    if options.images is None:
+        return [file for path in paths for file in _files(path)]
+    with open_recording(paths, images=options.images) as reader:
+        return list(reader.files)
 
 
 def _files(path: Path) -> Iterator[Path]:

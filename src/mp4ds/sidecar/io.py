@@ -104,13 +104,20 @@ def _remove(document: Any, place: tuple[int | str, ...]) -> None:
     document.pop(place[-1], None)
 
 
-def load_stream(path: Path) -> StreamSidecar:
+def load_stream(path: Path, *, video: str | None = None) -> StreamSidecar:
     """Read a stream's sidecar.
+
+    Args:
+        path: The file.
+        video: Name of the video that it is for, where that is another one than it tells.
 
     Raises:
         FormatError: Any code of `load_document`, or ``model-invalid``.
     """
-    return _model(StreamSidecar, load_document(path), path)
+    document = load_document(path)
+    if video is not None and isinstance(document.get("video"), dict):
+        document["video"]["file"] = video
+    return _model(StreamSidecar, document, path)
 
 
 def load_manifest(path: Path) -> Manifest:

@@ -1,0 +1,169 @@
+"""``mp4ds import``: what is no recording of ROS into a dataset."""
+
+from __future__ import annotations
+
+from typing import Annotated, Optional
+
+import typer
+
+from mp4ds.cli.arguments import parse_size
+from mp4ds.cli.failures import told_errors
+from mp4ds.cli.output import print_json, print_pack
+from mp4ds.cli.progress import pack_progress
+
+imports = typer.Typer(
+    name="import",
+    help="Make a dataset of images, or of a video of the paper's tool.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+_Output = Annotated[
+    str, typer.Option("--output", "-o", metavar="DATASET", help="The folder to make.")
+]
+_Force = Annotated[bool, typer.Option("--force", "-f", help="Replace an existing output.")]
+_Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+@imports.command()
+def images(
+    folder: Annotated[str, typer.Argument(help="A folder of images, or of a known layout.")],
+    output: _Output,
+    layout: Annotated[
+        Optional[str],  # noqa: UP045 - read at run time by typer
+        typer.Option("--layout", help="euroc, kitti, tum or plain; as found by default."),
+    ] = None,
+    stamps: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            "--stamps", metavar="FILE", help="Times, one a line; or times and file names."
+        ),
+    ] = None,
+    rate: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--rate", metavar="HZ", help="Where there are no times, such as 20."),
+    ] = None,
+    unit: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--unit", help="Of times that are whole numbers: s, ms, us or ns."),
+    ] = None,
+    calibration: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--calibration", metavar="YAML", help="As ROS's camera_calibration saves it."),
+    ] = None,
+    topic: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--topic", "-t", help="Of plain images; /camera/image_raw by default."),
+    ] = None,
+    frame_id: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--frame-id", help="Of plain images; camera by default."),
+    ] = None,
+    encoding: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            "--encoding", help="Of plain images, such as bayer_rggb8 or 16UC1; as in the files."
+        ),
+    ] = None,
+    quality: Annotated[
+        str, typer.Option("--quality", "-q", help="lossless, visual, or crf=N.")
+    ] = "lossless",
+    codec: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--codec", help="h264, h265, av1 or ffv1; the best by default."),
+    ] = None,
+    preset: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--preset", help="The encoder's preset, such as 6 or veryfast."),
+    ] = None,
+    transcode: Annotated[
+        bool,
+        typer.Option(
+            "--transcode", help="Encode JPEG files anew by --quality, instead of copying them."
+        ),
+    ] = False,
+    purpose: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--for", metavar="PURPOSE", help="archive or training; see mp4ds pack."),
+    ] = None,
+    gop: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option("--gop", min=1, max=100_000, help="Most frames between key frames."),
+    ] = None,
+    jobs: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(
+            "--jobs", "-j", min=1, max=1024, help="Processes at a time; all cores by default."
+        ),
+    ] = None,
+    memory: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            "--memory", metavar="SIZE", help="Such as 8G; half of the machine's by default."
+        ),
+    ] = None,
+    restart: Annotated[
+        bool, typer.Option("--restart", help="Begin anew where an unfinished run was left.")
+    ] = False,
+    force: _Force = False,
+    as_json: _Json = False,
+) -> None:
+    """Make a dataset of a folder of images with times.
+
+    EuRoC, KITTI and TUM RGB-D folders give all their cameras at once. Lossless by default. A run
+    that was interrupted goes on when the same command is run again.
+    """
+    from mp4ds.importing import ImageFolder
+    from mp4ds.packing import PackOptions
+    from mp4ds.packing import pack as run
+
+    with told_errors(as_json), pack_progress(as_json) as progress:
+        options = PackOptions(
+            quality=quality,
+            codec=codec,
+            preset=preset,
+            transcode=transcode,
+            purpose=purpose,
+            gop=gop,
+            jobs=jobs,
+            memory=parse_size(memory) if memory else None,
+            restart=restart,
+            force=force,
+            images=ImageFolder(
+                layout=layout,
+                stamps=stamps,
+                rate=rate,
+                unit=unit,
+                calibration=calibration,
+                topic=topic,
+                frame_id=frame_id,
+                encoding=encoding,
+            ),
+        )
+        summary = run(folder, output, options, progress=progress)
+    if as_json:
+        print_json(summary)
+    else:
+        print_pack(summary)
+
+
+@imports.command("ros-mp4")
+def ros_mp4(
+    video: Annotated[str, typer.Argument(metavar="VIDEO", help="The mp4.")],
+    sidecar: Annotated[str, typer.Argument(metavar="YAML", help="The YAML that came with it.")],
+    output: _Output,
+    force: _Force = False,
+    as_json: _Json = False,
+) -> None:
+    """Make a dataset of a video and YAML of the tool published with the paper.
+
+    The video is not encoded anew: its packets are copied.
+    """
+    from mp4ds.packing import import_ros_mp4
+
+    with told_errors(as_json):
+        summary = import_ros_mp4(video, sidecar, output, force=force)
+    if as_json:
+        print_json(summary)
+    else:
+        print_pack(summary)

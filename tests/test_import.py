@@ -1,0 +1,864 @@
+"""Folders of images and pairs of the paper's tool become datasets.
+
+The folders are written with OpenCV, Pillow and text; what comes out is read with mcap and rosbags.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from decimal import Decimal
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from numpy.typing import NDArray
+from PIL import Image
+from rosbags.highlevel import AnyReader
+from typer.testing import CliRunner
+
+import mp4ds
+from in_parts import InlineEngine, facts, leftovers
+from mp4ds.cli import app
+from mp4ds.errors import SourceError
+from mp4ds.importing import times
+from mp4ds.importing.geometry import quaternion
+from mp4ds.sidecar import load_manifest
+from mp4ds.video.image_files import read_image
+from test_version0 import FIXTURE, STAMPS, TOPICS, document, nanoseconds, write_text
+
+WIDTH, HEIGHT = 32, 24
+START = 1_403_636_579_763_555_584
+Pixels = NDArray[Any]
+
+
+def noise(channels: int = 1, dtype: str = "u1") -> Pixels:
+    """All bits of all samples vary."""
+    shape = (HEIGHT, WIDTH) if channels == 1 else (HEIGHT, WIDTH, channels)
+    return np.random.default_rng(1).integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
+
+
+def image(number: int, channels: int = 1, dtype: str = "u1") -> Pixels:
+    """Slopes that move, of which a video is smaller than its images."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    planes = [x * (3 + plane) + y * 2 + number * 5 for plane in range(channels)]
+    values = np.stack(planes, axis=-1) * (100 if dtype == "u2" else 1)
+    return (values[..., 0] if channels == 1 else values).astype(dtype)
+
+
+def save(path: Path, pixels: Pixels) -> Path:
+    """Write an image by OpenCV, whose colours are the other way round."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    order = {2: slice(None), 3: [2, 1, 0], 4: [2, 1, 0, 3]}
+    colours = pixels if pixels.ndim == 2 else pixels[:, :, order[pixels.shape[2]]]
+    assert cv2.imwrite(str(path), colours)
+    return path
+
+
+def folder(**options: Any) -> mp4ds.PackOptions:
+    return mp4ds.PackOptions(images=mp4ds.ImageFolder(**options), codec="ffv1")
+
+
+def messages(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    """Log times and messages of an MCAP file, by topic."""
+    found: dict[str, list[tuple[int, Any]]] = {}
+    with path.open("rb") as stream:
+        for item in make_reader(
+            stream, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages():
+            found.setdefault(item.channel.topic, []).append(
+                (item.message.log_time, item.decoded_message)
+            )
+    return found
+
+
+def attachments(path: Path) -> dict[str, bytes]:
+    with path.open("rb") as stream:
+        return {item.name: item.data for item in make_reader(stream).iter_attachments()}
+
+
+def stamp(message: Any) -> int:
+    return int(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+
+
+def pixels_of(message: Any, dtype: str = "u1", channels: int = 1) -> Pixels:
+    shape = (
+        (message.height, message.width) if channels == 1 else (message.height, message.width, -1)
+    )
+    return np.frombuffer(bytes(message.data), dtype).reshape(shape)
+
+
+def imported(source: Path, tmp_path: Path, **options: Any) -> dict[str, list[tuple[int, Any]]]:
+    """Pack, validate, unpack; returns what came out."""
+    mp4ds.pack(source, tmp_path / "ds", folder(**options))
+    assert mp4ds.validate(tmp_path / "ds", deep=True) == []
+    mp4ds.unpack(tmp_path / "ds", "mcap", tmp_path / "again.mcap")
+    found = messages(tmp_path / "again.mcap")
+    for rows in found.values():
+        for time, message in rows:
+            if hasattr(message, "header"):
+                assert time == stamp(message)
+    return found
+
+
+# ---------------------------------------------------------------- pixels
+
+DEEP = noise(1, "u2")
+EXACT: dict[str, tuple[Callable[[Path], Any], str, Pixels]] = {
+    "grey.png": (lambda path: save(path, noise()), "mono8", noise()),
+    "grey16.png": (lambda path: save(path, DEEP), "mono16", DEEP),
+    "rgb.png": (lambda path: save(path, noise(3)), "rgb8", noise(3)),
+    "rgb16.png": (lambda path: save(path, noise(3, "u2")), "rgb16", noise(3, "u2")),
+    "rgba.png": (lambda path: save(path, noise(4)), "rgba8", noise(4)),
+    "rgba16.png": (lambda path: save(path, noise(4, "u2")), "rgba16", noise(4, "u2")),
+    "la.png": (lambda path: Image.fromarray(noise(2), "LA").save(path), "8UC2", noise(2)),
+    "bits.png": (
+        lambda path: Image.fromarray(noise() > 99).save(path),
+        "mono8",
+        np.where(noise() > 99, 255, 0).astype("u1"),
+    ),
+    "grey16.tiff": (lambda path: save(path, DEEP), "mono16", DEEP),
+    "rgb16.tif": (lambda path: save(path, noise(3, "u2")), "rgb16", noise(3, "u2")),
+    "float.tiff": (
+        lambda path: save(path, DEEP.astype("f4") / 7),
+        "32FC1",
+        DEEP.astype("f4") / 7,
+    ),
+    "grey.pgm": (lambda path: save(path, noise()), "mono8", noise()),
+    "grey16.pgm": (lambda path: save(path, DEEP), "mono16", DEEP),
+    "rgb.ppm": (lambda path: save(path, noise(3)), "rgb8", noise(3)),
+    # 12 bits stay 12 bits
+    "bits12.pgm": (
+        lambda path: path.write_bytes(
+            b"P5 # a comment\n32 24\n4095\n" + (DEEP >> 4).astype(">u2").tobytes()
+        ),
+        "mono16",
+        DEEP >> 4,
+    ),
+    "grey.bmp": (lambda path: save(path, noise()), "mono8", noise()),
+}
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_files_are_read_to_the_bit(name: str, tmp_path: Path) -> None:
+    write, encoding, expected = EXACT[name]
+    write(tmp_path / name)
+    found, pixels = read_image(tmp_path / name)
+    assert found == encoding
+    assert pixels.dtype == expected.dtype.newbyteorder("<")
+    assert np.array_equal(pixels, expected)
+
+
+def test_what_cannot_be_had_as_it_is_is_refused(tmp_path: Path) -> None:
+    grey = Image.fromarray(noise())
+    grey.convert("P").save(tmp_path / "palette.png")
+    grey.convert("CMYK").save(tmp_path / "inks.tiff")
+    grey.save(tmp_path / "pages.tiff", save_all=True, append_images=[grey])
+    save(tmp_path / "whole.png", noise())
+    (tmp_path / "cut.png").write_bytes((tmp_path / "whole.png").read_bytes()[:300])
+    (tmp_path / "cut.pgm").write_bytes(b"P5 4 4 255\n123")
+    (tmp_path / "text.png").write_text("no image")
+    (tmp_path / "empty.png").write_bytes(b"")
+    for name in (
+        "palette.png",
+        "inks.tiff",
+        "pages.tiff",
+        "cut.png",
+        "cut.pgm",
+        "text.png",
+        "empty.png",
+    ):
+        with pytest.raises(SourceError) as caught:
+            read_image(tmp_path / name)
+        assert str(tmp_path / name) in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+# ---------------------------------------------------------------- times
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1305031102.175304",
+        "0",
+        "0.1",
+        "1.037359e-01",
+        "2147483647.999999999",
+        "+3.5",
+        "1403636579.",
+    ],
+)
+def test_decimal_seconds_are_exact(text: str) -> None:
+    rounded: Counter[str] = Counter()
+    assert times.of_unit("s", rounded)(text) == int(Decimal(text) * 10**9)
+    assert not rounded
+
+
+def test_finer_times_are_rounded_and_counted() -> None:
+    rounded: Counter[str] = Counter()
+    assert times.of_unit("s", rounded)("0.0000000015") == 2
+    assert times.of_unit("us", rounded)("1.2345") == 1234
+    assert times.of_unit("us", rounded)("1.234") == 1234
+    assert rounded == {times.ROUNDED: 2}
+
+
+def test_dates_are_exact() -> None:
+    read = times.of_date(Counter())
+    # date --utc -d '2011-09-26 13:02:25' +%s
+    assert read("2011-09-26 13:02:25.964389445") == 1317042145_964389445
+    assert read("1970-01-01 00:00:00") == 0
+
+
+@pytest.mark.parametrize(
+    "text", ["", "x", "-1", "nan", "inf", "1e99", "0x10", "1_000", "2147483648"]
+)
+def test_what_is_no_time_is_refused(text: str) -> None:
+    with pytest.raises(times.NoTimeError):
+        times.of_unit("s", Counter())(text)
+
+
+def test_rates_are_exact() -> None:
+    found = times.at_rate(1000, "30000/1001").tolist()
+    assert found == [round(Fraction(number * 1001 * 10**9, 30000)) for number in range(1000)]
+    for rate in ("0", "-1", "x", "1/0", ""):
+        with pytest.raises(times.NoTimeError):
+            times.at_rate(3, rate)
+
+
+# ---------------------------------------------------------------- plain folders
+
+
+def plain(place: Path, names: list[str], dtype: str = "u1") -> list[Pixels]:
+    pictures = [image(number, dtype=dtype) for number in range(len(names))]
+    for name, pixels in zip(names, pictures, strict=True):
+        save(place / name, pixels)
+    return pictures
+
+
+CASES: dict[str, tuple[list[str], str | None, dict[str, str], list[int]]] = {
+    "names-ns": ([f"{START + n * 50_000_001}.png" for n in range(3)], None, {},
+                 [START + n * 50_000_001 for n in range(3)]),
+    "names-seconds": (["1305031102.175304.png", "1305031102.211214.png"], None, {},
+                      [1305031102_175304000, 1305031102_211214000]),
+    "names-unit": (["9.png", "10.png"], None, {"unit": "ms"}, [9_000_000, 10_000_000]),
+    "lines": (["2.png", "10.png"], "1305031102.175304\n\n1305031102.2\n", {},
+              [1305031102_175304000, 1305031102_200000000]),
+    "lines-unit": (["a.png", "b.png"], "# us\n7\n9\n", {"unit": "us"}, [7000, 9000]),
+    "named": (["a.png", "b.png"], "1305031102.5 a.png\n1305031103.5 b.png\n", {},
+              [1305031102_500000000, 1305031103_500000000]),
+    "csv": (["a.png", "b.png"], "#timestamp [ns],filename\n1403636579763555584,a.png\n"
+            "1403636579813555456,b.png\n", {}, [1403636579763555584, 1403636579813555456]),
+    "our-csv": (["0.png", "1.png"], "file,stamp_ns,log_time_ns,frame_id\n0.png,5,6,cam\n"
+                "1.png,7,8,cam\n", {}, [5, 7]),
+    "rate": (["f9.png", "f10.png", "f11.png"], None, {"rate": "30"}, [0, 33333333, 66666667]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_times_of_plain_folders(case: str, tmp_path: Path) -> None:
+    names, listed, options, expected = CASES[case]
+    pictures = plain(tmp_path / "images", names)
+    if listed is not None:
+        (tmp_path / "images" / "stamps.txt").write_text(listed)
+        options = {**options, "stamps": str(tmp_path / "images" / "stamps.txt")}
+    summary = mp4ds.pack(tmp_path / "images", tmp_path / "ds", folder(**options))
+    assert summary.skipped == {}
+    with mp4ds.open(tmp_path / "ds") as dataset:
+        stream = dataset["/camera/image_raw"]
+        assert stream.stamps.tolist() == stream.log_times.tolist() == expected
+        for frame, pixels in zip(stream, pictures, strict=True):
+            assert (frame.encoding, frame.frame_id) == ("mono8", "camera")
+            assert np.array_equal(frame.data, pixels)
+
+
+def test_a_plain_folder_round_trip(tmp_path: Path) -> None:
+    """Depths out of order, a calibration, a file that is no image, and an image without a time."""
+    pictures = plain(tmp_path / "in", ["a.png", "b.png", "c.png", "d.png"], "u2")
+    (tmp_path / "in" / "notes.txt").write_text("of the day")
+    (tmp_path / "times.csv").write_text("t,name\n3.5,a.png\n1.000000001,b.png\n2.25,c.png\n")
+    (tmp_path / "cam.yaml").write_text(ROS_CALIBRATION)
+    found = imported(
+        tmp_path / "in", tmp_path, stamps=str(tmp_path / "times.csv"), topic="/d/image",
+        frame_id="optical", encoding="16UC1", calibration=str(tmp_path / "cam.yaml"),
+    )  # fmt: skip
+    assert set(found) == {"/d/image", "/d/camera_info"}
+    for (time, message), (due, number) in zip(
+        found["/d/image"], [(1_000_000_001, 1), (2_250_000_000, 2), (3_500_000_000, 0)], strict=True
+    ):
+        assert (time, message.encoding, message.header.frame_id) == (due, "16UC1", "optical")
+        assert np.array_equal(pixels_of(message, "<u2"), pictures[number])
+    assert [time for time, _ in found["/d/camera_info"]] == [10**9 + 1, 2250 * 10**6, 3500 * 10**6]
+    for _, info in found["/d/camera_info"]:
+        assert (info.width, info.height, info.distortion_model) == (32, 24, "plumb_bob")
+        assert list(info.d) == [-0.3, 0.1, 1e-05, -2.0, 0.0]
+        assert list(info.k) == [30.5, 0, 16, 0, 31, 12, 0, 0, 1]
+        assert list(info.r) == [1, 0, 0, 0, 1, 0, 0, 0, 1]
+        assert list(info.p) == [30.5, 0, 16, 0, 0, 31, 12, 0, 0, 0, 1, 0]
+    summary = mp4ds.pack(
+        tmp_path / "in", tmp_path / "ds2", folder(stamps=str(tmp_path / "times.csv"))
+    )
+    assert summary.skipped == {"images without a time": 1, "files in in that are no images": 1}
+    kept = attachments(tmp_path / "ds" / "messages.mcap")
+    assert kept["cam.yaml"].decode() == ROS_CALIBRATION
+    assert kept["images.csv"].decode().splitlines() == [
+        "topic,stamp_ns,file", "/d/image,1000000001,b.png", "/d/image,2250000000,c.png",
+        "/d/image,3500000000,a.png",
+    ]  # fmt: skip
+
+
+ROS_CALIBRATION = """\
+image_width: 32
+image_height: 24
+camera_name: narrow
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [30.5, 0., 16, 0, 31.0, 12, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.3, 1.0e-01, 1e-05, -2, 0.000000]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [30.5, 0, 16, 0, 0, 31, 12, 0, 0, 0, 1, 0]
+"""
+
+
+def test_jpeg_files_are_kept_beside_others(tmp_path: Path) -> None:
+    for number in range(3):
+        save(tmp_path / "in" / f"{number}.jpg", image(number, 3))
+    save(tmp_path / "in" / "3.png", image(3, 3))
+    found = imported(tmp_path / "in", tmp_path, rate="2")
+    rows = found["/camera/image_raw/compressed"]
+    assert [time for time, _ in rows] == [0, 500_000_000, 1_000_000_000]
+    for number, (_, message) in enumerate(rows):
+        assert message.format == "jpeg"
+        assert bytes(message.data) == (tmp_path / "in" / f"{number}.jpg").read_bytes()
+    ((time, raw),) = found["/camera/image_raw"]
+    assert (time, raw.encoding) == (1_500_000_000, "rgb8")
+    assert np.array_equal(pixels_of(raw, channels=3), image(3, 3))
+    assert (tmp_path / "ds" / "camera_image_raw_compressed.mp4").is_file()
+
+
+def test_in_parts_is_as_in_one_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = euroc(tmp_path)
+    options = mp4ds.PackOptions(images=mp4ds.ImageFolder(), codec="ffv1", gop=2)
+    mp4ds.pack(place, tmp_path / "whole", options)
+    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: InlineEngine())
+    tasks: list[int] = []
+    mp4ds.pack(
+        place,
+        tmp_path / "parts",
+        replace(options, window=2),
+        progress=lambda state: tasks.append(state.tasks_total),
+    )
+    assert max(tasks) == 3
+    assert facts(tmp_path / "parts") == facts(tmp_path / "whole")
+    assert mp4ds.validate(tmp_path / "parts", deep=True) == []
+    assert leftovers(tmp_path) == []
+
+
+# ---------------------------------------------------------------- EuRoC
+
+SENSOR = """\
+#Default camera sensor yaml file.
+sensor_type: camera
+comment: VI-Sensor cam0 (MT9M034)
+
+# Sensor extrinsics wrt. the body-frame.
+T_BS:
+  cols: 4
+  rows: 4
+  data: [0.0, -1.0, 0.0, -0.0216401454975,
+         1.0, 0.0, 0.0, -0.064676986768,
+         0.0, 0.0, 1.0, 0.00981073058949,
+         0.0, 0.0, 0.0, 1.0]
+
+rate_hz: 20
+resolution: [32, 24]
+camera_model: pinhole
+intrinsics: [458.654, 457.296, 367.215, 248.375] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
+"""
+FRAMES = 5
+
+
+def euroc(tmp_path: Path) -> Path:
+    root = tmp_path / "MH_01"
+    for name, shift in (("cam0", 0), ("cam1", 100)):
+        rows = ["#timestamp [ns],filename"]
+        for number in range(FRAMES):
+            time = START + number * 50_000_128 + shift
+            save(root / "mav0" / name / "data" / f"{time}.png", image(number + shift))
+            rows.append(f"{time},{time}.png")
+        (root / "mav0" / name / "data.csv").write_text("\r\n".join(rows) + "\r\n")
+        (root / "mav0" / name / "sensor.yaml").write_text(SENSOR)
+    for name, header, rows in (
+        ("imu0", "#timestamp [ns],w_RS_S_x [rad s^-1],...", IMU),
+        ("state_groundtruth_estimate0", "#timestamp, p_RS_R_x [m], ...", TRUTH),
+        ("leica0", "#timestamp [ns], p_RS_R_x [m]", ["1403636579763555584,1,2,3"]),
+    ):
+        (root / "mav0" / name).mkdir()
+        (root / "mav0" / name / "data.csv").write_text("\n".join([header, *rows]) + "\n")
+    (root / "mav0" / "body.yaml").write_text("comment: a MAV\n")
+    return root
+
+
+IMU = [
+    "1403636579758555392,-0.099134701513277898,0.14730578886832138,0.02722713633111154,"
+    "8.1476917083333333,-0.37592158333333331,-2.4026292499999999",
+    "1403636579763555584,-0.1,0.2,0.3,8,-0.5,1e-3",
+]
+TRUTH = [
+    "1403636580838555648,4.688319,-1.786938,0.783338,0.534108,-0.153029,-0.827383,-0.082152,"
+    "-0.027876,0.033207,0.800006,-0.003172,0.021267,0.078502,-0.025266,0.136696,0.075593"
+]
+
+
+def test_euroc(tmp_path: Path) -> None:
+    root = euroc(tmp_path)
+    found = imported(root, tmp_path)
+    assert set(found) == {
+        "/tf_static", "/cam0/image_raw", "/cam0/camera_info", "/cam1/image_raw",
+        "/cam1/camera_info", "/imu0", "/state_groundtruth_estimate0",
+    }  # fmt: skip
+    for name, shift in (("cam0", 0), ("cam1", 100)):
+        due = [START + number * 50_000_128 + shift for number in range(FRAMES)]
+        assert [time for time, _ in found[f"/{name}/image_raw"]] == due
+        assert [time for time, _ in found[f"/{name}/camera_info"]] == due
+        for number, (_, message) in enumerate(found[f"/{name}/image_raw"]):
+            assert (message.encoding, message.header.frame_id) == ("mono8", name)
+            assert np.array_equal(pixels_of(message), image(number + shift))
+        info = found[f"/{name}/camera_info"][0][1]
+        assert list(info.d) == [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0]
+        assert list(info.k) == [458.654, 0, 367.215, 0, 457.296, 248.375, 0, 0, 1]
+        assert info.distortion_model == "plumb_bob"
+    for (time, imu), text in zip(found["/imu0"], IMU, strict=True):
+        words = text.split(",")
+        assert time == int(words[0])
+        turn, force = imu.angular_velocity, imu.linear_acceleration
+        assert [turn.x, turn.y, turn.z, force.x, force.y, force.z] == list(map(float, words[1:]))
+        assert imu.orientation_covariance[0] == -1
+    ((time, pose),) = found["/state_groundtruth_estimate0"]
+    words = TRUTH[0].split(",")
+    assert time == int(words[0])
+    place, turned = pose.pose.position, pose.pose.orientation
+    assert [place.x, place.y, place.z] == list(map(float, words[1:4]))
+    assert [turned.w, turned.x, turned.y, turned.z] == list(map(float, words[4:8]))
+    ((_, tree),) = found["/tf_static"]
+    assert [(item.header.frame_id, item.child_frame_id) for item in tree.transforms] == [
+        ("body", "cam0"),
+        ("body", "cam1"),
+    ]
+    shift, turn = tree.transforms[0].transform.translation, tree.transforms[0].transform.rotation
+    assert [shift.x, shift.y, shift.z] == [-0.0216401454975, -0.064676986768, 0.00981073058949]
+    assert np.allclose([turn.x, turn.y, turn.z, turn.w], [0, 0, 0.5**0.5, 0.5**0.5], atol=1e-15)
+    check_euroc_manifest(root, tmp_path / "ds")
+
+
+def check_euroc_manifest(root: Path, dataset: Path) -> None:
+    manifest = load_manifest(dataset / "dataset.yaml")
+    assert [item.child for item in manifest.transforms] == ["cam0", "cam1"]
+    sources = {item.name: (item.size, item.sha256) for item in manifest.sources}
+    images = sorted((root / "mav0" / "cam0" / "data").iterdir())
+    listing = "".join(f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.name}\n" for p in images)
+    assert sources["MH_01/mav0/cam0/data"] == (
+        sum(path.stat().st_size for path in images),
+        hashlib.sha256(listing.encode()).hexdigest(),
+    )
+    text = (root / "mav0" / "cam0" / "data.csv").read_bytes()
+    assert sources["MH_01/mav0/cam0/data.csv"] == (len(text), hashlib.sha256(text).hexdigest())
+    assert len(sources) == 9
+    kept = attachments(dataset / "messages.mcap")
+    assert kept["MH_01/mav0/cam0/sensor.yaml"].decode() == SENSOR
+
+
+def test_euroc_tells_what_it_leaves_out(tmp_path: Path) -> None:
+    root = euroc(tmp_path)
+    save(root / "mav0" / "cam0" / "data" / "1.png", image(0))
+    summary = mp4ds.pack(root / "mav0", tmp_path / "ds", folder())
+    assert summary.skipped == {
+        "files in data of cam0 that data.csv does not list": 1,
+        "files of leica0, which is neither camera, IMU nor pose": 1,
+        "rows of state_groundtruth_estimate0 of which the pose alone was taken": 1,
+    }
+
+
+def test_quaternions_turn_as_their_matrices_do() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(50):
+        matrix = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        matrix *= np.linalg.det(matrix)
+        x, y, z, w = quaternion(matrix)
+        assert w >= 0
+        vector = rng.normal(size=3)
+        part = np.cross([x, y, z], vector) * 2
+        assert np.allclose(vector + w * part + np.cross([x, y, z], part), matrix @ vector)
+    for bad in (np.zeros((3, 3)), -np.eye(3), np.full((3, 3), np.nan)):
+        with pytest.raises(ValueError, match="rotation"):
+            quaternion(bad)
+
+
+# ---------------------------------------------------------------- KITTI
+
+
+def test_kitti_odometry(tmp_path: Path) -> None:
+    root = tmp_path / "00"
+    lines = ["0.000000e+00", "1.037359e-01", "2.073430e-01"]
+    root.mkdir()
+    (root / "times.txt").write_text("\n".join(lines) + "\n")
+    (root / "calib.txt").write_text(
+        "P0: 7e+02 0 6e+02 0 0 7e+02 1.8e+02 0 0 0 1 0\n"
+        "P1: 7e+02 0 6e+02 -3.5e+02 0 7e+02 1.8e+02 0 0 0 1 0\n"
+        "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n"
+    )
+    for camera in (0, 1):
+        for number in range(3):
+            save(root / f"image_{camera}" / f"{number:06}.png", image(number + camera))
+    found = imported(root, tmp_path)
+    for camera in (0, 1):
+        rows = found[f"/image_{camera}/image_raw"]
+        assert [time for time, _ in rows] == [0, 103_735_900, 207_343_000]
+        for number, (_, message) in enumerate(rows):
+            assert np.array_equal(pixels_of(message), image(number + camera))
+    info = found["/image_1/camera_info"][2][1]
+    assert list(info.p) == [700, 0, 600, -350, 0, 700, 180, 0, 0, 0, 1, 0]
+    assert list(info.k) == [700, 0, 600, 0, 700, 180, 0, 0, 1]
+    ((_, tree),) = found["/tf_static"]
+    (item,) = tree.transforms
+    assert (item.header.frame_id, item.child_frame_id) == ("image_0", "image_1")
+    assert item.transform.translation.x == pytest.approx(0.5)  # to the right of the first
+    assert item.transform.rotation.w == 1
+
+
+@pytest.mark.parametrize("rectified", [True, False])
+def test_kitti_raw(rectified: bool, tmp_path: Path) -> None:
+    drive = tmp_path / "2011_09_26" / "2011_09_26_drive_0001"
+    sizes = ("5.0e+01 4.0e+01", "3.2e+01 2.4e+01")
+    (drive / "oxts").mkdir(parents=True)
+    (drive / "oxts" / "dataformat.txt").write_text("lat\n")
+    lines = ["calib_time: 09-Jan-2012 13:57:47"]
+    for camera, shift in (("00", 0), ("01", -350)):
+        (drive / f"image_{camera}").mkdir()
+        stamps = [f"2011-09-26 13:02:25.96438944{number}" for number in range(2)]
+        (drive / f"image_{camera}" / "timestamps.txt").write_text("\n".join(stamps) + "\n")
+        for number in range(2):
+            save(drive / f"image_{camera}" / "data" / f"{number:010}.png", image(number, 3))
+        lines += [
+            f"S_{camera}: {sizes[0] if rectified else sizes[1]}",
+            f"K_{camera}: 9 0 5 0 9 4 0 0 1",
+            f"D_{camera}: -0.3 0.2 0.001 0.002 -0.07",
+            f"R_{camera}: 0 -1 0 1 0 0 0 0 1",
+            f"T_{camera}: 1 2 3",
+            f"S_rect_{camera}: {sizes[1] if rectified else sizes[0]}",
+            f"R_rect_{camera}: 1 0 0 0 1 0 0 0 1",
+            f"P_rect_{camera}: 7e+02 0 6e+02 {shift} 0 7e+02 1.8e+02 0 0 0 1 0",
+        ]
+    (drive.parent / "calib_cam_to_cam.txt").write_text("\n".join(lines) + "\n")
+    found = imported(drive, tmp_path)
+    rows = found["/image_01/image_raw"]
+    assert [time for time, _ in rows] == [1317042145_964389440, 1317042145_964389441]
+    assert np.array_equal(pixels_of(rows[1][1], channels=3), image(1, 3))
+    info = found["/image_01/camera_info"][0][1]
+    assert list(info.p) == [700, 0, 600, -350, 0, 700, 180, 0, 0, 0, 1, 0]
+    assert list(info.d) == ([0] * 5 if rectified else [-0.3, 0.2, 0.001, 0.002, -0.07])
+    assert info.k[0] == (700 if rectified else 9)
+    ((_, tree),) = found["/tf_static"]
+    (item,) = tree.transforms
+    place, turn = item.transform.translation, item.transform.rotation
+    # where the origin of the second camera is seen from the first: -R^T T
+    due = [0.5, 0, 0] if rectified else [-2, 1, -3]
+    assert [place.x, place.y, place.z] == pytest.approx(due)
+    half = 0.5**0.5
+    assert [turn.z, turn.w] == pytest.approx([0, 1] if rectified else [-half, half])
+    summary = mp4ds.pack(drive, tmp_path / "ds2", folder())
+    assert summary.skipped == {"files of oxts, which is no camera": 1}
+
+
+# ---------------------------------------------------------------- TUM
+
+
+def test_tum(tmp_path: Path) -> None:
+    root = tmp_path / "xyz"
+    colour, depth = [image(n, 3) for n in range(2)], [image(n, 1, "u2") for n in range(2)]
+    for number in range(2):
+        save(root / "rgb" / f"130503110{number}.175304.png", colour[number])
+        save(root / "depth" / f"130503110{number}.160407.png", depth[number])
+    (root / "rgb.txt").write_text(
+        "# color images\n# timestamp filename\n1305031100.175304 rgb/1305031100.175304.png\n"
+        "1305031101.175304 rgb/1305031101.175304.png\n"
+    )
+    (root / "depth.txt").write_text(
+        "1305031100.160407 depth/1305031100.160407.png\n"
+        "1305031101.160407 depth/1305031101.160407.png\n"
+    )
+    (root / "groundtruth.txt").write_text(
+        "# x\n1305031098.6659 1.3563 0.6305 1.6380 0.6132 0.5962 -0.3311 -0.3986\n"
+    )
+    (root / "accelerometer.txt").write_text("1305031098.5 0.1 8.9 -3.7\n")
+    (tmp_path / "cam.yaml").write_text(ROS_CALIBRATION)
+    found = imported(root, tmp_path, calibration=str(tmp_path / "cam.yaml"))
+    assert [time for time, _ in found["/rgb/image_raw"]] == [
+        1305031100_175304000,
+        1305031101_175304000,
+    ]
+    for number, (_, message) in enumerate(found["/rgb/image_raw"]):
+        assert message.encoding == "rgb8"
+        assert np.array_equal(pixels_of(message, channels=3), colour[number])
+    for number, (_, message) in enumerate(found["/depth/image_raw"]):
+        assert message.encoding == "16UC1"
+        assert np.array_equal(pixels_of(message, "<u2"), depth[number])
+    assert len(found["/rgb/camera_info"]) == len(found["/depth/camera_info"]) == 2
+    ((time, pose),) = found["/groundtruth"]
+    assert time == 1305031098_665900000
+    assert (pose.pose.position.z, pose.pose.orientation.w) == (1.6380, -0.3986)
+    ((_, imu),) = found["/accelerometer"]
+    assert (imu.linear_acceleration.y, imu.angular_velocity_covariance[0]) == (8.9, -1)
+
+
+# ---------------------------------------------------------------- bad input
+
+
+def run(*arguments: object) -> Any:
+    return CliRunner().invoke(app, list(map(str, arguments)), catch_exceptions=False)
+
+
+def spoil(path: Path, text: str) -> Callable[[Path], None]:
+    def change(root: Path) -> None:
+        (root / path).write_text(text)
+
+    return change
+
+
+CAM0 = Path("mav0/cam0")
+BAD: dict[str, tuple[Callable[[Path], Any], list[str], str]] = {
+    "missing-image": (
+        lambda root: next((root / CAM0 / "data").iterdir()).unlink(),
+        [],
+        "not there",
+    ),
+    "bad-stamp": (spoil(CAM0 / "data.csv", "#t\n12x,1.png\n"), [], "line 2: '12x' is no time"),
+    "outside": (spoil(CAM0 / "data.csv", "1,../../x.png\n"), [], "outside"),
+    "no-name": (spoil(CAM0 / "data.csv", "123456\n"), [], "line 1 is not a time and a file name"),
+    "late": (spoil(CAM0 / "data.csv", "9999999999999999999,x.png\n"), [], "2038"),
+    "bad-yaml": (spoil(CAM0 / "sensor.yaml", "a: [1\n"), [], "YAML"),
+    "no-model": (
+        spoil(CAM0 / "sensor.yaml", "intrinsics: [1, 2, 3, 4]\n"),
+        [],
+        "camera_model is missing",
+    ),
+    "omni": (
+        spoil(CAM0 / "sensor.yaml", "intrinsics: [1, 2, 3, 4]\ncamera_model: omni\n"),
+        [],
+        "pinhole",
+    ),
+    "no-rotation": (spoil(CAM0 / "sensor.yaml", f"T_BS: {[2] * 16}\n"), [], "rotation is none"),
+    "short-imu": (
+        spoil(Path("mav0/imu0/data.csv"), "1403636579758555392,1,2\n"),
+        [],
+        "has 3 values, not 7",
+    ),
+    "no-number": (spoil(Path("mav0/imu0/data.csv"), "1,1,2,3,4,5,x\n"), [], "than numbers"),
+    "damaged-image": (
+        lambda root: next((root / CAM0 / "data").iterdir()).write_bytes(b"\x89PNG"),
+        [],
+        "cannot be read as an image",
+    ),
+    "other-layout": (lambda root: None, ["--layout", "tum"], "has not the layout tum"),
+    "no-layout": (lambda root: None, ["--layout", "x"], "euroc, kitti, tum, plain"),
+    "stamps": (lambda root: None, ["--stamps", "x"], "--stamps is for plain folders"),
+    "frame-id": (lambda root: None, ["--frame-id", "x"], "--frame-id is for plain folders"),
+    "own-calibration": (lambda root: None, ["--calibration", "x"], "has its own"),
+    "no-images": (lambda root: None, ["--layout", "plain"], "holds no images"),
+    "quality": (lambda root: None, ["--quality", "x"], "x"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_folders_are_refused_in_a_sentence(case: str, tmp_path: Path) -> None:
+    spoiled, options, words = BAD[case]
+    root = euroc(tmp_path)
+    spoiled(root)
+    done = run("import", "images", root, "-o", tmp_path / "ds", *options)
+    refused(done, words)
+    assert [path.name for path in tmp_path.iterdir()] == ["MH_01"]
+
+
+def refused(done: Any, words: str) -> None:
+    assert done.exit_code == 2, done.output
+    (line,) = done.stderr.strip().splitlines()
+    assert line.startswith("mp4ds: ")
+    assert words in line
+
+
+WITH_CALIBRATION = ["--rate", "2", "--calibration", "c"]
+PLAIN_BAD: dict[str, tuple[list[str], dict[str, str], list[str], str]] = {
+    "no-times": (["a.png"], {}, [], "--rate HZ"),
+    "frame-numbers": (["0.png", "1.png"], {}, [], "--rate HZ"),
+    "names-of-no-unit": (["a.png"], {}, ["--unit", "ns"], "name that is no time"),
+    "unknown-unit": (["a.png"], {"t": "17\n"}, ["--stamps", "t"], "Give --unit"),
+    "no-unit": (["a.png"], {}, ["--unit", "h"], "s, ms, us, ns"),
+    "fewer-times": (
+        ["a.png", "b.png"],
+        {"t": "1.5\n"},
+        ["--stamps", "t"],
+        "1 times, and there are 2",
+    ),
+    "empty-list": (["a.png"], {"t": "# none\n"}, ["--stamps", "t"], "holds no times"),
+    "binary-list": (["a.png"], {}, ["--stamps", "in/a.png"], "is no text"),
+    "no-list": (["a.png"], {}, ["--stamps", "none"], "cannot be read"),
+    "unlisted": (["a.png"], {"t": "1.5 b.png\n"}, ["--stamps", "t"], "not there"),
+    "both": (["a.png"], {}, ["--stamps", "t", "--rate", "2"], "Give one of them"),
+    "bad-rate": (["a.png"], {}, ["--rate", "fast"], "'fast' is no rate"),
+    "bad-encoding": (["a.png"], {}, ["--rate", "2", "--encoding", "x"], "--encoding 'x'"),
+    "other-encoding": (["a.png"], {}, ["--rate", "2", "--encoding", "rgb8"], "cannot be rgb8"),
+    "jpeg-encoding": (["a.jpg"], {}, ["--rate", "2", "--encoding", "mono8"], "JPEG"),
+    "no-topic": (["a.png"], {}, ["--rate", "2", "--topic", "/"], "is no topic"),
+    "other-size": (
+        ["a.png"],
+        {"c": ROS_CALIBRATION.replace("32", "33", 1)},
+        WITH_CALIBRATION,
+        "33x24",
+    ),
+    "other-model": (
+        ["a.png"],
+        {"c": ROS_CALIBRATION.replace("plumb_bob", "fov")},
+        WITH_CALIBRATION,
+        "there are plumb_bob",
+    ),
+    "no-matrix": (
+        ["a.png"],
+        {"c": "image_width: 3\nimage_height: 3\n"},
+        WITH_CALIBRATION,
+        "camera_matrix is missing",
+    ),
+    "nan": (["a.png"], {"c": ROS_CALIBRATION.replace("30.5", ".nan")}, WITH_CALIBRATION, "'.nan'"),
+    "tags": (["a.png"], {"c": "a: !!opencv-matrix {}\n"}, WITH_CALIBRATION, "tags"),
+}
+
+
+@pytest.mark.parametrize("case", PLAIN_BAD)
+def test_bad_plain_folders_are_refused(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names, texts, options, words = PLAIN_BAD[case]
+    monkeypatch.chdir(tmp_path)
+    plain(tmp_path / "in", names)
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    refused(run("import", "images", "in", "-o", "ds", *options), words)
+    assert {path.name for path in tmp_path.iterdir()} == {"in", *texts}
+
+
+def test_targets_are_kept(tmp_path: Path) -> None:
+    plain(tmp_path / "in", ["a.png"])
+    arguments = ("import", "images", tmp_path / "in", "--rate", 5, "-o")
+    refused(run(*arguments, tmp_path / "in" / "ds"), "overlaps")
+    done = run(*arguments, tmp_path / "ds", "--json", "--codec", "ffv1")
+    assert done.exit_code == 0
+    assert json.loads(done.stdout)["topics"][0]["frames"] == 1
+    refused(run(*arguments, tmp_path / "ds"), "--force")
+    assert run(*arguments, tmp_path / "ds", "--force").exit_code == 0
+    refused(run("import", "images", tmp_path / "none", "-o", tmp_path / "x"), "no such file")
+    refused(run("import", "images", tmp_path / "in" / "a.png", "-o", tmp_path / "x"), "no folder")
+    options = replace(folder(rate="1"), salvage=True)
+    with pytest.raises(mp4ds.OptionError, match="salvage"):
+        mp4ds.pack(tmp_path / "in", tmp_path / "x", options)
+    with pytest.raises(mp4ds.OptionError, match="One folder"):
+        mp4ds.pack([tmp_path / "in", tmp_path / "ds"], tmp_path / "x", folder(rate="1"))
+
+
+# ---------------------------------------------------------------- pairs of the paper's tool
+
+
+def packets(path: Path) -> tuple[list[bytes], list[Fraction]]:
+    with av.open(str(path)) as container:
+        found = [packet for packet in container.demux(video=0) if packet.size]
+        return [bytes(packet) for packet in found], [p.pts * p.time_base for p in found]
+
+
+def test_a_pair_becomes_a_dataset(tmp_path: Path) -> None:
+    done = run(
+        "import", "ros-mp4", FIXTURE / "drive.mp4", FIXTURE / "drive.yaml", "-o", tmp_path / "ds"
+    )
+    assert done.exit_code == 0, done.output
+    assert "float seconds" in done.stdout
+    dataset = tmp_path / "ds"
+    assert mp4ds.validate(dataset, deep=True) == []
+    due = list(map(nanoseconds, STAMPS))
+    (video,) = dataset.glob("*.mp4")
+    data, shown = packets(video)
+    assert data == packets(FIXTURE / "drive.mp4")[0]
+    assert [int(time * 10**6) for time in shown] == [(time - due[0]) // 1000 for time in due]
+    with mp4ds.open(dataset) as opened, mp4ds.open(FIXTURE / "drive.yaml") as pair:
+        stream, before = opened[TOPICS[1]], pair[TOPICS[1]]
+        assert stream.stamps.tolist() == due
+        assert stream.sidecar.stamps == "record-float"
+        for frame, old in zip(stream, before, strict=True):
+            assert np.array_equal(frame.data, old.data)
+            assert frame.intrinsics == old.intrinsics
+            assert frame.intrinsics is not None
+            assert frame.intrinsics.k == document()["camera_info"]["K"]
+    mp4ds.unpack(dataset, "bag", tmp_path / "again.bag")
+    with AnyReader([tmp_path / "again.bag"]) as reader:
+        assert [time for _, time, _ in reader.messages()] == due
+    sources = {item.name: item.sha256 for item in load_manifest(dataset / "dataset.yaml").sources}
+    assert sources == {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in (FIXTURE / "drive.mp4", FIXTURE / "drive.yaml")
+    }
+
+
+def test_bad_pairs_are_refused(tmp_path: Path) -> None:
+    video, text = tmp_path / "a.mp4", tmp_path / "b.yaml"
+    shutil.copy(FIXTURE / "drive.mp4", video)
+    shutil.copy(FIXTURE / "drive.yaml", text)
+    output = tmp_path / "ds"
+
+    def fails(code: int, words: str) -> None:
+        done = run("import", "ros-mp4", video, text, "-o", output)
+        assert done.exit_code == code, done.output
+        assert words in done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1
+        assert not [path for path in tmp_path.iterdir() if path not in (video, text)]
+
+    write_text(text, document(STAMPS[:-1]))
+    fails(1, "tells the times of 11")
+    write_text(text, document([-1.5, *STAMPS[1:]]))
+    fails(1, "no bits for")
+    content = document()
+    content["camera_info"]["width"] = 66
+    write_text(text, content)
+    fails(1, "66x48")
+    text.write_text("a: 1\n")
+    fails(1, "version")
+    shutil.copy(FIXTURE / "drive.yaml", text)
+    video.write_bytes(video.read_bytes()[:1000])
+    fails(1, str(video))
+    video.unlink()
+    fails(2, "no such file")
+    shutil.copy(FIXTURE / "drive.yaml", tmp_path / "of äll.yaml")
+    mp4ds.import_ros_mp4(FIXTURE / "drive.mp4", tmp_path / "of äll.yaml", output)
+    plain(tmp_path / "in", ["a.png", "b.png"])
+    mp4ds.pack(tmp_path / "in", tmp_path / "own", folder(rate="2"))
+    own = tmp_path / "own" / "camera_image_raw.yaml"
+    done = run("import", "ros-mp4", own.with_suffix(".mp4"), own, "-o", tmp_path / "x")
+    refused(done, "a sidecar of mp4ds already")
