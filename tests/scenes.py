@@ -97,6 +97,8 @@ def build(encoding: str, msgtype: str, values: Mapping[str, Any]) -> Any:
             (inner, inner_detail), count = detail
             if inner == Nodetype.NAME:
                 fields[name] = [build(encoding, inner_detail, item) for item in given or ()]
+            elif inner_detail[0] == "string":
+                fields[name] = [*(given or ())]
             else:
                 size = count if kind == Nodetype.ARRAY else 0
                 if isinstance(given, bytes):

@@ -100,7 +100,7 @@ def test_readme_python(demo_dataset: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "command",
     [
-        *("pack", "unpack", "play", "evaluate", "report", "frames", "validate", "info"),
+        *("pack", "unpack", "export", "play", "evaluate", "report", "frames", "validate", "info"),
         *("conformance-dump", "demo", "import images", "import ros-mp4"),
     ],
 )

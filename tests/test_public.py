@@ -21,6 +21,8 @@ NAMES = [
     "ClusterError",
     "ConversionError",
     "Dataset",
+    "ExportOptions",
+    "ExportSummary",
     "FormatError",
     "Frame",
     "FrameNotFoundError",
@@ -50,6 +52,7 @@ NAMES = [
     "VideoError",
     "WriteError",
     "__version__",
+    "export",
     "import_ros_mp4",
     "open",
     "pack",
@@ -185,7 +188,9 @@ def test_all_is_documented(name: str) -> None:
             assert known, f"{name}({parameter.name})"
 
 
-@pytest.mark.parametrize("name", ["import_ros_mp4", "open", "pack", "play", "unpack", "validate"])
+@pytest.mark.parametrize(
+    "name", ["export", "import_ros_mp4", "open", "pack", "play", "unpack", "validate"]
+)
 def test_the_functions_are_annotated(name: str) -> None:
     function = getattr(mp4ds, name)
     signature = inspect.signature(function)
@@ -197,7 +202,7 @@ def test_the_functions_are_annotated(name: str) -> None:
 
 
 def test_options_are_frozen_and_compare() -> None:
-    for options in (mp4ds.PackOptions(), mp4ds.UnpackOptions()):
+    for options in (mp4ds.PackOptions(), mp4ds.UnpackOptions(), mp4ds.ExportOptions()):
         with pytest.raises(dataclasses.FrozenInstanceError):
             options.force = True  # type: ignore[misc]
         assert options == type(options)()

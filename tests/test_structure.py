@@ -85,6 +85,8 @@ HOMES = {
     "rclpy": ("publishers",),
     "cyclonedds": ("publishers",),
     "foxglove": ("publishers",),
+    "pyarrow": ("exporting",),
+    "rerun": ("exporting",),
     "yaml": ("yamlio.py", "bags", "publishers"),
     "pydantic": ("sidecar", "checks.py"),
     "jsonschema": ("checks.py",),

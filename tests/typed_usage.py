@@ -56,6 +56,16 @@ def unpack(dataset: str | Path) -> Path:
     return summary.output
 
 
+def export(datasets: list[str]) -> dict[str, dict[str, int]]:
+    """What could not be held."""
+    options = mp4ds.ExportOptions(resize=(64, 48), tolerance_ns=5_000_000, pixels="gray")
+    summary: mp4ds.ExportSummary = mp4ds.export(Path(datasets[0]), "euroc", "out", options)
+    others = mp4ds.ExportOptions(fps=10, state="/joint_states", task="push")
+    use(mp4ds.export(datasets, "lerobot", "episodes", others, progress=use).messages)
+    use(summary.output.name, summary.format.upper(), summary.places, summary.notes)
+    return summary.left_out
+
+
 def play(dataset: str | Path) -> float:
     """Seconds that the clock stood still."""
     options = mp4ds.PlayOptions(to="ros1", rate=0.5, clock=100.0, topics=["/cam*"], every=2)

@@ -20,6 +20,7 @@ from mp4ds._version import __version__
 from mp4ds.cli.arguments import parse_resize, parse_share, parse_size, spelled
 from mp4ds.cli.conformance import conformance_dump
 from mp4ds.cli.evaluate import evaluate
+from mp4ds.cli.export import export
 from mp4ds.cli.failures import told_errors
 from mp4ds.cli.imports import imports
 from mp4ds.cli.output import (
@@ -293,6 +294,7 @@ def unpack(
 
 
 app.add_typer(imports)
+app.command()(export)
 app.command()(play)
 app.command()(report)
 app.command()(frames)

@@ -1,0 +1,232 @@
+"""Rerun: an .rrd file of videos or images, cameras, transforms and inertial measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from mp4ds.errors import OptionError
+from mp4ds.exporting.cameras import Camera, hold_calibration
+from mp4ds.exporting.job import Job
+from mp4ds.exporting.motion import ros_type, topics_of
+from mp4ds.exporting.transforms import static_transforms
+from mp4ds.plan import FileNames
+from mp4ds.recorded import RecordedMessage
+from mp4ds.republish.pictures import files_of, holds_files
+from mp4ds.sidecar import Calibration
+from mp4ds.video import ImageFile, encoding_as
+from mp4ds.video.stand_alone import StandAlonePackets
+from mp4ds.wire.transforms import TransformCollector
+
+_CODECS = {"h264": "H264", "h265": "H265", "av1": "AV1"}
+_UNITS_IN_METRE = {"16UC1": 1000.0, "32FC1": 1.0}
+_TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
+_IMU = "sensor_msgs/Imu"
+_STAMP, _RECORDED = "stamp", "recorded"
+_MOST_DEPTH = 64  # frames above each other
+
+
+def write(job: Job) -> None:
+    """Write the format."""
+    if find_spec("rerun") is None:
+        raise OptionError("Rerun's files need rerun-sdk. Install it: pip install 'mp4ds[rerun]'")
+    import rerun
+
+    stream = rerun.RecordingStream("mp4ds")
+    stream.save(str(job.path))
+    try:
+        _Writer(job, rerun, stream).write()
+        stream.flush()
+    finally:
+        stream.disconnect()
+
+
+class _Writer:
+    """Logs a dataset; every frame is an entity below its parent's."""
+
+    def __init__(self, job: Job, rerun: Any, stream: Any) -> None:
+        self._job, self._rerun, self._stream = job, rerun, stream
+        self._source = job.source
+        self._dataset = job.source.dataset
+        self._static = static_transforms(self._dataset)
+        topics = [channel.topic for channel in self._dataset.channels]
+        self._tf_topics = [
+            topic
+            for topic in dict.fromkeys(topics)
+            if ros_type(self._dataset, topic) in _TF_TYPES
+            and self._source.chosen(topic)
+            and topic not in self._static_topics
+        ]
+        self._parents = {_name(item.child): _name(item.parent) for item in self._static}
+        for _, transform in self._moving():
+            self._parents[_name(transform.child_frame_id)] = _name(transform.header.frame_id)
+
+    @property
+    def _static_topics(self) -> list[str]:
+        takes = TransformCollector.takes
+        return [channel.topic for channel in self._dataset.channels if takes(channel)]
+
+    def _moving(self) -> Iterator[tuple[RecordedMessage, Any]]:
+        """The transforms of /tf and its kin, each with its message."""
+        for message in self._dataset.messages(self._tf_topics) if self._tf_topics else ():
+            for transform in message.decoded.transforms:
+                yield message, transform
+
+    def _path(self, frame: str, *more: str) -> str:
+        """Entity of a frame: below its parents."""
+        names = [_name(frame) or "unknown"]
+        while len(names) < _MOST_DEPTH and (parent := self._parents.get(names[-1])):
+            if parent in names:
+                break
+            names.append(parent)
+        found: str = self._rerun.new_entity_path(["tf", *reversed(names), *more])
+        return found
+
+    def _at(self, stamp: int, log_time: int) -> None:
+        for name, time in ((_STAMP, stamp), (_RECORDED, log_time)):
+            self._stream.set_time(name, timestamp=np.datetime64(time, "ns"))
+
+    def _log(self, path: str, value: Any, *, static: bool = False) -> None:
+        self._stream.log(path, value, static=static)
+
+    def write(self) -> None:
+        """Log everything."""
+        self._write_transforms()
+        names = FileNames()
+        for camera in self._source.cameras:
+            path = self._path(camera.frame_id, names.name_for(camera.topic)[0])
+            if self._write_camera(camera, path):
+                self._job.places[path] = camera.topic
+                self._source.ledger.hold(camera.topic, len(camera))
+        for topic in topics_of(self._dataset, _IMU, self._source.chosen):
+            self._write_imu(topic)
+
+    # ------------------------------------------------------------ transforms
+
+    def _write_transforms(self) -> None:
+        for item in self._static:
+            self._log(
+                self._path(item.child),
+                self._transform(item.translation, item.rotation),
+                static=True,
+            )
+        ledger = self._source.ledger
+        for topic in dict.fromkeys(self._static_topics):
+            if self._source.chosen(topic):
+                ledger.hold(topic, ledger.total(topic))
+                self._job.note(f"{topic}: of each child frame the last transform is held")
+        for message, transform in self._moving():
+            child, parent = _name(transform.child_frame_id), _name(transform.header.frame_id)
+            if self._parents[child] != parent:
+                self._job.note(f"{message.topic}: {child!r} has several parents")
+                continue
+            stamp = transform.header.stamp
+            at, turn = transform.transform.translation, transform.transform.rotation
+            self._at(int(stamp.sec) * 10**9 + int(stamp.nanosec), message.log_time_ns)
+            value = self._transform((at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w))
+            self._log(self._path(child), value)
+        for topic in self._tf_topics:
+            ledger.hold(topic, ledger.total(topic))
+            self._job.places[self._rerun.new_entity_path(["tf"])] = topic
+
+    def _transform(self, translation: tuple[float, ...], rotation: tuple[float, ...]) -> Any:
+        return self._rerun.Transform3D(
+            translation=translation, quaternion=self._rerun.Quaternion(xyzw=rotation)
+        )
+
+    # ------------------------------------------------------------ cameras
+
+    def _write_camera(self, camera: Camera, path: str) -> bool:
+        """Log the frames of a camera; returns whether they could be."""
+        encoding = camera.view.encoding
+        is_light = encoding_as(encoding, "rgb") is not None
+        if not is_light and encoding.name not in _UNITS_IN_METRE:
+            reason = f"Rerun has neither light nor depths of {encoding.name}"
+            self._source.ledger.leave(camera.topic, reason, len(camera))
+            return False
+        calibration = hold_calibration(camera, self._source.ledger)
+        if calibration is not None:
+            self._log(path, self._pinhole(camera, calibration), static=True)
+            if any(calibration.d):
+                self._job.note(f"{camera.topic}: Rerun has no place for its distortion")
+        if not is_light:
+            self._write_depths(camera, path, _UNITS_IN_METRE[encoding.name])
+        elif self._can_be_video(camera):
+            self._write_packets(camera, path)
+        elif camera.is_as_recorded and holds_files(camera.stream.sidecar, "jpeg"):
+            self._write_files(camera, path, files_of(camera.stream), "image/jpeg")
+        else:
+            file = ImageFile(encoding.name, "png")
+            found = ((place, file.encode(pixels)) for place, pixels in camera.pictures())
+            self._write_files(camera, path, found, "image/png")
+        return True
+
+    def _pinhole(self, camera: Camera, calibration: Calibration) -> Any:
+        return self._rerun.Pinhole(
+            image_from_camera=np.array(calibration.k).reshape(3, 3),
+            resolution=camera.size,
+            camera_xyz=self._rerun.ViewCoordinates.RDF,
+        )
+
+    def _can_be_video(self, camera: Camera) -> bool:
+        sidecar = camera.stream.sidecar
+        is_shown = sidecar.body == "packet" or sidecar.layout.is_shown
+        # a viewer decodes in the order of the times
+        is_later = len(camera) < 2 or bool((np.diff(camera.times) > 0).all())
+        return camera.is_as_recorded and is_shown and is_later and sidecar.video.codec in _CODECS
+
+    def _write_packets(self, camera: Camera, path: str) -> None:
+        stream, codec = camera.stream, camera.stream.sidecar.video.codec
+        kind = getattr(self._rerun.VideoCodec, _CODECS[codec])
+        stream.verify_video()
+        self._log(path, self._rerun.VideoStream(codec=kind), static=True)
+        with StandAlonePackets(stream.video_path, codec=codec, frames=len(stream)) as packets:
+            found = ((index, packets.packet(index)) for index in range(len(stream)))
+            for index, packet in self._job.counted(found, camera.topic, len(camera)):
+                self._at_frame(camera, index)
+                self._log(path, self._rerun.VideoStream.from_fields(sample=packet))
+
+    def _write_files(
+        self, camera: Camera, path: str, files: Iterator[tuple[int, Any]], kind: str
+    ) -> None:
+        for place, data in self._job.counted(files, camera.topic, len(camera)):
+            self._at_frame(camera, place)
+            value = self._rerun.EncodedImage(contents=bytes(data), media_type=kind)
+            self._log(path, value)
+
+    def _write_depths(self, camera: Camera, path: str, metre: float) -> None:
+        for place, pixels in camera.pictures():
+            self._at_frame(camera, place)
+            self._log(path, self._rerun.DepthImage(pixels, meter=metre))
+
+    def _at_frame(self, camera: Camera, place: int) -> None:
+        number = int(camera.numbers[place])
+        stream = camera.stream
+        self._at(int(stream.stamps[number]), int(stream.log_times[number]))
+
+    # ------------------------------------------------------------ inertial measurements
+
+    def _write_imu(self, topic: str) -> None:
+        paths = {
+            name: self._rerun.new_entity_path(["imu", topic.strip("/"), name])
+            for name in ("angular_velocity", "linear_acceleration")
+        }
+        count = 0
+        for message in self._dataset.messages([topic]):
+            values = message.decoded
+            stamp = values.header.stamp
+            self._at(int(stamp.sec) * 10**9 + int(stamp.nanosec), message.log_time_ns)
+            for name, path in paths.items():
+                vector = getattr(values, name)
+                self._log(path, self._rerun.Scalars([vector.x, vector.y, vector.z]))
+            count += 1
+        self._source.ledger.hold(topic, count)
+        self._job.places[self._rerun.new_entity_path(["imu", topic.strip("/")])] = topic
+        self._job.note(f"{topic}: orientation and covariances are not held")
+
+
+def _name(frame: str) -> str:
+    return frame.removeprefix("/")

@@ -1,0 +1,625 @@
+"""Exports, read again with libraries that are not the project's."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+import mp4ds
+from export_scenes import (
+    COLOUR,
+    DEPTH,
+    FRAMES,
+    GREY,
+    HEIGHT,
+    IMU,
+    JOINTS,
+    ODOMETRY,
+    WIDTH,
+    drive,
+    joints_at,
+    pack_drive,
+    pixels_of,
+    pose_at,
+    stamps_of,
+)
+from mp4ds.exporting.colmap import Track, model_of
+from mp4ds.exporting.euroc import distortion
+from mp4ds.exporting.lerobot import nearest
+from mp4ds.exporting.motion import in_order
+from mp4ds.exporting.transforms import (
+    inverse,
+    pose_matrix,
+    quaternion_of,
+    rotation_matrix,
+)
+from mp4ds.exporting.tum import seconds
+from mp4ds.sidecar import Calibration
+from scenes import PERIOD, Record, Scene, scene
+
+MADE = drive()
+FX, CX, CY = 0.9 * WIDTH, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5
+D = [-0.3, 0.1, 1e-3, -2e-4]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The drive, lossless; not to be changed."""
+    return pack_drive(tmp_path_factory.mktemp("export"), MADE)
+
+
+def export(
+    dataset: Path | list[Path], to: str, output: Path, **options: Any
+) -> mp4ds.ExportSummary:
+    summary = mp4ds.export(dataset, to, output, mp4ds.ExportOptions(**options))  # type: ignore[arg-type]
+    check_account(summary, dataset)
+    return summary
+
+
+def check_account(summary: mp4ds.ExportSummary, datasets: Path | list[Path]) -> None:
+    """Every message of the recording is held, or left out for a reason."""
+    count = len(datasets) if isinstance(datasets, list) else 1
+    sent = Counter(message.topic for message in MADE.messages)
+    found = Counter(summary.messages)
+    for topic, reasons in summary.left_out.items():
+        assert all(number > 0 for number in reasons.values())
+        found[topic] += sum(reasons.values())
+    assert +found == Counter({topic: count * number for topic, number in sent.items()})
+
+
+def read_png(path: Path) -> np.ndarray[Any, Any]:
+    with Image.open(path) as image:
+        image.load()
+        return np.asarray(image)
+
+
+def rows_of(path: Path) -> list[list[str]]:
+    with path.open() as file:
+        return [*csv.reader(file)]
+
+
+# ---------------------------------------------------------------- EuRoC
+
+
+def test_euroc(dataset: Path, tmp_path: Path) -> None:
+    summary = export(dataset, "euroc", tmp_path / "out", poses=ODOMETRY)
+    assert summary.places == {
+        "mav0/cam0": COLOUR,
+        "mav0/cam1": GREY,
+        "mav0/cam2": DEPTH,
+        "mav0/imu0": IMU,
+        "mav0/pose0": ODOMETRY,
+    }
+    for number, topic in enumerate((COLOUR, GREY, DEPTH)):
+        folder = tmp_path / "out/mav0" / f"cam{number}"
+        head, *rows = rows_of(folder / "data.csv")
+        assert head == ["#timestamp [ns]", "filename"]
+        assert [int(row[0]) for row in rows] == stamps_of(MADE, topic)
+        for index, (time, name) in enumerate(rows):
+            assert name == f"{time}.png"
+            assert (read_png(folder / "data" / name) == pixels_of(topic, index)).all()
+        assert len(list((folder / "data").iterdir())) == FRAMES
+    sensor = yaml.safe_load((tmp_path / "out/mav0/cam1/sensor.yaml").read_text())
+    assert sensor["resolution"] == [WIDTH, HEIGHT]
+    assert sensor["intrinsics"] == pytest.approx([FX, FX, CX, CY])
+    assert sensor["distortion_model"] == "radial-tangential"
+    assert sensor["distortion_coefficients"] == D
+    assert sensor["rate_hz"] == pytest.approx(1e9 / PERIOD, rel=0.02)
+    # the body is the IMU, which is above the base; the camera beside it is a quarter turned
+    pose = np.array(sensor["T_BS"]["data"]).reshape(4, 4)
+    turned = [[0, -1, 0, 0], [1, 0, 0, 0.25], [0, 0, 1, 0], [0, 0, 0, 1]]
+    assert pose == pytest.approx(np.array(turned), abs=1e-12)
+    assert "T_BS" not in yaml.safe_load((tmp_path / "out/mav0/cam2/sensor.yaml").read_text())
+    assert any(DEPTH in note and "T_BS" in note for note in summary.notes)
+
+
+def test_euroc_imu_and_poses(dataset: Path, tmp_path: Path) -> None:
+    summary = export(dataset, "euroc", tmp_path / "out", poses=ODOMETRY, topics=[IMU])
+    sent = sorted((m.values["header"]["stamp"], m.values) for m in MADE.messages if m.topic == IMU)
+    _, *rows = rows_of(tmp_path / "out/mav0/imu0/data.csv")
+    assert [int(row[0]) for row in rows] == [stamp for stamp, _ in sent]
+    for row, (_, values) in zip(rows, sent, strict=True):
+        turn, pull = values["angular_velocity"], values["linear_acceleration"]
+        expected = [*(turn.get(axis, 0.0) for axis in "xyz"), 0.0, 0.0, pull["z"]]
+        assert [float(value) for value in row[1:]] == expected
+    _, *poses = rows_of(tmp_path / "out/mav0/pose0/data.csv")
+    assert [int(row[0]) for row in poses] == [pose_at(n)[0] for n in range(FRAMES + 1)]
+    assert [float(value) for value in poses[3][1:]] == [pose_at(3)[1], 0, 0, 1, 0, 0, 0]
+    assert summary.left_out[COLOUR] == {"not chosen": FRAMES}
+
+
+# ---------------------------------------------------------------- TUM
+
+
+def test_tum(dataset: Path, tmp_path: Path) -> None:
+    summary = export(dataset, "tum", tmp_path / "out", poses=ODOMETRY)
+    for kind, topic in (("rgb", COLOUR), ("depth", DEPTH)):
+        lines = (tmp_path / "out" / f"{kind}.txt").read_text().splitlines()
+        rows = [line.split() for line in lines if not line.startswith("#")]
+        nanoseconds = [int(time.replace(".", "")) for time, _ in rows]
+        assert nanoseconds == stamps_of(MADE, topic)
+        for index, (time, name) in enumerate(rows):
+            assert name == f"{kind}/{time}.png"
+            assert (read_png(tmp_path / "out" / name) == pixels_of(topic, index)).all()
+    (reason,) = summary.left_out[GREY]
+    assert COLOUR in reason
+    truth = np.loadtxt(tmp_path / "out/groundtruth.txt")
+    assert truth.shape == (FRAMES + 1, 8)
+    assert truth[3, 1:] == pytest.approx([pose_at(3)[1], 0, 0, 0, 0, 0, 1])
+    acceleration = np.loadtxt(tmp_path / "out/accelerometer.txt")
+    assert (np.diff(acceleration[:, 0]) >= 0).all()
+    assert acceleration[:, 3] == pytest.approx([9.81] * 4 * FRAMES)
+
+
+@pytest.mark.parametrize(
+    ("time", "text"),
+    [
+        (1_700_000_000_000_000_007, "1700000000.000000007"),
+        (0, "0.000000000"),
+        (-1, "-0.000000001"),
+        (-2_500_000_000, "-2.500000000"),
+    ],
+)
+def test_seconds_keep_every_digit(time: int, text: str) -> None:
+    assert seconds(time) == text
+
+
+# ---------------------------------------------------------------- KITTI
+
+
+def read_kitti(path: Path) -> dict[str, np.ndarray[Any, Any]]:
+    lines = (line.split(":") for line in path.read_text().splitlines())
+    return {name: np.array(values.split(), float) for name, values in lines}
+
+
+def test_kitti(dataset: Path, tmp_path: Path) -> None:
+    export(dataset, "kitti", tmp_path / "out")
+    for number, topic in enumerate((COLOUR, GREY, DEPTH)):
+        folder = tmp_path / "out" / f"image_{number:02d}"
+        names = sorted(path.name for path in (folder / "data").iterdir())
+        assert names == [f"{index:010d}.png" for index in range(FRAMES)]
+        for index, name in enumerate(names):
+            assert (read_png(folder / "data" / name) == pixels_of(topic, index)).all()
+        stamps = (folder / "timestamps.txt").read_text().splitlines()
+        assert all(len(line) == 29 and line[10] == " " for line in stamps)
+        found = np.array([line.replace(" ", "T") for line in stamps], "datetime64[ns]")
+        assert found.astype(np.int64).tolist() == stamps_of(MADE, topic)
+    times = np.loadtxt(tmp_path / "out/times.txt")
+    stamps_ns = np.array(stamps_of(MADE, COLOUR))
+    assert times == pytest.approx((stamps_ns - stamps_ns[0]) / 1e9, abs=1e-9)
+    found = read_kitti(tmp_path / "out/calib_cam_to_cam.txt")
+    assert found["K_01"] == pytest.approx([FX, 0, CX, 0, FX, CY, 0, 0, 1])
+    assert found["D_01"] == pytest.approx([*D, 0])
+    assert found["S_01"].tolist() == [WIDTH, HEIGHT]
+    assert found["P_rect_01"] == pytest.approx([FX, 0, CX, 0, 0, FX, CY, 0, 0, 0, 1, 0])
+    # a point half a metre before the front camera along x, as the left camera sees it
+    rotation, translation = found["R_01"].reshape(3, 3), found["T_01"]
+    in_base = np.array([1.0, 0.0, 1.0])
+    turned_back = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]) @ (in_base - [0, 0.25, 1])
+    assert rotation @ [0.5, 0, 0] + translation == pytest.approx(turned_back)
+    assert "K_02" not in found
+
+
+def test_frames_that_belong_together(dataset: Path, tmp_path: Path) -> None:
+    options = {"topics": [COLOUR, GREY], "tolerance_ns": 100_000}
+    summary = export(dataset, "kitti", tmp_path / "out", **options)
+    first, second = (stamps_of(MADE, topic) for topic in (COLOUR, GREY))
+    near = [n for n in range(FRAMES) if abs(first[n] - second[n]) <= 100_000]
+    assert 0 < len(near) < FRAMES
+    assert summary.messages[COLOUR] == summary.messages[GREY] == len(near)
+    data = tmp_path / "out/image_01/data"
+    for index, number in enumerate(near):
+        assert (read_png(data / f"{index:010d}.png") == pixels_of(GREY, number)).all()
+
+
+# ---------------------------------------------------------------- COLMAP
+
+
+def test_colmap(dataset: Path, tmp_path: Path) -> None:
+    summary = export(dataset, "colmap", tmp_path / "out", poses=ODOMETRY)
+    model = tmp_path / "out/sparse/0"
+    lines = (model / "cameras.txt").read_text().splitlines()
+    cameras = [line.split() for line in lines if not line.startswith("#")]
+    assert [camera[:4] for camera in cameras] == [
+        [number, "OPENCV", str(WIDTH), str(HEIGHT)] for number in ("1", "2")
+    ]
+    # the middle of the first pixel is at one half
+    expected = [FX, FX, CX + 0.5, CY + 0.5, *D]
+    assert [float(value) for value in cameras[0][4:]] == pytest.approx(expected)
+    rows = (model / "images.txt").read_text().splitlines()[2:]
+    images = [row.split() for row in rows if row]
+    assert rows[1::2] == [""] * len(images)
+    assert [row[0] for row in images] == [str(n + 1) for n in range(2 * FRAMES)]
+    for row in images:
+        assert (tmp_path / "out/images" / row[9]).is_file()
+    stamps = stamps_of(MADE, GREY)
+    for frame, row in enumerate(images[FRAMES:]):
+        qw, qx, qy, qz, *translation = (float(value) for value in row[1:8])
+        assert (qw, qx, qy, qz) == pytest.approx((0.5**0.5, 0, 0, -(0.5**0.5)))
+        # where the camera is: the robot goes a decimetre in each period along x
+        start, _ = pose_at(0)
+        along = 0.1 * (stamps[frame] - start) / PERIOD
+        rotation = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+        assert -rotation.T @ translation == pytest.approx([along, 0.25, 1.0], abs=1e-6)
+        assert row[8] == "2"
+    assert (model / "points3D.txt").is_file()
+    assert any(DEPTH in note and "cameras.txt" in note for note in summary.notes)
+
+
+def test_colmap_without_poses(dataset: Path, tmp_path: Path) -> None:
+    summary = export(dataset, "colmap", tmp_path / "out", topics=["/front/*"])
+    assert not (tmp_path / "out/sparse/0/images.txt").exists()
+    assert any("images.txt is not written" in note for note in summary.notes)
+
+
+def lens(model: str, d: list[float]) -> Calibration:
+    return Calibration(
+        frame_id="",
+        height=HEIGHT,
+        width=WIDTH,
+        distortion_model=model,
+        d=d,
+        k=[100.0, 0, 31.5, 0, 90.0, 23.5, 0, 0, 1],
+        r=[1.0, 0, 0, 0, 1, 0, 0, 0, 1],
+        p=[0.0] * 12,
+    )
+
+
+@pytest.mark.parametrize(
+    ("model", "d", "colmap", "euroc"),
+    [
+        ("plumb_bob", [0.0] * 5, ("PINHOLE", []), "radial-tangential"),
+        ("", [], ("PINHOLE", []), "none"),
+        ("plumb_bob", [*D, 0.0], ("OPENCV", D), "radial-tangential"),
+        ("plumb_bob", [*D, 0.5], ("FULL_OPENCV", [*D, 0.5, 0, 0, 0]), "plumb_bob"),
+        (
+            "rational_polynomial",
+            [*D, 1.0, 2.0, 3.0, 4.0],
+            ("FULL_OPENCV", [*D, 1, 2, 3, 4]),
+            "rational_polynomial",
+        ),
+        ("equidistant", D, ("OPENCV_FISHEYE", D), "equidistant"),
+        ("rational_polynomial", [*D, 1, 2, 3, 4, 5.0], None, "rational_polynomial"),
+        ("vendor", [1.0], None, "vendor"),
+    ],
+)
+def test_models_of_distortion(
+    model: str, d: list[float], colmap: tuple[str, list[float]] | None, euroc: str
+) -> None:
+    calibration = lens(model, d)
+    found = model_of(calibration)
+    if colmap is None:
+        assert found is None
+    else:
+        assert found == (colmap[0], [100.0, 90.0, 32.0, 24.0, *colmap[1]])
+    assert distortion(calibration)[0] == euroc
+
+
+# ---------------------------------------------------------------- poses
+
+
+def test_quaternions_and_matrices() -> None:
+    rng = np.random.default_rng(5)
+    for turn in [*rng.normal(size=(20, 4)), np.array([1.0, 0, 0, 0]), np.array([0, 0, 0, 1.0])]:
+        matrix = rotation_matrix(turn)
+        assert matrix @ matrix.T == pytest.approx(np.eye(3), abs=1e-12)
+        found = np.array(quaternion_of(matrix))
+        unit = turn / np.linalg.norm(turn)
+        assert abs(float(found @ unit)) == pytest.approx(1.0)
+        pose = pose_matrix(rng.normal(size=3), turn)
+        assert inverse(pose) @ pose == pytest.approx(np.eye(4), abs=1e-12)
+    quarter = rotation_matrix((0.0, 0.0, 0.5**0.5, 0.5**0.5))
+    assert quarter @ [1, 0, 0] == pytest.approx([0, 1, 0])
+
+
+def test_poses_between_two() -> None:
+    half = 0.5**0.5
+    rows = [(200, (2.0, 0, 0, 0, 0, -half, -half)), (100, (1.0, 0, 0, 0, 0, 0, 1.0))]
+    track = Track.of(iter(rows))
+    assert track.at(99) is None
+    assert track.at(201) is None
+    middle = track.at(150)
+    assert middle is not None
+    assert middle[:3, 3].tolist() == [1.5, 0, 0]
+    angle = np.pi / 4  # half of the quarter, the shorter way round
+    assert middle[0, :2] == pytest.approx([np.cos(angle), -np.sin(angle)])
+
+
+def test_rows_that_come_too_early() -> None:
+    rows = [(time, (float(time),)) for time in (3, 1, 2, 5, 4, 9, 7)]
+    assert [time for time, _ in in_order(rows, window=2)] == [1, 2, 3, 4, 5, 7, 9]
+    assert [time for time, _ in in_order(rows)] == [1, 2, 3, 4, 5, 7, 9]
+
+
+# ---------------------------------------------------------------- which frames, and how
+
+
+def test_smaller_and_fewer(dataset: Path, tmp_path: Path) -> None:
+    options = {"topics": ["/front/*"], "every": 3, "resize": 0.5}
+    summary = export(dataset, "euroc", tmp_path / "out", **options)
+    assert summary.messages[COLOUR] == 3
+    assert summary.left_out[COLOUR] == {"left out on request (--every, --max-rate)": FRAMES - 3}
+    stamps = stamps_of(MADE, COLOUR)[::3]
+    folder = tmp_path / "out/mav0/cam0"
+    assert sorted(path.stem for path in (folder / "data").iterdir()) == [*map(str, stamps)]
+    image = read_png(folder / "data" / f"{stamps[1]}.png").astype(float)
+    whole = pixels_of(COLOUR, 3).reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
+    assert np.abs(image - whole).max() <= 1.5
+    sensor = yaml.safe_load((folder / "sensor.yaml").read_text())
+    half = [FX / 2, FX / 2, (CX + 0.5) / 2 - 0.5, (CY + 0.5) / 2 - 0.5]
+    assert sensor["intrinsics"] == pytest.approx(half)
+
+
+@pytest.mark.parametrize("pixels", ["seen", "native", "gray"])
+def test_mosaics(pixels: str, tmp_path: Path) -> None:
+    made = scene("bayer_rggb8", frames=2, noisy=False)
+    dataset = pack_drive(tmp_path, made)
+    options = mp4ds.ExportOptions(pixels=pixels, topics=["/cam/image_raw"])
+    summary = mp4ds.export(dataset, "tum", tmp_path / "out", options)
+    (first, _) = sorted((tmp_path / "out/rgb").iterdir())
+    image = read_png(first)
+    mosaic = next(m.values["data"] for m in made.messages if m.topic == "/cam/image_raw")
+    mosaic = np.asarray(mosaic).reshape(48, 64)
+    if pixels == "native":
+        assert (image == mosaic).all()
+        assert summary.notes == ["TUM has no place for calibrations"]
+    else:
+        assert image.shape == ((48, 64, 3) if pixels == "seen" else (48, 64))
+        assert any("Bayer mosaic" in note for note in summary.notes)
+    if pixels == "seen":  # where the sensor has a colour, interpolation leaves it
+        assert (image[::2, ::2, 0] == mosaic[::2, ::2]).all()
+
+
+def test_frames_of_one_time(tmp_path: Path) -> None:
+    made = scene("mono8", frames=6, with_info=False)
+    first, second, third, *others = stamps_of(made, "/cam/image_raw")
+    changed = Scene([_stamped(message, {third: second}) for message in made.messages])
+    summary = mp4ds.export(pack_drive(tmp_path, changed), "euroc", tmp_path / "out")
+    assert summary.messages["/cam/image_raw"] == 5
+    reason = "another frame has the same time, and so its name"
+    assert summary.left_out["/cam/image_raw"] == {reason: 1}
+    rows = (tmp_path / "out/mav0/cam0/data.csv").read_text().splitlines()[1:]
+    assert [int(row.split(",")[0]) for row in rows] == [first, second, *others]
+
+
+def _stamped(message: Record, instead: dict[int, int]) -> Record:
+    header = message.values.get("header", {})
+    if message.topic != "/cam/image_raw" or header["stamp"] not in instead:
+        return message
+    header = {**header, "stamp": instead[header["stamp"]]}
+    return replace(message, values={**message.values, "header": header})
+
+
+def test_what_png_cannot_hold(tmp_path: Path) -> None:
+    dataset = pack_drive(tmp_path, scene("32FC1", frames=3, with_info=False))
+    summary = mp4ds.export(dataset, "euroc", tmp_path / "out")
+    assert summary.left_out["/cam/image_raw"] == {"PNG cannot hold 32FC1 images": 3}
+    with pytest.raises(mp4ds.OptionError, match="PNG cannot hold 32FC1"):
+        mp4ds.export(
+            dataset, "kitti", tmp_path / "none", mp4ds.ExportOptions(topics=["/cam/image_raw"])
+        )
+    assert not (tmp_path / "none").exists()
+
+
+# ---------------------------------------------------------------- LeRobot
+
+
+@pytest.mark.parametrize(
+    ("times", "wanted", "found"),
+    [
+        ([0, 10, 20], [-5, 0, 4, 5, 6, 20, 99], [0, 0, 0, 0, 1, 2, 2]),
+        ([7], [0, 9], [0, 0]),
+        ([0, 0, 10], [0, 10], [0, 2]),
+    ],
+)
+def test_the_nearest_time(times: list[int], wanted: list[int], found: list[int]) -> None:
+    assert nearest(np.array(times), np.array(wanted)).tolist() == found
+
+
+@pytest.fixture(scope="module")
+def lerobot_folder(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two episodes of the drive."""
+    pytest.importorskip("pyarrow")
+    folder = tmp_path_factory.mktemp("lerobot") / "out"
+    summary = export(
+        [dataset, dataset],
+        "lerobot",
+        folder,
+        topics=[COLOUR, JOINTS, IMU],
+        state=JOINTS,
+        action=JOINTS,
+        task="push the cube",
+        fps=30,
+        codec="h264",
+        crf=10,
+    )
+    assert summary.places["videos/observation.images.front_image_raw"] == COLOUR
+    return folder
+
+
+def test_lerobot_tables(lerobot_folder: Path) -> None:
+    import pyarrow.parquet as pq
+
+    info = json.loads((lerobot_folder / "meta/info.json").read_text())
+    assert (info["codebase_version"], info["fps"], info["total_episodes"]) == ("v3.0", 30, 2)
+    stamps = stamps_of(MADE, COLOUR)
+    length = round((stamps[-1] - stamps[0]) * 30 / 1e9) + 1
+    assert info["total_frames"] == 2 * length
+    feature = info["features"]["observation.images.front_image_raw"]
+    assert feature["shape"] == [HEIGHT, WIDTH, 3]
+    assert info["features"]["observation.state"]["names"] == ["shoulder", "elbow"]
+    sent = [joints_at(n) for n in range(3 * FRAMES)]
+    for episode in range(2):
+        path = info["data_path"].format(chunk_index=0, file_index=episode)
+        table = pq.read_table(lerobot_folder / path).to_pydict()
+        assert table["frame_index"] == list(range(length))
+        assert table["index"] == list(range(episode * length, (episode + 1) * length))
+        assert table["episode_index"] == [episode] * length
+        assert table["timestamp"] == pytest.approx([n / 30 for n in range(length)])
+        for n, state in enumerate(table["observation.state"]):
+            time = stamps[0] + round(n * 10**9 / 30)
+            expected = min(sent, key=lambda item: abs(item[0] - time))[1]
+            assert state == pytest.approx(expected)
+    tasks = pq.read_table(lerobot_folder / "meta/tasks.parquet").to_pydict()
+    assert tasks == {"task_index": [0], "task": ["push the cube"]}
+    statistics = json.loads((lerobot_folder / "meta/stats.json").read_text())
+    pixels = np.stack([pixels_of(COLOUR, n) for n in range(FRAMES)]) / 255
+    for name, expected in (("mean", pixels.mean((0, 1, 2))), ("std", pixels.std((0, 1, 2)))):
+        found = np.array(statistics["observation.images.front_image_raw"][name])
+        assert found.shape == (3, 1, 1)
+        assert found.ravel() == pytest.approx(expected, abs=0.02)
+
+
+def test_lerobot_videos(lerobot_folder: Path) -> None:
+    import cv2
+
+    path = "videos/observation.images.front_image_raw/chunk-000/file-001.mp4"
+    capture = cv2.VideoCapture(str(lerobot_folder / path))
+    assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(30, abs=0.01)
+    stamps = stamps_of(MADE, COLOUR)
+    number = 0
+    while True:
+        there, image = capture.read()
+        if not there:
+            break
+        time = stamps[0] + round(number * 10**9 / 30)
+        nearest_frame = min(range(FRAMES), key=lambda n: abs(stamps[n] - time))
+        expected = pixels_of(COLOUR, nearest_frame).astype(float)
+        assert np.abs(image[..., ::-1] - expected).mean() < 8  # other frames: more than 20
+        number += 1
+    assert number == round((stamps[-1] - stamps[0]) * 30 / 1e9) + 1
+
+
+def test_lerobot_loads_it(lerobot_folder: Path) -> None:
+    pytest.importorskip("lerobot")
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    loaded = LeRobotDataset("local/drive", root=lerobot_folder, video_backend="pyav")
+    assert loaded.num_episodes == 2
+    item = loaded[len(loaded) - 1]
+    assert item["task"] == "push the cube"
+    image = item["observation.images.front_image_raw"].numpy().transpose(1, 2, 0) * 255
+    number = len(loaded) // 2 - 1
+    assert np.abs(image - pixels_of(COLOUR, number).astype(float)).mean() < 8
+    assert item["observation.state"].shape == (2,)
+
+
+def test_a_video_is_copied_where_its_frames_are_even(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    made = scene("rgb8", frames=6, with_info=False, noisy=False)
+    dataset = pack_drive(tmp_path, made, quality="visual", codec="h264")
+    summary = mp4ds.export(
+        dataset, "lerobot", tmp_path / "out", mp4ds.ExportOptions(topics=["/cam/image_raw"], fps=30)
+    )
+    assert any("copied" in note for note in summary.notes)
+    path = "videos/observation.images.cam_image_raw/chunk-000/file-000.mp4"
+    with mp4ds.open(tmp_path / "out" / path) as video, mp4ds.open(dataset) as own:
+        copied, stream = video.videos[0], own["/cam/image_raw"]
+        assert len(copied) == summary.messages["/cam/image_raw"]
+        assert (copied.read([4]) == stream.read([4])).all()
+
+
+def test_frames_that_are_dropped_and_doubled(dataset: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    stamps = stamps_of(MADE, COLOUR)
+    slow = {"topics": [COLOUR], "fps": 10, "codec": "h264"}
+    summary = export(dataset, "lerobot", tmp_path / "slow", **slow)
+    given = round((stamps[-1] - stamps[0]) * 10 / 1e9) + 1
+    assert summary.messages == {COLOUR: given}
+    assert sum(summary.left_out[COLOUR].values()) == FRAMES - given
+    fast = {**slow, "fps": 60}
+    summary = export(dataset, "lerobot", tmp_path / "fast", **fast)
+    length = round((stamps[-1] - stamps[0]) * 60 / 1e9) + 1
+    used = summary.messages[COLOUR]
+    assert any(f"{length - used} of {length} frames repeat" in note for note in summary.notes)
+
+
+# ---------------------------------------------------------------- Rerun
+
+
+def test_rerun(dataset: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    from rerun.chunk import RrdReader
+
+    summary = export(dataset, "rerun", tmp_path / "out.rrd")
+    assert summary.messages[COLOUR] == summary.messages[DEPTH] == FRAMES
+    assert summary.messages["/tf"] == FRAMES
+    found: Counter[str] = Counter()
+    times: dict[str, list[int]] = {}
+    for chunk in RrdReader(tmp_path / "out.rrd").stream():
+        batch = chunk.to_record_batch()
+        if not chunk.is_static:
+            found[chunk.entity_path] += batch.num_rows
+            stamps = batch.column("stamp").cast("int64").to_pylist()
+            times.setdefault(chunk.entity_path, []).extend(stamps)
+    path = next(place for place, topic in summary.places.items() if topic == GREY)
+    assert path == "/tf/map/base/left_optical/left_image_raw"
+    assert sorted(times[path]) == stamps_of(MADE, GREY)
+    assert found["/imu/imu/linear_acceleration"] == 4 * FRAMES
+
+
+# ---------------------------------------------------------------- the command
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "mp4ds", "export", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_the_command(dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = run("tum", str(dataset), "-o", str(out), "-t", COLOUR, "--json")
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["messages"] == {COLOUR: FRAMES}
+    assert told["left_out"][GREY] == {"not chosen": FRAMES}
+    note = json.loads((out / "mp4ds_export.json").read_text())
+    assert note["left_out"] == told["left_out"]
+    again = run("tum", str(dataset), "-o", str(out), "-t", COLOUR)
+    assert again.returncode == 2
+    assert "exists already" in again.stderr
+    again = run("tum", str(dataset), "-o", str(out), "-t", DEPTH, "--force", "--every", "2")
+    assert again.returncode == 0, again.stderr
+    assert f"left out: {FRAMES // 2} messages of {DEPTH}: left out on request" in again.stdout
+    assert not (out / "rgb").exists()
+
+
+@pytest.mark.parametrize(
+    ("to", "options", "words"),
+    [
+        ("nuscenes", {}, "format 'nuscenes' is not known"),
+        ("kitti", {"poses": ODOMETRY}, "--poses goes with"),
+        ("euroc", {"fps": 30}, "--fps goes with lerobot"),
+        ("euroc", {"poses": IMU}, "--poses /imu is of type sensor_msgs/Imu"),
+        ("euroc", {"poses": "/none"}, "no topic of ROS"),
+        ("euroc", {"topics": ["/nothing*"]}, "matches no topic"),
+        ("tum", {"topics": ["/chatter"]}, "TUM can hold no topic"),
+    ],
+)
+def test_bad_options(
+    to: str, options: dict[str, Any], words: str, dataset: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(mp4ds.OptionError, match=words):
+        mp4ds.export(dataset, to, tmp_path / "out", mp4ds.ExportOptions(**options))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_not_ours_is_kept(dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/thesis.txt").write_text("mine")
+    with pytest.raises(mp4ds.TargetError, match="not something that mp4ds wrote"):
+        mp4ds.export(dataset, "euroc", tmp_path / "out", mp4ds.ExportOptions(force=True))
+    assert (tmp_path / "out/thesis.txt").read_text() == "mine"
+    with pytest.raises(mp4ds.OptionError, match="holds one dataset"):
+        mp4ds.export([dataset, dataset], "euroc", tmp_path / "two")
