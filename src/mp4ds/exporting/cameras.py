@@ -160,8 +160,11 @@ def _view(stream: Stream, options: ExportOptions, notes: list[str]) -> View:
     if options.pixels == "seen" and not is_plain(known):
         colours = "rgb"
     if colours != "native" and not is_plain(known):
-        kind = "a Bayer mosaic, which --pixels native keeps" if known.mosaic else "YUV"
-        notes.append(f"{stream.topic}: its pixels are made of {kind}")
+        kind = "a Bayer mosaic" if known.mosaic else "YUV"
+        keeps = (
+            ", which --pixels native keeps" if known.mosaic and colours != options.pixels else ""
+        )
+        notes.append(f"{stream.topic}: its pixels are made of {kind}{keeps}")
     if encoding_as(known, "rgb") is None:
         colours = "native"  # depths and other numbers have no colours
     return view_of(

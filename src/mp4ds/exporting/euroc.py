@@ -45,6 +45,7 @@ def write(job: Job) -> None:
         job.note(f"{topic}: orientation and covariances have no place in an IMU's data.csv")
     if job.options.poses:
         poses = Poses(source.dataset, job.options.poses)
+        job.note(f"{poses.topic}: of a message the position and orientation are held")
         rows = ((time, (*v[:3], v[6], *v[3:6])) for time, v in poses.rows())
         _write_rows(job, "mav0/pose0", poses.topic, _POSE_HEAD, rows)
         pose = tree.pose(poses.body, body)

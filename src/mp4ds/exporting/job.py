@@ -26,6 +26,7 @@ class Source:
     """
 
     def __init__(self, dataset: Dataset, options: ExportOptions) -> None:
+        dataset.verify_messages()
         self.dataset = dataset
         self.ledger = Ledger(dataset)
         self.notes: list[str] = []
@@ -69,7 +70,8 @@ class Job:
 
     def note(self, sentence: str) -> None:
         """Tell what the format does not say as it was recorded."""
-        self.source.notes.append(sentence)
+        if sentence not in self.source.notes:
+            self.source.notes.append(sentence)
 
     def write_png_files(self, camera: Camera, place: str, names: Sequence[str]) -> None:
         """Write the frames of a camera as PNG files, and count them.

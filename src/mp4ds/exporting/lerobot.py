@@ -6,7 +6,6 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -56,9 +55,12 @@ class Episode:
 
 def write(job: Job) -> None:
     """Write the format."""
-    if find_spec("pyarrow") is None:
-        raise OptionError("LeRobot's tables need pyarrow. Install it: pip install 'mp4ds[lerobot]'")
-    from mp4ds.exporting import lerobot_tables as tables
+    try:
+        from mp4ds.exporting import lerobot_tables as tables
+    except ImportError as error:
+        raise OptionError(
+            f"LeRobot's tables need pyarrow ({error}). Install it: pip install 'mp4ds[lerobot]'"
+        ) from None
 
     cameras = [_shown(source) for source in job.sources]
     rate = cameras[0][0].rate if cameras[0] else 0.0

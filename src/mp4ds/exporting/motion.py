@@ -32,7 +32,8 @@ def topics_of(dataset: Dataset, type_name: str, chosen: Callable[[str], bool]) -
     return [topic for topic in topics if chosen(topic) and ros_type(dataset, topic) == type_name]
 
 
-def _stamp(header: Any) -> int:
+def stamp_of(header: Any) -> int:
+    """Stamp of a message's header, nanoseconds."""
     return int(header.stamp.sec) * _NS + int(header.stamp.nanosec)
 
 
@@ -51,7 +52,7 @@ def imu_rows(dataset: Dataset, topic: str) -> Iterator[Row]:
     for message in dataset.messages([topic]):
         values = message.decoded
         turn, pull = values.angular_velocity, values.linear_acceleration
-        yield _stamp(values.header), (turn.x, turn.y, turn.z, pull.x, pull.y, pull.z)
+        yield stamp_of(values.header), (turn.x, turn.y, turn.z, pull.x, pull.y, pull.z)
 
 
 _POSES: dict[str, Callable[[Any], tuple[Any, Any]]] = {
@@ -99,7 +100,7 @@ class Poses:
         for message in self._dataset.messages([self.topic]):
             values = message.decoded
             at, turn = self._parts(values)
-            yield _stamp(values.header), (at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w)
+            yield stamp_of(values.header), (at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w)
 
 
 class Vectors:
@@ -148,7 +149,7 @@ class Vectors:
             SourceError: A message is not of the type that its topic tells.
         """
         for message in self._dataset.messages([self.topic]):
-            time = _stamp(message.decoded.header) if self._is_joints else message.log_time_ns
+            time = stamp_of(message.decoded.header) if self._is_joints else message.log_time_ns
             yield time, self._values(message)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from mp4ds.errors import OptionError
 from mp4ds.exporting.cameras import Camera, hold_calibration
 from mp4ds.exporting.job import Job
-from mp4ds.exporting.motion import ros_type, topics_of
+from mp4ds.exporting.motion import ros_type, stamp_of, topics_of
 from mp4ds.exporting.transforms import static_transforms
 from mp4ds.plan import FileNames
 from mp4ds.recorded import RecordedMessage
@@ -31,9 +30,12 @@ _MOST_DEPTH = 64  # frames above each other
 
 def write(job: Job) -> None:
     """Write the format."""
-    if find_spec("rerun") is None:
-        raise OptionError("Rerun's files need rerun-sdk. Install it: pip install 'mp4ds[rerun]'")
-    import rerun
+    try:
+        import rerun
+    except ImportError as error:
+        raise OptionError(
+            f"Rerun's files need rerun-sdk ({error}). Install it: pip install 'mp4ds[rerun]'"
+        ) from None
 
     stream = rerun.RecordingStream("mp4ds")
     stream.save(str(job.path))
@@ -61,19 +63,18 @@ class _Writer:
             and topic not in self._static_topics
         ]
         self._parents = {_name(item.child): _name(item.parent) for item in self._static}
-        for _, transform in self._moving():
-            self._parents[_name(transform.child_frame_id)] = _name(transform.header.frame_id)
+        for message in self._moving():
+            for transform in message.decoded.transforms:
+                self._parents[_name(transform.child_frame_id)] = _name(transform.header.frame_id)
 
     @property
     def _static_topics(self) -> list[str]:
         takes = TransformCollector.takes
         return [channel.topic for channel in self._dataset.channels if takes(channel)]
 
-    def _moving(self) -> Iterator[tuple[RecordedMessage, Any]]:
-        """The transforms of /tf and its kin, each with its message."""
-        for message in self._dataset.messages(self._tf_topics) if self._tf_topics else ():
-            for transform in message.decoded.transforms:
-                yield message, transform
+    def _moving(self) -> Iterator[RecordedMessage]:
+        """The messages of /tf and its kin."""
+        return self._dataset.messages(self._tf_topics) if self._tf_topics else iter(())
 
     def _path(self, frame: str, *more: str) -> str:
         """Entity of a frame: below its parents."""
@@ -118,19 +119,27 @@ class _Writer:
             if self._source.chosen(topic):
                 ledger.hold(topic, ledger.total(topic))
                 self._job.note(f"{topic}: of each child frame the last transform is held")
-        for message, transform in self._moving():
-            child, parent = _name(transform.child_frame_id), _name(transform.header.frame_id)
-            if self._parents[child] != parent:
-                self._job.note(f"{message.topic}: {child!r} has several parents")
+        for message in self._moving():
+            if self._write_moving(message):
+                ledger.hold(message.topic)
+            else:
+                ledger.leave(message.topic, "a frame has several parents, and in Rerun one", 1)
+        for topic in self._tf_topics:
+            self._job.places[self._rerun.new_entity_path(["tf"])] = topic
+
+    def _write_moving(self, message: RecordedMessage) -> bool:
+        """Log the transforms of a message; returns whether all of them could be."""
+        is_whole = True
+        for item in message.decoded.transforms:
+            child = _name(item.child_frame_id)
+            if self._parents[child] != _name(item.header.frame_id):
+                is_whole = False
                 continue
-            stamp = transform.header.stamp
-            at, turn = transform.transform.translation, transform.transform.rotation
-            self._at(int(stamp.sec) * 10**9 + int(stamp.nanosec), message.log_time_ns)
+            self._at(stamp_of(item.header), message.log_time_ns)
+            at, turn = item.transform.translation, item.transform.rotation
             value = self._transform((at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w))
             self._log(self._path(child), value)
-        for topic in self._tf_topics:
-            ledger.hold(topic, ledger.total(topic))
-            self._job.places[self._rerun.new_entity_path(["tf"])] = topic
+        return is_whole
 
     def _transform(self, translation: tuple[float, ...], rotation: tuple[float, ...]) -> Any:
         return self._rerun.Transform3D(
@@ -217,8 +226,7 @@ class _Writer:
         count = 0
         for message in self._dataset.messages([topic]):
             values = message.decoded
-            stamp = values.header.stamp
-            self._at(int(stamp.sec) * 10**9 + int(stamp.nanosec), message.log_time_ns)
+            self._at(stamp_of(values.header), message.log_time_ns)
             for name, path in paths.items():
                 vector = getattr(values, name)
                 self._log(path, self._rerun.Scalars([vector.x, vector.y, vector.z]))

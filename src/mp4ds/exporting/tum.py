@@ -46,6 +46,7 @@ def write(job: Job) -> None:
         job.note(f"{imus[0]}: TUM has the acceleration of an IMU only")
     if job.options.poses:
         poses = Poses(source.dataset, job.options.poses)
+        job.note(f"{poses.topic}: of a message the position and orientation are held")
         head = "timestamp tx ty tz qx qy qz qw"
         _write_rows(job, "groundtruth.txt", poses.topic, head, poses.rows())
     if any(camera.calibration for camera in cameras):
