@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -34,6 +35,7 @@ from export_scenes import (
     pose_at,
     stamps_of,
 )
+from mp4ds import exporting
 from mp4ds.exporting.colmap import Track, model_of
 from mp4ds.exporting.euroc import distortion
 from mp4ds.exporting.lerobot import nearest
@@ -535,12 +537,12 @@ def test_a_video_is_copied_where_its_frames_are_even(tmp_path: Path) -> None:
 def test_frames_that_are_dropped_and_doubled(dataset: Path, tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     stamps = stamps_of(MADE, COLOUR)
-    slow = {"topics": [COLOUR], "fps": 10, "codec": "h264"}
+    slow: dict[str, Any] = {"topics": [COLOUR], "fps": 10}
     summary = export(dataset, "lerobot", tmp_path / "slow", **slow)
     given = round((stamps[-1] - stamps[0]) * 10 / 1e9) + 1
     assert summary.messages == {COLOUR: given}
     assert sum(summary.left_out[COLOUR].values()) == FRAMES - given
-    fast = {**slow, "fps": 60}
+    fast = {**slow, "fps": 60, "codec": "h265", "resize": 2.0}
     summary = export(dataset, "lerobot", tmp_path / "fast", **fast)
     length = round((stamps[-1] - stamps[0]) * 60 / 1e9) + 1
     used = summary.messages[COLOUR]
@@ -567,6 +569,18 @@ def test_rerun(dataset: Path, tmp_path: Path) -> None:
     assert path == "/tf/map/base/left_optical/left_image_raw"
     assert sorted(times[path]) == stamps_of(MADE, GREY)
     assert found["/imu/imu/linear_acceleration"] == 4 * FRAMES
+
+
+@pytest.mark.parametrize(("to", "library"), [("lerobot", "pyarrow"), ("rerun", "rerun")])
+def test_a_library_that_is_missing(
+    to: str, library: str, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.delitem(sys.modules, "mp4ds.exporting.lerobot_tables", raising=False)
+    monkeypatch.delattr(exporting, "lerobot_tables", raising=False)
+    with pytest.raises(mp4ds.OptionError, match=re.escape(f"pip install 'mp4ds[{to}]'")):
+        mp4ds.export(dataset, to, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
 
 
 # ---------------------------------------------------------------- the command

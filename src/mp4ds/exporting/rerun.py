@@ -219,8 +219,9 @@ class _Writer:
     # ------------------------------------------------------------ inertial measurements
 
     def _write_imu(self, topic: str) -> None:
+        parts = ["imu", *topic.strip("/").split("/")]
         paths = {
-            name: self._rerun.new_entity_path(["imu", topic.strip("/"), name])
+            name: self._rerun.new_entity_path([*parts, name])
             for name in ("angular_velocity", "linear_acceleration")
         }
         count = 0
@@ -232,7 +233,7 @@ class _Writer:
                 self._log(path, self._rerun.Scalars([vector.x, vector.y, vector.z]))
             count += 1
         self._source.ledger.hold(topic, count)
-        self._job.places[self._rerun.new_entity_path(["imu", topic.strip("/")])] = topic
+        self._job.places[self._rerun.new_entity_path(parts)] = topic
         self._job.note(f"{topic}: orientation and covariances are not held")
 
 
