@@ -618,6 +618,13 @@ def test_the_command(dataset: Path, tmp_path: Path) -> None:
         ("euroc", {"poses": "/none"}, "no topic of ROS"),
         ("euroc", {"topics": ["/nothing*"]}, "matches no topic"),
         ("tum", {"topics": ["/chatter"]}, "TUM can hold no topic"),
+        ("kitti", {"crf": 20}, "--crf goes with lerobot"),
+        ("lerobot", {"codec": "ffv1"}, "--codec 'ffv1' is not known"),
+        ("lerobot", {"codec": "h264", "crf": 60}, "not from 0 to 51"),
+        ("lerobot", {"pixels": "gray"}, "--pixels gray is not"),
+        ("euroc", {"pixels": "pink"}, "--pixels 'pink' is not known"),
+        ("euroc", {"tolerance_ns": -1}, "--sync is the most milliseconds"),
+        ("euroc", {"every": 0}, "--every 0"),
     ],
 )
 def test_bad_options(

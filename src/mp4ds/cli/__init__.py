@@ -23,6 +23,15 @@ from mp4ds.cli.evaluate import evaluate
 from mp4ds.cli.export import export
 from mp4ds.cli.failures import told_errors
 from mp4ds.cli.imports import imports
+from mp4ds.cli.options import (
+    EveryOption,
+    ExcludeOption,
+    ForceFlag,
+    JsonFlag,
+    MaxRateOption,
+    ResizeOption,
+    TopicsOption,
+)
 from mp4ds.cli.output import (
     print_info,
     print_json,
@@ -47,17 +56,6 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-JsonFlag = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-TopicsOption = Annotated[
-    Optional[list[str]],  # noqa: UP045 - read at run time by typer
-    typer.Option("--topics", "-t", metavar="GLOB", help="Only topics that match; may be repeated."),
-]
-ExcludeOption = Annotated[
-    Optional[list[str]],  # noqa: UP045
-    typer.Option("--exclude", "-x", metavar="GLOB", help="Leave out topics that match."),
-]
-ForceFlag = Annotated[bool, typer.Option("--force", "-f", help="Replace an existing output.")]
 
 
 @app.callback(invoke_without_command=True)
@@ -250,17 +248,9 @@ def unpack(
     jpeg_quality: Annotated[
         int, typer.Option("--jpeg-quality", min=1, max=100, help="Of JPEG files that are made.")
     ] = 95,
-    resize: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option("--resize", metavar="0.5|WxH", help="Smaller images, calibrations to match."),
-    ] = None,
-    every: Annotated[
-        int, typer.Option("--every", min=1, metavar="N", help="Every Nth frame only.")
-    ] = 1,
-    max_rate: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option("--max-rate", metavar="HZ", help="So many frames a second at most."),
-    ] = None,
+    resize: ResizeOption = None,
+    every: EveryOption = 1,
+    max_rate: MaxRateOption = None,
     topics: TopicsOption = None,
     exclude: ExcludeOption = None,
     force: ForceFlag = False,

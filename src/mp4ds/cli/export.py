@@ -9,6 +9,15 @@ import typer
 
 from mp4ds.cli.arguments import parse_resize
 from mp4ds.cli.failures import told_errors
+from mp4ds.cli.options import (
+    EveryOption,
+    ExcludeOption,
+    ForceFlag,
+    JsonFlag,
+    MaxRateOption,
+    ResizeOption,
+    TopicsOption,
+)
 from mp4ds.cli.output import print_json, say, status_line
 
 if TYPE_CHECKING:
@@ -34,27 +43,11 @@ def export(
             "--output", "-o", metavar="OUT", help="The folder to make; for rerun an .rrd file."
         ),
     ],
-    topics: Annotated[
-        Optional[list[str]],  # noqa: UP045 - read at run time by typer
-        typer.Option(
-            "--topics", "-t", metavar="GLOB", help="Only topics that match; may be repeated."
-        ),
-    ] = None,
-    exclude: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option("--exclude", "-x", metavar="GLOB", help="Leave out topics that match."),
-    ] = None,
-    resize: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option("--resize", metavar="0.5|WxH", help="Smaller images, calibrations to match."),
-    ] = None,
-    every: Annotated[
-        int, typer.Option("--every", min=1, metavar="N", help="Every Nth frame only.")
-    ] = 1,
-    max_rate: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option("--max-rate", metavar="HZ", help="So many frames a second at most."),
-    ] = None,
+    topics: TopicsOption = None,
+    exclude: ExcludeOption = None,
+    resize: ResizeOption = None,
+    every: EveryOption = 1,
+    max_rate: MaxRateOption = None,
     pixels: Annotated[
         str,
         typer.Option(
@@ -64,7 +57,7 @@ def export(
         ),
     ] = "seen",
     sync: Annotated[
-        Optional[float],  # noqa: UP045
+        Optional[float],  # noqa: UP045 - read at run time by typer
         typer.Option(
             "--sync",
             metavar="MS",
@@ -100,10 +93,8 @@ def export(
     crf: Annotated[
         int, typer.Option("--crf", min=0, max=63, help="Their quality; less is better.")
     ] = 30,
-    force: Annotated[
-        bool, typer.Option("--force", "-f", help="Replace an existing output.")
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    force: ForceFlag = False,
+    as_json: JsonFlag = False,
 ) -> None:
     """Write a dataset in the format of another tool, as far as that can hold it.
 

@@ -41,6 +41,8 @@ _OPTIONS_OF = {
     "state": ("lerobot",),
     "action": ("lerobot",),
     "task": ("lerobot",),
+    "codec": ("lerobot",),
+    "crf": ("lerobot",),
 }
 
 
@@ -120,8 +122,9 @@ def _check(to: str, paths: Sequence[Path | str], options: ExportOptions) -> None
         raise OptionError(
             f"{FORMATS[to]} holds one dataset, and {len(paths)} are given: export each by itself."
         )
+    usual = ExportOptions()
     for name, formats in _OPTIONS_OF.items():
-        if getattr(options, name) and to not in formats:
+        if getattr(options, name) != getattr(usual, name) and to not in formats:
             raise OptionError(f"--{name} goes with {', '.join(formats)}, not with {to}.")
     if to == "lerobot" and options.pixels not in ("seen", "rgb"):
         raise OptionError(f"LeRobot's videos are of colours: --pixels {options.pixels} is not.")

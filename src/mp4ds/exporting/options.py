@@ -10,7 +10,7 @@ from mp4ds.errors import OptionError
 from mp4ds.republish import Reduction
 
 PIXELS = ("seen", "native", "rgb", "gray")
-CODECS = ("av1", "h264", "h265")
+_MOST_CRF = {"av1": 63, "h264": 51, "h265": 51}
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class ExportOptions:
         action: Topic of ``action``, for lerobot.
         task: What the robot does, for lerobot.
         codec: ``av1``, ``h264`` or ``h265``: of videos that are encoded, for lerobot.
-        crf: Their constant rate factor, 0 to 63, less is better.
+        crf: Their constant rate factor; less is better. 0 to 63, of h264 and h265 0 to 51.
         force: Replace an existing export.
     """
 
@@ -57,10 +57,11 @@ class ExportOptions:
     def __post_init__(self) -> None:
         if self.pixels not in PIXELS:
             raise OptionError(f"--pixels {self.pixels!r} is not known. Use {', '.join(PIXELS)}.")
-        if self.codec not in CODECS:
-            raise OptionError(f"--codec {self.codec!r} is not known. Use {', '.join(CODECS)}.")
-        if not 0 <= self.crf <= 63:
-            raise OptionError(f"--crf {self.crf} is not from 0 to 63.")
+        if self.codec not in _MOST_CRF:
+            raise OptionError(f"--codec {self.codec!r} is not known. Use {', '.join(_MOST_CRF)}.")
+        most = _MOST_CRF[self.codec]
+        if not 0 <= self.crf <= most:
+            raise OptionError(f"--crf {self.crf} is not from 0 to {most}, as {self.codec} has it.")
         if self.fps is not None and not 1 <= self.fps <= 1000:
             raise OptionError(f"--fps {self.fps} is not from 1 to 1000.")
 
