@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 from collections import Counter
 from collections.abc import Callable
@@ -32,6 +33,7 @@ from in_parts import InlineEngine, facts, leftovers
 from mp4ds.cli import app
 from mp4ds.errors import SourceError
 from mp4ds.importing import times
+from mp4ds.importing.calibration import ros_calibration
 from mp4ds.importing.geometry import quaternion
 from mp4ds.sidecar import load_manifest
 from mp4ds.video.image_files import read_image
@@ -373,6 +375,68 @@ def test_in_parts_is_as_in_one_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert facts(tmp_path / "parts") == facts(tmp_path / "whole")
     assert mp4ds.validate(tmp_path / "parts", deep=True) == []
     assert leftovers(tmp_path) == []
+
+
+def test_an_import_goes_on_unless_the_images_have_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = euroc(tmp_path)
+    options = mp4ds.PackOptions(images=mp4ds.ImageFolder(), codec="ffv1", gop=2, window=2)
+
+    def use(engine: InlineEngine) -> InlineEngine:
+        monkeypatch.setattr("mp4ds.packing._engine", lambda *_: engine)
+        return engine
+
+    use(InlineEngine(lambda name: name == "00001-0"))
+    with pytest.raises(mp4ds.PartsFailedError):
+        mp4ds.pack(place, tmp_path / "ds", options)
+    other = replace(options, images=mp4ds.ImageFolder(layout="euroc"))
+    with pytest.raises(mp4ds.OptionError, match="another --images"):
+        mp4ds.pack(place, tmp_path / "ds", other)
+    shown = sorted((place / CAM0 / "data").iterdir())[3]
+    before, times_of = shown.read_bytes(), shown.stat()
+    save(shown, image(77))
+    with pytest.raises(SourceError, match="has changed since"):
+        mp4ds.pack(place, tmp_path / "ds", options)
+    shown.write_bytes(before)
+    os.utime(shown, ns=(times_of.st_atime_ns, times_of.st_mtime_ns))
+    engine = use(InlineEngine())
+    mp4ds.pack(place, tmp_path / "ds", options)
+    assert "00000-0" not in engine.ran
+    assert mp4ds.validate(tmp_path / "ds", deep=True) == []
+    assert leftovers(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("model", "values", "name", "due"),
+    [
+        ("plumb_bob", [1, 2, 3, 4], "plumb_bob", [1, 2, 3, 4, 0]),
+        ("rational_polynomial", list(range(8)), "rational_polynomial", list(range(8))),
+        ("equidistant", [1, 2, 3, 4], "equidistant", [1, 2, 3, 4]),
+        ("fisheye", [1, 2, 3, 4], "equidistant", [1, 2, 3, 4]),
+    ],
+)
+def test_models_of_calibrations(
+    model: str, values: list[int], name: str, due: list[int], tmp_path: Path
+) -> None:
+    (tmp_path / "cam.yaml").write_text(
+        "image_width: 2\nimage_height: 3\ncamera_matrix: {data: [5, 0, 1, 0, 6, 2, 0, 0, 1]}\n"
+        f"distortion_model: {model}\ndistortion_coefficients:\n  data: {values}\n"
+    )
+    found = ros_calibration(tmp_path / "cam.yaml")
+    assert (found.width, found.height, found.distortion_model) == (2, 3, name)
+    assert list(found.d) == due
+    assert list(found.r) == [1, 0, 0, 0, 1, 0, 0, 0, 1]
+    assert list(found.p) == [5, 0, 1, 0, 0, 6, 2, 0, 0, 0, 1, 0]
+
+
+def test_a_mosaic_is_called_one(tmp_path: Path) -> None:
+    plain(tmp_path / "in", ["0.png", "1.png"])
+    mp4ds.pack(tmp_path / "in", tmp_path / "ds", folder(rate="2", encoding="bayer_rggb8"))
+    with mp4ds.open(tmp_path / "ds") as dataset:
+        frame = dataset["/camera/image_raw"][1]
+        assert frame.encoding == "bayer_rggb8"
+        assert np.array_equal(frame.data, image(1))
 
 
 # ---------------------------------------------------------------- EuRoC

@@ -27,7 +27,9 @@ _Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")
 
 @imports.command()
 def images(
-    folder: Annotated[str, typer.Argument(help="A folder of images, or of a known layout.")],
+    folder: Annotated[
+        str, typer.Argument(metavar="FOLDER", help="Of images, or of a layout that is known.")
+    ],
     output: _Output,
     layout: Annotated[
         Optional[str],  # noqa: UP045 - read at run time by typer
