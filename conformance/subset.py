@@ -30,11 +30,12 @@ class Loader(yaml.SafeLoader):
         event = self.peek_event()
         if getattr(event, "anchor", None) or getattr(event, "tag", None):
             raise yaml.YAMLError("anchors, aliases and tags are refused")
-        self.depth = getattr(self, "depth", 0) + 1
-        if self.depth > 33:
+        is_open = isinstance(event, yaml.CollectionStartEvent)
+        self.depth = getattr(self, "depth", 0) + is_open
+        if self.depth > 32:
             raise yaml.YAMLError("nested too deeply")
         node = super().compose_node(parent, index)
-        self.depth -= 1
+        self.depth -= is_open
         return node
 
     def construct_mapping(self, node, deep=False):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import itertools
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -17,8 +19,9 @@ import numpy as np
 import pytest
 
 import mp4ds
+from mp4ds import yamlio
 from mp4ds.conformance import conformance_dump
-from mp4ds.errors import VideoError
+from mp4ds.errors import FormatError, VideoError
 from mp4ds.layouts import LAYOUTS
 from mp4ds.sidecar import FORMAT_VERSION
 from mp4ds.sidecar.fields import Body
@@ -40,9 +43,11 @@ def ids(case: Case) -> str:
     return str(case["path"])
 
 
-def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
+def run(
+    *command: str | Path, env: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        list(map(str, command)), capture_output=True, text=True, check=False, timeout=600
+        list(map(str, command)), capture_output=True, text=True, check=False, timeout=600, env=env
     )
 
 
@@ -64,6 +69,22 @@ def streams() -> Iterator[Case]:
 def test_mp4ds_reads_what_is_expected(case: Case) -> None:
     found = load_tool("conformance").dump(CASES / case["path"])
     assert found == (expected(case) if "expected" in case else {"problems": case["problems"]})
+
+
+@pytest.mark.parametrize(("inside", "is_taken"), [(31, True), (32, False)])
+def test_both_readers_count_nesting_alike(inside: int, is_taken: bool) -> None:
+    """32 maps and lists within one another, the top being the first."""
+    text = "a: " + "[" * inside + "1" + "]" * inside + "\n"
+    done = run(
+        *(sys.executable, "-c"),
+        "import sys, yaml, subset; yaml.load(sys.argv[1], subset.Loader)",
+        text,
+        env={**os.environ, "PYTHONPATH": str(SUITE)},
+    )
+    assert (done.returncode == 0) == is_taken, done.stderr
+    assert "nested too deeply" in done.stderr or is_taken
+    with contextlib.nullcontext() if is_taken else pytest.raises(FormatError, match="nested"):
+        yamlio.load(text.encode(), "some.yaml")
 
 
 def has_ffmpeg() -> bool:

@@ -259,9 +259,11 @@ def test_columns_do_not_count_as_structure() -> None:
 
 def test_depth_just_allowed() -> None:
     document: dict[str, Any] = {"a": 1}
-    for _ in range(29):
+    for _ in range(yamlio.MAX_DEPTH - 1):
         document = {"a": document}
     assert same(load_back(document), document)
+    with pytest.raises(FormatError, match="nested deeper than 32 levels"):
+        load_back({"a": document})
 
 
 @pytest.mark.parametrize(

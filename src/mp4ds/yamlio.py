@@ -182,7 +182,7 @@ def _build(events: Iterable[Any]) -> Any:
         if isinstance(value, (dict, list)):
             open_nodes.append(value)
             keys.append(None)
-            if len(open_nodes) > MAX_DEPTH:
+            if len(open_nodes) > MAX_DEPTH + 1:  # the first is around the document
                 raise ValueError(f"line {line}: is nested deeper than {MAX_DEPTH} levels")
     if len(root) != 1:
         raise ValueError("holds no document, or several")
