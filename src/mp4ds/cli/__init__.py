@@ -91,7 +91,7 @@ def pack(
     ] = "lossless",
     codec: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option("--codec", help="h264, h265, av1 or ffv1; the best by default."),
+        typer.Option("--codec", help="h264, h265, ffv1 (lossless) or av1 (lossy)."),
     ] = None,
     preset: Annotated[
         Optional[str],  # noqa: UP045
@@ -125,7 +125,7 @@ def pack(
             "--gop",
             min=1,
             max=100_000,
-            help="Most frames between key frames; 30 by default, 60 where lossy.",
+            help="Most frames from a key frame to the next; 30 by default, 60 where lossy.",
         ),
     ] = None,
     window: Annotated[
@@ -134,7 +134,7 @@ def pack(
             "--window",
             min=2,
             max=10_000_000,
-            help="Frames in each part of a long recording; 10 groups of --gop by default.",
+            help="Frames of the busiest camera in a part of a long recording; 10 times --gop.",
         ),
     ] = None,
     jobs: Annotated[
@@ -231,7 +231,7 @@ def unpack(
     ] = None,
     storage: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option("--storage", help="sqlite3 or mcap, for rosbag2; as recorded by default."),
+        typer.Option("--storage", help="sqlite3 or mcap, for rosbag2; as recorded, or mcap."),
     ] = None,
     image_format: Annotated[
         str, typer.Option("--image-format", help="png (exact) or jpeg, for images.")
@@ -296,7 +296,7 @@ app.command()(conformance_dump)
 def validate(
     path: Annotated[str, typer.Argument(help="A sidecar, a dataset, or a folder of datasets.")],
     deep: Annotated[
-        bool, typer.Option("--deep", help="Also decode every frame and compare every message.")
+        bool, typer.Option("--deep", help="Also hash and decode all, and compare every message.")
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:

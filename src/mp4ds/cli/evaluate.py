@@ -82,7 +82,9 @@ def evaluate(
     ] = None,
     gop: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option("--gop", min=1, max=100_000, help="Most frames between key frames; 60."),
+        typer.Option(
+            "--gop", min=1, max=100_000, help="Most frames from a key frame to the next; 60."
+        ),
     ] = None,
     threads: Annotated[
         Optional[int],  # noqa: UP045
