@@ -240,7 +240,12 @@ def anchors(path: Path) -> set[str]:
 
 @pytest.mark.parametrize(
     "path",
-    [*sorted(ROOT.glob("*.md")), *sorted(SPEC.glob("*.md"))],
+    [
+        *sorted(ROOT.glob("*.md")),
+        *sorted(SPEC.glob("*.md")),
+        *sorted((ROOT / "docs").rglob("*.md")),
+        ROOT / "conformance" / "README.md",
+    ],
     ids=lambda path: str(path.relative_to(ROOT)),
 )
 def test_links_lead_somewhere(path: Path) -> None:

@@ -1,0 +1,202 @@
+"""The tutorials: each command and snippet in order, in one folder, and what they say is printed.
+
+A page has blocks. ``sh`` and ``python`` are run; a command that is to fail says so behind it
+(``# exit code 2``). ``text`` right after a block is what this prints, of which numbers may differ
+and lines may be left out; their order is not compared. ``console`` is for what needs ROS or another
+machine, and is not run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from mp4ds.cli import app
+from mp4ds.cli.arguments import spelled
+from test_examples import ROOT
+
+DOCS = ROOT / "docs"
+PAGES = sorted((DOCS / "tutorials").glob("*.md"))
+NEEDS = {"--foxglove": "foxglove", "mp4ds.torch": "torch"}
+"""What a line needs beside the package -> the module of it; the page is skipped without."""
+
+# a demonstration as long as these tests can afford
+SECONDS = {"mp4ds demo": "--seconds 0.8"}
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page."""
+
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a command or snippet did."""
+
+    code: int
+    printed: str
+
+
+def blocks_of(page: Path) -> list[Block]:
+    return [Block(*found) for found in re.findall(r"```(\w+)\n(.*?)```", page.read_text(), re.S)]
+
+
+def commands(text: str) -> Iterator[tuple[str, int]]:
+    """Each command of a block, and the exit code that it is to have."""
+    for line in text.replace("\\\n", " ").splitlines():
+        command, _, remark = line.partition(" #")
+        if command.strip():
+            found = re.search(r"exit code (\d+)", remark)
+            yield command.strip(), int(found[1]) if found else 0
+
+
+def run_command(command: str, folder: Path) -> Done:
+    """A command of the package in this process, which has it loaded; any other in a shell."""
+    for begins, option in SECONDS.items():
+        if command.startswith(begins) and "--seconds" not in command:
+            command = f"{command} {option}"
+    words = shlex.split(command)
+    needs_shell = set(re.sub("'[^']*'", "", command)) & set("*|;&$<>")
+    if words[0] == "mp4ds" and not needs_shell:
+        return call(spelled(words[1:]))
+    bin_folder = str(Path(sys.executable).parent)
+    done = subprocess.run(
+        ["bash", "-c", command],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        env={**os.environ, "PATH": f"{bin_folder}:{os.environ['PATH']}"},
+    )
+    return Done(done.returncode, done.stdout + done.stderr)
+
+
+def call(arguments: list[str]) -> Done:
+    printed = io.StringIO()
+    code = 0
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        try:
+            app(args=arguments)
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+    return Done(code, printed.getvalue())
+
+
+def run_snippet(text: str, names: dict[str, Any]) -> str:
+    """What a snippet prints; it knows what those before it on the page made."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        exec(text, names)
+    return printed.getvalue()
+
+
+def loosely(line: str) -> str:
+    """A line as it is compared: its words; numbers, units of bytes and folders do not matter."""
+    line = re.sub(r"\d+(\.\d+)?", "0", line.replace("/home/ada/", ""))
+    return " ".join(re.sub(r"\b0 (B|kB|MB|GB)\b", "0 bytes", line).split())
+
+
+def assert_printed(said: str, printed: str) -> None:
+    """Each line that a page shows is printed; topics come in the order of their first message."""
+    lines = [loosely(line) for line in printed.splitlines()]
+    for line in said.splitlines():
+        due = loosely(line)
+        assert any(due in found for found in lines), f"{line}\n\n{printed}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_tutorial(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    blocks = blocks_of(page)
+    for text, module in NEEDS.items():
+        if any(text in block.text for block in blocks) and find_spec(module) is None:
+            pytest.skip(f"needs {module}")
+    names: dict[str, Any] = {}
+    printed = ""
+    for block in blocks:
+        if block.kind == "sh":
+            printed = ""
+            for command, code in commands(block.text):
+                done = run_command(command, tmp_path)
+                assert done.code == code, f"{command}\n{done.printed}"
+                printed += done.printed
+        elif block.kind == "python":
+            printed = run_snippet(block.text, names)
+        elif block.kind == "text":
+            assert printed, f"nothing was run before:\n{block.text}"
+            assert_printed(block.text, printed.replace(f"{tmp_path}/", ""))
+        else:
+            assert block.kind in ("console", "yaml"), block.kind
+
+
+def test_there_are_tutorials_and_they_run_something() -> None:
+    assert [page.stem for page in PAGES] == ["archive", "replay", "share", "train"]
+    for page in PAGES:
+        blocks = blocks_of(page)
+        count = sum(len(list(commands(block.text))) for block in blocks if block.kind == "sh")
+        assert count >= 5, page
+        assert any(block.kind == "text" for block in blocks), page
+        for block in blocks:
+            assert "mp4ds " in block.text or block.kind != "sh", block.text
+
+
+# ---------------------------------------------------------------- options that pages name
+
+LATER = {"import", "export"}
+"""Commands that pages speak of before they are there."""
+
+
+@cache
+def options_of(command: str) -> set[str]:
+    group = typer.main.get_command(app)
+    assert hasattr(group, "commands")
+    known = group.commands.get(command)
+    if known is None:
+        assert command in LATER, f"there is no command {command}"
+        return set()
+    below = getattr(known, "commands", {}).values()
+    params = [option for each in (known, *below) for option in each.params]
+    names = {name for option in params for name in (*option.opts, *option.secondary_opts)}
+    return {name for name in names if name.startswith("-")} | {"--help", "-h"}
+
+
+def invocations(text: str) -> Iterator[tuple[str, list[str]]]:
+    """Commands in the code of a page, each with the options it is given."""
+    spans = re.findall(r"```(?:sh|console|bash)\n(.*?)```", text, re.S)
+    for span in [
+        *spans,
+        *re.findall(r"`(mp4ds [^`]*)`", re.sub(r"```.*?```", "", text, flags=re.S)),
+    ]:
+        for line in span.replace("\\\n", " ").splitlines():
+            for found in re.finditer(r"\bmp4ds ([a-z][a-z-]*)\b([^|;&]*)", line.split(" #")[0]):
+                yield found[1], re.findall(r"(?<![\w-])--?[a-z][a-z0-9-]*", found[2])
+
+
+@pytest.mark.parametrize(
+    "page",
+    [ROOT / "README.md", *sorted(DOCS.rglob("*.md")), *sorted((ROOT / "spec").glob("*.md"))],
+    ids=lambda page: str(page.relative_to(ROOT)),
+)
+def test_every_option_that_a_page_names_is_there(page: Path) -> None:
+    for command, given in invocations(page.read_text()):
+        known = options_of(command)
+        unknown = [option for option in given if known and option not in known]
+        assert not unknown, f"mp4ds {command} has no {', '.join(unknown)}"
