@@ -227,7 +227,7 @@ def unpack(
     to: Annotated[str, typer.Option("--to", help="bag, rosbag2, mcap or images.")],
     output: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option("--output", "-o", metavar="OUT", help="What to make."),
+        typer.Option("--output", "-o", metavar="OUT", help="What to make, else NAME_unpacked."),
     ] = None,
     storage: Annotated[
         Optional[str],  # noqa: UP045

@@ -68,10 +68,14 @@ def play(
     ] = None,
     prefix: Annotated[str, typer.Option("--prefix", help="Put before the topics.")] = "",
     clock: Annotated[
-        bool, typer.Option("--clock", help="Publish /clock, and lead those that follow it.")
+        bool,
+        typer.Option(
+            "--clock",
+            help="Publish /clock, and lead those that follow it; a rate may stand behind it.",
+        ),
     ] = False,
     clock_hz: Annotated[
-        float, typer.Option("--hz", help="Of /clock, besides with each message.")
+        float, typer.Option("--hz", help="The rate of --clock, besides with each message.")
     ] = _DEFAULT_CLOCK_HZ,
     follow_clock: Annotated[
         Optional[bool],  # noqa: UP045
