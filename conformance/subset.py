@@ -126,7 +126,14 @@ def load(path, kind):
     schema = json.loads((SCHEMAS / f"{kind}.schema.json").read_text())
     if not fits(document, schema, schema.get("$defs", {}), newer=version != "1.0"):
         raise RefusedError("schema-invalid", path)
-    return document
+    return without_nulls(document)
+
+
+def without_nulls(value):
+    """A document in which keys that are null are absent, which means the same."""
+    if isinstance(value, dict):
+        return {key: without_nulls(item) for key, item in value.items() if item is not None}
+    return [without_nulls(item) for item in value] if isinstance(value, list) else value
 
 
 TYPES = {"string": str, "integer": int, "number": (int, float), "array": list, "object": dict}

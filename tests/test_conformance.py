@@ -87,6 +87,24 @@ def test_both_readers_count_nesting_alike(inside: int, is_taken: bool) -> None:
         yamlio.load(text.encode(), "some.yaml")
 
 
+def test_null_is_as_good_as_absent(tmp_path: Path) -> None:
+    for file in ("least.yaml", "gray.mp4"):
+        shutil.copy(CASES / "sidecars" / "valid" / file, tmp_path)
+    path = tmp_path / "least.yaml"
+    text = re.sub("^checksum.*\n", "", path.read_text(), flags=re.MULTILINE)
+    path.write_text(text.replace("\ncolumns:\n", "\ncamera_info: null\ncolumns:\n  seq: null\n"))
+    assert mp4ds.validate(path, deep=True) == []
+    done = run(
+        *(sys.executable, "-c"),
+        "import sys, pathlib, subset; print(*subset.load(pathlib.Path(sys.argv[1]), 'stream'))",
+        path,
+        env={**os.environ, "PYTHONPATH": str(SUITE)},
+    )
+    assert done.returncode == 0, done.stderr
+    assert "columns" in done.stdout.split()
+    assert "camera_info" not in done.stdout.split()
+
+
 def has_ffmpeg() -> bool:
     if not (shutil.which("ffmpeg") and shutil.which("ffprobe")):
         return False
