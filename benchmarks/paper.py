@@ -2,8 +2,8 @@
 
     python benchmarks/paper.py [--scene cups] [--frames N] [--folder F]
 
-A Bayer camera of 640x480 at 30 Hz is recorded in a bag (see clips.py), and `mp4ds evaluate` is run on
-it for each table; its own output is what is printed.
+A Bayer camera of 640x480 at 30 Hz is recorded in a bag (see clips.py), and `mp4ds evaluate` is
+run on it for each table; its own output is what is printed.
 """
 
 from __future__ import annotations
