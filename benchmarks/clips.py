@@ -197,10 +197,22 @@ def make(spec: ClipSpec) -> Iterator[Pixels]:
         paths = sorted(folder.glob(SCENES[spec.scene].pattern))
         yield from (_read_still(path) for path in paths[: spec.frames])
         return
-    sensor = SENSORS[spec.noise]
     for number, rgb in enumerate(islice(_rgb_frames(spec), spec.frames)):
-        rng = np.random.default_rng((SEED, list(SENSORS).index(spec.noise), number))
-        yield _camera(spec, rgb, sensor, rng)
+        yield _camera(spec, rgb, SENSORS[spec.noise], _noise_of(spec.noise, number))
+
+
+def expose(encoding: str, rgb: Signal, noise: str, number: int) -> Pixels:
+    """What a camera publishes of frame ``number`` of a scene, given in grey levels, 0 to 255."""
+    return _CAMERA[encoding](rgb, SENSORS[noise], _noise_of(noise, number))
+
+
+def first_picture(scene: str) -> Signal:
+    """The first frame of one of `MOVING`, or of the demo where there is no data, 0 to 255."""
+    return next(_rgb_frames(ClipSpec(scene, "rgb8", "low", 1)))
+
+
+def _noise_of(noise: str, number: int) -> np.random.Generator:
+    return np.random.default_rng((SEED, list(SENSORS).index(noise), number))
 
 
 def load(spec: ClipSpec, cache: Path | None = None) -> Pixels:

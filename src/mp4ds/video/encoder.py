@@ -178,7 +178,9 @@ def open_encoder(context: Any, recipe: Recipe, width: int, height: int, *, threa
     if recipe.encoder == "libsvtav1":
         # it prints to stderr on its own; errors reach us as return codes
         os.environ.setdefault("SVT_LOG", "0")
-        context.options = {**context.options, "svtav1-params": f"lp={threads}"}
+        given = context.options.get("svtav1-params")
+        parameters = f"{given}:lp={threads}" if given else f"lp={threads}"
+        context.options = {**context.options, "svtav1-params": parameters}
     if recipe.encoder == "libx265":
         # it would write its threads and the processor beside the parameter sets
         parameters = f"{context.options['x265-params']}:info=0"
