@@ -198,12 +198,12 @@ def make(spec: ClipSpec) -> Iterator[Pixels]:
         yield from (_read_still(path) for path in paths[: spec.frames])
         return
     for number, rgb in enumerate(islice(_rgb_frames(spec), spec.frames)):
-        yield _camera(spec, rgb, SENSORS[spec.noise], _noise_of(spec.noise, number))
+        yield _camera(spec, rgb, SENSORS[spec.noise], noise_of(spec.noise, number))
 
 
-def expose(encoding: str, rgb: Signal, noise: str, number: int) -> Pixels:
-    """What a camera publishes of frame ``number`` of a scene, given in grey levels, 0 to 255."""
-    return _CAMERA[encoding](rgb, SENSORS[noise], _noise_of(noise, number))
+def expose(encoding: str, rgb: Signal, sensor: Sensor, rng: np.random.Generator) -> Pixels:
+    """What a camera publishes of a picture of a scene, given in grey levels, 0 to 255."""
+    return _CAMERA[encoding](rgb, sensor, rng)
 
 
 def first_picture(scene: str) -> Signal:
@@ -211,7 +211,8 @@ def first_picture(scene: str) -> Signal:
     return next(_rgb_frames(ClipSpec(scene, "rgb8", "low", 1)))
 
 
-def _noise_of(noise: str, number: int) -> np.random.Generator:
+def noise_of(noise: str, number: int) -> np.random.Generator:
+    """Where frame ``number`` has its noise from; the same each time."""
     return np.random.default_rng((SEED, list(SENSORS).index(noise), number))
 
 

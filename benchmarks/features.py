@@ -18,10 +18,11 @@ decoded by the package; its bytes are those of a long video with a key frame eve
                median and 95th percentile. The detector pulls corners that a lens has rounded
                inwards, in the original, too; "jitter" is the distance from the mean error of each
                corner over the frames.
+    PSNR       of the colours, against what the camera would have seen without noise, dB
 
 A row is the mean over the clips of one noise. Then `visual` is compared with JPEG 90 clip by clip,
-and sizes at equal quality, along the curves of several crf: how many more or fewer bits a tool
-against noise needs than plain AV1 of preset 6.
+and the tools against noise with plain AV1 of preset 6 at equal size, along the curves of several
+crf.
 """
 
 from __future__ import annotations
@@ -152,12 +153,20 @@ def tags(frames: Frames, clip: plane_clips.PlaneClip) -> dict[str, float]:
     return values
 
 
+def psnr(frames: Frames, clean: Frames) -> float:
+    """Of all values against what the camera would have seen without noise, dB."""
+    errors = [
+        np.mean((one.astype(float) - other) ** 2) for one, other in zip(frames, clean, strict=True)
+    ]
+    return float(10 * np.log10(255**2 / np.mean(errors)))
+
+
 def measured(clip: plane_clips.PlaneClip, way: Way) -> Measured:
     """One way on one clip."""
     with tempfile.TemporaryDirectory() as folder:
         frames, size = kept(clip.frames, way, Path(folder))
     found = features(frames, clip) if not clip.tags else tags(frames, clip)
-    return Measured(size, found)
+    return Measured(size, {**found, "PSNR": psnr(frames, clip.clean)})
 
 
 # ---------------------------------------------------------------- reporting
@@ -171,27 +180,30 @@ def mean(by_clip: Sequence[Measured], name: str) -> float:
     return float(np.mean(values)) if values else float("nan")
 
 
-def bits(results: Results, family: str, name: str, known: dict[str, Way], noise: str) -> float:
-    """Bits at equal error, against plain AV1: in percent, the mean of the clips of a noise."""
-    rates = []
+def gained(results: Results, family: str, name: str, known: dict[str, Way], noise: str) -> float:
+    """What a family's values are more than plain AV1's at equal size, mean of a noise's clips.
+
+    The sizes are those that both reach, evenly by their logarithm; between the points of a curve
+    values are interpolated.
+    """
     plain = [results[n] for n, way in known.items() if way.family == PLAIN and n in results]
     other = [results[n] for n, way in known.items() if way.family == family and n in results]
+    gains = []
     for clip in plain[0]:
         if not clip.endswith(noise) or name not in plain[0][clip].values:
             continue
-        curves = [_curve([point[clip] for point in points], name) for points in (plain, other)]
-        low = max(curve[0].min() for curve in curves)
-        high = min(curve[0].max() for curve in curves)
+        ours, theirs = (
+            _curve([point[clip] for point in points], name) for points in (other, plain)
+        )
+        low, high = max(ours[0].min(), theirs[0].min()), min(ours[0].max(), theirs[0].max())
         if high > low:
             at = np.linspace(low, high, 50)
-            theirs, ours = (np.interp(at, *curve) for curve in curves)
-            rates.append(np.exp(np.mean(ours - theirs)))
-    return float(100 * (np.mean(rates) - 1)) if rates else float("nan")
+            gains.append(np.mean(np.interp(at, *ours) - np.interp(at, *theirs)))
+    return float(np.mean(gains)) if gains else float("nan")
 
 
 def _curve(points: Sequence[Measured], name: str) -> Errors:
-    pairs = sorted((point.values[name], np.log(point.size)) for point in points)
-    return np.array(pairs).T
+    return np.array(sorted((np.log(point.size), point.values[name]) for point in points)).T
 
 
 Cell = Callable[[Sequence[Measured]], str]
@@ -210,6 +222,7 @@ def _share(name: str) -> Cell:
 
 
 _COLUMNS: dict[str, Cell] = {
+    "PSNR": _number("PSNR", 2),
     "ORB inliers, %": _share("ORB inliers"),
     "right": _number("ORB right", 0),
     "error": _pair("ORB error"),
@@ -253,21 +266,23 @@ def report(results: Results, known: dict[str, Way]) -> None:
         ]
         rows.append([name, f"{base_item.size / ours.size:.1f}", *cells])
     print_table(["clip, visual", "JPEG 90 / it", *_COMPARED], rows)
-    print("\nBits at equal error, against plain AV1 of preset 6:")
-    names = ("ORB error", "SIFT error", "SIFT right", "tags jitter")
-    rows = []
-    for family in dict.fromkeys(way.family for way in known.values() if way.family):
-        if any(name in results for name, way in known.items() if way.family == family):
-            cells = [
-                f"{bits(results, family, name, known, noise):+.1f} %"
-                for noise in clips.SENSORS
-                for name in names
-            ]
-            rows.append([family, *cells])
-    print_table(["", *(f"{name}, {noise}" for noise in clips.SENSORS for name in names)], rows)
+    print("\nMore than plain AV1 of preset 6 at equal size:")
+    rows = [
+        [family, noise, *(f"{gained(results, family, n, known, noise):+.3f}" for n in _GAINED)]
+        for noise in clips.SENSORS
+        for family in dict.fromkeys(way.family for way in known.values() if way.family)
+        if family != PLAIN and any(known[name].family == family for name in results)
+        if any(name.endswith(noise) for name in clips_known)
+    ]
+    print_table(["tool", "noise", *_GAINED], rows)
 
 
+_GAINED = (
+    *("PSNR", "ORB inliers", "ORB right", "ORB error", "SIFT inliers", "SIFT right", "SIFT error"),
+    "tags jitter",
+)
 _COMPARED = {
+    "PSNR": 1,
     **{f"{kind} inliers": 1 for kind in ("ORB", "SIFT")},
     **{f"{kind} {what}": -1 for kind in ("ORB", "SIFT") for what in ("error", "error 95")},
     **{f"{kind} {what}": -1 for kind in ("ORB", "SIFT") for what in ("corner", "corner 95")},

@@ -34,6 +34,7 @@ MOTIONS = {"cups": "hand", "lane": "drive", "people": "pan", "aloe": "turn", TAG
 """Scene -> how the camera moves before it."""
 
 _STILLS = {"aloe": "images/stereo_image_proc/aloe-L.png"}
+_NOISELESS = clips.Sensor(full_well=np.inf, read_electrons=0)
 _SAMPLES = 4  # of a pixel's side
 _LENS = 0.5  # pixels
 _SHOWN = 0.8  # of the plane's smaller side, in the first frame
@@ -50,12 +51,14 @@ class PlaneClip:
     Attributes:
         name: Scene, motion and noise.
         frames: Shape (frames, H, W, 3), rgb8 as a driver publishes it.
+        clean: The same without the sensor's noise.
         poses: Shape (frames, 3, 3): from the plane's pixels to the frame's.
         tags: Id -> corners on the plane, shape (4, 2), clockwise from the tag's upper left.
     """
 
     name: str
     frames: NDArray[np.uint8]
+    clean: NDArray[np.uint8]
     poses: NDArray[np.float64]
     tags: dict[int, Points]
 
@@ -91,12 +94,12 @@ def load(
     if kept and kept.is_file():
         pictures = np.load(kept)
     else:
-        pictures = np.stack(list(_exposed(plane, poses, noise, size)))
+        pictures = np.stack([*_exposed(plane, poses, noise, size)])
         if kept:
             part = kept.with_suffix(".part.npy")
             np.save(part, pictures)
             part.rename(kept)
-    return PlaneClip(name, pictures, poses, tags)
+    return PlaneClip(name, pictures[:, 0], pictures[:, 1], poses, tags)
 
 
 def _picture(scene: str) -> clips.Signal:
@@ -110,6 +113,7 @@ def _picture(scene: str) -> clips.Signal:
 def _exposed(
     plane: clips.Signal, poses: NDArray[np.float64], noise: str, size: tuple[int, int]
 ) -> Iterator[clips.Pixels]:
+    """Each frame with noise and without, shape (2, H, W, 3)."""
     width, height = size
     centre = (_SAMPLES - 1) / 2
     finer = np.array([[_SAMPLES, 0, centre], [0, _SAMPLES, centre], [0, 0, 1]])
@@ -123,7 +127,10 @@ def _exposed(
         )
         seen = cv2.GaussianBlur(seen, None, _LENS * _SAMPLES)
         pixels = seen.reshape(height, _SAMPLES, width, _SAMPLES, 3).mean(axis=(1, 3))
-        yield clips.expose("rgb8", np.clip(pixels, 0, 255), noise, number)
+        signal = np.clip(pixels, 0, 255)
+        rng = clips.noise_of(noise, number)
+        sensors = clips.SENSORS[noise], _NOISELESS
+        yield np.stack([clips.expose("rgb8", signal, sensor, rng) for sensor in sensors])
 
 
 # ---------------------------------------------------------------- motion

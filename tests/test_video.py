@@ -10,6 +10,7 @@ import random
 import shutil
 import subprocess
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -460,6 +461,20 @@ def test_times_in_the_file_are_the_ticks(codec: str, tmp_path: Path) -> None:
     assert [packet.dts for packet in packets] == ticks
     assert all(packet.duration for packet in packets)
     assert packets[0].is_keyframe
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_parameters_of_a_recipe_reach_svt_av1(threads: int, tmp_path: Path) -> None:
+    """Beside the threads, which are parameters of it, too."""
+    pictures = scene_pictures("mono8", 64, 48, 3)
+    recipe = recipe_for("gray", lossless=False, codec="av1", crf=50)
+    exact = replace(recipe, options={**recipe.options, "svtav1-params": "lossless=1"})
+    came_back = []
+    for number, item in enumerate((recipe, exact)):
+        path = tmp_path / f"{number}.mp4"
+        told = encode(path, item, pictures, "gray", threads=threads)
+        came_back.append(all(map(same, decode(path, told), pictures)))
+    assert came_back == [False, True]
 
 
 @pytest.mark.parametrize("rate", [None, 0.0, 1e-9, 0.3, 29.97, 1e9])
