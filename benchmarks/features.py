@@ -6,8 +6,8 @@ Clips are those of plane_clips.py: the camera's motion is known, so the truth is
 way of keeping the frames is measured on the same noisy frames as all others. Video is encoded and
 decoded by the package; its bytes are those of a long video with a key frame every 60 frames.
 
-    features   ORB and SIFT, up to 1000 of a frame. Of every second frame, those `STEP` apart are
-               matched both ways, with a ratio test of 0.8.
+    features   ORB and SIFT, up to 1000 of a frame. Of every second frame, or as `--every` says,
+               those `STEP` apart are matched both ways, with a ratio test of 0.8.
     right      matches that are within 3 pixels of the truth: their share of all matches
                ("inliers"), and how many there are of a pair of frames
     error      distance of the right matches from the truth, pixels: median and 95th percentile
@@ -46,7 +46,7 @@ from measure import parse_size, print_machine, print_table
 
 Errors = NDArray[np.float64]
 
-STEP, _EACH = 4, 2  # frames
+STEP = 4  # frames
 _NEAR = 3.0  # pixels
 _FEATURES, _RATIO = 1000, 0.8
 _LOST = 100.0  # pixels: where no homography was found
@@ -68,9 +68,9 @@ class Measured:
     values: dict[str, float] = field(default_factory=dict)
 
 
-def features(frames: Frames, clip: plane_clips.PlaneClip) -> dict[str, float]:
-    """ORB and SIFT against the truth."""
-    grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames[::_EACH]]
+def features(frames: Frames, clip: plane_clips.PlaneClip, every: int) -> dict[str, float]:
+    """ORB and SIFT of every so many frames against the truth."""
+    grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames[::every]]
     kinds: dict[str, tuple[Any, int]] = {
         "ORB": (cv2.ORB_create(_FEATURES), cv2.NORM_HAMMING),
         "SIFT": (cv2.SIFT_create(_FEATURES), cv2.NORM_L2),
@@ -80,11 +80,11 @@ def features(frames: Frames, clip: plane_clips.PlaneClip) -> dict[str, float]:
         seen = [detector.detectAndCompute(picture, None) for picture in grey]
         places = [cv2.KeyPoint_convert(keys).astype(np.float64) for keys, _ in seen]
         shares, counts, errors, corners = [], [], [], []
-        for first in range(len(grey) - STEP // _EACH):
-            second = first + STEP // _EACH
+        for first in range(len(grey) - STEP // every):
+            second = first + STEP // every
             pairs = _matches(seen[first][1], seen[second][1], norm)
             here, there = places[first][pairs[:, 0]], places[second][pairs[:, 1]]
-            truth = clip.between(first * _EACH, second * _EACH)
+            truth = clip.between(first * every, second * every)
             distance = np.linalg.norm(plane_clips.moved(truth, here) - there, axis=1)
             is_right = distance < _NEAR
             shares.append(is_right.mean() if len(pairs) else 0.0)
@@ -161,11 +161,11 @@ def psnr(frames: Frames, clean: Frames) -> float:
     return float(10 * np.log10(255**2 / np.mean(errors)))
 
 
-def measured(clip: plane_clips.PlaneClip, way: Way) -> Measured:
+def measured(clip: plane_clips.PlaneClip, way: Way, every: int) -> Measured:
     """One way on one clip."""
     with tempfile.TemporaryDirectory() as folder:
         frames, size = kept(clip.frames, way, Path(folder))
-    found = features(frames, clip) if not clip.tags else tags(frames, clip)
+    found = features(frames, clip, every) if not clip.tags else tags(frames, clip)
     return Measured(size, {**found, "PSNR": psnr(frames, clip.clean)})
 
 
@@ -301,6 +301,9 @@ def main() -> None:
     )
     known = ways()
     parser.add_argument("--frames", type=int, default=25)
+    parser.add_argument(
+        "--every", type=int, choices=(1, 2, 4), default=2, help="frames of which features are taken"
+    )
     parser.add_argument("--size", type=parse_size, default=(640, 480), help="WxH")
     parser.add_argument("--way", nargs="+", choices=known, default=list(known), metavar="WAY")
     parser.add_argument("--clip", nargs="+", choices=plane_clips.MOTIONS)
@@ -317,7 +320,11 @@ def main() -> None:
     print_machine()
     print(f"- opencv {cv2.__version__}")
     width, height = chosen.size
-    print(f"- {chosen.frames} frames of {width}x{height}, pairs {STEP} apart", flush=True)
+    print(
+        f"- {chosen.frames} frames of {width}x{height}, one of {chosen.every} used, "
+        f"pairs {STEP} apart",
+        flush=True,
+    )
     chosen.folder.mkdir(parents=True, exist_ok=True)
     names = list(dict.fromkeys(["JPEG 90", "visual", *chosen.way]))
     results: Results = {name: {} for name in known if name in names}
@@ -325,10 +332,10 @@ def main() -> None:
         for scene in chosen.clip or plane_clips.MOTIONS:
             loaded = plane_clips.load(scene, noise, chosen.frames, chosen.size, chosen.folder)
             for name in results:
-                key = f"{loaded.name}, {name}, {chosen.frames}, {width}x{height}"
+                key = f"{loaded.name}, {name}, {chosen.frames}, {width}x{height}, {chosen.every}"
                 file = chosen.folder / f"{key.replace(', ', '-').replace(' ', '_')}.json"
                 if not file.is_file():
-                    found = measured(loaded, known[name])
+                    found = measured(loaded, known[name], chosen.every)
                     file.write_text(json.dumps(asdict(found)))
                 results[name][loaded.name] = Measured(**json.loads(file.read_text()))
     report(results, known)
