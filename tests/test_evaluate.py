@@ -44,15 +44,15 @@ from mp4ds.evaluating.clips import (
     chosen_at_rate,
     make_clip,
 )
-from mp4ds.evaluating.options import MAX_CRF, grid_of, parse_crfs
+from mp4ds.evaluating.options import grid_of, parse_crfs
 from mp4ds.evaluating.results import Cell
-from mp4ds.evaluating.search import largest_crf
 from mp4ds.evaluating.sources import open_source
 from mp4ds.evaluating.tables import pareto, reachable_score, recommend
 from mp4ds.layouts import ENCODINGS as ENCODING_TABLE
 from mp4ds.packing import PackOptions
-from mp4ds.scoring import ScoringError, Summary
+from mp4ds.scoring import ScoringError, Summary, largest_crf
 from mp4ds.unpacking import UnpackOptions
+from mp4ds.video.codecs import MAX_CRF
 from mp4ds.video.planes import PacketSizes, packet_sizes
 from scenes import PERIOD, TRAITS, Scene, odd_scene
 from sources import ENCODINGS, SOURCES, scene, write_bag

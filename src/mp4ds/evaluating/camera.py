@@ -14,7 +14,6 @@ from mp4ds.evaluating.clips import (
     make_clip,
 )
 from mp4ds.evaluating.options import (
-    MAX_CRF,
     EvaluateOptions,
     Grid,
     Setting,
@@ -28,7 +27,6 @@ from mp4ds.evaluating.results import (
     RateRow,
     StorageRow,
 )
-from mp4ds.evaluating.search import largest_crf
 from mp4ds.evaluating.sources import Camera
 from mp4ds.evaluating.tables import (
     CEILING_MARGIN,
@@ -38,7 +36,8 @@ from mp4ds.evaluating.tables import (
     storage,
 )
 from mp4ds.evaluating.trials import ClipPlace, Failure, Trials
-from mp4ds.scoring import VMAF_MODEL, ScoringError, Summary
+from mp4ds.scoring import VMAF_MODEL, ScoringError, Summary, largest_crf
+from mp4ds.video.codecs import MAX_CRF
 
 _NEAR = 1.05  # rates that differ by less are the same
 _SHORT = 30  # frames

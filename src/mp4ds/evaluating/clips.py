@@ -17,7 +17,7 @@ from mp4ds.evaluating.sources import Camera, Shot
 from mp4ds.layouts import ENCODINGS, Layout, layout_for
 from mp4ds.outputs import write_synced
 from mp4ds.stamps import NS_PER_TICK, PresentationClock
-from mp4ds.video.planes import PlaneMaker, Planes
+from mp4ds.video.planes import PlaneMaker, Planes, planes_in
 
 _SECOND = 1_000_000_000
 _DETAIL = (128, 96)  # columns and rows that are shown beside each other
@@ -257,8 +257,7 @@ class ClipFile:
     def __init__(self, path: Path) -> None:
         self.clip = clip_from_json(path.with_suffix(".json").read_text())
         clip = self.clip
-        self._luma = clip.width * clip.height
-        size = self._luma * 3 // 2
+        size = clip.width * clip.height * 3 // 2
         if path.stat().st_size != size * clip.frames:
             raise SourceError(path, "is not whole", "Remove the folder and evaluate again.")
         self._frames = np.memmap(path, np.uint8, "r", shape=(clip.frames, size))
@@ -268,13 +267,7 @@ class ClipFile:
 
     def planes(self, number: int) -> Planes:
         """The planes of one frame, as views."""
-        width, height, luma = self.clip.width, self.clip.height, self._luma
-        frame = np.asarray(self._frames[number])
-        return (
-            frame[:luma].reshape(height, width),
-            frame[luma : luma * 5 // 4].reshape(height // 2, width // 2),
-            frame[luma * 5 // 4 :].reshape(height // 2, width // 2),
-        )
+        return planes_in(np.asarray(self._frames[number]), self.clip.width, self.clip.height)
 
 
 def detail_of(planes: Planes, clip: Clip) -> Planes:

@@ -11,13 +11,10 @@ from mp4ds.errors import OptionError
 from mp4ds.plan import visual_setting
 from mp4ds.scoring import METRICS
 from mp4ds.video import check_codec
-from mp4ds.video.codecs import LOSSY_GOP
+from mp4ds.video.codecs import LOSSY_GOP, MAX_CRF
 
 CODEC_NAMES = {"svtav1": "av1", "x264": "h264", "x265": "h265"}
 """Names of the encoders -> of the codecs, as `mp4ds pack` takes them."""
-
-MAX_CRF = {"av1": 63, "h264": 51, "h265": 51}
-"""The largest crf of each codec."""
 
 _DEFAULT_PRESETS = {"av1": ("6", "8"), "h264": ("medium",), "h265": ("medium",)}
 _MOST_CELLS = 10_000

@@ -9,12 +9,21 @@ from __future__ import annotations
 from mp4ds.scoring.errors import ScoringError
 from mp4ds.scoring.ffmpeg import VMAF_MODEL, Ffmpeg, find_ffmpeg
 from mp4ds.scoring.measures import MAX_PSNR, psnr, ssim
-from mp4ds.scoring.scorer import Scorer, YuvFrame
+from mp4ds.scoring.scorer import (
+    SMALLEST,
+    Scorer,
+    YuvFrame,
+    psnr_scores,
+    ssim_scores,
+    vmaf_scores,
+)
 from mp4ds.scoring.scores import METRICS, Scores, Summary, summary_of
+from mp4ds.scoring.search import largest_crf
 
 __all__ = [
     "MAX_PSNR",
     "METRICS",
+    "SMALLEST",
     "VMAF_MODEL",
     "Ffmpeg",
     "Scorer",
@@ -23,7 +32,11 @@ __all__ = [
     "Summary",
     "YuvFrame",
     "find_ffmpeg",
+    "largest_crf",
     "psnr",
+    "psnr_scores",
     "ssim",
+    "ssim_scores",
     "summary_of",
+    "vmaf_scores",
 ]

@@ -54,6 +54,7 @@ class _Coding:
     tried: bool = True  # without being asked for
 
 
+_SAME_HEADERS = "stitchable=1"  # parameter sets that do not depend on the crf
 # the converter sites chroma in the middle; untagged, decoders take it for left
 _CENTRED = "chromaloc=1"
 _FFV1 = MappingProxyType({"level": "3", "slicecrc": "1", "slices": "4"})
@@ -121,6 +122,9 @@ _LOSSY: dict[str, _Coding] = {
 }
 _DEFAULT_LOSSY = "av1"
 
+MAX_CRF = {"av1": 63, "h264": 51, "h265": 51}
+"""The largest crf of each lossy codec."""
+
 
 _X26X_PRESETS = (
     *("ultrafast", "superfast", "veryfast", "faster", "fast"),
@@ -172,6 +176,7 @@ def recipe_for(
     codec: str | None = None,
     crf: int | None = None,
     preset: str | None = None,
+    varied: bool = False,
 ) -> Recipe:
     """The recipe for pictures of a pixel format.
 
@@ -181,6 +186,7 @@ def recipe_for(
         codec: ``h264``, ``h265``, ``av1``, ``ffv1``, or None for the default.
         crf: Constant rate factor of a lossy recipe.
         preset: The encoder's preset, or None for the default; encoders without ignore it.
+        varied: Whether videos with several crf are to be joined to one.
 
     Raises:
         OptionError: The codec is unknown or cannot do it; names those that can.
@@ -204,6 +210,9 @@ def recipe_for(
         options = {**coding.options, "crf": str(crf)}
         if pixel_format in _YUV:
             options = _sited_left(options)
+        if varied and name == "h264":
+            parameters = options.get("x264-params")
+            options["x264-params"] = ":".join(filter(None, (parameters, _SAME_HEADERS)))
     if coding.default_preset:
         options["preset"] = preset or coding.default_preset
     if coding.tuning and preset is None:

@@ -55,6 +55,22 @@ def planes_of(frame: av.VideoFrame) -> Planes:
     return y, u, v
 
 
+def planes_in(frame: NDArray[np.uint8], width: int, height: int) -> Planes:
+    """The planes of a frame that stand one after the other, as views.
+
+    Args:
+        frame: uint8, shape (width * height * 3 / 2,).
+        width: Columns, even.
+        height: Rows, even.
+    """
+    luma = width * height
+    return (
+        frame[:luma].reshape(height, width),
+        frame[luma : luma * 5 // 4].reshape(height // 2, width // 2),
+        frame[luma * 5 // 4 :].reshape(height // 2, width // 2),
+    )
+
+
 def _buffers(frame: av.VideoFrame) -> tuple[Any, ...]:
     return tuple(frame.planes)  # buffers, which their type does not tell
 

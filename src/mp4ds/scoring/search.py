@@ -4,9 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+_STEP = 4  # of crf, where nothing is known of how fast scores fall
+
 
 def largest_crf(
-    score: Callable[[int], float], target: float, *, guess: int, largest: int
+    score: Callable[[int], float],
+    target: float,
+    *,
+    guess: int,
+    largest: int,
+    fall: float | None = None,
+    most: int | None = None,
 ) -> tuple[int, bool, int]:
     """Look for it between 1 and the largest, where scores fall as it grows.
 
@@ -18,10 +26,14 @@ def largest_crf(
         target: The score to reach.
         guess: The crf to begin with.
         largest: That the codec has.
+        fall: About how much less the score is for each crf more, by which the first steps are
+            chosen; None: not known.
+        most: The search ends after so many were tried, with the best it has; None: when it is
+            sure.
 
     Returns:
         The crf, whether it reaches the target, and how many were tried. Where none reaches it,
-        the crf is the smallest one that was tried: 1.
+        the crf is the smallest one that was tried.
     """
     known: dict[int, float] = {}
 
@@ -32,23 +44,25 @@ def largest_crf(
 
     good, bad = 0, largest + 1  # the first does, the second does not, as far as is known
     crf = min(max(guess, 1), largest)
-    step = 4
-    while bad - good > 1:
+    least = _STEP if fall is None else 1  # that it goes on; doubled each time
+    while bad - good > 1 and (most is None or len(known) < most):
         width = bad - good
-        if at(crf) >= target:
+        found = at(crf)
+        if found >= target:
             good = crf
         else:
             bad = crf
         if good in known and bad in known:
             is_slow = bad - good > width / 2
             crf = (good + bad) // 2 if is_slow else _between(good, bad, known, target)
-        elif good in known:  # the last one that was tried was still good enough
-            crf, step = min(good + step, largest, bad - 1), step * 2
-        else:
-            crf, step = max(bad - step, 1), step * 2
+            continue
+        step = max(least, round(abs(found - target) / fall)) if fall else least
+        least *= 2
+        # the last one that was tried was still good enough, or not yet
+        crf = min(good + step, largest, bad - 1) if good in known else max(bad - step, 1)
     if good in known:
         return good, True, len(known)
-    return 1, False, len(known)
+    return min(known), False, len(known)
 
 
 def _between(good: int, bad: int, known: dict[int, float], target: float) -> int:
