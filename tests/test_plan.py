@@ -17,6 +17,7 @@ from mp4ds.plan import (
     FileNames,
     Quality,
     Selection,
+    Target,
     parse_quality,
     visual_setting,
 )
@@ -33,6 +34,10 @@ steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
         ("lossless", Quality("lossless"), True),
         ("visual", Quality("visual"), False),
         *((f"crf={n}", Quality("crf", n), False) for n in (0, 7, 22, 63)),
+        *(
+            (f"{name}={score}", Quality("target", target=Target(name, score)), False)
+            for name, score in (("vmaf", 99.5), ("psnr", 42), ("ssim", 0.9801))
+        ),
     ],
 )
 def test_qualities(text: str, quality: Quality, lossless: bool) -> None:
@@ -44,10 +49,11 @@ def test_qualities(text: str, quality: Quality, lossless: bool) -> None:
 @pytest.mark.parametrize(
     "text",
     ["", "Lossless", "lossless ", "crf", "crf=", "crf=64", "crf=-1", "crf=1.5", "crf=100", "22",
-     "crf=\u0662", "crf=22\n", "vmaf=99.5", "best"],
+     "crf=\u0662", "crf=22\n", "vmaf=100", "vmaf=", "psnr=60", "ssim=1.0", "ssim=0",
+     "vmaf=99.12345", "psnr=1e1", "psnr_y=40", "vmaf=nan", "best"],
 )  # fmt: skip
 def test_other_qualities_are_refused(text: str) -> None:
-    with pytest.raises(OptionError, match="Use lossless, visual, or crf=N"):
+    with pytest.raises(OptionError, match="Use lossless, visual, crf=N"):
         parse_quality(text)
 
 

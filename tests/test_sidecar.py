@@ -183,6 +183,26 @@ def png() -> Document:
     return document
 
 
+def scored() -> Document:
+    """A sidecar of a video that keeps a score."""
+    document = stream()
+    del document["digests"]
+    document["profile"] = "vmaf=99.5"
+    document["video"]["quality"] = {
+        "metric": "vmaf",
+        "target": 99.5,
+        "mean": 99.53,
+        "p5": 99.503,
+        "min": 99.5,
+        "worst_window": 99.5,
+        "windows": 2,
+        "reencoded": 1,
+        "limited": 1,
+        "scores": {"start": 9950, "step": 3, "values": "0*2\n"},
+    }
+    return document
+
+
 def dataset() -> Document:
     """A manifest with every key that there is."""
     return {
@@ -229,6 +249,7 @@ WHOLE: dict[str, Callable[[], Document]] = {
     "stream": stream,
     "packet": packet,
     "png": png,
+    "scored": scored,
     "dataset": dataset,
 }
 KINDS = ("stream", "dataset")
@@ -451,6 +472,20 @@ REFUSED: dict[str, list[tuple[str, Any]]] = {
         *(("body", value) for value in ("pixels", "png", "rvl", "jpeg", ...)),
         *(("video.parameters", value) for value in ({"bits": 12, "shift": 0}, [], 5)),
     ],
+    "scored": [
+        *(("profile", value)
+          for value in ("lossless", "visual", "vmaf=99", "psnr=99.5", "vmaf", "vmaf=99.12345")),
+        *((f"video.quality.{key}", value)
+          for key in ("target", "mean", "p5", "min", "worst_window")
+          for value in (101, -101, "99.5", None, True, ...)),
+        *(("video.quality.metric", value) for value in ("VMAF", "psnr", "", None, ...)),
+        *((f"video.quality.{key}", value)
+          for key in ("windows", "reencoded", "limited") for value in (-1, 3, 1.0, "1", None)
+          if (key, value) != ("windows", 3)),
+        *(("video.quality.windows", value) for value in (0, ...)),
+        *(("video.quality.scores", value) for value in ([9950], "0*2", None, ...)),
+        ("video.quality.surprise", 1),
+    ],
     "png": [
         ("body", ...),
         *(("headers.0.prefix", value)
@@ -543,6 +578,9 @@ def test_the_released_schema_takes_what_the_model_takes(kind: str) -> None:
 
 # Rules over several keys, or over what the names mean: for the model alone.
 _ONLY_MODEL: list[tuple[str, Any]] = [
+    *(("profile", value) for value in ("lossless", "visual", "vmaf=99", "psnr=99.5")),
+    ("video.quality.metric", "psnr"),
+    *((f"video.quality.{key}", 3) for key in ("reencoded", "limited")),
     *(("image.encoding", value) for value in ("rgba8", "", "RGB8", "mono16")),
     *(("image.step", value) for value in (23, 24 + 4097)),
     *(("video.layout", value) for value in ("gray8", "bgr24", "", "nv12")),

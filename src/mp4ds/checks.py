@@ -225,6 +225,7 @@ def _validate_stream(path: Path, deep: bool, report: Callable[[str], None]) -> l
         problems += _check_video_file(stream, deep, report)
         _ = stream.rebuilder  # decodes and checks the columns
         _ = stream.camera_info_columns
+        _check_quality(stream)
         with stream.open_video(sequential=True) as decoder:
             coded = decoder.coded_frames
             if coded != len(stream):
@@ -241,6 +242,21 @@ def _validate_stream(path: Path, deep: bool, report: Callable[[str], None]) -> l
     except FormatError as error:
         problems.append(Problem(error.code, error.place, error.problem))
     return problems
+
+
+def _check_quality(stream: Stream) -> None:
+    """The scores are one for each frame, and come to what is told of them.
+
+    Raises:
+        FormatError: They are not, or do not.
+    """
+    quality = stream.sidecar.video.quality
+    if quality is not None:
+        try:
+            quality.decode(len(stream))
+        except ValueError as error:
+            place = f"{stream.path} at video.quality.scores"
+            raise FormatError("column-invalid", place, str(error)) from None
 
 
 def _check_video_file(

@@ -185,6 +185,11 @@ def _dataset_info(dataset: Dataset) -> Info:
         if dataset.manifest.topics_left_out:
             left_out = ", ".join(dataset.manifest.topics_left_out)
             result.notes.append(f"left out when packed: {left_out}")
+    result.notes += [
+        f"{stream.topic}: {stream.sidecar.video.quality}"
+        for stream in dataset.streams
+        if stream.sidecar.video.quality
+    ]
     if any(stream.sidecar.stamps == "record-float" for stream in dataset.streams):
         result.notes.append("times are record times that were stored as float seconds: not exact")
     return result

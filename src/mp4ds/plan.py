@@ -32,18 +32,46 @@ VISUAL_TABLE: tuple[tuple[float, int, int], ...] = (
 
 _UNKNOWN_RATE = 30.0
 
+TOLERANCES = {"vmaf": 0.5, "psnr": 0.5, "ssim": 0.005}
+"""Metric of a target -> how far below it the mean of a single window may be."""
+
+_BOUNDS = {"vmaf": 100.0, "psnr": 60.0, "ssim": 1.0}  # of PSNR, dB: identical planes have it
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """The score that packed frames are to have.
+
+    Attributes:
+        metric: ``vmaf`` (0 to 100), or of the luma ``psnr`` (dB) or ``ssim`` (0 to 1).
+        score: What the mean over the frames is to be.
+    """
+
+    metric: str
+    score: float
+
+    @property
+    def tolerance(self) -> float:
+        """How far below the score the mean of a single window may be."""
+        return TOLERANCES[self.metric]
+
+    def __str__(self) -> str:
+        return f"{self.metric}={self.score:g}"
+
 
 @dataclass(frozen=True, slots=True)
 class Quality:
     """What ``--quality`` asked for.
 
     Attributes:
-        name: ``lossless``, ``visual`` or ``crf``.
+        name: ``lossless``, ``visual``, ``crf`` or ``target``.
         crf: The constant rate factor, for ``crf`` only.
+        target: The score to reach, for ``target`` only.
     """
 
     name: str
     crf: int | None = None
+    target: Target | None = None
 
     @property
     def lossless(self) -> bool:
@@ -51,11 +79,13 @@ class Quality:
         return self.name == "lossless"
 
     def __str__(self) -> str:
+        if self.target is not None:
+            return str(self.target)
         return self.name if self.crf is None else f"crf={self.crf}"
 
 
 def parse_quality(text: str) -> Quality:
-    """Parse ``lossless``, ``visual`` or ``crf=N``.
+    """Parse ``lossless``, ``visual``, ``crf=N``, ``vmaf=SCORE``, ``psnr=DB`` or ``ssim=SCORE``.
 
     Raises:
         OptionError: Anything else.
@@ -65,8 +95,14 @@ def parse_quality(text: str) -> Quality:
     match = re.fullmatch(r"crf=([0-9]{1,2})", text)
     if match and int(match.group(1)) <= 63:
         return Quality("crf", int(match.group(1)))
+    match = re.fullmatch(r"(vmaf|psnr|ssim)=([0-9]{1,3}(?:\.[0-9]{1,4})?)", text)
+    if match:
+        target = Target(match.group(1), float(match.group(2)))
+        if 0 < target.score < _BOUNDS[target.metric]:
+            return Quality("target", target=target)
     raise OptionError(
-        f"--quality {text!r} is not known. Use lossless, visual, or crf=N with N from 0 to 63."
+        f"--quality {text!r} is not known. Use lossless, visual, crf=N with N from 0 to 63, or a "
+        "score to reach: vmaf=99.5 (below 100), psnr=42 (dB, below 60) or ssim=0.98 (below 1)."
     )
 
 

@@ -87,7 +87,12 @@ def pack(
     topics: TopicsOption = None,
     exclude: ExcludeOption = None,
     quality: Annotated[
-        str, typer.Option("--quality", "-q", help="lossless, visual, or crf=N.")
+        str,
+        typer.Option(
+            "--quality",
+            "-q",
+            help="lossless, visual, crf=N, or a score to keep: vmaf=99.5, psnr=42, ssim=0.98.",
+        ),
     ] = "lossless",
     codec: Annotated[
         Optional[str],  # noqa: UP045

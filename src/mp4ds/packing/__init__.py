@@ -15,9 +15,11 @@ from pathlib import Path
 from mp4ds.engine import Engine, ProcessEngine
 from mp4ds.errors import FormatError, OptionError, SourceError, TargetExistsError, WriteError
 from mp4ds.outputs import check_target, staged
+from mp4ds.packing.cameras import Exact
 from mp4ds.packing.coordinator import Coordinator, Run, claimed
 from mp4ds.packing.job import open_recording, outcome_options
 from mp4ds.packing.manifest import is_dataset
+from mp4ds.packing.packer import until_in_reach
 from mp4ds.packing.planning import Means, plan_job
 from mp4ds.packing.report import PackOptions, PackProgress, PackSummary, TopicSummary
 from mp4ds.packing.ros_mp4 import import_ros_mp4
@@ -27,6 +29,7 @@ from mp4ds.packing.work import command
 from mp4ds.packing.workplace import Workplace
 from mp4ds.plan import parse_quality
 from mp4ds.remote import RemotePath, location, remote
+from mp4ds.scoring import find_ffmpeg
 from mp4ds.sidecar import MANIFEST_NAME, load_manifest
 from mp4ds.source_files import source_size
 from mp4ds.video import check_codec
@@ -87,7 +90,7 @@ def _pack(
         return pack_to_store(paths, store, options, is_dataset, pack_here, progress)
     run = _plan(paths, target, options)
     if run.is_new and run.job.is_single and not options.cluster:
-        return _pack_in_one_pass(run, progress)
+        return until_in_reach(partial(_pack_in_one_pass, run, progress))
     return _pack_runs([run], options, progress)[0]
 
 
@@ -184,6 +187,7 @@ def _checked(options: PackOptions) -> PackOptions:
 
     Raises:
         OptionError: They do.
+        ScoringError: VMAF is asked for, and there is nothing that computes it.
     """
     quality = parse_quality(options.quality)
     if options.transcode and quality.lossless:
@@ -192,8 +196,12 @@ def _checked(options: PackOptions) -> PackOptions:
             "is smaller than any video of its pixels."
         )
     check_codec(options.codec, options.preset, lossless=quality.lossless)
+    if quality.target is not None and quality.target.metric == "vmaf":
+        find_ffmpeg()  # says how to get one before anything is read
     images = options.images.absolute() if options.images else None
-    return replace(options, purpose=None, gop=options.group_frames, images=images)
+    return replace(
+        options, quality=str(quality), purpose=None, gop=options.group_frames, images=images
+    )
 
 
 def _plan(paths: Sequence[Path], target: Path, options: PackOptions, *, recordings: int = 1) -> Run:
@@ -212,14 +220,14 @@ def _plan(paths: Sequence[Path], target: Path, options: PackOptions, *, recordin
     return Run(job, place, paths, target, options.force, is_new=True)
 
 
-def _pack_in_one_pass(run: Run, progress: Report | None) -> PackSummary:
+def _pack_in_one_pass(run: Run, progress: Report | None, exact: Exact) -> PackSummary:
     with (
         run.job.open() as reader,
         staged(run.target, force=run.force, replaceable=is_dataset, sources=run.paths) as folder,
     ):
         folder.mkdir()
         try:
-            return pack_in_one_pass(reader, run.job, folder, run.target, progress)
+            return pack_in_one_pass(reader, run.job, folder, run.target, progress, exact)
         except OSError as error:
             if isinstance(error, SourceError) or error.errno is None:
                 raise

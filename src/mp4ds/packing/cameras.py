@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mp4ds.bags import BagReader
@@ -15,6 +15,7 @@ from mp4ds.packing.report import TopicSummary
 from mp4ds.packing.survey import (
     MAX_STREAMS_PER_CHANNEL,
     SAMPLES,
+    Decision,
     Survey,
     decide,
     rate_of,
@@ -23,6 +24,7 @@ from mp4ds.plan import FileNames
 from mp4ds.records import Channel, Message
 from mp4ds.streams import (
     Looker,
+    PicturePlan,
     Seen,
     StreamKey,
     StreamSettings,
@@ -31,6 +33,9 @@ from mp4ds.streams import (
     Unsuited,
     needs_trial,
 )
+
+Exact = Mapping[tuple[int, StreamKey], str]
+"""Id of a channel and key of streams that no score is asked of any more -> why."""
 
 NOT_SURVEYED = "images of its size or encoding were not met where the recording was looked into"
 
@@ -88,6 +93,7 @@ class Cameras:
         survey: What was decided before; None to decide here.
         topic_of: The summary of a channel's topic.
         keep: Stores what no stream can carry exactly.
+        exact: Streams that are to be lossless although a score is asked for, and why.
     """
 
     def __init__(
@@ -100,6 +106,7 @@ class Cameras:
         *,
         topic_of: Callable[[Channel], TopicSummary],
         keep: Callable[[Message], None],
+        exact: Exact,
     ) -> None:
         self._reader = reader
         self._folder = folder
@@ -108,6 +115,7 @@ class Cameras:
         self._survey = survey
         self._topic_of = topic_of
         self._keep = keep
+        self._exact = exact
         self._names = FileNames()
         self._channels: dict[tuple[object, ...], _CameraChannel] = {}
         self._streams: list[StreamWriter] = []
@@ -145,9 +153,7 @@ class Cameras:
             decisions = self._survey.decisions.get(channel.id) if self._survey else None
             if decisions is not None:
                 state.is_surveyed = True
-                state.routes = {
-                    item.key: _Route(list(item.plans), refusal=item.refusal) for item in decisions
-                }
+                state.routes = {item.key: self._route(channel, item) for item in decisions}
         return self._channels[channel.identity]
 
     def settle(self, workers: Workers) -> None:
@@ -166,8 +172,18 @@ class Cameras:
             self._write(state, item, workers)
 
     def _plan(self, samples: list[Seen], channel: Channel) -> _Route:
-        decision = decide(samples, self._settings, self._rate(channel))
-        return _Route(decision.plans, refusal=decision.refusal)
+        return self._route(channel, decide(samples, self._settings, self._rate(channel)))
+
+    def _route(self, channel: Channel, decision: Decision) -> _Route:
+        reason = self._exact.get((channel.id, decision.key))
+        if reason is None:
+            return _Route(list(decision.plans), refusal=decision.refusal)
+        plans: list[TrackPlan] = [
+            replace(plan, note=f"partly kept lossless: {reason}")
+            for plan in decision.plans
+            if isinstance(plan, PicturePlan) and plan.exact
+        ]
+        return _Route(plans, refusal="" if plans else reason)
 
     def _rate(self, channel: Channel) -> float | None:
         return rate_of(self._reader, channel)

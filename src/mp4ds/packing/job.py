@@ -13,6 +13,7 @@ from mp4ds._version import __version__
 from mp4ds.bags import BagReader, open_sources
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.importing import ImageFolder, open_images
+from mp4ds.packing.cameras import Exact
 from mp4ds.packing.kept import dump_kept, load_kept
 from mp4ds.packing.packer import PartSettings
 from mp4ds.packing.report import PackOptions
@@ -227,8 +228,13 @@ class Job:
                     "Begin anew with --restart, or give the file back as it was.",
                 )
 
-    def settings(self, task: Task) -> PartSettings:
-        """How a task packs."""
+    def settings(self, task: Task, exact: Exact) -> PartSettings:
+        """How a task packs.
+
+        Args:
+            task: One of the job's.
+            exact: Streams that are made lossless, since a score is out of their reach.
+        """
         options = self.options
         return PartSettings(
             streams=StreamSettings(
@@ -246,6 +252,7 @@ class Job:
             workers=self.workers,
             compression="zstd" if task.whole else "lz4",  # that is read once, in the joining
             is_whole=task.whole,
+            exact=exact,
         )
 
     def _survey_for(self, task: Task) -> Survey | None:

@@ -165,6 +165,8 @@ def summarize(part: Part, target: Path, source_bytes: int) -> PackSummary:
         topic.packed_bytes += (video.size or 0) + (
             part.folder / f"{stream.stem}.yaml"
         ).stat().st_size
+        if video.quality is not None:
+            topic.notes.append(str(video.quality))
         if stream.is_renamed:
             topic.notes.append(f"stored as {video.file}: the plain name was taken")
     return PackSummary(

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from mp4ds.bags import BagReader, BagWriter
 from mp4ds.bags.mcap_write import McapWriter
 from mp4ds.bags.salvage import losses_of
 from mp4ds.engine import Workers
 from mp4ds.packing.calibrations import Calibrations
-from mp4ds.packing.cameras import Cameras
+from mp4ds.packing.cameras import Cameras, Exact
 from mp4ds.packing.manifest import declare_rest
 from mp4ds.packing.part import Part
 from mp4ds.packing.survey import Survey
 from mp4ds.plan import Selection
 from mp4ds.records import EVERYTHING, Attachment, Excerpt, Message, Record
-from mp4ds.streams import StreamSettings
+from mp4ds.streams import OutOfReachError, StreamKey, StreamSettings
 from mp4ds.wire import is_calibration, is_camera
 from mp4ds.wire.transforms import TransformCollector
+
+_Made = TypeVar("_Made")
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,7 @@ class PartSettings:
         workers: Streams that are encoded side by side.
         compression: Of messages.mcap.
         is_whole: Whether there are no other parts.
+        exact: Streams that are made lossless, since a score is out of their reach, and why.
     """
 
     streams: StreamSettings
@@ -45,6 +49,23 @@ class PartSettings:
     workers: int = 1
     compression: str = "zstd"
     is_whole: bool = True
+    exact: Exact = field(default_factory=dict)
+
+
+def until_in_reach(make: Callable[[Exact], _Made]) -> _Made:
+    """Pack; and again, with other streams lossless, while one cannot have the score asked for.
+
+    Args:
+        make: Packs, beginning anew each time; given the streams that are to be lossless.
+    """
+    exact: dict[tuple[int, StreamKey], str] = {}
+    while True:
+        try:
+            return make(exact)
+        except OutOfReachError as error:
+            if error.stream in exact:
+                raise
+            exact = {**exact, error.stream: error.reason}
 
 
 class Packer:
@@ -87,6 +108,7 @@ class Packer:
             survey,
             topic_of=self._part.topic,
             keep=self._keep,
+            exact=settings.exact,
         )
 
     def run(self) -> Part:
@@ -94,6 +116,7 @@ class Packer:
 
         Raises:
             SourceError: The recording is damaged.
+            OutOfReachError: A stream cannot have the score that was asked for.
             OSError: The disk refused.
         """
         part = self._part

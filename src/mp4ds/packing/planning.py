@@ -23,7 +23,7 @@ from mp4ds.packing.survey import (
     survey_pairs,
 )
 from mp4ds.pairing import choose_pairs, pair_camera_infos
-from mp4ds.plan import Selection, parse_quality
+from mp4ds.plan import Quality, Selection, parse_quality
 from mp4ds.records import Channel
 from mp4ds.streams import (
     Looker,
@@ -302,6 +302,8 @@ def _encoder_bytes(decision: Decision, threads: int) -> int:
 def _assumed_bytes(reader: BagReader, topics: _Topics, settings: StreamSettings) -> int:
     """Memory of packing everything at once, before the images were looked at closely."""
     needed = TASK_BYTES
+    if settings.quality.target is not None:  # no crf is looked for yet
+        settings = replace(settings, quality=Quality("visual"))
     for channel in topics.free:
         first = reader.first(channel)
         if first is None:

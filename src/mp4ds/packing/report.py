@@ -23,7 +23,8 @@ class PackOptions:
     Attributes:
         topics: Globs of the topics to pack; empty for all.
         exclude: Globs of topics to leave out.
-        quality: ``lossless``, ``visual`` or ``crf=N``.
+        quality: ``lossless``, ``visual``, ``crf=N``, or a score that the frames are to have:
+            ``vmaf=99.5``, ``psnr=42`` or ``ssim=0.98``.
         codec: ``h264``, ``h265``, ``av1`` or ``ffv1``; None chooses by measurement.
         preset: The encoder's preset; None chooses.
         transcode: Encode JPEG topics anew, by `quality`, instead of copying their files.

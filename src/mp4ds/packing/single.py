@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mp4ds.bags import BagReader, SourceHasher
+from mp4ds.packing.cameras import Exact
 from mp4ds.packing.job import Job
 from mp4ds.packing.manifest import folder_size, summarize, write_manifest
 from mp4ds.packing.packer import Packer
@@ -24,6 +25,7 @@ def pack_in_one_pass(
     folder: Path,
     target: Path,
     report: Callable[[PackProgress], None] | None,
+    exact: Exact,
 ) -> PackSummary:
     """Pack a whole recording; its files are hashed while they are read.
 
@@ -33,9 +35,11 @@ def pack_in_one_pass(
         folder: The folder to fill, empty.
         target: Its final name.
         report: Told of progress several times a second.
+        exact: Streams that are made lossless, since a score is out of their reach.
 
     Raises:
         SourceError: The recording is damaged.
+        OutOfReachError: A stream cannot have the score that was asked for.
         OSError: The disk refused.
     """
     hasher = SourceHasher(reader.path, reader.files)
@@ -72,7 +76,7 @@ def pack_in_one_pass(
         )
 
     (task,) = (task for task in job.tasks if task.whole)
-    part = Packer(reader, folder, job.settings(task), progress).run()
+    part = Packer(reader, folder, job.settings(task, exact), progress).run()
     hasher.advance(None)
     write_manifest(part, reader, hasher.digests, job.options["quality"])
     progress(part, done=True)

@@ -32,6 +32,7 @@ MAX_STREAMS_PER_CHANNEL = 16
 """A channel that changes its geometry more often than this is not split any further."""
 
 _MAX_LOOKS = 64
+_PLACES = 3  # beside the first at which samples are taken where a score is asked for
 _PAIRING_MESSAGES = 5_000
 
 
@@ -105,17 +106,26 @@ def rate_of(reader: BagReader, channel: Channel) -> float | None:
     return stats.rate if stats else None
 
 
-def decide(samples: Sequence[Seen], settings: StreamSettings, rate: float | None) -> Decision:
+def decide(
+    samples: Sequence[Seen],
+    settings: StreamSettings,
+    rate: float | None,
+    elsewhere: Sequence[Sequence[Seen]] = (),
+) -> Decision:
     """How images are stored, by looking at the first of them.
 
     Args:
         samples: The first images of one key, at least one, at most `SAMPLES`.
         settings: What was asked for.
         rate: Frames per second, where known.
+        elsewhere: Further ones of the same key, from other places of the recording.
+
+    Raises:
+        ScoringError: A score is asked for that cannot be computed.
     """
     key = samples[0].key
     try:
-        return Decision(key, plan_tracks(samples, settings, rate))
+        return Decision(key, plan_tracks(samples, settings, rate, elsewhere))
     except Unsuited as reason:
         return Decision(key, [], str(reason))
 
@@ -137,10 +147,25 @@ def survey_channel(
     for start in starts[::step]:
         samples = _samples(reader, channel, start, looker, settings)
         if samples and samples[0].key not in decisions:
-            decisions[samples[0].key] = decide(samples, settings, rate_of(reader, channel))
+            elsewhere: list[list[Seen]] = []
+            if settings.quality.target is not None:
+                for place in _places_between(starts):
+                    more = _samples(reader, channel, place, looker, settings)
+                    if more and more[0].key == samples[0].key:
+                        elsewhere.append(more)
+            decisions[samples[0].key] = decide(
+                samples, settings, rate_of(reader, channel), elsewhere
+            )
             if len(decisions) == MAX_STREAMS_PER_CHANNEL:
                 break
     return list(decisions.values())
+
+
+def _places_between(starts: Sequence[int | None]) -> list[int | None]:
+    """Some parts' beginnings, all over the recording but for the first."""
+    count = len(starts)
+    numbers = {count * n // (_PLACES + 1) for n in range(1, _PLACES + 1)}
+    return [starts[number] for number in sorted(numbers - {0})]
 
 
 def _samples(

@@ -23,9 +23,10 @@ from mp4ds.bags import BagReader
 from mp4ds.engine import give_back
 from mp4ds.errors import Mp4dsError
 from mp4ds.outputs import write_synced
+from mp4ds.packing.cameras import Exact
 from mp4ds.packing.job import Job, Task, digest_source
 from mp4ds.packing.kept import dump_kept
-from mp4ds.packing.packer import Packer
+from mp4ds.packing.packer import Packer, until_in_reach
 from mp4ds.packing.part import RECORD_NAME, Part
 from mp4ds.packing.workplace import Workplace
 
@@ -86,7 +87,12 @@ class Tasks:
                 next_report = now + _REPORT_SECONDS
                 progress(told(part))
 
-        part = Packer(self._open(job), into, job.settings(task), report).run()
+        def make(exact: Exact) -> Part:
+            for path in into.iterdir():
+                path.unlink()
+            return Packer(self._open(job), into, job.settings(task, exact), report).run()
+
+        part = until_in_reach(make)
         if progress is not None:
             progress(told(part))
         part.save()

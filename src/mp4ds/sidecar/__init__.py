@@ -36,6 +36,7 @@ from mp4ds.sidecar.models import (
     StreamSidecar,
     Video,
 )
+from mp4ds.sidecar.quality import Quality
 from mp4ds.sidecar.references import References
 
 __all__ = [
@@ -56,6 +57,7 @@ __all__ = [
     "LossEntry",
     "Manifest",
     "PngFile",
+    "Quality",
     "References",
     "Roi",
     "SchemaModel",

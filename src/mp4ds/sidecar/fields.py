@@ -36,7 +36,13 @@ FileName = Annotated[
 Base64 = Annotated[str, Field(pattern=r"^[A-Za-z0-9+/]*={0,2}$")]
 Version = Annotated[str, Field(pattern=r"^(0|[1-9][0-9]*)\.(0|[1-9][0-9]*)$")]
 Body = Literal["pixels", "packet", "png", "rvl", "jpeg"]
-Profile = Annotated[str, Field(pattern=r"^(lossless|visual|crf=[0-9]{1,2})$")]
+Profile = Annotated[
+    str,
+    Field(
+        pattern=r"^(lossless|visual|crf=[0-9]{1,2}"
+        r"|(vmaf|psnr|ssim)=[0-9]{1,3}(\.[0-9]{1,4})?)$"
+    ),
+]
 
 
 class Model(BaseModel):

@@ -24,6 +24,7 @@ from mp4ds.layouts import (
     bind,
     why_not,
 )
+from mp4ds.plan import Target
 from mp4ds.records import Channel, Schema
 from mp4ds.sidecar.columns import Columns, Digests
 from mp4ds.sidecar.fields import (
@@ -43,6 +44,7 @@ from mp4ds.sidecar.fields import (
     Version,
     decode_base64,
 )
+from mp4ds.sidecar.quality import Quality
 from mp4ds.sidecar.references import References
 from mp4ds.wire import WIRES
 
@@ -243,6 +245,7 @@ class Video(Model):
     references: References | None = Field(
         None, description="What its frames refer to; absent: the packets tell."
     )
+    quality: Quality | None = Field(None, description="Present where a score was asked for.")
 
     @property
     def matrix(self) -> str | None:
@@ -349,6 +352,9 @@ class StreamSidecar(Model):
                 raise ValueError(f"wire {wire!r} is not one of {', '.join(WIRES)}")
         if self.profile == "lossless" and self.digests is None:
             raise ValueError("a lossless stream has digests")
+        quality = self.video.quality
+        if quality and self.profile != str(Target(quality.metric, quality.target)):
+            raise ValueError(f"video.quality is of another profile than {self.profile}")
         width, height = self.layout.picture_size(self.image.width, self.image.height)
         if self.video.width < width or self.video.height < height:
             raise ValueError(f"the video is smaller than its pictures of {width}x{height}")

@@ -12,6 +12,7 @@ from mp4ds.streams.look import Looker, Seen, StreamKey, depends_on_others
 from mp4ds.streams.planning import needs_trial, plan_from_values, plan_to_values, plan_tracks
 from mp4ds.streams.reader import Stream
 from mp4ds.streams.rebuild import CameraInfoRebuilder
+from mp4ds.streams.target import OutOfReachError, TargetPlan
 from mp4ds.streams.tracks import PicturePlan, StreamSettings, TrackPlan
 from mp4ds.streams.video_file import Video
 from mp4ds.streams.writer import StreamWriter
@@ -25,6 +26,7 @@ __all__ = [
     "Frames",
     "Looker",
     "MessageRebuilder",
+    "OutOfReachError",
     "PicturePlan",
     "Seen",
     "Stream",
@@ -32,6 +34,7 @@ __all__ = [
     "StreamKey",
     "StreamSettings",
     "StreamWriter",
+    "TargetPlan",
     "TrackPlan",
     "Unsuited",
     "Video",

@@ -15,6 +15,7 @@ from mp4ds.sidecar import (
     Columns,
     Digests,
     Header,
+    Quality,
     StreamSidecar,
 )
 from mp4ds.sidecar.fields import MAX_CAMERA_INFOS, MAX_FRAMES, MAX_VARIANTS
@@ -45,6 +46,7 @@ class StreamJoin:
         self._infos = _JoinedColumns()
         self._calibrations = _Numbered[Calibration]()
         self._info: CameraInfo | None = None
+        self._qualities: list[tuple[Quality, int]] = []
 
     def takes(self, sidecar: StreamSidecar, video: Path) -> bool:
         """Whether a segment continues this stream.
@@ -84,6 +86,8 @@ class StreamJoin:
         self._columns.add(sidecar.columns, sidecar.frames, variants, ordinal)
         if sidecar.digests is not None:
             self._digests.append(sidecar.digests.decode(sidecar.frames))
+        if sidecar.video.quality is not None:
+            self._qualities.append((sidecar.video.quality, sidecar.frames))
         info = sidecar.camera_info
         if info is not None and info.columns is not None:
             self._info = self._info or info
@@ -107,12 +111,14 @@ class StreamJoin:
         path = folder / f"{stem}.mp4"
         columns = self._columns.to_model()
         join_segments(self._videos, self._columns.ticks(), path)
-        facts = video_facts(path, self._first.video.codec)
+        made = video_facts(path, self._first.video.codec)
+        if self._qualities:
+            made["quality"] = Quality.joined(self._qualities)
         return self._first.model_copy(
             update={
                 "frames": len(self._columns),
                 "headers": self._headers.items,
-                "video": self._first.video.model_copy(update=facts),
+                "video": self._first.video.model_copy(update=made),
                 "camera_info": self._camera_info(),
                 "columns": columns,
                 "digests": self._digests_model(),
@@ -138,10 +144,10 @@ class StreamJoin:
 
 def _identity(sidecar: StreamSidecar) -> tuple[object, ...]:
     """What all segments of a stream have in common."""
-    video = sidecar.video.model_dump(exclude=set(FACTS))
+    video = sidecar.video.model_dump(exclude={*FACTS, "quality"})
     return (
         *(sidecar.profile, sidecar.stamps, sidecar.channel, sidecar.wire, sidecar.body),
-        *(sidecar.image, video, sidecar.digests is None),
+        *(sidecar.image, video, sidecar.digests is None, sidecar.video.quality is None),
         *(name in sidecar.columns.names() for name in ("seq", "pts")),
     )
 

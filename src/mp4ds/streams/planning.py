@@ -9,9 +9,10 @@ from typing import Any
 from mp4ds.bags.mcap_write import compressed_size
 from mp4ds.errors import OptionError
 from mp4ds.layouts import ENCODINGS, Parameters, bind, layout_for
-from mp4ds.plan import visual_setting
+from mp4ds.plan import Target, visual_setting
 from mp4ds.streams.columns import Unsuited
 from mp4ds.streams.look import Seen, StreamKey
+from mp4ds.streams.target import OutOfReach, TargetPlan, target_plan
 from mp4ds.streams.tracks import PacketPlan, PicturePlan, StreamSettings, TrackPlan
 from mp4ds.video import Recipe, choose, recipe_for
 from mp4ds.video.encoder import EncoderRefusedError
@@ -25,6 +26,8 @@ def needs_trial(seen: Seen, settings: StreamSettings) -> bool:
     """Whether `plan_tracks` is better for having several messages."""
     if seen.pixels is None:
         return False
+    if settings.quality.target is not None:
+        return True
     return seen.key.body != "jpeg" and _is_lossless(seen.key.encoding, settings)
 
 
@@ -33,7 +36,10 @@ def _is_lossless(encoding: str, settings: StreamSettings) -> bool:
 
 
 def plan_tracks(
-    samples: Sequence[Seen], settings: StreamSettings, rate: float | None
+    samples: Sequence[Seen],
+    settings: StreamSettings,
+    rate: float | None,
+    elsewhere: Sequence[Sequence[Seen]] = (),
 ) -> list[TrackPlan]:
     """How the messages of one key are stored in videos.
 
@@ -41,19 +47,26 @@ def plan_tracks(
         samples: The first messages, at least one.
         settings: What was asked for.
         rate: Frames per second, where known.
+        elsewhere: Further ones of the same key, from other places of the recording.
 
     Returns:
         The best plan first; the last one takes every message of the key.
 
     Raises:
-        Unsuited: A video would be larger than the messages are by zstd.
+        Unsuited: A video would be larger than the messages are by zstd, or cannot have the
+            score that was asked for.
+        ScoringError: VMAF cannot be computed.
     """
     first = samples[0]
     if first.pixels is None:
         can_shrink = first.key.codec == "mjpeg" and not settings.quality.lossless
         return [PacketPlan(note=_KEPT_JPEG if can_shrink else "")]
     if not _is_lossless(first.key.encoding, settings):
-        return [_lossy_plan(first.key, settings, rate)]
+        plan = _lossy_plan(first.key, settings, rate)
+        target = settings.quality.target
+        if target is None:
+            return [plan]
+        return _target_plans(plan, target, [samples, *elsewhere], settings, rate)
     return _lossless_plans(samples, settings)
 
 
@@ -61,21 +74,54 @@ def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) ->
     quality = settings.quality
     layout = layout_for(ENCODINGS[key.encoding], lossless=False)
     crf, preset = quality.crf, settings.preset
-    if quality.name == "visual":
+    if crf is None:  # a score is looked for from there
         crf, table_preset = visual_setting(rate)
         if settings.codec in (None, "av1"):
             preset = preset or str(table_preset)
     recipe = recipe_for(
-        layout.pixel_format, lossless=False, codec=settings.codec, crf=crf, preset=preset
+        layout.pixel_format,
+        lossless=False,
+        codec=settings.codec,
+        crf=crf,
+        preset=preset,
+        varied=quality.target is not None,
     )
     return PicturePlan(layout, recipe, str(quality), exact=False)
 
 
-def _lossless_plans(samples: Sequence[Seen], settings: StreamSettings) -> list[TrackPlan]:
+def _target_plans(
+    plan: PicturePlan,
+    target: Target,
+    windows: Sequence[Sequence[Seen]],
+    settings: StreamSettings,
+    rate: float | None,
+) -> list[TrackPlan]:
+    """A plan that keeps a score, and one for images that cannot have it."""
+    samples = windows[0]
+    is_jpeg = samples[0].key.body == "jpeg"
+    try:
+        found = target_plan(plan, target, windows, settings, rate)
+    except EncoderRefusedError as error:
+        raise Unsuited(str(error)) from None
+    except OutOfReach as reason:
+        if is_jpeg:  # which is smaller than any lossless video of its pixels
+            raise Unsuited(str(reason)) from None
+        return _lossless_plans(samples, settings, f"kept lossless: {reason}")
+    if is_jpeg:
+        return [found]
+    general = layout_for(plan.layout.encoding, lossless=True)
+    recipe = recipe_for(general.pixel_format, lossless=True)
+    return [found, PicturePlan(general, recipe, "lossless", exact=True)]
+
+
+def _lossless_plans(
+    samples: Sequence[Seen], settings: StreamSettings, note: str = ""
+) -> list[TrackPlan]:
     encoding = ENCODINGS[samples[0].key.encoding]
     pixels = [seen.pixels for seen in samples if seen.pixels is not None]
     asked = settings.quality.lossless
-    note = "" if asked else f"{encoding.name} is kept lossless"
+    if not (asked or note):
+        note = f"{encoding.name} is kept lossless"
     gop, threads = settings.gop, settings.threads
     try:
         best = choose(
@@ -127,6 +173,8 @@ def plan_to_values(plan: TrackPlan) -> dict[str, Any]:
         values["encoding"] = layout.encoding.name
         values["parameters"] = layout.parameters.to_values()
         values["recipe"] = asdict(plan.recipe)
+    if isinstance(plan, TargetPlan):
+        values["target"] = asdict(plan.target)
     return values
 
 
@@ -141,4 +189,7 @@ def plan_from_values(values: Mapping[str, Any]) -> TrackPlan:
         return PacketPlan(**common)
     parameters = Parameters.from_values(values["parameters"])
     layout = bind(values["layout"], ENCODINGS[values["encoding"]], parameters)
-    return PicturePlan(layout, Recipe(**values["recipe"]), **common)
+    recipe = Recipe(**values["recipe"])
+    if "target" in values:
+        return TargetPlan(layout, recipe, target=Target(**values["target"]), **common)
+    return PicturePlan(layout, recipe, **common)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -171,19 +172,33 @@ class _PictureTrack:
 
     def describe(self) -> dict[str, Any]:
         """See `Track.describe`."""
-        layout, recipe = self._layout, self._plan.recipe
-        values = layout.parameters.to_values()
-        return {
-            "layout": layout.name,
-            "parameters": LayoutParameters.model_validate(values) if values else None,
-            "codec": recipe.codec,
-            "pixel_format": recipe.pixel_format,
-            "width": self._encoder.width,
-            "height": self._encoder.height,
-            "color": _color(recipe) if layout.is_shown else None,
-            "encoder": recipe.encoder,
-            "options": self._encoder.options,
-        }
+        encoder = self._encoder
+        return picture_facts(self._plan, (encoder.width, encoder.height), encoder.options)
+
+
+def picture_facts(
+    plan: PicturePlan, size: tuple[int, int], options: Mapping[str, str]
+) -> dict[str, Any]:
+    """What `Track.describe` says of a video that is encoded here.
+
+    Args:
+        plan: How it was made.
+        size: Columns and rows of its pictures.
+        options: Of the encoder.
+    """
+    layout, recipe = plan.layout, plan.recipe
+    values = layout.parameters.to_values()
+    return {
+        "layout": layout.name,
+        "parameters": LayoutParameters.model_validate(values) if values else None,
+        "codec": recipe.codec,
+        "pixel_format": recipe.pixel_format,
+        "width": size[0],
+        "height": size[1],
+        "color": _color(recipe) if layout.is_shown else None,
+        "encoder": recipe.encoder,
+        "options": dict(options),
+    }
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,7 @@ from mp4ds.streams.columns import ColumnsWriter, Unsuited, digests_model
 from mp4ds.streams.facts import video_facts
 from mp4ds.streams.headers import Heads
 from mp4ds.streams.look import Seen
+from mp4ds.streams.target import OutOfReach, OutOfReachError
 from mp4ds.streams.tracks import StreamSettings, TrackPlan
 from mp4ds.wire import CodedFields
 
@@ -87,7 +88,7 @@ class StreamWriter:
             ordinal: Its place among the channel's messages.
 
         Returns:
-            The job that writes its frame.
+            The job that writes its frame, and raises what `finish` does.
 
         Raises:
             Unsuited: The stream cannot carry it exactly; nothing was changed.
@@ -110,7 +111,10 @@ class StreamWriter:
         def write() -> None:
             if self._plan.exact:
                 self._digests.append(xxhash.xxh64_intdigest(message.data))
-            self._track.write(seen, tick)
+            try:
+                self._track.write(seen, tick)
+            except OutOfReach as reason:
+                raise OutOfReachError(self.channel, self._key, str(reason)) from None
 
         return write
 
@@ -121,9 +125,13 @@ class StreamWriter:
             The sidecar.
 
         Raises:
+            OutOfReachError: The video cannot have the score that was asked for.
             OSError: The disk refused.
         """
-        self._track.close()
+        try:
+            self._track.close()
+        except OutOfReach as reason:
+            raise OutOfReachError(self.channel, self._key, str(reason)) from None
         key = self._key
         sidecar = StreamSidecar(
             mp4ds=FORMAT_VERSION,

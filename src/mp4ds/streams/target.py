@@ -1,0 +1,271 @@
+"""Streams that are to have a score: the crf to begin with, and the track that keeps it."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from array import array
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.errors import Mp4dsError
+from mp4ds.plan import Target
+from mp4ds.records import Channel
+from mp4ds.scoring import SMALLEST, largest_crf
+from mp4ds.sidecar import Quality as Measured
+from mp4ds.stamps import TIMESCALE
+from mp4ds.streams.crf_control import FALLS, CrfControl
+from mp4ds.streams.look import Seen, StreamKey
+from mp4ds.streams.tracks import PicturePlan, StreamSettings, Track, picture_facts
+from mp4ds.streams.windows import WindowCoder, window_frames
+from mp4ds.video import join_segments
+from mp4ds.video.codecs import MAX_CRF
+
+_MOST_SEARCHED = 5  # encodings of the samples
+_USUAL_RATE = 30.0
+
+
+class OutOfReach(Exception):  # noqa: N818 - no error: the stream is made lossless
+    """A score that frames do not have with any crf; says how far they are from it."""
+
+
+class OutOfReachError(Mp4dsError):
+    """A stream that was begun cannot have the score that was asked for.
+
+    Args:
+        channel: Of its messages.
+        key: Of its messages.
+        reason: What was tried.
+    """
+
+    def __init__(self, channel: Channel, key: StreamKey, reason: str) -> None:
+        self.stream = (channel.id, key)
+        self.reason = reason
+        super().__init__(
+            f"{channel.topic}: {reason}. Ask for less, or pack it with --quality lossless."
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TargetPlan(PicturePlan):
+    """Pictures, encoded here until they have a score. See `TrackPlan`."""
+
+    target: Target
+
+    def open(self, path: Path, seen: Seen, settings: StreamSettings, rate: float | None) -> Track:
+        """See `TrackPlan.open`."""
+        return _TargetTrack(self, path, seen.key, settings, rate)
+
+
+def target_plan(
+    plan: PicturePlan,
+    target: Target,
+    windows: Sequence[Sequence[Seen]],
+    settings: StreamSettings,
+    rate: float | None,
+) -> TargetPlan:
+    """Look for the crf with which samples of a stream have a score.
+
+    Args:
+        plan: How the stream is made; with the crf to try first.
+        target: The score.
+        windows: Consecutive messages from one or several places of the stream.
+        settings: How to encode.
+        rate: Frames per second, where known.
+
+    Raises:
+        OutOfReach: No crf gives it.
+        EncoderRefusedError: The encoder does not take such pictures.
+        ScoringError: VMAF cannot be computed.
+    """
+    coder = _coder(plan, target, windows[0][0].key, settings, rate)
+    if min(coder.coded_size) < SMALLEST:
+        raise OutOfReach(f"images with less than {SMALLEST} rows or columns have no {target}")
+    with tempfile.TemporaryDirectory(prefix="mp4ds-") as folder:
+        crf = _start_crf(coder, windows, int(plan.recipe.options["crf"]), Path(folder))
+    recipe = replace(plan.recipe, options={**plan.recipe.options, "crf": str(crf)})
+    return TargetPlan(plan.layout, recipe, str(target), exact=False, target=target)
+
+
+def _coder(
+    plan: PicturePlan, target: Target, key: StreamKey, settings: StreamSettings, rate: float | None
+) -> WindowCoder:
+    return WindowCoder(
+        plan.recipe,
+        plan.layout,
+        (key.width, key.height),
+        target,
+        gop=settings.gop,
+        threads=settings.threads,
+        rate=rate,
+    )
+
+
+def _start_crf(
+    coder: WindowCoder, windows: Sequence[Sequence[Seen]], guess: int, folder: Path
+) -> int:
+    maker, target = coder.maker(), coder.target
+    spools = []
+    try:
+        for number, window in enumerate(windows):
+            spools.append(coder.spool(folder / f"{number}.yuv"))
+            for seen in window:
+                if seen.pixels is not None:
+                    spools[-1].append(maker.make(coder.layout.to_picture(seen.pixels)))
+        due = float(np.mean([coder.reachable(spool) for spool in spools]))
+
+        known: dict[int, float] = {}
+
+        def score(crf: int) -> float:
+            video = folder / "sample.mp4"
+            step = round(TIMESCALE / (coder.rate or _USUAL_RATE)) or 1
+            found = []
+            for spool in spools:
+                ticks = range(0, len(spool) * step, step)
+                found.append(coder.mean(coder.encode(spool, ticks, crf, video)))
+            known[crf] = float(np.mean(found))
+            return known[crf]
+
+        crf, reached, _ = largest_crf(
+            score,
+            due,
+            guess=guess,
+            largest=MAX_CRF[coder.recipe.codec],
+            fall=FALLS[target.metric],
+            most=_MOST_SEARCHED,
+        )
+        if not reached and crf == 1:
+            raise OutOfReach(f"{target} is out of reach: crf 1 gives {known[1]:.2f}")
+        return crf
+    finally:
+        for spool in spools:
+            spool.close()
+
+
+class _TargetTrack:
+    """See `Track`.
+
+    The frames of a window are kept on disk as planes. When it is full it is encoded, decoded and
+    scored, and encoded again with a lower crf until it is good enough. The windows' videos are
+    joined at the end.
+    """
+
+    def __init__(
+        self,
+        plan: TargetPlan,
+        path: Path,
+        key: StreamKey,
+        settings: StreamSettings,
+        rate: float | None,
+    ) -> None:
+        self._plan = plan
+        self._path = path
+        self._coder = _coder(plan, plan.target, key, settings, rate)
+        self._maker = self._coder.maker()
+        self._most = window_frames(settings.gop)
+        self._control = CrfControl(
+            int(plan.recipe.options["crf"]),
+            MAX_CRF[plan.recipe.codec],
+            plan.target.tolerance,
+            FALLS[plan.target.metric],
+        )
+        self._folder = path.with_name(f".{path.stem}.windows")
+        self._folder.mkdir()
+        self._spool = self._coder.spool(self._folder / "frames.yuv")
+        self._ticks = array("q")
+        self._segments: list[Path] = []
+        self._scores: list[NDArray[np.int64]] = []
+        self._reencoded = self._limited = 0
+
+    def refuses(self, seen: Seen) -> str | None:
+        """See `Track.refuses`."""
+        if seen.pixels is None:
+            return "it has no pixels"
+        return self._plan.layout.refuses(seen.pixels)
+
+    def write(self, seen: Seen, tick: int) -> None:
+        """See `Track.write`.
+
+        Raises:
+            OutOfReach: A window cannot have the score.
+        """
+        if seen.pixels is not None:
+            self._spool.append(self._maker.make(self._plan.layout.to_picture(seen.pixels)))
+            self._ticks.append(tick)
+        if len(self._spool) == self._most:
+            self._finish_window()
+
+    def _finish_window(self) -> None:
+        """Encode the window until it is good enough.
+
+        Raises:
+            OutOfReach: It is not with any crf.
+        """
+        coder, control, target = self._coder, self._control, self._plan.target
+        spool, due = self._spool, target.score
+        frames = len(spool)
+        ticks = self._ticks[-frames:]
+        path = self._folder / f"{len(self._segments):06}.mp4"
+        tried: list[tuple[int, float]] = []
+        crf = control.crf
+        while True:
+            scores = coder.encode(spool, ticks, crf, path)
+            tried.append((crf, coder.mean(scores)))
+            if control.accepts(tried[-1][1], due, frames):
+                break
+            if len(tried) == 1:
+                due = coder.reachable(spool)
+                if control.accepts(tried[-1][1], due, frames):
+                    break
+            if crf == 1:
+                first = len(self._ticks) - frames
+                raise OutOfReach(
+                    f"{target} is out of reach: crf 1 gives frames {first} to "
+                    f"{first + frames - 1} of a part {tried[-1][1]:.2f}"
+                )
+            crf = control.lower(tried, due, frames)
+        control.keep(tried, due, frames)
+        self._segments.append(path)
+        self._scores.append(scores)
+        self._reencoded += len(tried) > 1
+        self._limited += due < target.score
+        spool.clear()
+
+    def close(self) -> None:
+        """See `Track.close`.
+
+        Raises:
+            OutOfReach: A window cannot have the score.
+        """
+        try:
+            if len(self._spool):
+                self._finish_window()
+            join_segments(self._segments, self._ticks, self._path)
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """See `Track.abandon`."""
+        self._spool.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def describe(self) -> dict[str, Any]:
+        """See `Track.describe`."""
+        coder = self._coder
+        options = {**self._plan.recipe.options, "g": str(coder.gop)}
+        return {
+            **picture_facts(self._plan, coder.coded_size, options),
+            "quality": Measured.from_scores(
+                self._plan.target,
+                np.concatenate(self._scores),
+                worst_window=min(map(coder.mean, self._scores)),
+                windows=len(self._scores),
+                reencoded=self._reencoded,
+                limited=self._limited,
+            ),
+        }

@@ -1,0 +1,418 @@
+"""Packing that keeps a score: that every window has it, and what is done where it cannot."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import mp4ds
+from coded_scenes import CODED
+from definitions import IMAGE
+from in_parts import InlineEngine, leftovers
+from mp4ds import yamlio
+from mp4ds.errors import OptionError
+from mp4ds.info import info
+from mp4ds.packing import PackOptions
+from mp4ds.plan import Target, parse_quality
+from mp4ds.scoring import ScoringError, find_ffmpeg, largest_crf, vmaf_scores
+from mp4ds.sidecar import Quality
+from mp4ds.streams.crf_control import CrfControl
+from mp4ds.streams.windows import window_frames
+from round_trips import unpacked
+from scenes import Record, Scene, instant, scene, together
+from sources import SOURCES
+
+TOPIC = "/cam/image_raw"
+WIDTH, HEIGHT = 64, 48
+WINDOW = 10
+QUICK: dict[str, Any] = {"codec": "h264", "preset": "ultrafast", "gop": WINDOW}
+
+needs_vmaf = pytest.mark.skipif(
+    importlib.util.find_spec("imageio_ffmpeg") is None, reason="needs imageio-ffmpeg"
+)
+
+
+@pytest.fixture(autouse=True)
+def engine(monkeypatch: pytest.MonkeyPatch) -> InlineEngine:
+    inline = InlineEngine()
+    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: inline)
+    monkeypatch.setattr("mp4ds.streams.windows._FRAMES", WINDOW)
+    return inline
+
+
+# ---------------------------------------------------------------- recordings
+
+
+def luma(n: int, noise: float) -> NDArray[np.uint8]:
+    """A pattern that moves, with noise of a standard deviation, shape (HEIGHT, WIDTH)."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    smooth = 120 + 60 * np.sin((x + 2 * n) / 9) + 30 * np.sin((y - n) / 7)
+    rng = np.random.default_rng(n)
+    return np.clip(smooth + rng.normal(0, noise, smooth.shape), 0, 255).astype(np.uint8)
+
+
+def recording(folder: Path, noises: list[float], source: str = "mcap-ros2-none") -> list[Path]:
+    """Images of nv12, whose luma is what is encoded; with a noise for each window."""
+    rng = np.random.default_rng(0)
+    groups = []
+    for n in range(WINDOW * len(noises)):
+        stamp, log = instant(n, rng)
+        data = np.full((HEIGHT * 3 // 2, WIDTH), 128, np.uint8)
+        data[:HEIGHT] = luma(n, noises[n // WINDOW])
+        image = {
+            "header": {"seq": n, "stamp": stamp, "frame_id": "cam"},
+            "height": HEIGHT, "width": WIDTH, "encoding": "nv12", "step": WIDTH,
+            "data": data.ravel(),
+        }  # fmt: skip
+        groups.append([Record(TOPIC, IMAGE, log, image)])
+    (folder / "source").mkdir(exist_ok=True)
+    return SOURCES[source](folder / "source", together(groups))
+
+
+def decoded(video: Path) -> Iterator[NDArray[np.uint8]]:
+    """The luma of each frame of a video."""
+    with av.open(str(video)) as container:
+        for frame in container.decode(video=0):
+            yield frame.to_ndarray(format="yuv420p")[: frame.height]
+
+
+def own_psnr(video: Path, noises: list[float]) -> NDArray[np.float64]:
+    """PSNR of each frame, by its definition."""
+    found = []
+    for n, made in enumerate(decoded(video)):
+        error = np.mean((luma(n, noises[n // WINDOW]).astype(float) - made) ** 2)
+        found.append(min(60.0, 10 * np.log10(255**2 / max(error, 1e-9))))
+    return np.array(found)
+
+
+def quality_of(dataset: Path) -> Quality:
+    with mp4ds.open(dataset) as opened:
+        (stream,) = opened.streams
+        assert stream.sidecar.video.quality is not None
+        return stream.sidecar.video.quality
+
+
+def check_psnr(dataset: Path, noises: list[float], target: float) -> Quality:
+    """What the sidecar tells is what the video has, and what was promised."""
+    found = quality_of(dataset)
+    own = own_psnr(dataset / "cam_image_raw.mp4", noises)
+    assert len(own) == WINDOW * len(noises)
+    windows = own.reshape(-1, WINDOW).mean(axis=1)
+    assert np.abs(found.decode(len(own)) - own).max() <= 0.0051
+    assert found.mean == pytest.approx(own.mean(), abs=0.01)
+    assert found.p5 == pytest.approx(np.percentile(own, 5), abs=0.01)
+    assert found.min == pytest.approx(own.min(), abs=0.01)
+    assert found.worst_window == pytest.approx(windows.min(), abs=0.01)
+    assert (found.metric, found.target, found.windows) == ("psnr", target, len(windows))
+    assert own.mean() >= target - 0.005
+    assert windows.min() >= target - 0.505
+    return found
+
+
+# ---------------------------------------------------------------- what is asked for
+
+
+def test_scores_that_may_be_asked_for() -> None:
+    assert parse_quality("vmaf=99.5").target == Target("vmaf", 99.5)
+    assert str(parse_quality("psnr=42.00")) == "psnr=42"
+    assert not parse_quality("ssim=0.98").lossless
+    for text in ("vmaf", "vmaf=", "vmaf=0", "vmaf=100", "psnr=60", "ssim=1", "ssim=nan", "x=3"):
+        with pytest.raises(OptionError, match="score to reach"):
+            parse_quality(text)
+
+
+@pytest.mark.parametrize(
+    ("gop", "frames"), [(1, 60), (10, 60), (25, 50), (60, 60), (120, 120), (1000, 240)]
+)
+def test_windows_are_whole_groups_of_pictures(
+    gop: int, frames: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()
+    assert window_frames(gop) == frames
+
+
+# ---------------------------------------------------------------- which crf
+
+
+def test_the_search_ends_after_a_few_encodings() -> None:
+    def score(crf: int) -> float:
+        return 60 - 0.5 * crf
+
+    assert largest_crf(score, 40.0, guess=18, largest=63, fall=0.5) == (40, True, 4)
+    assert largest_crf(score, 59.4, guess=60, largest=63, fall=2, most=5)[2] <= 5
+    assert largest_crf(score, 70.0, guess=18, largest=63, fall=0.5, most=5)[:2] == (1, False)
+    crf, reached, tried = largest_crf(score, 30.2, guess=50, largest=63, most=2)
+    assert (reached, tried) == (score(crf) >= 30.2, 2)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_course_of_the_crf_keeps_mean_and_windows(seed: int) -> None:
+    """Scenes of any difficulty: the mean never falls below the target, nor a window far."""
+    rng = np.random.default_rng(seed)
+    control = CrfControl(20, 63, 0.5, 0.4)
+    slope = rng.uniform(0.1, 1.2)
+    height = 45 + 15 * slope * np.cumsum(rng.normal(0, 0.3, 200)).clip(-1.2, 2)
+    means, crfs, encodings = [], [], 0
+    for level in height:
+        tried: list[tuple[int, float]] = []
+        crf = control.crf
+        while True:
+            tried.append((crf, float(level - slope * (crf - 20))))
+            if control.accepts(tried[-1][1], 42.0, 60) or crf == 1:
+                break
+            crf = control.lower(tried, 42.0, 60)
+        assert control.accepts(tried[-1][1], 42.0, 60), "these scenes all have a crf"
+        control.keep(tried, 42.0, 60)
+        means.append(tried[-1][1])
+        crfs.append(crf)
+        encodings += len(tried)
+        assert np.mean(means) >= 42 - 1e-6
+    assert min(means) >= 41.5 - 1e-6
+    assert encodings < 2 * len(height)
+    best = np.clip(np.floor(20 + (height - 42) / slope), 1, 63)
+    assert np.mean(best - crfs) < 4, "no more bits than need be"
+
+
+# ---------------------------------------------------------------- the promise
+
+
+CHANGING = [0.0, 0.0, 8.0, 8.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("codec", ["h264", "h265", "av1"])
+def test_every_window_has_the_score(codec: str, tmp_path: Path) -> None:
+    """Windows of other difficulty have another crf, and one video."""
+    preset = "12" if codec == "av1" else "ultrafast"
+    paths = recording(tmp_path, CHANGING)
+    options = PackOptions(quality="psnr=40", codec=codec, preset=preset, gop=WINDOW)
+    summary = mp4ds.pack(paths, tmp_path / "dataset", options)
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    found = check_psnr(tmp_path / "dataset", CHANGING, 40)
+    assert found.reencoded >= 1
+    (topic,) = (topic for topic in summary.topics if topic.topic == TOPIC)
+    assert str(found) in topic.notes
+    assert f"{TOPIC}: {found}" in info(tmp_path / "dataset").notes
+    with mp4ds.open(tmp_path / "dataset") as dataset:
+        sidecar = dataset.streams[0].sidecar
+        assert (dataset.manifest.profile, sidecar.profile) == ("psnr=40", "psnr=40")
+        assert sidecar.video.options["g"] == str(WINDOW)
+    with av.open(str(tmp_path / "dataset/cam_image_raw.mp4")) as container:
+        keys = [n for n, p in enumerate(container.demux(video=0)) if p.size and p.is_keyframe]
+    assert set(range(0, WINDOW * len(CHANGING), WINDOW)) <= set(keys)
+
+
+def test_in_parts_too_and_each_time_alike(tmp_path: Path, engine: InlineEngine) -> None:
+    """Parts begin with the same crf, and what comes out does not depend on an interruption."""
+    noises = [0.0, 8.0, 0.0, 0.0, 4.0, 0.0]
+    paths = recording(tmp_path, noises)
+    options = PackOptions(quality="psnr=40", window=2 * WINDOW, **QUICK)
+    mp4ds.pack(paths, tmp_path / "dataset", options)
+    assert len([name for name in engine.ran if not name.startswith("source")]) == 3
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    found = check_psnr(tmp_path / "dataset", noises, 40)
+
+    def fails(name: str) -> bool:
+        return name == "00001-0"
+
+    broken = InlineEngine(fails)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mp4ds.packing._engine", lambda *_: broken)
+        with pytest.raises(mp4ds.PartsFailedError):
+            mp4ds.pack(paths, tmp_path / "again", options)
+    mp4ds.pack(paths, tmp_path / "again", options)
+    assert quality_of(tmp_path / "again") == found
+    videos = [tmp_path / name / "cam_image_raw.mp4" for name in ("dataset", "again")]
+    assert videos[0].read_bytes() == videos[1].read_bytes()
+    assert leftovers(tmp_path) == []
+
+
+def test_easy_images_have_a_higher_crf_than_hard_ones(tmp_path: Path) -> None:
+    """The search begins with what the images need."""
+    crfs = []
+    for name, noise in (("easy", 0.0), ("hard", 8.0)):
+        (tmp_path / name).mkdir()
+        paths = recording(tmp_path / name, [noise])
+        dataset = tmp_path / name / "dataset"
+        mp4ds.pack(paths, dataset, PackOptions(quality="psnr=40", **QUICK))
+        with mp4ds.open(dataset) as opened:
+            crfs.append(int(opened.streams[0].sidecar.video.options["crf"]))
+    assert crfs[0] > crfs[1] + 5
+
+
+def test_a_last_window_of_one_frame(tmp_path: Path) -> None:
+    (tmp_path / "source").mkdir()
+    recorded = scene("rgb8", frames=WINDOW + 1, width=66, height=47)
+    paths = SOURCES["bag-none"](tmp_path / "source", recorded)
+    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="ssim=0.95", **QUICK))
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    found = quality_of(tmp_path / "dataset")
+    assert (found.metric, found.windows) == ("ssim", 2)
+    assert found.mean >= 0.95
+    assert found.worst_window >= 0.945
+
+
+@pytest.mark.parametrize("quality", ["crf=20", "visual", "lossless"])
+def test_other_profiles_say_nothing_of_scores(quality: str, tmp_path: Path) -> None:
+    paths = recording(tmp_path, [0.0])
+    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality=quality))
+    assert b"quality" not in (tmp_path / "dataset/cam_image_raw.yaml").read_bytes()
+
+
+# ---------------------------------------------------------------- out of reach
+
+
+def test_what_cannot_have_the_score_is_lossless(
+    tmp_path: Path, compare: Callable[..., list[str]]
+) -> None:
+    paths = recording(tmp_path, [20.0])
+    options = PackOptions(quality="psnr=59.9", **{**QUICK, "codec": "av1", "preset": "12"})
+    summary = mp4ds.pack(paths, tmp_path / "dataset", options)
+    (topic,) = (topic for topic in summary.topics if topic.topic == TOPIC)
+    assert any("kept lossless: psnr=59.9 is out of reach" in note for note in topic.notes)
+    with mp4ds.open(tmp_path / "dataset") as dataset:
+        assert dataset.streams[0].sidecar.profile == "lossless"
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare(paths, unpacked(tmp_path, "mcap")) == []
+
+
+@pytest.mark.parametrize("window", [None, 2 * WINDOW])
+def test_what_cannot_have_it_later_on_is_lossless(
+    window: int | None,
+    tmp_path: Path,
+    compare: Callable[..., list[str]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The first images have it, later ones do not: with parts, only theirs are lossless."""
+    monkeypatch.setattr("mp4ds.packing.survey._PLACES", 0)
+    noises = [0.0, 0.0, 30.0, 0.0, 0.0, 0.0]
+    paths = recording(tmp_path, noises)
+    options = PackOptions(
+        quality="psnr=55", window=window, **{**QUICK, "codec": "av1", "preset": "12"}
+    )
+    summary = mp4ds.pack(paths, tmp_path / "dataset", options)
+    (topic,) = (topic for topic in summary.topics if topic.topic == TOPIC)
+    assert topic.frames == topic.messages == WINDOW * len(noises)
+    assert any("kept lossless: psnr=55 is out of reach" in note for note in topic.notes)
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare(paths, unpacked(tmp_path, "mcap"), ignore_pixels=[TOPIC]) == []
+    with mp4ds.open(tmp_path / "dataset") as dataset:
+        profiles = {stream.sidecar.profile: len(stream) for stream in dataset.streams}
+    assert profiles == ({"lossless": 60} if window is None else {"psnr=55": 40, "lossless": 20})
+
+
+def test_small_images_are_lossless(tmp_path: Path) -> None:
+    (tmp_path / "source").mkdir()
+    paths = SOURCES["bag-none"](tmp_path / "source", scene("rgb8", width=12, height=12))
+    summary = mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="psnr=30", **QUICK))
+    (topic,) = (topic for topic in summary.topics if topic.topic == TOPIC)
+    assert any("less than 16 rows" in str(text) for text in (*topic.notes, *topic.verbatim))
+
+
+def test_jpeg_files_that_cannot_have_it_stay(
+    tmp_path: Path, compare: Callable[..., list[str]]
+) -> None:
+    (tmp_path / "source").mkdir()
+    paths = SOURCES["mcap-ros2-none"](tmp_path / "source", CODED["jpeg-rgb"]())
+    options = {"transcode": True, **QUICK}
+    mp4ds.pack(paths, tmp_path / "small", PackOptions(quality="ssim=0.9", **options))
+    assert quality_of(tmp_path / "small").mean >= 0.9
+    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="psnr=59.9", **options))
+    assert compare(paths, unpacked(tmp_path, "mcap")) == []
+
+
+# ---------------------------------------------------------------- what is written is checked
+
+
+def test_scores_that_do_not_come_to_what_is_told(tmp_path: Path) -> None:
+    mp4ds.pack(recording(tmp_path, [0.0]), tmp_path / "d", PackOptions(quality="psnr=40", **QUICK))
+    path = tmp_path / "d/cam_image_raw.yaml"
+    document = yamlio.load(path.read_bytes(), "it")
+    for change, code in (
+        ({"mean": 50.0}, "column-invalid"),
+        ({"scores": {"start": 1, "step": 0, "values": ""}}, "column-invalid"),
+        ({"target": 41.0}, "model-invalid"),
+        ({"reencoded": 9}, "model-invalid"),
+        ({"metric": "msssim"}, "schema-invalid"),
+    ):
+        quality = {**document["video"]["quality"], **change}
+        changed = {**document, "video": {**document["video"], "quality": quality}}
+        changed.pop("checksum", None)
+        path.write_bytes(yamlio.dump(changed))
+        assert [problem.code for problem in mp4ds.validate(path)] == [code]
+
+
+# ---------------------------------------------------------------- VMAF
+
+
+@needs_vmaf
+def test_vmaf(tmp_path: Path) -> None:
+    """The scores are those of libvmaf; a scene at rest cannot have more than its ceiling."""
+    noises = [2.0, 6.0]
+    paths = recording(tmp_path, noises)
+    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="vmaf=93", **QUICK))
+    found = quality_of(tmp_path / "dataset")
+    assert found.mean >= 93
+    assert found.worst_window >= 92.5
+    chroma = np.full((2, HEIGHT // 2, WIDTH // 2), 128, np.uint8)
+    originals = [(luma(n, noises[n // WINDOW]), *chroma) for n in range(WINDOW * len(noises))]
+    made = [(y, *chroma) for y in decoded(tmp_path / "dataset/cam_image_raw.mp4")]
+    own = vmaf_scores(originals, made, ffmpeg=find_ffmpeg(), before=originals[1])
+    # but for the first and last frames of windows, which tell less of what moves
+    inner = np.arange(len(own)) % WINDOW
+    same = (inner > 0) & (inner < WINDOW - 1)
+    assert np.abs(found.decode(len(own)) - own)[same].max() < 0.02
+    assert found.mean == pytest.approx(own.mean(), abs=0.5)
+
+
+@needs_vmaf
+def test_vmaf_of_a_scene_at_rest(tmp_path: Path) -> None:
+    (tmp_path / "source").mkdir()
+    moving = scene("mono8", frames=WINDOW, width=64, height=48, noisy=False)
+    still = next(m for m in moving.messages if m.topic == TOPIC).values["data"]
+    messages = [
+        Record(m.topic, m.msgtype, m.log_time, {**m.values, "data": still}, m.publisher)
+        if m.topic == TOPIC
+        else m
+        for m in moving.messages
+    ]
+    paths = SOURCES["bag-none"](tmp_path / "source", Scene(messages, moving.silent))
+    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="vmaf=99.5", **QUICK))
+    found = quality_of(tmp_path / "dataset")
+    assert (found.windows, found.limited) == (1, 1)
+    assert 96 < found.mean < 98
+
+
+def test_without_libvmaf_it_is_said_how_to_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = recording(tmp_path, [0.0])
+    monkeypatch.setattr("mp4ds.scoring.ffmpeg._can_score", lambda path: False)
+    with pytest.raises(ScoringError, match=r"pip install 'mp4ds\[vmaf\]'"):
+        mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="vmaf=95"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]
+
+
+# ---------------------------------------------------------------- the command
+
+
+def test_the_command_tells_what_it_came_to(tmp_path: Path) -> None:
+    (path,) = recording(tmp_path, [0.0])
+    command = [sys.executable, "-m", "mp4ds", "pack", str(path), "-o", str(tmp_path / "d")]
+    options = ["--quality", "psnr=40", "--codec", "h264", "--preset", "ultrafast"]
+    done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert f"{TOPIC}: psnr " in done.stdout
+    assert "(asked for: 40)" in done.stdout
+    wrong = [*command, "--quality", "psnr=99"]
+    done = subprocess.run(wrong, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "--quality 'psnr=99' is not known" in done.stderr
