@@ -23,7 +23,7 @@ from mp4ds.errors import OptionError
 from mp4ds.info import info
 from mp4ds.packing import PackOptions
 from mp4ds.plan import Target, parse_quality
-from mp4ds.scoring import ScoringError, find_ffmpeg, largest_crf, vmaf_scores
+from mp4ds.scoring import ScoringError, find_ffmpeg, largest_crf, vmaf_bytes, vmaf_scores
 from mp4ds.sidecar import Quality
 from mp4ds.streams.crf_control import CrfControl
 from mp4ds.streams.windows import window_frames
@@ -389,6 +389,24 @@ def test_vmaf_of_a_scene_at_rest(tmp_path: Path) -> None:
     found = quality_of(tmp_path / "dataset")
     assert (found.windows, found.limited) == (1, 1)
     assert 96 < found.mean < 98
+
+
+@needs_vmaf
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_memory_of_vmaf_is_not_underestimated(threads: int) -> None:
+    """Of a process of its own, which tells the most that its children took."""
+    code = f"""if True:
+        import resource
+        import numpy as np
+        from mp4ds.scoring import find_ffmpeg, vmaf_scores
+        luma = np.random.default_rng(0).integers(0, 255, (480, 640), np.uint8)
+        grey = np.full((240, 320), 128, np.uint8)
+        frames = [(np.roll(luma, n), grey, grey) for n in range(6)]
+        vmaf_scores(frames, frames, ffmpeg=find_ffmpeg(), threads={threads})
+        print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024)
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert 0 < int(done.stdout) < vmaf_bytes(640, 480, threads)
 
 
 def test_without_libvmaf_it_is_said_how_to_get_it(

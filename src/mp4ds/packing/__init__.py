@@ -196,7 +196,7 @@ def _checked(options: PackOptions) -> PackOptions:
             "is smaller than any video of its pixels."
         )
     check_codec(options.codec, options.preset, lossless=quality.lossless)
-    if quality.target is not None and quality.target.metric == "vmaf":
+    if quality.target and quality.target.metric == "vmaf" and not options.join:
         find_ffmpeg()  # says how to get one before anything is read
     images = options.images.absolute() if options.images else None
     return replace(

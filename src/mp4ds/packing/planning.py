@@ -25,10 +25,12 @@ from mp4ds.packing.survey import (
 from mp4ds.pairing import choose_pairs, pair_camera_infos
 from mp4ds.plan import Quality, Selection, parse_quality
 from mp4ds.records import Channel
+from mp4ds.scoring import vmaf_bytes
 from mp4ds.streams import (
     Looker,
     PicturePlan,
     StreamSettings,
+    TargetPlan,
     Unsuited,
     depends_on_others,
     needs_trial,
@@ -295,7 +297,11 @@ def _encoder_bytes(decision: Decision, threads: int) -> int:
     for plan in decision.plans[:1]:
         if isinstance(plan, PicturePlan):
             size = plan.layout.picture_size(decision.key.width, decision.key.height)
-            return encoder_bytes(plan.recipe, *size, threads)
+            needed = encoder_bytes(plan.recipe, *size, threads)
+            if isinstance(plan, TargetPlan) and plan.target.metric == "vmaf":
+                # a window is scored when its encoder is gone
+                needed = max(needed, vmaf_bytes(*size, threads))
+            return needed
     return 0
 
 

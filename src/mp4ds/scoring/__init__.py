@@ -7,7 +7,7 @@ process: the optional package imageio-ffmpeg brings one, or one on the PATH is t
 from __future__ import annotations
 
 from mp4ds.scoring.errors import ScoringError
-from mp4ds.scoring.ffmpeg import VMAF_MODEL, Ffmpeg, find_ffmpeg
+from mp4ds.scoring.ffmpeg import VMAF_MODEL, Ffmpeg, find_ffmpeg, vmaf_bytes
 from mp4ds.scoring.measures import MAX_PSNR, psnr, ssim
 from mp4ds.scoring.scorer import (
     SMALLEST,
@@ -38,5 +38,6 @@ __all__ = [
     "ssim",
     "ssim_scores",
     "summary_of",
+    "vmaf_bytes",
     "vmaf_scores",
 ]
