@@ -10,7 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 import mp4ds
 from in_parts import InlineEngine, facts
@@ -458,3 +460,20 @@ def test_the_command_line(source: Path, folder_url: str, put: Put, s3: Server) -
     again = f"{folder_url}/again.bag"
     assert run("unpack", dataset, "--to", "bag", "-o", again)["output"] == again
     assert run("info", again)["topics"] == run("info", recording)["topics"]
+
+
+# ---------------------------------------------------------------- folders of images
+
+
+def test_a_folder_of_images_is_packed_to_a_url(folder_url: str, tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    slope = np.add.outer(np.arange(24), np.arange(32)).astype(np.uint8)
+    for number in range(3):
+        Image.fromarray(slope + number).save(tmp_path / "images" / f"{number}.png")
+    options = PackOptions(codec="ffv1", images=mp4ds.ImageFolder(rate="2"))
+    mp4ds.pack(tmp_path / "images", f"{folder_url}/ds", options)
+    with mp4ds.open(f"{folder_url}/ds") as dataset:
+        for number, frame in enumerate(dataset["/camera/image_raw"]):
+            assert np.array_equal(frame.data, slope + number)
+    with pytest.raises(SourceError, match="Download it first"):
+        mp4ds.pack(f"{folder_url}/ds", tmp_path / "ds", options)
