@@ -29,6 +29,7 @@ from rosbags.highlevel import AnyReader
 from typer.testing import CliRunner
 
 import mp4ds
+from conftest import real
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.cli import app
 from mp4ds.errors import SourceError
@@ -159,6 +160,22 @@ def test_files_are_read_to_the_bit(name: str, tmp_path: Path) -> None:
     assert found == encoding
     assert pixels.dtype == expected.dtype.newbyteorder("<")
     assert np.array_equal(pixels, expected)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "depth/slambook2_rgbd/depth/1.pgm",
+        "depth/slambook2_rgbd/color/1.png",
+        "images/image_pipeline_wide_stereo_pgm/left0003.pgm",
+    ],
+)
+def test_files_of_others_are_read_as_opencv_reads_them(name: str) -> None:
+    path = real(name)
+    encoding, pixels = read_image(path)
+    expected = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert expected is not None
+    assert np.array_equal(pixels, expected[..., ::-1] if encoding == "rgb8" else expected)
 
 
 def test_what_cannot_be_had_as_it_is_is_refused(tmp_path: Path) -> None:
