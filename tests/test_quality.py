@@ -150,6 +150,7 @@ def test_the_search_ends_after_a_few_encodings() -> None:
     assert largest_crf(score, 40.0, guess=18, largest=63, fall=0.5) == (40, True, 4)
     assert largest_crf(score, 59.4, guess=60, largest=63, fall=2, most=5)[2] <= 5
     assert largest_crf(score, 70.0, guess=18, largest=63, fall=0.5, most=5)[:2] == (1, False)
+    assert largest_crf(score, 70.0, guess=18, largest=63, smallest=3)[:2] == (3, False)
     crf, reached, tried = largest_crf(score, 30.2, guess=50, largest=63, most=2)
     assert (reached, tried) == (score(crf) >= 30.2, 2)
 
@@ -158,7 +159,7 @@ def test_the_search_ends_after_a_few_encodings() -> None:
 def test_the_course_of_the_crf_keeps_mean_and_windows(seed: int) -> None:
     """Scenes of any difficulty: the mean never falls below the target, nor a window far."""
     rng = np.random.default_rng(seed)
-    control = CrfControl(20, 63, 0.5, 0.4)
+    control = CrfControl(20, 1, 63, 0.5, 0.4)
     slope = rng.uniform(0.1, 1.2)
     height = 45 + 15 * slope * np.cumsum(rng.normal(0, 0.3, 200)).clip(-1.2, 2)
     means, crfs, encodings = [], [], 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -32,7 +32,8 @@ MAX_STREAMS_PER_CHANNEL = 16
 """A channel that changes its geometry more often than this is not split any further."""
 
 _MAX_LOOKS = 64
-_PLACES = 3  # beside the first at which samples are taken where a score is asked for
+# where a score is asked for: places beside the first that are looked at, and images of each
+_PLACES, _RUN = 3, 16
 _PAIRING_MESSAGES = 5_000
 
 
@@ -110,7 +111,7 @@ def decide(
     samples: Sequence[Seen],
     settings: StreamSettings,
     rate: float | None,
-    elsewhere: Sequence[Sequence[Seen]] = (),
+    windows: Iterable[Sequence[Seen]] | None = None,
 ) -> Decision:
     """How images are stored, by looking at the first of them.
 
@@ -118,14 +119,15 @@ def decide(
         samples: The first images of one key, at least one, at most `SAMPLES`.
         settings: What was asked for.
         rate: Frames per second, where known.
-        elsewhere: Further ones of the same key, from other places of the recording.
+        windows: Runs of messages of the same key from several places of the recording, of which
+            one at a time is held; None: the samples.
 
     Raises:
         ScoringError: A score is asked for that cannot be computed.
     """
     key = samples[0].key
     try:
-        return Decision(key, plan_tracks(samples, settings, rate, elsewhere))
+        return Decision(key, plan_tracks(samples, settings, rate, windows))
     except Unsuited as reason:
         return Decision(key, [], str(reason))
 
@@ -147,15 +149,13 @@ def survey_channel(
     for start in starts[::step]:
         samples = _samples(reader, channel, start, looker, settings)
         if samples and samples[0].key not in decisions:
-            elsewhere: list[list[Seen]] = []
-            if settings.quality.target is not None:
-                for place in _places_between(starts):
-                    more = _samples(reader, channel, place, looker, settings)
-                    if more and more[0].key == samples[0].key:
-                        elsewhere.append(more)
-            decisions[samples[0].key] = decide(
-                samples, settings, rate_of(reader, channel), elsewhere
+            key = samples[0].key
+            runs = (
+                _samples(reader, channel, place, looker, settings, _RUN)
+                for place in (start, *_places_between(starts))
             )
+            windows = (run for run in runs if run and run[0].key == key)
+            decisions[key] = decide(samples, settings, rate_of(reader, channel), windows)
             if len(decisions) == MAX_STREAMS_PER_CHANNEL:
                 break
     return list(decisions.values())
@@ -174,6 +174,7 @@ def _samples(
     start: int | None,
     looker: Looker,
     settings: StreamSettings,
+    count: int = SAMPLES,
 ) -> list[Seen]:
     """The first images of one key from a log time on, as many as decide."""
     samples: list[Seen] = []
@@ -184,8 +185,8 @@ def _samples(
                 seen = looker.look(record)
                 if not samples or seen.key == samples[0].key:
                     samples.append(seen)
-        enough = SAMPLES if samples and needs_trial(samples[0], settings) else 1
-        if len(samples) == enough or number == 4 * SAMPLES:
+        enough = count if samples and needs_trial(samples[0], settings) else 1
+        if len(samples) == enough or number == 4 * count:
             break
     return samples
 

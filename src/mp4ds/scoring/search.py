@@ -13,10 +13,11 @@ def largest_crf(
     *,
     guess: int,
     largest: int,
+    smallest: int = 1,
     fall: float | None = None,
     most: int | None = None,
 ) -> tuple[int, bool, int]:
-    """Look for it between 1 and the largest, where scores fall as it grows.
+    """Look for it between the smallest and the largest, where scores fall as it grows.
 
     Between two crf that are known, the next one to try is where a straight line through their
     scores meets the target; where that did not halve what is left, the middle.
@@ -26,6 +27,7 @@ def largest_crf(
         target: The score to reach.
         guess: The crf to begin with.
         largest: That the codec has.
+        smallest: That is tried.
         fall: About how much less the score is for each crf more, by which the first steps are
             chosen; None: not known.
         most: The search ends after so many were tried, with the best it has; None: when it is
@@ -42,8 +44,8 @@ def largest_crf(
             known[crf] = score(crf)
         return known[crf]
 
-    good, bad = 0, largest + 1  # the first does, the second does not, as far as is known
-    crf = min(max(guess, 1), largest)
+    good, bad = smallest - 1, largest + 1  # the first does, the second does not, as far as is known
+    crf = min(max(guess, smallest), largest)
     least = _STEP if fall is None else 1  # that it goes on; doubled each time
     while bad - good > 1 and (most is None or len(known) < most):
         width = bad - good
@@ -59,7 +61,10 @@ def largest_crf(
         step = max(least, round(abs(found - target) / fall)) if fall else least
         least *= 2
         # the last one that was tried was still good enough, or not yet
-        crf = min(good + step, largest, bad - 1) if good in known else max(bad - step, 1)
+        if good in known:
+            crf = min(good + step, largest, bad - 1)
+        else:  # a half at the most: small crf differ more
+            crf = max(bad - step, bad // 2, smallest)
     if good in known:
         return good, True, len(known)
     return min(known), False, len(known)

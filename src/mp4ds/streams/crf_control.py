@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import ceil
 
-FALLS = {"vmaf": 0.2, "psnr": 0.4, "ssim": 0.001}
+FALLS = {"vmaf": 0.3, "psnr": 0.4, "ssim": 0.001}
 """Metric -> about how much less it is for each crf more, around what is asked for."""
 
 _MOST_UP = 4  # crf from one window to the next
@@ -20,14 +20,17 @@ class CrfControl:
 
     Args:
         start: The crf of the first window.
-        largest: That the codec has.
+        smallest: That may be chosen.
+        largest: That may be chosen.
         tolerance: How far below the target the mean of a window may be.
         fall: About how much less a score is for each crf more.
     """
 
-    def __init__(self, start: int, largest: int, tolerance: float, fall: float) -> None:
+    def __init__(
+        self, start: int, smallest: int, largest: int, tolerance: float, fall: float
+    ) -> None:
         self.crf = start
-        self._largest = largest
+        self._smallest, self._largest = smallest, largest
         self._tolerance = tolerance
         self._assumed = self._fall = fall
         self._surplus = 0.0  # of all frames together
@@ -49,16 +52,18 @@ class CrfControl:
         """The crf to encode a window with again.
 
         Args:
-            tried: The crf and scores of it so far, none of which was accepted; the last is not 1.
+            tried: The crf and scores of it so far, none of which was accepted; the last is not
+                with the smallest crf.
             due: What is asked for.
             frames: How many it has.
         """
         self._learn(tried)
         crf, mean = tried[-1]
         short = self._least(due, frames) - mean
-        # doubled each time: a scene whose scores do not rise comes to an end soon
+        # doubled each time: a scene whose scores do not rise comes to an end soon; but a half
+        # at the most, as small crf differ more
         step = max(ceil(short / self._fall), 1 << (len(tried) - 1))
-        return max(1, crf - step)
+        return max(self._smallest, crf // 2, crf - step)
 
     def keep(self, tried: list[tuple[int, float]], due: float, frames: int) -> None:
         """Take a window as it was encoded last, and choose the crf of the next one.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -39,7 +39,7 @@ def plan_tracks(
     samples: Sequence[Seen],
     settings: StreamSettings,
     rate: float | None,
-    elsewhere: Sequence[Sequence[Seen]] = (),
+    windows: Iterable[Sequence[Seen]] | None = None,
 ) -> list[TrackPlan]:
     """How the messages of one key are stored in videos.
 
@@ -47,7 +47,8 @@ def plan_tracks(
         samples: The first messages, at least one.
         settings: What was asked for.
         rate: Frames per second, where known.
-        elsewhere: Further ones of the same key, from other places of the recording.
+        windows: Runs of messages of the same key from several places of the recording, by which
+            the crf for a score is chosen; None: the samples.
 
     Returns:
         The best plan first; the last one takes every message of the key.
@@ -66,7 +67,7 @@ def plan_tracks(
         target = settings.quality.target
         if target is None:
             return [plan]
-        return _target_plans(plan, target, [samples, *elsewhere], settings, rate)
+        return _target_plans(plan, target, samples, windows, settings, rate)
     return _lossless_plans(samples, settings)
 
 
@@ -92,15 +93,16 @@ def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) ->
 def _target_plans(
     plan: PicturePlan,
     target: Target,
-    windows: Sequence[Sequence[Seen]],
+    samples: Sequence[Seen],
+    windows: Iterable[Sequence[Seen]] | None,
     settings: StreamSettings,
     rate: float | None,
 ) -> list[TrackPlan]:
     """A plan that keeps a score, and one for images that cannot have it."""
-    samples = windows[0]
-    is_jpeg = samples[0].key.body == "jpeg"
+    key = samples[0].key
+    is_jpeg = key.body == "jpeg"
     try:
-        found = target_plan(plan, target, windows, settings, rate)
+        found = target_plan(plan, target, key, windows or [samples], settings, rate)
     except EncoderRefusedError as error:
         raise Unsuited(str(error)) from None
     except OutOfReach as reason:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from mp4ds.streams.look import Seen, StreamKey
 from mp4ds.streams.tracks import PicturePlan, StreamSettings, Track, picture_facts
 from mp4ds.streams.windows import WindowCoder, window_frames
 from mp4ds.video import join_segments
-from mp4ds.video.codecs import MAX_CRF
+from mp4ds.video.codecs import LEAST_CRF, MAX_CRF
 
 _MOST_SEARCHED = 5  # encodings of the samples
 _USUAL_RATE = 30.0
@@ -65,7 +65,8 @@ class TargetPlan(PicturePlan):
 def target_plan(
     plan: PicturePlan,
     target: Target,
-    windows: Sequence[Sequence[Seen]],
+    key: StreamKey,
+    windows: Iterable[Sequence[Seen]],
     settings: StreamSettings,
     rate: float | None,
 ) -> TargetPlan:
@@ -74,7 +75,8 @@ def target_plan(
     Args:
         plan: How the stream is made; with the crf to try first.
         target: The score.
-        windows: Consecutive messages from one or several places of the stream.
+        key: Of the stream.
+        windows: Consecutive messages of it from one or several places, at least one.
         settings: How to encode.
         rate: Frames per second, where known.
 
@@ -83,7 +85,7 @@ def target_plan(
         EncoderRefusedError: The encoder does not take such pictures.
         ScoringError: VMAF cannot be computed.
     """
-    coder = _coder(plan, target, windows[0][0].key, settings, rate)
+    coder = _coder(plan, target, key, settings, rate)
     if min(coder.coded_size) < SMALLEST:
         raise OutOfReach(f"images with less than {SMALLEST} rows or columns have no {target}")
     with tempfile.TemporaryDirectory(prefix="mp4ds-") as folder:
@@ -107,9 +109,10 @@ def _coder(
 
 
 def _start_crf(
-    coder: WindowCoder, windows: Sequence[Sequence[Seen]], guess: int, folder: Path
+    coder: WindowCoder, windows: Iterable[Sequence[Seen]], guess: int, folder: Path
 ) -> int:
     maker, target = coder.maker(), coder.target
+    least = LEAST_CRF[coder.recipe.codec]
     spools = []
     try:
         for number, window in enumerate(windows):
@@ -136,11 +139,12 @@ def _start_crf(
             due,
             guess=guess,
             largest=MAX_CRF[coder.recipe.codec],
+            smallest=least,
             fall=FALLS[target.metric],
             most=_MOST_SEARCHED,
         )
-        if not reached and crf == 1:
-            raise OutOfReach(f"{target} is out of reach: crf 1 gives {known[1]:.2f}")
+        if not reached and crf == least:
+            raise OutOfReach(f"{target} is out of reach: crf {crf} gives {known[crf]:.2f}")
         return crf
     finally:
         for spool in spools:
@@ -170,6 +174,7 @@ class _TargetTrack:
         self._most = window_frames(settings.gop)
         self._control = CrfControl(
             int(plan.recipe.options["crf"]),
+            LEAST_CRF[plan.recipe.codec],
             MAX_CRF[plan.recipe.codec],
             plan.target.tolerance,
             FALLS[plan.target.metric],
@@ -222,10 +227,10 @@ class _TargetTrack:
                 due = coder.reachable(spool)
                 if control.accepts(tried[-1][1], due, frames):
                     break
-            if crf == 1:
+            if crf == LEAST_CRF[self._plan.recipe.codec]:
                 first = len(self._ticks) - frames
                 raise OutOfReach(
-                    f"{target} is out of reach: crf 1 gives frames {first} to "
+                    f"{target} is out of reach: crf {crf} gives frames {first} to "
                     f"{first + frames - 1} of a part {tried[-1][1]:.2f}"
                 )
             crf = control.lower(tried, due, frames)

@@ -125,6 +125,10 @@ _DEFAULT_LOSSY = "av1"
 MAX_CRF = {"av1": 63, "h264": 51, "h265": 51}
 """The largest crf of each lossy codec."""
 
+# with 1, SVT-AV1's preset 12 was seen to make frames that do not look like the pictures
+LEAST_CRF = {"av1": 2, "h264": 1, "h265": 1}
+"""The smallest crf that is chosen for each lossy codec without being asked for."""
+
 
 _X26X_PRESETS = (
     *("ultrafast", "superfast", "veryfast", "faster", "fast"),
