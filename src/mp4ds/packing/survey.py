@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -33,7 +33,7 @@ MAX_STREAMS_PER_CHANNEL = 16
 
 _MAX_LOOKS = 64
 # where a score is asked for: places beside the first that are looked at, and images of each
-_PLACES, _RUN = 3, 16
+_PLACES, _RUN = 2, 30
 _PAIRING_MESSAGES = 5_000
 
 
@@ -111,7 +111,7 @@ def decide(
     samples: Sequence[Seen],
     settings: StreamSettings,
     rate: float | None,
-    windows: Iterable[Sequence[Seen]] | None = None,
+    runs: Iterable[Iterable[Seen]] | None = None,
 ) -> Decision:
     """How images are stored, by looking at the first of them.
 
@@ -119,15 +119,15 @@ def decide(
         samples: The first images of one key, at least one, at most `SAMPLES`.
         settings: What was asked for.
         rate: Frames per second, where known.
-        windows: Runs of messages of the same key from several places of the recording, of which
-            one at a time is held; None: the samples.
+        runs: Of messages of the same key, from several places of the recording; one of them at a
+            time is held. None: the samples.
 
     Raises:
         ScoringError: A score is asked for that cannot be computed.
     """
     key = samples[0].key
     try:
-        return Decision(key, plan_tracks(samples, settings, rate, windows))
+        return Decision(key, plan_tracks(samples, settings, rate, runs))
     except Unsuited as reason:
         return Decision(key, [], str(reason))
 
@@ -150,22 +150,34 @@ def survey_channel(
         samples = _samples(reader, channel, start, looker, settings)
         if samples and samples[0].key not in decisions:
             key = samples[0].key
-            runs = (
-                _samples(reader, channel, place, looker, settings, _RUN)
-                for place in (start, *_places_between(starts))
-            )
-            windows = (run for run in runs if run and run[0].key == key)
-            decisions[key] = decide(samples, settings, rate_of(reader, channel), windows)
+            places = dict.fromkeys((start, *_places_between(starts)))
+            runs = (_run(reader, channel, place, looker, key) for place in places)
+            decisions[key] = decide(samples, settings, rate_of(reader, channel), runs)
             if len(decisions) == MAX_STREAMS_PER_CHANNEL:
                 break
     return list(decisions.values())
 
 
 def _places_between(starts: Sequence[int | None]) -> list[int | None]:
-    """Some parts' beginnings, all over the recording but for the first."""
-    count = len(starts)
-    numbers = {count * n // (_PLACES + 1) for n in range(1, _PLACES + 1)}
-    return [starts[number] for number in sorted(numbers - {0})]
+    """Some parts' beginnings, all over the recording."""
+    return [starts[len(starts) * n // (_PLACES + 1)] for n in range(1, _PLACES + 1)]
+
+
+def _run(
+    reader: BagReader, channel: Channel, start: int | None, looker: Looker, key: StreamKey
+) -> Iterator[Seen]:
+    """Images of a key from a log time on; of another one's stretch there are none."""
+    left = _RUN
+    excerpt = Excerpt(start=start, topics=frozenset([channel.topic]), others=False)
+    for number, record in enumerate(reader.records(excerpt)):
+        if isinstance(record, Message) and record.channel.id == channel.id:
+            with suppress(Unsuited):
+                seen = looker.look(record)
+                if seen.key == key:
+                    yield seen
+                    left -= 1
+        if not left or number == 4 * _RUN:
+            return
 
 
 def _samples(
@@ -174,7 +186,6 @@ def _samples(
     start: int | None,
     looker: Looker,
     settings: StreamSettings,
-    count: int = SAMPLES,
 ) -> list[Seen]:
     """The first images of one key from a log time on, as many as decide."""
     samples: list[Seen] = []
@@ -185,8 +196,8 @@ def _samples(
                 seen = looker.look(record)
                 if not samples or seen.key == samples[0].key:
                     samples.append(seen)
-        enough = count if samples and needs_trial(samples[0], settings) else 1
-        if len(samples) == enough or number == 4 * count:
+        enough = SAMPLES if samples and needs_trial(samples[0], settings) else 1
+        if len(samples) == enough or number == 4 * SAMPLES:
             break
     return samples
 

@@ -39,7 +39,7 @@ def plan_tracks(
     samples: Sequence[Seen],
     settings: StreamSettings,
     rate: float | None,
-    windows: Iterable[Sequence[Seen]] | None = None,
+    runs: Iterable[Iterable[Seen]] | None = None,
 ) -> list[TrackPlan]:
     """How the messages of one key are stored in videos.
 
@@ -47,8 +47,8 @@ def plan_tracks(
         samples: The first messages, at least one.
         settings: What was asked for.
         rate: Frames per second, where known.
-        windows: Runs of messages of the same key from several places of the recording, by which
-            the crf for a score is chosen; None: the samples.
+        runs: Of messages of the same key, from several places of the recording, by which the crf
+            for a score is chosen. None: the samples.
 
     Returns:
         The best plan first; the last one takes every message of the key.
@@ -67,7 +67,7 @@ def plan_tracks(
         target = settings.quality.target
         if target is None:
             return [plan]
-        return _target_plans(plan, target, samples, windows, settings, rate)
+        return _target_plans(plan, target, samples, runs, settings, rate)
     return _lossless_plans(samples, settings)
 
 
@@ -94,7 +94,7 @@ def _target_plans(
     plan: PicturePlan,
     target: Target,
     samples: Sequence[Seen],
-    windows: Iterable[Sequence[Seen]] | None,
+    runs: Iterable[Iterable[Seen]] | None,
     settings: StreamSettings,
     rate: float | None,
 ) -> list[TrackPlan]:
@@ -102,7 +102,7 @@ def _target_plans(
     key = samples[0].key
     is_jpeg = key.body == "jpeg"
     try:
-        found = target_plan(plan, target, key, windows or [samples], settings, rate)
+        found = target_plan(plan, target, key, runs or [samples], settings, rate)
     except EncoderRefusedError as error:
         raise Unsuited(str(error)) from None
     except OutOfReach as reason:

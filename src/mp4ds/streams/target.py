@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from array import array
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -66,7 +66,7 @@ def target_plan(
     plan: PicturePlan,
     target: Target,
     key: StreamKey,
-    windows: Iterable[Sequence[Seen]],
+    runs: Iterable[Iterable[Seen]],
     settings: StreamSettings,
     rate: float | None,
 ) -> TargetPlan:
@@ -76,7 +76,7 @@ def target_plan(
         plan: How the stream is made; with the crf to try first.
         target: The score.
         key: Of the stream.
-        windows: Consecutive messages of it from one or several places, at least one.
+        runs: Consecutive messages of it from one or several places, at least one message.
         settings: How to encode.
         rate: Frames per second, where known.
 
@@ -89,7 +89,7 @@ def target_plan(
     if min(coder.coded_size) < SMALLEST:
         raise OutOfReach(f"images with less than {SMALLEST} rows or columns have no {target}")
     with tempfile.TemporaryDirectory(prefix="mp4ds-") as folder:
-        crf = _start_crf(coder, windows, int(plan.recipe.options["crf"]), Path(folder))
+        crf = _start_crf(coder, runs, int(plan.recipe.options["crf"]), Path(folder))
     recipe = replace(plan.recipe, options={**plan.recipe.options, "crf": str(crf)})
     return TargetPlan(plan.layout, recipe, str(target), exact=False, target=target)
 
@@ -108,19 +108,18 @@ def _coder(
     )
 
 
-def _start_crf(
-    coder: WindowCoder, windows: Iterable[Sequence[Seen]], guess: int, folder: Path
-) -> int:
+def _start_crf(coder: WindowCoder, runs: Iterable[Iterable[Seen]], guess: int, folder: Path) -> int:
     maker, target = coder.maker(), coder.target
     least = LEAST_CRF[coder.recipe.codec]
     spools = []
     try:
-        for number, window in enumerate(windows):
+        for number, run in enumerate(runs):
             spools.append(coder.spool(folder / f"{number}.yuv"))
-            for seen in window:
+            for seen in run:
                 if seen.pixels is not None:
                     spools[-1].append(maker.make(coder.layout.to_picture(seen.pixels)))
-        due = float(np.mean([coder.reachable(spool) for spool in spools]))
+        filled = [spool for spool in spools if len(spool)]
+        due = float(np.mean([coder.reachable(spool) for spool in filled]))
 
         known: dict[int, float] = {}
 
@@ -128,7 +127,7 @@ def _start_crf(
             video = folder / "sample.mp4"
             step = round(TIMESCALE / (coder.rate or _USUAL_RATE)) or 1
             found = []
-            for spool in spools:
+            for spool in filled:
                 ticks = range(0, len(spool) * step, step)
                 found.append(coder.mean(coder.encode(spool, ticks, crf, video)))
             known[crf] = float(np.mean(found))
