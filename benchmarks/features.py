@@ -189,7 +189,7 @@ def gained(results: Results, family: str, name: str, known: dict[str, Way], nois
     plain = [results[n] for n, way in known.items() if way.family == PLAIN and n in results]
     other = [results[n] for n, way in known.items() if way.family == family and n in results]
     gains = []
-    for clip in plain[0]:
+    for clip in plain[0] if plain else ():
         if not clip.endswith(noise) or name not in plain[0][clip].values:
             continue
         ours, theirs = (
