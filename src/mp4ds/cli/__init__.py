@@ -24,11 +24,17 @@ from mp4ds.cli.export import export
 from mp4ds.cli.failures import told_errors
 from mp4ds.cli.imports import imports
 from mp4ds.cli.options import (
+    CodecOption,
     EveryOption,
     ExcludeOption,
     ForceFlag,
+    GopOption,
+    JobsOption,
     JsonFlag,
     MaxRateOption,
+    MemoryOption,
+    PresetOption,
+    PurposeOption,
     ResizeOption,
     TopicsOption,
 )
@@ -94,14 +100,8 @@ def pack(
             help="lossless, visual, crf=N, or a score to keep: vmaf=99.5, psnr=42, ssim=0.98.",
         ),
     ] = "lossless",
-    codec: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option("--codec", help="h264, h265, ffv1 (lossless) or av1 (lossy)."),
-    ] = None,
-    preset: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option("--preset", help="The encoder's preset, such as 6 or veryfast."),
-    ] = None,
+    codec: CodecOption = None,
+    preset: PresetOption = None,
     transcode: Annotated[
         bool,
         typer.Option(
@@ -116,23 +116,8 @@ def pack(
             help="Topics that belong together, where names and stamps do not tell.",
         ),
     ] = None,
-    purpose: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(
-            "--for",
-            metavar="PURPOSE",
-            help="archive: smallest files. training: fastest random access.",
-        ),
-    ] = None,
-    gop: Annotated[
-        Optional[int],  # noqa: UP045
-        typer.Option(
-            "--gop",
-            min=1,
-            max=100_000,
-            help="Most frames from a key frame to the next; 30 by default, 60 where lossy.",
-        ),
-    ] = None,
+    purpose: PurposeOption = None,
+    gop: GopOption = None,
     window: Annotated[
         Optional[int],  # noqa: UP045
         typer.Option(
@@ -142,18 +127,8 @@ def pack(
             help="Frames of the busiest camera in a part of a long recording; 10 times --gop.",
         ),
     ] = None,
-    jobs: Annotated[
-        Optional[int],  # noqa: UP045
-        typer.Option(
-            "--jobs", "-j", min=1, max=1024, help="Processes at a time; all cores by default."
-        ),
-    ] = None,
-    memory: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(
-            "--memory", metavar="SIZE", help="Such as 8G; half of the machine's by default."
-        ),
-    ] = None,
+    jobs: JobsOption = None,
+    memory: MemoryOption = None,
     cluster: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(

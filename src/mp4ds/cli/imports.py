@@ -8,6 +8,16 @@ import typer
 
 from mp4ds.cli.arguments import parse_size
 from mp4ds.cli.failures import told_errors
+from mp4ds.cli.options import (
+    CodecOption,
+    ForceFlag,
+    GopOption,
+    JobsOption,
+    JsonFlag,
+    MemoryOption,
+    PresetOption,
+    PurposeOption,
+)
 from mp4ds.cli.output import print_json, print_pack
 from mp4ds.cli.progress import pack_progress
 
@@ -21,8 +31,6 @@ imports = typer.Typer(
 _Output = Annotated[
     str, typer.Option("--output", "-o", metavar="DATASET", help="The folder to make.")
 ]
-_Force = Annotated[bool, typer.Option("--force", "-f", help="Replace an existing output.")]
-_Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 @imports.command()
@@ -68,47 +76,25 @@ def images(
         ),
     ] = None,
     quality: Annotated[
-        str, typer.Option("--quality", "-q", help="lossless, visual, or crf=N.")
+        str, typer.Option("--quality", "-q", help="lossless, visual, crf=N, or vmaf=99.5.")
     ] = "lossless",
-    codec: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option("--codec", help="h264, h265, av1 or ffv1; the best by default."),
-    ] = None,
-    preset: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option("--preset", help="The encoder's preset, such as 6 or veryfast."),
-    ] = None,
+    codec: CodecOption = None,
+    preset: PresetOption = None,
     transcode: Annotated[
         bool,
         typer.Option(
             "--transcode", help="Encode JPEG files anew by --quality, instead of copying them."
         ),
     ] = False,
-    purpose: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option("--for", metavar="PURPOSE", help="archive or training; see mp4ds pack."),
-    ] = None,
-    gop: Annotated[
-        Optional[int],  # noqa: UP045
-        typer.Option("--gop", min=1, max=100_000, help="Most frames between key frames."),
-    ] = None,
-    jobs: Annotated[
-        Optional[int],  # noqa: UP045
-        typer.Option(
-            "--jobs", "-j", min=1, max=1024, help="Processes at a time; all cores by default."
-        ),
-    ] = None,
-    memory: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(
-            "--memory", metavar="SIZE", help="Such as 8G; half of the machine's by default."
-        ),
-    ] = None,
+    purpose: PurposeOption = None,
+    gop: GopOption = None,
+    jobs: JobsOption = None,
+    memory: MemoryOption = None,
     restart: Annotated[
         bool, typer.Option("--restart", help="Begin anew where an unfinished run was left.")
     ] = False,
-    force: _Force = False,
-    as_json: _Json = False,
+    force: ForceFlag = False,
+    as_json: JsonFlag = False,
 ) -> None:
     """Make a dataset of a folder of images with times.
 
@@ -154,8 +140,8 @@ def ros_mp4(
     video: Annotated[str, typer.Argument(metavar="VIDEO", help="The mp4.")],
     sidecar: Annotated[str, typer.Argument(metavar="YAML", help="The YAML that came with it.")],
     output: _Output,
-    force: _Force = False,
-    as_json: _Json = False,
+    force: ForceFlag = False,
+    as_json: JsonFlag = False,
 ) -> None:
     """Make a dataset of a video and YAML of the tool published with the paper.
 

@@ -27,3 +27,40 @@ MaxRateOption = Annotated[
     Optional[float],  # noqa: UP045
     typer.Option("--max-rate", metavar="HZ", help="So many frames a second at most."),
 ]
+
+# of what makes videos
+CodecOption = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--codec", help="h264, h265, ffv1 (lossless) or av1 (lossy)."),
+]
+PresetOption = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--preset", help="The encoder's preset, such as 6 or veryfast."),
+]
+PurposeOption = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option(
+        "--for",
+        metavar="PURPOSE",
+        help="archive: smallest files. training: fastest random access.",
+    ),
+]
+GopOption = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option(
+        "--gop",
+        min=1,
+        max=100_000,
+        help="Most frames from a key frame to the next; 30 by default, 60 where lossy.",
+    ),
+]
+JobsOption = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option(
+        "--jobs", "-j", min=1, max=1024, help="Processes at a time; all cores by default."
+    ),
+]
+MemoryOption = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--memory", metavar="SIZE", help="Such as 8G; half of the machine's by default."),
+]
