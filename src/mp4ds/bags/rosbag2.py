@@ -365,7 +365,8 @@ def _folder_info(path: Path) -> BagInfo:
         raise SourceError(
             path,
             f"has no {METADATA_FILE}",
-            f"If it is a rosbag2 recording, run `ros2 bag reindex` on it first, or {_GO_ON}",
+            f"If it is a rosbag2 recording, run `ros2 bag reindex` on it first, or {_GO_ON} "
+            "A folder of images is for `mp4ds import images`.",
         )
     info = read_bag_info(path / METADATA_FILE)
     missing = [name for name in info.file_names if not (path / name).exists()]
