@@ -36,7 +36,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--scene", default="cups", choices=clips.SCENES)
+    parser.add_argument("--scene", default="cups", choices=clips.MOVING)
     parser.add_argument("--noise", default="low", choices=clips.SENSORS)
     parser.add_argument("--frames", type=int, default=90)
     parser.add_argument("--folder", type=Path, help="keeps the recording and the evaluations")
