@@ -8,7 +8,7 @@ one encoder thread, in one pass. Printed are
     mean, 5 %, worst window    what the sidecar tells
     crf                        that of the search, and the least and most of the windows
     search                     encodings of samples before the stream began
-    windows                    how many, and how many encodings they took
+    windows                    how many (of them limited by their originals), and their encodings
     search s, windows s        seconds of encoding, decoding and scoring
     pack s                     of the whole pack
     visual / this              bytes of the same clip with --quality visual beside these
@@ -97,7 +97,7 @@ def measured(spec: clips.ClipSpec, quality: str, folder: Path) -> list[str]:
         f"{found.mean:.2f}, {found.p5:.2f}, {found.worst_window:.2f}",
         f"{video.options['crf']}; {min(crfs)} to {max(crfs)}",
         str(len(watch.search)),
-        f"{found.windows}, {len(watch.windows)}",
+        f"{found.windows} ({found.limited}), {len(watch.windows)}",
         f"{sum(watch.search):.1f}",
         f"{sum(watch.windows):.1f}",
         f"{seconds:.1f}",

@@ -252,7 +252,7 @@ def test_easy_images_have_a_higher_crf_than_hard_ones(tmp_path: Path) -> None:
 def test_a_last_window_of_one_frame(tmp_path: Path) -> None:
     (tmp_path / "source").mkdir()
     recorded = scene("rgb8", frames=WINDOW + 1, width=66, height=47)
-    paths = SOURCES["bag-none"](tmp_path / "source", recorded)
+    paths = SOURCES["mcap-unindexed"](tmp_path / "source", recorded)
     mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="ssim=0.95", **QUICK))
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
     found = quality_of(tmp_path / "dataset")
