@@ -251,7 +251,8 @@ def test_the_datasets_cover_the_format() -> None:
     assert {stream["codec"] for stream in seen} == set(CODECS)
     assert {stream["body"] for stream in seen} == set(Body.__args__)  # type: ignore[attr-defined]
     assert {stream["wire"] for stream in seen} == set(WIRES)
-    assert {stream["profile"] for stream in seen} == {"lossless", "crf=30", "crf=22", "crf=1"}
+    profiles = {"lossless", "crf=30", "crf=22", "crf=1", "psnr=41"}
+    assert {stream["profile"] for stream in seen} == profiles
     assert any(stream["camera_info"] for stream in seen)
     assert any(stream["image"]["is_bigendian"] for stream in seen)
     stamps = [list(map(int, stream["columns"]["stamp"])) for stream in seen]

@@ -339,8 +339,8 @@ def test_scores_that_do_not_come_to_what_is_told(tmp_path: Path) -> None:
     path = tmp_path / "d/cam_image_raw.yaml"
     document = yamlio.load(path.read_bytes(), "it")
     for change, code in (
-        ({"mean": 50.0}, "column-invalid"),
-        ({"scores": {"start": 1, "step": 0, "values": ""}}, "column-invalid"),
+        ({"mean": 50.0}, "scores-invalid"),
+        ({"scores": {"start": 1, "step": 0, "values": ""}}, "scores-invalid"),
         ({"target": 41.0}, "model-invalid"),
         ({"reencoded": 9}, "model-invalid"),
         ({"metric": "msssim"}, "schema-invalid"),

@@ -40,7 +40,10 @@ PARTS = {
         *("frame-count", "references-invalid"),
     ),
     "dataset": ("messages-missing", "messages-unreadable"),
-    "integrity": ("size-mismatch", "hash-mismatch", "file-unlisted", "message-count"),
+    "integrity": (
+        *("size-mismatch", "hash-mismatch", "file-unlisted", "message-count"),
+        "scores-invalid",
+    ),
 }
 """What an implementation may claim -> the problem codes that it then tells."""
 
@@ -191,7 +194,35 @@ def with_template(document: Document) -> None:
 
 
 _TOP = 2**63 - 1
+
+
+def scored(mean: float) -> Edit:
+    """Makes it the sidecar of a video of four frames that keeps a score.
+
+    Args:
+        mean: Told of the scores, which have 41.5.
+    """
+
+    def edit(document: Document) -> None:
+        not_lossless(document)
+        document["profile"] = "psnr=41"
+        document["video"]["quality"] = {
+            "metric": "psnr",
+            "target": 41.0,
+            "mean": mean,
+            "p5": 40.15,
+            "min": 40.0,
+            "worst_window": 40.5,
+            "windows": 2,
+            "reencoded": 1,
+            "scores": column(4000, 100, "0*3"),
+        }
+
+    return edit
+
+
 VALID: dict[str, FileCase] = {
+    "scores": FileCase("the scores that frames were measured to have", edit=scored(41.5)),
     "as-written": FileCase("as mp4ds writes it, with a checksum"),
     "least": FileCase(
         "the required keys alone",

@@ -13,6 +13,7 @@ from conformance_files import (
     not_lossless,
     plain,
     replacing,
+    scored,
     setting,
     with_template,
     without,
@@ -77,6 +78,9 @@ INVALID: dict[str, FileCase] = {
         base="h264",
         edit=setting("headers.0.framing", "4 4 4 4 4 4 4"),
         code="decode-failed",
+    ),
+    "scores": FileCase(
+        "scores that do not come to the mean that is told", edit=scored(42.0), code="scores-invalid"
     ),
     "references": FileCase(
         "references of more packets than the group of pictures has",

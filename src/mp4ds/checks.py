@@ -256,7 +256,7 @@ def _check_quality(stream: Stream) -> None:
             quality.decode(len(stream))
         except ValueError as error:
             place = f"{stream.path} at video.quality.scores"
-            raise FormatError("column-invalid", place, str(error)) from None
+            raise FormatError("scores-invalid", place, str(error)) from None
 
 
 def _check_video_file(
