@@ -178,8 +178,9 @@ class Cameras:
         reason = self._exact.get((channel.id, decision.key))
         if reason is None:
             return _Route(list(decision.plans), refusal=decision.refusal)
+        kept = "partly kept lossless" if self._survey else "kept lossless"
         plans: list[TrackPlan] = [
-            replace(plan, note=f"partly kept lossless: {reason}")
+            replace(plan, note=f"{kept}: {reason}")
             for plan in decision.plans
             if isinstance(plan, PicturePlan) and plan.exact
         ]
