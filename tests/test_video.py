@@ -658,6 +658,36 @@ def test_others_are_refused(codec: str | None, preset: str | None, lossless: boo
     assert repr(codec if preset is None else preset) in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("codec", "preset", "crf"),
+    [(None, None, 1), ("av1", "10", 1), ("av1", "12", 2), ("h264", None, 0), ("h265", None, 51)],
+)
+def test_the_ends_of_crf_look_like_the_pictures(
+    codec: str | None, preset: str | None, crf: int, tmp_path: Path
+) -> None:
+    check_codec(codec, preset, lossless=False, crf=crf)
+    recipe = recipe_for("gray", lossless=False, codec=codec, crf=crf, preset=preset)
+    pictures = scene_pictures("mono8", 128, 96, 6)
+    info = encode(tmp_path / "v.mp4", recipe, pictures, "gray")
+    for found, expected in zip(decode(tmp_path / "v.mp4", info), pictures, strict=True):
+        away = np.asarray(found, float).reshape(96, 128) - np.asarray(expected).reshape(96, 128)
+        assert np.sqrt(np.mean(away**2)) < (3 if crf <= 2 else 60)
+
+
+@pytest.mark.parametrize(
+    ("codec", "preset", "crf"),
+    [
+        *((None, None, 0), (None, "11", 1), ("av1", "13", 1), ("av1", None, 64)),
+        *(("h264", None, 52), ("h265", "medium", 60)),
+    ],
+)
+def test_a_crf_that_a_codec_has_not_is_refused(
+    codec: str | None, preset: str | None, crf: int
+) -> None:
+    with pytest.raises(OptionError, match=rf"crf={crf} is not one of .*Use \d+ to (63|51)"):
+        check_codec(codec, preset, lossless=False, crf=crf)
+
+
 @pytest.mark.parametrize("picture_format", FORMATS)
 def test_an_unable_codec_names_those_that_can(picture_format: str) -> None:
     able = [codec for codec in CODECS if exists(codec, picture_format, lossless=True)]

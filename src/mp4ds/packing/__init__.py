@@ -195,7 +195,7 @@ def _checked(options: PackOptions) -> PackOptions:
             "--transcode goes with a lossy --quality, such as visual: without loss, a JPEG file "
             "is smaller than any video of its pixels."
         )
-    check_codec(options.codec, options.preset, lossless=quality.lossless)
+    check_codec(options.codec, options.preset, lossless=quality.lossless, crf=quality.crf)
     if quality.target and quality.target.metric == "vmaf" and not options.join:
         find_ffmpeg()  # says how to get one before anything is read
     images = options.images.absolute() if options.images else None

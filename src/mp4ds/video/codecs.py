@@ -125,7 +125,9 @@ _DEFAULT_LOSSY = "av1"
 MAX_CRF = {"av1": 63, "h264": 51, "h265": 51}
 """The largest crf of each lossy codec."""
 
-# with 1, SVT-AV1's preset 12 was seen to make frames that do not look like the pictures
+# with 1, SVT-AV1's presets from 11 on were seen to make frames that do not look like the pictures,
+# and videos that do not decode
+_AV1_FAST = 11
 LEAST_CRF = {"av1": 2, "h264": 1, "h265": 1}
 """The smallest crf that is chosen for each lossy codec without being asked for."""
 
@@ -152,8 +154,10 @@ def codecs_to_try(pixel_format: str) -> Sequence[str]:
     return tuple(name for name, coding in _LOSSLESS[pixel_format].items() if coding.tried)
 
 
-def check_codec(codec: str | None, preset: str | None, *, lossless: bool) -> None:
-    """Refuse a codec that could make no stream of a profile, or a preset that it does not have.
+def check_codec(
+    codec: str | None, preset: str | None, *, lossless: bool, crf: int | None = None
+) -> None:
+    """Refuse a codec that could make no stream of a profile, or what it does not have.
 
     Raises:
         OptionError: Names those that can.
@@ -170,6 +174,20 @@ def check_codec(codec: str | None, preset: str | None, *, lossless: bool) -> Non
         raise OptionError(
             f"--preset {preset!r} is not one of {name}. "
             + (f"Use one of {known}." if known else "It has no presets.")
+        )
+    if crf is not None:
+        _check_crf(name, preset, crf)
+
+
+def _check_crf(codec: str, preset: str | None, crf: int) -> None:
+    least = 0
+    if codec == "av1":  # ffmpeg takes 0 for none
+        is_fast = preset is not None and int(preset) >= _AV1_FAST
+        least = LEAST_CRF["av1"] if is_fast else 1
+    if not least <= crf <= MAX_CRF[codec]:
+        of = f"{codec} with preset {preset}" if preset else codec
+        raise OptionError(
+            f"--quality crf={crf} is not one of {of}. Use {least} to {MAX_CRF[codec]}."
         )
 
 
