@@ -338,9 +338,9 @@ OF_READING = {
     *("the parameters of the track are cut short", "its PNG recipe holds unknown values"),
     *("a message of this type needs a template", "says something else than the fields beside it"),
     *("a blank message has data", "a blank message has a timestamp or data"),
-    "it has no pixels",
+    *("it has no pixels", "* has no plain form"),
 }
-"""Refusals of what a sidecar or a video says, which no message meets while it is packed."""
+"""Refusals of what a sidecar, a video or mp4ds itself says, which no message meets when packed."""
 
 
 def blanked(text: str) -> str:

@@ -484,6 +484,7 @@ def test_a_forked_child_opens_its_own(drives: list[Path]) -> None:
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
 def test_what_was_dropped_does_not_stop_workers(drives: list[Path]) -> None:
     """A worker that collects the parent's garbage must not wait for threads of its decoders."""
+    gc.collect()  # decoders with threads that other tests have left
     dropped: list[Any] = [FrameDataset(drives[0], topics=BOTH), mp4ds.open(drives[0])]
     dropped[0][0], dropped[1][LEFT][0]
     dropped.append(dropped)  # so that it waits for the garbage collector

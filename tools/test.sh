@@ -7,5 +7,5 @@ cd "$(dirname "$0")/.."
 .venv/bin/ruff check .
 .venv/bin/ruff format --check .
 .venv/bin/mypy
-.venv/bin/pytest -n auto -m "not network" "$@"
-exec .venv/bin/pytest -n 2 --dist loadgroup -m network "$@"
+.venv/bin/pytest -n auto -m "not network and not slow" "$@"
+exec .venv/bin/pytest -n 2 --dist loadgroup -m "network and not slow" "$@"
