@@ -13,6 +13,8 @@ NS = 1_000_000_000
 _TOLD = 8  # times of a clock that its pace is taken from
 _JUMP_NS = 2 * NS
 """A clock of others that goes on by more than this at once was moved."""
+_MISSED_NS = NS // 5
+"""What may be missed of the beginning of a clock, as it takes a while to be connected with it."""
 
 
 class Pace:
@@ -134,7 +136,7 @@ class FollowedClock:
             start: Where the recording starts, nanoseconds.
         """
         before = self.time_ns
-        is_moved = time_ns > start
+        is_moved = time_ns > start + _MISSED_NS
         if before is not None:
             is_moved = not before <= time_ns <= before + _JUMP_NS
             if is_moved or time_ns == before:  # it stands, or is somewhere else
