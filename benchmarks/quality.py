@@ -31,6 +31,7 @@ import numpy as np
 import clips
 import mp4ds
 from measure import parse_size, print_machine, print_table
+from mp4ds.streams.crf_control import CrfControl
 from mp4ds.streams.windows import WindowCoder
 from recordings import write_mcap
 
@@ -45,18 +46,18 @@ class Watch:
     Attributes:
         search: Seconds of each encoding of samples.
         windows: Of each encoding of a window.
-        crfs: That a window was encoded with last.
+        crfs: Of each window, as it was kept.
     """
 
     search: list[float] = field(default_factory=list)
     windows: list[float] = field(default_factory=list)
-    crfs: dict[str, int] = field(default_factory=dict)
+    crfs: list[int] = field(default_factory=list)
 
 
 @contextmanager
 def watched() -> Iterator[Watch]:
     """Measure the encodings of packs."""
-    watch, encode = Watch(), WindowCoder.encode
+    watch, encode, keep = Watch(), WindowCoder.encode, CrfControl.keep
 
     def timed(
         coder: WindowCoder, frames: Any, ticks: Sequence[int], crf: int, path: Path
@@ -65,11 +66,16 @@ def watched() -> Iterator[Watch]:
         found = encode(coder, frames, ticks, crf, path)
         is_sample = path.name == SAMPLES
         (watch.search if is_sample else watch.windows).append(time.perf_counter() - begun)
-        if not is_sample:
-            watch.crfs[path.name] = crf
         return found
 
-    with mock.patch.object(WindowCoder, "encode", timed):
+    def kept(control: CrfControl, tried: Any, crf: int, *facts: Any) -> None:
+        watch.crfs.append(crf)
+        keep(control, tried, crf, *facts)
+
+    with (
+        mock.patch.object(WindowCoder, "encode", timed),
+        mock.patch.object(CrfControl, "keep", kept),
+    ):
         yield watch
 
 
@@ -91,7 +97,7 @@ def measured(spec: clips.ClipSpec, quality: str, folder: Path) -> list[str]:
         beside = (visual.streams[0].sidecar.video.size or 0) / (video.size or 1)
     if video.quality is None:
         return [spec.name, "lossless", *[""] * 7]
-    found, crfs = video.quality, watch.crfs.values()
+    found, crfs = video.quality, watch.crfs
     return [
         f"{spec.scene}, {spec.encoding}, {spec.noise}",
         f"{found.mean:.2f}, {found.p5:.2f}, {found.worst_window:.2f}",

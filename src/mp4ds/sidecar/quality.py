@@ -37,7 +37,7 @@ class Quality(Model):
     windows: Annotated[Count, Field(ge=1)] = Field(
         description="Windows that were measured each by itself."
     )
-    reencoded: Count = Field(0, description="Of these, encoded again since they fell short.")
+    reencoded: Count = Field(0, description="Of these, encoded more than once.")
     limited: Count = Field(
         0, description="Of these, with originals that themselves score too little."
     )

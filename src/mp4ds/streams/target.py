@@ -214,31 +214,34 @@ class _TargetTrack:
         spool, due = self._spool, target.score
         frames = len(spool)
         ticks = self._ticks[-frames:]
-        path = self._folder / f"{len(self._segments):06}.mp4"
-        tried: list[tuple[int, float]] = []
-        crf = control.crf
-        while True:
-            scores = coder.encode(spool, ticks, crf, path)
-            tried.append((crf, coder.mean(scores)))
-            if control.accepts(tried[-1][1], due, frames):
-                break
-            if len(tried) == 1:
+        number = len(self._segments)
+        found: dict[int, NDArray[np.int64]] = {}
+        tried: dict[int, float] = {}
+        crf: int | None = control.crf
+        while crf is not None:
+            found[crf] = coder.encode(spool, ticks, crf, self._segment(number, crf))
+            tried[crf] = coder.mean(found[crf])
+            if len(tried) == 1 and control.accepted(tried, due, frames) is None:
                 due = coder.reachable(spool)
-                if control.accepts(tried[-1][1], due, frames):
-                    break
-            if crf == LEAST_CRF[self._plan.recipe.codec]:
-                first = len(self._ticks) - frames
-                raise OutOfReach(
-                    f"{target} is out of reach: crf {crf} gives frames {first} to "
-                    f"{first + frames - 1} of a part {tried[-1][1]:.2f}"
-                )
-            crf = control.lower(tried, due, frames)
-        control.keep(tried, due, frames)
-        self._segments.append(path)
-        self._scores.append(scores)
+            crf = control.next(tried, due, frames)
+        kept = control.accepted(tried, due, frames)
+        if kept is None:
+            first, least = len(self._ticks) - frames, min(tried)
+            raise OutOfReach(
+                f"{target} is out of reach: crf {least} gives frames {first} to "
+                f"{first + frames - 1} of a part {tried[least]:.2f}"
+            )
+        control.keep(tried, kept, due, frames)
+        for crf in tried.keys() - {kept}:
+            self._segment(number, crf).unlink()
+        self._segments.append(self._segment(number, kept))
+        self._scores.append(found[kept])
         self._reencoded += len(tried) > 1
         self._limited += due < target.score
         spool.clear()
+
+    def _segment(self, number: int, crf: int) -> Path:
+        return self._folder / f"{number:06}-{crf}.mp4"
 
     def close(self) -> None:
         """See `Track.close`.
