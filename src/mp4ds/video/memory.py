@@ -19,7 +19,7 @@ _MB = 1_000_000
 # between machines, which map more or less of a library at once
 _BASE = 8 * _MB
 _BORDER = 160  # columns, and rows, that borders and rounding add to a picture
-_PICTURE = 8  # bytes of a pixel: a picture and its conversions, where all are made yuv420p
+_PICTURE = 9  # bytes of a pixel: a picture and its conversions, where all are made yuv420p
 
 _SVT_LEVELS = 6
 _SVT_SMALL = 1_500_000  # pixels from which SVT-AV1's preset 8 looks ahead no further than its 9
