@@ -20,6 +20,7 @@ from mp4ds.sidecar.fields import Body
 from mp4ds.sidecar.models import CODECS, PIXEL_FORMATS
 from mp4ds.video import recipe_for
 from mp4ds.video.codecs import codecs_to_try, lossless_codecs
+from mp4ds.video.hardware import HARDWARE
 from mp4ds.wire import WIRES
 from mp4ds.wire.foxglove import TYPES as FOXGLOVE_TYPES
 from mp4ds.wire.ros import LAYOUTS as ROS_TYPES
@@ -323,6 +324,22 @@ def test_the_registry_has_every_lossless_coding() -> None:
     assert {(name, codec) for name in formats for codec in lossless_codecs(name)} == set(listed)
     coded = {recipe_for(name, lossless=True, codec=codec).pixel_format for name, codec in listed}
     assert coded == set(PIXEL_FORMATS)
+
+
+def test_the_registry_lists_exactly_the_hardware() -> None:
+    rows = tables(registry("Codecs"))[2]
+    assert [quoted(row[0]) for row in rows] == [[name] for name in HARDWARE]
+    for name, codec, encoder, options, scale, crfs, presets in rows:
+        found = HARDWARE[quoted(name)[0]]
+        assert (quoted(codec), encoder) == ([found.codec], found.encoder)
+        assert dict(option.split("=") for option in quoted(options)) == found.given
+        option, _, formula = scale.partition(" = ")
+        first, _, step = formula.removesuffix("N").strip().rpartition("- ")
+        assert (quoted(option), int(first or 0)) == ([found.scale], found.first)
+        assert int(step or 1) * (-1 if first else 1) == found.step
+        assert crfs == f"1 to {found.most}"
+        assert presets.replace("*", "").split() == list(found.presets)
+        assert re.findall(r"(\w+)\*", presets) == [found.default_preset][: len(found.presets)]
 
 
 # ---------------------------------------------------------------- reasons for verbatim storage

@@ -30,7 +30,11 @@ def evaluate(
         ),
     ] = None,
     codecs: Annotated[
-        str, typer.Option("--codecs", help="Of svtav1, x264 and x265, with commas between.")
+        str,
+        typer.Option(
+            "--codecs",
+            help="Of svtav1, x264 and x265, with commas between; or as --codec of mp4ds pack.",
+        ),
     ] = "svtav1,x264,x265",
     crf: Annotated[
         str, typer.Option("--crf", help="Such as 16:25, 16:25:3 or 16,20,24.")

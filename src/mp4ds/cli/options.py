@@ -31,11 +31,15 @@ MaxRateOption = Annotated[
 # of what makes videos
 CodecOption = Annotated[
     Optional[str],  # noqa: UP045
-    typer.Option("--codec", help="h264, h265, ffv1 (lossless) or av1 (lossy)."),
+    typer.Option(
+        "--codec",
+        help="h264, h265, ffv1 (lossless) or av1 (lossy); of a graphics card (lossy) av1-nvenc, "
+        "h264-nvenc, h265-nvenc, ...-vaapi or ...-videotoolbox.",
+    ),
 ]
 PresetOption = Annotated[
     Optional[str],  # noqa: UP045
-    typer.Option("--preset", help="The encoder's preset, such as 6 or veryfast."),
+    typer.Option("--preset", help="The encoder's preset, such as 6, veryfast or p4."),
 ]
 PurposeOption = Annotated[
     Optional[str],  # noqa: UP045

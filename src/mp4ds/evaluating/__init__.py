@@ -44,7 +44,7 @@ from mp4ds.outputs import check_target
 from mp4ds.plan import FileNames, Selection
 from mp4ds.remote import remote
 from mp4ds.scoring import Ffmpeg, ScoringError, find_ffmpeg
-from mp4ds.video import tool_versions
+from mp4ds.video import check_hardware, tool_versions
 
 __all__ = [
     "CameraEvaluation",
@@ -88,6 +88,7 @@ def evaluate(
     Raises:
         SourceError: The source cannot be read, or has no camera that could be tried.
         OptionError: An option is wrong.
+        HardwareError: An encoder is asked for that this machine has not.
         TargetError: The folder may not be used.
         ScoringError: There is no libvmaf, and the target is one of VMAF.
         OSError: The disk refused.
@@ -95,6 +96,8 @@ def evaluate(
     chosen = options or EvaluateOptions()
     check_options(chosen)
     grid = grid_of(chosen)
+    for codec in grid.presets:
+        check_hardware(codec)
     ffmpeg = _ffmpeg(chosen)
     versions = {**tool_versions(), "mp4ds": __version__}
     versions["vmaf"] = ffmpeg.version if ffmpeg else "none"

@@ -10,13 +10,18 @@ from dataclasses import dataclass, field
 from mp4ds.errors import OptionError
 from mp4ds.plan import visual_setting
 from mp4ds.scoring import METRICS
-from mp4ds.video import check_codec
+from mp4ds.video import HARDWARE, check_codec
 from mp4ds.video.codecs import LOSSY_GOP, MAX_CRF
 
 CODEC_NAMES = {"svtav1": "av1", "x264": "h264", "x265": "h265"}
 """Names of the encoders -> of the codecs, as `mp4ds pack` takes them."""
 
-_DEFAULT_PRESETS = {"av1": ("6", "8"), "h264": ("medium",), "h265": ("medium",)}
+_DEFAULT_PRESETS = {
+    "av1": ("6", "8"),
+    "h264": ("medium",),
+    "h265": ("medium",),
+    **{name: (found.default_preset,) for name, found in HARDWARE.items()},
+}
 _MOST_CELLS = 10_000
 _CRF = re.compile(r"([0-9]{1,2})(?::([0-9]{1,2})(?::([0-9]{1,2}))?)?")
 
@@ -26,8 +31,8 @@ class Setting:
     """How a clip is encoded, in the words of ``mp4ds pack``.
 
     Attributes:
-        codec: ``av1``, ``h264`` or ``h265``.
-        preset: Of its encoder.
+        codec: ``av1``, ``h264``, ``h265``, or an encoder of the hardware, such as ``h264-nvenc``.
+        preset: Of its encoder; empty where it has none.
         crf: Constant rate factor.
         gop: Most frames between key frames.
     """
@@ -40,13 +45,14 @@ class Setting:
     @property
     def name(self) -> str:
         """Short, and different for each of a grid."""
-        return f"{self.codec} {self.preset} crf {self.crf}"
+        return " ".join(filter(None, (self.codec, self.preset, f"crf {self.crf}")))
 
     @property
     def pack_options(self) -> str:
         """The options of ``mp4ds pack`` that encode so."""
+        preset = f" --preset {self.preset}" if self.preset else ""
         gop = f" --gop {self.gop}" if self.gop != LOSSY_GOP else ""
-        return f"--quality crf={self.crf} --codec {self.codec} --preset {self.preset}{gop}"
+        return f"--quality crf={self.crf} --codec {self.codec}{preset}{gop}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +76,8 @@ class EvaluateOptions:
     """How to evaluate.
 
     Attributes:
-        codecs: ``svtav1``, ``x264`` and ``x265``, or as ``mp4ds pack`` calls them.
+        codecs: ``svtav1``, ``x264`` and ``x265``, or as ``mp4ds pack`` calls them, which has
+            encoders of the hardware, too.
         crf: Values, and ranges ``FIRST:LAST`` or ``FIRST:LAST:STEP`` with the last one in them.
         presets: Each is tried with the codecs that have it; none: usual ones of each codec.
         topics: Globs of the cameras; empty for all.
@@ -158,7 +165,8 @@ def grid_of(options: EvaluateOptions) -> Grid:
 def _codec(name: str) -> str:
     codec = CODEC_NAMES.get(name, name)
     if codec not in MAX_CRF:
-        known = ", ".join(f"{encoder} ({codec})" for encoder, codec in CODEC_NAMES.items())
+        names = [f"{encoder} ({codec})" for encoder, codec in CODEC_NAMES.items()]
+        known = ", ".join([*names, *HARDWARE])
         raise OptionError(f"--codecs {name!r} is not one of {known}.")
     return codec
 

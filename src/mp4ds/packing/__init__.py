@@ -32,7 +32,7 @@ from mp4ds.remote import RemotePath, location, remote
 from mp4ds.scoring import find_ffmpeg
 from mp4ds.sidecar import MANIFEST_NAME, load_manifest
 from mp4ds.source_files import source_size
-from mp4ds.video import check_codec
+from mp4ds.video import check_codec, check_hardware
 
 __all__ = [
     "PackOptions",
@@ -187,6 +187,7 @@ def _checked(options: PackOptions) -> PackOptions:
 
     Raises:
         OptionError: They do.
+        HardwareError: An encoder is asked for that this machine has not.
         ScoringError: VMAF is asked for, and there is nothing that computes it.
     """
     quality = parse_quality(options.quality)
@@ -195,7 +196,15 @@ def _checked(options: PackOptions) -> PackOptions:
             "--transcode goes with a lossy --quality, such as visual: without loss, a JPEG file "
             "is smaller than any video of its pixels."
         )
-    check_codec(options.codec, options.preset, lossless=quality.lossless, crf=quality.crf)
+    check_codec(
+        options.codec,
+        options.preset,
+        lossless=quality.lossless,
+        crf=quality.crf,
+        varied=quality.target is not None,
+    )
+    if not (options.cluster or options.join):  # else others encode, or did
+        check_hardware(options.codec)
     if quality.target and quality.target.metric == "vmaf" and not options.join:
         find_ffmpeg()  # says how to get one before anything is read
     images = options.images.absolute() if options.images else None

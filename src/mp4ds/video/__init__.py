@@ -7,6 +7,7 @@ from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.digest import VideoDigest, digest_video, packets_in_groups
 from mp4ds.video.encoder import VideoEncoder, tool_versions
 from mp4ds.video.file import VideoFile, open_file_frames
+from mp4ds.video.hardware import HARDWARE, HardwareError, check_hardware
 from mp4ds.video.images import ImageFile
 from mp4ds.video.join import SegmentsDifferError, join_segments
 from mp4ds.video.jpeg import JpegDecoder
@@ -18,8 +19,10 @@ from mp4ds.video.sample_entry import read_sample_entry
 from mp4ds.video.trial import Choice, choose
 
 __all__ = [
+    "HARDWARE",
     "Choice",
     "FrameReader",
+    "HardwareError",
     "ImageFile",
     "JpegDecoder",
     "PacketReader",
@@ -32,6 +35,7 @@ __all__ = [
     "VideoEncoder",
     "VideoFile",
     "check_codec",
+    "check_hardware",
     "choose",
     "digest_video",
     "encoder_bytes",

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from mp4ds.errors import OptionError
+from mp4ds.video.hardware import CHROMA_PLACE, HARDWARE
 
 # most frames between key frames, chosen by what they cost (spec/notes.md)
 LOSSLESS_GOP, LOSSY_GOP = 30, 60
@@ -26,13 +27,14 @@ class Recipe:
     """How a stream is encoded.
 
     Attributes:
-        codec: Name in the registry.
+        codec: Name in the registry: what a reader needs.
         encoder: ffmpeg's name of the encoder.
         pixel_format: Pixel format given to the encoder.
         lossless: Whether every sample returns as it was.
         options: Options of the encoder.
         matrix: Matrix coefficients to tag, by ffmpeg's name: bt709, gbr or smpte170m.
         full_range: Whether to tag the samples as using their full range.
+        hardware: Its name among `HARDWARE`, or empty for an encoder that runs on processors.
     """
 
     codec: str
@@ -42,6 +44,7 @@ class Recipe:
     options: Mapping[str, str] = field(default_factory=dict)
     matrix: str = "bt709"
     full_range: bool = True
+    hardware: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,15 +125,19 @@ _LOSSY: dict[str, _Coding] = {
 }
 _DEFAULT_LOSSY = "av1"
 
-MAX_CRF = {"av1": 63, "h264": 51, "h265": 51}
-"""The largest crf of each lossy codec."""
+MAX_CRF = {
+    "av1": 63,
+    "h264": 51,
+    "h265": 51,
+    **{name: found.most for name, found in HARDWARE.items()},
+}
+"""The largest crf of each lossy codec, and of each encoder of the hardware."""
 
 # with 1, SVT-AV1's presets from 11 on were seen to make frames that do not look like the pictures,
 # and videos that do not decode
 _AV1_FAST = 11
 LEAST_CRF = {"av1": 2, "h264": 1, "h265": 1}
 """The smallest crf that is chosen for each lossy codec without being asked for."""
-
 
 _X26X_PRESETS = (
     *("ultrafast", "superfast", "veryfast", "faster", "fast"),
@@ -141,6 +148,7 @@ _PRESETS: dict[str, Sequence[str]] = {
     "h265": _X26X_PRESETS,
     "av1": [str(number) for number in range(14)],
     "ffv1": (),
+    **{name: found.presets for name, found in HARDWARE.items()},
 }
 
 
@@ -155,14 +163,34 @@ def codecs_to_try(pixel_format: str) -> Sequence[str]:
 
 
 def check_codec(
-    codec: str | None, preset: str | None, *, lossless: bool, crf: int | None = None
+    codec: str | None,
+    preset: str | None,
+    *,
+    lossless: bool,
+    crf: int | None = None,
+    varied: bool = False,
 ) -> None:
     """Refuse a codec that could make no stream of a profile, or what it does not have.
+
+    Args:
+        codec: As ``--codec`` has it, or None for the default.
+        preset: The encoder's preset, or None for the default.
+        lossless: Whether every sample must return as it was.
+        crf: Constant rate factor, where there is one.
+        varied: Whether videos with several crf are to be joined to one.
 
     Raises:
         OptionError: Names those that can.
     """
-    able = {name for codings in _LOSSLESS.values() for name in codings} if lossless else set(_LOSSY)
+    software = {name for codings in _LOSSLESS.values() for name in codings} if lossless else _LOSSY
+    able = software if lossless else {*software, *HARDWARE}
+    if varied and codec is not None and codec in HARDWARE:
+        raise OptionError(
+            f"--codec {codec} goes with --quality visual or crf=N. A score is kept by joining "
+            "pieces of several crf to one video, which the headers that hardware encoders write "
+            f"are not known to allow: use --codec {HARDWARE[codec].codec}, or find the crf by "
+            "mp4ds evaluate."
+        )
     if codec is not None and codec not in able:
         kind = "lossless" if lossless else "lossy"
         raise OptionError(
@@ -180,7 +208,7 @@ def check_codec(
 
 
 def _check_crf(codec: str, preset: str | None, crf: int) -> None:
-    least = 0
+    least = 1 if codec in HARDWARE else 0
     if codec == "av1":  # ffmpeg takes 0 for none
         is_fast = preset is not None and int(preset) >= _AV1_FAST
         least = LEAST_CRF["av1"] if is_fast else 1
@@ -205,7 +233,8 @@ def recipe_for(
     Args:
         pixel_format: Of the pictures, as a layout gives them.
         lossless: Whether every sample must return as it was.
-        codec: ``h264``, ``h265``, ``av1``, ``ffv1``, or None for the default.
+        codec: ``h264``, ``h265``, ``av1``, ``ffv1``, a name among `HARDWARE`, or None for the
+            default.
         crf: Constant rate factor of a lossy recipe.
         preset: The encoder's preset, or None for the default; encoders without ignore it.
         varied: Whether videos with several crf are to be joined to one.
@@ -225,11 +254,7 @@ def recipe_for(
         options = dict(coding.options)
     else:
         name = codec or _DEFAULT_LOSSY
-        found = _LOSSY.get(name)
-        if found is None:
-            raise OptionError(f"codec {name} is lossless only; use one of {', '.join(_LOSSY)}")
-        coding = found
-        options = {**coding.options, "crf": str(crf)}
+        coding, options = _lossy(name, crf)
         if pixel_format in _YUV:
             options = _sited_left(options)
         if varied and name == "h264":
@@ -242,7 +267,7 @@ def recipe_for(
     is_yuv = pixel_format in _YUV
     is_rgb = coding.pixel_format.startswith(("rgb", "bgr", "gbr"))
     return Recipe(
-        name,
+        HARDWARE[name].codec if name in HARDWARE else name,
         coding.encoder,
         coding.pixel_format,
         lossless,
@@ -250,7 +275,20 @@ def recipe_for(
         # a camera's own YUV is kept, and tagged as what ROS and OpenCV take it for
         matrix="smpte170m" if is_yuv else "gbr" if is_rgb else "bt709",
         full_range=not is_yuv,
+        hardware=name if name in HARDWARE else "",
     )
+
+
+def _lossy(name: str, crf: int | None) -> tuple[_Coding, dict[str, str]]:
+    """How pictures are coded with a crf, and all options but the preset."""
+    if name in HARDWARE:
+        device = HARDWARE[name]
+        options = device.options(crf or 1)
+        return _Coding(device.encoder, "yuv420p", options, device.default_preset), options
+    if name not in _LOSSY:
+        known = ", ".join((*_LOSSY, *HARDWARE))
+        raise OptionError(f"codec {name} is lossless only; use one of {known}")
+    return _LOSSY[name], {**_LOSSY[name].options, "crf": str(crf)}
 
 
 def _sited_left(options: Mapping[str, str]) -> dict[str, str]:
@@ -258,5 +296,6 @@ def _sited_left(options: Mapping[str, str]) -> dict[str, str]:
     parts = {
         key: ":".join(part for part in value.split(":") if part != _CENTRED)
         for key, value in options.items()
+        if key != CHROMA_PLACE
     }
     return {key: value for key, value in parts.items() if value}

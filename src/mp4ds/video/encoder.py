@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from mp4ds.layouts import Picture
 from mp4ds.stamps import TIMESCALE
 from mp4ds.video.codecs import Recipe
 from mp4ds.video.convert import Converter, picture_to_frame
+from mp4ds.video.hardware import HardwareError, device_for, refuse_if_unusable, surface_format
 from mp4ds.video.scheduling import ordinary_scheduling
 
 _TIME_BASE = Fraction(1, TIMESCALE)
@@ -44,6 +45,7 @@ class VideoEncoder:
 
     Raises:
         EncoderRefusedError: The codec does not take such pictures.
+        HardwareError: It is one of a device that is not there, or fails.
     """
 
     def __init__(
@@ -80,6 +82,8 @@ class VideoEncoder:
             raise
         except (FFmpegError, ValueError):
             self._container.close()
+            if recipe.hardware:
+                refuse_if_unusable(recipe.hardware, self.width, self.height)
             raise EncoderRefusedError(
                 f"{recipe.encoder} does not take pictures of {width}x{height}"
             ) from None
@@ -87,10 +91,12 @@ class VideoEncoder:
     def _open_stream(self, threads: int, rate: float | None) -> None:
         # the rate gives the last frame its duration: one of no ticks would be cut off
         hint = min(max(rate or _USUAL_RATE, _LOWEST_RATE), _HIGHEST_RATE)
+        device = device_for(self.recipe.hardware)
         stream: Any = self._container.add_stream(
             self.recipe.encoder,
             rate=Fraction(hint).limit_denominator(1000),
             options=dict(self.options),
+            **({"hwaccel": device} if device else {}),
         )
         stream.time_base = _TIME_BASE
         context = stream.codec_context
@@ -107,6 +113,7 @@ class VideoEncoder:
 
         Raises:
             OSError: The disk refused.
+            HardwareError: A device failed.
         """
         frame = picture_to_frame(
             picture, self._picture_format, self.recipe.pixel_format, self._converter
@@ -114,18 +121,31 @@ class VideoEncoder:
         frame.pts = tick
         frame.time_base = _TIME_BASE
         frame.color_range = color_range(self.recipe)
-        for packet in self._stream.encode(frame):
+        for packet in self._encoded(frame):
             self._container.mux(packet)
         self.frames += 1
+
+    def _encoded(self, frame: av.VideoFrame | None) -> Sequence[Any]:
+        try:
+            packets: Sequence[Any] = self._stream.encode(frame)
+        except FFmpegError as error:
+            if not self.recipe.hardware:
+                raise
+            raise HardwareError(
+                self.recipe.hardware,
+                f"{self.recipe.encoder} failed at frame {self.frames}: {error}",
+            ) from None
+        return packets
 
     def close(self) -> None:
         """Finish the file.
 
         Raises:
             OSError: The disk refused.
+            HardwareError: A device failed.
         """
         try:
-            for packet in self._stream.encode(None):
+            for packet in self._encoded(None):
                 self._container.mux(packet)
         finally:
             self._container.close()
@@ -169,7 +189,7 @@ def open_encoder(context: Any, recipe: Recipe, width: int, height: int, *, threa
         # and to give wrong pictures up to 32
         raise ValueError("too narrow")
     context.width, context.height = width, height
-    context.pix_fmt = recipe.pixel_format
+    context.pix_fmt = surface_format(recipe.hardware) or recipe.pixel_format
     context.thread_count = threads
     context.colorspace = _MATRICES[recipe.matrix]
     context.color_primaries = _BT709
