@@ -4,14 +4,15 @@
 
 Clips are those of clips.py: real scenes through a modelled sensor, demosaiced, as a ROS driver
 publishes them. Each recipe encodes each clip with several crf. CPU seconds are those of all threads
-of the encoder. Frames are scored after decoding, rounded to 8 bits, against the clip in 4:2:0 of
-8 bits, full range: VMAF (libvmaf), PSNR of luma and chroma, SSIM. (Against a clip of 10 bits, what
-was merely rounded to 8 has more VMAF than the clip itself, by 0.1 to 0.2, which is as much as a
-quarter of the bits.)
+of the encoder. All encoders are given the same pictures, 4:2:0 of 8 bits and full range, those of
+10 bits as the same levels in 10. Frames are scored against them after decoding, rounded to 8 bits:
+VMAF (libvmaf), PSNR of luma and chroma, SSIM. (Against a clip of 10 bits, what was merely rounded
+to 8 has more VMAF than the clip itself, by 0.1 to 0.2, which is as much as a quarter of the bits.)
 
 A figure is a Bjontegaard rate: how many more bits than the baseline for equal quality, in percent,
-the mean over the qualities that both reach between VMAF 97 and 99.5 (PSNR: those of the baseline
-there), by linear interpolation of the logarithm of the rate. "CPU" is that of encoding, over the
+the mean over the qualities that both reach between VMAF 97 and 99.5 (others: those of the baseline
+there), by linear interpolation of the logarithm of the rate. A clip of which the baseline has less
+than 99.5, as those at rest have, is compared over the 2.5 below what it has. "CPU" is that of encoding, over the
 same crf. The baseline is the paper's: SVT-AV1, preset 6, 8 bits.
 """
 
@@ -19,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -33,8 +35,8 @@ from numpy.typing import NDArray
 
 import clips
 from measure import parse_size, print_machine
-from mp4ds.scoring import Scorer, YuvFrame, find_ffmpeg
-from mp4ds.video.convert import Converter, plain_frame
+from mp4ds.scoring import Scorer, find_ffmpeg
+from mp4ds.video.planes import PlaneMaker, Planes
 
 RANGE = (97.0, 99.5)
 GOP = 60
@@ -68,27 +70,42 @@ def _svt(parameters: str = "", *, preset: int = 6, bits: int = 10) -> Recipe:
     return Recipe("libsvtav1", str(preset), pixel_format, parameters)
 
 
-_BEST = "hierarchical-levels=3:enable-qm=1:qm-min=8"
+_QM = "enable-qm=1:qm-min=8"
+_BEST = f"hierarchical-levels=3:{_QM}"
+_X265 = "log-level=error"
 RECIPES = {
     "paper": _svt(bits=8),
+    "restoration off": _svt("enable-restoration=0", bits=8),
+    "cdef off": _svt("enable-cdef=0", bits=8),
+    "no temporal filter": _svt("enable-tf=0", bits=8),
+    "stronger temporal filter": _svt("tf-strength=4", bits=8),
+    "aq off": _svt("aq-mode=0", bits=8),
+    "variance boost": _svt("enable-variance-boost=1", bits=8),
+    "levels 3": _svt("hierarchical-levels=3", bits=8),
+    "qp compressed": _svt("qp-scale-compress-strength=1", bits=8),
+    "ac-bias": _svt("ac-bias=1.0", bits=8),
+    "qm": _svt(_QM, bits=8),
+    "qm from 0": _svt("enable-qm=1:qm-min=0", bits=8),
+    "transforms to 32": _svt("max-tx-size=32", bits=8),
+    "tune 0": _svt("tune=0", bits=8),
+    "tune 2": _svt("tune=2", bits=8),
+    "preset 7": _svt(bits=8, preset=7),
+    "preset 5": _svt(bits=8, preset=5),
+    "preset 4": _svt(bits=8, preset=4),
     "10 bits": _svt(),
-    "levels 3": _svt("hierarchical-levels=3"),
-    "levels 3, 8 bits": _svt("hierarchical-levels=3", bits=8),
-    "levels 2": _svt("hierarchical-levels=2"),
-    "qm": _svt(_BEST),
-    "qm, ac-bias": _svt(f"{_BEST}:ac-bias=1.0"),
-    "qm, ac-bias, tune 0": _svt(f"{_BEST}:ac-bias=1.0:tune=0"),
-    "qm, ac-bias, variance boost": _svt(f"{_BEST}:ac-bias=1.0:enable-variance-boost=1"),
-    "qm, ac-bias, no temporal filter": _svt(f"{_BEST}:ac-bias=1.0:enable-tf=0"),
-    "qm, ac-bias, sharpness 2": _svt(f"{_BEST}:ac-bias=1.0:sharpness=2"),
-    "qm, ac-bias, overlays": _svt(f"{_BEST}:ac-bias=1.0:enable-overlays=1"),
-    "qm, ac-bias, preset 7": _svt(f"{_BEST}:ac-bias=1.0", preset=7),
-    "qm, ac-bias, preset 5": _svt(f"{_BEST}:ac-bias=1.0", preset=5),
-    "qm, ac-bias, preset 4": _svt(f"{_BEST}:ac-bias=1.0", preset=4),
-    "film grain 10": _svt(f"{_BEST}:ac-bias=1.0:film-grain=10"),
-    "denoised, grain 10": _svt(f"{_BEST}:ac-bias=1.0:film-grain=10:film-grain-denoise=1"),
+    "10 bits, qm": _svt(_QM),
+    "10 bits, weaker temporal filter": _svt("tf-strength=1"),
+    "10 bits, preset 7, qm": _svt(_QM, preset=7),
+    "10 bits, levels 3, qm, ac-bias": _svt(f"{_BEST}:ac-bias=1.0"),
+    "10 bits, levels 3, qm, ac-bias, preset 5": _svt(f"{_BEST}:ac-bias=1.0", preset=5),
+    "film grain 10": _svt("film-grain=10", bits=8),
+    "denoised, grain 10": _svt("film-grain=10:film-grain-denoise=1", bits=8),
     "x264 medium": Recipe("libx264", "medium", crf=_X26X_CRF),
-    "x265 medium": Recipe("libx265", "medium", parameters="log-level=error", crf=_X26X_CRF),
+    "x264 slow, no psy": Recipe("libx264", "slow", parameters="psy=0", crf=_X26X_CRF),
+    "x265 medium": Recipe("libx265", "medium", parameters=_X265, crf=_X26X_CRF),
+    "x265 medium, no psy": Recipe(
+        "libx265", "medium", parameters=f"{_X265}:psy-rd=0:psy-rdoq=0", crf=_X26X_CRF
+    ),
 }
 """The first is the baseline."""
 
@@ -119,47 +136,57 @@ class Point:
 
 
 class Clip:
-    """The frames of a clip in memory, as pictures for the encoder and the scorer."""
+    """The frames of a clip in memory, as planes of 4:2:0 and 8 bits."""
 
     def __init__(self, scene: str, noise: str, frames: int, size: tuple[int, int]) -> None:
         self.name = f"{scene}, {noise}"
+        self.size = size
         spec = clips.ClipSpec(scene, "rgb8", noise, frames, size)
-        self.rgb = list(clips.make(spec))
-        self._converter = Converter()
+        maker = PlaneMaker("rgb24")
+        self.frames = [maker.make((rgb,)) for rgb in clips.make(spec)]
 
-    def frames(self, pixel_format: str) -> Iterator[av.VideoFrame]:
-        """The frames for an encoder."""
-        for rgb in self.rgb:
-            yield self._converter.convert(plain_frame((rgb,), "rgb24"), pixel_format)
+    def pictures(self, pixel_format: str) -> Iterator[av.VideoFrame]:
+        """The frames for an encoder; in 10 bits the same pictures."""
+        for planes in self.frames:
+            frame = av.VideoFrame(*self.size, pixel_format)
+            for index, samples in enumerate(planes):
+                table = _WIDER[index > 0] if pixel_format.endswith("10le") else None
+                rows = _rows(frame, index, np.uint8 if table is None else np.uint16)
+                rows[...] = samples if table is None else table[samples]
+            yield frame
 
-    def reference(self) -> Iterator[YuvFrame]:
-        """The frames for the scorer."""
-        return map(planes, self.frames("yuv420p"))
+
+# full range, between 8 and 10 bits: luma, and chroma, whose middle is 128 and 512; there and back
+# is what it was
+_EIGHT, _TEN = np.arange(256), np.arange(1024)
+_WIDER = (
+    np.rint(_EIGHT * 1023 / 255).astype(np.uint16),
+    np.rint(512 + (_EIGHT - 128) * 1023 / 255).clip(0, 1023).astype(np.uint16),
+)
+_NARROWER = (
+    np.rint(_TEN * 255 / 1023).astype(np.uint8),
+    np.rint(128 + (_TEN - 512) * 255 / 1023).clip(0, 255).astype(np.uint8),
+)
 
 
-def planes(frame: av.VideoFrame) -> YuvFrame:
+def _rows(frame: av.VideoFrame, index: int, dtype: Any) -> NDArray[Any]:
+    plane: Any = frame.planes[index]
+    return np.frombuffer(plane, dtype).reshape(plane.height, -1)[:, : plane.width]
+
+
+def planes_of(frame: av.VideoFrame) -> Planes:
     """Copies of the planes of a frame of 4:2:0, full range, rounded to 8 bits."""
-    found = []
-    for index, plane in enumerate(frame.planes):
-        shift = 1 if index else 0
-        depth = frame.format.components[index].bits
-        dtype = np.uint8 if depth == 8 else np.uint16
-        rows = np.frombuffer(plane, dtype).reshape(frame.planes[index].height, -1)  # type: ignore[call-overload]
-        seen = rows[: frame.height >> shift, : frame.width >> shift]
-        if depth == 8:
-            found.append(seen.copy())
-        elif index:  # chroma is around the middle of its range, 128 or 512
-            found.append(np.minimum((seen + 2) >> 2, 255).astype(np.uint8))
-        else:
-            found.append(((seen.astype(np.uint32) * 510 + 1023) // 2046).astype(np.uint8))
-    return (found[0], found[1], found[2])
+    if frame.format.components[0].bits == 8:
+        y, u, v = (_rows(frame, index, np.uint8).copy() for index in range(3))
+    else:
+        y, u, v = (_NARROWER[index > 0][_rows(frame, index, np.uint16)] for index in range(3))
+    return y, u, v
 
 
 def encode(clip: Clip, recipe: Recipe, crf: int) -> tuple[list[av.Packet], Any, float]:
     """Packets, the encoder's context, and the CPU seconds that it took."""
     context: Any = av.CodecContext.create(recipe.encoder, "w")
-    height, width = clip.rgb[0].shape[:2]
-    context.width, context.height = width, height
+    context.width, context.height = clip.size
     context.pix_fmt = recipe.pixel_format
     context.time_base = Fraction(1, 30)
     context.framerate = Fraction(30)
@@ -171,7 +198,7 @@ def encode(clip: Clip, recipe: Recipe, crf: int) -> tuple[list[av.Packet], Any, 
     if recipe.parameters:
         options[name[recipe.encoder]] = recipe.parameters
     context.options = options
-    frames = list(clip.frames(recipe.pixel_format))
+    frames = list(clip.pictures(recipe.pixel_format))
     before = time.process_time()
     packets = []
     for number, frame in enumerate(frames):
@@ -181,14 +208,14 @@ def encode(clip: Clip, recipe: Recipe, crf: int) -> tuple[list[av.Packet], Any, 
     return packets, context, time.process_time() - before
 
 
-def decoded(packets: Sequence[av.Packet], context: Any, encoder: str) -> Iterator[YuvFrame]:
+def decoded(packets: Sequence[av.Packet], context: Any, encoder: str) -> Iterator[Planes]:
     """The planes of the decoded frames, in the order shown."""
     names = {"libsvtav1": "libdav1d", "libx264": "h264", "libx265": "hevc"}
     decoder: Any = av.CodecContext.create(names[encoder], "r")
     decoder.extradata = context.extradata
-    found: list[tuple[int, YuvFrame]] = []
+    found: list[tuple[int, Planes]] = []
     for packet in [*packets, None]:
-        found += ((frame.pts, planes(frame)) for frame in decoder.decode(packet))
+        found += ((frame.pts, planes_of(frame)) for frame in decoder.decode(packet))
     return (frame for _, frame in sorted(found, key=lambda pair: pair[0]))
 
 
@@ -198,13 +225,13 @@ def measure(clip: Clip, recipe: Recipe, scorer: Scorer) -> list[Point]:
     for crf in recipe.crf:
         packets, context, cpu = encode(clip, recipe, crf)
         size = sum(packet.size for packet in packets)
-        scores = scorer.score(clip.reference(), decoded(packets, context, recipe.encoder))
+        scores = scorer.score(clip.frames, decoded(packets, context, recipe.encoder))
         if scores.vmaf is None:
             raise SystemExit("no ffmpeg with libvmaf: pip install imageio-ffmpeg")
         points.append(
             Point(
                 crf,
-                size * 8 / 1000 / (len(clip.rgb) / 30),
+                size * 8 / 1000 / (len(clip.frames) / 30),
                 cpu,
                 float(scores.vmaf.mean()),
                 float(np.percentile(scores.vmaf, 5)),
@@ -234,11 +261,13 @@ def rate(
 
 
 def span_of(baseline: Sequence[Point], metric: str) -> tuple[float, float]:
-    """The baseline's range of a metric where its VMAF is in `RANGE`."""
+    """The baseline's range of a metric where its VMAF is in that which is compared."""
+    top = min(RANGE[1], max(point.vmaf for point in baseline))
+    span = (top - (RANGE[1] - RANGE[0]), top)
     if metric == "vmaf":
-        return RANGE
+        return span
     pairs = np.array(sorted((point.vmaf, getattr(point, metric)) for point in baseline)).T
-    low, high = np.interp(RANGE, pairs[0], pairs[1])
+    low, high = np.interp(span, pairs[0], pairs[1])
     return float(low), float(high)
 
 
@@ -259,6 +288,7 @@ def main() -> None:
     )
     chosen = parser.parse_args()
     clips.check_data()
+    os.environ.setdefault("SVT_LOG", "1")  # errors alone
     print_machine()
     print(f"- {chosen.frames} frames of {chosen.size[0]}x{chosen.size[1]}, GOP {GOP}\n", flush=True)
     chosen.folder.mkdir(parents=True, exist_ok=True)
