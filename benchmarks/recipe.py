@@ -12,8 +12,8 @@ to 8 has more VMAF than the clip itself, by 0.1 to 0.2, which is as much as a qu
 A figure is a Bjontegaard rate: how many more bits than the baseline for equal quality, in percent,
 the mean over the qualities that both reach between VMAF 97 and 99.5 (others: those of the baseline
 there), by linear interpolation of the logarithm of the rate. A clip of which the baseline has less
-than 99.5, as those at rest have, is compared over the 2.5 below what it has. "CPU" is that of encoding, over the
-same crf. The baseline is the paper's: SVT-AV1, preset 6, 8 bits.
+than 99.5, as those at rest have, is compared over the 2.5 below what it has. "CPU" is that of
+encoding, over the same crf. The baseline is the paper's: SVT-AV1, preset 6, 8 bits.
 """
 
 from __future__ import annotations
