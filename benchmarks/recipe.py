@@ -37,6 +37,7 @@ import clips
 from measure import parse_size, print_machine
 from mp4ds.scoring import Scorer, find_ffmpeg
 from mp4ds.video.planes import PlaneMaker, Planes
+from mp4ds.video.scheduling import ordinary_scheduling
 
 RANGE = (97.0, 99.5)
 GOP = 60
@@ -200,6 +201,8 @@ def encode(clip: Clip, recipe: Recipe, crf: int) -> tuple[list[av.Packet], Any, 
     context.options = options
     frames = list(clip.pictures(recipe.pixel_format))
     before = time.process_time()
+    with ordinary_scheduling():
+        context.open()
     packets = []
     for number, frame in enumerate(frames):
         frame.pts = number
