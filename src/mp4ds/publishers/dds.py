@@ -8,22 +8,21 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from mp4ds.bags.typedefs import World, ros2_world
-from mp4ds.errors import ConversionError, OptionError
+from mp4ds.errors import OptionError
 from mp4ds.publishers.dds_domain import domain_id, open_participant
 from mp4ds.publishers.dds_ears import Ears
 from mp4ds.publishers.dds_services import serve
 from mp4ds.publishers.dds_types import dds_topic, message_type
 from mp4ds.publishers.dds_writer import Writer, dds_qos
 from mp4ds.publishers.protocol import Controls
-from mp4ds.publishers.qos import CLOCK_QOS, Qos, offered_qos
+from mp4ds.publishers.qos import CLOCK_QOS, Qos
+from mp4ds.publishers.ros2_writers import CLOCK, CLOCK_TYPE, PARTING_S, Writers, clock_message
 from mp4ds.records import Channel, Schema
 
 _DISTRIBUTION = "jazzy"  # its definitions stand in for those that a recording lacks
 _SECOND = 10**9
-_PARTING = 3.0  # seconds that subscribers have at the end
-_CLOCK = "/clock"
-_CDR = b"\0\1\0\0"
 _TIME = struct.Struct("<iI")
+_CDR_HEADER = 4  # bytes
 
 
 class DdsPublisher:
@@ -33,8 +32,7 @@ class DdsPublisher:
     their end to a multiple of 4 bytes, and that messages of the other byte order are turned
     into this machine's.
 
-    Channels of one topic and quality of service have one writer; latched ones have one each,
-    so that late subscribers get the last message of each, as from the recorded publishers.
+    Channels share writers (`Writers`).
 
     Args:
         domain: The DDS domain, 0 to 232; None for that of ROS_DOMAIN_ID, else 0.
@@ -56,13 +54,11 @@ class DdsPublisher:
         node: str = "rosbag2_player",
     ) -> None:
         self._domain = domain_id(domain)
-        self._overrides = dict(overrides)
         self._node = node
         self._types: World = ros2_world(_DISTRIBUTION)
         self._participant = open_participant(self._domain)
         self._ears = Ears(self._participant)
-        self._channels: dict[int, tuple[Channel, Writer]] = {}
-        self._shared: dict[tuple[str, Schema | None, Qos], Writer] = {}
+        self._writers: Writers[Writer] = Writers(overrides)
         self._services: list[Any] = []
         self._clock: Writer | None = None
         self._is_open = True
@@ -74,18 +70,12 @@ class DdsPublisher:
 
     def advertise(self, channel: Channel) -> None:
         """Announce a channel before its first message; see `Publisher`."""
-        if id(channel) in self._channels:
-            return
-        if channel.message_encoding != "cdr":
-            encoding = channel.message_encoding or "of no known encoding"
-            raise ConversionError(channel.topic, f"its messages are {encoding}, not those of ROS 2")
-        qos = offered_qos(channel, self._overrides)
-        key = (channel.topic, channel.schema, qos)
-        writer = None if qos.is_latched else self._shared.get(key)
-        if writer is None:
+
+        def make(qos: Qos) -> Writer:
             kind = message_type(channel, self._types)
-            writer = self._shared[key] = Writer(self._participant, channel.topic, kind, qos)
-        self._channels[id(channel)] = channel, writer
+            return Writer(self._participant, channel.topic, kind, qos)
+
+        self._writers.add(channel, channel.schema, make)
 
     def publish(self, channel: Channel, payload: bytes | memoryview, time_ns: int) -> None:
         """Publish one message of a channel that was advertised; see `Publisher`.
@@ -94,18 +84,18 @@ class DdsPublisher:
             ConversionError: The message is not of its type.
             PublishError: A subscriber takes nothing for 15 s, where all are kept.
         """
-        self._channels[id(channel)][1].write(payload)
+        self._writers[channel].write(payload)
 
     def clock(self, time_ns: int) -> None:
         """Publish the time of the recording as /clock."""
         if self._clock is None:
             kind = message_type(_clock_channel(), self._types)
-            self._clock = Writer(self._participant, _CLOCK, kind, CLOCK_QOS)
-        self._clock.write(_CDR + _TIME.pack(*divmod(time_ns, _SECOND)))
+            self._clock = Writer(self._participant, CLOCK, kind, CLOCK_QOS)
+        self._clock.write(clock_message(time_ns))
 
     def subscribers(self, channel: Channel) -> int:
         """How many subscribers a channel's topic has now."""
-        return self._channels[id(channel)][1].subscribers()
+        return self._writers[channel].subscribers()
 
     def follow_clock(self, on_time: Callable[[int], None]) -> None:
         """Call with each time, nanoseconds, that others publish as /clock."""
@@ -113,7 +103,7 @@ class DdsPublisher:
         from cyclonedds.topic import Topic
 
         kind = message_type(_clock_channel(), self._types)
-        topic = Topic(self._participant, dds_topic(_CLOCK), kind.writes)
+        topic = Topic(self._participant, dds_topic(CLOCK), kind.writes)
         qos = dds_qos(CLOCK_QOS, ignore_own=True)
         reader = DataReader(self._participant, topic, qos=qos)
         self._ears.hear(reader, lambda sample: on_time(_time_of(sample.payload)))
@@ -144,13 +134,12 @@ class DdsPublisher:
         if not self._is_open:
             return
         self._is_open = False
-        end = time.monotonic() + _PARTING
-        for _, writer in self._channels.values():
+        end = time.monotonic() + PARTING_S
+        for writer in self._writers:
             writer.wait(max(0.0, end - time.monotonic()))
         self._ears.close()
         self._services.clear()
-        self._channels.clear()
-        self._shared.clear()
+        self._writers.clear()
         self._clock = None
         self._participant = None
 
@@ -162,10 +151,10 @@ class DdsPublisher:
 
 
 def _clock_channel() -> Channel:
-    return Channel(0, _CLOCK, "cdr", Schema("rosgraph_msgs/msg/Clock", "", b""))
+    return Channel(0, CLOCK, "cdr", Schema(CLOCK_TYPE, "", b""))
 
 
 def _time_of(payload: bytes) -> int:
     """Nanoseconds of a Clock message, which the library has turned into this machine's order."""
-    sec, nanosec = _TIME.unpack_from(payload, len(_CDR))
+    sec, nanosec = _TIME.unpack_from(payload, _CDR_HEADER)
     return int(sec) * _SECOND + int(nanosec)

@@ -12,16 +12,13 @@ from typing import Any
 from mp4ds.errors import ConversionError, OptionError, PublishError
 from mp4ds.publishers.dds_types import dds_topic
 from mp4ds.publishers.protocol import Controls
-from mp4ds.publishers.qos import CLOCK_QOS, Qos, offered_qos
+from mp4ds.publishers.qos import CLOCK_QOS, Qos
+from mp4ds.publishers.ros2_writers import CLOCK, CLOCK_TYPE, PARTING_S, Writers, clock_message
 from mp4ds.publishers.services import PLAYER_SERVICES, Service
 from mp4ds.records import Channel
 
 _SECOND = 10**9
-_PARTING = 3.0  # seconds that subscribers have at the end
 _LOOK = 0.1  # seconds between two looks for who publishes a topic
-_CLOCK = "/clock"
-_CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
-_LITTLE = b"\0\1\0\0"
 
 
 class RclpyPublisher:
@@ -47,14 +44,12 @@ class RclpyPublisher:
         except ImportError as error:
             problem = f"rclpy is missing ({error}); source a ROS 2 first"
             raise PublishError("ROS 2", problem) from None
-        self._overrides = dict(overrides)
         self._context = Context()
         rclpy.init(args=[], context=self._context)
         self._node = rclpy.create_node(node, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._channels: dict[int, tuple[Channel, Any]] = {}
-        self._shared: dict[tuple[str, str, Qos], Any] = {}
+        self._writers: Writers[Any] = Writers(overrides)
         self._clock: Any = None
         self._ended = threading.Event()
         self._threads = [threading.Thread(target=self._spin, name="mp4ds-rclpy", daemon=True)]
@@ -67,18 +62,8 @@ class RclpyPublisher:
 
     def advertise(self, channel: Channel) -> None:
         """Announce a channel before its first message; see `Publisher`."""
-        if id(channel) in self._channels:
-            return
-        if channel.message_encoding != "cdr":
-            encoding = channel.message_encoding or "of no known encoding"
-            raise ConversionError(channel.topic, f"its messages are {encoding}, not those of ROS 2")
-        qos = offered_qos(channel, self._overrides)
-        key = (channel.topic, channel.type_name, qos)
-        publisher = None if qos.is_latched else self._shared.get(key)
-        if publisher is None:
-            publisher = self._create(channel.topic, channel.type_name, qos)
-            self._shared[key] = publisher
-        self._channels[id(channel)] = channel, publisher
+        kind = channel.type_name
+        self._writers.add(channel, kind, partial(self._create, channel.topic, kind))
 
     def _create(self, topic: str, type_name: str, qos: Qos) -> Any:
         """A publisher of rclpy.
@@ -97,7 +82,7 @@ class RclpyPublisher:
 
     def publish(self, channel: Channel, payload: bytes | memoryview, time_ns: int) -> None:
         """Publish one message of a channel that was advertised; see `Publisher`."""
-        self._send(self._channels[id(channel)][1], channel.topic, bytes(payload))
+        self._send(self._writers[channel], channel.topic, bytes(payload))
 
     def _send(self, publisher: Any, topic: str, payload: bytes) -> None:
         try:
@@ -108,17 +93,16 @@ class RclpyPublisher:
     def clock(self, time_ns: int) -> None:
         """Publish the time of the recording as /clock."""
         if self._clock is None:
-            self._clock = self._create(_CLOCK, _CLOCK_TYPE, CLOCK_QOS)
-        payload = _LITTLE + struct.pack("<iI", *divmod(time_ns, _SECOND))
-        self._send(self._clock, _CLOCK, payload)
+            self._clock = self._create(CLOCK, CLOCK_TYPE, CLOCK_QOS)
+        self._send(self._clock, CLOCK, clock_message(time_ns))
 
     def subscribers(self, channel: Channel) -> int:
         """How many subscribers a channel's topic has now."""
-        return int(self._channels[id(channel)][1].get_subscription_count())
+        return int(self._writers[channel].get_subscription_count())
 
     def follow_clock(self, on_time: Callable[[int], None]) -> None:
         """Call with each time, nanoseconds, that others publish as /clock."""
-        self._subscribe(_CLOCK, _CLOCK_TYPE, CLOCK_QOS, lambda raw: on_time(_time_of(raw)))
+        self._subscribe(CLOCK, CLOCK_TYPE, CLOCK_QOS, lambda raw: on_time(_time_of(raw)))
 
     def listen(self, topic: str, on_message: Callable[[], None]) -> None:
         """Call for each message on a topic, from when somebody publishes it."""
@@ -184,9 +168,9 @@ class RclpyPublisher:
 
         if self._ended.is_set():
             return
-        end = time.monotonic() + _PARTING
+        end = time.monotonic() + PARTING_S
         if self._context.ok():
-            for _, publisher in self._channels.values():
+            for publisher in self._writers:
                 left = max(0.0, end - time.monotonic())
                 publisher.wait_for_all_acked(Duration(seconds=left))
         self._ended.set()
