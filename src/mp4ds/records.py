@@ -9,6 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+QOS_KEY = "offered_qos_profiles"
+"""Key of a ROS 2 channel's metadata with the recorded QoS profiles, a YAML text."""
+
+HASH_KEY = "topic_type_hash"
+"""Key of a ROS 2 channel's metadata with the hash of its type's description."""
+
 
 @dataclass(frozen=True, slots=True)
 class Schema:

@@ -32,7 +32,7 @@ from mp4ds.bags.typedefs import (
     types_of,
 )
 from mp4ds.errors import ConversionError, OptionError
-from mp4ds.records import Channel, Schema
+from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import Typesdict
@@ -232,7 +232,7 @@ class Converter:
         return replace(channel, message_encoding="ros1", schema=schema, metadata=known)
 
     def _ros1_channel(self, channel: Channel, plan: _Plan) -> Channel:
-        qos = channel.metadata.get("offered_qos_profiles", "")
+        qos = channel.metadata.get(QOS_KEY, "")
         metadata = {"md5sum": plan.digest}
         if is_latched(channel):
             metadata["latching"] = "1"
@@ -243,8 +243,8 @@ class Converter:
 
 def _ros2_channel(channel: Channel, plan: _Plan) -> Channel:
     metadata = {
-        "offered_qos_profiles": LATCHED_QOS if is_latched(channel) else "",
-        "topic_type_hash": plan.digest,
+        QOS_KEY: LATCHED_QOS if is_latched(channel) else "",
+        HASH_KEY: plan.digest,
         **{_ROS1 + key: value for key, value in channel.metadata.items()},
         _ROS1 + "type": channel.type_name,
     }
@@ -261,7 +261,7 @@ def is_latched(channel: Channel) -> bool:
     """Whether those that subscribe late get the last message: latching, or transient local."""
     if channel.metadata.get("latching", "").lower() in ("1", "true"):
         return True
-    qos = channel.metadata.get("offered_qos_profiles", "")
+    qos = channel.metadata.get(QOS_KEY, "")
     found = re.findall(r"durability[\"']?\s*:\s*[\"']?(\w+)", qos)
     return bool(found) and set(found) <= {"1", "transient_local"}
 

@@ -9,7 +9,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from mp4ds.bags.convert import LATCHED_QOS
-from mp4ds.records import Channel, Schema
+from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 
 
 def ros1_channel(channel_id: int, topic: str, type_name: str, callerid: str) -> Channel:
@@ -47,13 +47,13 @@ def ros2_channel(channel_id: int, topic: str, type_name: str) -> Channel:
         topic,
         "cdr",
         Schema(type_name, "ros2msg", definition.encode()),
-        {"offered_qos_profiles": "", "topic_type_hash": store.hash_rihs01(type_name)},
+        {QOS_KEY: "", HASH_KEY: store.hash_rihs01(type_name)},
     )
 
 
 def latched(channel: Channel) -> Channel:
     """The same ROS 2 channel, which gives those that subscribe late its last message."""
-    return replace(channel, metadata={**channel.metadata, "offered_qos_profiles": LATCHED_QOS})
+    return replace(channel, metadata={**channel.metadata, QOS_KEY: LATCHED_QOS})
 
 
 @lru_cache(maxsize=1)

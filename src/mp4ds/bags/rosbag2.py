@@ -26,12 +26,13 @@ from mp4ds.bags.rosbag2_metadata import (
     parse_bag_info,
     read_bag_info,
 )
-from mp4ds.bags.rosbag2_sqlite import QOS_KEY, SqliteReader
+from mp4ds.bags.rosbag2_sqlite import SqliteReader
 from mp4ds.bags.rosbag2_write import Rosbag2Writer
 from mp4ds.bags.zstd_files import ZstdFile, copy_file, decompress_file, is_zstd
 from mp4ds.errors import SourceError, SourceNotFoundError
 from mp4ds.records import (
     EVERYTHING,
+    QOS_KEY,
     Channel,
     ChannelStats,
     Excerpt,

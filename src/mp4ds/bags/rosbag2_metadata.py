@@ -12,9 +12,8 @@ from typing import Any
 import yaml
 
 from mp4ds.bags.mcap_records import SALVAGE_REMEDY
-from mp4ds.bags.rosbag2_sqlite import HASH_KEY, QOS_KEY
 from mp4ds.errors import SourceError
-from mp4ds.records import Channel, Schema
+from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 
 METADATA_FILE = "metadata.yaml"
 NEWEST_VERSION = 9

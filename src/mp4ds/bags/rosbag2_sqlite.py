@@ -14,10 +14,7 @@ from numpy.typing import NDArray
 
 from mp4ds.bags.mcap_records import SALVAGE_REMEDY, DamageError, open_source
 from mp4ds.errors import SourceError
-from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Schema
-
-QOS_KEY = "offered_qos_profiles"
-HASH_KEY = "topic_type_hash"
+from mp4ds.records import EVERYTHING, HASH_KEY, Channel, ChannelStats, Excerpt, Message, Schema
 
 _MAGIC = b"SQLite format 3\0"
 _TOPIC_COLUMNS = ("id", "name", "type", "serialization_format")

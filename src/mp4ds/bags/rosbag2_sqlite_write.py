@@ -15,9 +15,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 
-from mp4ds.bags.rosbag2_sqlite import HASH_KEY, QOS_KEY
 from mp4ds.errors import ConversionError
-from mp4ds.records import Channel, Message, Schema
+from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Message, Schema
 
 _WITHOUT_QOS, _WITHOUT_HASHES, _NEWEST = 1, 3, 4  # schemas; 2 differs from 3 by no topic
 

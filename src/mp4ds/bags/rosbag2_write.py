@@ -23,10 +23,9 @@ from mp4ds.bags.rosbag2_metadata import (
     native_qos,
     parse_bag_info,
 )
-from mp4ds.bags.rosbag2_sqlite import HASH_KEY, QOS_KEY
 from mp4ds.bags.rosbag2_sqlite_write import SqliteWriter
 from mp4ds.errors import OptionError, SourceError
-from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
+from mp4ds.records import HASH_KEY, QOS_KEY, Attachment, Channel, Message, MetadataRecord, Schema
 
 _EMPTY_START = 2**63 - 1  # what rosbag2 writes where there is no message
 _SUFFIXES = {"sqlite3": "db3", "mcap": "mcap"}

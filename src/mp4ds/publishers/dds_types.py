@@ -18,13 +18,10 @@ from mp4ds.bags.typedefs import (
     types_of,
 )
 from mp4ds.errors import ConversionError
-from mp4ds.records import Channel
+from mp4ds.records import HASH_KEY, Channel
 
 Types = dict[str, Any]
 """Definitions by name, as `types_of` finds them."""
-
-HASH_KEY = "topic_type_hash"
-"""Key of a channel's metadata with the type hash."""
 
 _FILLER = "structure_needs_at_least_one_member"
 _NAME = re.compile(r"[A-Za-z]\w*(?:/[A-Za-z]\w*)+", re.ASCII)

@@ -11,13 +11,10 @@ import yaml
 
 from mp4ds.bags.rosbag2_metadata import native_qos
 from mp4ds.errors import OptionError
-from mp4ds.records import Channel
+from mp4ds.records import QOS_KEY, Channel
 
 PLAYER_DEPTH = 10
 """What rosbag2 keeps of a topic: recordings do not know the depth of their publishers."""
-
-QOS_KEY = "offered_qos_profiles"
-"""Key of a channel's metadata with the recorded profiles, a YAML text."""
 
 _MAX_BYTES = 2**20
 _MAX_DEPTH = 2**31 - 1

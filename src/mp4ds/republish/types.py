@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.typedefs import World, make_store, ros1_world, ros2_world, types_of
-from mp4ds.records import Channel, Schema
+from mp4ds.records import HASH_KEY, Channel, Schema
 from mp4ds.republish import packets
 from mp4ds.republish.packets import VideoFields
 from mp4ds.wire import Fields, Slots, plain_message
@@ -40,7 +40,7 @@ _DEFINITIONS = {  # of the types that are not among the standard ones
     ),
 }
 _WIRES = {"ros1": "ros1", "cdr": "cdr-le"}
-_HASHES = {"ros1": "md5sum", "cdr": "topic_type_hash"}
+_HASHES = {"ros1": "md5sum", "cdr": HASH_KEY}
 _DEFINITION = "message_definition"
 _REMEMBERED = "ros1:"  # begins keys that tell what a ROS 2 channel was in ROS 1
 _OF_TYPE = ("type", "md5sum", _DEFINITION)
@@ -155,7 +155,7 @@ class Types:
 def _is_kept(key: str) -> bool:
     """Whether metadata belongs to the topic, and not to the type of its messages."""
     plain = key.removesuffix(";base64").removeprefix(_REMEMBERED)
-    return plain not in (*_OF_TYPE, "topic_type_hash") and key != "topic;base64"
+    return plain not in (*_OF_TYPE, HASH_KEY) and key != "topic;base64"
 
 
 def _generated(schema: Schema, world: World) -> tuple[Schema, str]:

@@ -17,7 +17,6 @@ from mp4ds.bags.mcap_records import unzstd
 from mp4ds.bags.ordering import HoldBack, Part, merged
 from mp4ds.bags.protocols import Format
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, RECORD, TABLES_RECORD
-from mp4ds.bags.rosbag2_sqlite import QOS_KEY
 from mp4ds.bags.salvage.losses import bounded
 from mp4ds.bags.salvage.mcap import McapSalvage
 from mp4ds.bags.salvage.reader import Salvage
@@ -26,7 +25,7 @@ from mp4ds.bags.salvage.sqlite import SqliteSalvage
 from mp4ds.bags.salvage.zstd_stream import ZstdStream
 from mp4ds.bags.zstd_files import MAGIC as ZSTD_MAGIC
 from mp4ds.errors import SourceError
-from mp4ds.records import Channel, Loss, Message, MetadataRecord, Record, Schema
+from mp4ds.records import QOS_KEY, Channel, Loss, Message, MetadataRecord, Record, Schema
 
 Storage = McapSalvage | SqliteSalvage
 
