@@ -6,7 +6,6 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from mp4ds.bags.mcap import McapReader, is_mcap
 from mp4ds.bags.mcap_records import SALVAGE_REMEDY, unzstd
-from mp4ds.bags.ordering import HoldBack, Part, merged
+from mp4ds.bags.ordering import Part, merged
 from mp4ds.bags.protocols import Format
 from mp4ds.bags.rosbag2_metadata import (
     METADATA_FILE,
@@ -26,13 +25,13 @@ from mp4ds.bags.rosbag2_metadata import (
     parse_bag_info,
     read_bag_info,
 )
+from mp4ds.bags.rosbag2_parts import SharedChannels, consecutive
 from mp4ds.bags.rosbag2_sqlite import SqliteReader
 from mp4ds.bags.rosbag2_write import Rosbag2Writer
 from mp4ds.bags.zstd_files import ZstdFile, copy_file, decompress_file, is_zstd
 from mp4ds.errors import SourceError, SourceNotFoundError
 from mp4ds.records import (
     EVERYTHING,
-    QOS_KEY,
     Channel,
     ChannelStats,
     Excerpt,
@@ -83,10 +82,6 @@ class Rosbag2Reader:
             self._info = _sibling_info(path)
         head = [path / METADATA_FILE] if path.is_dir() else []
         self.files: Sequence[Path] = [*head, *self._storage_files]
-        self._channels: dict[tuple[tuple[object, ...], int], Channel] = {}
-        self._shared: dict[tuple[int, int], Channel] = {}
-        self._seen: Counter[tuple[int, tuple[object, ...]]] = Counter()
-        self._schemas: dict[Schema, None] = {}
         self._unpacked: ExitStack | None = None
         self._active: list[tuple[int, StorageReader]] = []
         self._done = 0
@@ -94,10 +89,11 @@ class Rosbag2Reader:
         mcaps = [reader for reader in self._readers if isinstance(reader, McapReader)]
         self.library = mcaps[0].library if mcaps else ""
         self._storage = "mcap" if mcaps else "sqlite3" if self._readers else ""
+        self._channels = SharedChannels(self._info, self._storage, is_folder=path.is_dir())
         self._is_packed = [reader is None for reader in self._readers]
         for number, reader in enumerate(self._readers):
             if reader:
-                self._take_over(number, reader)
+                self._channels.take_over(number, reader)
         if self._readers and self._readers[0] is None:
             self._unpack_first()
         self._tables = {
@@ -106,7 +102,7 @@ class Rosbag2Reader:
             if isinstance(reader, SqliteReader)
         }
         if all(reader is not None and _is_complete(reader) for reader in self._readers):
-            self._add_listed_topics()
+            self._channels.add_listed()
 
     def _storage_reader(self, file: Path) -> StorageReader | None:
         """The reader of a storage file; None where it must be decompressed or fetched first."""
@@ -129,7 +125,7 @@ class Rosbag2Reader:
         with ExitStack() as stack:
             reader = stack.enter_context(self._opened(0))
             self._readers[0] = reader
-            self._take_over(0, reader)
+            self._channels.take_over(0, reader)
             self._unpacked = stack.pop_all()
 
     @contextmanager
@@ -151,55 +147,15 @@ class Rosbag2Reader:
             self._unpacked.close()
             self._unpacked = None
 
-    def _take_over(self, number: int, reader: StorageReader) -> None:
-        """Make all that a storage file declares part of the recording."""
-        for channel in reader.channels:
-            self._share(number, channel)
-        self._schemas.update(dict.fromkeys(reader.unused_schemas))
-
-    def _share(self, number: int, channel: Channel) -> Channel:
-        """The recording's channel for one of a storage file."""
-        known = self._shared.get((number, channel.id))
-        if known:
-            return known
-        channel = self._with_listed_qos(channel)
-        # Equal channels of one file stay apart; those of several files are one.
-        place = number, channel.identity
-        key = channel.identity, self._seen[place]
-        self._seen[place] += 1
-        shared = self._channels.setdefault(key, replace(channel, id=len(self._channels)))
-        self._shared[number, channel.id] = shared
-        return shared
-
-    def _with_listed_qos(self, channel: Channel) -> Channel:
-        """A topic of a database without a column for QoS, with what metadata.yaml tells."""
-        if self._storage == "mcap" or not self._info or QOS_KEY in channel.metadata:
-            return channel
-        for topic in self._info.topics:
-            if topic.qos and (topic.name, topic.type_name) == (channel.topic, channel.type_name):
-                return replace(channel, metadata={**channel.metadata, QOS_KEY: topic.qos})
-        return channel
-
-    def _add_listed_topics(self) -> None:
-        """Topics without messages may stand in metadata.yaml alone."""
-        if not self._info or not self.path.is_dir():
-            return
-        known = {(channel.topic, channel.type_name) for channel in self._channels.values()}
-        for topic in self._info.topics:
-            if (topic.name, topic.type_name) not in known:
-                channel = topic.to_channel(len(self._channels))
-                self._channels[channel.identity, 0] = channel
-
     @property
     def channels(self) -> Sequence[Channel]:
         """See `BagReader.channels`."""
-        return list(self._channels.values())
+        return self._channels.all
 
     @property
     def unused_schemas(self) -> Sequence[Schema]:
         """See `BagReader.unused_schemas`."""
-        used = {channel.schema for channel in self._channels.values()}
-        return [schema for schema in self._schemas if schema not in used]
+        return self._channels.unused_schemas
 
     @property
     def skipped(self) -> Mapping[str, int]:
@@ -252,47 +208,31 @@ class Rosbag2Reader:
             )
         else:
             yield from filter(excerpt.has, self._consecutive_records(excerpt))
-        self._add_listed_topics()
+        self._channels.add_listed()
 
     def _consecutive_records(self, excerpt: Excerpt) -> Iterator[Record]:
         """What an excerpt needs at least, file by file."""
-        held = HoldBack()
         part = EVERYTHING if excerpt.has_messages else excerpt
-        for number in range(len(self._storage_files)):
-            until = self._later_start(number)
-            for record in self._file_records(number, part):
-                if isinstance(record, Message) and (
-                    held or (until is not None and record.log_time > until)
-                ):
-                    held.add(record)
-                    now = record.log_time
-                    yield from held.release(now if until is None else min(now, until))
-                else:
-                    yield record
-        yield from held.release(None)
+        return consecutive(self._readers, lambda number: self._file_records(number, part))
 
     def _file_records(self, number: int, excerpt: Excerpt) -> Iterator[Record]:
         with self._opened(number) as reader:
-            self._take_over(number, reader)
+            self._channels.take_over(number, reader)
             if isinstance(reader, SqliteReader) and number not in self._tables:
                 yield MetadataRecord(TABLES_RECORD, reader.tables)
             self._active.append((number, reader))
             try:
                 for record in reader.records(excerpt):
                     if isinstance(record, Message):
-                        yield record.of_channel(self._share(number, record.channel))
+                        yield record.of_channel(self._channels.share(number, record.channel))
                     else:
                         yield record
             finally:
                 self._active.remove((number, reader))
-            self._take_over(number, reader)
+            self._channels.take_over(number, reader)
         self._done += self._storage_files[number].stat().st_size
         if number == 0:
             self._drop_unpacked()
-
-    def _later_start(self, number: int) -> int | None:
-        starts = [reader.start for reader in self._readers[number + 1 :] if reader]
-        return min((start for start in starts if start is not None), default=None)
 
     def _info_record(self) -> MetadataRecord:
         content = {
@@ -313,9 +253,9 @@ class Rosbag2Reader:
             if not reader or not _is_complete(reader) or (reader.channels and not stats):
                 return {}
             for channel in reader.channels:
-                shared = self._share(number, channel).id
+                shared = self._channels.share(number, channel).id
                 total[shared] = total.get(shared, _NO_STATS).plus(stats.get(channel.id, _NO_STATS))
-        for channel in self._channels.values():
+        for channel in self._channels.all:
             total.setdefault(channel.id, _NO_STATS)
         return total
 
@@ -327,7 +267,7 @@ class Rosbag2Reader:
                 times = reader.times()
                 for channel in reader.channels:
                     if channel.id in times:
-                        shared = self._share(number, channel)
+                        shared = self._channels.share(number, channel)
                         found.setdefault(shared.id, []).append(times[channel.id])
         return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items()}
 
@@ -339,7 +279,7 @@ class Rosbag2Reader:
                 continue
             with self._opened(number) as reader:
                 for own in reader.channels:
-                    if self._share(number, own).id != channel.id:
+                    if self._channels.share(number, own).id != channel.id:
                         continue
                     message = reader.first(own)
                     if message and (best is None or message.log_time < best.log_time):

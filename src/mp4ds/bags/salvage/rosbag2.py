@@ -7,16 +7,16 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
 
 from mp4ds.bags.mcap import is_mcap
 from mp4ds.bags.mcap_records import unzstd
-from mp4ds.bags.ordering import HoldBack, Part, merged
+from mp4ds.bags.ordering import Part, merged
 from mp4ds.bags.protocols import Format
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, RECORD, TABLES_RECORD
+from mp4ds.bags.rosbag2_parts import SharedChannels, consecutive
 from mp4ds.bags.salvage.losses import bounded
 from mp4ds.bags.salvage.mcap import McapSalvage
 from mp4ds.bags.salvage.reader import Salvage
@@ -25,7 +25,7 @@ from mp4ds.bags.salvage.sqlite import SqliteSalvage
 from mp4ds.bags.salvage.zstd_stream import ZstdStream
 from mp4ds.bags.zstd_files import MAGIC as ZSTD_MAGIC
 from mp4ds.errors import SourceError
-from mp4ds.records import QOS_KEY, Channel, Loss, Message, MetadataRecord, Record, Schema
+from mp4ds.records import Channel, Loss, Message, MetadataRecord, Record, Schema
 
 Storage = McapSalvage | SqliteSalvage
 
@@ -54,10 +54,6 @@ class Rosbag2Salvage(Salvage):
         self._info, self._storage_files, self._missing = find_storage(path)
         has_yaml = path.is_dir() and (path / METADATA_FILE).is_file()
         self._head = [path / METADATA_FILE] if has_yaml else []
-        self._channels: dict[tuple[tuple[object, ...], int], Channel] = {}
-        self._shared: dict[tuple[int, int], Channel] = {}
-        self._seen: Counter[tuple[int, tuple[object, ...]]] = Counter()
-        self._schemas: dict[Schema, None] = {}
         self._active: list[tuple[int, Storage]] = []
         self._done = 0
         self._unpacked = ExitStack()
@@ -69,17 +65,18 @@ class Rosbag2Salvage(Salvage):
         mcaps = [reader for reader in self._readers if isinstance(reader, McapSalvage)]
         self.library = mcaps[0].library if mcaps else ""
         self._storage = "mcap" if mcaps else "sqlite3" if self._readers else ""
+        self._channels = SharedChannels(self._info, self._storage, is_folder=path.is_dir())
         for number, reader in enumerate(self._readers):
             if reader:
-                self._take_over(number, reader)
+                self._channels.take_over(number, reader)
         if self._readers and self._readers[0] is None:
             # Its channels are wanted before anything is read: keep it until it was.
             with contextlib.suppress(SourceError):  # it is told when it is read
                 self._first_copy = self._unpacked.enter_context(self._decompressed(0))
                 self._first_tables = self._first_copy.tables
-                self._take_over(0, self._first_copy)
+                self._channels.take_over(0, self._first_copy)
         if all(reader is not None and _is_complete(reader) for reader in self._readers):
-            self._add_listed_topics()
+            self._channels.add_listed()
 
     def _open_storage(self) -> list[Storage | None]:
         """The readers of the storage files, of which those that cannot be opened are lost."""
@@ -144,55 +141,15 @@ class Rosbag2Salvage(Salvage):
                 expected=file.messages,
             )
 
-    def _take_over(self, number: int, reader: Storage) -> None:
-        """Make all that a storage file declares part of the recording."""
-        for channel in reader.channels:
-            self._share(number, channel)
-        self._schemas.update(dict.fromkeys(reader.unused_schemas))
-
-    def _share(self, number: int, channel: Channel) -> Channel:
-        """The recording's channel for one of a storage file."""
-        known = self._shared.get((number, channel.id))
-        if known:
-            return known
-        channel = self._with_listed_qos(channel)
-        # Equal channels of one file stay apart; those of several files are one.
-        place = number, channel.identity
-        key = channel.identity, self._seen[place]
-        self._seen[place] += 1
-        shared = self._channels.setdefault(key, replace(channel, id=len(self._channels)))
-        self._shared[number, channel.id] = shared
-        return shared
-
-    def _with_listed_qos(self, channel: Channel) -> Channel:
-        """A topic of a database without a column for QoS, with what metadata.yaml tells."""
-        if self._storage == "mcap" or not self._info or QOS_KEY in channel.metadata:
-            return channel
-        for topic in self._info.topics:
-            if topic.qos and (topic.name, topic.type_name) == (channel.topic, channel.type_name):
-                return replace(channel, metadata={**channel.metadata, QOS_KEY: topic.qos})
-        return channel
-
-    def _add_listed_topics(self) -> None:
-        """Topics without messages may stand in metadata.yaml alone."""
-        if not self._info or not self.path.is_dir():
-            return
-        known = {(channel.topic, channel.type_name) for channel in self._channels.values()}
-        for topic in self._info.topics:
-            if (topic.name, topic.type_name) not in known:
-                channel = topic.to_channel(len(self._channels))
-                self._channels[channel.identity, 0] = channel
-
     @property
     def channels(self) -> Sequence[Channel]:
         """See `BagReader.channels`."""
-        return list(self._channels.values())
+        return self._channels.all
 
     @property
     def unused_schemas(self) -> Sequence[Schema]:
         """See `BagReader.unused_schemas`."""
-        used = {channel.schema for channel in self._channels.values()}
-        return [schema for schema in self._schemas if schema not in used]
+        return self._channels.unused_schemas
 
     @property
     def skipped(self) -> Mapping[str, int]:
@@ -227,27 +184,12 @@ class Rosbag2Salvage(Salvage):
                 ]
             )
         else:
-            yield from self._consecutive_records(found)
-        self._add_listed_topics()
+            yield from consecutive(self._readers, lambda number: self._file_records(number, found))
+        self._channels.add_listed()
         lost = [loss for number in sorted(found) for loss in found[number]]
         losses += bounded([*self._missing, *lost])
-        if losses and not self._given and not self._channels:
+        if losses and not self._given and not self.channels:
             raise SourceError(self.path, f"holds no message that can be read: {losses[-1].problem}")
-
-    def _consecutive_records(self, found: dict[int, Sequence[Loss]]) -> Iterator[Record]:
-        held = HoldBack()
-        for number in range(len(self._storage_files)):
-            until = self._later_start(number)
-            for record in self._file_records(number, found):
-                if isinstance(record, Message) and (
-                    held or (until is not None and record.log_time > until)
-                ):
-                    held.add(record)
-                    now = record.log_time
-                    yield from held.release(now if until is None else min(now, until))
-                else:
-                    yield record
-        yield from held.release(None)
 
     def _file_records(self, number: int, found: dict[int, Sequence[Loss]]) -> Iterator[Record]:
         try:
@@ -262,7 +204,7 @@ class Rosbag2Salvage(Salvage):
     def _salvaged_records(self, number: int, found: dict[int, Sequence[Loss]]) -> Iterator[Record]:
         is_packed = self._readers[number] is None
         with self._opened(number) as reader:
-            self._take_over(number, reader)
+            self._channels.take_over(number, reader)
             if is_packed and number > 0 and isinstance(reader, SqliteSalvage):
                 yield MetadataRecord(TABLES_RECORD, reader.tables)
             self._active.append((number, reader))
@@ -270,13 +212,13 @@ class Rosbag2Salvage(Salvage):
                 for record in reader.records():
                     if isinstance(record, Message):
                         self._given += 1
-                        yield record.of_channel(self._share(number, record.channel))
+                        yield record.of_channel(self._channels.share(number, record.channel))
                     else:
                         yield record
             finally:
                 self._active.remove((number, reader))
             found[number] = reader.losses
-            self._take_over(number, reader)
+            self._channels.take_over(number, reader)
 
     def _drop_unpacked(self) -> None:
         self._first_copy = None
@@ -289,10 +231,6 @@ class Rosbag2Salvage(Salvage):
         tb: TracebackType | None,
     ) -> None:
         self._drop_unpacked()
-
-    def _later_start(self, number: int) -> int | None:
-        starts = [reader.start for reader in self._readers[number + 1 :] if reader]
-        return min((start for start in starts if start is not None), default=None)
 
     def _info_record(self) -> MetadataRecord:
         content = {

@@ -1,0 +1,122 @@
+"""What makes one recording of the storage files of a rosbag2 folder."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Protocol
+
+from mp4ds.bags.ordering import HoldBack
+from mp4ds.bags.rosbag2_metadata import BagInfo
+from mp4ds.records import QOS_KEY, Channel, Message, Record, Schema
+
+
+class StorageReader(Protocol):
+    """The reader of a storage file."""
+
+    @property
+    def channels(self) -> Sequence[Channel]:
+        """See `BagReader.channels`."""
+
+    @property
+    def unused_schemas(self) -> Sequence[Schema]:
+        """See `BagReader.unused_schemas`."""
+
+    @property
+    def start(self) -> int | None:
+        """The earliest log time, nanoseconds; None where it is not known."""
+
+
+class SharedChannels:
+    """Channels of the storage files, made those of the recording.
+
+    Args:
+        info: What the metadata.yaml tells, if there is one.
+        storage: ``sqlite3`` or ``mcap``.
+        is_folder: Whether all that the metadata.yaml lists belongs to the recording.
+    """
+
+    def __init__(self, info: BagInfo | None, storage: str, *, is_folder: bool) -> None:
+        self._info = info
+        self._storage = storage
+        self._is_folder = is_folder
+        self._channels: dict[tuple[tuple[object, ...], int], Channel] = {}
+        self._shared: dict[tuple[int, int], Channel] = {}
+        self._seen: Counter[tuple[int, tuple[object, ...]]] = Counter()
+        self._schemas: dict[Schema, None] = {}
+
+    def take_over(self, number: int, reader: StorageReader) -> None:
+        """Make all that a storage file declares part of the recording."""
+        for channel in reader.channels:
+            self.share(number, channel)
+        self._schemas.update(dict.fromkeys(reader.unused_schemas))
+
+    def share(self, number: int, channel: Channel) -> Channel:
+        """The recording's channel for one of a storage file."""
+        known = self._shared.get((number, channel.id))
+        if known:
+            return known
+        channel = self._with_listed_qos(channel)
+        # Equal channels of one file stay apart; those of several files are one.
+        place = number, channel.identity
+        key = channel.identity, self._seen[place]
+        self._seen[place] += 1
+        shared = self._channels.setdefault(key, replace(channel, id=len(self._channels)))
+        self._shared[number, channel.id] = shared
+        return shared
+
+    def _with_listed_qos(self, channel: Channel) -> Channel:
+        """A topic of a database without a column for QoS, with what metadata.yaml tells."""
+        if self._storage == "mcap" or not self._info or QOS_KEY in channel.metadata:
+            return channel
+        for topic in self._info.topics:
+            if topic.qos and (topic.name, topic.type_name) == (channel.topic, channel.type_name):
+                return replace(channel, metadata={**channel.metadata, QOS_KEY: topic.qos})
+        return channel
+
+    def add_listed(self) -> None:
+        """Topics without messages may stand in metadata.yaml alone."""
+        if not self._info or not self._is_folder:
+            return
+        known = {(channel.topic, channel.type_name) for channel in self._channels.values()}
+        for topic in self._info.topics:
+            if (topic.name, topic.type_name) not in known:
+                channel = topic.to_channel(len(self._channels))
+                self._channels[channel.identity, 0] = channel
+
+    @property
+    def all(self) -> Sequence[Channel]:
+        """Those known so far."""
+        return list(self._channels.values())
+
+    @property
+    def unused_schemas(self) -> Sequence[Schema]:
+        """Definitions that none of them refers to."""
+        used = {channel.schema for channel in self._channels.values()}
+        return [schema for schema in self._schemas if schema not in used]
+
+
+def consecutive(
+    readers: Sequence[StorageReader | None], records: Callable[[int], Iterator[Record]]
+) -> Iterator[Record]:
+    """Storage files one after the other, with what overlaps in log-time order.
+
+    Args:
+        readers: Of the files; None for one that is not open yet.
+        records: Reads the file of a number.
+    """
+    held = HoldBack()
+    for number in range(len(readers)):
+        starts = [reader.start for reader in readers[number + 1 :] if reader]
+        until = min((start for start in starts if start is not None), default=None)
+        for record in records(number):
+            if isinstance(record, Message) and (
+                held or (until is not None and record.log_time > until)
+            ):
+                held.add(record)
+                now = record.log_time
+                yield from held.release(now if until is None else min(now, until))
+            else:
+                yield record
+    yield from held.release(None)
