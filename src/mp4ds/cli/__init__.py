@@ -25,18 +25,22 @@ from mp4ds.cli.failures import told_errors
 from mp4ds.cli.imports import imports
 from mp4ds.cli.options import (
     CodecOption,
+    DatasetArgument,
     EveryOption,
     ExcludeOption,
     ForceFlag,
     GopOption,
     JobsOption,
+    JpegQualityOption,
     JsonFlag,
     MaxRateOption,
     MemoryOption,
     PresetOption,
     PurposeOption,
     ResizeOption,
+    RestartFlag,
     TopicsOption,
+    TranscodeFlag,
 )
 from mp4ds.cli.output import (
     print_info,
@@ -102,12 +106,7 @@ def pack(
     ] = "lossless",
     codec: CodecOption = None,
     preset: PresetOption = None,
-    transcode: Annotated[
-        bool,
-        typer.Option(
-            "--transcode", help="Encode JPEG topics anew by --quality, instead of copying them."
-        ),
-    ] = False,
+    transcode: TranscodeFlag = False,
     camera_info: Annotated[
         Optional[list[str]],  # noqa: UP045
         typer.Option(
@@ -148,9 +147,7 @@ def pack(
     salvage: Annotated[
         bool, typer.Option("--salvage", help="Pack what can be read of a damaged recording.")
     ] = False,
-    restart: Annotated[
-        bool, typer.Option("--restart", help="Begin anew where an unfinished pack was left.")
-    ] = False,
+    restart: RestartFlag = False,
     force: ForceFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
@@ -176,7 +173,7 @@ def pack(
             gop=gop,
             window=window,
             jobs=jobs,
-            memory=parse_size(memory) if memory else None,
+            memory=parse_size(memory),
             cluster=cluster,
             join=join,
             keep_going=keep_going,
@@ -203,7 +200,7 @@ def pack(
 
 @app.command()
 def unpack(
-    dataset: Annotated[str, typer.Argument(help="A dataset, or a sidecar beside its video.")],
+    dataset: DatasetArgument,
     to: Annotated[str, typer.Option("--to", help="bag, rosbag2, mcap or images.")],
     output: Annotated[
         Optional[str],  # noqa: UP045
@@ -225,9 +222,7 @@ def unpack(
             "default.",
         ),
     ] = None,
-    jpeg_quality: Annotated[
-        int, typer.Option("--jpeg-quality", min=1, max=100, help="Of JPEG files that are made.")
-    ] = 95,
+    jpeg_quality: JpegQualityOption = 95,
     resize: ResizeOption = None,
     every: EveryOption = 1,
     max_rate: MaxRateOption = None,
@@ -251,7 +246,7 @@ def unpack(
             image_format=image_format,
             images=images,
             jpeg_quality=jpeg_quality,
-            resize=parse_resize(resize) if resize is not None else None,
+            resize=parse_resize(resize),
             every=every,
             max_rate=max_rate,
             force=force,

@@ -10,12 +10,14 @@ from mp4ds.errors import OptionError
 _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
 
 
-def parse_size(text: str) -> int:
-    """Bytes of ``8G``, ``500M`` or ``1.5GB``; units of 1024.
+def parse_size(text: str | None) -> int | None:
+    """Bytes of ``8G``, ``500M`` or ``1.5GB``; units of 1024. None where nothing is given.
 
     Raises:
         OptionError: It is no size.
     """
+    if not text:
+        return None
     match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) *([kmgt]?)(?:i?b)?", text.strip().lower())
     size = int(float(match[1]) * _UNITS[match[2]]) if match else 0
     if not size:
@@ -55,12 +57,14 @@ def spelled(arguments: Sequence[str]) -> list[str]:
     return made
 
 
-def parse_resize(text: str) -> float | tuple[int, int]:
-    """A factor, or width and height, of ``0.5`` or ``640x480``.
+def parse_resize(text: str | None) -> float | tuple[int, int] | None:
+    """A factor, or width and height, of ``0.5`` or ``640x480``. None where nothing is given.
 
     Raises:
         OptionError: It is neither.
     """
+    if text is None:
+        return None
     match = re.fullmatch(r"([0-9]{1,6})x([0-9]{1,6})", text.strip().lower())
     if match:
         return int(match[1]), int(match[2])

@@ -107,7 +107,7 @@ def export(
         options = ExportOptions(
             topics=topics or (),
             exclude=exclude or (),
-            resize=parse_resize(resize) if resize is not None else None,
+            resize=parse_resize(resize),
             every=every,
             max_rate=max_rate,
             pixels=pixels,

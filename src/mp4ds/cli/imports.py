@@ -17,6 +17,8 @@ from mp4ds.cli.options import (
     MemoryOption,
     PresetOption,
     PurposeOption,
+    RestartFlag,
+    TranscodeFlag,
 )
 from mp4ds.cli.output import print_json, print_pack
 from mp4ds.cli.progress import pack_progress
@@ -80,19 +82,12 @@ def images(
     ] = "lossless",
     codec: CodecOption = None,
     preset: PresetOption = None,
-    transcode: Annotated[
-        bool,
-        typer.Option(
-            "--transcode", help="Encode JPEG files anew by --quality, instead of copying them."
-        ),
-    ] = False,
+    transcode: TranscodeFlag = False,
     purpose: PurposeOption = None,
     gop: GopOption = None,
     jobs: JobsOption = None,
     memory: MemoryOption = None,
-    restart: Annotated[
-        bool, typer.Option("--restart", help="Begin anew where an unfinished run was left.")
-    ] = False,
+    restart: RestartFlag = False,
     force: ForceFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
@@ -114,7 +109,7 @@ def images(
             purpose=purpose,
             gop=gop,
             jobs=jobs,
-            memory=parse_size(memory) if memory else None,
+            memory=parse_size(memory),
             restart=restart,
             force=force,
             images=ImageFolder(

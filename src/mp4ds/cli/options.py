@@ -6,6 +6,7 @@ from typing import Annotated, Optional
 
 import typer
 
+DatasetArgument = Annotated[str, typer.Argument(help="A dataset, or a sidecar beside its video.")]
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 TopicsOption = Annotated[
     Optional[list[str]],  # noqa: UP045 - read at run time by typer
@@ -27,6 +28,9 @@ MaxRateOption = Annotated[
     Optional[float],  # noqa: UP045
     typer.Option("--max-rate", metavar="HZ", help="So many frames a second at most."),
 ]
+JpegQualityOption = Annotated[
+    int, typer.Option("--jpeg-quality", min=1, max=100, help="Of JPEG files that are made.")
+]
 
 # of what makes videos
 CodecOption = Annotated[
@@ -40,6 +44,12 @@ CodecOption = Annotated[
 PresetOption = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option("--preset", help="The encoder's preset, such as 6, veryfast or p4."),
+]
+TranscodeFlag = Annotated[
+    bool,
+    typer.Option(
+        "--transcode", help="Encode JPEG images anew by --quality, instead of copying them."
+    ),
 ]
 PurposeOption = Annotated[
     Optional[str],  # noqa: UP045
@@ -67,4 +77,7 @@ JobsOption = Annotated[
 MemoryOption = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option("--memory", metavar="SIZE", help="Such as 8G; half of the machine's by default."),
+]
+RestartFlag = Annotated[
+    bool, typer.Option("--restart", help="Begin anew where an unfinished run was left.")
 ]

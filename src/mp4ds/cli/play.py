@@ -6,18 +6,23 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import Annotated, Any, Optional
 
 import typer
 
 from mp4ds.cli.arguments import parse_resize
 from mp4ds.cli.failures import told_errors
+from mp4ds.cli.options import (
+    EveryOption,
+    JpegQualityOption,
+    JsonFlag,
+    MaxRateOption,
+    ResizeOption,
+    TopicsOption,
+)
 from mp4ds.cli.output import print_json
 from mp4ds.cli.play_output import play_progress, print_play, tell
 from mp4ds.errors import OptionError
-
-if TYPE_CHECKING:
-    pass
 
 _DEFAULT_CLOCK_HZ = 100.0
 
@@ -49,10 +54,7 @@ def play(
     pause: Annotated[
         bool, typer.Option("--pause", "--start-paused", "-p", help="Stand still at first.")
     ] = False,
-    topics: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option("--topics", "-t", metavar="GLOB", help="Only topics that match."),
-    ] = None,
+    topics: TopicsOption = None,
     exclude: Annotated[
         Optional[list[str]],  # noqa: UP045
         typer.Option(
@@ -103,20 +105,10 @@ def play(
             "--publish-as", help="Cameras as raw, compressed (JPEG) or ffmpeg (video packets)."
         ),
     ] = None,
-    jpeg_quality: Annotated[
-        int, typer.Option("--jpeg-quality", min=1, max=100, help="Of JPEG files that are made.")
-    ] = 95,
-    resize: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option("--resize", metavar="0.5|WxH", help="Smaller images, calibrations to match."),
-    ] = None,
-    every: Annotated[
-        int, typer.Option("--every", min=1, metavar="N", help="Every Nth frame only.")
-    ] = 1,
-    max_rate: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option("--max-rate", metavar="HZ", help="At most so many frames a second."),
-    ] = None,
+    jpeg_quality: JpegQualityOption = 95,
+    resize: ResizeOption = None,
+    every: EveryOption = 1,
+    max_rate: MaxRateOption = None,
     read_ahead: Annotated[
         int,
         typer.Option(
@@ -150,7 +142,7 @@ def play(
     progress: Annotated[
         bool, typer.Option("--progress/--no-progress", help="A line that tells where it is.")
     ] = True,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    as_json: JsonFlag = False,
 ) -> None:
     """Publish datasets as if they were the recording: into ROS 1, ROS 2 or Foxglove.
 
@@ -159,7 +151,8 @@ def play(
     from mp4ds.playing import PlayOptions, open_player
 
     with told_errors(as_json), ExitStack() as stack:
-        chosen = [name for name, on in _kinds(ros1, ros2, foxglove) if on]
+        kinds = {"ros1": ros1, "ros2": ros2, "foxglove": foxglove}
+        chosen = [name for name, on in kinds.items() if on]
         if len(chosen) > 1:
             raise OptionError(f"--{chosen[0]} contradicts --{chosen[1]}.")
         options = PlayOptions(
@@ -182,7 +175,7 @@ def play(
             qos_overrides=qos_overrides,
             publish_as=publish_as,
             jpeg_quality=jpeg_quality,
-            resize=parse_resize(resize) if resize is not None else None,
+            resize=parse_resize(resize),
             every=every,
             max_rate=max_rate,
             read_ahead=read_ahead,
@@ -209,10 +202,6 @@ def play(
         print_play(summary)
     if caught:
         raise typer.Exit(128 + caught[0])
-
-
-def _kinds(ros1: bool, ros2: bool, foxglove: bool) -> list[tuple[str, bool]]:
-    return [("ros1", ros1), ("ros2", ros2), ("foxglove", foxglove)]
 
 
 @contextmanager

@@ -10,6 +10,7 @@ import typer
 
 from mp4ds.cli.arguments import parse_resize
 from mp4ds.cli.failures import told_errors
+from mp4ds.cli.options import DatasetArgument, ForceFlag, JsonFlag
 from mp4ds.cli.output import print_json, say, size_text, status_line
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def report(
-    dataset: Annotated[str, typer.Argument(help="A dataset, or a sidecar beside its video.")],
+    dataset: DatasetArgument,
     output: Annotated[
         Optional[Path],  # noqa: UP045 - read at run time by typer
         typer.Option(
@@ -51,7 +52,7 @@ def report(
     force: Annotated[
         bool, typer.Option("--force", "-f", help="Replace an index.html that is no report.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    as_json: JsonFlag = False,
 ) -> None:
     """Make a page of a dataset: all cameras in step, timing, topics, calibrations.
 
@@ -109,7 +110,7 @@ def _serve(summary: ReportSummary, port: int, as_json: bool) -> None:
 
 
 def frames(
-    dataset: Annotated[str, typer.Argument(help="A dataset, or a sidecar beside its video.")],
+    dataset: DatasetArgument,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="IMAGE", help="A .png or .jpg to make.")
     ],
@@ -137,10 +138,8 @@ def frames(
         bool,
         typer.Option("--exact", help="The samples as recorded, as unpack --to images has them."),
     ] = False,
-    force: Annotated[
-        bool, typer.Option("--force", "-f", help="Replace an existing output.")
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    force: ForceFlag = False,
+    as_json: JsonFlag = False,
 ) -> None:
     """Save the frame of a time as an image, or many frames as a contact sheet."""
     from mp4ds.report.stills import StillOptions, parse_sheet
@@ -151,7 +150,7 @@ def frames(
             topic=topic,
             at=at,
             sheet=parse_sheet(sheet) if sheet is not None else None,
-            resize=parse_resize(resize) if resize is not None else None,
+            resize=parse_resize(resize),
             exact=exact,
             force=force,
         )
