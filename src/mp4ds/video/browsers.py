@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import Any
-
-from av.error import FFmpegError
 
 from mp4ds.errors import VideoError
 from mp4ds.video.media import Media
@@ -27,20 +26,12 @@ def why_not_in_browsers(path: Path) -> str:
     Raises:
         VideoError: It cannot be read.
     """
-    if not path.is_file():
-        raise VideoError("file-missing", path, "does not exist")
-    try:
-        media = Media(path)
-    except (FFmpegError, OSError) as error:
-        raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
-    try:
+    with closing(Media(path)) as media:
         tracks = media.container.streams.video
         context: Any = tracks[0].codec_context if tracks else None
         if context is None or context.codec is None:
             raise VideoError("video-unreadable", path, "has no video track of a known codec")
         name, pixel_format = context.codec.canonical_name, context.pix_fmt
-    finally:
-        media.close()
     if name not in _PLAYED:
         return f"no browser plays {name}"
     if pixel_format not in _PLAYED[name]:

@@ -76,12 +76,7 @@ class VideoDecoder:
             fast_colour=fast_colour,
         )
         self._ticks: np.ndarray[tuple[int], np.dtype[np.int64]] | None = None
-        if not path.is_file():
-            raise VideoError("file-missing", path, "does not exist")
-        try:
-            self._media = Media(path)
-        except (FFmpegError, OSError) as error:
-            raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
+        self._media = Media(path)
         self._container = self._media.container
         try:
             self._check(codec, coded_size)

@@ -45,12 +45,7 @@ class VideoFile:
         self._path = path
         self._frames: Iterator[av.VideoFrame] = iter(())
         self._last: int | None = None
-        if not path.is_file():
-            raise VideoError("file-missing", path, "does not exist")
-        try:
-            self._media = Media(path)
-        except (FFmpegError, OSError) as error:
-            raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
+        self._media = Media(path)
         try:
             self._stream = self._video_track()
             context: Any = self._stream.codec_context

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import av
+from av.error import FFmpegError
 
-from mp4ds.errors import RemoteError
+from mp4ds.errors import RemoteError, VideoError
 from mp4ds.remote import remote
 
 
@@ -21,12 +22,19 @@ class Media:
         container: PyAV's.
 
     Raises:
-        FFmpegError: It is no video.
-        OSError: It cannot be read.
+        VideoError: ``file-missing`` or ``video-unreadable``.
         RemoteError: It is at a URL, and cannot be read there.
     """
 
     def __init__(self, path: Path) -> None:
+        if not path.is_file():
+            raise VideoError("file-missing", path, "does not exist")
+        try:
+            self._open(path)
+        except (FFmpegError, OSError) as error:
+            raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
+
+    def _open(self, path: Path) -> None:
         self._file = _Source(path.open("rb")) if remote(path) else None
         try:
             # absolute: ffmpeg takes a relative name with a colon for an address

@@ -243,13 +243,7 @@ class PacketReader:
         coded_size: tuple[int, int] | None = None,
     ) -> None:
         self._path = path
-        if not path.is_file():
-            raise VideoError("file-missing", path, "does not exist")
-        try:
-            media = Media(path)
-        except (FFmpegError, OSError) as error:
-            raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
-        with closing(media):
+        with closing(Media(path)) as media:
             container = media.container
             self._check(container, codec, coded_size)
             stream = container.streams.video[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -87,10 +88,7 @@ def decoded_planes(path: Path) -> Iterator[Planes]:
     Raises:
         VideoError: It does not decode, or to something else.
     """
-    try:
-        media = Media(path)
-    except (FFmpegError, OSError) as error:
-        raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
+    media = Media(path)
     try:
         stream = media.container.streams.video[0]
         stream.thread_count = 1
@@ -159,13 +157,10 @@ def packet_sizes(path: Path) -> PacketSizes:
     keys: list[int] = []
     others: list[int] = []
     try:
-        media = Media(path)
-        try:
+        with closing(Media(path)) as media:
             for packet in media.container.demux(media.container.streams.video[0]):
                 if packet.size:
                     (keys if packet.is_keyframe else others).append(packet.size)
-        finally:
-            media.close()
     except (FFmpegError, OSError) as error:
         raise VideoError("video-unreadable", path, f"cannot be read: {error}") from None
     return PacketSizes(tuple(keys), tuple(others))

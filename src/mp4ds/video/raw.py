@@ -55,12 +55,9 @@ def raw_pictures(path: Path, *, is_gray: bool) -> Iterator[RawPicture]:
         Views that hold until the next one is asked for.
 
     Raises:
-        VideoError: ``video-unreadable`` or ``decode-failed``.
+        VideoError: ``file-missing``, ``video-unreadable`` or ``decode-failed``.
     """
-    try:
-        media = Media(path)
-    except (FFmpegError, OSError) as error:
-        raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
+    media = Media(path)
     number = 0
     try:
         for frame in media.container.decode(video=0):
