@@ -15,6 +15,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from mp4ds.bags import ordering
+from mp4ds.bags.by_reading import first_of, sorted_times, times_of, with_own_payload
 from mp4ds.bags.mcap_between import Between, look_between
 from mp4ds.bags.mcap_declared import Declared
 from mp4ds.bags.mcap_excerpt import read_chunks, read_others
@@ -48,8 +49,6 @@ from mp4ds.records import (
 )
 
 __all__ = ["McapReader", "McapWriter"]
-
-_INT64_MAX = np.uint64(2**63 - 1)
 
 
 class McapReader:
@@ -290,16 +289,12 @@ class McapReader:
                     raise stream.damaged(error) from None
             indexed = sum(len(piece) for found in pieces.values() for piece in found)
             if self._summary.covers(indexed):
-                return {key: _sorted(np.concatenate(found)) for key, found in pieces.items()}
+                return {key: sorted_times(np.concatenate(found)) for key, found in pieces.items()}
         return self._times_by_reading()
 
     def _times_by_reading(self) -> dict[int, NDArray[np.int64]]:
-        found: dict[int, list[int]] = {}
         with closing(self._start_pass()) as stream:
-            for record in self._read_through(stream):
-                if isinstance(record, Message):
-                    found.setdefault(record.channel.id, []).append(record.log_time)
-        return {key: _sorted(np.array(times, dtype=np.uint64)) for key, times in found.items()}
+            return times_of(self._read_through(stream))
 
     def first(self, channel: Channel) -> Message | None:
         """The channel's first message by log time, or None.
@@ -342,17 +337,11 @@ class McapReader:
             if head is None or head.channel_id != channel_id:
                 raise DamageError("its message index points beside the messages")
             message = self._declared.message(head, "the first message")
-            yield channel_id, _own_payload(self._unpacked(message))
+            yield channel_id, with_own_payload(self._unpacked(message))
 
     def _first_by_reading(self) -> dict[int, Message]:
-        first: dict[int, Message] = {}
         with closing(self._start_pass()) as stream:
-            for record in self._read_through(stream):
-                if isinstance(record, Message):
-                    known = first.get(record.channel.id)
-                    if known is None or record.log_time < known.log_time:
-                        first[record.channel.id] = _own_payload(record)
-        return first
+            return first_of(self._read_through(stream))
 
     def __enter__(self) -> McapReader:
         return self
@@ -381,18 +370,3 @@ def is_mcap(path: Path, is_compressed: bool) -> bool:
         return ".mcap" in path.suffixes
     with open_source(path) as stream:
         return stream.read(len(MAGIC)) == MAGIC
-
-
-def _own_payload(message: Message) -> Message:
-    # A view would keep the whole chunk in memory for as long as the message is kept.
-    return Message(
-        message.channel,
-        message.log_time,
-        message.publish_time,
-        message.sequence,
-        bytes(message.data),
-    )
-
-
-def _sorted(times: NDArray[np.uint64]) -> NDArray[np.int64]:
-    return np.sort(np.minimum(times, _INT64_MAX)).astype(np.int64)

@@ -17,22 +17,13 @@ from mp4ds.bags.mcap_chunks import ChunkTable
 from mp4ds.bags.mcap_records import (
     FOOTER_BYTES,
     MAGIC,
+    OF_SUMMARY,
     PRIVATE_OPCODE,
     DamageError,
     RecordStream,
     parse,
 )
 from mp4ds.records import ChannelStats
-
-_OF_SUMMARY = {
-    Opcode.SCHEMA,
-    Opcode.CHANNEL,
-    Opcode.STATISTICS,
-    Opcode.CHUNK_INDEX,
-    Opcode.ATTACHMENT_INDEX,
-    Opcode.METADATA_INDEX,
-    Opcode.SUMMARY_OFFSET,
-}
 
 
 class IndexEntries(NamedTuple):
@@ -217,5 +208,5 @@ def _add(summary: Summary, opcode: int, body: bytes) -> None:
         summary.statistics = parse(mcap_records.Statistics, body)
     elif opcode >= PRIVATE_OPCODE:
         summary.private[opcode] += 1
-    elif opcode not in _OF_SUMMARY:
+    elif opcode not in OF_SUMMARY:
         summary.has_data = True

@@ -18,6 +18,7 @@ import zstandard
 from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
 
 from mp4ds.errors import SourceError, SourceNotFoundError
 from mp4ds.remote import expect
@@ -31,6 +32,17 @@ MAGIC = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES = 4 * 2**30
 FOOTER_BYTES = 9 + 20 + len(MAGIC)
 PRIVATE_OPCODE = 0x80
+OF_SUMMARY = frozenset(
+    {
+        Opcode.SCHEMA,
+        Opcode.CHANNEL,
+        Opcode.STATISTICS,
+        Opcode.CHUNK_INDEX,
+        Opcode.ATTACHMENT_INDEX,
+        Opcode.METADATA_INDEX,
+        Opcode.SUMMARY_OFFSET,
+    }
+)
 SALVAGE_REMEDY = "`mp4ds pack --salvage` packs what can be read."
 CUT_SHORT_REMEDY = (
     "The recording was cut short: recover it with `mcap recover`, or not at all; " + SALVAGE_REMEDY

@@ -12,22 +12,13 @@ from mcap import records as mcap_records
 from mcap.opcode import Opcode
 
 from mp4ds.bags.mcap_chunks import ChunkTable
-from mp4ds.bags.mcap_records import FOOTER_BYTES, MAGIC, DamageError, parse
+from mp4ds.bags.mcap_records import FOOTER_BYTES, MAGIC, OF_SUMMARY, DamageError, parse
 from mp4ds.bags.salvage.mcap_framing import McapFraming
 from mp4ds.bags.salvage.scan import Scan
 from mp4ds.bags.salvage.window import Window
 from mp4ds.records import ChannelStats
 
 _MAX_SEARCHED = 256 * 2**20
-_IN_SUMMARY = {
-    Opcode.SCHEMA,
-    Opcode.CHANNEL,
-    Opcode.STATISTICS,
-    Opcode.CHUNK_INDEX,
-    Opcode.ATTACHMENT_INDEX,
-    Opcode.METADATA_INDEX,
-    Opcode.SUMMARY_OFFSET,
-}
 
 
 class SalvagedSummary:
@@ -137,7 +128,7 @@ def _read_from(path: Path, start: int, summary: SalvagedSummary) -> None:
         while frame := scan.next():
             if frame.kind == Opcode.FOOTER:
                 return
-            if frame.kind not in _IN_SUMMARY:
+            if frame.kind not in OF_SUMMARY:
                 break
             body = scan.body(frame)
             if body is not None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol
@@ -12,6 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.bags.by_reading import first_of, times_of
 from mp4ds.bags.protocols import BagReader, Format
 from mp4ds.bags.salvage.losses import LossLog
 from mp4ds.records import (
@@ -111,22 +111,12 @@ class Salvage(ABC):
 
     def times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times of what can be read, by reading it."""
-        found: dict[int, list[int]] = {}
-        for record in self._read([]):
-            if isinstance(record, Message):
-                found.setdefault(record.channel.id, []).append(record.log_time)
-        return {key: _sorted(times) for key, times in found.items()}
+        return times_of(self._read([]))
 
     def first(self, channel: Channel) -> Message | None:
         """The channel's first message by log time, by reading once for all channels."""
         if self._first is None:
-            self._first = {}
-            for record in self._read([]):
-                if isinstance(record, Message):
-                    known = self._first.get(record.channel.id)
-                    if known is None or record.log_time < known.log_time:
-                        own = replace(record, data=bytes(record.data))
-                        self._first[record.channel.id] = own
+            self._first = first_of(self._read([]))
         return self._first.get(channel.id)
 
     def __enter__(self) -> Salvage:
@@ -193,8 +183,3 @@ class FileSalvage(Salvage):
         for _ in self._pass(log):
             pass
         return not log.finish()
-
-
-def _sorted(times: Sequence[int]) -> NDArray[np.int64]:
-    """Log times, sorted; those past the year 2262 as the last one that fits."""
-    return np.sort(np.minimum(np.array(times, np.uint64), np.uint64(2**63 - 1))).astype(np.int64)
