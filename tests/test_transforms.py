@@ -30,7 +30,6 @@ from mp4ds.wire.transforms import (
     MAX_TRANSFORMS,
     Transform,
     TransformCollector,
-    parse_transforms,
     transform_parser,
 )
 
@@ -43,6 +42,10 @@ TREE = [
     Transform("head", "right \u00e4", (0.0, -0.05, 0.0), (-0.5, 0.5, -0.5, 0.5)),
     Transform("base", "lidar", (0.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0)),
 ]
+
+
+def parse_transforms(channel: Channel, data: bytes | memoryview) -> list[Transform]:
+    return transform_parser(channel)(memoryview(data))
 
 
 # ---------------------------------------------------------------- writers of messages

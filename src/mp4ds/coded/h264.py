@@ -12,7 +12,7 @@ from mp4ds.coded.annexb import join_plain, unescape
 from mp4ds.coded.base import BitReader, Refused, check_size
 from mp4ds.coded.pictures import REORDERED, NoPicture, Picture
 
-SLICE, PARTITION_A, IDR, SEI, SPS, PPS, AUD = 1, 2, 5, 6, 7, 8, 9
+SLICE, PARTITION_A, IDR, SPS, PPS, AUD = 1, 2, 5, 7, 8, 9
 _HEADER_BYTES = 1024
 _SLICE_HEADER_BYTES = 64
 _B_SLICE = 1

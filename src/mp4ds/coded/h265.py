@@ -12,7 +12,7 @@ from mp4ds.coded.annexb import join_plain, unescape
 from mp4ds.coded.base import BitReader, Refused, check_size
 from mp4ds.coded.pictures import REORDERED, NoPicture, Picture
 
-VPS, SPS, PPS, AUD, PREFIX_SEI, SUFFIX_SEI = 32, 33, 34, 35, 39, 40
+VPS, SPS, PPS, AUD = 32, 33, 34, 35
 _SLICES = range(32)
 _LEADING = range(6, 10)  # RADL and RASL: shown before the key frame that they follow
 _IRAP = range(16, 24)

@@ -67,22 +67,15 @@ class Transform:
 Parser = Callable[[memoryview], list[Transform]]
 
 
-def parse_transforms(channel: Channel, data: bytes | memoryview) -> list[Transform]:
-    """The transforms of a message, whether they are usable or not.
+def transform_parser(channel: Channel) -> Parser:
+    """What gives the transforms of a channel's messages, whether they are usable or not.
 
     Takes tf2_msgs/TFMessage, tf/tfMessage and the ROS types of foxglove_msgs in ROS 1 and CDR;
     foxglove.FrameTransform and foxglove.FrameTransforms in protobuf (by the recorded descriptor)
     and JSON. Of the latter two, an absent translation is zero and an absent rotation is none.
 
-    Raises:
-        WireError: The type is not one of these, the message does not parse as it, or it is
-            beyond all measure (more than 1 MiB).
-    """
-    return transform_parser(channel)(memoryview(data))
-
-
-def transform_parser(channel: Channel) -> Parser:
-    """What parses the messages of a channel; see `parse_transforms`.
+    It raises `WireError` for a message that does not parse, or is beyond all measure (more than
+    1 MiB).
 
     Raises:
         WireError: The type is none of transforms, or its descriptor does not parse.
