@@ -14,7 +14,7 @@ from mp4ds.bags import BagReader, open_reader
 from mp4ds.dataset import Dataset, Stream
 from mp4ds.records import Channel
 from mp4ds.remote import location
-from mp4ds.sidecar import MANIFEST_NAME
+from mp4ds.sidecar import names_dataset
 from mp4ds.streams import Forms, Unsuited
 from mp4ds.wire import CodedFields, ImageFields, kind_of
 
@@ -84,8 +84,7 @@ def info(path: Path | str) -> Info:
         FormatError: The dataset breaks a rule of the format.
     """
     path = location(path)
-    is_whole = path.is_dir() and (path / MANIFEST_NAME).is_file()
-    if is_whole or (path.suffix in (".yaml", ".yml", ".mp4") and path.exists()):
+    if names_dataset(path):
         with Dataset(path) as dataset:
             return _dataset_info(dataset)
     with open_reader(path) as reader:

@@ -17,7 +17,7 @@ from mp4ds.dataset import Dataset, Stream
 from mp4ds.pairing import StampPairing, pair_camera_infos
 from mp4ds.records import Channel, Message
 from mp4ds.remote import location
-from mp4ds.sidecar import MANIFEST_NAME
+from mp4ds.sidecar import names_dataset
 from mp4ds.streams import Forms, Looker, Unsuited
 from mp4ds.streams.calibrations import Matrix, effective
 from mp4ds.streams.camera_info import fields_of
@@ -115,8 +115,7 @@ def intrinsics(path: Path | str) -> Intrinsics:
         FormatError: The dataset breaks a rule of the format.
     """
     path = location(path)
-    is_whole = path.is_dir() and (path / MANIFEST_NAME).is_file()
-    if is_whole or (path.suffix in (".yaml", ".yml", ".mp4") and path.exists()):
+    if names_dataset(path):
         with Dataset(path) as dataset:
             return _of_dataset(dataset)
     with open_reader(path) as reader:

@@ -10,6 +10,7 @@ from mp4ds.sidecar.io import (
     load_document,
     load_manifest,
     load_stream,
+    names_dataset,
     schema_text,
 )
 from mp4ds.sidecar.manifest import (
@@ -72,5 +73,6 @@ __all__ = [
     "load_document",
     "load_manifest",
     "load_stream",
+    "names_dataset",
     "schema_text",
 ]

@@ -32,6 +32,13 @@ _NEWS_LISTED = 5
 _ModelT = TypeVar("_ModelT", bound=BaseModel)
 
 
+def names_dataset(path: Path) -> bool:
+    """Whether a path is that of a dataset, a sidecar or a video, not of a recording."""
+    if path.is_dir() and (path / MANIFEST_NAME).is_file():
+        return True
+    return path.suffix in (".yaml", ".yml", ".mp4") and path.exists()
+
+
 def dump_document(model: StreamSidecar | Manifest) -> bytes:
     """The YAML file of a model."""
     return yamlio.dump(document_of(model), comment=_COMMENTS[model.kind])
