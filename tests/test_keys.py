@@ -179,15 +179,6 @@ def test_faster_and_slower_cancel(terminal: Terminal) -> None:
     assert controls.rate == pytest.approx(1, abs=1e-8)
 
 
-def test_more_keys(terminal: Terminal) -> None:
-    controls = RecordedControls()
-    extra = {"q": lambda: controls.calls.append("q"), "left": lambda: controls.calls.append("no")}
-    with Keyboard(controls, extra, fd=terminal.fd):
-        terminal.type(b"q" + ESC + b"[D" + b"b")
-        wait(lambda: len(controls.calls) == 3)
-    assert controls.calls == ["q", "no", "step_back"]
-
-
 @pytest.mark.parametrize("size", range(1, 6))
 def test_keys_wherever_they_are_cut(size: int) -> None:
     typed = b" " + ESC + b"[C" + ESC + b"[1;2A" + ESC + b"s" + ESC + ESC + b"OB" + b"\xc3\xa9b"

@@ -292,8 +292,8 @@ def _check_messages(
             gaps = [Problem("messages-missing", topic, what) for topic, what in dataset.gaps()]
             if gaps:
                 return gaps
-            counted: int | None = dataset.recorded_count
-            if deep or counted is None:
+            counted = dataset.recorded_count
+            if deep:
                 report(f"reading {MESSAGES_NAME}")
                 counts = Counter(
                     isinstance(record, Message) for record in dataset.recorded_records()

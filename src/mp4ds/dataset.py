@@ -144,7 +144,7 @@ class Dataset:
         return self._file.unused_schemas
 
     @property
-    def recorded_count(self) -> int | None:
+    def recorded_count(self) -> int:
         """Messages in messages.mcap as far as its index tells."""
         return sum(self._file.counts().values())
 

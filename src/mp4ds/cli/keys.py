@@ -7,7 +7,7 @@ import select
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -38,18 +38,10 @@ class Keyboard:
 
     Args:
         controls: The player.
-        extra: More keys, by character, or other meanings of those above, by character or
-            ``up``, ``down``, ``left``, ``right``; called from the keyboard's thread.
         fd: File descriptor of the terminal; None for standard input.
     """
 
-    def __init__(
-        self,
-        controls: Controls,
-        extra: Mapping[str, Callable[[], object]] | None = None,
-        *,
-        fd: int | None = None,
-    ) -> None:
+    def __init__(self, controls: Controls, *, fd: int | None = None) -> None:
         self._actions: dict[str, Callable[[], object]] = {
             " ": controls.toggle_paused,
             "right": controls.play_next,
@@ -58,7 +50,6 @@ class Keyboard:
             "b": controls.step_back,
             "up": lambda: controls.set_rate(_rounded(controls.rate * _FASTER)),
             "down": lambda: controls.set_rate(_rounded(controls.rate / _FASTER)),
-            **(extra or {}),
         }
         self._terminal = _terminal(fd)
         self._handlers: dict[int, Any] = {}
