@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,7 +137,7 @@ class MultiReader:
             self._done += sum(file.stat().st_size for file in part.files)
         finally:
             self._active.remove(part)
-            part.__exit__(None, None, None)
+            part.__exit__()
 
     def stats(self) -> Mapping[int, ChannelStats]:
         """See `BagReader.stats`."""
@@ -171,11 +170,6 @@ class MultiReader:
     def __enter__(self) -> MultiReader:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        tb: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for part in self._active:
-            part.__exit__(exc_type, exc, tb)
+            part.__exit__()

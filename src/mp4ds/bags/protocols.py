@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Literal, Protocol
 
 import numpy as np
@@ -117,12 +116,7 @@ class BagReader(Protocol):
 
     def __enter__(self) -> BagReader: ...
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        tb: TracebackType | None,
-    ) -> None: ...
+    def __exit__(self, *_: object) -> None: ...
 
 
 class BagWriter(Protocol):
@@ -165,9 +159,4 @@ class BagWriter(Protocol):
 
     def __enter__(self) -> BagWriter: ...
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        tb: TracebackType | None,
-    ) -> None: ...
+    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None: ...

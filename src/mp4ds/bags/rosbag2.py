@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -289,15 +288,10 @@ class Rosbag2Reader:
     def __enter__(self) -> Rosbag2Reader:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        tb: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for reader in self._readers:
             if isinstance(reader, McapReader):
-                reader.__exit__(exc_type, exc, tb)
+                reader.__exit__()
         self._drop_unpacked()
 
 

@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
 
 from mp4ds.errors import ConversionError
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Message, Schema
@@ -186,12 +185,7 @@ class SqliteWriter:
             ),
         )
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        tb: TracebackType | None,
-    ) -> None:
+    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
         try:
             if exc_type is None:
                 with self._disk_errors():

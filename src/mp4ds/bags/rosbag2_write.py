@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from mp4ds.bags.mcap_write import McapWriter
@@ -231,25 +230,20 @@ class Rosbag2Writer:
             self._writer.add_bag_info(info["version"], inside, self._ros_distro)
         elif not self._source_has_record:
             self._writer.add_metadata(MetadataRecord(_MCAP_RECORD, {"serialized_metadata": inside}))
-        self._writer.__exit__(None, None, None)
+        self._writer.__exit__(None)
         (self._folder / METADATA_FILE).write_bytes(dump_bag_info(info).encode())
 
     def __enter__(self) -> Rosbag2Writer:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        tb: TracebackType | None,
-    ) -> None:
+    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
         if exc_type is not None:
-            self._writer.__exit__(exc_type, exc, tb)
+            self._writer.__exit__(exc_type)
             return
         try:
             self._finish()
         except BaseException as error:
-            self._writer.__exit__(type(error), error, None)
+            self._writer.__exit__(type(error))
             raise
 
 

@@ -16,7 +16,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from mp4ds.bags import BagReader
@@ -108,18 +107,13 @@ class Tasks:
     def close(self) -> None:
         """Close the recording."""
         if self._reader is not None:
-            self._reader.__exit__(None, None, None)
+            self._reader.__exit__()
         self._reader = None
 
     def __enter__(self) -> Tasks:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        tb: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 
 from mp4ds.bags.mcap import is_mcap
 from mp4ds.bags.mcap_records import unzstd
@@ -224,12 +223,7 @@ class Rosbag2Salvage(Salvage):
         self._first_copy = None
         self._unpacked.close()
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        tb: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._drop_unpacked()
 
     def _info_record(self) -> MetadataRecord:
