@@ -15,6 +15,7 @@ import pytest
 import mp4ds
 from mp4ds.errors import FormatError, OptionError
 from mp4ds.playing import Player, PlayOptions, PlaySummary, open_player
+from mp4ds.playing.pace import FollowedClock
 from player_scenes import MS, START, Recorded, RecordingPublisher, make_drive, recorded
 
 FIRST = START
@@ -267,6 +268,16 @@ def test_a_recorded_clock_is_not_published_beside_ours(tmp_path: Path) -> None:
     publisher, _ = run(tmp_path / "c", immediate=True, clock=10.0)
     assert not any(sent.topic == "/clock" for sent in publisher.sent)
     assert len(publisher.clocks) >= 8
+
+
+def test_what_is_missed_of_the_beginning_of_a_clock_that_is_followed() -> None:
+    """A clock that is first heard 0.2 s after the start is at the start; later, in the middle."""
+    start, allowed = 7 * 10**9, 200 * 10**6
+    assert not FollowedClock().hear(start + allowed, start)
+    assert FollowedClock().hear(start + allowed + 1, start)
+    clock = FollowedClock()
+    assert not clock.hear(start - 10**9, start)
+    assert not clock.hear(start + allowed + 1, start), "it went on as it does"
 
 
 def test_follows_a_clock(drive: tuple[Path, list[Recorded]]) -> None:

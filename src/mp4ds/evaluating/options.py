@@ -13,7 +13,7 @@ from mp4ds.scoring import METRICS
 from mp4ds.video import HARDWARE, check_codec
 from mp4ds.video.codecs import LOSSY_GOP, MAX_CRF
 
-CODEC_NAMES = {"svtav1": "av1", "x264": "h264", "x265": "h265"}
+ENCODER_NAMES = {"svtav1": "av1", "x264": "h264", "x265": "h265"}
 """Names of the encoders -> of the codecs, as `mp4ds pack` takes them."""
 
 _DEFAULT_PRESETS = {
@@ -163,9 +163,9 @@ def grid_of(options: EvaluateOptions) -> Grid:
 
 
 def _codec(name: str) -> str:
-    codec = CODEC_NAMES.get(name, name)
+    codec = ENCODER_NAMES.get(name, name)
     if codec not in MAX_CRF:
-        names = [f"{encoder} ({codec})" for encoder, codec in CODEC_NAMES.items()]
+        names = [f"{encoder} ({codec})" for encoder, codec in ENCODER_NAMES.items()]
         known = ", ".join([*names, *HARDWARE])
         raise OptionError(f"--codecs {name!r} is not one of {known}.")
     return codec

@@ -17,7 +17,7 @@ from mp4ds.layouts import Picture
 from mp4ds.video.media import Media
 from mp4ds.video.pictures import PictureMaker
 
-CODEC_NAMES = {
+FFMPEG_NAMES = {
     "h264": "h264",
     "h265": "hevc",
     "av1": "av1",
@@ -98,7 +98,7 @@ class VideoDecoder:
         context: Any = self._container.streams.video[0].codec_context
         if context is None or context.codec is None:
             raise VideoError("video-unreadable", self._path, "has a video track of no known codec")
-        expected = CODEC_NAMES.get(codec)
+        expected = FFMPEG_NAMES.get(codec)
         found = context.codec.canonical_name
         if expected is None or found != expected:
             raise VideoError(

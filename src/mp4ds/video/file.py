@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import VideoError
 from mp4ds.layouts import MAX_SIDE, Picture
 from mp4ds.video.access import FrameAccess
-from mp4ds.video.decoder import CODEC_NAMES
+from mp4ds.video.decoder import FFMPEG_NAMES
 from mp4ds.video.media import Media
 from mp4ds.video.pictures import PictureMaker
 from mp4ds.video.reader import FrameReader
@@ -51,7 +51,7 @@ class VideoFile:
             context: Any = self._stream.codec_context
             self.size: tuple[int, int] = context.width, context.height
             name = context.codec.canonical_name
-            self.codec = next((key for key, value in CODEC_NAMES.items() if value == name), name)
+            self.codec = next((key for key, value in FFMPEG_NAMES.items() if value == name), name)
             if not 1 <= min(self.size) <= max(self.size) <= MAX_SIDE:
                 width, height = self.size
                 raise VideoError("video-unreadable", path, f"has frames of {width}x{height} pixels")
