@@ -7,6 +7,7 @@ import hashlib
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, cast
 
 import numpy as np
@@ -37,7 +38,6 @@ class Digester:
 
     ignore: Sequence[str] = ()
     crossed: frozenset[str] = frozenset()
-    stores: dict[Channel, Any] = field(default_factory=dict)
     undecodable: set[str] = field(default_factory=set)
 
     def digest(self, channel: Channel, payload: bytes) -> bytes:
@@ -59,7 +59,7 @@ class Digester:
     def _fields(self, channel: Channel, payload: bytes, *, skip_data: bool) -> Iterator[bytes]:
         name = ros2_name(channel.type)
         try:
-            store = self.stores.get(channel) or self.stores.setdefault(channel, typestore(channel))
+            store = typestore(channel.type, channel.encoding, channel.definition)
             decode = store.deserialize_ros1 if channel.encoding == "ros1" else store.deserialize_cdr
             return iter(list(field_bytes(decode(payload, name), skip_data=skip_data)))
         except Exception:  # whatever the generated deserialiser trips over
@@ -73,13 +73,14 @@ def ros2_name(name: str) -> str:
     return name if "/" in rest or not rest else f"{package}/msg/{rest}"
 
 
-def typestore(channel: Channel) -> Any:
+@lru_cache(maxsize=256)  # most topics, of most recordings, are of a few types
+def typestore(of: str, encoding: str, definition: tuple[str, bytes] | None) -> Any:
     """A typestore with the recording's own definition, else the distribution's."""
-    fallback = Stores.ROS1_NOETIC if channel.encoding == "ros1" else Stores.LATEST
-    form, text = channel.definition or ("", b"")
+    fallback = Stores.ROS1_NOETIC if encoding == "ros1" else Stores.LATEST
+    form, text = definition or ("", b"")
     if not text:
         return get_typestore(fallback)
-    store, name = get_typestore(Stores.EMPTY), ros2_name(channel.type)
+    store, name = get_typestore(Stores.EMPTY), ros2_name(of)
     parse = get_types_from_idl if form == "ros2idl" else get_types_from_msg
     arguments = (text.decode(),) if form == "ros2idl" else (text.decode(), name)
     try:
