@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -59,13 +60,16 @@ def test_modules_are_short(path: Path) -> None:
     assert lines > MAX_LINES or name not in LONGER, f"{name} is no longer long: strike it"
 
 
-def imports_of(path: Path) -> Iterator[str]:
+@cache  # each library looks into all modules
+def imports_of(path: Path) -> frozenset[str]:
     """Top-level names of the packages that a module imports, anywhere in it."""
+    found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            yield from (alias.name.split(".")[0] for alias in node.names)
+            found.update(alias.name.split(".")[0] for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            yield node.module.split(".")[0]
+            found.add(node.module.split(".")[0])
+    return frozenset(found)
 
 
 # Each package is known to one room only.
