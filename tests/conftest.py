@@ -13,6 +13,14 @@ import mp4ds
 from mp4ds.packing import PackOptions
 from sources import SOURCES, load_tool, scene
 
+NETWORKS = {
+    "test_play_ros1": "ros1",
+    "test_publish_ros1": "ros1",
+    "test_publish_dds": "dds",
+    "test_publish_ros2": "dds",
+}
+"""Files of tests that need a network of ROS, and which; tools/test.sh collects them alone."""
+
 DATA = Path(os.environ.get("MP4DS_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
@@ -27,12 +35,11 @@ def real(name: str) -> Path:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that keep to times: they run apart, one process for each network."""
     for item in items:
-        network = ""
-        if "roscore" in getattr(item, "fixturenames", ()):
-            network = "ros1"
-        elif item.path.stem in ("test_publish_dds", "test_publish_ros2"):
-            network = "dds"
-        if network:
+        network = NETWORKS.get(item.path.stem)
+        needs_master = "roscore" in getattr(item, "fixturenames", ())
+        if needs_master and network != "ros1":
+            raise pytest.UsageError(f"{item.nodeid}: its file is not one of NETWORKS, conftest.py")
+        if network == "dds" or needs_master:
             item.add_marker(pytest.mark.network)
             item.add_marker(pytest.mark.xdist_group(network))
 

@@ -8,7 +8,6 @@ cd "$(dirname "$0")/.."
 .venv/bin/ruff format --check .
 .venv/bin/mypy
 .venv/bin/pytest -n auto -m "not network and not slow" "$@"
-# without arguments, none but the files of NETWORKS in tests/conftest.py: to collect all takes longer
-# than a tenth of these tests
+# of no other file than those of NETWORKS in tests/conftest.py: to collect all takes 15 seconds
 [ $# -gt 0 ] || set -- tests/test_play_ros1.py tests/test_publish_{dds,ros1,ros2}.py
 exec .venv/bin/pytest -n 2 --dist loadgroup -m "network and not slow" "$@"
