@@ -316,6 +316,26 @@ def test_many_recordings_are_one_job(
         pack_each(paths[:1], tmp_path / "datasets", IN_PARTS)
 
 
+class LastFirst(InlineEngine):
+    """Runs the last task first."""
+
+    def run(self, tasks: Any, on_progress: Any) -> Any:
+        return super().run(tasks[::-1], on_progress)
+
+
+def test_summaries_are_in_the_order_of_the_sources(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whichever was done first."""
+    paths = []
+    for name in ("b", "a", "c"):
+        (path,) = SOURCES["bag-none"](tmp_path, scene("mono8", frames=9))
+        paths.append(path.rename(tmp_path / f"{name}.bag"))
+    use(monkeypatch, LastFirst())
+    done = pack_each(paths, tmp_path / "datasets", IN_PARTS)
+    assert [summary.dataset.name for summary in done] == ["b", "a", "c"]
+
+
 # ---------------------------------------------------------------- killed, in earnest
 
 

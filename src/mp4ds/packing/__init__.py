@@ -137,8 +137,8 @@ def pack_each(
         progress: Called several times a second.
 
     Returns:
-        What became of each that was packed now; datasets that are there already, of the same
-        recordings, are left as they are.
+        What became of each that was packed now, in the order of the sources; datasets that are
+        there already, of the same recordings, are left as they are.
 
     Raises:
         Mp4dsError: As `pack`.
@@ -251,7 +251,7 @@ def _pack_runs(
     share: tuple[int, int] | None = None,
 ) -> list[PackSummary]:
     """Run the tasks of packs, and make their datasets unless only a share of the tasks is run."""
-    summaries = []
+    summaries = {}
     with claimed(runs, shared=share is not None):
         for run in runs:
             run.begin(outcome_options(options), anew=options.restart, alone=share is None)
@@ -266,8 +266,8 @@ def _pack_runs(
             coordinator.refuse_missing()
         for run in coordinator.run():
             if share is None:
-                summaries.append(coordinator.finish(run))
-    return summaries
+                summaries[run.target] = coordinator.finish(run)
+    return [summaries[run.target] for run in runs if run.target in summaries]
 
 
 def _engine(runs: Sequence[Run], options: PackOptions) -> Engine:
