@@ -99,6 +99,16 @@ RECIPES = {
     "10 bits, preset 7, qm": _svt(_QM, preset=7),
     "10 bits, levels 3, qm, ac-bias": _svt(f"{_BEST}:ac-bias=1.0"),
     "10 bits, levels 3, qm, ac-bias, preset 5": _svt(f"{_BEST}:ac-bias=1.0", preset=5),
+    "10 bits, levels 3, qm": _svt(_BEST),
+    "10 bits, levels 3, qm, preset 5": _svt(_BEST, preset=5),
+    "10 bits, levels 3, qm, ac-bias 0.5": _svt(f"{_BEST}:ac-bias=0.5"),
+    "10 bits, levels 4, qm, ac-bias": _svt(f"hierarchical-levels=4:{_QM}:ac-bias=1.0"),
+    "10 bits, levels 3, qm from 10, ac-bias": _svt(
+        "hierarchical-levels=3:enable-qm=1:qm-min=10:ac-bias=1.0"
+    ),
+    "10 bits, levels 3, qm, ac-bias, restoration off": _svt(
+        f"{_BEST}:ac-bias=1.0:enable-restoration=0"
+    ),
     "film grain 10": _svt("film-grain=10", bits=8),
     "denoised, grain 10": _svt("film-grain=10:film-grain-denoise=1", bits=8),
     "x264 medium": Recipe("libx264", "medium", crf=_X26X_CRF),
