@@ -22,6 +22,7 @@ from clusters import RealCluster, Relay, wait_until
 from mp4ds.engine import Engine, Outcome
 from mp4ds.engine import cluster_access as access
 from mp4ds.engine.cluster import ClusterEngine
+from mp4ds.engine.cluster_access import Connection
 from mp4ds.errors import ClusterError, OptionError
 
 MIB = 2**20
@@ -260,6 +261,34 @@ def test_workers_may_come_late(tmp_path: Path) -> None:
         timer.join()
 
 
+def test_a_scheduler_that_was_lost_between_two_runs(tmp_path: Path) -> None:
+    with (
+        RealCluster(tmp_path / "dask", workers=1) as cluster,
+        Connection(cluster.address, 1) as connection,
+    ):
+        engine = ClusterEngine(cluster_tasks.write, connection, task_bytes=MIB)
+        assert not errors(run(engine, tasks_in(tmp_path, "a")))
+        cluster.scheduler.kill()
+        with pytest.raises(ClusterError, match="run the same command again to go on"):
+            run(engine, tasks_in(tmp_path, "b"))
+
+
+def test_time_between_two_runs_is_no_waiting(tmp_path: Path) -> None:
+    with (
+        RealCluster(tmp_path / "dask", workers=0) as cluster,
+        dask.config.set({"mp4ds.worker-timeout": "30 s"}),
+        Connection(cluster.address, 1) as connection,
+    ):
+        _, watch = connection.way()
+        watch.look()  # there is no worker
+        watch._empty_since = time.monotonic() - 60
+        timer = threading.Timer(1, cluster.add_worker)
+        timer.start()
+        engine = ClusterEngine(cluster_tasks.write, connection, task_bytes=MIB)
+        assert not errors(run(engine, tasks_in(tmp_path, "a")))
+        timer.join()
+
+
 # ---------------------------------------------------------------- ways to a cluster
 
 
@@ -421,6 +450,17 @@ def test_there_are_not_more_jobs_than_tasks(batch: Batch, tmp_path: Path) -> Non
     engine = ClusterEngine(cluster_tasks.write, "slurm", task_bytes=MIB)
     assert not errors(run(engine, tasks_in(tmp_path, "a")))
     assert len(batch.numbers("jobs")) == 1
+
+
+def test_runs_of_one_connection_share_its_jobs(batch: Batch, tmp_path: Path) -> None:
+    with Connection("slurm", 2) as connection:
+        assert batch.numbers("jobs") == []
+        for folder, names in [("a", numbered(3)), ("b", numbered(2))]:
+            (tmp_path / folder).mkdir()
+            engine = ClusterEngine(cluster_tasks.write, connection, task_bytes=MIB)
+            assert not errors(run(engine, tasks_in(tmp_path / folder, *names)))
+        assert len(batch.numbers("jobs")) == 2
+        assert batch.numbers("cancelled") == []
 
 
 def test_a_job_that_ended_is_submitted_again(

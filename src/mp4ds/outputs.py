@@ -12,6 +12,7 @@ import os
 import shutil
 import socket
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -103,6 +104,7 @@ def as_write_error(error: OSError, target: Path) -> OSError:
 
 
 _BLOCK = 2**20
+_SEEN_SECONDS, _LOOK_SECONDS = 90.0, 1.0  # NFS keeps names and sizes for up to a minute
 _WRITE_ERRNOS = {
     errno.ENOSPC,
     errno.EDQUOT,
@@ -158,6 +160,21 @@ def sync_folder(folder: Path) -> None:
             os.fsync(handle)
         finally:
             os.close(handle)
+
+
+def is_seen(is_there: Callable[[], bool], *folders: Path) -> bool:
+    """Whether what another machine has made is there; a file system may show it after a while only.
+
+    Args:
+        is_there: Looks for it.
+        folders: In which it is.
+    """
+    end = time.monotonic() + _SEEN_SECONDS
+    while not (seen := is_there()) and time.monotonic() < end:
+        for folder in folders:
+            list(folder.iterdir())  # which asks the server for its names anew
+        time.sleep(_LOOK_SECONDS)
+    return seen
 
 
 def move_into_place(path: Path, target: Path, folder: Path, *, force: bool) -> None:

@@ -24,6 +24,7 @@ from mp4ds.cli.export import export
 from mp4ds.cli.failures import told_errors
 from mp4ds.cli.imports import imports
 from mp4ds.cli.options import (
+    ClusterOption,
     CodecOption,
     DatasetArgument,
     EveryOption,
@@ -128,12 +129,7 @@ def pack(
     ] = None,
     jobs: JobsOption = None,
     memory: MemoryOption = None,
-    cluster: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(
-            "--cluster", metavar="ADDRESS", help="Dask scheduler, tcp://HOST:PORT, or slurm."
-        ),
-    ] = None,
+    cluster: ClusterOption = None,
     shard: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option("--shard", metavar="I/N", help="Pack one share of the parts only."),

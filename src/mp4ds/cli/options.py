@@ -32,6 +32,11 @@ JpegQualityOption = Annotated[
     int, typer.Option("--jpeg-quality", min=1, max=100, help="Of JPEG files that are made.")
 ]
 
+ClusterOption = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--cluster", metavar="ADDRESS", help="Dask scheduler, tcp://HOST:PORT, or slurm."),
+]
+
 # of what makes videos
 CodecOption = Annotated[
     Optional[str],  # noqa: UP045

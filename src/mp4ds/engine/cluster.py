@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import queue
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Sequence
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
-from mp4ds.engine.cluster_access import Watch, check_address, opened
+from mp4ds.engine.cluster_access import Connection, Watch, check_address
 from mp4ds.engine.cluster_worker import TaskFailedError, attempt
 from mp4ds.engine.protocol import Outcome
 
@@ -37,7 +37,8 @@ class ClusterEngine:
         address: ``tcp://HOST:PORT`` or ``tls://HOST:PORT`` of a scheduler, which is left as it
             is; ``slurm``, ``pbs``, ``sge``, ``lsf``, ``htcondor`` or ``oar`` for jobs of that
             batch system, as dask-jobqueue is configured, which are ended after the last task;
-            ``local`` for workers on this machine.
+            ``local`` for workers on this machine. Or a connection, which several engines and runs
+            share.
         task_bytes: Memory of a task; a worker runs as many at a time as its own holds.
 
     Raises:
@@ -45,9 +46,10 @@ class ClusterEngine:
     """
 
     def __init__(
-        self, function: Callable[[str, str], None], address: str, *, task_bytes: int
+        self, function: Callable[..., None], address: str | Connection, *, task_bytes: int
     ) -> None:
-        check_address(address)
+        if isinstance(address, str):
+            check_address(address)
         self._function = function
         self._address = address
         self._task_bytes = task_bytes
@@ -56,7 +58,7 @@ class ClusterEngine:
         self,
         tasks: Sequence[tuple[str, ...]],
         on_progress: Callable[[tuple[str, ...], dict[str, Any]], None],
-    ) -> Iterator[Outcome]:
+    ) -> Generator[Outcome, None, None]:
         """See `Engine.run`.
 
         Closing the generator drops the tasks that wait; on a cluster that goes on, those that
@@ -66,13 +68,17 @@ class ClusterEngine:
             ClusterError: No scheduler answers, it was lost, or there are no workers.
             OptionError: The configuration of Dask lacks something.
         """
-        if tasks:
-            with opened(self._address, len(tasks)) as (client, watch):
-                yield from self._run(client, watch, tasks)
+        if not tasks:
+            return
+        with ExitStack() as stack:
+            connection = self._address
+            if isinstance(connection, str):
+                connection = stack.enter_context(Connection(connection, len(tasks)))
+            yield from self._run(*connection.way(), tasks)
 
     def _run(
         self, client: Client, watch: Watch, tasks: Sequence[tuple[str, ...]]
-    ) -> Iterator[Outcome]:
+    ) -> Generator[Outcome, None, None]:
         waiting: dict[str, tuple[tuple[str, ...], Future]] = {}
         heard: queue.SimpleQueue[Future] = queue.SimpleQueue()
         drops: Counter[tuple[str, ...]] = Counter()

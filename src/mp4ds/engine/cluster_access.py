@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
+from types import TracebackType
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
@@ -53,6 +54,16 @@ class Watch:
         self._refill = refill
         self._next = 0.0
         self._empty_since: float | None = None
+
+    def begin(self) -> None:
+        """Begin to wait for tasks; the time before, in which there were none, does not count.
+
+        Raises:
+            ClusterError: The scheduler is lost.
+        """
+        self._next = 0.0
+        self._empty_since = None
+        self.wait_until_connected()
 
     def look(self) -> None:
         """Look after the cluster, unless that was done just now.
@@ -134,8 +145,55 @@ def _is_of_scheduler(address: str) -> bool:
     return bool(complete) and not (parts.path or parts.query or parts.fragment)
 
 
+class Connection:
+    """A way to a cluster, opened when it is first needed, and kept.
+
+    Jobs of a batch system, which may have had to queue, are so of use to more than one run of
+    tasks. A context manager; what was started for it is ended with it.
+
+    Args:
+        address: As `ClusterEngine` takes it.
+        tasks: Most that there are to run at a time.
+
+    Raises:
+        OptionError: The address is none, or a package is missing.
+    """
+
+    def __init__(self, address: str, tasks: int) -> None:
+        check_address(address)
+        self._address = address
+        self._tasks = tasks
+        self._stack = ExitStack()
+        self._way: tuple[Client, Watch] | None = None
+
+    def way(self) -> tuple[Client, Watch]:
+        """What tasks are handed out with, ready for some.
+
+        Raises:
+            ClusterError: No scheduler answers in 15 s, the batch system refuses the jobs, or the
+                scheduler was lost since.
+            OptionError: The configuration lacks something.
+        """
+        if self._way is None:
+            self._way = self._stack.enter_context(_opened(self._address, self._tasks))
+        self._way[1].begin()
+        return self._way
+
+    def __enter__(self) -> Connection:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        tb: TracebackType | None,
+    ) -> None:
+        self._way = None
+        self._stack.close()
+
+
 @contextmanager
-def opened(address: str, tasks: int) -> Iterator[tuple[Client, Watch]]:
+def _opened(address: str, tasks: int) -> Iterator[tuple[Client, Watch]]:
     """Open the way to a cluster; what is started for it is ended with it.
 
     Args:

@@ -13,7 +13,7 @@ import selectors
 import signal
 import subprocess
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import IO, Any
@@ -78,7 +78,7 @@ class ProcessEngine:
         self,
         tasks: Sequence[tuple[str, ...]],
         on_progress: Callable[[tuple[str, ...], dict[str, Any]], None],
-    ) -> Iterator[Outcome]:
+    ) -> Generator[Outcome, None, None]:
         """See `Engine.run`."""
         shift = _Shift(self._command, tasks, on_progress)
         try:

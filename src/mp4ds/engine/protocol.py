@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -33,7 +33,7 @@ class Engine(Protocol):
         self,
         tasks: Sequence[tuple[str, ...]],
         on_progress: Callable[[tuple[str, ...], dict[str, Any]], None],
-    ) -> Iterator[Outcome]:
+    ) -> Generator[Outcome, None, None]:
         """Run tasks, in any order, several at a time.
 
         Args:

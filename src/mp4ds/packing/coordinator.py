@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from mp4ds.errors import (
     TargetError,
     WriteError,
 )
-from mp4ds.outputs import move_into_place, sync
+from mp4ds.outputs import is_seen, move_into_place, sync
 from mp4ds.packing.assemble import Assembler
 from mp4ds.packing.job import Job, Task, absolute
 from mp4ds.packing.manifest import folder_size, summarize, write_manifest
@@ -34,7 +33,6 @@ from mp4ds.source_files import source_name
 
 _LISTED = 10
 _JOINED_AT_ONCE = 4  # more would only wait for the disk
-_SEEN_SECONDS, _LOOK_SECONDS = 90.0, 1.0  # NFS keeps names and sizes for up to a minute
 _SHARED = "all machines must share the folder of the dataset"
 _KEPT = "interrupted; what is finished is kept: run the same command again to go on"
 
@@ -176,8 +174,7 @@ class Coordinator:
             run.raise_failures()
 
     def _run(self, tasks: list[tuple[str, ...]], waiting: dict[str, int]) -> Iterator[Run]:
-        outcomes = self._engine.run(tasks, self._heard)
-        try:
+        with closing(self._engine.run(tasks, self._heard)) as outcomes:
             for outcome in outcomes:
                 folder = outcome.task[0]
                 waiting[folder] -= self._take(outcome)
@@ -185,10 +182,6 @@ class Coordinator:
                     return
                 if not waiting[folder]:
                     yield self._runs[folder]
-        finally:
-            close: Any = getattr(outcomes, "close", None)
-            if close is not None:
-                close()
 
     def _heard(self, task: tuple[str, ...], told: dict[str, Any]) -> None:
         self._progress[task[0]].heard(task[1], told)
@@ -198,7 +191,7 @@ class Coordinator:
         folder, name = outcome.task
         run, progress = self._runs[folder], self._progress[folder]
         error, task = outcome.error, run.job.task(name)
-        if error is None and not _is_seen(run, task):
+        if error is None and not is_seen(lambda: run.place.is_done(task), run.place.parts):
             error = ("TargetError", f"its result is not seen in {run.place.parts}; {_SHARED}")
         if error is None:
             self._tell_done(run, [task], before=False)
@@ -274,15 +267,6 @@ class Coordinator:
                 chain = task.name if task.solo else task.name.partition("-")[2]
                 assembler.add(Part.load(parts / task.name), chain)
             return assembler.finish(lambda name: progress.report("joining", name, now=True))
-
-
-def _is_seen(run: Run, task: Task) -> bool:
-    """Whether a result is there; a shared file system may show it only after a while."""
-    end = time.monotonic() + _SEEN_SECONDS
-    while not (seen := run.place.is_done(task)) and time.monotonic() < end:
-        list(run.place.parts.iterdir())  # which asks the server for its names anew
-        time.sleep(_LOOK_SECONDS)
-    return seen
 
 
 def _link(path: Path, new: Path) -> None:
