@@ -34,7 +34,6 @@ from mp4ds.evaluating import (
     Setting,
     Target,
     evaluate,
-    parse_target,
 )
 from mp4ds.evaluating.clips import (
     Clip,
@@ -44,7 +43,7 @@ from mp4ds.evaluating.clips import (
     chosen_at_rate,
     make_clip,
 )
-from mp4ds.evaluating.options import grid_of, parse_crfs
+from mp4ds.evaluating.options import grid_of, parse_crfs, parse_target
 from mp4ds.evaluating.results import Cell
 from mp4ds.evaluating.sources import open_source
 from mp4ds.evaluating.tables import pareto, reachable_score, recommend
@@ -59,7 +58,7 @@ from sources import ENCODINGS, SOURCES, scene, write_bag
 ROOT = Path(__file__).parents[1]
 TOPIC = "/cam/image_raw"
 QUICK = EvaluateOptions(
-    codecs=["x264"], presets=["ultrafast"], crf=["24"], frames=10, target=Target("psnr_y", 20),
+    codecs=["x264"], presets=["ultrafast"], crf=["24"], frames=10, target="psnr_y=20",
     threads=1,
 )  # fmt: skip
 
@@ -473,7 +472,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 WHOLE = EvaluateOptions(
     codecs=["svtav1", "x264"], presets=["12", "ultrafast"], crf=["8", "40"], frames=12,
-    target=Target("vmaf", 95), streams=9, hours=10, rates=[5, 100],
+    target="vmaf=95", streams=9, hours=10, rates=[5, 100],
     topics=["/left/*"], threads=1,
 )  # fmt: skip
 
@@ -566,7 +565,7 @@ def test_files(whole: Evaluation) -> None:
         for item in camera.cells[2:]
     )
     assert 0 < near < far
-    assert not (folder / "work").exists()
+    assert not list(folder.glob("work*"))
 
 
 class Page(HTMLParser):
@@ -642,7 +641,7 @@ def test_an_interrupted_one_goes_on(tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         evaluate(path, options, output=tmp_path / "out", progress=interrupt)
-    assert not (tmp_path / "out" / "work").exists()
+    assert not list((tmp_path / "out").glob("work*"))
     assert not (tmp_path / "out" / "index.html").exists()
     again = evaluate(path, options, output=tmp_path / "out")
     assert (again.tried, again.known) == (1, 3)  # the ceiling is known, too
@@ -711,7 +710,7 @@ def test_without_libvmaf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("mp4ds.evaluating.find_ffmpeg", no_ffmpeg)
     path = recording(tmp_path)
     with pytest.raises(ScoringError, match="--target psnr_y"):
-        evaluate(path, replace(QUICK, target=Target()), output=tmp_path / "out")
+        evaluate(path, replace(QUICK, target="vmaf=99.5"), output=tmp_path / "out")
     found = evaluate(path, QUICK, output=tmp_path / "out")
     (camera,) = found.cameras
     assert set(camera.cells[0].scores) == {"psnr_y", "psnr_cb", "psnr_cr", "ssim"}
@@ -720,7 +719,7 @@ def test_without_libvmaf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_where_nothing_reaches_the_target(tmp_path: Path) -> None:
-    options = replace(QUICK, target=Target("psnr_y", 59))
+    options = replace(QUICK, target="psnr_y=59")
     (camera,) = evaluate(recording(tmp_path), options, output=tmp_path / "out").cameras
     assert camera.recommended == []
     assert any("no setting reaches psnr_y 59.00" in note for note in camera.notes)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from mp4ds.cli.failures import told_errors
+from mp4ds.cli.options import ClusterOption
 from mp4ds.cli.output import print_json
 from mp4ds.errors import OptionError
 
@@ -92,12 +93,18 @@ def evaluate(
     ] = None,
     threads: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option("--threads", min=1, max=1024, help="Of an encoder; all cores by default."),
+        typer.Option(
+            "--threads",
+            min=1,
+            max=1024,
+            help="Of an encoder; all cores by default, one on a cluster.",
+        ),
     ] = None,
     jobs: Annotated[
         int,
         typer.Option("--jobs", "-j", min=1, max=1024, help="Settings at a time; 1 for true times."),
     ] = 1,
+    cluster: ClusterOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Try encoder settings on clips of a recording: quality, size and time.
@@ -106,7 +113,7 @@ def evaluate(
     that was interrupted goes on when the same command is run again.
     """
     from mp4ds.cli.evaluate_output import print_evaluation
-    from mp4ds.evaluating import EvaluateOptions, parse_target
+    from mp4ds.evaluating import EvaluateOptions
     from mp4ds.evaluating import evaluate as run
     from mp4ds.video.codecs import LOSSY_GOP
 
@@ -124,7 +131,8 @@ def evaluate(
             gop=gop or LOSSY_GOP,
             threads=threads,
             jobs=jobs,
-            target=parse_target(target),
+            cluster=cluster,
+            target=target,
             rates=_numbers("--rates", rates),
             streams=streams,
             hours=hours,

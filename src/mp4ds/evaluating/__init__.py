@@ -8,16 +8,17 @@ kept in the folder of the evaluation, so that the same call goes on where it was
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from mp4ds._version import __version__
 from mp4ds.errors import SourceError
 from mp4ds.evaluating.camera import CameraTrial
 from mp4ds.evaluating.clips import Unfit
+from mp4ds.evaluating.engines import Engines
 from mp4ds.evaluating.files import write_files
 from mp4ds.evaluating.options import (
     EvaluateOptions,
@@ -25,7 +26,6 @@ from mp4ds.evaluating.options import (
     Target,
     check_options,
     grid_of,
-    parse_target,
 )
 from mp4ds.evaluating.results import (
     CameraEvaluation,
@@ -40,11 +40,12 @@ from mp4ds.evaluating.results import (
 from mp4ds.evaluating.sources import Camera, Source, open_source
 from mp4ds.evaluating.tables import recommend
 from mp4ds.evaluating.trials import Trials
+from mp4ds.evaluating.work import versions_of
 from mp4ds.outputs import check_target
 from mp4ds.plan import FileNames, Selection
 from mp4ds.remote import remote
 from mp4ds.scoring import Ffmpeg, ScoringError, find_ffmpeg
-from mp4ds.video import check_hardware, tool_versions
+from mp4ds.video import check_hardware
 
 __all__ = [
     "CameraEvaluation",
@@ -59,11 +60,10 @@ __all__ = [
     "StorageRow",
     "Target",
     "evaluate",
-    "parse_target",
 ]
 
 _FOLDERS = ("cells", "pictures", "plots")
-_WORK = "work"
+_WORK = "work-"
 
 
 def evaluate(
@@ -90,24 +90,26 @@ def evaluate(
         OptionError: An option is wrong.
         HardwareError: An encoder is asked for that this machine has not.
         TargetError: The folder may not be used.
-        ScoringError: There is no libvmaf, and the target is one of VMAF.
+        ScoringError: There is no libvmaf, and the target is one of VMAF; or no setting could be
+            tried.
+        ClusterError: The cluster does not answer, or was lost; what was measured is kept.
+        RemoteError: A store or web server fails.
         OSError: The disk refused.
     """
     chosen = options or EvaluateOptions()
     check_options(chosen)
     grid = grid_of(chosen)
-    for codec in grid.presets:
-        check_hardware(codec)
-    ffmpeg = _ffmpeg(chosen)
-    versions = {**tool_versions(), "mp4ds": __version__}
-    versions["vmaf"] = ffmpeg.version if ffmpeg else "none"
+    if not chosen.cluster:  # else others encode
+        for codec in grid.presets:
+            check_hardware(codec)
+    engines = Engines(chosen, len(grid.settings()) + 1)
+    versions = versions_of(_ffmpeg(chosen.wanted))
     with open_source(source, fps=chosen.fps) as found:
         folder = _folder(found.path, output)
-        with _work_in(folder) as work:
+        with _work_in(folder) as work, engines:
             trials = Trials(
-                folder, work, ffmpeg=ffmpeg, versions=versions,
-                threads=chosen.encoder_threads, jobs=chosen.jobs,
-            )  # fmt: skip
+                folder, work, engines, versions=versions, threads=chosen.encoder_threads
+            )
             result = Evaluation(found.path, folder, [], dict(found.left_out), versions)
             names = FileNames()
             origin = _origin(found)
@@ -120,17 +122,17 @@ def evaluate(
                     result.left_out[camera.topic] = str(reason)
         _refuse_none(result)
         rated = [(camera.cells, camera.reachable) for camera in result.cameras]
-        result.recommended = recommend(rated, chosen.target)
+        result.recommended = recommend(rated, chosen.wanted)
         result = replace(result, tried=trials.tried, known=trials.known)
         write_files(result, chosen)
     return result
 
 
-def _ffmpeg(options: EvaluateOptions) -> Ffmpeg | None:
+def _ffmpeg(target: Target) -> Ffmpeg | None:
     try:
         return find_ffmpeg()
     except ScoringError as error:
-        if options.target.metric == "vmaf":
+        if target.metric == "vmaf":
             raise ScoringError(
                 f"{error} Or give a target of another metric, such as --target psnr_y=42."
             ) from None
@@ -151,11 +153,16 @@ def _is_evaluation(path: Path) -> bool:
 
 @contextmanager
 def _work_in(folder: Path) -> Iterator[Path]:
-    """A folder for what is not kept, within that of the evaluation."""
+    """A folder for what is not kept, within that of the evaluation.
+
+    It has a new name each time: workers of a cluster may still be at a trial of a run that was
+    interrupted, and must not take another clip for theirs.
+    """
     for name in _FOLDERS:
         (folder / name).mkdir(parents=True, exist_ok=True)
-    work = folder / _WORK
-    shutil.rmtree(work, ignore_errors=True)  # of one that was killed
+    for old in folder.glob(f"{_WORK}*"):
+        shutil.rmtree(old, ignore_errors=True)  # of one that was killed
+    work = folder / f"{_WORK}{secrets.token_hex(4)}"
     work.mkdir()
     try:
         yield work

@@ -35,8 +35,8 @@ from mp4ds.evaluating.tables import (
     score_of,
     storage,
 )
-from mp4ds.evaluating.trials import ClipPlace, Failure, Trials
-from mp4ds.scoring import VMAF_MODEL, ScoringError, Summary, largest_crf
+from mp4ds.evaluating.trials import ClipPlace, Failure, Found, Trials
+from mp4ds.scoring import VMAF_MODEL, ScoringError, largest_crf
 from mp4ds.video.codecs import MAX_CRF
 
 _NEAR = 1.05  # rates that differ by less are the same
@@ -70,6 +70,7 @@ class CameraTrial:
         self._camera = camera
         self._name = name
         self._options = options
+        self._target = options.wanted
         self._grid = grid
         self._trials = trials
         self._work = work
@@ -96,12 +97,12 @@ class CameraTrial:
             place.path.unlink(missing_ok=True)
 
     def _evaluated(self, place: ClipPlace) -> CameraEvaluation:
-        clip, target = place.clip, self._options.target
-        self._tell("scoring the clip beside itself")
-        ceiling = self._ceiling(place)
+        clip, target = place.clip, self._target
+        settings = self._grid.settings()
+        measured = self._trials.run(place, [None, *settings], self._count)
+        ceiling = _measured(measured, None)["scores"]
         reachable = reachable_score(target, ceiling[target.metric].mean)
-        self._tell("trying settings")
-        cells = self._cells(place)
+        cells = self._cells(place, {item: measured[item] for item in settings})
         self._note(clip, reachable, cells)
         recommended = recommend([(cells, reachable)], target)
         rates = self._rates()
@@ -139,16 +140,8 @@ class CameraTrial:
         path = self._work / f"{self._name}{suffix}.yuv"
         return ClipPlace(make_clip(self._camera, indices, rate, path), path, self._name)
 
-    def _ceiling(self, place: ClipPlace) -> dict[str, Summary]:
-        """Scores of a clip beside itself."""
-        scores: dict[str, Summary] = _measured(self._trials.run(place, [None]), None)["scores"]
-        return scores
-
-    def _cells(self, place: ClipPlace) -> list[Cell]:
-        settings = self._grid.settings()
-        measured = self._trials.run(place, settings, self._count)
-        ordered: dict[Setting | None, Any] = {item: measured[item] for item in settings}
-        found = list(self._trials.cells(place, ordered))
+    def _cells(self, place: ClipPlace, measured: dict[Setting | None, Found]) -> list[Cell]:
+        found = list(self._trials.cells(place, measured))
         cells = [item for item in found if isinstance(item, Cell)]
         failures = [item for item in found if isinstance(item, Failure)]
         if not cells:
@@ -163,7 +156,7 @@ class CameraTrial:
         return cells
 
     def _note(self, clip: Clip, reachable: float, cells: Sequence[Cell]) -> None:
-        target, options = self._options.target, self._options
+        target, options = self._target, self._options
         if reachable < target.score:
             self._notes.append(
                 f"the clip beside itself has {target.metric} {reachable + CEILING_MARGIN:.2f}: "
@@ -189,8 +182,14 @@ class CameraTrial:
                 f"{VMAF_MODEL} is a model of {_MODEL_ROWS} rows; it is used for {clip.height}, "
                 "too, and not the one for 4K, so that cameras compare"
             )
-        if options.jobs > 1:
+        if options.jobs > 1 or options.cluster:
             self._notes.append("times are those of settings that were tried side by side")
+        machines = sorted({cell.machine for cell in cells} - {""})
+        if len(machines) > 1:
+            self._notes.append(
+                f"times are those of {len(machines)} machines, {', '.join(machines)}, and compare "
+                "as far as these are alike"
+            )
 
     # ------------------------------------------------------------ rates
 
@@ -212,8 +211,9 @@ class CameraTrial:
         return rows
 
     def _rate_row(self, place: ClipPlace, rate: float, codec: str, preset: str) -> RateRow:
-        target = self._options.target
-        ceiling = self._ceiling(place)[target.metric].mean
+        target = self._target
+        original = _measured(self._trials.run(place, [None]), None)
+        ceiling = original["scores"][target.metric].mean
         cells: dict[int, Cell] = {}
 
         def score(crf: int) -> float:
@@ -263,7 +263,7 @@ class CameraTrial:
             self._report(EvaluateProgress(self._camera.topic, what, self._done, self._total))
 
 
-def _measured(found: dict[Setting | None, Any], setting: Setting | None) -> dict[str, Any]:
+def _measured(found: dict[Setting | None, Found], setting: Setting | None) -> dict[str, Any]:
     """What was measured with a setting.
 
     Raises:
@@ -272,5 +272,4 @@ def _measured(found: dict[Setting | None, Any], setting: Setting | None) -> dict
     values = found[setting]
     if isinstance(values, Failure):
         raise ScoringError(values.sentence)
-    measured: dict[str, Any] = values
-    return measured
+    return values

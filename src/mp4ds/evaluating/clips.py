@@ -20,6 +20,7 @@ from mp4ds.stamps import NS_PER_TICK, PresentationClock
 from mp4ds.video.planes import PlaneMaker, Planes, planes_in
 
 _SECOND = 1_000_000_000
+_BLOCK = 2**20
 _DETAIL = (128, 96)  # columns and rows that are shown beside each other
 _MOST_PIXELS = 16  # samples: of less no scores are made
 
@@ -255,12 +256,19 @@ class ClipFile:
     """
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         self.clip = clip_from_json(path.with_suffix(".json").read_text())
         clip = self.clip
         size = clip.width * clip.height * 3 // 2
         if path.stat().st_size != size * clip.frames:
             raise SourceError(path, "is not whole", "Remove the folder and evaluate again.")
         self._frames = np.memmap(path, np.uint8, "r", shape=(clip.frames, size))
+
+    def fetch(self) -> None:
+        """Read all once, so that what follows does not wait for a disk or a network."""
+        with self._path.open("rb") as file:
+            while file.read(_BLOCK):
+                pass
 
     def __iter__(self) -> Iterator[Planes]:
         return map(self.planes, range(self.clip.frames))

@@ -69,7 +69,7 @@ def _columns() -> Iterator[str]:
     yield from ("topic", "codec", "preset", "crf", "gop", "frames", *_FIGURES)
     for metric in METRICS:
         yield from (f"{metric}_{statistic}" for statistic in _STATISTICS)
-    yield "recommended"
+    yield from ("machine", "recommended")
 
 
 def _row(camera: CameraEvaluation, cell: Cell) -> dict[str, Any]:
@@ -87,6 +87,7 @@ def _row(camera: CameraEvaluation, cell: Cell) -> dict[str, Any]:
         "frames": camera.frames,
         **{name: round(value, 6) for name, value in figures.items()},
         **scores,
+        "machine": cell.machine,
         "recommended": " ".join(why),
     }
 

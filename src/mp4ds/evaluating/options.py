@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from mp4ds.errors import OptionError
 from mp4ds.plan import visual_setting
@@ -88,9 +88,12 @@ class EvaluateOptions:
         frames: Frames of a clip, where there is no `duration`.
         fps: Frames per second of a folder of images.
         gop: Most frames between key frames.
-        threads: Of an encoder; None for all cores, shared among the jobs.
+        threads: Of an encoder; None for all cores, shared among the jobs, or 1 on a cluster.
         jobs: Settings that are tried at a time. Times are those of an idle machine with 1 only.
-        target: The score to reach.
+        cluster: Dask scheduler (``tcp://HOST:PORT``) or batch system (``slurm`` ...) whose
+            workers try the settings; None for this machine.
+        target: The score to reach, as the mean of a clip's frames: ``vmaf=99.5``, ``psnr_y=42``
+            (dB) or ``ssim=0.98``.
         rates: Frames per second at which to look for the crf that reaches the target.
         streams: Cameras of a data set of which to tell the size.
         hours: How long they record.
@@ -108,7 +111,8 @@ class EvaluateOptions:
     gop: int = LOSSY_GOP
     threads: int | None = None
     jobs: int = 1
-    target: Target = field(default_factory=Target)
+    cluster: str | None = None
+    target: str = "vmaf=99.5"
     rates: Sequence[float] = ()
     streams: int | None = None
     hours: float | None = None
@@ -116,7 +120,18 @@ class EvaluateOptions:
     @property
     def encoder_threads(self) -> int:
         """Threads of an encoder."""
+        if self.cluster:
+            return self.threads or 1  # its workers have a core each
         return self.threads or max(1, (os.cpu_count() or 1) // self.jobs)
+
+    @property
+    def wanted(self) -> Target:
+        """The score to reach.
+
+        Raises:
+            OptionError: `target` is none.
+        """
+        return parse_target(self.target)
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +248,7 @@ def parse_target(text: str) -> Target:
 
 
 def check_options(options: EvaluateOptions) -> None:
-    """Refuse numbers that make no sense.
+    """Refuse numbers that make no sense, and options that contradict each other.
 
     Raises:
         OptionError: Names one.
@@ -254,6 +269,9 @@ def check_options(options: EvaluateOptions) -> None:
             raise OptionError(f"{name} {value:g} is not above 0.")
     if options.start is not None and not 0 <= options.start < float("inf"):
         raise OptionError(f"--start {options.start:g} is not a number of seconds.")
+    if options.cluster and options.jobs != 1:
+        raise OptionError("--jobs is for this machine; how many a --cluster tries is up to it.")
+    parse_target(options.target)
 
 
 def first_guess(codec: str, rate: float | None) -> int:

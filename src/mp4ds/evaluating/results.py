@@ -27,6 +27,7 @@ class Cell:
         picture: Name of the PNG file of its detail, in the folder of the evaluation.
         whole_bytes: Bytes of the camera's whole recording.
         whole_seconds: Time to encode the camera's whole recording.
+        machine: Name of that which took these times; empty where it was not kept.
     """
 
     setting: Setting
@@ -41,6 +42,7 @@ class Cell:
     picture: str
     whole_bytes: float
     whole_seconds: float
+    machine: str = ""
 
 
 @dataclass(frozen=True, slots=True)

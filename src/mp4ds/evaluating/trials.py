@@ -5,17 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from mp4ds.engine import ProcessEngine
+from mp4ds.engine import Outcome
 from mp4ds.evaluating.clips import Clip, clip_seconds
+from mp4ds.evaluating.engines import Engines
 from mp4ds.evaluating.options import Setting
 from mp4ds.evaluating.results import Cell
-from mp4ds.evaluating.work import Trial, command
-from mp4ds.outputs import write_synced
-from mp4ds.scoring import Ffmpeg, Summary
+from mp4ds.evaluating.work import REFUSED, Trial, task_bytes
+from mp4ds.outputs import is_seen, write_synced
+from mp4ds.scoring import ScoringError, Summary
 
 _SHORT = 12  # digits of a digest in a name
 
@@ -31,6 +33,10 @@ class Failure:
 
     setting: Setting | None
     sentence: str
+
+
+Found = dict[str, Any] | Failure
+"""What was measured with a setting, or why nothing was."""
 
 
 @dataclass(frozen=True)
@@ -54,28 +60,25 @@ class Trials:
     Args:
         folder: Where results are kept; in ``cells`` and ``pictures``.
         work: Where files are that are not kept.
-        ffmpeg: What computes VMAF, or None.
+        engines: Run them.
         versions: Of what makes videos and scores: with others, all is measured anew.
         threads: Of an encoder.
-        jobs: Processes at a time.
     """
 
     def __init__(
         self,
         folder: Path,
         work: Path,
+        engines: Engines,
         *,
-        ffmpeg: Ffmpeg | None,
         versions: dict[str, str],
         threads: int,
-        jobs: int,
     ) -> None:
         self._folder = folder
         self._work = work
-        self._ffmpeg = ffmpeg
+        self._engines = engines
         self._versions = versions
         self._threads = threads
-        self._engine = ProcessEngine(command, jobs)
         self.tried = 0
         self.known = 0
 
@@ -84,18 +87,22 @@ class Trials:
         place: ClipPlace,
         settings: Sequence[Setting | None],
         on_done: Callable[[int], None] = lambda _: None,
-    ) -> dict[Setting | None, dict[str, Any] | Failure]:
+    ) -> dict[Setting | None, Found]:
         """Try settings on a clip, but for those whose results are there.
 
         Args:
             place: The clip.
             settings: Each once; None scores the clip as it is.
-            on_done: Called with the number of those that are done.
+            on_done: Called with the number of settings that are done, None left out.
 
         Returns:
             What was measured by setting, or why nothing was.
+
+        Raises:
+            ScoringError: The clip as it is could not be scored, so that the others are of no use.
+            ClusterError: The cluster does not answer, or was lost.
         """
-        found: dict[Setting | None, dict[str, Any] | Failure] = {}
+        found: dict[Setting | None, Found] = {}
         tasks: dict[tuple[str, ...], Setting | None] = {}
         for setting in settings:
             known = self._read(place, setting)
@@ -106,18 +113,36 @@ class Trials:
             write_synced(job, self._trial(place, setting).to_json())
             tasks[(str(job),)] = setting
         self.known += len(found)
-        on_done(len(found))
-        for outcome in self._engine.run(list(tasks), lambda *_: None):
-            setting = tasks[outcome.task]
-            result = self._read(place, setting)
-            if outcome.error is None and result is not None:
-                found[setting] = result
-                self.tried += 1
-            else:
-                sentence = outcome.error[1] if outcome.error else "it left no result"
-                found[setting] = Failure(setting, sentence)
-            on_done(len(found))
+        on_done(len(found.keys() - {None}))
+        engine = self._engines.engine(task_bytes(place.clip, settings, self._threads))
+        with closing(engine.run(list(tasks), lambda *_: None)) as outcomes:
+            for outcome in outcomes:
+                setting = tasks[outcome.task]
+                found[setting] = self._found(place, setting, outcome)
+                on_done(len(found.keys() - {None}))
         return found
+
+    def _found(self, place: ClipPlace, setting: Setting | None, outcome: Outcome) -> Found:
+        """What became of a trial.
+
+        Raises:
+            ScoringError: It failed, and without it the others are of no use.
+        """
+        sentence = outcome.error[1] if outcome.error else ""
+        if not sentence and not self._is_seen(place, setting):
+            folder = self._folder / "cells"
+            sentence = f"its result is not seen in {folder}; all machines must share this folder."
+        result = None if sentence else self._read(place, setting)
+        if result is not None:
+            self.tried += 1
+            return result
+        if setting is None:
+            raise ScoringError(sentence)
+        return Failure(setting, sentence)
+
+    def _is_seen(self, place: ClipPlace, setting: Setting | None) -> bool:
+        folders = self._folder / "cells", self._folder / "pictures"
+        return is_seen(lambda: self._read(place, setting) is not None, *folders)
 
     def _trial(self, place: ClipPlace, setting: Setting | None) -> Trial:
         return Trial(
@@ -126,7 +151,7 @@ class Trials:
             picture=str(self._folder / self.picture(place, setting)),
             setting=setting,
             threads=self._threads,
-            ffmpeg=self._ffmpeg.path if self._ffmpeg else None,
+            versions=self._versions,
         )
 
     def _name(self, place: ClipPlace, setting: Setting | None) -> str:
@@ -149,10 +174,12 @@ class Trials:
         """Name of a PNG file of a clip's detail, in the folder."""
         return f"pictures/{self._name(place, setting)}.png"
 
-    def _read(self, place: ClipPlace, setting: Setting | None) -> dict[str, Any] | None:
+    def _read(self, place: ClipPlace, setting: Setting | None) -> Found | None:
         """What was measured before, if that is whole."""
         try:
             values = json.loads(self._result(place, setting).read_bytes())
+            if REFUSED in values:
+                return Failure(setting, str(values[REFUSED]))
             scores = {name: Summary(**score) for name, score in values["scores"].items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
@@ -161,7 +188,7 @@ class Trials:
         return {**values, "scores": scores}
 
     def cells(
-        self, place: ClipPlace, measured: dict[Setting | None, dict[str, Any] | Failure]
+        self, place: ClipPlace, measured: dict[Setting | None, Found]
     ) -> Iterator[Cell | Failure]:
         """What was measured, made into figures."""
         for setting, values in measured.items():
@@ -187,4 +214,5 @@ class Trials:
             picture=self.picture(place, setting),
             whole_bytes=frame_bytes * clip.source_frames,
             whole_seconds=seconds / clip.frames * clip.source_frames,
+            machine=values.get("machine", ""),
         )
