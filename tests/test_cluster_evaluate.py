@@ -17,10 +17,11 @@ from typing import Any
 
 import pytest
 
+import mp4ds
 from clusters import RealCluster, wait_until
 from mp4ds.engine import Outcome
 from mp4ds.errors import ClusterError, Mp4dsError, OptionError
-from mp4ds.evaluating import EvaluateOptions, Evaluation, evaluate
+from mp4ds.evaluating import EvaluateOptions, Evaluation
 from mp4ds.evaluating.engines import Engines
 from mp4ds.evaluating.work import command, run_task
 from mp4ds.scoring import ScoringError
@@ -52,7 +53,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def expected(bag: Path) -> dict[str, Any]:
-    return facts(evaluate(bag, QUICK, output=bag.parent / "expected"))
+    return facts(mp4ds.evaluate(bag, QUICK, output=bag.parent / "expected"))
 
 
 def facts(found: Evaluation) -> dict[str, Any]:
@@ -108,7 +109,7 @@ def trials_of(worker: subprocess.Popen[bytes]) -> list[int]:
 def test_it_finds_the_same(
     cluster: RealCluster, bag: Path, expected: dict[str, Any], tmp_path: Path
 ) -> None:
-    found = evaluate(bag, on(cluster), output=tmp_path / "out")
+    found = mp4ds.evaluate(bag, on(cluster), output=tmp_path / "out")
     assert (found.tried, found.known) == (2 * SETTINGS + 1, 0)
     assert facts(found) == expected
     (camera,) = found.cameras
@@ -121,7 +122,7 @@ def test_it_finds_the_same(
         *("cells", "evaluation.csv", "evaluation.json", "index.html", "pictures", "plots")
     ]
     # what is known needs no cluster
-    again = evaluate(bag, replace(QUICK, cluster=NOBODY), output=tmp_path / "out")
+    again = mp4ds.evaluate(bag, replace(QUICK, cluster=NOBODY), output=tmp_path / "out")
     assert (again.tried, again.known) == (0, 2 * SETTINGS + 1)
     assert facts(again) == expected
 
@@ -129,11 +130,11 @@ def test_it_finds_the_same(
 def test_what_one_machine_began_a_cluster_ends(
     cluster: RealCluster, bag: Path, expected: dict[str, Any], tmp_path: Path
 ) -> None:
-    evaluate(bag, replace(QUICK, crf=["20:24:4"]), output=tmp_path / "out")
+    mp4ds.evaluate(bag, replace(QUICK, crf=["20:24:4"]), output=tmp_path / "out")
     (known,) = (tmp_path / "out" / "cells").glob("*h264*crf-24*")
     values = json.loads(known.read_text())
     known.write_text(json.dumps({**values, "machine": "another"}))
-    found = evaluate(bag, on(cluster), output=tmp_path / "out")
+    found = mp4ds.evaluate(bag, on(cluster), output=tmp_path / "out")
     assert found.known == 5
     assert facts(found) == expected
     (note,) = (note for note in found.cameras[0].notes if "machines" in note)
@@ -143,8 +144,10 @@ def test_what_one_machine_began_a_cluster_ends(
 
 def test_rates_are_searched_on_a_cluster(cluster: RealCluster, bag: Path, tmp_path: Path) -> None:
     options = replace(QUICK, codecs=["x264"], crf=["24"], rates=[5], target="psnr_y=35")
-    here = evaluate(bag, options, output=tmp_path / "here")
-    there = evaluate(bag, replace(options, cluster=cluster.address), output=tmp_path / "there")
+    here = mp4ds.evaluate(bag, options, output=tmp_path / "here")
+    there = mp4ds.evaluate(
+        bag, replace(options, cluster=cluster.address), output=tmp_path / "there"
+    )
     (ours,), (theirs,) = here.cameras[0].rates, there.cameras[0].rates
     assert replace(theirs, frame_seconds=0) == replace(ours, frame_seconds=0)
 
@@ -165,7 +168,7 @@ def test_a_killed_worker_does_not_matter(
             _, stderr = process.communicate(timeout=180)
         assert process.returncode == 0, stderr
         wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in orphans))
-    found = evaluate(bag, QUICK, output=tmp_path / "out")
+    found = mp4ds.evaluate(bag, QUICK, output=tmp_path / "out")
     assert (found.tried, found.known) == (0, 2 * SETTINGS + 1)
     assert facts(found) == expected
 
@@ -179,7 +182,7 @@ def test_a_lost_scheduler_is_told(bag: Path, expected: dict[str, Any], tmp_path:
     assert "Traceback" not in stderr
     assert "the connection to the Dask scheduler was lost" in " ".join(stderr.split())
     kept = len(measured(tmp_path))
-    found = evaluate(bag, QUICK, output=tmp_path / "out")
+    found = mp4ds.evaluate(bag, QUICK, output=tmp_path / "out")
     assert found.known == kept
     assert facts(found) == expected
 
@@ -201,7 +204,7 @@ def test_one_that_is_interrupted_leaves_the_cluster_idle(
     assert measured(tmp_path) == idle
     assert len(idle) < 2 * SETTINGS + 1
     assert all(p.poll() is None for p in (cluster.scheduler, *cluster.workers))
-    found = evaluate(bag, on(cluster), output=tmp_path / "out")
+    found = mp4ds.evaluate(bag, on(cluster), output=tmp_path / "out")
     assert found.known == len(idle)
     assert facts(found) == expected
 
@@ -214,7 +217,7 @@ def test_workers_of_another_version_are_refused(bag: Path, tmp_path: Path) -> No
             ScoringError, match=r"on worker tcp:.* other versions: mp4ds 0.0.1 instead of"
         ),
     ):
-        evaluate(bag, on(cluster), output=tmp_path / "out")
+        mp4ds.evaluate(bag, on(cluster), output=tmp_path / "out")
     assert not measured(tmp_path)
 
 
@@ -237,13 +240,13 @@ def test_results_that_are_not_seen(
     monkeypatch.setattr("mp4ds.outputs._LOOK_SECONDS", 0.01)
     monkeypatch.setattr(Engines, "engine", lambda *_: Elsewhere())
     with pytest.raises(ScoringError, match=r"not seen in .*cells; all machines must share"):
-        evaluate(bag, QUICK, output=tmp_path / "out")
+        mp4ds.evaluate(bag, QUICK, output=tmp_path / "out")
 
 
 def test_nobody_at_the_address(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mp4ds.engine.cluster_access._CONNECT_SECONDS", 1.0)
     with pytest.raises(ClusterError, match="no Dask scheduler could be reached"):
-        evaluate(bag, replace(QUICK, cluster=NOBODY), output=tmp_path / "out")
+        mp4ds.evaluate(bag, replace(QUICK, cluster=NOBODY), output=tmp_path / "out")
     assert not list((tmp_path / "out").glob("work*"))
 
 
@@ -258,7 +261,7 @@ def test_options_that_are_wrong(
     changed: dict[str, Any], said: str, bag: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(OptionError, match=said):
-        evaluate(bag, replace(QUICK, **changed), output=tmp_path / "out")
+        mp4ds.evaluate(bag, replace(QUICK, **changed), output=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -288,6 +291,6 @@ def test_a_trial_may_be_run_twice_at_once(
 
     monkeypatch.setattr(Engines, "engine", lambda *_: Twice())
     options = replace(QUICK, codecs=["x264"], crf=["20:24:4"])
-    found = facts(evaluate(bag, options, output=tmp_path / "out"))
+    found = facts(mp4ds.evaluate(bag, options, output=tmp_path / "out"))
     assert found["cells"] == expected["cells"][:2]
     assert not list((tmp_path / "out" / "cells").glob("*.mp4"))

@@ -21,6 +21,8 @@ NAMES = [
     "ClusterError",
     "ConversionError",
     "Dataset",
+    "EvaluateOptions",
+    "Evaluation",
     "ExportOptions",
     "ExportSummary",
     "FormatError",
@@ -52,6 +54,7 @@ NAMES = [
     "VideoError",
     "WriteError",
     "__version__",
+    "evaluate",
     "export",
     "import_ros_mp4",
     "open",
@@ -189,7 +192,7 @@ def test_all_is_documented(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["export", "import_ros_mp4", "open", "pack", "play", "unpack", "validate"]
+    "name", ["evaluate", "export", "import_ros_mp4", "open", "pack", "play", "unpack", "validate"]
 )
 def test_the_functions_are_annotated(name: str) -> None:
     function = getattr(mp4ds, name)
@@ -202,7 +205,10 @@ def test_the_functions_are_annotated(name: str) -> None:
 
 
 def test_options_are_frozen_and_compare() -> None:
-    for options in (mp4ds.PackOptions(), mp4ds.UnpackOptions(), mp4ds.ExportOptions()):
+    for options in (
+        *(mp4ds.PackOptions(), mp4ds.UnpackOptions(), mp4ds.ExportOptions()),
+        mp4ds.EvaluateOptions(),
+    ):
         with pytest.raises(dataclasses.FrozenInstanceError):
             options.force = True  # type: ignore[misc]
         assert options == type(options)()
@@ -226,6 +232,7 @@ def test_importing_is_cheap() -> None:
         ("import mp4ds.cli", ["numpy", "av", "pydantic", "rosbags", "mcap"]),
         ("mp4ds.open", ["typer", "rich", "jsonschema"]),
         ("mp4ds.pack", ["typer", "rich", "jsonschema"]),
+        ("mp4ds.evaluate", ["typer", "rich", "jsonschema", "distributed", "dask"]),
     ],
 )
 def test_what_is_used_is_imported(code: str, absent: list[str]) -> None:

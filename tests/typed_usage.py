@@ -66,6 +66,23 @@ def export(datasets: list[str]) -> dict[str, dict[str, int]]:
     return summary.left_out
 
 
+def evaluate(source: str | Path) -> dict[str, float]:
+    """Mean VMAF of each setting, by the options that pack with it."""
+    options = mp4ds.EvaluateOptions(
+        codecs=["svtav1"], crf=["16:25:3"], target="vmaf=97", cluster="slurm", threads=4
+    )
+    found: mp4ds.Evaluation = mp4ds.evaluate(source, options, output=Path("out"), progress=use)
+    use(mp4ds.evaluate(Path("drive.bag")).output.name, found.left_out, found.tried + found.known)
+    for item in found.recommended:
+        use(item.why.upper(), item.options.upper(), item.score, item.setting.crf)
+    scores: dict[str, float] = {}
+    for camera in found.cameras:
+        for cell in camera.cells:
+            scores[cell.setting.pack_options] = cell.scores["vmaf"].mean
+            use(cell.kbps, cell.encode_cpu_seconds, cell.machine.upper())
+    return scores
+
+
 def play(dataset: str | Path) -> float:
     """Seconds that the clock stood still."""
     options = mp4ds.PlayOptions(to="ros1", rate=0.5, clock=100.0, topics=["/cam*"], every=2)

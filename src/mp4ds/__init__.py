@@ -6,6 +6,7 @@ The public surface, and nothing else::
     mp4ds.unpack("drive", "bag", "again.bag")   and back
     mp4ds.import_ros_mp4("a.mp4", "a.yaml", "a")   a dataset of the paper's tool as it is
     mp4ds.export("drive", "euroc", "for_slam")  EuRoC, TUM, KITTI, COLMAP, Rerun, LeRobot
+    mp4ds.evaluate("drive.bag").recommended     encoder settings, tried on clips of its cameras
     mp4ds.play("drive")                         as if it were the recording: ROS 1, ROS 2, Foxglove
     mp4ds.validate("drive", deep=True)          every problem, or an empty list
     mp4ds.open("drive")["/camera/image_raw"][7].data
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
         VideoError,
         WriteError,
     )
+    from mp4ds.evaluating import EvaluateOptions, Evaluation, evaluate
     from mp4ds.exporting import ExportOptions, ExportSummary, export
     from mp4ds.importing import ImageFolder
     from mp4ds.packing import (
@@ -83,6 +85,7 @@ _HOMES = {
     ),
     "importing": ("ImageFolder",),
     "packing": ("PackOptions", "PackSummary", "import_ros_mp4", "pack", "pack_each", "pack_share"),
+    "evaluating": ("EvaluateOptions", "Evaluation", "evaluate"),
     "exporting": ("ExportOptions", "ExportSummary", "export"),
     "playing": ("PlayOptions", "PlaySummary", "play"),
     "recorded": ("RecordedMessage",),
@@ -94,6 +97,8 @@ __all__ = [
     "ClusterError",
     "ConversionError",
     "Dataset",
+    "EvaluateOptions",
+    "Evaluation",
     "ExportOptions",
     "ExportSummary",
     "FormatError",
@@ -125,6 +130,7 @@ __all__ = [
     "VideoError",
     "WriteError",
     "__version__",
+    "evaluate",
     "export",
     "import_ros_mp4",
     "open",
