@@ -98,7 +98,8 @@ def test_what_is_encoded_here(
     assert table.order.tolist() == list(range(11))
     assert table.sync[::4].all()  # and where the encoder sees another scene
     assert not lossless or table.sync.sum() == 3
-    assert table.codec == {"h264": "avc1", "h265": "hev1", "av1": "av01", "ffv1": "FFV1"}[codec]
+    entries = {"h264": "avc1", "h265": "hev1", "av1": "av01", "av1-10bit": "av01", "ffv1": "FFV1"}
+    assert table.codec == entries[codec]
     assert table.configuration
 
 

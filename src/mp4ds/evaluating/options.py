@@ -11,13 +11,13 @@ from mp4ds.errors import OptionError
 from mp4ds.plan import visual_setting
 from mp4ds.scoring import METRICS
 from mp4ds.video import HARDWARE, check_codec
-from mp4ds.video.codecs import LOSSY_GOP, MAX_CRF
+from mp4ds.video.codecs import AV1, LOSSY_GOP, MAX_CRF
 
 ENCODER_NAMES = {"svtav1": "av1", "x264": "h264", "x265": "h265"}
 """Names of the encoders -> of the codecs, as `mp4ds pack` takes them."""
 
 _DEFAULT_PRESETS = {
-    "av1": ("6", "8"),
+    **dict.fromkeys(AV1, ("6", "8")),
     "h264": ("medium",),
     "h265": ("medium",),
     **{name: (found.default_preset,) for name, found in HARDWARE.items()},
@@ -181,7 +181,7 @@ def _codec(name: str) -> str:
     codec = ENCODER_NAMES.get(name, name)
     if codec not in MAX_CRF:
         names = [f"{encoder} ({codec})" for encoder, codec in ENCODER_NAMES.items()]
-        known = ", ".join([*names, *HARDWARE])
+        known = ", ".join([*names, AV1[1], *HARDWARE])
         raise OptionError(f"--codecs {name!r} is not one of {known}.")
     return codec
 
@@ -277,4 +277,4 @@ def check_options(options: EvaluateOptions) -> None:
 def first_guess(codec: str, rate: float | None) -> int:
     """A crf to begin the search for a target with."""
     crf, _ = visual_setting(rate)
-    return crf if codec == "av1" else crf - 2
+    return crf if codec in AV1 else crf - 2

@@ -61,7 +61,7 @@ PIXEL_FORMATS = (
     *("rgb24", "bgr24", "bgr0", "bgra"),
     *("gbrp10le", "gbrp12le", "gbrp14le", "gbrp16le"),
     *("gbrap10le", "gbrap12le", "gbrap14le", "gbrap16le"),
-    *("yuv420p", "yuv422p", "yuv444p"),
+    *("yuv420p", "yuv422p", "yuv444p", "yuv420p10le"),
 )
 
 

@@ -15,6 +15,7 @@ from mp4ds.streams.look import Seen, StreamKey
 from mp4ds.streams.target import OutOfReach, TargetPlan, target_plan
 from mp4ds.streams.tracks import PacketPlan, PicturePlan, StreamSettings, TrackPlan
 from mp4ds.video import Recipe, choose, recipe_for
+from mp4ds.video.codecs import AV1
 from mp4ds.video.encoder import EncoderRefusedError
 
 _KEPT_JPEG = "JPEG files are kept as they are; --transcode encodes them anew"
@@ -77,7 +78,7 @@ def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) ->
     crf, preset = quality.crf, settings.preset
     if crf is None:  # a score is looked for from there
         crf, table_preset = visual_setting(rate)
-        if settings.codec in (None, "av1"):
+        if settings.codec in (None, *AV1):
             preset = preset or str(table_preset)
     recipe = recipe_for(
         layout.pixel_format,

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from mp4ds.errors import OptionError
+from mp4ds.video.depths import TEN_BITS
 from mp4ds.video.hardware import CHROMA_PLACE, HARDWARE
 
 # most frames between key frames, chosen by what they cost (spec/notes.md)
@@ -55,6 +56,7 @@ class _Coding:
     default_preset: str = ""
     tuning: str = ""  # further x264 parameters of the default preset
     tried: bool = True  # without being asked for
+    codec: str = ""  # name in the registry, where that is another one
 
 
 _SAME_HEADERS = "stitchable=1"  # parameter sets that do not depend on the crf
@@ -116,8 +118,11 @@ _LOSSLESS: dict[str, dict[str, _Coding]] = {
         for planar in _YUV
     },
 }
+_SMALL = "hierarchical-levels=3:enable-qm=1:qm-min=8:ac-bias=1.0"
 _LOSSY: dict[str, _Coding] = {
     "av1": _Coding("libsvtav1", "yuv420p", {}, "6"),
+    # a sixth fewer bits for 1.3 times the time (benchmarks/RESULTS.md)
+    "av1-10bit": _Coding("libsvtav1", TEN_BITS, {"svtav1-params": _SMALL}, "6", codec="av1"),
     "h264": _Coding("libx264", "yuv420p", {**_X264, "x264-params": _CENTRED}, "medium"),
     "h265": _Coding(
         "libx265", "yuv420p", {"x265-params": f"{_X265}:{_CENTRED}:{_QUIET}"}, "medium"
@@ -125,8 +130,12 @@ _LOSSY: dict[str, _Coding] = {
 }
 _DEFAULT_LOSSY = "av1"
 
+AV1 = ("av1", "av1-10bit")
+"""The names of SVT-AV1's two forms."""
+
 MAX_CRF = {
     "av1": 63,
+    "av1-10bit": 63,
     "h264": 51,
     "h265": 51,
     **{name: found.most for name, found in HARDWARE.items()},
@@ -143,10 +152,12 @@ _X26X_PRESETS = (
     *("ultrafast", "superfast", "veryfast", "faster", "fast"),
     *("medium", "slow", "slower", "veryslow"),
 )
+_AV1_PRESETS = [str(number) for number in range(14)]
 _PRESETS: dict[str, Sequence[str]] = {
     "h264": _X26X_PRESETS,
     "h265": _X26X_PRESETS,
-    "av1": [str(number) for number in range(14)],
+    "av1": _AV1_PRESETS,
+    "av1-10bit": _AV1_PRESETS,
     "ffv1": (),
     **{name: found.presets for name, found in HARDWARE.items()},
 }
@@ -209,7 +220,7 @@ def check_codec(
 
 def _check_crf(codec: str, preset: str | None, crf: int) -> None:
     least = 1 if codec in HARDWARE else 0
-    if codec == "av1":  # ffmpeg takes 0 for none
+    if codec in AV1:  # ffmpeg takes 0 for none
         is_fast = preset is not None and int(preset) >= _AV1_FAST
         least = LEAST_CRF["av1"] if is_fast else 1
     if not least <= crf <= MAX_CRF[codec]:
@@ -233,8 +244,8 @@ def recipe_for(
     Args:
         pixel_format: Of the pictures, as a layout gives them.
         lossless: Whether every sample must return as it was.
-        codec: ``h264``, ``h265``, ``av1``, ``ffv1``, a name among `HARDWARE`, or None for the
-            default.
+        codec: ``h264``, ``h265``, ``av1``, ``av1-10bit``, ``ffv1``, a name among `HARDWARE`, or
+            None for the default.
         crf: Constant rate factor of a lossy recipe.
         preset: The encoder's preset, or None for the default; encoders without ignore it.
         varied: Whether videos with several crf are to be joined to one.
@@ -267,7 +278,7 @@ def recipe_for(
     is_yuv = pixel_format in _YUV
     is_rgb = coding.pixel_format.startswith(("rgb", "bgr", "gbr"))
     return Recipe(
-        HARDWARE[name].codec if name in HARDWARE else name,
+        coding.codec or name,
         coding.encoder,
         coding.pixel_format,
         lossless,
@@ -284,7 +295,8 @@ def _lossy(name: str, crf: int | None) -> tuple[_Coding, dict[str, str]]:
     if name in HARDWARE:
         device = HARDWARE[name]
         options = device.options(crf or 1)
-        return _Coding(device.encoder, "yuv420p", options, device.default_preset), options
+        preset, codec = device.default_preset, device.codec
+        return _Coding(device.encoder, "yuv420p", options, preset, codec=codec), options
     if name not in _LOSSY:
         known = ", ".join((*_LOSSY, *HARDWARE))
         raise OptionError(f"codec {name} is lossless only; use one of {known}")

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mp4ds.errors import VideoError
 from mp4ds.layouts import CHROMA_SHIFTS, Picture
+from mp4ds.video.depths import TEN_BITS, narrowed, rounded, widened
 
 _BT709, _FULL_RANGE = 1, 2  # in a frame's tags (H.273; ffmpeg's AVColorRange)
 
@@ -73,8 +74,8 @@ class Converter:
             planes = self._reformat(self._to_planes, frame, "gbrp")
             return self._reformat(self._reformatter, planes, pixel_format)
         is_ranged = frame.format.is_rgb or self._source_range != ColorRange.JPEG
-        if pixel_format == "yuv420p" and is_ranged:
-            return _in_8_bits(self._reformat(self._to_planes, frame, "yuv420p16le"))
+        if pixel_format in ("yuv420p", TEN_BITS) and is_ranged:
+            return rounded(self._reformat(self._to_planes, frame, "yuv420p16le"), pixel_format)
         return self._reformat(self._reformatter, frame, pixel_format)
 
     def _reformat(
@@ -92,28 +93,13 @@ class Converter:
         )
 
 
-def _in_8_bits(wide: av.VideoFrame) -> av.VideoFrame:
-    """4:2:0 of 16 bits, which are lost, rounded to 8.
-
-    libswscale puts the middle of chroma that uses the full range between two values. In 8 bits
-    that makes all chroma half a level low, a tint of -0.8 levels of red, 0.3 of green, -0.9 of
-    blue; in 16 bits it is nothing.
-    """
-    frame = av.VideoFrame(wide.width, wide.height, "yuv420p")
-    for index in range(3):
-        height, width = frame.planes[index].height, frame.planes[index].width
-        samples = _rows(wide, index).view("<u2")[:height, :width]
-        half = 257 if index else 128  # 257 are a level; chroma's middle is 32767.5, and 128
-        np.minimum(samples, 65535 - half, out=samples)
-        samples += half
-        samples //= 257
-        _rows(frame, index)[:height, :width] = samples
-    frame.colorspace, frame.color_range = wide.colorspace, wide.color_range
-    return frame
-
-
 def picture_to_frame(
-    picture: Picture, picture_format: str, pixel_format: str, converter: Converter
+    picture: Picture,
+    picture_format: str,
+    pixel_format: str,
+    converter: Converter,
+    *,
+    full_range: bool = True,
 ) -> av.VideoFrame:
     """A frame for the encoder; a view of the picture where formats and rows allow it.
 
@@ -122,10 +108,14 @@ def picture_to_frame(
         picture_format: Its pixel format.
         pixel_format: The encoder's.
         converter: The stream's own.
+        full_range: Whether the samples of the video use their full range.
     """
+    if pixel_format == TEN_BITS and (picture_format == "gray" or picture_format in CHROMA_SHIFTS):
+        frame = picture_to_frame(picture, picture_format, "yuv420p", converter)
+        return widened(frame, full_range=full_range)
     if pixel_format == "yuv420p" and picture_format == "gray":
         return _gray_to_yuv(picture[0], pixel_format)
-    if pixel_format == "yuv420p" and picture_format not in CHROMA_SHIFTS:
+    if pixel_format in ("yuv420p", TEN_BITS) and picture_format not in CHROMA_SHIFTS:
         picture = (_pad_to_even(picture[0]),)
     frame = plain_frame(picture, picture_format)
     if picture_format.startswith("bayer_"):
@@ -202,6 +192,8 @@ def frame_to_picture(
         return (_sample_mosaic(colours, picture_format, width, height),)
     if picture_format in _CHANNELS:
         return (_packed(frame, picture_format, converter)[:height, :width],)
+    if frame.format.name == TEN_BITS and picture_format in ("gray", *CHROMA_SHIFTS):
+        frame = narrowed(frame)
     return _planes(frame, picture_format, width, height, place)
 
 

@@ -116,7 +116,11 @@ class VideoEncoder:
             HardwareError: A device failed.
         """
         frame = picture_to_frame(
-            picture, self._picture_format, self.recipe.pixel_format, self._converter
+            picture,
+            self._picture_format,
+            self.recipe.pixel_format,
+            self._converter,
+            full_range=self.recipe.full_range,
         )
         frame.pts = tick
         frame.time_base = _TIME_BASE
@@ -160,7 +164,7 @@ class VideoEncoder:
 
 def coded_size(recipe: Recipe, width: int, height: int) -> tuple[int, int]:
     """Size of the coded pictures, which is even where chroma is halved."""
-    if recipe.pixel_format == "yuv420p":
+    if recipe.pixel_format.startswith("yuv420p"):
         return width + width % 2, height + height % 2
     return width, height
 

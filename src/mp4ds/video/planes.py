@@ -17,6 +17,7 @@ from mp4ds.errors import VideoError
 from mp4ds.layouts import Picture
 from mp4ds.video.codecs import Recipe
 from mp4ds.video.convert import Converter, picture_to_frame
+from mp4ds.video.depths import TEN_BITS, narrowed
 from mp4ds.video.media import Media
 
 PLANES_FORMAT = "yuv420p"
@@ -80,7 +81,7 @@ def decoded_planes(path: Path) -> Iterator[Planes]:
     """The frames of a video in order, decoded by one thread.
 
     Args:
-        path: A video of 8 bits with halved chroma.
+        path: A video with halved chroma, of 8 bits, or of 10, which are rounded.
 
     Yields:
         Views that hold until the next one is asked for.
@@ -93,6 +94,8 @@ def decoded_planes(path: Path) -> Iterator[Planes]:
         stream = media.container.streams.video[0]
         stream.thread_count = 1
         for frame in media.container.decode(stream):
+            if frame.format.name == TEN_BITS:
+                frame = narrowed(frame)
             if frame.format.name not in (PLANES_FORMAT, f"yuvj{PLANES_FORMAT[3:]}"):
                 raise VideoError(
                     "codec-mismatch", path, f"decodes to {frame.format.name}, not {PLANES_FORMAT}"
