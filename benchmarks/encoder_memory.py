@@ -81,6 +81,9 @@ CASES = {
     "svt 4": Case("rgb24", "av1", False, "4"),
     "svt 6": Case("rgb24", "av1", False, "6"),
     "svt 8": Case("rgb24", "av1", False, "8"),
+    "svt 4, 10 bits": Case("rgb24", "av1-10bit", False, "4"),
+    "svt 6, 10 bits": Case("rgb24", "av1-10bit", False, "6"),
+    "svt 8, 10 bits": Case("rgb24", "av1-10bit", False, "8"),
     "x264 medium": Case("rgb24", "h264", False, "medium"),
     "x264 slow": Case("rgb24", "h264", False, "slow"),
     "x265 medium": Case("rgb24", "h265", False, "medium"),
@@ -174,7 +177,7 @@ def packets(names: Sequence[str], common: dict[str, Any]) -> Iterator[tuple[obje
 def _frames(case: Case, size: tuple[int, int], threads: int) -> int:
     """Frames that fill what an encoder looks ahead."""
     ahead = 60 if case.codec in ("h264", "h265") and not case.lossless else 16
-    if case.codec == "av1":
+    if case.codec.startswith("av1"):
         ahead = {1: 106, 2: 106, 3: 106, 4: 139, 5: 172}.get(threads, 337)
     elif case.codec == "h265":
         ahead += threads

@@ -62,6 +62,7 @@ ASKED = {  # codec, picture format, lossless, preset
     "svt 4": ("av1", "rgb24", False, "4"),
     "svt 6": ("av1", "rgb24", False, "6"),
     "svt 8": ("av1", "rgb24", False, "8"),
+    "svt 6, 10 bits": ("av1-10bit", "rgb24", False, "6"),
 }
 
 GRAYS = [f"gray{bits}le" for bits in (10, 12, 14, 16)]
@@ -72,6 +73,7 @@ PRESETS = {  # from the one that keeps the least to the one that keeps the most
     "h264": [*X26X, "veryslow"],
     "h265": [*X26X, "veryslow"],
     "av1": [str(number) for number in range(13, -1, -1)],
+    "av1-10bit": [str(number) for number in range(13, -1, -1)],
     "ffv1": [],
 }
 
@@ -133,7 +135,14 @@ def test_every_recipe_is_known_and_grows_with_pictures_and_threads(found: Recipe
 
 @pytest.mark.parametrize(
     ("codec", "lossless"),
-    [("h264", True), ("h264", False), ("h265", True), ("h265", False), ("av1", False)],
+    [
+        ("h264", True),
+        ("h264", False),
+        ("h265", True),
+        ("h265", False),
+        ("av1", False),
+        ("av1-10bit", False),
+    ],
 )
 def test_presets_that_keep_more_are_not_estimated_lower(codec: str, lossless: bool) -> None:
     for size in ((640, 480), (2448, 2048)):

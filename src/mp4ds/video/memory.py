@@ -13,6 +13,7 @@ import os
 import av
 
 from mp4ds.video.codecs import Recipe
+from mp4ds.video.depths import TEN_BITS
 
 _MB = 1_000_000
 # code, tables and the mp4's index, which do not grow with the pictures, but differ by some MB
@@ -31,6 +32,7 @@ _SVT: tuple[tuple[int, tuple[tuple[int, int], ...]], ...] = (
     (7, ((16, 240), (28, 310), (44, 410), (64, 590), (86, 770), (140, 1405))),
     (13, ((4, 150), (10, 195), (24, 305), (36, 430), (36, 555), (64, 890))),
 )
+_SVT_TEN_BITS = 1.25  # times the bytes of a pixel with 10 bits
 
 # preset: frames looked ahead (with a lossy rate control), and referred to
 _X264_PRESETS = {
@@ -125,7 +127,8 @@ def _svt_bytes(recipe: Recipe, pixels: int, bordered: int, threads: int) -> floa
         preset = 7
     levels = next(levels for last, levels in _SVT if preset <= last)
     megabytes, each = levels[svt_level(threads) - 1]
-    return megabytes * _MB + (each + _PICTURE) * bordered
+    times = _SVT_TEN_BITS if recipe.pixel_format == TEN_BITS else 1
+    return megabytes * _MB + (times * each + _PICTURE) * bordered
 
 
 def _x264_bytes(recipe: Recipe, bordered: int, threads: int) -> float:
