@@ -333,6 +333,7 @@ QUALITIES: dict[str, dict[str, Any]] = {
     "visual": {"quality": "visual"},
     "crf": {"quality": "crf=12", "codec": "h264", "preset": "veryfast"},
     "crf-h265": {"quality": "crf=12", "codec": "h265", "preset": "veryfast"},
+    "crf-10bit": {"quality": "crf=12", "codec": "av1-10bit", "preset": "8"},
 }
 
 

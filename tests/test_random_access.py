@@ -96,13 +96,15 @@ def test_frames_of_coded_messages(name: str, tmp_path: Path) -> None:
         assert same(stream.read(order, format="native"), np.stack([every[i] for i in order]))
 
 
-@pytest.mark.parametrize("quality", ["visual", "crf=30"])
+@pytest.mark.parametrize(
+    ("quality", "codec"), [("visual", None), ("crf=30", None), ("crf=30", "av1-10bit")]
+)
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8", "bayer_grbg8", "nv12"])
 def test_frames_of_a_lossy_video_are_those_of_unpack(
-    encoding: str, quality: str, tmp_path: Path
+    encoding: str, quality: str, codec: str | None, tmp_path: Path
 ) -> None:
     source = scene(encoding, frames=FRAMES, width=66, height=50)
-    dataset = packed(tmp_path, source, quality=quality, gop=4)
+    dataset = packed(tmp_path, source, quality=quality, codec=codec, gop=4)
     again = mp4ds.unpack(dataset, "bag", tmp_path / "again.bag", UnpackOptions()).output
     mp4ds.pack(again, tmp_path / "exact")
     with mp4ds.open(dataset) as lossy, mp4ds.open(tmp_path / "exact") as exact:

@@ -407,6 +407,15 @@ def test_the_page_fits_the_window(width: int, browser: Tab, drive: Path) -> None
         browser.command("Emulation.clearDeviceMetricsOverride")
 
 
+def test_videos_of_10_bits_are_shown_as_they_are(browser: Tab, tmp_path: Path) -> None:
+    drive = pack_cameras(tmp_path, two_cameras(), codec="av1-10bit")
+    report(drive)
+    page, made = show(browser, (drive / "index.html").as_uri()), Recorded(drive)
+    for number in (FRAMES - 1, 0, 5):
+        page.evaluate(f"mp4dsReport.player.go({float(made.stamps[1][number] - made.base)})")
+        assert_shows(page, made, 1, number)
+
+
 def test_two_hours_at_60_hz(browser: Tab, drive: Path, tmp_path: Path) -> None:
     """432,000 frames in the columns of both cameras: shown, zoomed and stepped at once."""
     copy = Path(shutil.copytree(drive, tmp_path / "long"))

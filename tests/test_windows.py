@@ -116,7 +116,7 @@ def test_foxglove_messages(
     assert compare(paths, unpacked(tmp_path, "mcap")) == []
 
 
-@pytest.mark.parametrize("codec", ["av1", "h264", "h265"])
+@pytest.mark.parametrize("codec", ["av1", "av1-10bit", "h264", "h265"])
 def test_a_lossy_profile(
     codec: str, tmp_path: Path, compare: Compare, engine: InlineEngine
 ) -> None:
