@@ -42,7 +42,7 @@ CodecOption = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(
         "--codec",
-        help="h264, h265, ffv1 (lossless) or av1 (lossy); of a graphics card (lossy) av1-nvenc, "
+        help="h264, h265, ffv1 (lossless), av1, av1-10bit (lossy); of a graphics card av1-nvenc, "
         "h264-nvenc, h265-nvenc, ...-vaapi or ...-videotoolbox.",
     ),
 ]

@@ -31,7 +31,8 @@ class Setting:
     """How a clip is encoded, in the words of ``mp4ds pack``.
 
     Attributes:
-        codec: ``av1``, ``h264``, ``h265``, or an encoder of the hardware, such as ``h264-nvenc``.
+        codec: ``av1``, ``av1-10bit``, ``h264``, ``h265``, or an encoder of the hardware, such as
+            ``h264-nvenc``.
         preset: Of its encoder; empty where it has none.
         crf: Constant rate factor.
         gop: Most frames between key frames.

@@ -25,8 +25,8 @@ class PackOptions:
         exclude: Globs of topics to leave out.
         quality: ``lossless``, ``visual``, ``crf=N``, or a score that the frames are to have:
             ``vmaf=99.5``, ``psnr=42`` or ``ssim=0.98``.
-        codec: ``h264``, ``h265``, ``av1`` or ``ffv1``, or an encoder of the hardware, such as
-            ``h264-nvenc``; None chooses by measurement.
+        codec: ``h264``, ``h265``, ``av1``, ``av1-10bit`` or ``ffv1``, or an encoder of the
+            hardware, such as ``h264-nvenc``; None chooses by measurement.
         preset: The encoder's preset; None chooses.
         transcode: Encode JPEG topics anew, by `quality`, instead of copying their files.
         camera_info: Pairs ``IMAGE=INFO`` of topics that belong together, beyond what names tell.
