@@ -23,7 +23,7 @@ import mp4ds
 from in_parts import InlineEngine, leftovers
 from mp4ds.cli import app
 from mp4ds.errors import OptionError
-from mp4ds.evaluating import EvaluateOptions, Setting, Target, evaluate
+from mp4ds.evaluating import EvaluateOptions, Setting, evaluate
 from mp4ds.evaluating.options import first_guess, grid_of
 from mp4ds.packing import PackOptions, _checked
 from mp4ds.video import (
@@ -128,7 +128,9 @@ def ffmpeg_libraries() -> tuple[Any, Any]:
     paths = {line.split()[-1] for line in maps.read_text().splitlines() if "/libav" in line}
     found = []
     for name in ("libavcodec", "libavutil"):
-        (path,) = (path for path in paths if Path(path).name.startswith(name))
+        named = [path for path in paths if Path(path).name.startswith(name)]
+        # others may have loaded their own beside those of PyAV's wheel
+        path = next((path for path in named if "av.libs" in path), named[0])
         found.append(ctypes.CDLL(path))
     return found[0], found[1]
 
@@ -362,9 +364,9 @@ def test_evaluating(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stand_in: s
         "from mp4ds.evaluating import work; work._main()"
     )
     monkeypatch.setattr(
-        "mp4ds.evaluating.trials.command", lambda task: [sys.executable, "-c", code, *task]
+        "mp4ds.evaluating.engines.command", lambda task: [sys.executable, "-c", code, *task]
     )
-    options = EvaluateOptions(codecs=[stand_in], crf=["30"], frames=6, target=Target("psnr_y", 20))
+    options = EvaluateOptions(codecs=[stand_in], crf=["30"], frames=6, target="psnr_y=20")
     (camera,) = evaluate(recording(tmp_path)[0], options, output=tmp_path / "out").cameras
     assert [cell.setting.name for cell in camera.cells] == [f"{NAME} crf 30"]
     assert camera.recommended[0].options == f"--quality crf=30 --codec {NAME}"
