@@ -51,8 +51,8 @@ class Way:
     family: str = ""
 
 
-def _av1(crf: int, preset: str = "6", parameters: str = "") -> Recipe:
-    recipe = recipe_for("rgb24", lossless=False, codec="av1", crf=crf, preset=preset)
+def _av1(crf: int, preset: str = "6", parameters: str = "", codec: str = "av1") -> Recipe:
+    recipe = recipe_for("rgb24", lossless=False, codec=codec, crf=crf, preset=preset)
     if not parameters:
         return recipe
     return replace(recipe, options={**recipe.options, "svtav1-params": parameters})
@@ -86,6 +86,8 @@ def ways() -> dict[str, Way]:
         "visual": Way(_av1(crf, str(preset))),
     }
     found |= {f"{PLAIN}, crf {crf}": Way(_av1(crf), family=PLAIN) for crf in _CURVE}
+    for crf in _CURVE[::2]:
+        found[f"10 bits, crf {crf}"] = Way(_av1(crf, codec="av1-10bit"), family="10 bits")
     found["x264 medium, crf 16"] = Way(_x264(16))
     for name, (parameters, filters) in _TOOLS.items():
         for crf in _CURVE[::2]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from mp4ds.dataset import Stream, Video
@@ -13,6 +15,7 @@ from mp4ds.errors import OptionError, VideoError
 from mp4ds.layouts import LAYOUTS
 from mp4ds.remote import remote
 from mp4ds.torch.pictures import Crop
+from mp4ds.video.depths import TEN_BITS
 
 
 class TorchcodecReader:
@@ -24,7 +27,8 @@ class TorchcodecReader:
         device: Such as ``cpu`` or ``cuda``.
 
     Raises:
-        OptionError: torchcodec is missing, or the video's pictures are not the images.
+        OptionError: torchcodec is missing, mistakes the video's range, or the video's pictures
+            are not the images.
         VideoError: It cannot open the video.
     """
 
@@ -40,6 +44,7 @@ class TorchcodecReader:
             raise OptionError(f"topic {stream.topic}: crop {crop} is not within {columns}x{rows}.")
         self._rows, self._columns = slice(y, y + height), slice(x, x + width)
         self._decoder = self._opened(device)
+        self._check_range(stream)
 
     def _opened(self, device: str) -> Any:
         if find_spec("torchcodec") is None:
@@ -58,6 +63,26 @@ class TorchcodecReader:
             )
         except (RuntimeError, ValueError) as error:
             raise self._refused(error) from None
+
+    def _check_range(self, stream: Stream | Video) -> None:
+        """Refuse a video whose range torchcodec mistakes.
+
+        Of AV1, torchcodec 0.13 on a CPU was seen to take the full range for the limited one: the
+        contrast is then 255 / 219 of what it is, and what is dark or bright is lost.
+        """
+        if not len(stream):
+            return
+        with closing(stream):  # it opens its video again where that is asked of it
+            first = stream.read([0], format="rgb")[0]
+        ours = first[self._rows, self._columns].astype(np.int16)
+        mistaken = ((ours - 16) * (255 / 219)).clip(0, 255)
+        theirs = self.read([0])[0].cpu().numpy()
+        if np.abs(theirs - mistaken).mean() < np.abs(theirs - ours).mean():
+            raise OptionError(
+                f"topic {stream.topic}: torchcodec takes its video of the full range for one of "
+                "the limited, so that the contrast would be wrong. Use backend='mp4ds', or a "
+                "dataset that was packed with --codec h264."
+            )
 
     def _refused(self, error: Exception) -> VideoError:
         reason = " ".join(str(error).split()[:40])
@@ -81,9 +106,12 @@ class TorchcodecReader:
 
 
 def _check_layout(stream: Stream) -> None:
-    """Refuse pictures that are not the images, or that have more than 8 bits."""
+    """Refuse pictures that are not the images, or that have more than 8 bits.
+
+    Of lossy videos, 10 bits hold images of 8.
+    """
     image, video = stream.sidecar.image, stream.sidecar.video
-    is_8_bits = video.pixel_format is None or not video.pixel_format.endswith("le")
+    is_8_bits = video.pixel_format in (None, TEN_BITS) or not video.pixel_format.endswith("le")
     if not LAYOUTS[video.layout].is_shown or not is_8_bits:
         raise OptionError(
             f"topic {stream.topic}: {image.encoding} images are stored in the layout "
