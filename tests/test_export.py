@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import re
@@ -12,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 import yaml
@@ -501,6 +503,30 @@ def test_lerobot_videos(lerobot_folder: Path) -> None:
         assert np.abs(image[..., ::-1] - expected).mean() < 8  # other frames: more than 20
         number += 1
     assert number == round((stamps[-1] - stamps[0]) * 30 / 1e9) + 1
+
+
+def test_lerobot_videos_have_the_range_that_its_decoder_takes_them_for(tmp_path: Path) -> None:
+    """AV1 of the full range is encoded anew: torchcodec would give it another contrast."""
+    pytest.importorskip("pyarrow")
+    made = scene("rgb8", frames=6, with_info=False, noisy=False)
+    dataset = pack_drive(tmp_path, made, quality="visual")
+    mp4ds.export(
+        dataset, "lerobot", tmp_path / "out", mp4ds.ExportOptions(topics=["/cam/image_raw"], fps=30)
+    )
+    path = tmp_path / "out/videos/observation.images.cam_image_raw/chunk-000/file-000.mp4"
+    with av.open(str(path)) as container:
+        context = container.streams.video[0].codec_context
+        assert (context.name, context.color_range, context.colorspace) == ("libdav1d", 1, 1)
+    with mp4ds.open(path) as video, mp4ds.open(dataset) as own:
+        shown = [video.videos[0].read([4])]
+        expected = own["/cam/image_raw"].read([4])
+    with contextlib.suppress(ImportError, RuntimeError, OSError):
+        from torchcodec.decoders import VideoDecoder
+
+        shown.append(VideoDecoder(str(path), dimension_order="NHWC")[4:5].numpy())
+    for pixels in shown:
+        light = [image[0].mean(-1).ravel() for image in (expected, pixels)]
+        assert np.polyfit(*light, 1)[0] == pytest.approx(1, abs=0.04)
 
 
 @pytest.mark.filterwarnings("default")  # of others

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,9 @@ _SAMPLES = 100  # frames of which the statistics of a camera are made
 _MOST_THREADS = 8
 _TELL_EVERY = 16  # frames
 _PLAYED = ("av1", "h264", "h265", "vp9")  # codecs of videos that are taken as they are
+# whose decoders tell the full range by the pixel format, too: of others, torchcodec, LeRobot's
+# decoder, was seen to take it for the limited one
+_RANGE_TOLD = ("h264", "h265")
 _VECTORS = {"observation.state": "state", "action": "action"}  # feature -> option
 
 
@@ -222,6 +225,7 @@ class _Maker:
             is_whole
             and is_shown
             and sidecar.video.codec in _PLAYED
+            and (sidecar.video.codec in _RANGE_TOLD or not sidecar.video.full_range)
             and size == camera.size == camera.stream.image_size
         ):
             camera.stream.verify_video()
@@ -235,6 +239,7 @@ class _Maker:
     ) -> dict[str, Any]:
         options = self._job.options
         recipe = recipe_for("rgb24", lossless=False, codec=options.codec, crf=options.crf)
+        recipe = replace(recipe, full_range=False)  # for which LeRobot's decoder takes all AV1
         encoder = VideoEncoder(
             path,
             recipe,

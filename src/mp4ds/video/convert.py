@@ -28,6 +28,7 @@ _MATRICES = {"bt709": Colorspace.ITU709, "smpte170m": Colorspace.ITU601}
 
 _CHANNELS = {"rgb24": 3, "bgr24": 3, "rgba": 4, "bgra": 4}
 _VIA_PLANES = ("rgb24", "bgr24")
+_ROUNDED = ("yuv420p", TEN_BITS)
 _VIEWED = ("gray", "gray16le", *_CHANNELS)  # PyAV makes frames of their arrays without a copy
 # x264 codes grey with neutral chroma; full range has a name of its own in some decoders
 _DECODED_AS = {
@@ -37,12 +38,13 @@ _DECODED_AS = {
 
 
 class Converter:
-    """Converts frames between pixel formats, to full range; not to be shared between threads.
+    """Converts frames between pixel formats; not to be shared between threads.
 
     Args:
         matrix: Between RGB and YUV, by ffmpeg's name: ours is bt709, JPEG files have smpte170m.
             None: what each frame is tagged with.
         source_full_range: Whether the frames to convert use the full range.
+        full_range: Whether YUV that is made is to use it.
         fast: Take halved chroma as it is, several times as fast as interpolating it. Of camera
             images this is 48 to 49 dB like the other, and 0.9 dB less like the original.
     """
@@ -52,6 +54,7 @@ class Converter:
         matrix: str | None = "bt709",
         *,
         source_full_range: bool = True,
+        full_range: bool = True,
         fast: bool = False,
     ) -> None:
         self._interpolation = _BILINEAR if fast else _INTERPOLATION
@@ -59,6 +62,7 @@ class Converter:
         self._is_tagged = matrix is None
         self._matrix = _MATRICES.get(matrix or "", Colorspace.ITU709)
         self._source_range = ColorRange.JPEG if source_full_range else ColorRange.MPEG
+        self._range = ColorRange.JPEG if full_range else ColorRange.MPEG
         self._reformatter = VideoReformatter()
         self._to_planes = VideoReformatter()
 
@@ -73,8 +77,8 @@ class Converter:
             # the same samples in a third of the time: libswscale makes planes with SIMD
             planes = self._reformat(self._to_planes, frame, "gbrp")
             return self._reformat(self._reformatter, planes, pixel_format)
-        is_ranged = frame.format.is_rgb or self._source_range != ColorRange.JPEG
-        if pixel_format in ("yuv420p", TEN_BITS) and is_ranged:
+        is_kept = not frame.format.is_rgb and self._source_range == self._range
+        if pixel_format in _ROUNDED and self._range == ColorRange.JPEG and not is_kept:
             return rounded(self._reformat(self._to_planes, frame, "yuv420p16le"), pixel_format)
         return self._reformat(self._reformatter, frame, pixel_format)
 
@@ -87,7 +91,7 @@ class Converter:
             src_colorspace=self._matrix,
             dst_colorspace=self._matrix,
             src_color_range=self._source_range,
-            dst_color_range=ColorRange.JPEG,
+            dst_color_range=self._range,
             interpolation=self._interpolation,
             threads=1,  # a pool inherited over fork would never end
         )

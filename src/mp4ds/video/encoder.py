@@ -63,7 +63,10 @@ class VideoEncoder:
         self.recipe = recipe
         self.frames = 0
         self._picture_format = picture_format
-        self._converter = Converter()
+        # a camera's own YUV keeps its range
+        self._converter = Converter(
+            source_full_range=recipe.full_range, full_range=recipe.full_range
+        )
         self.width, self.height = coded_size(recipe, width, height)
         self.options = {**recipe.options, "g": str(gop)}
         self._container = av.open(
