@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mp4ds.errors import VideoError
-from mp4ds.video.media import Media
+from mp4ds.video.media import Media, pixel_format_of
 
 _YUV420 = frozenset({"yuv420p", "yuvj420p", "gray"})
 _PLAYED = {
@@ -31,7 +31,7 @@ def why_not_in_browsers(path: Path) -> str:
         context: Any = tracks[0].codec_context if tracks else None
         if context is None or context.codec is None:
             raise VideoError("video-unreadable", path, "has no video track of a known codec")
-        name, pixel_format = context.codec.canonical_name, context.pix_fmt
+        name, pixel_format = context.codec.canonical_name, pixel_format_of(context)
     if name not in _PLAYED:
         return f"no browser plays {name}"
     if pixel_format not in _PLAYED[name]:

@@ -52,6 +52,14 @@ class Media:
             self._file.close()
 
 
+def pixel_format_of(context: Any) -> str:
+    """Ffmpeg's name of the pixel format of a video's codec context; empty where none is told.
+
+    PyAV 17, which Python 3.10 has, crashes where it is asked for `pix_fmt` then.
+    """
+    return str(context.format.name) if context.format else ""
+
+
 class _Source:
     """A remote file for PyAV, which raises the first error of a file and prints the others."""
 

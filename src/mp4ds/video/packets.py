@@ -21,7 +21,7 @@ from mp4ds.coded import PACKET_CODECS, Refused, annexb, av1, h264, h265
 from mp4ds.coded.packets import plain_body
 from mp4ds.errors import VideoError
 from mp4ds.stamps import TIMESCALE
-from mp4ds.video.media import Media
+from mp4ds.video.media import Media, pixel_format_of
 
 _TIME_BASE = Fraction(1, TIMESCALE)
 _LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.1, 30.0, 240.0  # Hz
@@ -249,7 +249,7 @@ class PacketReader:
             stream = container.streams.video[0]
             context: Any = stream.codec_context
             self.extradata: bytes = bytes(context.extradata or b"")
-            self.pixel_format: str = context.pix_fmt or ""
+            self.pixel_format = pixel_format_of(context)
             entries = stream.index_entries
             if not len(entries):
                 raise VideoError("frame-count", path, "has no frames")
