@@ -42,6 +42,13 @@ KINDS = ["bag-none", "mcap-ros2-zstd", "rosbag2-sqlite3-v9", "rosbag2-mcap-v9"]
 AGAIN = "run the same command again to go on"
 
 
+def instead_of_open(patch: pytest.MonkeyPatch, opened: Callable[..., Any]) -> None:
+    """Have files opened by another function, those of `pathlib`, too."""
+    patch.setattr("io.open", opened)
+    if sys.version_info < (3, 11):  # which keeps io.open as a method of its own
+        patch.setattr("pathlib._NormalAccessor.open", staticmethod(opened))
+
+
 def recorded(folder: Path, kind: str = "bag-none") -> Path:
     """A recording of two parts."""
     (folder / "source").mkdir()
@@ -237,7 +244,7 @@ def failing_open(
         return real(file, mode, *args, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr("io.open", refuse)
+        instead_of_open(patch, refuse)
         yield
 
 
@@ -312,7 +319,7 @@ def test_a_bad_sector(
 
     engine = use(monkeypatch, before_task(PARTS[0], lambda: setattr(Drive, "broken", True)))
     with monkeypatch.context() as patch:
-        patch.setattr("io.open", opened)
+        instead_of_open(patch, opened)
         with pytest.raises(PartsFailedError, match="Input/output error") as caught:
             mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, keep_going=True))
     assert engine.ran == ["source-0", *PARTS]
