@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 import clips
 from measure import parse_size, print_machine
 from mp4ds.scoring import Scorer, find_ffmpeg
+from mp4ds.video.depths import TEN_BITS, narrowed, samples, widened
 from mp4ds.video.planes import PlaneMaker, Planes
 from mp4ds.video.scheduling import ordinary_scheduling
 
@@ -162,38 +163,17 @@ class Clip:
     def pictures(self, pixel_format: str) -> Iterator[av.VideoFrame]:
         """The frames for an encoder; in 10 bits the same pictures."""
         for planes in self.frames:
-            frame = av.VideoFrame(*self.size, pixel_format)
-            for index, samples in enumerate(planes):
-                table = _WIDER[index > 0] if pixel_format.endswith("10le") else None
-                rows = _rows(frame, index, np.uint8 if table is None else np.uint16)
-                rows[...] = samples if table is None else table[samples]
-            yield frame
-
-
-# full range, between 8 and 10 bits: luma, and chroma, whose middle is 128 and 512; there and back
-# is what it was
-_EIGHT, _TEN = np.arange(256), np.arange(1024)
-_WIDER = (
-    np.rint(_EIGHT * 1023 / 255).astype(np.uint16),
-    np.rint(512 + (_EIGHT - 128) * 1023 / 255).clip(0, 1023).astype(np.uint16),
-)
-_NARROWER = (
-    np.rint(_TEN * 255 / 1023).astype(np.uint8),
-    np.rint(128 + (_TEN - 512) * 255 / 1023).clip(0, 255).astype(np.uint8),
-)
-
-
-def _rows(frame: av.VideoFrame, index: int, dtype: Any) -> NDArray[Any]:
-    plane: Any = frame.planes[index]
-    return np.frombuffer(plane, dtype).reshape(plane.height, -1)[:, : plane.width]
+            frame = av.VideoFrame(*self.size, "yuv420p")
+            for index, plane in enumerate(planes):
+                samples(frame, index)[...] = plane
+            yield widened(frame, full_range=True) if pixel_format == TEN_BITS else frame
 
 
 def planes_of(frame: av.VideoFrame) -> Planes:
     """Copies of the planes of a frame of 4:2:0, full range, rounded to 8 bits."""
-    if frame.format.components[0].bits == 8:
-        y, u, v = (_rows(frame, index, np.uint8).copy() for index in range(3))
-    else:
-        y, u, v = (_NARROWER[index > 0][_rows(frame, index, np.uint16)] for index in range(3))
+    if frame.format.name == TEN_BITS:
+        frame = narrowed(frame)
+    y, u, v = (samples(frame, index).copy() for index in range(3))
     return y, u, v
 
 

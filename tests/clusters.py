@@ -20,6 +20,9 @@ SECONDS = 60.0
 
 _LOOPBACK = ("--host", "127.0.0.1", "--no-dashboard")
 
+OTHER_VERSION = "import mp4ds._version\nmp4ds._version.__version__ = '0.0.1'\n"
+"""A sitecustomize.py that makes a worker one of another mp4ds."""
+
 
 def wait_until(true: Callable[[], bool], seconds: float = SECONDS) -> None:
     """Wait for something, but not for ever."""

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 import mp4ds
-from clusters import RealCluster, wait_until
+from clusters import OTHER_VERSION, RealCluster, wait_until
 from mp4ds.engine import Outcome
 from mp4ds.errors import ClusterError, Mp4dsError, OptionError
 from mp4ds.evaluating import EvaluateOptions, Evaluation
@@ -30,7 +30,6 @@ from sources import scene, write_bag
 CRF = "20:40:4"
 NOBODY = "tcp://127.0.0.1:1"
 TIMES = {"encode_seconds", "encode_cpu_seconds", "decode_fps", "encode_fps", "whole_seconds"}
-OTHER_VERSION = "import mp4ds._version\nmp4ds._version.__version__ = '0.0.1'\n"
 QUICK = EvaluateOptions(
     codecs=["x264", "x265"], presets=["ultrafast"], crf=[CRF], target="psnr_y=20", threads=1
 )

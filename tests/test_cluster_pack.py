@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import mp4ds
-from clusters import RealCluster, wait_until
+from clusters import OTHER_VERSION, RealCluster, wait_until
 from in_parts import facts, leftovers
 from mp4ds.errors import PartsFailedError
 from mp4ds.packing import PackOptions
@@ -25,7 +25,6 @@ FRAMES = 120
 WINDOW = 3
 PARTS = FRAMES // WINDOW
 WORK = ".dataset.mp4ds-part"
-OTHER_VERSION = "import mp4ds._version\nmp4ds._version.__version__ = '0.0.1'\n"
 
 
 @pytest.fixture(scope="module")

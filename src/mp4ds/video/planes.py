@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
@@ -17,7 +16,7 @@ from mp4ds.errors import VideoError
 from mp4ds.layouts import Picture
 from mp4ds.video.codecs import Recipe
 from mp4ds.video.convert import Converter, picture_to_frame
-from mp4ds.video.depths import TEN_BITS, narrowed
+from mp4ds.video.depths import TEN_BITS, narrowed, samples
 from mp4ds.video.media import Media
 
 PLANES_FORMAT = "yuv420p"
@@ -50,10 +49,7 @@ class PlaneMaker:
 
 def planes_of(frame: av.VideoFrame) -> Planes:
     """The planes of a frame of `PLANES_FORMAT`, as views of it."""
-    y, u, v = (
-        np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
-        for plane in _buffers(frame)
-    )
+    y, u, v = (samples(frame, index) for index in range(3))
     return y, u, v
 
 
@@ -71,10 +67,6 @@ def planes_in(frame: NDArray[np.uint8], width: int, height: int) -> Planes:
         frame[luma : luma * 5 // 4].reshape(height // 2, width // 2),
         frame[luma * 5 // 4 :].reshape(height // 2, width // 2),
     )
-
-
-def _buffers(frame: av.VideoFrame) -> tuple[Any, ...]:
-    return tuple(frame.planes)  # buffers, which their type does not tell
 
 
 def decoded_planes(path: Path) -> Iterator[Planes]:
