@@ -28,6 +28,8 @@ from numpy.typing import NDArray
 import mp4ds
 from coded_scenes import CODED
 from mp4ds.errors import OptionError, SourceError, TargetError, TargetExistsError
+from mp4ds.info import info
+from mp4ds.intervals import lost_frames
 from mp4ds.report import ReportOptions, report
 from mp4ds.report.cameras import Camera
 from mp4ds.report.grid import overlay_of
@@ -36,7 +38,7 @@ from mp4ds.report.packed import pack_column
 from mp4ds.report.page import as_script, utc_text
 from mp4ds.report.proxies import proxy_size
 from mp4ds.report.server import ReportServer, byte_range
-from mp4ds.report.timing import axis_of, lost_frames, nearest_offsets, timing_of
+from mp4ds.report.timing import axis_of, nearest_offsets, timing_of
 from mp4ds.sidecar import Calibration, Roi
 from report_scenes import (
     COLOUR,
@@ -171,6 +173,21 @@ def test_lost_frames_by_the_rule() -> None:
     steps = np.array([10, 10, 10, 15, 15.1, 24.9, 25, 10, 100, 10, 0, -30, 10], float)
     assert lost_frames(steps).tolist() == [0, 0, 0, 0, 1, 1, 2, 0, 9, 0, 0, 0, 0]
     assert not len(lost_frames(np.empty(0)))
+
+
+def test_late_frames_are_not_lost_ones() -> None:
+    late = np.array([10, 10, 16, 4, 10, 3, 17, 10, 10, 19, 2, 9, 10], float)
+    assert not lost_frames(late).any()
+    lost = np.array([10, 10, 20, 10, 22, 8, 7, 26, 7, 10, 10], float)
+    assert np.flatnonzero(lost_frames(lost)).tolist() == [2, 4, 7]
+
+
+def test_a_single_lost_frame_is_a_gap_to_all(drive: Path) -> None:
+    gaps = {topic.topic: topic.gaps for topic in info(drive).topics}
+    assert (gaps[COLOUR], gaps[DEPTH]) == (0, 1)
+    with mp4ds.open(drive) as dataset:
+        stream = dataset[DEPTH]
+        assert timing_of(stream.stamps, stream.log_times, None).gaps == 1
 
 
 def test_offsets_to_the_nearest_frame() -> None:

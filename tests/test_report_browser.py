@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 import mp4ds
 from chromium import Tab, chromium
 from conftest import real
+from mp4ds.intervals import intervals, lost_frames
 from mp4ds.report import ReportOptions, report
 from mp4ds.report.looks import Look
 from mp4ds.report.packed import pack_column
 from mp4ds.report.page import as_script
 from mp4ds.report.server import ReportServer
-from mp4ds.report.timing import intervals, lost_frames, nearest_offsets
+from mp4ds.report.timing import nearest_offsets
 from report_scenes import (
     COLOUR,
     DEPTH,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mp4ds.bags import BagReader, open_reader
 from mp4ds.dataset import Dataset, Stream
+from mp4ds.intervals import intervals, lost_frames
 from mp4ds.records import Channel
 from mp4ds.remote import location
 from mp4ds.sidecar import names_dataset
@@ -29,7 +30,7 @@ class TopicInfo:
         messages: Number of messages.
         rate_hz: Mean rate, from the log times of the first and the last message.
         jitter_ms: Standard deviation of the times between messages.
-        gaps: Times between messages of more than twice the median.
+        gaps: Places where messages are missing by the log times: see `intervals.lost_frames`.
         longest_gap_s: The longest time between two messages.
         content: For images the encoding and size, for calibrations the focal length.
         stored: In a dataset, where and how: codec and file.
@@ -128,10 +129,10 @@ def _timing(item: TopicInfo, times: NDArray[np.int64]) -> TopicInfo:
     item.messages = len(times)
     if len(times) < 2 or times[-1] == times[0]:
         return item
-    steps = np.diff(times)
+    steps = intervals(times)
     item.rate_hz = (len(times) - 1) * 1e9 / float(times[-1] - times[0])
     item.jitter_ms = float(steps.std()) / 1e6
-    item.gaps = int((steps > 2 * np.median(steps)).sum())
+    item.gaps = int((lost_frames(steps) > 0).sum())
     item.longest_gap_s = float(steps.max()) / 1e9
     return item
 

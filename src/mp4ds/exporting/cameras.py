@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import OptionError
 from mp4ds.exporting.ledger import Ledger
 from mp4ds.exporting.options import ExportOptions
+from mp4ds.intervals import intervals, usual_interval
 from mp4ds.layouts import ENCODINGS, Encoding, Pixels
 from mp4ds.republish.forms import is_inverse_depth
 from mp4ds.republish.reduction import times_of
@@ -85,9 +86,8 @@ class Camera:
     @property
     def rate(self) -> float:
         """Usual frames in a second; 0 where there is one frame."""
-        steps = np.diff(self.times)
-        steps = steps[steps > 0]
-        return 1e9 / float(np.median(steps)) if len(steps) else 0.0
+        usual = usual_interval(intervals(self.times))
+        return 1e9 / usual if usual else 0.0
 
     def at(self, places: Integers) -> Camera:
         """The camera with some of its frames only."""

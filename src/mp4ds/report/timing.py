@@ -1,4 +1,4 @@
-"""What the times of frames tell: intervals, frames lost and repeated, offsets; numpy only."""
+"""What the times of frames tell: jitter, frames lost and repeated, offsets; numpy only."""
 
 from __future__ import annotations
 
@@ -6,13 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
+from mp4ds.intervals import Floats, Integers, differences, intervals, lost_frames, usual_interval
 
 _MS = 1e6  # nanoseconds
-_LOST_FROM = 1.5  # median intervals without a frame
 _WIDER = 2  # times the span of the log times, beyond which stamps are of several clocks
 _SLACK_NS = 10 * 10**9
 
@@ -52,39 +49,6 @@ class Timing:
     delay_median_ms: float
     delay_least_ms: float
     delay_most_ms: float
-
-
-def differences(later: Integers, earlier: Integers) -> Floats:
-    """Differences of times in nanoseconds; exact below 2^53, and right in size beyond 2^63."""
-    with np.errstate(over="ignore"):
-        exact = later - earlier
-    rough: Floats = later.astype(np.float64) - earlier.astype(np.float64)
-    return np.where(np.abs(rough) < 2.0**62, exact.astype(np.float64), rough)
-
-
-def intervals(stamps: Integers) -> Floats:
-    """Nanoseconds from each frame to the next, shape (frames - 1,)."""
-    return differences(stamps[1:], stamps[:-1])
-
-
-def usual_interval(steps: Floats) -> float | None:
-    """Median of the intervals that advance, nanoseconds; None where none does."""
-    advancing = steps[steps > 0]
-    return float(np.median(advancing)) if len(advancing) else None
-
-
-def lost_frames(steps: Floats) -> Integers:
-    """How many frames seem to be missing in each interval.
-
-    An interval of more than 1.5 times the median is taken for as many as fit into it, rounded.
-    """
-    usual = usual_interval(steps)
-    if usual is None:
-        return np.zeros(len(steps), np.int64)
-    missing = np.floor(steps / usual + 0.5) - 1
-    missing[steps <= _LOST_FROM * usual] = 0
-    whole: Integers = np.minimum(missing, 2.0**53).astype(np.int64)
-    return whole
 
 
 def timing_of(stamps: Integers, log_times: Integers, seq: Integers | None) -> Timing:

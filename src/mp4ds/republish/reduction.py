@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.errors import OptionError
+from mp4ds.intervals import intervals, usual_interval
 from mp4ds.layouts import MAX_SIDE
 from mp4ds.streams import Stream
 from mp4ds.streams.choices import Choice, everything, marked
@@ -118,9 +119,8 @@ def at_most(rate: float, times: NDArray[np.int64]) -> NDArray[np.bool_]:
         times: Nanoseconds, shape (frames,).
     """
     period = max(1, round(_NS / rate))
-    steps = np.diff(times)
-    usual = int(np.median(steps[steps > 0])) if (steps > 0).any() else period
-    early = min(period, usual) // 2
+    usual = usual_interval(intervals(times))
+    early = min(period, int(usual or period)) // 2
     is_kept = np.zeros(len(times), np.bool_)
     due: int | None = None
     for index, time in enumerate(times.tolist()):

@@ -60,12 +60,14 @@ var mp4dsColumns = (() => {
     return out;
   }
 
-  /** Frames missing before each frame (above 0); repeated or earlier stamps are -1. */
+  /** Frames missing before each frame (above 0), as intervals.py has it; repeated or earlier stamps are -1. */
   function lost(steps, usual) {
     const out = new Float64Array(steps.length);
+    const short = i => i > 0 && i < steps.length ? Math.min(Math.max(usual - steps[i], 0), usual) : 0;
     for (let i = 1; i < steps.length; i++) {
+      const spread = steps[i] - short(i - 1) - short(i + 1);
       if (steps[i] <= 0) out[i] = -1;
-      else if (usual && steps[i] > 1.5 * usual) out[i] = Math.round(steps[i] / usual) - 1;
+      else if (usual && spread > 1.5 * usual) out[i] = Math.round(spread / usual) - 1;
     }
     return out;
   }

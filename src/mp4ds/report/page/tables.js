@@ -87,7 +87,7 @@ var mp4dsTables = (() => {
       if (reference) row.push(offset ? `${numberText(offset.median_ms)} (99 % within ${numberText(offset.p99_ms)})` : "reference");
       return row;
     }));
-    return "Interval is the median between header stamps, jitter the standard deviation. An interval of more than 1.5 medians counts as lost frames; "
+    return "Interval is the median between header stamps, jitter the standard deviation. An interval of more than 1.5 medians counts as lost frames, unless shorter ones beside it make up for it; "
       + "repeated frames have the stamp of the one before."
       + (reference ? ` Offset is each frame's stamp less that of the nearest frame of ${reference}.` : "");
   }
