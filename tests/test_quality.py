@@ -19,6 +19,7 @@ from coded_scenes import CODED
 from definitions import IMAGE
 from in_parts import InlineEngine, leftovers
 from mp4ds import yamlio
+from mp4ds.demo import demo
 from mp4ds.errors import OptionError
 from mp4ds.info import info
 from mp4ds.packing import PackOptions
@@ -441,3 +442,19 @@ def test_the_command_tells_what_it_came_to(tmp_path: Path) -> None:
     done = subprocess.run(wrong, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
     assert "--quality 'psnr=99' is not known" in done.stderr
+
+
+@needs_vmaf
+def test_vmaf_of_a_noisy_camera_is_measured_against_its_ceiling(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The demonstration: the few samples before the first window do not decide that it cannot."""
+    monkeypatch.undo()
+    demo(tmp_path / "demo.bag", seconds=2)
+    options = PackOptions(quality="vmaf=99.5", topics=["/left/image_raw"])
+    summary = mp4ds.pack(tmp_path / "demo.bag", tmp_path / "dataset", options)
+    found = quality_of(tmp_path / "dataset")
+    assert (found.windows, found.limited) == (1, 1)
+    assert 98.5 < found.mean < 99.5
+    (topic,) = (topic for topic in summary.topics if topic.frames)
+    assert "were to have 0.5 less than the originals beside themselves" in topic.notes[0]

@@ -316,7 +316,7 @@ def test_the_report_of_a_dataset(copy: Path) -> None:
                 ticks = [p.pts for p in container.demux(video=0) if p.pts is not None]
             assert unpacked(columns["ticks"], count) == ticks
     depth, colour = data["cameras"]
-    assert (depth["timing"]["lost"], depth["timing"]["repeated"]) == (1 + 1, 1)
+    assert (depth["timing"]["lost"], depth["timing"]["repeated"]) == (1, 1)
     assert (colour["timing"]["lost"], colour["timing"]["repeated"]) == (0, 0)
     assert abs(colour["offset"]["median_ms"]) == pytest.approx(LATE / 1e6, abs=0.3)
     assert len(colour["calibrations"]) == 1

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from mp4ds.plan import Target
+from mp4ds.plan import TOLERANCES, Target
 from mp4ds.sidecar.columns import Column
 from mp4ds.sidecar.fields import Count, Model
 from mp4ds.stamps import encode_column
@@ -126,7 +126,10 @@ class Quality(Model):
         if self.reencoded:
             text += f"; {self.reencoded} encoded again"
         if self.limited:
-            text += f"; {self.limited} whose originals beside themselves score too little for it"
+            text += (
+                f"; {self.limited} that were to have {TOLERANCES[self.metric]:g} less than the "
+                "originals beside themselves, which is less than was asked for"
+            )
         return text
 
 

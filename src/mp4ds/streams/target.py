@@ -142,12 +142,20 @@ def _start_crf(coder: WindowCoder, runs: Iterable[Iterable[Seen]], guess: int, f
             fall=FALLS[target.metric],
             most=_MOST_SEARCHED,
         )
-        if not reached and crf == least:
-            raise OutOfReach(f"{target} is out of reach: crf {crf} gives {known[crf]:.2f}")
+        # a few frames have less VMAF than many, compared with their originals too: where they fall
+        # a little short, the first window tells
+        if not reached and crf == least and known[crf] < due - target.tolerance:
+            raise OutOfReach(_far_off(target, due, f"crf {crf} gives {known[crf]:.2f}"))
         return crf
     finally:
         for spool in spools:
             spool.close()
+
+
+def _far_off(target: Target, due: float, made: str) -> str:
+    """Why a stream is lossless: a score, what is due at least, and what there is."""
+    limit = f" of the {due:.2f} that its originals allow" if due < target.score else ""
+    return f"{target} is out of reach: {made}{limit}"
 
 
 class _TargetTrack:
@@ -227,10 +235,8 @@ class _TargetTrack:
         kept = control.accepted(tried, due, frames)
         if kept is None:
             first, least = len(self._ticks) - frames, min(tried)
-            raise OutOfReach(
-                f"{target} is out of reach: crf {least} gives frames {first} to "
-                f"{first + frames - 1} of a part {tried[least]:.2f}"
-            )
+            made = f"crf {least} gives frames {first} to {first + frames - 1} of a part "
+            raise OutOfReach(_far_off(target, due, f"{made}{tried[least]:.2f}"))
         control.keep(tried, kept, due, frames)
         for crf in tried.keys() - {kept}:
             self._segment(number, crf).unlink()
