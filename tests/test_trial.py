@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +10,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import mp4ds
 from mp4ds.errors import OptionError
 from mp4ds.layouts import ENCODINGS, MAX_SIDE, bind, fit
-from mp4ds.video import VideoEncoder, choose, recipe_for
+from mp4ds.packing import PackOptions
+from mp4ds.video import Recipe, VideoEncoder, choose, recipe_for
 from mp4ds.video.codecs import lossless_codecs
-from mp4ds.video.encoder import EncoderRefusedError
+from mp4ds.video.encoder import EncoderRefusedError, open_encoder
 from mp4ds.video.trial import NEAR, Choice, estimate
 from pictures import picture
 from pixel_kinds import as_message, rounded
+from round_trips import unpacked
+from scenes import scene as source_scene
+from sources import SOURCES
 
 Pixels = NDArray[Any]
 
@@ -259,3 +264,39 @@ def test_large_images_are_tried_in_part(encoding: str) -> None:
         threads=1,
     )
     assert choice.bytes_per_frame == pytest.approx(whole, rel=0.1)
+
+
+@pytest.mark.parametrize("codec", [None, "ffv1"])
+def test_the_next_codec_where_one_refuses(
+    codec: str | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    compare: Callable[..., list[str]],
+) -> None:
+    """The encoder may refuse, by its size, what it took of the middle of an image."""
+    asked: list[str] = []
+
+    def refuses(context: Any, recipe: Recipe, *rest: Any, **options: Any) -> None:
+        asked.append(recipe.codec)
+        if recipe.codec == asked[0]:
+            raise ValueError
+        open_encoder(context, recipe, *rest, **options)
+
+    monkeypatch.setattr("mp4ds.video.encoder.open_encoder", refuses)
+    paths = SOURCES["mcap-ros2-none"](tmp_path, source_scene("rgb8", frames=3))
+    summary = mp4ds.pack(paths, tmp_path / "dataset", PackOptions(codec=codec))
+    (topic,) = (topic for topic in summary.topics if topic.topic == "/cam/image_raw")
+    assert topic.frames == topic.messages == 3
+    first, then = asked
+    assert topic.notes == [f"coded as {then}: " + topic.notes[0].split(": ")[1]]
+    assert codec in (None, first)
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare(paths, unpacked(tmp_path, "mcap")) == []
+
+
+def test_a_codec_that_refuses_the_size_is_not_insisted_on(tmp_path: Path) -> None:
+    """x265 takes no narrow pictures."""
+    paths = SOURCES["mcap-ros2-none"](tmp_path, source_scene("mono8", width=40, height=30))
+    summary = mp4ds.pack(paths, tmp_path / "dataset", PackOptions(codec="h265"))
+    (topic,) = (topic for topic in summary.topics if topic.topic == "/cam/image_raw")
+    assert topic.notes[0].startswith("coded as ")

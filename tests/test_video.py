@@ -177,7 +177,7 @@ def test_lossless_is_exact(codec: str, picture_format: str, tmp_path: Path) -> N
         assert first.dtype.itemsize == (2 if picture_format.endswith("le") else 1)
         with VideoDecoder(path, **told, sequential=False) as decoder:
             assert same(copied(decoder.picture(5)), pictures[5])
-    # the smallest pictures are refused by some, and then stored verbatim
+    # the smallest pictures are refused by some, and then another codec has them
     if codec == "h265":
         assert refused == {size for size in SIZES if size[0] < 64}
     assert codec == "h265" or all(min(size) < 4 for size in refused)
@@ -193,6 +193,38 @@ def test_the_default_takes_every_size_from_four_on(picture_format: str, tmp_path
         pictures = noise(picture_format, width, height, 4)
         told = encode(tmp_path / "video.mp4", recipe, pictures, picture_format)
         assert all(map(same, decode(tmp_path / "video.mp4", told), pictures))
+
+
+@pytest.mark.parametrize(
+    ("picture_format", "width", "height"),
+    [
+        ("rgb24", 5472, 3648),
+        ("rgba", 4096, 3648),
+        ("gbrp16le", 4096, 3000),
+        ("gbrap16le", 4096, 3000),
+        ("gbrap16le", 16384, 12000),
+        ("yuv420p", 5472, 3648),
+        ("gray", 16384, 16000),
+    ],
+)
+def test_large_pictures_have_more_slices(
+    picture_format: str, width: int, height: int, tmp_path: Path
+) -> None:
+    recipe = recipe_for(picture_format, lossless=True, codec="ffv1")
+    encoder = VideoEncoder(
+        tmp_path / "v.mp4", recipe, picture_format=picture_format, width=width, height=height,
+        gop=1, threads=1, rate=None,
+    )  # fmt: skip
+    encoder.abandon()
+    assert int(encoder.options["slices"]) > 4
+
+
+def test_a_large_picture_is_exact(tmp_path: Path) -> None:
+    large = np.zeros((3648, 4096, 4), np.uint8)
+    large[::7, ::5] = np.arange(4096 // 5 + 1, dtype=np.uint8)[:, None]
+    recipe = recipe_for("rgba", lossless=True)
+    told = encode(tmp_path / "v.mp4", recipe, [large], "rgba", threads=2)
+    assert same(decode(tmp_path / "v.mp4", told)[0], large)
 
 
 SCENES = {"gray": "mono8", "gray16le": "mono16", "rgb24": "rgb8", "bgr24": "bgr8",

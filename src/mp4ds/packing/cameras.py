@@ -243,8 +243,8 @@ class Cameras:
         self._streams.append(stream)
         if renamed:
             self._renamed.add(stem)
-        if plan.note:
-            self._topic_of(channel).notes.append(plan.note)
+        if stream.note:
+            self._topic_of(channel).notes.append(stream.note)
         return stream
 
     def _keep_verbatim(self, message: Message, number: int, reason: str) -> None:

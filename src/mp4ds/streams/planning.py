@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 from mp4ds.bags.mcap_write import compressed_size
@@ -125,19 +126,16 @@ def _lossless_plans(
     asked = settings.quality.lossless
     if not (asked or note):
         note = f"{encoding.name} is kept lossless"
-    gop, threads = settings.gop, settings.threads
+    tried = partial(choose, pixels, encoding, gop=settings.gop, threads=settings.threads)
+    codec = settings.codec if asked else None  # else they were meant for lossy videos
     try:
-        best = choose(
-            pixels,
-            encoding,
-            codec=settings.codec if asked else None,  # else they were meant for lossy videos
-            preset=settings.preset if asked else None,
-            gop=gop,
-            threads=threads,
-        )
-    except OptionError as error:
-        best = choose(pixels, encoding, codec=None, preset=None, gop=gop, threads=threads)
-        note = "; ".join(filter(None, (note, f"coded as {best.recipe.codec}: {error}")))
+        try:
+            best = tried(codec=codec, preset=settings.preset if asked else None)
+        except (OptionError, EncoderRefusedError) as error:
+            if codec is None:
+                raise
+            best = tried(codec=None, preset=None)
+            note = "; ".join(filter(None, (note, f"coded as {best.recipe.codec}: {error}")))
     except EncoderRefusedError as error:
         raise Unsuited(str(error)) from None
     _refuse_noise(samples, best.bytes_per_frame)

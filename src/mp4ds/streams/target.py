@@ -175,6 +175,7 @@ class _TargetTrack:
         rate: float | None,
     ) -> None:
         self._plan = plan
+        self.note = plan.note
         self._path = path
         self._coder = _coder(plan, plan.target, key, settings, rate)
         self._maker = self._coder.maker()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,7 +13,8 @@ from mp4ds.plan import Quality
 from mp4ds.sidecar import Color, LayoutParameters
 from mp4ds.streams.columns import Unsuited
 from mp4ds.streams.look import Seen, StreamKey
-from mp4ds.video import PacketWriter, Recipe, VideoEncoder
+from mp4ds.video import PacketWriter, Recipe, VideoEncoder, recipe_for
+from mp4ds.video.codecs import lossless_codecs
 from mp4ds.video.encoder import EncoderRefusedError
 
 
@@ -39,7 +40,13 @@ class StreamSettings:
 
 
 class Track(Protocol):
-    """A video being written."""
+    """A video being written.
+
+    Attributes:
+        note: What the user should know of it; empty if nothing.
+    """
+
+    note: str
 
     def refuses(self, seen: Seen) -> str | None:
         """Why the track cannot carry a message exactly, or None if it can."""
@@ -122,6 +129,15 @@ class PicturePlan:
         return _PictureTrack(self, path, seen.key, settings, rate)
 
 
+def _recipes(plan: PicturePlan) -> Iterator[Recipe]:
+    """The recipe of a plan, then those of the other codecs that hold its pictures exactly."""
+    yield plan.recipe
+    pixel_format = plan.layout.pixel_format
+    for codec in lossless_codecs(pixel_format) if plan.recipe.lossless else ():
+        if codec != plan.recipe.codec:
+            yield recipe_for(pixel_format, lossless=True, codec=codec)
+
+
 class _PictureTrack:
     """See `Track`."""
 
@@ -133,23 +149,32 @@ class _PictureTrack:
         settings: StreamSettings,
         rate: float | None,
     ) -> None:
-        self._plan = plan
-        self._layout = plan.layout
-        width, height = self._layout.picture_size(key.width, key.height)
-        try:
-            self._encoder = VideoEncoder(
-                path,
-                plan.recipe,
-                picture_format=self._layout.pixel_format,
-                width=width,
-                height=height,
-                gop=settings.gop,
-                threads=settings.threads,
-                rate=rate,
-            )
-        except EncoderRefusedError as error:
-            path.unlink(missing_ok=True)
-            raise Unsuited(str(error)) from None
+        self._layout = layout = plan.layout
+        self.note = plan.note
+        width, height = layout.picture_size(key.width, key.height)
+        refusals: list[str] = []
+        for recipe in _recipes(plan):
+            try:
+                self._encoder = VideoEncoder(
+                    path,
+                    recipe,
+                    picture_format=layout.pixel_format,
+                    width=width,
+                    height=height,
+                    gop=settings.gop,
+                    threads=settings.threads,
+                    rate=rate,
+                )
+            except EncoderRefusedError as error:
+                path.unlink(missing_ok=True)
+                refusals.append(str(error))
+                continue
+            self._plan = replace(plan, recipe=recipe)
+            if refusals:
+                coded = f"coded as {recipe.codec}: {refusals[0]}"
+                self.note = "; ".join(filter(None, (plan.note, coded)))
+            return
+        raise Unsuited(refusals[0])
 
     def refuses(self, seen: Seen) -> str | None:
         """See `Track.refuses`."""
@@ -211,13 +236,14 @@ class PacketPlan:
 
     def open(self, path: Path, seen: Seen, settings: StreamSettings, rate: float | None) -> Track:
         """See `TrackPlan.open`."""
-        return _PacketTrack(path, seen, rate)
+        return _PacketTrack(path, seen, rate, self.note)
 
 
 class _PacketTrack:
     """See `Track`."""
 
-    def __init__(self, path: Path, seen: Seen, rate: float | None) -> None:
+    def __init__(self, path: Path, seen: Seen, rate: float | None, note: str) -> None:
+        self.note = note
         self._key = seen.key
         self._begun = False
         self._writer = PacketWriter(

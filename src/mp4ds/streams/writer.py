@@ -75,6 +75,11 @@ class StreamWriter:
         self._track = plan.open(self.video_path, seen, settings, rate)
 
     @property
+    def note(self) -> str:
+        """What the user should know of how the video is made; empty if nothing."""
+        return self._track.note
+
+    @property
     def frames(self) -> int:
         """Messages accepted so far."""
         return len(self._columns)

@@ -24,6 +24,8 @@ _MATRICES = {"gbr": 0, "bt709": 1, "smpte170m": 6}  # as H.273 numbers them
 _BT709 = 1  # of primaries and transfer characteristics
 _LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.1, 30.0, 240.0  # Hz, what every encoder takes
 _NARROW = 64  # columns
+_SLICE_BYTES = 10_000_000  # of samples, chroma counted whole; FFV1 takes some 14 million
+_SLICE_COUNTS = sorted({rows * n for rows in range(1, 17) for n in range(rows, 2 * rows + 1)})
 
 
 class EncoderRefusedError(Mp4dsError):
@@ -68,7 +70,7 @@ class VideoEncoder:
             source_full_range=recipe.full_range, full_range=recipe.full_range
         )
         self.width, self.height = coded_size(recipe, width, height)
-        self.options = {**recipe.options, "g": str(gop)}
+        self.options = {**_options(recipe, self.width, self.height), "g": str(gop)}
         self._container = av.open(
             str(path.absolute()),  # ffmpeg takes a relative name with a colon for an address
             "w",
@@ -170,6 +172,17 @@ def coded_size(recipe: Recipe, width: int, height: int) -> tuple[int, int]:
     if recipe.pixel_format.startswith("yuv420p"):
         return width + width % 2, height + height % 2
     return width, height
+
+
+def _options(recipe: Recipe, width: int, height: int) -> Mapping[str, str]:
+    """The options of a recipe; FFV1 refuses large slices, and so gets as many as it takes."""
+    if recipe.encoder != "ffv1":
+        return recipe.options
+    components = av.VideoFormat(recipe.pixel_format, width, height).components
+    size = width * height * sum(-(-component.bits // 8) for component in components)
+    usual = int(recipe.options["slices"])
+    enough = (n for n in _SLICE_COUNTS if n >= usual and size <= n * _SLICE_BYTES)
+    return {**recipe.options, "slices": str(next(enough, _SLICE_COUNTS[-1]))}
 
 
 def color_range(recipe: Recipe) -> int:
