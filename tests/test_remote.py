@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mp4ds
-from in_parts import InlineEngine, facts
+from in_parts import InlineEngine, facts, leftovers
 from mp4ds.bags import open_sources
 from mp4ds.cli import app
 from mp4ds.errors import (
@@ -501,6 +501,19 @@ def test_a_recording_that_changes(
     mp4ds.pack(url, tmp_path / "dataset", PackOptions(window=3))
     assert "00000-0" not in going_on.ran
     assert "00001-0" in going_on.ran
+
+
+def test_a_recording_that_changes_while_it_is_packed(tmp_path: Path, put: Put, stores: Any) -> None:
+    write_bag(tmp_path / "drive.bag", scene("mono8", frames=9))
+    write_bag(tmp_path / "other.bag", scene("mono8", frames=9, seed=1))
+    url = put(tmp_path / "drive.bag")
+
+    def progress(_: object) -> None:
+        stores.put(str(tmp_path / "other.bag"), url)
+
+    with pytest.raises(SourceError, match=r"changed while it was read"):
+        mp4ds.pack(url, tmp_path / "dataset", progress=progress)
+    assert leftovers(tmp_path) == []
 
 
 def test_secrets_are_not_told(tmp_path: Path, web: Server) -> None:

@@ -17,7 +17,7 @@ class SourceHasher:
     """SHA-256 of the source files, taken while they are read, behind the reader.
 
     The bytes are then still in the system's cache: the disk is read once. A folder is hashed when
-    the reader is past its bytes.
+    the reader is past its bytes. A context manager.
 
     Args:
         path: The recording; a folder's name is put before those of its files.
@@ -32,6 +32,7 @@ class SourceHasher:
         self._number = 0
         self._offset = 0
         self._hash = hashlib.sha256()
+        self._stream: BinaryIO | None = None  # held, as another file may take the name
         self.digests: list[tuple[str, int, str]] = []
 
     def advance(self, position: int | None) -> None:
@@ -50,9 +51,9 @@ class SourceHasher:
                     self._finish(path, *source_digest(path))
                     self._position = end
                     continue
-                with path.open("rb") as stream:
-                    stream.seek(self._offset)
-                    at_end = self._hash_file(stream, position)
+                if self._stream is None:
+                    self._stream = path.open("rb")
+                at_end = self._hash_file(self._stream, position)
             except OSError as error:
                 raise SourceError(path, f"cannot be read: {error.strerror}") from None
             if at_end:
@@ -73,3 +74,15 @@ class SourceHasher:
         self._hash = hashlib.sha256()
         self._offset = 0
         self._number += 1
+        self._close()
+
+    def _close(self) -> None:
+        if self._stream:
+            self._stream.close()
+        self._stream = None
+
+    def __enter__(self) -> SourceHasher:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()

@@ -7,8 +7,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import xxhash
-
 from mp4ds._version import __version__
 from mp4ds.bags import BagReader, open_sources
 from mp4ds.errors import OptionError, SourceError
@@ -20,67 +18,15 @@ from mp4ds.packing.report import PackOptions
 from mp4ds.packing.survey import Survey
 from mp4ds.plan import Selection, parse_quality
 from mp4ds.records import Excerpt
-from mp4ds.remote import location, remote, spelled
-from mp4ds.source_files import is_folder, members, source_digest
+from mp4ds.remote import location, spelled
+from mp4ds.source_files import SourceState, source_digest
 from mp4ds.streams import StreamSettings
 from mp4ds.video import tool_versions
 
-_SAMPLE = 2**16
 _OUTCOME_OPTIONS = (
     *("topics", "exclude", "quality", "codec", "preset", "transcode", "camera_info"),
     *("gop", "window", "salvage", "images"),
 )
-
-
-@dataclass(frozen=True, slots=True)
-class SourceState:
-    """A file of the recording, as far as a change would show.
-
-    Attributes:
-        path: Absolute, or a URL.
-        size: Bytes.
-        modified_ns: When it was written, as the file system tells; 0 at a URL.
-        sample: XXH64 of its first and last bytes, or of the names, sizes and times in a folder; at
-            a URL, what the store says of its content, such as an ETag, where it says anything.
-    """
-
-    path: str
-    size: int
-    modified_ns: int
-    sample: str
-
-    @classmethod
-    def of(cls, path: Path) -> SourceState:
-        """The state of a file now.
-
-        Raises:
-            SourceError: It cannot be read.
-        """
-        try:
-            if is_folder(path):
-                return cls._of_folder(path)
-            stat = path.stat()
-            found = remote(path)
-            if found and found.tag:
-                return cls(found.url, stat.st_size, 0, found.tag)
-            with path.open("rb") as stream:
-                digest = xxhash.xxh64(stream.read(_SAMPLE))
-                if stat.st_size > _SAMPLE:
-                    stream.seek(max(_SAMPLE, stat.st_size - _SAMPLE))
-                    digest.update(stream.read(_SAMPLE))
-        except OSError as error:
-            raise SourceError(path, f"cannot be read: {error.strerror}") from None
-        return cls(spelled(path), stat.st_size, stat.st_mtime_ns, digest.hexdigest())
-
-    @classmethod
-    def _of_folder(cls, folder: Path) -> SourceState:
-        stats = {path.name: path.stat() for path in members(folder)}
-        digest = xxhash.xxh64()
-        for name, stat in stats.items():
-            digest.update(f"{name}\0{stat.st_size}\0{stat.st_mtime_ns}\n".encode(errors="replace"))
-        size = sum(stat.st_size for stat in stats.values())
-        latest = max((stat.st_mtime_ns for stat in stats.values()), default=0)
-        return cls(spelled(folder), size, latest, digest.hexdigest())
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,13 +166,7 @@ class Job:
             SourceError: Names the file that changed.
         """
         for source in self.sources:
-            path = location(source.path)
-            if SourceState.of(path) != source:
-                raise SourceError(
-                    path,
-                    "has changed since its packing began",
-                    "Begin anew with --restart, or give the file back as it was.",
-                )
+            source.check()
 
     def settings(self, task: Task, exact: Exact) -> PartSettings:
         """How a task packs.

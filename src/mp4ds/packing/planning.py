@@ -11,7 +11,7 @@ from pathlib import Path
 from mp4ds.bags import BagReader
 from mp4ds.errors import OptionError
 from mp4ds.packing.calibrations import unpaired_infos
-from mp4ds.packing.job import Job, SourceState, Task, absolute, outcome_options, tools
+from mp4ds.packing.job import Job, Task, absolute, outcome_options, tools
 from mp4ds.packing.report import PackOptions
 from mp4ds.packing.spans import GOPS_PER_WINDOW, cut_times, group_topics, spans_of
 from mp4ds.packing.survey import (
@@ -26,6 +26,7 @@ from mp4ds.pairing import choose_pairs, pair_camera_infos
 from mp4ds.plan import Quality, Selection, parse_quality
 from mp4ds.records import Channel
 from mp4ds.scoring import vmaf_bytes
+from mp4ds.source_files import SourceState
 from mp4ds.streams import (
     Looker,
     PicturePlan,

@@ -20,6 +20,7 @@ from mp4ds.packing.report import PackSummary
 from mp4ds.plan import FileNames
 from mp4ds.remote import location, remote
 from mp4ds.sidecar import ChannelModel, StreamSidecar, dump_document, load_stream
+from mp4ds.source_files import SourceState, unchanged
 from mp4ds.stamps import PresentationClock
 from mp4ds.streams.facts import video_facts
 from mp4ds.video import PacketReader, join_segments
@@ -66,13 +67,17 @@ def import_ros_mp4(
                 SourceNotFoundError(path) if not path.exists() else SourceError(path, "is no file")
             )
     target = Path(os.path.abspath(_local(dataset)))  # noqa: PTH100 - keeps links, unlike resolve()
+    states = [SourceState.of(source), SourceState.of(described)]
     old = load_stream(described, video=_ANY)  # users may have named theirs as they like
     if old.stamps != "record-float":
         raise OptionError(
             f"{described} is no YAML of the tool published with the paper: it is a sidecar of "
             "mp4ds already."
         )
-    with staged(target, force=force, replaceable=is_dataset, sources=[source, described]) as folder:
+    with (
+        staged(target, force=force, replaceable=is_dataset, sources=[source, described]) as folder,
+        unchanged(states),
+    ):
         _check(source, described, old)
         folder.mkdir()
         part = _part_of(source, old, folder)

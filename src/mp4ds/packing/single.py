@@ -13,7 +13,7 @@ from mp4ds.packing.manifest import folder_size, summarize, write_manifest
 from mp4ds.packing.packer import Packer
 from mp4ds.packing.part import Part
 from mp4ds.packing.report import PackProgress, PackSummary
-from mp4ds.source_files import source_size
+from mp4ds.source_files import source_size, unchanged
 from mp4ds.wire import is_camera
 
 _REPORT_SECONDS = 0.1
@@ -38,11 +38,10 @@ def pack_in_one_pass(
         exact: Streams that are made lossless, since a score is out of their reach.
 
     Raises:
-        SourceError: The recording is damaged.
+        SourceError: The recording is damaged, or changed while it was read.
         OutOfReachError: A stream cannot have the score that was asked for.
         OSError: The disk refused.
     """
-    hasher = SourceHasher(reader.path, reader.files)
     total = sum(map(source_size, reader.files))
     stats = reader.stats()
     counts: dict[str, int | None] = {}
@@ -76,8 +75,9 @@ def pack_in_one_pass(
         )
 
     (task,) = (task for task in job.tasks if task.whole)
-    part = Packer(reader, folder, job.settings(task, exact), progress).run()
-    hasher.advance(None)
+    with unchanged(job.sources), SourceHasher(reader.path, reader.files) as hasher:
+        part = Packer(reader, folder, job.settings(task, exact), progress).run()
+        hasher.advance(None)
     write_manifest(part, reader, hasher.digests, job.options["quality"])
     progress(part, done=True)
     return summarize(part, target, total)

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any, cast
 
 from mp4ds.errors import SourceNotFoundError
-from mp4ds.packing.job import SourceState, open_recording, outcome_options, tools
+from mp4ds.packing.job import open_recording, outcome_options, tools
 from mp4ds.packing.report import PackOptions, PackProgress, PackSummary, TopicSummary
 from mp4ds.remote import RemotePath
 from mp4ds.sidecar import MANIFEST_NAME
+from mp4ds.source_files import SourceState
 from mp4ds.uploads import Upload
 
 Report = Callable[[PackProgress], None]

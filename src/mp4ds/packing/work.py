@@ -28,6 +28,7 @@ from mp4ds.packing.kept import dump_kept
 from mp4ds.packing.packer import Packer, until_in_reach
 from mp4ds.packing.part import RECORD_NAME, Part
 from mp4ds.packing.workplace import Workplace
+from mp4ds.source_files import unchanged
 
 _REPORT_SECONDS = 0.5
 _KEPT_BYTES = 400 * 2**20
@@ -69,12 +70,11 @@ class Tasks:
         with place.making(task) as into:
             if into is None:
                 return
-            job.check_sources()
-            if task.source is not None:
-                _digest(job, task.source, into)
-            else:
-                self._pack(job, task, into, progress)
-            job.check_sources()
+            with unchanged(job.sources):
+                if task.source is not None:
+                    _digest(job, task.source, into)
+                else:
+                    self._pack(job, task, into, progress)
 
     def _pack(self, job: Job, task: Task, into: Path, progress: Progress | None) -> None:
         next_report = 0.0
