@@ -6,11 +6,7 @@ options are wrong; 130 interrupted.
 
 from __future__ import annotations
 
-import os
-import signal
 import sys
-import warnings
-from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, NoReturn, Optional
 
@@ -49,11 +45,12 @@ from mp4ds.cli.output import (
     print_pack,
     print_unpack,
     print_validation,
-    shown,
+    say,
     status_line,
     unpack_progress,
 )
 from mp4ds.cli.play import play
+from mp4ds.cli.process import exit_code_of, prepare_process
 from mp4ds.cli.progress import pack_progress
 from mp4ds.cli.report import frames, report
 from mp4ds.errors import OptionError
@@ -74,7 +71,7 @@ def _top(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
 ) -> None:
     if version:
-        print(f"mp4ds {__version__}")
+        say(f"mp4ds {__version__}")
         raise typer.Exit
 
 
@@ -191,7 +188,7 @@ def pack(
     for summary in summaries:
         print_pack(summary)
     if shard:
-        print(f"share {shard} is packed; when all are, --join makes the dataset")
+        say(f"share {shard} is packed; when all are, --join makes the dataset")
 
 
 @app.command()
@@ -337,22 +334,11 @@ def demo(
     if as_json:
         print_json({"output": output, "messages": messages})
     else:
-        print(f"{shown(output)}: {messages} messages")
-
-
-def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    print(f"mp4ds: {shown(message)}", file=sys.stderr)
+        say(f"{output}: {messages} messages")
 
 
 def main() -> NoReturn:
     """Run the command line and exit."""
-    # numpy is yet to be imported: no matrix is multiplied here, and idle threads cost time
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    warnings.showwarning = _show_warning
-    # a batch system's way to interrupt: leave as tidily as after Ctrl-C
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a terminal may lack a topic's letters
-    app(args=spelled(sys.argv[1:]))
-    sys.exit(0)
+    arguments = spelled(sys.argv[1:])
+    prepare_process()
+    sys.exit(exit_code_of(lambda: app(args=arguments), as_json="--json" in arguments))

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from mp4ds.cli.failures import told_errors
-from mp4ds.cli.output import status_line
+from mp4ds.cli.output import printed, status_line
 
 
 def conformance_dump(
@@ -22,5 +22,6 @@ def conformance_dump(
 
     with told_errors(as_json=True), status_line(as_json=False) as report:
         found = run(path, progress=report)
-    print(as_json(found))
+    with printed():
+        print(as_json(found))
     raise typer.Exit(1 if found["problems"] else 0)

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import typer
+
+from mp4ds.errors import Mp4dsError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -28,9 +33,30 @@ def _jsonable(value: Any) -> Any:
     return str(value)
 
 
+@contextmanager
+def printed() -> Iterator[None]:
+    """Tell of standard output what the system says of it: no other file is meant.
+
+    Raises:
+        Mp4dsError: It takes nothing more.
+        typer.Exit: Who reads it has enough.
+    """
+    try:
+        yield
+    except BrokenPipeError:
+        raise typer.Exit(1) from None
+    except OSError as error:
+        raise Mp4dsError(
+            f"standard output: {error.strerror or error}. What the command was to print is lost, "
+            "what it made is whole."
+        ) from None
+
+
 def print_json(value: Any) -> None:
     """Print a result for scripts."""
-    print(json.dumps(value, default=_jsonable, indent=2))
+    text = json.dumps(value, default=_jsonable, indent=2)
+    with printed():
+        print(text)
 
 
 def _console() -> Console:
@@ -78,8 +104,11 @@ def status_line(as_json: bool, text: str = "validating") -> Iterator[Callable[[s
     if as_json or not console.is_terminal:
         yield None
         return
-    with console.status(text) as status:
-        yield status.update
+    from rich.text import Text
+
+    with console.status(Text(text)) as status:
+        # of a plain string, what a topic is called would be taken for markup
+        yield lambda told: status.update(Text(shown(told)))
 
 
 def shown(value: object) -> str:
@@ -92,7 +121,14 @@ def shown(value: object) -> str:
 
 def say(value: object) -> None:
     """Print one line."""
-    print(shown(value))
+    with printed():
+        print(shown(value))
+
+
+def complain(value: object) -> None:
+    """Print a line beside the result; nothing fails because nobody takes it."""
+    with suppress(OSError, ValueError):
+        print(f"mp4ds: {shown(value)}", file=sys.stderr, flush=True)
 
 
 def size_text(count: float) -> str:
@@ -120,7 +156,8 @@ def print_table(columns: list[tuple[str, str]], rows: list[list[str]]) -> None:
             table.add_column(name, overflow="fold")
     for row in rows:
         table.add_row(*map(shown, row))
-    console.print(table)
+    with printed():
+        console.print(table)
 
 
 def print_pack(summary: PackSummary) -> None:

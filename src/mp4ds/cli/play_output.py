@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from mp4ds.cli.output import say, shown
+from mp4ds.cli.output import complain, say, shown
 
 if TYPE_CHECKING:
     from mp4ds.playing import PlayProgress, PlaySummary
@@ -24,8 +23,9 @@ def play_progress(*, is_quiet: bool) -> Iterator[Callable[[PlayProgress], None]]
         is_quiet: No line.
     """
     from rich.console import Console
+    from rich.text import Text
 
-    console = Console(stderr=True, markup=False, highlight=False)
+    console = Console(stderr=True)
     told: set[str] = set()
 
     def warn(state: PlayProgress) -> None:
@@ -43,14 +43,14 @@ def play_progress(*, is_quiet: bool) -> Iterator[Callable[[PlayProgress], None]]
 
         def report(state: PlayProgress) -> None:
             warn(state)
-            status.update(_standing(state))
+            status.update(Text(_standing(state)))
 
         yield report
 
 
 def tell(text: str) -> None:
     """Say something beside the result."""
-    print(f"mp4ds: {shown(text)}", file=sys.stderr)
+    complain(text)
 
 
 def _standing(state: PlayProgress) -> str:

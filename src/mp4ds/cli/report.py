@@ -11,7 +11,7 @@ import typer
 from mp4ds.cli.arguments import parse_resize
 from mp4ds.cli.failures import told_errors
 from mp4ds.cli.options import DatasetArgument, ForceFlag, JsonFlag
-from mp4ds.cli.output import print_json, say, size_text, status_line
+from mp4ds.cli.output import print_json, printed, say, size_text, status_line
 
 if TYPE_CHECKING:
     from mp4ds.report import ReportSummary
@@ -105,7 +105,8 @@ def _serve(summary: ReportSummary, port: int, as_json: bool) -> None:
 
     with ReportServer(summary.files, summary.start, port=port) as server:
         told = sys.stderr if as_json else sys.stdout
-        print(f"{server.url} (Ctrl-C ends)", file=told, flush=True)
+        with printed():
+            print(f"{server.url} (Ctrl-C ends)", file=told, flush=True)
         server.serve()
 
 

@@ -1,0 +1,197 @@
+"""What terminals and streams get: nothing that a recording decides, never a traceback."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mp4ds
+from mp4ds.cli import app
+from mp4ds.cli.output import status_line
+from scenes import Scene
+from sources import scene, write_mcap
+
+TITLE = "/a\x1b]0;title\x07\x1b]8;;http://x\x1b\\b"
+TOPICS = (TITLE, "/b[/foo]", "/c[link=http://x]d[red]", "/e\x9b31m\u202e")
+LIMITED = pytest.mark.skipif(sys.platform != "linux", reason="how limits act is the system's")
+
+
+class Screen(io.StringIO):
+    """Takes what a terminal would show."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@dataclass(frozen=True)
+class Result:
+    code: int
+    out: str
+    err: str
+
+
+def call(*arguments: object) -> Result:
+    """A command in this process, on a terminal."""
+    out, err = Screen(), Screen()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            app([str(argument) for argument in arguments])
+            code: Any = 0
+        except SystemExit as ended:
+            code = ended.code or 0
+    return Result(code, out.getvalue(), err.getvalue())
+
+
+def drive() -> Scene:
+    """A camera for each of the topics."""
+    images = [m for m in scene("rgb8", frames=4, with_info=False).messages if "image" in m.topic]
+    messages = [replace(m, topic=topic) for topic in TOPICS for m in images]
+    return Scene(sorted(messages, key=lambda message: message.log_time))
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("drive") / "drive.mcap"
+    write_mcap(path, drive())
+    return path
+
+
+@pytest.fixture(scope="module")
+def dataset(recording: Path) -> Path:
+    mp4ds.pack(recording, recording.parent / "dataset")
+    return recording.parent / "dataset"
+
+
+COMMANDS = {
+    "pack": "pack RECORDING -o OUT",
+    "pack-parts": "pack RECORDING -o OUT --gop 2 --window 2",
+    "info": "info RECORDING",
+    "info-dataset": "info DATASET",
+    "intrinsics": "info RECORDING --intrinsics",
+    "validate": "validate DATASET --deep",
+    "unpack": "unpack DATASET --to mcap -o OUT.mcap",
+    "unpack-images": "unpack DATASET --to images -o OUT",
+    "report": "report DATASET -o OUT --proxies all",
+    "export-euroc": "export euroc DATASET -o OUT",
+    "export-tum": "export tum DATASET -o OUT",
+    "frames": "frames DATASET -t TOPIC --at #1 -o OUT.png",
+    "evaluate": "evaluate RECORDING -o OUT --codecs x264 --frames 4 --crf 30 --presets ultrafast "
+    "--target psnr_y=20 --jobs 1",
+    "play": "play DATASET --foxglove --port 0 --rate 100 --disable-keyboard-controls",
+}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_topics_steer_no_terminal(
+    name: str, recording: Path, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if name == "play":
+        pytest.importorskip("foxglove")
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setenv("COLUMNS", "200")
+    places = {"RECORDING": recording, "DATASET": dataset, "TOPIC": TITLE}
+    places |= {f"OUT{end}": tmp_path / f"out{end}" for end in ("", ".mcap", ".png")}
+    done = call(*(places.get(word, word) for word in COMMANDS[name].split()))
+    assert "Traceback" not in done.err
+    assert done.code == 0, done.err
+    shown = done.out + done.err
+    assert "\x1b]" not in shown
+    assert "\x07" not in shown
+    assert "\x9b" not in shown
+    assert "\u202e" not in shown
+    assert "http://x" not in re.sub(r"\\x1b]8;;http://x|\[link=http://x\]", "", shown)
+
+
+def test_a_status_line_is_no_markup(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    err = Screen()
+    with contextlib.redirect_stderr(err), status_line(False) as told:
+        assert told is not None
+        told("/x[/foo][link=http://x]\x1b]0;title\x07")
+    assert "/x[/foo][link=http://x]\\x1b]0;title\\x07" in err.getvalue()
+
+
+# ---------------------------------------------------------------- standard streams
+
+
+def run(words: str, where: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """A command as a process of its own, its streams as a shell is told."""
+    return subprocess.run(
+        ["bash", "-c", f'"$PYTHON" -m mp4ds {words} {where}'],
+        cwd=folder,
+        env={
+            **os.environ,
+            "PYTHON": sys.executable,
+            "PYTHONPATH": str(Path(mp4ds.__file__).parents[1]),
+        },
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        stdin=subprocess.DEVNULL,
+    )
+
+
+FULL = r"mp4ds: standard output: No space left on device[^\n]*\n"
+STREAMS = {
+    "full": ("info drive.mcap", "> /dev/full", 1, FULL),
+    "full-json": ("info drive.mcap --json", "> /dev/full", 1, FULL),
+    "full-help": ("--help", "> /dev/full", 1, FULL),
+    "full-error": ("info none.mcap --json", "> /dev/full", 2, r"mp4ds: none.mcap[^\n]*\n"),
+    "full-stderr": ("info none.mcap", "2> /dev/full", 2, ""),
+    "no-stderr": ("info none.mcap", "2>&-", 2, ""),
+    "no-stdout": ("info drive.mcap", ">&-", 0, ""),
+    "nothing": ("pack drive.mcap -o OUT", ">&- 2>&- <&-", 0, ""),
+}
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+@pytest.mark.parametrize("name", STREAMS)
+def test_a_standard_stream_that_takes_nothing(name: str, recording: Path, tmp_path: Path) -> None:
+    words, where, code, said = STREAMS[name]
+    done = run(words.replace("OUT", str(tmp_path / "out")), where, recording.parent)
+    assert done.returncode == code, done.stderr
+    assert done.stdout == ""
+    assert re.fullmatch(said, done.stderr), done.stderr
+    if "OUT" in words:
+        assert mp4ds.validate(tmp_path / "out", deep=True) == []
+
+
+# ---------------------------------------------------------------- errors that nobody thought of
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+@pytest.mark.parametrize("debug", [False, True])
+def test_an_error_that_nobody_thought_of(
+    as_json: bool, debug: bool, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(_: object) -> None:
+        raise TypeError("open() got an unexpected keyword argument 'x'\n\x1b[31m.")
+
+    monkeypatch.setattr("mp4ds.info.info", broken)
+    monkeypatch.setenv("MP4DS_DEBUG", "1" if debug else "")
+    done = call("info", recording, *(["--json"] if as_json else []))
+    assert done.code == 1
+    *trace, sentence, versions = done.err.splitlines()
+    assert any("Traceback" in line for line in trace) == debug
+    assert sentence.startswith("mp4ds: TypeError in cli/")
+    assert "unexpected keyword argument 'x' \\x1b[31m. This" in sentence
+    assert "MP4DS_DEBUG=1" in sentence
+    for name in ("Python", "av", "libavcodec", "numpy", "rosbags", "mcap", "pydantic", "typer"):
+        assert re.search(rf"\b{name} \d+\.\d+", versions), versions
+    assert "pytest" not in versions
+    if as_json:
+        told = json.loads(done.out)
+        assert told["error"].startswith("TypeError in cli/")
+        assert told["exit_code"] == 1
+        assert told["versions"]["mp4ds"] == mp4ds.__version__
