@@ -10,6 +10,8 @@ import os
 import re
 import shutil
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -18,6 +20,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import av
 import cv2
@@ -657,7 +660,7 @@ def ask(
 ) -> tuple[int, dict[str, str], bytes]:
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
     try:
-        connection.request(method, path, headers=headers)
+        connection.request(method, urlsplit(server.root).path + path, headers=headers)
         answer = connection.getresponse()
         return answer.status, dict(answer.getheaders()), answer.read()
     finally:
@@ -710,9 +713,54 @@ def test_whole_files_and_heads(server: ReportServer) -> None:
     assert ask(server, "/index.html", "POST")[0] == 501
 
 
-def test_other_sites_get_nothing(server: ReportServer) -> None:
-    assert ask(server, "/index.html", Host=f"evil.example:{server.port}")[0] == 403
+def test_other_sites_and_users_get_nothing(server: ReportServer) -> None:
+    for host in (f"evil.example:{server.port}", "127.0.0.1", f"127.0.0.1:{server.port}:1"):
+        assert ask(server, "/index.html", Host=host)[0] == 403
     assert ask(server, "/index.html", Host=f"localhost:{server.port}")[0] == 200
+    for site, dest, status in (
+        ("same-origin", "script", 200),
+        ("none", "document", 200),
+        ("cross-site", "document", 200),  # a link in a terminal that is a web page
+        ("cross-site", "script", 403),
+        ("cross-site", "iframe", 403),
+        ("same-site", "video", 403),
+    ):
+        fetched = {"Sec-Fetch-Site": site, "Sec-Fetch-Dest": dest}
+        found, headers, _ = ask(server, "/index.html", **fetched)
+        assert found == status
+        assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
+        assert headers["X-Content-Type-Options"] == "nosniff"
+    with ReportServer({}, "/index.html") as other:
+        path = urlsplit(other.url).path
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
+    for guess in ("/index.html", path, path.replace("/index.html", "")):
+        connection.request("GET", guess)
+        answer = connection.getresponse()
+        assert (answer.status, answer.read()) == (404, b"")
+    connection.close()
+
+
+def test_odd_requests_print_nothing(
+    server: ReportServer, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """What scanners and browsers that were closed send; the next one is answered all the same."""
+    path = urlsplit(server.root).path.encode()
+    host = b" HTTP/1.1\r\nHost: 127.0.0.1:%d\r\n" % server.port
+    asked = (b"GET http://[" + host, b"GET //[" + host, b"GET " + path + b"/d/a%20b.mp4" + host)
+    for request in (*(line + b"\r\n" for line in asked), asked[2], b"GET /", b"\x16\x03\x01\r\n"):
+        for is_reset in (False, True):
+            with socket.create_connection(("127.0.0.1", server.port), 20) as connection:
+                connection.sendall(request)
+                if is_reset:
+                    linger = struct.pack("ii", 1, 0)
+                    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+                elif request.startswith(asked[:2]):
+                    assert connection.recv(100).startswith(b"HTTP/1.1 404")
+    for _ in range(3):
+        assert ask(server, "/index.html")[0] == 200
+    while any("process_request" in thread.name for thread in threading.enumerate()):
+        time.sleep(0.01)  # each ends: it reads the end of what was sent, or a reset
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_port_that_is_taken(server: ReportServer) -> None:
@@ -754,12 +802,12 @@ def test_serving_until_interrupted(copy: Path) -> None:
         while "127.0.0.1" not in line:
             line = process.stdout.readline()
             assert line, process.stderr.read() if process.stderr else ""
-        match = re.match(r"http://127\.0\.0\.1:(\d+)(/\S+)", line)
+        match = re.match(r"http://127\.0\.0\.1:(\d+)(/[\w-]{20,})/out%20put/index\.html ", line)
         assert match
-        assert match[2] == "/out%20put/index.html"
         connection = http.client.HTTPConnection("127.0.0.1", int(match[1]), timeout=20)
-        for path in (match[2], "/out%20put/report/data.js", "/drive/front_image_raw.mp4"):
-            connection.request("GET", path)
+        pages = ("/out%20put/index.html", "/out%20put/report/data.js", "/drive/front_image_raw.mp4")
+        for path in pages:
+            connection.request("GET", match[2] + path)
             answer = connection.getresponse()
             assert answer.status == 200
             assert answer.read()

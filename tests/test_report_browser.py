@@ -492,6 +492,45 @@ def test_a_server_shows_the_same(
             thread.join()
 
 
+INTRUDER = """<!doctype html><title>intruder</title><script>
+const root = "ROOT", got = [], tries = [];
+const include = (name, facts, ready) => tries.push(new Promise(done => {
+  const made = Object.assign(document.createElement(name), facts);
+  made[ready] = () => { got.push(name); done(); };
+  made.onerror = done;
+  document.head.append(made);
+}));
+mp4dsReport = {dataset: facts => got.push(facts)};
+include("script", {src: `${root}/report/data.js`}, "onload");
+include("link", {rel: "stylesheet", href: `${root}/report/report.css`}, "onload");
+include("video", {src: `${root}/front_image_raw.mp4`}, "onloadedmetadata");
+for (const mode of ["cors", "no-cors"])
+  tries.push(fetch(`${root}/report/data.js`, {mode}).then(() => got.push(mode), () => 0));
+all = Promise.all(tries).then(() => got);
+</script>"""
+
+
+def test_another_origin_can_include_nothing(browser: Tab, drive: Path, tmp_path: Path) -> None:
+    """Even one that has learned the token."""
+    summary = report(drive)
+    page = tmp_path / "intruder.html"
+    with ReportServer(summary.files, summary.start) as server:
+        page.write_text(INTRUDER.replace("ROOT", server.root))
+        with ReportServer({"/intruder.html": page}, "/intruder.html") as other:
+            threads = [threading.Thread(target=each.serve) for each in (server, other)]
+            for thread in threads:
+                thread.start()
+            try:
+                for url in (page.as_uri(), other.url, other.url.replace("127.0.0.1", "localhost")):
+                    browser.open(url, ready="typeof all === 'object'")
+                    assert browser.evaluate("all") == []
+                browser.open("about:blank", ready="true")
+            finally:
+                for each, thread in zip((server, other), threads, strict=True):
+                    each.stop()
+                    thread.join()
+
+
 def test_troubles_are_told(browser: Tab, drive: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(drive, tmp_path / "copy"))
     report(copy, ReportOptions(proxies="none"))

@@ -1,21 +1,39 @@
-"""Shows a page to this machine's browsers, with byte ranges, which they need to seek."""
+"""Shows a page to this machine's browsers, with byte ranges, which they need to seek.
+
+Other sites in such a browser, and other users of this machine, can reach the port, too. They do
+not know the token in the paths, and what they include is refused.
+"""
 
 from __future__ import annotations
 
+import os
 import re
+import secrets
+import sys
 from collections.abc import Mapping
 from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import BinaryIO
-from urllib.parse import unquote, urlsplit
+from urllib.parse import unquote
 
 from mp4ds.errors import OptionError
 
 _HOST = "127.0.0.1"
 _BLOCK = 1 << 18
 _LONGEST_RANGE = 64  # characters
+_TOKEN_BYTES = 18
+_SAME_SITE = ("none", "same-origin")  # Sec-Fetch-Site: typed by the user, or of this page
+_GUARDS = {
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+"""Headers of every answer: no other site includes, frames or keeps hold of it."""
+
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -28,11 +46,13 @@ class ReportServer:
     """Serves some files, and nothing else. A context manager.
 
     Args:
-        files: What there is, by the path of its URL, ``/index.html`` without quoting.
-        start: Path of the page.
+        files: What there is, by the path of its URL, ``/index.html`` without quoting. A token
+            that cannot be guessed goes before it.
+        start: Path of the page, quoted.
         port: To listen at; 0 for a free one.
 
     Attributes:
+        root: What all URLs begin with, without a slash at the end.
         url: Of the page.
 
     Raises:
@@ -40,14 +60,16 @@ class ReportServer:
     """
 
     def __init__(self, files: Mapping[str, Path], start: str, *, port: int = 0) -> None:
+        token = secrets.token_urlsafe(_TOKEN_BYTES)
+        served = {f"/{token}{path}": file for path, file in files.items()}
         try:
-            self._server = ThreadingHTTPServer((_HOST, port), partial(_Handler, dict(files)))
+            self._server = _Server((_HOST, port), partial(_Handler, served))
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or str(error)
             raise OptionError(f"--port {port} cannot be used: {reason}.") from None
-        self._server.daemon_threads = True
         self.port: int = self._server.server_address[1]
-        self.url = f"http://{_HOST}:{self.port}{start}"
+        self.root = f"http://{_HOST}:{self.port}/{token}"
+        self.url = f"{self.root}{start}"
 
     def serve(self) -> None:
         """Answer until it is interrupted."""
@@ -62,6 +84,15 @@ class ReportServer:
 
     def __exit__(self, *_: object) -> None:
         self._server.server_close()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Say nothing of connections that the browser broke off."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)  # type: ignore[arg-type]
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -81,12 +112,28 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         self._answer(with_body=True)
 
+    def end_headers(self) -> None:
+        for name, value in _GUARDS.items():
+            self.send_header(name, value)
+        super().end_headers()
+
+    def _is_own(self) -> bool:
+        """Whether the page itself asks, or the user who opened it, and no other site."""
+        port = self.connection.getsockname()[1]
+        hosts = [f"{name}:{port}" for name in (_HOST, "localhost")]
+        if port == 80:
+            hosts += [_HOST, "localhost"]
+        if self.headers.get("Host") not in hosts:  # else another site, by a name of its own
+            return False
+        site = self.headers.get("Sec-Fetch-Site", "none")  # old browsers do not say
+        # a link to the page may stand anywhere, in a terminal that is a web page, say
+        return site in _SAME_SITE or self.headers.get("Sec-Fetch-Dest") == "document"
+
     def _answer(self, *, with_body: bool) -> None:
-        host = self.headers.get("Host", "").rpartition(":")[0]
-        if host not in (_HOST, "localhost"):  # a page of another site, by a name of its own
+        if not self._is_own():
             self._refuse(HTTPStatus.FORBIDDEN)
             return
-        path = self._files.get(unquote(urlsplit(self.path).path))
+        path = self._files.get(unquote(self.path.partition("?")[0]))
         try:
             file = path.open("rb") if path else None
         except OSError:
@@ -98,7 +145,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(file, path, with_body)
 
     def _send(self, file: BinaryIO, path: Path, with_body: bool) -> None:
-        size = path.stat().st_size
+        size = os.fstat(file.fileno()).st_size
         asked = self.headers.get("Range")
         part = (0, size) if asked is None else byte_range(asked, size)
         if part is None:
@@ -112,17 +159,15 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(end - start))
         self.send_header("Accept-Ranges", "bytes")
         self.send_header("Cache-Control", "no-cache")
-        self.send_header("X-Content-Type-Options", "nosniff")
         self.end_headers()
         if not with_body:
             return
         file.seek(start)
         left = end - start
-        try:
-            while left and (block := file.read(min(left, _BLOCK))):
-                self.wfile.write(block)
-                left -= len(block)
-        except OSError:  # the browser has seen enough
+        while left and (block := file.read(min(left, _BLOCK))):
+            self.wfile.write(block)
+            left -= len(block)
+        if left:  # the file became shorter
             self.close_connection = True
 
     def _refuse(self, status: HTTPStatus, content_range: str = "") -> None:
