@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from distributed import Client, LocalCluster
 
 LOCAL = "local"
+_LOOPBACK = "127.0.0.1"
 _SCHEMES = ("tcp", "tls")
 _CONNECT_SECONDS = 15.0
 _CONNECT_POLL_SECONDS = 0.1
@@ -126,8 +128,8 @@ def check_address(address: str) -> None:
             f"--cluster {address!r} is neither tcp://HOST:PORT or tls://HOST:PORT of a Dask "
             f"scheduler nor one of {', '.join(BATCH_SYSTEMS)}, {LOCAL}."
         )
-    needed = ["distributed"] + ["dask_jobqueue"] * (address in BATCH_SYSTEMS)
-    for name in needed:
+    needed = {LOCAL: "cryptography"} | dict.fromkeys(BATCH_SYSTEMS, "dask_jobqueue")
+    for name in filter(None, ("distributed", needed.get(address))):
         if find_spec(name) is None:
             raise OptionError(
                 f"--cluster {address} needs {name.replace('_', '-')}, which is not installed. "
@@ -267,15 +269,32 @@ def _unreachable(address: str, error: Exception) -> ClusterError:
 
 @contextmanager
 def _local_cluster(tasks: int) -> Iterator[LocalCluster]:
-    from dask.system import CPU_COUNT
-    from distributed import LocalCluster
+    """Workers of this user alone: who connects needs a certificate that is in memory only.
 
-    with LocalCluster(
-        n_workers=min(tasks, CPU_COUNT),
-        threads_per_worker=1,
-        dashboard_address=":0",
-        silence_logs=logging.CRITICAL,
-    ) as cluster:
+    Dask listens for HTTP, too, whatever it is told: on the loopback, and there is nothing to see.
+    """
+    import dask
+    from dask.system import CPU_COUNT
+    from distributed import LocalCluster, Security
+
+    no_pages: dict[str, list[str]] = {
+        "distributed.scheduler.http.routes": [],
+        "distributed.worker.http.routes": [],
+    }
+    with (
+        dask.config.set(no_pages),  # workers are given it when they start
+        TemporaryDirectory(prefix="mp4ds-") as folder,
+        LocalCluster(
+            n_workers=min(tasks, CPU_COUNT),
+            threads_per_worker=1,
+            host=_LOOPBACK,
+            security=Security.temporary(),
+            dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": f"{_LOOPBACK}:0"},
+            local_directory=folder,
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+    ):
         yield cluster
 
 
