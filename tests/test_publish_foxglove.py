@@ -6,6 +6,7 @@ import base64
 import json
 import os
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -15,7 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
+from chromium import chromium
 from foxglove_client import PAUSE, PLAY, Client
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from mp4ds.bags import open_sources
@@ -23,6 +28,7 @@ from mp4ds.errors import ConversionError, OptionError, PublishError
 from mp4ds.publishers.foxglove import FoxglovePublisher
 from mp4ds.publishers.protocol import Publisher
 from mp4ds.records import Channel, Message, Schema
+from mp4ds.report.server import ReportServer
 from sources import SOURCES, scene
 
 pytest.importorskip("foxglove")
@@ -500,6 +506,76 @@ publisher.close()
 
 
 # ---------------------------------------------------------------- what cannot be
+
+
+@pytest.mark.parametrize(
+    ("origin", "is_let_in"),
+    [
+        *((None, True), ("https://app.foxglove.dev", True), ("http://localhost:8080", True)),
+        *(("http://127.0.0.1:3000", True), ("http://[::1]:3000", True), ("file://", True)),
+        *(("http://robot:8080", True), ("https://robot:8080", False), ("null", False)),
+        *(("https://evil.example", False), ("http://localhost.evil.example", False)),
+        *(("https://app.foxglove.dev.evil.example", False), ("http://app.foxglove.dev", False)),
+        *(("http://[", False), ("", False), ("HTTPS://evil.example", False)),
+    ],
+)
+def test_web_sites_are_let_in_by_their_origin(origin: str | None, is_let_in: bool) -> None:
+    with FoxglovePublisher(port=0, origins=["http://robot:8080"]) as publisher:
+        headers = {} if origin is None else {"Origin": origin}
+        try:
+            with connect(
+                publisher.address,
+                subprotocols=[Subprotocol("foxglove.sdk.v1")],
+                additional_headers=headers,
+            ) as client:
+                answered = json.loads(client.recv(20))["op"]
+        except InvalidStatus as error:
+            answered = error.response.status_code
+    assert answered == ("serverInfo" if is_let_in else 403)
+
+
+@pytest.mark.browser
+def test_a_browser_reaches_neither_door_from_another_origin(tmp_path: Path) -> None:
+    """The SDK's own port, which a site might find, takes only who trusts its certificate."""
+    tries = """Promise.all(%s.map(url => new Promise(done => {
+      const socket = new WebSocket(url, ['foxglove.sdk.v1']);
+      socket.onmessage = () => done(true);
+      socket.onerror = () => done(false);
+    })))"""
+    page = tmp_path / "page.html"
+    page.write_text("<!doctype html><title>a page</title>")
+    (tmp_path / "profile").mkdir()
+    with (
+        FoxglovePublisher(port=0, span=(0, 10)) as publisher,
+        ReportServer({"/": page}, "/") as server,
+        chromium(tmp_path / "profile") as browser,
+    ):
+        inner = publisher._server.port
+        doors = [publisher.address, f"wss://127.0.0.1:{inner}", f"ws://127.0.0.1:{inner}"]
+        browser.open("data:text/html,<p>a page", ready="true")
+        assert browser.evaluate(tries % doors) == [False, False, False]
+        serving = threading.Thread(target=server.serve)
+        serving.start()
+        try:
+            browser.open(server.url, ready="document.title === 'a page'")
+            assert browser.evaluate(tries % doors) == [True, False, False]
+        finally:
+            server.stop()
+            serving.join()
+
+
+def test_odd_clients_leave_the_gate_open(
+    publisher: FoxglovePublisher, capfd: pytest.CaptureFixture[str]
+) -> None:
+    port = int(publisher.address.rpartition(":")[2])
+    head = b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * 200 + b"\r\n"
+    for said in (b"", b"\x16\x03\x01", b"\r\n\r\n", head, b"x" * 200_000, head + b"x" * 99):
+        with socket.create_connection(("127.0.0.1", port), 20) as odd:
+            odd.sendall(said)
+            odd.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    with Client(publisher.address) as client:
+        assert client.info["op"] == "serverInfo"
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_port_that_is_taken(publisher: FoxglovePublisher) -> None:

@@ -136,6 +136,15 @@ def play(
     port: Annotated[
         int, typer.Option("--port", min=0, max=65535, help="To listen on, for Foxglove.")
     ] = 8765,
+    allow_origin: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            "--allow-origin",
+            metavar="URL",
+            help="A web site that may connect, such as http://robot:8080, besides Foxglove's and "
+            "those of this machine.",
+        ),
+    ] = None,
     no_keyboard: Annotated[
         bool, typer.Option("--disable-keyboard-controls", help="Leave the keyboard alone.")
     ] = False,
@@ -184,6 +193,7 @@ def play(
             lock_step=lock_step,
             host=host,
             port=port,
+            origins=allow_origin or (),
         )
         report = stack.enter_context(play_progress(is_quiet=as_json or not progress))
         player = stack.enter_context(open_player(datasets, options, progress=report))

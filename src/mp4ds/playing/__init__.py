@@ -67,6 +67,7 @@ class PlayOptions:
         lock_step: Topic of whose messages each lets the next frame go.
         host: Address to listen on, for Foxglove.
         port: Port to listen on, for Foxglove.
+        origins: Web sites that may connect, for Foxglove, besides its own.
     """
 
     to: str | None = None
@@ -97,6 +98,7 @@ class PlayOptions:
     lock_step: str = ""
     host: str = "127.0.0.1"
     port: int = 8765
+    origins: Sequence[str] = ()
 
 
 def play(
@@ -174,6 +176,7 @@ def open_player(
                     kind,
                     qos_overrides=chosen.qos_overrides,
                     host=chosen.host,
+                    origins=chosen.origins,
                     port=chosen.port,
                     span=(timeline.start_ns, timeline.end_ns),
                     is_paced=not chosen.immediate,

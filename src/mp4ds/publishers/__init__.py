@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -43,6 +43,7 @@ def open_publisher(
     qos_overrides: Path | None = None,
     host: str = "127.0.0.1",
     port: int = 8765,
+    origins: Sequence[str] = (),
     span: tuple[int, int] | None = None,
     is_paced: bool = True,
 ) -> Publisher:
@@ -53,6 +54,7 @@ def open_publisher(
         qos_overrides: A YAML file of QoS profiles by topic, for ROS 2.
         host: Address to listen on, for Foxglove.
         port: Port to listen on, for Foxglove.
+        origins: Web sites that may connect, for Foxglove.
         span: Log times of the first and the last message, nanoseconds.
         is_paced: Whether messages come at their times; else slow subscribers are waited for where
             that is possible, which is in ROS 1.
@@ -73,7 +75,7 @@ def open_publisher(
     if kind == "foxglove":
         from mp4ds.publishers.foxglove import FoxglovePublisher
 
-        return FoxglovePublisher(host=host, port=port, span=span)
+        return FoxglovePublisher(host=host, port=port, origins=origins, span=span)
     from mp4ds.publishers.qos import load_overrides
 
     overrides = load_overrides(qos_overrides) if qos_overrides is not None else {}

@@ -9,11 +9,12 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from mp4ds.bags.convert import is_latched
 from mp4ds.errors import ConversionError, OptionError, PublishError
+from mp4ds.publishers.foxglove_gate import FOXGLOVE_ORIGIN, Gate
 from mp4ds.publishers.foxglove_teller import MAX_TIME, Teller
 from mp4ds.publishers.protocol import Controls
 from mp4ds.records import Channel, Schema
@@ -59,6 +60,8 @@ class FoxglovePublisher:
         span: First and last log time of the recording, nanoseconds: the time line that clients
             show to control the player. Without it they can only watch.
         backlog: Messages that wait for each slow client; also control messages.
+        origins: Web sites that may connect, such as ``https://app.foxglove.dev``, besides those
+            of this machine; programs that are no browser always may.
 
     Attributes:
         world: None: messages go as they are recorded.
@@ -78,6 +81,7 @@ class FoxglovePublisher:
         name: str = "mp4ds",
         span: tuple[int, int] | None = None,
         backlog: int = _BACKLOG,
+        origins: Sequence[str] = (),
     ) -> None:
         _check(port, span, backlog)
         self._host = host
@@ -92,30 +96,42 @@ class FoxglovePublisher:
         self._sent_at = 0.0
         self._is_closed = False
         self._teller = Teller(self._sdk.websocket, can_control=span is not None)
-        self._server = self._start(name, span, backlog)
-        self._port = self._server.port
+        self._gate = self._opened((FOXGLOVE_ORIGIN, *origins))
+        self._port = self._gate.port
+        try:
+            self._server = self._start(name, span, backlog)
+        except BaseException:
+            self._gate.close()
+            raise
+        self._gate.open(self._server.port)
         self._teller.start(self._server)
+
+    def _opened(self, origins: Sequence[str]) -> Gate:
+        try:
+            return Gate(self._host, self._port, origins)
+        except ImportError:
+            raise _missing(self.address, "cryptography") from None
+        except OSError as error:
+            raise PublishError(
+                self.address,
+                f"Foxglove cannot be served there: {error.strerror or error}; choose another port "
+                "with --port, or --port 0 for any that is free",
+            ) from None
 
     def _start(self, name: str, span: tuple[int, int] | None, backlog: int) -> Any:
         capability = self._sdk.websocket.Capability
-        try:
-            return self._sdk.start_server(
-                name=name,
-                host=self._host,
-                port=self._port,
-                context=self._context,
-                capabilities=[capability.Time],
-                server_listener=_Listener(self, self._teller),
-                playback_time_range=span,
-                message_backlog_size=backlog,
-            )
-        except RuntimeError as error:
-            reason = str(error).rpartition("port: ")[2].partition(" (os error")[0]
-            raise PublishError(
-                self.address,
-                f"Foxglove cannot be served there: {reason}; choose another port with --port, or "
-                "--port 0 for any that is free",
-            ) from None
+        return self._sdk.start_server(
+            name=name,
+            host="127.0.0.1",
+            port=0,
+            tls_cert=self._gate.certificate,
+            tls_key=self._gate.key,
+            context=self._context,
+            capabilities=[capability.Time],
+            server_listener=_Listener(self, self._teller),
+            playback_time_range=span,
+            message_backlog_size=backlog,
+        )
 
     @property
     def address(self) -> str:
@@ -260,6 +276,7 @@ class FoxglovePublisher:
             stopper = threading.Thread(target=self._server.stop, name="foxglove stop", daemon=True)
             stopper.start()
             stopper.join(_STOP_S)
+            self._gate.close()
 
     def __enter__(self) -> FoxglovePublisher:
         return self
@@ -310,13 +327,16 @@ def _sdk(address: str) -> Any:
         import foxglove
         import foxglove.websocket
     except ImportError:
-        raise PublishError(
-            address, "needs the Python package foxglove-sdk: pip install 'mp4ds[foxglove]'"
-        ) from None
+        raise _missing(address, "foxglove-sdk") from None
     logger = logging.getLogger("foxglove")
     if not any(isinstance(handler, logging.NullHandler) for handler in logger.handlers):
         logger.addHandler(logging.NullHandler())
     return foxglove
+
+
+def _missing(address: str, package: str) -> PublishError:
+    said = f"needs the Python package {package}: pip install 'mp4ds[foxglove]'"
+    return PublishError(address, said)
 
 
 def _text(text: str) -> str:
