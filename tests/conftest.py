@@ -32,6 +32,11 @@ def real(name: str) -> Path:
     return path
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Let one case of a test be chosen that goes through many."""
+    parser.addoption("--case", default="", help="of tests over each row of a table: part of a name")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that keep to times: they run apart, one process for each network."""
     for item in items:

@@ -11,6 +11,7 @@ from rosbags.rosbag1 import Reader
 
 from coded_tools import mutations, refusal
 from conftest import real
+from each import each
 from mp4ds.coded import depth
 from mp4ds.coded.rvl import encode as encode_rvl
 
@@ -33,8 +34,8 @@ def png_of(values: np.ndarray[tuple[int, int], np.dtype[np.uint16]], level: int 
     return cv2.imencode(".png", values, [cv2.IMWRITE_PNG_COMPRESSION, level])[1].tobytes()
 
 
-@pytest.mark.parametrize("header", [name for name in HEADERS if HEADERS[name]])
-@pytest.mark.parametrize("coding", ["png", "rvl"])
+@each("header", [name for name in HEADERS if HEADERS[name]])
+@each("coding", ["png", "rvl"])
 def test_comes_back(header: str, coding: str) -> None:
     hint = None
     for frame in range(3):
@@ -56,7 +57,7 @@ def test_a_png_without_the_header() -> None:
     assert depth.rebuild(image) == png_of(room())
 
 
-@pytest.mark.parametrize(
+@each(
     ("data", "reason"),
     [
         (b"", "no RVL"),

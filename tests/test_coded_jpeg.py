@@ -14,6 +14,7 @@ from rosbags.rosbag1 import Reader
 
 from coded_tools import decodes, jpeg, mutations, refusal, scene
 from conftest import real
+from each import each
 from mp4ds.coded.jpeg import parse
 
 PICTURE = next(scene(1))
@@ -51,7 +52,7 @@ KINDS: dict[str, tuple[bytes, dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@each("kind", KINDS)
 def test_headers_are_read(kind: str) -> None:
     data, expected = KINDS[kind]
     info = parse(memoryview(data))
@@ -62,7 +63,7 @@ def test_headers_are_read(kind: str) -> None:
     assert decodes("mjpeg", [data]) == 1
 
 
-@pytest.mark.parametrize("sampling", ["411", "420", "422", "440", "444"])
+@each("sampling", ["411", "420", "422", "440", "444"])
 def test_sampling_of_opencv(sampling: str) -> None:
     factor = getattr(cv2, f"IMWRITE_JPEG_SAMPLING_FACTOR_{sampling}")
     data = cv2.imencode(".jpg", PICTURE, [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, factor])[1].tobytes()
@@ -75,7 +76,7 @@ def test_sampling_of_opencv(sampling: str) -> None:
 FACTORS = [across << 4 | down for across in range(1, 5) for down in range(1, 5)]
 
 
-@pytest.mark.parametrize("luma", FACTORS)
+@each("luma", FACTORS)
 def test_every_sampling_taken_is_one_that_decodes(luma: int) -> None:
     taken = 0
     for chroma in FACTORS:
@@ -105,7 +106,7 @@ def test_fill_bytes_before_markers() -> None:
     assert parse(BASE[:-2] + b"\xff\xff" + BASE[-2:]).trailing == 0
 
 
-@pytest.mark.parametrize(
+@each(
     ("data", "reason"),
     [
         (b"", "no JPEG"),
@@ -143,7 +144,7 @@ def test_cmyk_is_refused() -> None:
     assert "4 colour components" in refusal(parse, data)
 
 
-@pytest.mark.parametrize("kind", ["420", "progressive", "exif", "restarts"])
+@each("kind", ["420", "progressive", "exif", "restarts"])
 def test_every_cut_is_refused(kind: str) -> None:
     data = KINDS[kind][0]
     for length in range(len(data)):

@@ -25,6 +25,7 @@ from rosbags.rosbag1 import Reader
 
 from coded_tools import mutations, refusal
 from conftest import real
+from each import each
 from mp4ds.coded import png
 from mp4ds.coded.png_filters import RULES, filter_rows, find_rule, unfilter
 
@@ -92,8 +93,8 @@ def check(data: bytes, hint: png.PngRecipe | None = None) -> png.PngRecipe:
 LEVELS = range(1, 10)
 
 
-@pytest.mark.parametrize(("channels", "dtype"), KINDS)
-@pytest.mark.parametrize("size", SIZES)
+@each(("channels", "dtype"), KINDS)
+@each("size", SIZES)
 def test_opencv(size: tuple[int, int], channels: int, dtype: Any) -> None:
     pixels = picture(*size, channels, dtype)
     assert check(by_opencv(pixels)).filters == "1" or 1 in size
@@ -101,25 +102,25 @@ def test_opencv(size: tuple[int, int], channels: int, dtype: Any) -> None:
         check(by_opencv(pixels, cv2.IMWRITE_PNG_COMPRESSION, level))
 
 
-@pytest.mark.parametrize("strategy", range(5))
-@pytest.mark.parametrize("filters", [8, 16, 32, 64, 128, 248, 56])
+@each("strategy", range(5))
+@each("filters", [8, 16, 32, 64, 128, 248, 56])
 def test_opencv_with_strategies_and_filters(strategy: int, filters: int) -> None:
     pixels = picture(60, 80, 3, np.uint8)
     check(by_opencv(pixels, cv2.IMWRITE_PNG_STRATEGY, strategy, cv2.IMWRITE_PNG_FILTER, filters))
 
 
-@pytest.mark.parametrize("optimize", [False, True])
-@pytest.mark.parametrize("channels", [1, 3, 4])
-@pytest.mark.parametrize("size", SIZES)
+@each("optimize", [False, True])
+@each("channels", [1, 3, 4])
+@each("size", SIZES)
 def test_pillow(size: tuple[int, int], channels: int, optimize: bool) -> None:
     check(by_pillow(picture(*size, channels, np.uint8), optimize=optimize))
     if channels == 1 and not optimize:
         check(by_pillow(picture(*size, 1, np.uint16)))
 
 
-@pytest.mark.parametrize("pred", ["", "none", "sub", "up", "avg", "paeth", "mixed"])
-@pytest.mark.parametrize(("channels", "dtype"), [(1, np.uint8), (3, np.uint8), (1, np.uint16)])
-@pytest.mark.parametrize("size", SIZES)
+@each("pred", ["", "none", "sub", "up", "avg", "paeth", "mixed"])
+@each(("channels", "dtype"), [(1, np.uint8), (3, np.uint8), (1, np.uint16)])
+@each("size", SIZES)
 def test_ffmpeg(size: tuple[int, int], channels: int, dtype: Any, pred: str) -> None:
     options = {"pred": pred} if pred else {}
     check(by_ffmpeg(picture(*size, channels, dtype), **options))
@@ -144,7 +145,7 @@ ENCODERS: dict[str, Callable[[Pixels], bytes]] = {
 }
 
 
-@pytest.mark.parametrize("name", ENCODERS)
+@each("name", ENCODERS)
 def test_one_recipe_for_a_topic(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     make = ENCODERS[name]
     recipe = check(make(picture(90, 120, 3, np.uint8)))
@@ -327,7 +328,7 @@ def test_the_base_is_taken() -> None:
     assert png.decode(BASE)[0].tolist() == [[0] * 4] * 3
 
 
-@pytest.mark.parametrize(
+@each(
     ("data", "reason"),
     [
         (b"", "no PNG"),
@@ -405,7 +406,7 @@ def test_damage_is_refused_or_comes_back() -> None:
             assert png.rebuild(*png.decode(damaged)) == damaged
 
 
-@pytest.mark.parametrize(
+@each(
     "change",
     [
         {"filters": "none"},
@@ -436,7 +437,7 @@ def test_forged_recipes(change: dict[str, Any]) -> None:
         return
 
 
-@pytest.mark.parametrize(
+@each(
     "pixels",
     [
         np.zeros((3, 4), np.uint32),

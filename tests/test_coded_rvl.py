@@ -13,6 +13,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from numpy.typing import NDArray
 
 from coded_tools import mutations, refusal
+from each import each
 from mp4ds.coded import Refused
 from mp4ds.coded.rvl import decode, encode
 
@@ -74,9 +75,9 @@ def random_depth(shape: tuple[int, int], filled: float, top: int) -> Depth:
 SHAPES = [(1, 1), (1, 7), (7, 1), (3, 5), (48, 64)]
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("filled", [0.0, 0.1, 0.5, 0.9, 1.0])
-@pytest.mark.parametrize("top", [1, 7, 300, 65535])
+@each("shape", SHAPES)
+@each("filled", [0.0, 0.1, 0.5, 0.9, 1.0])
+@each("top", [1, 7, 300, 65535])
 def test_like_the_reference(shape: tuple[int, int], filled: float, top: int) -> None:
     depth = random_depth(shape, filled, top)
     data = reference(depth)
@@ -105,7 +106,7 @@ def test_a_view_of_a_larger_image() -> None:
     assert encode(depth) == reference(depth)
 
 
-@pytest.mark.parametrize(
+@each(
     ("data", "reason"),
     [
         (b"", "whole number"),

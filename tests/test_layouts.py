@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from each import each
 from mp4ds.errors import OptionError
 from mp4ds.layouts import (
     CHROMA_SHIFTS,
@@ -74,8 +75,8 @@ def through(layout: Layout, pixels: np.ndarray, out: np.ndarray | None = None) -
 # ---------------------------------------------------------------- exact layouts
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("name", "layout"), GENERAL)
+@each("kind", KINDS)
+@each(("name", "layout"), GENERAL)
 def test_the_general_layout_gives_all_pixels_back(name: str, layout: str, kind: str) -> None:
     encoding = ENCODINGS[name]
     general = bind(layout, encoding)
@@ -94,8 +95,8 @@ def test_the_general_layout_gives_all_pixels_back(name: str, layout: str, kind: 
                 assert bits_of(through(general, view, target)) == bits_of(pixels)
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize(("name", "layout"), WITH_PARAMETERS)
+@each("seed", range(4))
+@each(("name", "layout"), WITH_PARAMETERS)
 def test_a_fitted_layout_gives_the_samples_back(name: str, layout: str, seed: int) -> None:
     encoding = ENCODINGS[name]
     for width, height in SIZES:
@@ -120,8 +121,8 @@ def refused_or_returned(layout: Layout, pixels: np.ndarray) -> bool:
     return refused != returned or (refused and layout.name.endswith("fold"))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("name", "layout"), WITH_PARAMETERS)
+@each("kind", KINDS)
+@each(("name", "layout"), WITH_PARAMETERS)
 def test_what_is_not_refused_comes_back(name: str, layout: str, kind: str) -> None:
     """And what does not come back is refused: for every kind of pixels, some changed."""
     encoding = ENCODINGS[name]
@@ -169,7 +170,7 @@ def test_every_word_comes_back(dtype: str) -> None:
 # ---------------------------------------------------------------- what the spec says of each
 
 
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@each(("width", "height"), SIZES)
 def test_tiles_are_where_the_spec_says(width: int, height: int) -> None:
     """spec/index.md, Layouts, mosaic8."""
     pixels = np.arange(width * height, dtype=np.uint16).reshape(height, width)
@@ -195,7 +196,7 @@ def test_signed_samples_keep_their_order() -> None:
     assert picture.ravel().tolist() == list(range(256))
 
 
-@pytest.mark.parametrize("word", [0x0000, 0x00FF, 0x0100, 0x01FF, 0x02FE, 0xFF00, 0xFFFF])
+@each("word", [0x0000, 0x00FF, 0x0100, 0x01FF, 0x02FE, 0xFF00, 0xFFFF])
 def test_low_bytes_are_folded(word: int) -> None:
     """A step of one never moves the low byte by more than one."""
     fold = bind("fold", ENCODINGS["mono16"], Parameters(bits=16, shift=0, low=8))
@@ -204,7 +205,7 @@ def test_low_bytes_are_folded(word: int) -> None:
     assert picture.tolist() == [[high], [255 - low if high % 2 else low]]
 
 
-@pytest.mark.parametrize(
+@each(
     ("bits", "shift", "low", "pixel_format"),
     [(12, 0, 3, "gray10le"), (12, 4, 4, "gray"), (14, 2, 5, "gray10le"), (10, 0, 2, "gray")],
 )
@@ -265,7 +266,7 @@ def test_channels_are_stacked() -> None:
     assert picture.tolist() == [[0, 2, 4], [6, 8, 10], [1, 3, 5], [7, 9, 11]]
 
 
-@pytest.mark.parametrize(
+@each(
     ("encoding", "order"),
     [
         *(("rgb16", "rgb"), ("bgr16", "bgr"), ("rgba16", "rgba"), ("bgra16", "bgra")),
@@ -294,7 +295,7 @@ PLANES = {
 }
 
 
-@pytest.mark.parametrize(
+@each(
     ("encoding", "same", "planes"),
     [
         ("yuv422", "yuv422", "yuv422"),
@@ -306,7 +307,7 @@ PLANES = {
         ("nv24", "nv24", "nv24"),
     ],
 )
-@pytest.mark.parametrize("pad", [0, 5])
+@each("pad", [0, 5])
 def test_yuv_becomes_planes(encoding: str, same: str, planes: str, pad: int) -> None:
     """By the FourCC codes UYVY, YUY2, NV12, NV21 and NV24."""
     known = ENCODINGS[encoding]
@@ -316,8 +317,8 @@ def test_yuv_becomes_planes(encoding: str, same: str, planes: str, pad: int) -> 
     assert (u.tolist(), v.tolist()) == PLANES[planes]
 
 
-@pytest.mark.parametrize("encoding", ["yuv422", "uyvy", "yuyv", "yuv422_yuy2", "nv24"])
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@each("encoding", ["yuv422", "uyvy", "yuyv", "yuv422_yuy2", "nv24"])
+@each(("width", "height"), SIZES)
 def test_halved_chroma_stays_near(encoding: str, width: int, height: int) -> None:
     known = ENCODINGS[encoding]
     width, height = rounded(known, width, height)
@@ -377,7 +378,7 @@ def parameters_of(layout: str, encoding: str, *samples: Any) -> Parameters | Non
     return fitted.parameters if fitted else None
 
 
-@pytest.mark.parametrize(
+@each(
     ("encoding", "samples", "expected"),
     [
         ("mono16", [[0, 4095]], (12, 0)),
@@ -409,7 +410,7 @@ def test_bits_that_are_fitted(
     assert (found and (found.bits, found.shift)) == expected
 
 
-@pytest.mark.parametrize(("encoding", "bits", "shift", "bad"), [
+@each(("encoding", "bits", "shift", "bad"), [
     ("mono16", 12, 0, 4096),
     ("mono16", 10, 6, 0x8020),
     ("16SC1", 12, 0, 2048),
@@ -473,8 +474,8 @@ def test_a_palette_stands_below_the_numbers() -> None:
     assert listed[512:].tolist() == [0]
 
 
-@pytest.mark.parametrize("encoding", ["mono16", "16SC1", "32FC1"])
-@pytest.mark.parametrize("count", [2, 100, 257, 2000])
+@each("encoding", ["mono16", "16SC1", "32FC1"])
+@each("count", [2, 100, 257, 2000])
 def test_images_of_few_values_have_palettes(encoding: str, count: int) -> None:
     known = ENCODINGS[encoding]
     rng = np.random.default_rng(count)
@@ -505,7 +506,7 @@ def test_numbers_beyond_a_table_are_no_error(encoding: str) -> None:
     assert out.view(f"u{out.itemsize}").tolist() == [[5, 9, 9]]
 
 
-@pytest.mark.parametrize("name", ["gray_bits", "fold", "metres16", "metres_fold"])
+@each("name", ["gray_bits", "fold", "metres16", "metres_fold"])
 def test_any_picture_gives_some_pixels(name: str) -> None:
     encoding = ENCODINGS["32FC1" if name.startswith("metres") else "16SC1"]
     layout = bound(name, encoding)
@@ -518,9 +519,9 @@ def test_any_picture_gives_some_pixels(name: str) -> None:
 COUNTS = np.arange(1, 65536, dtype=np.float32).reshape(255, 257)
 
 
-@pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize("hole", [0x00000000, 0x7FC00000, 0xFFC00000, 0x7F800000])
-@pytest.mark.parametrize("name", ["metres16", "metres_fold"])
+@each("scale", SCALES)
+@each("hole", [0x00000000, 0x7FC00000, 0xFFC00000, 0x7F800000])
+@each("name", ["metres16", "metres_fold"])
 def test_all_millimetres_come_back(name: str, hole: int, scale: str) -> None:
     pixels = COUNTS * np.float32(0.001) if scale == "product" else COUNTS / np.float32(1000)
     pixels[::7, ::5] = np.array(hole, np.uint32).view(np.float32)
@@ -540,9 +541,7 @@ def test_the_usual_ways_to_metres_are_two() -> None:
     assert bits_of(COUNTS * np.float32(0.001)) != quotient
 
 
-@pytest.mark.parametrize(
-    "value", [0.0005, 1.00025, -1.0, 65.536, 1e30, np.inf, -np.inf, np.nan, -0.0, 1e-40]
-)
+@each("value", [0.0005, 1.00025, -1.0, 65.536, 1e30, np.inf, -np.inf, np.nan, -0.0, 1e-40])
 def test_other_floats_are_refused(value: float) -> None:
     floats = ENCODINGS["32FC1"]
     layout = bind("metres16", floats, Parameters(hole=0, scale="quotient"))
@@ -558,7 +557,7 @@ def test_two_marks_of_a_hole_are_one_too_many() -> None:
     assert fit("metres16", ENCODINGS["32FC1"], [pixels]) is None
 
 
-@pytest.mark.parametrize(
+@each(
     ("encoding", "layout", "parameters", "words"),
     [
         ("mono8", "gray16", {}, "does not carry mono8"),
@@ -622,7 +621,7 @@ def test_layouts_that_cannot_be(
         bind(layout, ENCODINGS[encoding], Parameters.from_values(parameters))
 
 
-@pytest.mark.parametrize(("name", "layout"), PAIRS)
+@each(("name", "layout"), PAIRS)
 def test_parameters_are_plain_values(name: str, layout: str) -> None:
     parameters = bound(layout, ENCODINGS[name]).parameters
     plain = parameters.to_values()
@@ -643,9 +642,9 @@ def test_unknown_parameters() -> None:
 # ---------------------------------------------------------------- views
 
 
-@pytest.mark.parametrize("name", ENCODINGS)
-@pytest.mark.parametrize("pad", [0, 1, 3, 8])
-@pytest.mark.parametrize("big", [False, True])
+@each("name", ENCODINGS)
+@each("pad", [0, 1, 3, 8])
+@each("big", [False, True])
 def test_a_view_is_the_message_itself(name: str, pad: int, big: bool) -> None:
     encoding = ENCODINGS[name]
     width, height = rounded(encoding, 5, 3)
@@ -678,7 +677,7 @@ def test_a_view_of_bytes_is_read_only_and_not_a_copy() -> None:
     assert np.shares_memory(view, np.frombuffer(data, np.uint8))
 
 
-@pytest.mark.parametrize("name", ["mono8", "mono16", "rgb8", "bgra8", "16UC1", "nv12"])
+@each("name", ["mono8", "mono16", "rgb8", "bgra8", "16UC1", "nv12"])
 def test_plain_pictures_are_no_copies(name: str) -> None:
     encoding = ENCODINGS[name]
     pixels = as_message(values(encoding, "random", 6, 4), encoding, pad=4)
@@ -707,9 +706,9 @@ def test_padding(name: str, pad: int, data: st.DataObject | None) -> None:
 # ---------------------------------------------------------------- what has no layout
 
 
-@pytest.mark.parametrize("name", ENCODINGS)
-@pytest.mark.parametrize(("width", "height"), [(2, 2), (640, 480), (1920, 1080)])
-@pytest.mark.parametrize("pad", [0, 5, MAX_ROW_PADDING])
+@each("name", ENCODINGS)
+@each(("width", "height"), [(2, 2), (640, 480), (1920, 1080)])
+@each("pad", [0, 5, MAX_ROW_PADDING])
 def test_ordinary_images_have_one(name: str, width: int, height: int, pad: int) -> None:
     encoding = ENCODINGS[name]
     step = width * encoding.pixel_bytes + pad
@@ -717,7 +716,7 @@ def test_ordinary_images_have_one(name: str, width: int, height: int, pad: int) 
     assert why_not(name, width=width, height=height, step=step, size=size) is None
 
 
-@pytest.mark.parametrize("name", ENCODINGS)
+@each("name", ENCODINGS)
 def test_the_largest_image_is_the_one_of_the_largest_picture(name: str) -> None:
     encoding = ENCODINGS[name]
     layout = layout_for(encoding, lossless=True)
@@ -734,7 +733,7 @@ def test_the_largest_image_is_the_one_of_the_largest_picture(name: str) -> None:
         assert fits or "beyond 16384" in str(reason)
 
 
-@pytest.mark.parametrize(
+@each(
     ("encoding", "width", "height", "step", "size", "words"),
     [
         *((name, 4, 4, 16, 64, f"no layout for encoding {name!r}") for name in (

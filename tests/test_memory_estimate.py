@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from each import each
 from mp4ds.errors import OptionError
 from mp4ds.layouts import CHROMA_SHIFTS
 from mp4ds.video import Recipe, encoder_bytes, recipe_for
@@ -110,7 +111,7 @@ def measured(case: str, threads: int, frames: int) -> int:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-@pytest.mark.parametrize(
+@each(
     ("case", "threads", "frames"),
     [*MEASURED, *(pytest.param(*row, marks=pytest.mark.slow) for row in MEASURED_SLOWLY)],
 )
@@ -122,7 +123,7 @@ def test_estimate_is_above_what_is_taken_but_not_far(case: str, threads: int, fr
     assert taken <= estimate <= 1.6 * taken + MACHINES
 
 
-@pytest.mark.parametrize("found", list(recipes()))
+@each("found", list(recipes()))
 def test_every_recipe_is_known_and_grows_with_pictures_and_threads(found: Recipe) -> None:
     sizes = [(1, 1), (64, 48), (640, 480), (2448, 2048), (8192, 8192)]
     for (width, height), threads in itertools.product(sizes, (1, 2, 8)):
@@ -133,7 +134,7 @@ def test_every_recipe_is_known_and_grows_with_pictures_and_threads(found: Recipe
         assert estimate < encoder_bytes(found, width, height + 16, threads)
 
 
-@pytest.mark.parametrize(
+@each(
     ("codec", "lossless"),
     [
         ("h264", True),

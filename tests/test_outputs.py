@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from each import each, fresh
 from mp4ds.errors import Mp4dsError, TargetError, TargetExistsError, WriteError
 from mp4ds.outputs import as_write_error, check_target, digest_file, staged
 
@@ -33,7 +34,7 @@ def read(path: Path) -> str:
     return (path if path.is_file() else path / "deep" / "part").read_text()
 
 
-@pytest.fixture
+@fresh
 def target(tmp_path: Path) -> Path:
     return tmp_path / "out"
 
@@ -53,9 +54,9 @@ def test_an_output_appears_at_the_end(kind: str, target: Path) -> None:
     assert only(target.parent, "out")
 
 
-@pytest.mark.parametrize("kind", ["file", "folder"])
-@pytest.mark.parametrize("old", [None, "file", "folder"])
-@pytest.mark.parametrize("error", [ValueError("x"), KeyboardInterrupt(), SystemExit(3)])
+@each("kind", ["file", "folder"])
+@each("old", [None, "file", "folder"])
+@each("error", [ValueError("x"), KeyboardInterrupt(), SystemExit(3)])
 def test_what_goes_wrong_leaves_nothing(
     kind: str, old: str | None, error: BaseException, target: Path
 ) -> None:
@@ -72,8 +73,8 @@ def test_what_goes_wrong_leaves_nothing(
     assert only(target.parent, *(["out"] if old else []))
 
 
-@pytest.mark.parametrize("kind", ["file", "folder"])
-@pytest.mark.parametrize("old", ["file", "folder"])
+@each("kind", ["file", "folder"])
+@each("old", ["file", "folder"])
 def test_force_replaces_what_may_be_replaced(kind: str, old: str, target: Path) -> None:
     make(target, old, "old")
     with staged(target, force=True, replaceable=anything) as path:
@@ -119,8 +120,8 @@ def test_the_folder_must_exist(target: Path) -> None:
         check_target(target / "deep", force=False, replaceable=anything)
 
 
-@pytest.mark.parametrize("source", ["out", "out/deep", "out/deep/part", ".", "link", "link/deep"])
-@pytest.mark.parametrize("force", [False, True])
+@each("source", ["out", "out/deep", "out/deep/part", ".", "link", "link/deep"])
+@each("force", [False, True])
 def test_an_output_never_overlaps_with_its_source(
     source: str, force: bool, target: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -156,14 +157,14 @@ def test_a_folder_that_may_not_be_written(target: Path, monkeypatch: pytest.Monk
         pytest.fail("nothing can be made there")
 
 
-@pytest.mark.parametrize("name", ["x" * 250, "\U0001f916" * 61 + ".bag", "a b", ".hidden", "-x"])
+@each("name", ["x" * 250, "\U0001f916" * 61 + ".bag", "a b", ".hidden", "-x"])
 def test_any_name_that_the_disk_takes(name: str, tmp_path: Path) -> None:
     with staged(tmp_path / name, force=False, replaceable=nothing) as path:
         make(path, "folder")
     assert only(tmp_path, name)
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.EROFS])
+@each("code", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.EROFS])
 def test_a_disk_that_refuses(code: int, target: Path) -> None:
     with (  # noqa: PT012 - the body is what is tested
         pytest.raises(WriteError, match="the unfinished output was removed") as caught,
@@ -221,7 +222,7 @@ def test_what_appeared_meanwhile_is_not_replaced(kind: str, target: Path) -> Non
     assert only(target.parent, "out")
 
 
-@pytest.mark.parametrize("size", [0, 1, 2**20, 2**20 + 17])
+@each("size", [0, 1, 2**20, 2**20 + 17])
 def test_digests(size: int, tmp_path: Path) -> None:
     data = os.urandom(size)
     (tmp_path / "x").write_bytes(data)

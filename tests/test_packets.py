@@ -29,6 +29,7 @@ from coded_tools import (
     superframe,
 )
 from conftest import real
+from each import each, fresh
 from mp4ds.coded import CodedPicture, PictureParser, Refused, annexb, av1, body_of, h264, h265
 from mp4ds.errors import VideoError
 from mp4ds.stamps import MAX_GAP_NS, NS_PER_TICK
@@ -89,7 +90,7 @@ def ffprobe(path: Path) -> Any:
     return json.loads(done.stdout)["streams"]
 
 
-@pytest.mark.parametrize("name", IN_ORDER)
+@each("name", IN_ORDER)
 def test_packets_come_back(name: str, tmp_path: Path) -> None:
     codec = ENCODINGS[name].codec
     packets = encode(ENCODINGS[name])
@@ -104,7 +105,7 @@ def test_packets_come_back(name: str, tmp_path: Path) -> None:
             assert reader.packet(index) == everything[index]
 
 
-@pytest.mark.parametrize("name", IN_ORDER)
+@each("name", IN_ORDER)
 def test_the_file_plays(name: str, tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     write(path, ENCODINGS[name].codec, [packet.data for packet in encode(ENCODINGS[name])])
@@ -117,8 +118,8 @@ def test_the_file_plays(name: str, tmp_path: Path) -> None:
     assert float(stream["duration"]) == pytest.approx(12 / 30, abs=1e-4)
 
 
-@pytest.mark.parametrize("name", ["h264", "h265", "av1", "vp9"])
-@pytest.mark.parametrize(("width", "height"), [(66, 50), (322, 178)])
+@each("name", ["h264", "h265", "av1", "vp9"])
+@each(("width", "height"), [(66, 50), (322, 178)])
 def test_sizes_that_are_cropped(name: str, width: int, height: int, tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     packets = encode(ENCODINGS[name], frames=3, width=width, height=height)
@@ -159,8 +160,8 @@ def reframed(codec: str, body: bytes, framing: str) -> bytes:
     return annexb.join(units, " ".join([*lengths, "+2"] if framing == "6 3" else lengths))
 
 
-@pytest.mark.parametrize("framing", ["3", "4", "4 3", "6 3"])
-@pytest.mark.parametrize("name", ["h264", "h264-aud", "h264-slices", "h265", "h265-aud"])
+@each("framing", ["3", "4", "4 3", "6 3"])
+@each("name", ["h264", "h264-aud", "h264-slices", "h265", "h265-aud"])
 def test_start_codes(name: str, framing: str, tmp_path: Path) -> None:
     codec = ENCODINGS[name].codec
     bodies = [reframed(codec, packet.data, framing) for packet in encode(ENCODINGS[name])]
@@ -249,7 +250,7 @@ def test_parameters_that_were_sent_before(codec: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- refusals and faults
 
 
-@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "vp9"])
+@each("codec", ["h264", "h265", "av1", "vp9"])
 def test_a_first_picture_that_cannot_be_used(codec: str, tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     first, second = [packet.data for packet in encode(ENCODINGS[codec], frames=2, gop=9)]
@@ -320,14 +321,14 @@ def test_what_the_index_says_is_compared(
         writer.close()
 
 
-@pytest.fixture
+@fresh
 def video(tmp_path: Path) -> Path:
     path = tmp_path / "a.mp4"
     write(path, "mjpeg", [jpeg(picture) for picture in scene(5)])
     return path
 
 
-@pytest.mark.parametrize(
+@each(
     ("code", "options"),
     [
         ("codec-mismatch", {"codec": "h264"}),
@@ -418,7 +419,7 @@ def standing_alone(path: Path, codec: str) -> list[bytes]:
         return list(packets.packets())
 
 
-@pytest.mark.parametrize("name", IN_ORDER)
+@each("name", IN_ORDER)
 def test_packets_stand_alone(name: str, tmp_path: Path) -> None:
     codec, path = ENCODINGS[name].codec, tmp_path / "a.mp4"
     packets = encode(ENCODINGS[name])
@@ -503,7 +504,7 @@ REAL = {
 }
 
 
-@pytest.mark.parametrize("name", REAL)
+@each("name", REAL)
 def test_real_videos(name: str, tmp_path: Path) -> None:
     packets, size = packets_of(real(f"video/{name}"), REAL[name])
     bodies = [packet.data for packet in packets[:120]]

@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
+from each import each
 from mp4ds.errors import OptionError
 from mp4ds.plan import (
     VISUAL_TABLE,
@@ -28,7 +29,7 @@ steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 # ---------------------------------------------------------------- quality
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "quality", "lossless"),
     [
         ("lossless", Quality("lossless"), True),
@@ -46,7 +47,7 @@ def test_qualities(text: str, quality: Quality, lossless: bool) -> None:
     assert str(quality) == text
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     ["", "Lossless", "lossless ", "crf", "crf=", "crf=64", "crf=-1", "crf=1.5", "crf=100", "22",
      "crf=\u0662", "crf=22\n", "vmaf=100", "vmaf=", "psnr=60", "ssim=1.0", "ssim=0",
@@ -57,7 +58,7 @@ def test_other_qualities_are_refused(text: str) -> None:
         parse_quality(text)
 
 
-@pytest.mark.parametrize(
+@each(
     ("rate", "setting"),
     [
         (None, (18, 8)), (0.1, (18, 8)), (2, (18, 8)), (3.5, (18, 8)), (3.6, (17, 8)),
@@ -77,7 +78,7 @@ def test_the_table_is_ordered_by_rate() -> None:
 # ---------------------------------------------------------------- selection
 
 
-@pytest.mark.parametrize(
+@each(
     ("topics", "exclude", "chosen"),
     [
         ([], [], ["/a/image", "/a/info", "/b", "c"]),

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 import mp4ds
+from each import each
 from mp4ds import errors
 
 ROOT = Path(__file__).parents[1]
@@ -110,7 +111,7 @@ def test_every_error_is_public() -> None:
         assert name in str(errors.__doc__)  # the tree is drawn there
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "builtin", "code"),
     [
         ("SourceError", ValueError, 2),
@@ -173,7 +174,7 @@ def members(value: Any) -> list[tuple[str, Any]]:
     ]
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "__version__"])
+@each("name", [name for name in NAMES if name != "__version__"])
 def test_all_is_documented(name: str) -> None:
     value = getattr(mp4ds, name)
     text = inspect.getdoc(value)
@@ -191,7 +192,7 @@ def test_all_is_documented(name: str) -> None:
             assert known, f"{name}({parameter.name})"
 
 
-@pytest.mark.parametrize(
+@each(
     "name", ["evaluate", "export", "import_ros_mp4", "open", "pack", "play", "unpack", "validate"]
 )
 def test_the_functions_are_annotated(name: str) -> None:
@@ -224,7 +225,7 @@ def test_importing_is_cheap() -> None:
     assert [name for name in HEAVY if name in loaded] == []
 
 
-@pytest.mark.parametrize(
+@each(
     ("code", "absent"),
     [
         ("mp4ds.FormatError", ["numpy", "av", "pydantic"]),

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import mp4ds
+from each import each
 from in_parts import InlineEngine
 from mp4ds import yamlio
 from mp4ds.coded import structure
@@ -66,7 +67,7 @@ def chains_of(path: Path, codec: str, recorded: Structures | None) -> list[Piece
     return found
 
 
-@pytest.mark.parametrize("name", RECIPES)
+@each("name", RECIPES)
 def test_recorded_and_parsed_chains_are_the_same(name: str, tmp_path: Path) -> None:
     recipe = RECIPES[name]
     path = written(tmp_path, recipe)
@@ -94,7 +95,7 @@ def test_recorded_and_parsed_chains_are_the_same(name: str, tmp_path: Path) -> N
         assert again.is_plain == is_plain
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@each("name", REFUSED)
 def test_unknown_structures_are_not_recorded(name: str, tmp_path: Path) -> None:
     path = written(tmp_path, REFUSED[name])
     assert digest_video(path, REFUSED[name].codec).structures is None
@@ -143,9 +144,7 @@ def test_a_packet(frames: list[CodedFrame], text: str) -> None:
     assert write_packet(frames) == text
 
 
-@pytest.mark.parametrize(
-    "frames", [[], [frame(shown=False)], [frame(), frame(1)], [frame(), frame(1, shown=False)]]
-)
+@each("frames", [[], [frame(shown=False)], [frame(), frame(1)], [frame(), frame(1, shown=False)]])
 def test_a_packet_shows_its_last_frame(frames: list[CodedFrame]) -> None:
     with pytest.raises(UnknownStructure):
         write_packet(frames)
@@ -155,7 +154,7 @@ def test_needs_are_counted_from_the_key_frame() -> None:
     assert read_structure("k 1+2+1,3 1 k+2,4") == [[()], [(0,), (0,), (2, 0)], [(3,)], [(), (4, 2)]]
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "problem"),
     [
         ("k 2", "packet 1 refers to 2 frames back, before the key frame"),
@@ -169,7 +168,7 @@ def test_structures_that_contradict_themselves(text: str, problem: str) -> None:
         read_structure(text)
 
 
-@pytest.mark.parametrize(
+@each(
     ("texts", "plain"),
     [(["k 1 1,2"], True), (["k"], True), (["k 1", "k 1 2"], False), (["k 1+2+1"], False),
      (["k 1 12"], False), (["k 1 k"], False)],
@@ -309,7 +308,7 @@ def test_without_them_all_is_the_same(packed: Path, tmp_path: Path) -> None:
             assert np.array_equal(two[number].data, every[number])
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     [
         *("", "1", "k  1", "k 1 ", " k", "k 0", "k 01", "k 1,", "k +1", "k -1", "k 1234567"),
@@ -324,7 +323,7 @@ def test_what_is_no_structure(text: str, packed: Path, tmp_path: Path) -> None:
         Stream(path)
 
 
-@pytest.mark.parametrize(
+@each(
     ("structures", "code"),
     [
         ([], "schema-invalid"),
@@ -365,7 +364,7 @@ MISFITS: dict[str, tuple[Change, str]] = {
 }
 
 
-@pytest.mark.parametrize("name", MISFITS)
+@each("name", MISFITS)
 def test_references_of_another_video(name: str, packed: Path, tmp_path: Path) -> None:
     change, problem = MISFITS[name]
     path = edited(packed, tmp_path, change)
@@ -409,7 +408,7 @@ LIES: dict[str, Change] = {
 }
 
 
-@pytest.mark.parametrize("name", LIES)
+@each("name", LIES)
 def test_lies_are_found_and_do_no_harm(name: str, packed: Path, tmp_path: Path) -> None:
     path = edited(packed, tmp_path, LIES[name])
     assert mp4ds.validate(path) == []

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from coded_tools import mutations, refusal, scene
 from conftest import real
+from each import each
 from mp4ds.coded import av1
 from mp4ds.coded.configuration import parameter_units
 from mp4ds.coded.references import CodedFrame, ReferenceParser
@@ -272,7 +273,7 @@ def check(clip: Clip, numbers: Sequence[int]) -> int:
     return left_out
 
 
-@pytest.mark.parametrize("name", RECIPES)
+@each("name", RECIPES)
 def test_frames_decode_from_what_they_refer_to(name: str) -> None:
     recipe = RECIPES[name]
     clip = encoded(recipe)
@@ -285,7 +286,7 @@ def test_frames_decode_from_what_they_refer_to(name: str) -> None:
     assert flat or not hierarchical or left_out > 0
 
 
-@pytest.mark.parametrize("name", RECIPES)
+@each("name", RECIPES)
 def test_a_parser_may_begin_at_any_key_packet(name: str) -> None:
     clip = encoded(RECIPES[name])
     whole = parsed(clip)
@@ -298,7 +299,7 @@ def test_a_parser_may_begin_at_any_key_packet(name: str) -> None:
                 assert refusal(partial(parser.packet, packet.data, key=key))
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@each("name", REFUSED)
 def test_what_reaches_across_key_packets_is_refused(name: str) -> None:
     clip = encoded(REFUSED[name])
     parser = ReferenceParser(clip.codec, clip.configuration)
@@ -309,7 +310,7 @@ def test_what_reaches_across_key_packets_is_refused(name: str) -> None:
     assert all(reasons[first:following])
 
 
-@pytest.mark.parametrize("name", FILES)
+@each("name", FILES)
 def test_real_videos(name: str) -> None:
     path: Path = real(f"video/{name}")
     clip = read(str(path), most=60)
@@ -374,7 +375,7 @@ def test_a_picture_of_several_slices() -> None:
     assert parser.packet(clip.packets[0].data, key=True)[0].references == ()
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "data", "reason"),
     [
         ("x264-slices", b"", "one picture"),
@@ -503,8 +504,8 @@ SEQUENCES: dict[str, tuple[bytes, dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("name", SEQUENCES)
-@pytest.mark.parametrize("configured", [True, False])
+@each("name", SEQUENCES)
+@each("configured", [True, False])
 def test_av1_headers(name: str, configured: bool) -> None:
     """By the tables of the specification: frames fill slots and others name these."""
     head, told = SEQUENCES[name]
@@ -544,7 +545,7 @@ def test_av1_slots_chosen_by_order() -> None:
     assert short.references == (1, 2, 3, 4, 5, 6, 7, 8)
 
 
-@pytest.mark.parametrize(
+@each(
     ("head", "body", "reason"),
     [
         (sequence(points=(0x303,)), b"", "spatial layers"),
@@ -664,9 +665,7 @@ def test_av1_key_frames_shown_later() -> None:
 # ---------------------------------------------------------------- damage
 
 
-@pytest.mark.parametrize(
-    "name", ["svt-8", "x264-slices", "x265-b4-3-layers", "vp9", "ffv1", "mjpeg"]
-)
+@each("name", ["svt-8", "x264-slices", "x265-b4-3-layers", "vp9", "ffv1", "mjpeg"])
 def test_damage_is_refused_or_read(name: str) -> None:
     clip = encoded(RECIPES[name])
     for packet in clip.packets[:8]:
@@ -679,7 +678,7 @@ def test_damage_is_refused_or_read(name: str) -> None:
         refusal(ReferenceParser, clip.codec, data)
 
 
-@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "vp9", "ffv1", "png"])
+@each("codec", ["h264", "h265", "av1", "vp9", "ffv1", "png"])
 def test_noise_is_refused_or_read(codec: str) -> None:
     rng = random.Random(codec)
     for _ in range(500):

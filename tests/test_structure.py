@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from each import each
 from mp4ds.sidecar import (
     FORMAT_VERSION,
     Manifest,
@@ -52,7 +53,7 @@ def test_imports_keep_to_the_floors() -> None:
     assert re.search(r"\b[1-9]\d* kept, 0 broken", done.stdout)
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(SOURCE)))
+@each("path", MODULES, ids=lambda path: str(path.relative_to(SOURCE)))
 def test_modules_are_short(path: Path) -> None:
     lines = len(path.read_text().splitlines())
     name = str(path.relative_to(SOURCE))
@@ -97,7 +98,7 @@ HOMES = {
 }
 
 
-@pytest.mark.parametrize("package", HOMES)
+@each("package", HOMES)
 def test_each_library_has_its_room(package: str) -> None:
     found = {
         str(path.relative_to(SOURCE)).split("/")[0]
@@ -108,7 +109,7 @@ def test_each_library_has_its_room(package: str) -> None:
     assert found, f"nobody imports {package}: strike it, and from pyproject.toml"
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(SOURCE)))
+@each("path", MODULES, ids=lambda path: str(path.relative_to(SOURCE)))
 def test_habits(path: Path) -> None:
     """No print outside of the command line, no assert on state, a docstring for each module."""
     tree = ast.parse(path.read_text())
@@ -242,7 +243,7 @@ def anchors(path: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
-@pytest.mark.parametrize(
+@each(
     "path",
     [
         *sorted(ROOT.glob("*.md")),

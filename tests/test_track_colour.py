@@ -8,9 +8,9 @@ from typing import Any
 
 import av
 import numpy as np
-import pytest
 
 from conftest import real
+from each import each
 from mp4ds.streams.video_file import Video
 from mp4ds.video import read_sample_entry
 from mp4ds.video.access import FrameAccess
@@ -54,9 +54,9 @@ class Tagged:
         return tags(frame)
 
 
-@pytest.mark.parametrize("colour_range", [1, 2])
-@pytest.mark.parametrize("colour", [BT709, BT601])
-@pytest.mark.parametrize("name", NAMES)
+@each("colour_range", [1, 2])
+@each("colour", [BT709, BT601])
+@each("name", NAMES)
 def test_decoders_know_what_the_track_says(
     name: str, colour: tuple[int, int, int], colour_range: int, tmp_path: Path
 ) -> None:
@@ -104,7 +104,7 @@ def colr(kind: bytes, *numbers: int, flags: bytes = b"") -> tuple[str, bytes]:
     return "colr", kind + b"".join(number.to_bytes(2, "big") for number in numbers) + flags
 
 
-@pytest.mark.parametrize(
+@each(
     ("boxes", "expected"),
     [
         ([], None),

@@ -21,6 +21,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from conftest import real
+from each import each
 from mp4ds import yamlio
 from mp4ds.bags import open_reader
 from mp4ds.records import Channel, Message, Schema
@@ -196,7 +197,7 @@ Transforms = st.builds(
 # ---------------------------------------------------------------- parsing
 
 
-@pytest.mark.parametrize("kind", MANY_KINDS)
+@each("kind", MANY_KINDS)
 def test_messages_of_several_transforms(kind: str) -> None:
     own, write = MANY_KINDS[kind]
     for items in (TREE, TREE[:1], []):
@@ -204,7 +205,7 @@ def test_messages_of_several_transforms(kind: str) -> None:
         assert parse_transforms(own, memoryview(write(items))) == items
 
 
-@pytest.mark.parametrize("kind", ONE_KINDS)
+@each("kind", ONE_KINDS)
 def test_messages_of_one_transform(kind: str) -> None:
     own, write = ONE_KINDS[kind]
     for item in TREE:
@@ -272,7 +273,7 @@ def len_of(file: Any) -> int:
     return len(file.SerializeToString())
 
 
-@pytest.mark.parametrize(
+@each(
     "own",
     [
         channel("ros1", "sensor_msgs/Image"),
@@ -309,7 +310,7 @@ def test_descriptors_that_are_not_whole() -> None:
             transform_parser(channel("protobuf", ONE, schema.SerializeToString()))
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     [
         "", "{", "[]", "7", "null", '"text"', '{"transforms": 7}', '{"transforms": [7]}',
@@ -329,7 +330,7 @@ def test_json_of_another_shape(text: str) -> None:
         parse_transforms(channel("json", MANY), text.encode("utf-8", "surrogatepass"))
 
 
-@pytest.mark.parametrize(
+@each(
     "fields",
     [
         {"parent_frame_id": 5},
@@ -376,7 +377,7 @@ def test_damaged_messages_end_in_a_wire_error(data: st.DataObject) -> None:
         assert all(isinstance(item, Transform) for item in found)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in MANY_KINDS if kind[:3] in ("ros", "cdr")])
+@each("kind", [kind for kind in MANY_KINDS if kind[:3] in ("ros", "cdr")])
 def test_a_count_that_the_message_does_not_hold(kind: str) -> None:
     own, write = MANY_KINDS[kind]
     payload = bytearray(write(TREE))
@@ -408,7 +409,7 @@ def collected(items: Iterable[Transform], **options: Any) -> TransformCollector:
     return collector
 
 
-@pytest.mark.parametrize("kind", MANY_KINDS)
+@each("kind", MANY_KINDS)
 def test_a_collector_takes_every_kind(kind: str) -> None:
     own, write = MANY_KINDS[kind]
     collector = TransformCollector()
@@ -417,7 +418,7 @@ def test_a_collector_takes_every_kind(kind: str) -> None:
     assert collector.transforms == TREE
 
 
-@pytest.mark.parametrize(
+@each(
     ("topic", "taken"),
     [
         ("/tf_static", True),
@@ -446,7 +447,7 @@ def test_the_latest_of_each_child_holds() -> None:
     assert collector.transforms == [moved, elsewhere, *TREE[2:]]
 
 
-@pytest.mark.parametrize(
+@each(
     "item",
     [
         Transform("", "b", (0.0, 0.0, 0.0), TURN),
@@ -494,7 +495,7 @@ def test_the_number_of_children_is_bounded() -> None:
 # ---------------------------------------------------------------- between cameras
 
 
-@pytest.mark.parametrize(
+@each(
     ("frames", "children"),
     [
         (["left", "right \u00e4"], ["head", "left", "right \u00e4"]),
@@ -557,7 +558,7 @@ def test_a_manifest_holds_them_bit_for_bit() -> None:
     assert [tuple(item["rotation"]) for item in loaded] == [item.rotation for item in TREE]
 
 
-@pytest.mark.parametrize(
+@each(
     "change",
     [
         {"translation": [0.0, 0.0]},

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 import mp4ds
+from each import each
 from mp4ds.errors import OptionError
 from mp4ds.layouts import ENCODINGS, MAX_SIDE, bind, fit
 from mp4ds.packing import PackOptions
@@ -62,7 +63,7 @@ def video_size(path: Path, samples: Sequence[Pixels], encoding: str, choice: Cho
 # ---------------------------------------------------------------- estimates
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
+@each("encoding", ENCODINGS)
 def test_the_estimate_is_near_the_truth(encoding: str, tmp_path: Path) -> None:
     samples = scene(encoding, 24)
     choice = chosen(samples[:6], encoding)
@@ -105,7 +106,7 @@ def test_an_encoder_that_refuses() -> None:
 # ---------------------------------------------------------------- choices
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
+@each("encoding", ENCODINGS)
 def test_some_layout_is_chosen_for_every_encoding(encoding: str) -> None:
     samples = scene(encoding)
     first, again = chosen(samples, encoding), chosen(samples, encoding)
@@ -208,8 +209,8 @@ def test_the_earlier_of_two_near_ones_is_taken() -> None:
     assert choice.bytes_per_frame <= NEAR * min(every)
 
 
-@pytest.mark.parametrize("codec", ["h264", "h265", "ffv1"])
-@pytest.mark.parametrize("encoding", ENCODINGS)
+@each("codec", ["h264", "h265", "ffv1"])
+@each("encoding", ENCODINGS)
 def test_a_codec_that_was_asked_for(codec: str, encoding: str) -> None:
     samples = scene(encoding)
     able = {
@@ -250,7 +251,7 @@ def test_pictures_beyond_the_bounds_are_not_tried() -> None:
     assert chosen([ramp], "mono16", codec="ffv1").recipe.pixel_format == "gray16le"
 
 
-@pytest.mark.parametrize("encoding", ["mono8", "rgb8", "uyvy", "bayer_rggb8", "nv12"])
+@each("encoding", ["mono8", "rgb8", "uyvy", "bayer_rggb8", "nv12"])
 def test_large_images_are_tried_in_part(encoding: str) -> None:
     """The estimate is for the whole."""
     samples = scene(encoding, 3, width=1602, height=1202)

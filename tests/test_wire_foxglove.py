@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from conftest import real
+from each import each
 from foxglove_wire import SERIALIZATIONS, flatbuffer_module, message_class
 from mp4ds.wire.flatbuffer import FlatbufferForm
 from mp4ds.wire.forms import (
@@ -130,9 +131,9 @@ def test_the_types_are_those_of_the_tables() -> None:
     assert {SERIALIZATIONS[source].encoding for source in SOURCES} == set(FORMS)
 
 
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("kind", BODIED)
-@pytest.mark.parametrize("source", SOURCES)
+@each("size", SIZES)
+@each("kind", BODIED)
+@each("source", SOURCES)
 def test_an_image_splits_and_returns(source: str, kind: str, size: int) -> None:
     body, of = noise(size), form(source, kind)
     for stamp in (*STAMPS, LAST):
@@ -149,7 +150,7 @@ def test_an_image_splits_and_returns(source: str, kind: str, size: int) -> None:
         assert proven(of, message)
 
 
-@pytest.mark.parametrize("source", SOURCES)
+@each("source", SOURCES)
 def test_a_calibration_splits_and_returns(source: str) -> None:
     of = form(source, "CameraCalibration")
     blanks = set()
@@ -165,8 +166,8 @@ def test_a_calibration_splits_and_returns(source: str) -> None:
     assert len(blanks) == 1
 
 
-@pytest.mark.parametrize("kind", BODIED)
-@pytest.mark.parametrize("source", SOURCES)
+@each("kind", BODIED)
+@each("source", SOURCES)
 def test_a_blank_filled_anew_is_what_the_library_writes(source: str, kind: str) -> None:
     of, blanks = form(source, kind), {}
     for size in SIZES:
@@ -183,8 +184,8 @@ def test_a_blank_filled_anew_is_what_the_library_writes(source: str, kind: str) 
             assert found == payload(source, kind, stamp, body)
 
 
-@pytest.mark.parametrize("kind", ALL)
-@pytest.mark.parametrize("source", SOURCES)
+@each("kind", ALL)
+@each("source", SOURCES)
 def test_a_blank_is_a_blank_message(source: str, kind: str) -> None:
     of = form(source, kind)
     message = payload(source, kind, STAMPS[-1], b"something" * (kind in BODIED))
@@ -211,8 +212,8 @@ def test_a_blank_is_a_blank_message(source: str, kind: str) -> None:
         assert kind not in BODIED or read["data"] == ""
 
 
-@pytest.mark.parametrize("kind", ALL)
-@pytest.mark.parametrize("source", SOURCES)
+@each("kind", ALL)
+@each("source", SOURCES)
 def test_a_message_that_is_not_blank_makes_no_template(source: str, kind: str) -> None:
     of = form(source, kind)
     cases = [payload(source, kind, 7, b"x")]
@@ -239,8 +240,8 @@ def test_a_blank_is_not_large(source: str, more: bytes) -> None:
         of.template(blank + more)
 
 
-@pytest.mark.parametrize("kind", BODIED)
-@pytest.mark.parametrize("source", SOURCES)
+@each("kind", BODIED)
+@each("source", SOURCES)
 def test_bodies_are_views_where_they_stand_as_they_are(source: str, kind: str) -> None:
     message = payload(source, kind, 1, noise(99))
     parts = form(source, kind).split(memoryview(message))
@@ -251,8 +252,8 @@ def test_bodies_are_views_where_they_stand_as_they_are(source: str, kind: str) -
     assert (template.encode_body(parts.body) is parts.body) == template.keeps_body
 
 
-@pytest.mark.parametrize("kind", ALL)
-@pytest.mark.parametrize("source", SOURCES)
+@each("kind", ALL)
+@each("source", SOURCES)
 def test_every_cut_is_refused(source: str, kind: str) -> None:
     message = payload(source, kind, STAMPS[-1], b"something")
     if source == "protobuf-unknown-field":
@@ -269,13 +270,13 @@ def test_every_cut_is_refused(source: str, kind: str) -> None:
         assert parts.stamp == STAMPS[-1]
 
 
-@pytest.mark.parametrize("source", SOURCES)
+@each("source", SOURCES)
 def test_the_wire_has_the_name_that_sidecars_use(source: str) -> None:
     assert form(source, "RawImage").wire == SERIALIZATIONS[source].encoding
 
 
-@pytest.mark.parametrize("name", FORMS)
-@pytest.mark.parametrize("type_name", ["foxglove.PointCloud", "RawImage", "", "sensor_msgs/Image"])
+@each("name", FORMS)
+@each("type_name", ["foxglove.PointCloud", "RawImage", "", "sensor_msgs/Image"])
 def test_other_types_are_refused(name: str, type_name: str) -> None:
     with pytest.raises(WireError, match="is not modelled"):
         FORMS[name](type_name, b"")
@@ -338,7 +339,7 @@ def test_protobuf_fields_in_any_order() -> None:
         assert rebuilt(of.template(parts.blank), Slots(1), b"p" * 300) == expected
 
 
-@pytest.mark.parametrize(
+@each(
     ("stamp", "content"),
     [
         (-1, b"\x08" + b"\xff" * 9 + b"\x01" + b"\x10" + varint(999_999_999)),
@@ -357,7 +358,7 @@ def test_protobuf_stamps_of_64_bits(stamp: int, content: bytes) -> None:
     assert proven(of, message)
 
 
-@pytest.mark.parametrize(
+@each(
     "content",
     [
         b"\x08" + varint(9_223_372_036) + b"\x10" + varint(854_775_808),
@@ -374,7 +375,7 @@ def test_protobuf_stamps_that_have_no_value(content: bytes) -> None:
     assert refused(form("protobuf", "CompressedImage"), block(1, content) + DATA)
 
 
-@pytest.mark.parametrize(
+@each(
     "message",
     [
         block(1, b"\x08\x05\x10\x00") + DATA,  # a zero that serializers leave out
@@ -390,7 +391,7 @@ def test_protobuf_that_is_not_as_serializers_write_it_is_not_proven(message: byt
     assert not proven(form("protobuf", "CompressedImage"), message)
 
 
-@pytest.mark.parametrize(
+@each(
     ("more", "frame_id"),
     [
         (b"\x22\x83\x00cam", "cam"),  # its length in two bytes
@@ -410,7 +411,7 @@ def test_protobuf_that_is_odd_elsewhere_is_proven(more: bytes, frame_id: str) ->
         assert of.split(memoryview(message)).frame_id == frame_id
 
 
-@pytest.mark.parametrize(
+@each(
     ("message", "reason"),
     [
         (DATA, "it has no timestamp"),
@@ -459,7 +460,7 @@ def image_schema() -> tuple[FileDescriptorSet, dict[str, FieldDescriptorProto]]:
     return described, {field.name: field for field in message.field}
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "change"),
     [
         ("timestamp", {"type": FieldDescriptorProto.TYPE_INT64}),
@@ -552,7 +553,7 @@ def test_json_members_in_any_order() -> None:
         assert found == other.encode()
 
 
-@pytest.mark.parametrize(
+@each(
     "message",
     [
         ' \r\n\t{ "timestamp"\t:\n{ "nsec" : 7 , "sec" : 5 } ,"format":"","data" : "" }\n\n',
@@ -583,7 +584,7 @@ def json_image(**changes: str) -> bytes:
     return ("{" + ",".join(spelled) + "}").encode()
 
 
-@pytest.mark.parametrize(
+@each(
     "changes",
     [
         {"timestamp": '{"sec":-0,"nsec":7}'},
@@ -597,7 +598,7 @@ def test_json_that_is_not_as_serializers_write_it_is_not_proven(changes: dict[st
     assert not proven(form("json", "RawImage"), json_image(**changes))
 
 
-@pytest.mark.parametrize(
+@each(
     ("changes", "reason"),
     [
         ({"timestamp": ""}, "no member timestamp"),
@@ -647,7 +648,7 @@ def test_json_refusals_say_why(changes: dict[str, str], reason: str) -> None:
     assert reason in refused(form("json", "RawImage"), json_image(**changes))
 
 
-@pytest.mark.parametrize(
+@each(
     ("message", "reason"),
     [
         (b"", "no member data"),
@@ -667,9 +668,7 @@ def test_what_is_no_json_object_is_refused(message: bytes, reason: str) -> None:
     assert refused(form("json", "CameraCalibration"), message)
 
 
-@pytest.mark.parametrize(
-    "d", ["[NaN]", "[-Infinity]", "[1e999]", "[" + "9" * 400 + "]", '["1"]', "[true]", "{}", "1"]
-)
+@each("d", ["[NaN]", "[-Infinity]", "[1e999]", "[" + "9" * 400 + "]", '["1"]', "[true]", "{}", "1"])
 def test_json_lists_that_cannot_be_modelled(d: str) -> None:
     message = payload("json", "CameraCalibration", 1)
     at = message.index(b'"D":') + 4
@@ -724,7 +723,7 @@ ORDERS = [
 ]
 
 
-@pytest.mark.parametrize(("kind", "order"), ORDERS)
+@each(("kind", "order"), ORDERS)
 def test_flatbuffers_built_in_any_order(kind: str, order: tuple[str, ...]) -> None:
     of, blanks = form("flatbuffer", kind), {}
     for size in SIZES:
@@ -860,7 +859,7 @@ def test_flatbuffer_ids_are_those_of_the_schema() -> None:
     assert proven(of, message)
 
 
-@pytest.mark.parametrize("name", TYPES["foxglove.RawImage"])
+@each("name", TYPES["foxglove.RawImage"])
 def test_flatbuffer_schemas_of_other_types_are_refused(name: str) -> None:
     schema, fields = image_bfbs()
     field = fields[name]
@@ -939,10 +938,10 @@ def mutations(draw: st.DrawFn, message: bytes) -> bytes:
     return bytes(found)
 
 
+@each("kind", ["RawImage", "CompressedVideo", "CameraCalibration"])
+@each("source", ["protobuf", "protobuf-renumbered", "json", "flatbuffer"])
 @settings(steady, max_examples=400)
 @given(st.data())
-@pytest.mark.parametrize("kind", ["RawImage", "CompressedVideo", "CameraCalibration"])
-@pytest.mark.parametrize("source", ["protobuf", "protobuf-renumbered", "json", "flatbuffer"])
 def test_mutated_messages_are_harmless(source: str, kind: str, data: st.DataObject) -> None:
     harmless(form(source, kind), data.draw(mutations(whole(source, kind))))
 
@@ -961,18 +960,18 @@ def test_mutated_blanks_are_harmless(source: str, data: st.DataObject) -> None:
     assert isinstance(head + tail, bytes)
 
 
+@each("kind", ALL)
+@each("source", ["protobuf", "json", "flatbuffer"])
 @settings(steady, max_examples=200)
 @given(st.binary(max_size=200))
-@pytest.mark.parametrize("kind", ALL)
-@pytest.mark.parametrize("source", ["protobuf", "json", "flatbuffer"])
 def test_noise_is_harmless(source: str, kind: str, noise: bytes) -> None:
     harmless(form(source, kind), noise)
 
 
+@each("kind", ["RawImage", "CameraCalibration"])
+@each("name", ["protobuf", "flatbuffer"])
 @settings(steady, max_examples=300)
 @given(st.data())
-@pytest.mark.parametrize("kind", ["RawImage", "CameraCalibration"])
-@pytest.mark.parametrize("name", ["protobuf", "flatbuffer"])
 def test_mutated_schemas_are_harmless(name: str, kind: str, data: st.DataObject) -> None:
     type_name, schema = SERIALIZATIONS[name].schema(f"foxglove_msgs/msg/{kind}")
     try:
@@ -1010,10 +1009,8 @@ MANY: dict[str, dict[str, tuple[bytes, bytes, bytes]]] = {  # what is first, rep
 }
 
 
-@pytest.mark.parametrize("kind", ["RawImage", "CameraCalibration"])
-@pytest.mark.parametrize(
-    ("name", "case"), [(name, case) for name, cases in MANY.items() for case in cases]
-)
+@each("kind", ["RawImage", "CameraCalibration"])
+@each(("name", "case"), [(name, case) for name, cases in MANY.items() for case in cases])
 def test_large_hostile_messages_take_little_time(name: str, case: str, kind: str) -> None:
     first, repeated, last = MANY[name][case]
     message = first + repeated * (LARGE // len(repeated)) + last

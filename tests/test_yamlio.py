@@ -11,6 +11,7 @@ import yaml
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from each import each
 from mp4ds import yamlio
 from mp4ds.errors import FormatError
 
@@ -82,8 +83,8 @@ def load_back(document: dict[str, Any]) -> dict[str, Any]:
     return yamlio.load(yamlio.dump(document, comment="A comment."), "some.yaml")
 
 
-@pytest.mark.parametrize("text", NASTY)
-@pytest.mark.parametrize("place", ["value", "key", "item", "deep", "beside"])
+@each("text", NASTY)
+@each("place", ["value", "key", "item", "deep", "beside"])
 def test_nasty_strings_return_everywhere(text: str, place: str) -> None:
     document: dict[str, Any] = {
         "value": {"a": text, "b": 1},
@@ -147,7 +148,7 @@ def test_a_column_line_stands_in_no_other_block() -> None:
     assert [line.strip() for line in lines].count("values: |") == 1
 
 
-@pytest.mark.parametrize(
+@each(
     "document",
     [
         {"values": "mp4ds column 0\n", "text": "x\n  values: |\n    5\n"},
@@ -172,7 +173,7 @@ def test_layout_for_human_readers() -> None:
 # ---------------------------------------------------------------- reading
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "value"),
     [
         *((text, None) for text in ("", "null", "~")),
@@ -195,7 +196,7 @@ def test_plain_scalars(text: str, value: Any) -> None:
     assert same(load(f"a: {text}\n"), {"a": value})
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "words"),
     [
         ("a: &x 1\nb: *x\n", "anchors"),
@@ -266,16 +267,14 @@ def test_depth_just_allowed() -> None:
         load_back({"a": document})
 
 
-@pytest.mark.parametrize(
-    "header", ["values: |", "values: |-", "values: |+", "values: >", "values:"]
-)
+@each("header", ["values: |", "values: |-", "values: |+", "values: >", "values:"])
 def test_any_spelling_of_a_column_is_read(header: str) -> None:
     """Other writers choose other styles; the slicer must not make a difference."""
     text = f"c:\n  {header}\n    1 2\n    3\nd: 4\n"
     assert same(load(text), yaml.safe_load(text))
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     [
         "c:\n    values: |\n      1 2\n\n      3\nd: 4\n",  # a blank line inside
