@@ -41,11 +41,14 @@ KINDS: dict[str, tuple[str, str, dict[str, str], bool]] = {
 }
 
 
-def write_video(path: Path, kind: str, *, size: tuple[int, int] = (64, 48)) -> None:
+def write_video(
+    path: Path, kind: str, *, size: tuple[int, int] = (64, 48), title: str = ""
+) -> None:
     """Frames at uneven times, as phones and screen recorders write them."""
     encoder, pixel_format, options, in_fragments = KINDS[kind]
     muxer = {"movflags": "frag_keyframe+empty_moov"} if in_fragments else {}
     with av.open(str(path), "w", format="mp4", options=muxer) as container:
+        container.metadata["title"] = title
         stream: Any = container.add_stream(encoder, rate=30, options=options)
         stream.width, stream.height, stream.pix_fmt = *size, pixel_format
         stream.time_base = stream.codec_context.time_base = Fraction(1, 30_000)
@@ -191,6 +194,15 @@ def test_another_container(tmp_path: Path) -> None:
     (tmp_path / "clip.mkv").rename(tmp_path / "clip.mp4")
     with pytest.raises(mp4ds.VideoError, match="not an mp4"):
         mp4ds.open(tmp_path / "clip.mp4")
+
+
+def test_a_title_that_is_no_utf8(tmp_path: Path) -> None:
+    write_video(tmp_path / "clip.mp4", "h264", title="latin-1")
+    data = (tmp_path / "clip.mp4").read_bytes()
+    assert data.count(b"latin-1") == 1
+    (tmp_path / "clip.mp4").write_bytes(data.replace(b"latin-1", b"caf\xe9\xff.."))
+    with mp4ds.open(tmp_path / "clip.mp4") as dataset:
+        assert len(dataset["clip"]) == FRAMES
 
 
 def test_damage_is_told(tmp_path: Path) -> None:

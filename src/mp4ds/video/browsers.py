@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
-from mp4ds.errors import VideoError
 from mp4ds.video.media import Media, pixel_format_of
 
 _YUV420 = frozenset({"yuv420p", "yuvj420p", "gray"})
@@ -27,10 +25,7 @@ def why_not_in_browsers(path: Path) -> str:
         VideoError: It cannot be read.
     """
     with closing(Media(path)) as media:
-        tracks = media.container.streams.video
-        context: Any = tracks[0].codec_context if tracks else None
-        if context is None or context.codec is None:
-            raise VideoError("video-unreadable", path, "has no video track of a known codec")
+        context = media.track.codec_context
         name, pixel_format = context.codec.canonical_name, pixel_format_of(context)
     if name not in _PLAYED:
         return f"no browser plays {name}"

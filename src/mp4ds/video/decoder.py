@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
@@ -17,14 +16,6 @@ from mp4ds.layouts import Picture
 from mp4ds.video.media import Media
 from mp4ds.video.pictures import PictureMaker
 
-FFMPEG_NAMES = {
-    "h264": "h264",
-    "h265": "hevc",
-    "av1": "av1",
-    "vp9": "vp9",
-    "ffv1": "ffv1",
-    "mjpeg": "mjpeg",
-}
 _MOST_THREADS = 16  # that ffmpeg chooses of itself
 
 
@@ -79,38 +70,14 @@ class VideoDecoder:
         self._media = Media(path)
         self._container = self._media.container
         try:
-            self._check(codec, coded_size)
-            self._stream = self._container.streams.video[0]
+            self._media.check(codec, coded_size)
+            self._stream = self._media.track
             self._stream.thread_type = "AUTO" if sequential else "SLICE"
             if not sequential:
                 self._stream.thread_count = 1  # threads inherited over a fork would never end
         except BaseException:
             self.close()
             raise
-
-    def _check(self, codec: str, coded_size: tuple[int, int]) -> None:
-        if "mp4" not in self._container.format.name.split(","):
-            name = self._container.format.name
-            raise VideoError("video-unreadable", self._path, f"is a {name} file, not an mp4")
-        if len(self._container.streams.video) != 1:
-            count = len(self._container.streams.video)
-            raise VideoError("video-unreadable", self._path, f"has {count} video tracks, not one")
-        context: Any = self._container.streams.video[0].codec_context
-        if context is None or context.codec is None:
-            raise VideoError("video-unreadable", self._path, "has a video track of no known codec")
-        expected = FFMPEG_NAMES.get(codec)
-        found = context.codec.canonical_name
-        if expected is None or found != expected:
-            raise VideoError(
-                "codec-mismatch", self._path, f"is coded as {found} where its sidecar says {codec}"
-            )
-        if (context.width, context.height) != coded_size:
-            raise VideoError(
-                "geometry-mismatch",
-                self._path,
-                f"has {context.width}x{context.height} pixels where its sidecar says "
-                f"{coded_size[0]}x{coded_size[1]}",
-            )
 
     @property
     def coded_frames(self) -> int:

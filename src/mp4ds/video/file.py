@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import VideoError
 from mp4ds.layouts import MAX_SIDE, Picture
 from mp4ds.video.access import FrameAccess
-from mp4ds.video.decoder import FFMPEG_NAMES
-from mp4ds.video.media import Media
+from mp4ds.video.media import FFMPEG_NAMES, Media
 from mp4ds.video.pictures import PictureMaker
 from mp4ds.video.reader import FrameReader
 from mp4ds.video.samples import Unindexed, read_sample_table
@@ -47,7 +46,7 @@ class VideoFile:
         self._last: int | None = None
         self._media = Media(path)
         try:
-            self._stream = self._video_track()
+            self._stream = self._media.track
             context: Any = self._stream.codec_context
             self.size: tuple[int, int] = context.width, context.height
             name = context.codec.canonical_name
@@ -64,21 +63,6 @@ class VideoFile:
         except BaseException:
             self.close()
             raise
-
-    def _video_track(self) -> Any:
-        container = self._media.container
-        if "mp4" not in container.format.name.split(","):
-            raise VideoError(
-                "video-unreadable", self._path, f"is a {container.format.name} file, not an mp4"
-            )
-        tracks = container.streams.video
-        if len(tracks) != 1:
-            raise VideoError(
-                "video-unreadable", self._path, f"has {len(tracks)} video tracks, not one"
-            )
-        if tracks[0].codec_context is None or tracks[0].codec_context.codec is None:
-            raise VideoError("video-unreadable", self._path, "has a video track of no known codec")
-        return tracks[0]
 
     def _read_ticks(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Ticks at which frames are shown, and those of frames at which decoding can begin."""

@@ -14,6 +14,7 @@ from av.error import FFmpegError
 
 from mp4ds.errors import Mp4dsError, VideoError
 from mp4ds.stamps import TIMESCALE
+from mp4ds.video.media import Media
 from mp4ds.video.packets import PacketReader, new_mp4
 from mp4ds.video.sample_entry import SampleEntry, read_sample_entry
 
@@ -111,10 +112,9 @@ def _copy(
     segments: Sequence[Path], ticks: Iterator[int], target: Path, entry: SampleEntry
 ) -> _Written:
     duration = _last_duration(segments[-1])
-    with _opened(segments[0]) as source, closing(new_mp4(target)) as container:
-        template = _video_track(source, segments[0])
-        written = _Written(template.codec_context.codec.canonical_name)
-        stream = _new_stream(container, template, entry)
+    with closing(Media(segments[0])) as source, closing(new_mp4(target)) as container:
+        written = _Written(source.track.codec_context.codec.canonical_name)
+        stream = _new_stream(container, source.track, entry)
         try:
             for segment in segments:
                 _copy_segment(segment, ticks, container, stream, duration, written)
@@ -129,23 +129,6 @@ def _copy(
             raise
         _finish(container, target)
     return written
-
-
-def _opened(path: Path) -> Any:
-    try:
-        # absolute: ffmpeg takes a relative name with a colon for an address
-        return av.open(str(path.absolute()), "r", metadata_errors="ignore")
-    except (FFmpegError, OSError) as error:
-        raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
-
-
-def _video_track(container: Any, path: Path) -> Any:
-    videos = container.streams.video
-    if len(videos) != 1 or videos[0].codec_context is None:
-        raise VideoError("video-unreadable", path, "has not one video track of a known codec")
-    if not len(videos[0].index_entries):
-        raise VideoError("frame-count", path, "has no frames")
-    return videos[0]
 
 
 def _new_stream(container: Any, template: Any, entry: SampleEntry) -> Any:
@@ -163,11 +146,12 @@ def _new_stream(container: Any, template: Any, entry: SampleEntry) -> Any:
 
 def _last_duration(path: Path) -> int:
     """How long the last frame lasts, in ticks; all others last until the next one."""
-    with _opened(path) as container:
-        track = _video_track(container, path)
-        entries = track.index_entries
+    with closing(Media(path)) as source:
+        entries = source.track.index_entries
+        if not len(entries):
+            raise VideoError("frame-count", path, "has no frames")
         elapsed = entries[len(entries) - 1].timestamp - entries[0].timestamp
-        return max(int(track.duration or 0) - int(elapsed), 1)
+        return max(int(source.track.duration or 0) - int(elapsed), 1)
 
 
 def _copy_segment(

@@ -11,15 +11,30 @@ from av.error import FFmpegError
 from mp4ds.errors import RemoteError, VideoError
 from mp4ds.remote import remote
 
+FFMPEG_NAMES = {
+    "h264": "h264",
+    "h265": "hevc",
+    "av1": "av1",
+    "vp9": "vp9",
+    "ffv1": "ffv1",
+    "mjpeg": "mjpeg",
+}
+"""Codecs of the registry, as ffmpeg calls them."""
+# names and comments need not be UTF-8; PyAV 19 takes them as they are
+_ANY_METADATA: dict[str, Any] = (
+    {"metadata_errors": "ignore"} if int(av.__version__.split(".")[0]) < 19 else {}
+)
+
 
 class Media:
-    """A container being read; `close` closes its file, too.
+    """An mp4 being read: its one video track; `close` closes its file, too.
 
     Args:
         path: The video.
 
     Attributes:
         container: PyAV's.
+        track: The video track, of a codec that ffmpeg knows.
 
     Raises:
         VideoError: ``file-missing`` or ``video-unreadable``.
@@ -29,27 +44,80 @@ class Media:
     def __init__(self, path: Path) -> None:
         if not path.is_file():
             raise VideoError("file-missing", path, "does not exist")
+        self._path = path
+        self._file: _Source | None = None
         try:
-            self._open(path)
+            if remote(path):
+                self._file = _Source(path.open("rb"))
+            self.container: Any = open_input(self._file or str(path.absolute()))
         except (FFmpegError, OSError) as error:
-            raise VideoError("video-unreadable", path, f"cannot be opened: {error}") from None
-
-    def _open(self, path: Path) -> None:
-        self._file = _Source(path.open("rb")) if remote(path) else None
-        try:
-            # absolute: ffmpeg takes a relative name with a colon for an address
-            source: Any = self._file or str(path.absolute())
-            self.container: Any = av.open(source, "r", metadata_errors="ignore")
+            self._close_file()
+            reason = error.strerror or error
+            raise VideoError("video-unreadable", path, f"is not an mp4: {reason}") from None
         except BaseException:
-            if self._file:
-                self._file.close()
+            self._close_file()
             raise
+        try:
+            self.track = self._only_track()
+        except VideoError:
+            self.close()
+            raise
+
+    def _only_track(self) -> Any:
+        tracks = self.container.streams.video
+        if len(tracks) != 1:
+            raise VideoError(
+                "video-unreadable", self._path, f"has {len(tracks)} video tracks, not one"
+            )
+        if tracks[0].codec_context is None or tracks[0].codec_context.codec is None:
+            raise VideoError("video-unreadable", self._path, "has a video track of no known codec")
+        return tracks[0]
+
+    def check(self, codec: str, coded_size: tuple[int, int] | None) -> None:
+        """Compare what the header promises with what a sidecar says.
+
+        Args:
+            codec: Name in the registry, or ffmpeg's.
+            coded_size: Width and height that are due, if known.
+
+        Raises:
+            VideoError: ``codec-mismatch`` or ``geometry-mismatch``.
+        """
+        context = self.track.codec_context
+        found = context.codec.canonical_name
+        if found != FFMPEG_NAMES.get(codec, codec):
+            raise VideoError(
+                "codec-mismatch", self._path, f"is coded as {found} where its sidecar says {codec}"
+            )
+        if coded_size is not None and (context.width, context.height) != coded_size:
+            raise VideoError(
+                "geometry-mismatch",
+                self._path,
+                f"has {context.width}x{context.height} pixels where its sidecar says "
+                f"{coded_size[0]}x{coded_size[1]}",
+            )
 
     def close(self) -> None:
         """Close it."""
         self.container.close()
+        self._close_file()
+
+    def _close_file(self) -> None:
         if self._file:
             self._file.close()
+
+
+def open_input(source: Any, container: str = "mp4") -> Any:
+    """Open a video to read by PyAV.
+
+    Args:
+        source: Path, absolute: ffmpeg takes a relative name with a colon for an address; or a file.
+        container: Ffmpeg's name of the demuxer. No other is tried, whatever the bytes look like.
+
+    Raises:
+        FFmpegError, OSError: It cannot be read as that.
+    """
+    return av.open(source, "r", format=container, **_ANY_METADATA)
 
 
 def pixel_format_of(context: Any) -> str:

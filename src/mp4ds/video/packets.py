@@ -21,11 +21,10 @@ from mp4ds.coded import PACKET_CODECS, Refused, annexb, av1, h264, h265
 from mp4ds.coded.packets import plain_body
 from mp4ds.errors import VideoError
 from mp4ds.stamps import TIMESCALE
-from mp4ds.video.media import Media, pixel_format_of
+from mp4ds.video.media import FFMPEG_NAMES, Media, open_input, pixel_format_of
 
 _TIME_BASE = Fraction(1, TIMESCALE)
 _LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.1, 30.0, 240.0  # Hz
-_NAMES = {name: "hevc" if name == "h265" else name for name in PACKET_CODECS}
 _UNITS = {"h264": h264, "h265": h265}
 _IVF = {"av1": b"AV01", "vp9": b"VP90"}
 
@@ -189,7 +188,7 @@ def _probe(codec: str, parameters: bytes, plain: bytes) -> Any:
     else:
         has_parameters = codec != "av1" or bool(av1.sequence_header(plain))
     data = plain if has_parameters else parameters + plain
-    container = _NAMES[codec]
+    container = FFMPEG_NAMES[codec]
     if codec in _IVF:
         container = "ivf"
         # header of the file with rate and count, then size and time of the frame
@@ -201,7 +200,7 @@ def _probe(codec: str, parameters: bytes, plain: bytes) -> Any:
             )
         )
     try:
-        probe = av.open(io.BytesIO(data), "r", format=container, metadata_errors="ignore")
+        probe = open_input(io.BytesIO(data), container)
     except (FFmpegError, OSError):
         raise Refused("its first picture cannot be decoded") from None
     if not probe.streams.video or probe.streams.video[0].codec_context is None:
@@ -244,13 +243,11 @@ class PacketReader:
     ) -> None:
         self._path = path
         with closing(Media(path)) as media:
-            container = media.container
-            self._check(container, codec, coded_size)
-            stream = container.streams.video[0]
-            context: Any = stream.codec_context
+            media.check(codec, coded_size)
+            context = media.track.codec_context
             self.extradata: bytes = bytes(context.extradata or b"")
             self.pixel_format = pixel_format_of(context)
-            entries = stream.index_entries
+            entries = media.track.index_entries
             if not len(entries):
                 raise VideoError("frame-count", path, "has no frames")
             if frames is not None and len(entries) != frames:
@@ -266,31 +263,6 @@ class PacketReader:
                 self.keyframes.append(entry.is_keyframe)
         self._file = path.open("rb")
         self._check_index()
-
-    def _check(self, container: Any, codec: str, coded_size: tuple[int, int] | None) -> None:
-        if "mp4" not in container.format.name.split(","):
-            name = container.format.name
-            raise VideoError("video-unreadable", self._path, f"is a {name} file, not an mp4")
-        videos = container.streams.video
-        if len(videos) != 1:
-            raise VideoError(
-                "video-unreadable", self._path, f"has {len(videos)} video tracks, not one"
-            )
-        context = videos[0].codec_context
-        if context is None or context.codec is None:
-            raise VideoError("video-unreadable", self._path, "has a video track of no known codec")
-        found = context.codec.canonical_name
-        if found != _NAMES.get(codec, codec):
-            raise VideoError(
-                "codec-mismatch", self._path, f"is coded as {found} where its sidecar says {codec}"
-            )
-        if coded_size is not None and (context.width, context.height) != coded_size:
-            raise VideoError(
-                "geometry-mismatch",
-                self._path,
-                f"has {context.width}x{context.height} pixels where its sidecar says "
-                f"{coded_size[0]}x{coded_size[1]}",
-            )
 
     def _check_index(self) -> None:
         length = self._file.seek(0, io.SEEK_END)

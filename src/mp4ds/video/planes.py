@@ -83,9 +83,8 @@ def decoded_planes(path: Path) -> Iterator[Planes]:
     """
     media = Media(path)
     try:
-        stream = media.container.streams.video[0]
-        stream.thread_count = 1
-        for frame in media.container.decode(stream):
+        media.track.thread_count = 1
+        for frame in media.container.decode(media.track):
             if frame.format.name == TEN_BITS:
                 frame = narrowed(frame)
             if frame.format.name not in (PLANES_FORMAT, f"yuvj{PLANES_FORMAT[3:]}"):
@@ -153,7 +152,7 @@ def packet_sizes(path: Path) -> PacketSizes:
     others: list[int] = []
     try:
         with closing(Media(path)) as media:
-            for packet in media.container.demux(media.container.streams.video[0]):
+            for packet in media.container.demux(media.track):
                 if packet.size:
                     (keys if packet.is_keyframe else others).append(packet.size)
     except (FFmpegError, OSError) as error:

@@ -60,7 +60,7 @@ def raw_pictures(path: Path, *, is_gray: bool) -> Iterator[RawPicture]:
     media = Media(path)
     number = 0
     try:
-        for frame in media.container.decode(video=0):
+        for frame in media.container.decode(media.track):
             if frame.is_corrupt:
                 raise VideoError("decode-failed", path, f"frame {number} is marked as corrupt")
             yield _raw(frame, is_gray=is_gray)
