@@ -1,0 +1,59 @@
+#!/usr/bin/env bash
+# Takes the README's first command and the quick tests through every Python of this machine, each with
+# the newest and with the lowest dependencies, and prints a table. Each gets a clone and an environment
+# of its own in build/versions, and a log.
+#
+#   bash tools/test_versions.sh [ARGUMENT OF PYTEST ...]
+#   PYTHONS="3.10 3.13" DEPENDENCIES=lowest bash tools/test_versions.sh tests/test_video_file.py
+set -euo pipefail
+cd "$(dirname "$0")/.."
+work=$PWD/build/versions
+mkdir -p "$work"
+[ -x "$work/uv/bin/uv" ] || { python3 -m venv "$work/uv" && "$work/uv/bin/pip" install --quiet uv; }
+
+# the interpreter of a version: on the path, or of pyenv
+python_of() {
+  local found
+  for found in "$(command -v "python$1")" "${PYENV_ROOT:-$HOME/.pyenv}/versions/$1".*/bin/python; do
+    [ -x "$found" ] && "$found" -c '' 2>/dev/null && echo "$found" && return
+  done
+  return 1
+}
+
+# in a clone beside the real recordings, if there are any
+try() (
+  set -e
+  rm -rf "$place" && mkdir "$place" && git clone --quiet . "$place/mp4ds"
+  [ ! -d ../shared ] || ln -s "$(realpath ../shared)" "$place/shared"
+  cd "$place/mp4ds"
+  if [ "$dependencies" = lowest ]; then
+    "$work/uv/bin/uv" venv --quiet --seed --python "$python" .venv
+    # wheels only: nobody means to build an old numpy for a new Python
+    "$work/uv/bin/uv" pip install --quiet --python .venv/bin/python --resolution lowest-direct \
+      --only-binary :all: --no-binary mp4ds '.[test]'
+  fi
+  PYTHON=$python bash examples/quickstart.sh
+  .venv/bin/python -m pip install --quiet --editable '.[test]'
+  .venv/bin/python -m pip list --format freeze
+  .venv/bin/pytest -n auto -q -m "not slow and not network" "$@"
+)
+
+failed=0
+rows=()
+for version in ${PYTHONS:-3.10 3.11 3.12 3.13 3.14}; do
+  python=$(python_of "$version") || { rows+=("$version|not on this machine||"); continue; }
+  for dependencies in ${DEPENDENCIES:-lowest newest}; do
+    place=$work/$version-$dependencies
+    log=$place.log
+    echo "Python $version, $dependencies dependencies: $log"
+    set +e # a command that a condition waits for does not stop at its first failure
+    try "$@" >"$log" 2>&1
+    [ $? = 0 ] && outcome=passed || { outcome=FAILED && failed=1; }
+    set -e
+    av=$(sed -n 's/^av==//p' "$log")
+    equal=$(grep -c '^EQUAL$' "$log" || true)
+    rows+=("$version|$dependencies, PyAV ${av:-?}|$([ "$equal" = 1 ] && echo equal || echo NO)|$outcome: $(tail -n 1 "$log")")
+  done
+done
+printf '%s\n' "Python|dependencies|quickstart|quick tests" "${rows[@]}" | column -t -s '|'
+exit $failed
