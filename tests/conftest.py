@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -59,6 +60,11 @@ def pytest_collection_finish() -> None:
     """Leave the tests themselves, half a million objects, out of every collection of garbage."""
     gc.collect()
     gc.freeze()
+
+
+def pytest_configure() -> None:
+    """Take Ctrl-C, and let what tests start take it, where a shell's `&` has it ignored."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(tryfirst=True)
