@@ -13,7 +13,8 @@ from pathlib import Path
 import yaml
 
 M64 = 2**64 - 1
-SCHEMAS = Path(__file__).resolve().parents[1] / "schemas" / "v1.0"
+KNOWN = ("1.0", "1.1")
+SCHEMAS = Path(__file__).resolve().parents[1] / "schemas"
 
 
 class RefusedError(Exception):
@@ -123,8 +124,11 @@ def load(path, kind):
         raise RefusedError("version-unsupported", path)
     if document.get("kind") != kind:
         raise RefusedError("kind-unknown", path)
-    schema = json.loads((SCHEMAS / f"{kind}.schema.json").read_text())
-    if not fits(document, schema, schema.get("$defs", {}), newer=version != "1.0"):
+    newer = version not in KNOWN
+    schema = json.loads(
+        (SCHEMAS / f"v{KNOWN[-1] if newer else version}" / f"{kind}.schema.json").read_text()
+    )
+    if not fits(document, schema, schema.get("$defs", {}), newer=newer):
         raise RefusedError("schema-invalid", path)
     return without_nulls(document)
 

@@ -325,6 +325,14 @@ TRAITS: dict[str, Trait] = {
     "tail-bytes": lambda n, pixels: {"tail": b"\x00\xff\x00" if n % 2 else b"four"},
     "row-padding-zero": lambda n, pixels: {"data": _padded(pixels, b"\0\0\0\0"), "step": 36},
     "row-padding-garbage": lambda n, pixels: {"data": _padded(pixels, b"junk"), "step": 36},
+    "row-padding-varied": lambda n, pixels: {
+        "data": _padded(pixels, bytes([n % 3, 0, 255, n])),
+        "step": 36,
+    },
+    "row-padding-not-last": lambda n, pixels: {
+        "data": _padded(pixels, b"\xcd" * 4 if n % 2 else bytes(4))[:-4],
+        "step": 36,
+    },
     "data-short": lambda n, pixels: {"data": pixels[:-5], "step": 32},
     "data-long": lambda n, pixels: {"data": pixels + b"more", "step": 32},
     "data-empty": lambda n, pixels: {"data": b"" if n == 3 else pixels},

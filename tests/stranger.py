@@ -182,11 +182,14 @@ def _interleaved(picture: Sequence[Array], encoding: str, width: int, height: in
     )
 
 
-def rows(patterns: Array, step: int, *, big_endian: bool) -> bytes:
+def rows(patterns: Array, step: int, padding: str | None, *, big_endian: bool) -> bytes:
     """The body of an image message: rows of so many bytes."""
     ordered = patterns.astype(patterns.dtype.newbyteorder(">" if big_endian else "<"))
     raw = np.frombuffer(ordered.tobytes(), np.uint8).reshape(len(patterns), -1)
-    return np.pad(raw, ((0, 0), (0, step - raw.shape[1]))).tobytes()
+    if padding is None:
+        return np.pad(raw, ((0, 0), (0, step - raw.shape[1]))).tobytes()
+    between, size = zlib.decompress(base64.b64decode(padding)), step - raw.shape[1]
+    return b"".join(row.tobytes() + between[n * size : (n + 1) * size] for n, row in enumerate(raw))
 
 
 # ---------------------------------------------------------------- bodies

@@ -86,7 +86,7 @@ class Stream:
             prefix = bytes.fromhex(header.get("prefix", ""))
             if kind == "pixels":
                 big = bool(image["is_bigendian"])
-                yield stranger.rows(found, image["step"], big_endian=big)
+                yield stranger.rows(found, image["step"], header.get("padding"), big_endian=big)
             elif kind == "png":
                 yield prefix + stranger.png_file(found, header["png"])
             else:

@@ -1111,7 +1111,7 @@ def test_json_of_the_real_command(small_bag: Path, tmp_path: Path) -> None:
 def test_a_newer_minor_version_is_told_in_one_line(small_dataset: Path) -> None:
     path = small_dataset / "cam_image_raw.yaml"
     text = path.read_bytes()
-    text = text[: text.rindex(b"checksum:")].replace(b'mp4ds: "1.0"', b'mp4ds: "1.7"\nfancy: 1')
+    text = text[: text.rindex(b"checksum:")].replace(b'mp4ds: "1.1"', b'mp4ds: "1.7"\nfancy: 1')
     path.write_bytes(text)
     result = run("info", path)
     assert result.code == 0, result.err

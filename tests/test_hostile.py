@@ -29,7 +29,7 @@ from each import each, fresh
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from jail import Jail, Outcome
 from mp4ds import Mp4dsError, VersionError, yamlio
-from mp4ds.sidecar.fields import MAX_CAMERA_INFOS, MAX_FRAMES
+from mp4ds.sidecar.fields import FORMAT_VERSION, MAX_CAMERA_INFOS, MAX_FRAMES
 from scenes import Scene
 from sources import SOURCES, scene
 
@@ -335,7 +335,7 @@ TEXTS: dict[str, bytes] = {
 @each("to", ["sidecar", "manifest"])
 def test_yaml_beyond_the_subset(to: str, name: str, dataset: Path, jail: Jail) -> None:
     path = dataset / (f"{STEM}.yaml" if to == "sidecar" else "dataset.yaml")
-    head = b'mp4ds: "1.0"\nkind: stream\n' if TEXTS[name].startswith(b"a:") else b""
+    head = b'mp4ds: "1.1"\nkind: stream\n' if TEXTS[name].startswith(b"a:") else b""
     path.write_bytes(head + TEXTS[name])
     refused(jail, path if to == "sidecar" else dataset, "yaml-invalid")
     assert not list(dataset.glob("pwned"))
@@ -405,7 +405,7 @@ def test_a_newer_major_version_is_refused(version: str, pair: Path, jail: Jail) 
     changed(pair, put("mp4ds", value=version))
     text = refused(jail, pair, "version-unsupported")
     assert version in text
-    assert "1.0" in text
+    assert FORMAT_VERSION in text
     with pytest.raises(VersionError, match=version):
         mp4ds.open(pair)
 
@@ -416,7 +416,7 @@ def test_a_newer_major_version_is_refused(version: str, pair: Path, jail: Jail) 
      b"null", b"[1]", b"{}", b"true", b'"' + b"9" * 5000 + b'.0"'],
 )  # fmt: skip
 def test_what_is_no_version(version: bytes, pair: Path, jail: Jail) -> None:
-    edited(pair, b'mp4ds: "1.0"', b"mp4ds: " + version)
+    edited(pair, b'mp4ds: "1.1"', b"mp4ds: " + version)
     refused(jail, pair, "version-unsupported")
 
 
@@ -455,7 +455,7 @@ def test_a_newer_minor_version_may_not_break_the_rest(pair: Path, jail: Jail) ->
 
 def test_a_newer_minor_version_with_many_keys(pair: Path, jail: Jail) -> None:
     keys = b"".join(b"\nk%d: 1" % n for n in range(20_000))
-    edited(pair, b'mp4ds: "1.0"', b'mp4ds: "1.7"' + keys)
+    edited(pair, b'mp4ds: "1.1"', b'mp4ds: "1.7"' + keys)
     outcome = jail.validate(pair)
     bounded(outcome)
     assert not outcome.error, outcome.text

@@ -28,8 +28,9 @@ from mp4ds.layouts import (
     bind,
     fit,
     layout_for,
-    padding_is_zero,
     pixel_view,
+    put_padding,
+    row_padding,
     why_not,
 )
 from pixel_kinds import KINDS, PAIRS, as_message, bits_of, bound, rounded, suited, values
@@ -686,21 +687,33 @@ def test_plain_pictures_are_no_copies(name: str) -> None:
 
 
 @steady
-@given(st.sampled_from(["mono8", "rgb8", "nv12", "nv24"]), st.integers(0, 4), st.data())
-@example("mono8", 0, None)
-def test_padding(name: str, pad: int, data: st.DataObject | None) -> None:
+@given(
+    st.sampled_from(["mono8", "rgb8", "nv12", "nv24"]),
+    st.integers(0, 4),
+    st.booleans(),
+    st.sampled_from([0, 205, None]),
+)
+@example("mono8", 0, True, 0)
+def test_padding(name: str, pad: int, last: bool, value: int | None) -> None:
+    """What follows the pixels of rows is told, and comes back."""
     encoding = ENCODINGS[name]
     width, height = rounded(encoding, 4, 2)
     row_bytes = width * encoding.pixel_bytes
     rows = np.full((encoding.shape(width, height)[0], row_bytes + pad), 7, np.uint8)
-    rows[:, row_bytes:] = 0
+    rows[:, row_bytes:] = np.arange(pad) if value is None else value
     size = {"width": width, "height": height, "step": row_bytes + pad}
-    assert padding_is_zero(memoryview(rows.tobytes()), encoding, **size)
-    if pad and data:
-        y = data.draw(st.integers(0, len(rows) - 1))
-        x = data.draw(st.integers(row_bytes, rows.shape[1] - 1))
-        rows[y, x] = data.draw(st.integers(1, 255))
-        assert not padding_is_zero(memoryview(rows.tobytes()), encoding, **size)
+    data = rows.tobytes() if last else rows.tobytes()[: rows.size - pad]
+    assert why_not(name, **size, size=len(data)) is None
+    found = row_padding(memoryview(data), encoding, **size)
+    is_zero = not rows[: None if last else -1, row_bytes:].any()
+    assert (found is None) == (not pad or (last and is_zero))
+    if found is not None:
+        made = bytearray(data)
+        view = np.frombuffer(made, np.uint8)
+        for row in range(len(rows)):
+            view[row * rows.shape[1] + row_bytes : (row + 1) * rows.shape[1]] = 9
+        put_padding(made, found, row_bytes=row_bytes, step=rows.shape[1])
+        assert bytes(made) == data
 
 
 # ---------------------------------------------------------------- what has no layout

@@ -92,7 +92,7 @@ def stream() -> Document:
         "channel": channel("/cam/image_raw", "sensor_msgs/Image"),
         "wire": "ros1",
         "image": {"encoding": "rgb8", "width": 8, "height": 6, "step": 24, "is_bigendian": 0},
-        "headers": [{"frame_id": "cam", "template": "AAAA"}],
+        "headers": [{"frame_id": "cam", "template": "AAAA", "padding": "eJwDAAAAAAE="}],
         "video": {
             "file": "cam_image_raw.mp4",
             "layout": "rgb24",
@@ -419,7 +419,11 @@ REFUSED: dict[str, list[tuple[str, Any]]] = {
         *(("image.encoding", value) for value in ("rgba8", "", "RGB8", None, 8, ..., "mono16")),
         *(("image", value) for value in ([], None, {}, "rgb8", ...)),
         *(("headers", value) for value in ([], {}, None, ["cam"], [{}], ...)),
-        *(("headers.0.template", value) for value in ("AA=A", "AA\n", "\u00e4", "A A", 5)),
+        *(
+            (f"headers.0.{key}", value)
+            for key in ("template", "padding")
+            for value in ("AA=A", "AA\n", "\u00e4", "A A", 5)
+        ),
         *(("headers.0.frame_id", value) for value in (None, 5, ...)),
         *(("video.file", value) for value in BAD_NAMES),
         *(("video.layout", value) for value in ("gray8", "bgr24", "", "nv12", None, 1, ...)),

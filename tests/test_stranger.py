@@ -18,7 +18,7 @@ from coded_scenes import CODED
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from mp4ds.layouts import ENCODINGS, LAYOUTS, Encoding, fit
 from mp4ds.packing import pack
-from scenes import Scene, scene
+from scenes import Scene, odd_scene, scene
 from sources import SOURCES
 from stranger_messages import Stream
 
@@ -73,9 +73,18 @@ def test_every_exact_layout_is_what_the_spec_says() -> None:
     assert seen == {name for name, kind in LAYOUTS.items() if kind.is_exact}
 
 
+def padded(trait: str, *, frames: int, **_: int) -> Scene:
+    return odd_scene(trait, frames=frames)
+
+
 Case = tuple[Callable[..., Scene], Callable[[Path, Scene], list[Path]]]
 ROS1, ROS2 = SOURCES["mcap-ros1-zstd"], SOURCES["mcap-ros2-none"]
 CASES: dict[str, Case] = {
+    **{
+        f"{trait}-{world}": (partial(padded, trait), write)
+        for trait in ("row-padding-varied", "row-padding-not-last")
+        for world, write in (("ros1", ROS1), ("ros2", ROS2))
+    },
     **{
         f"{encoding}-{world}": (partial(scene, encoding, pad=5, big_endian=world == "ros2"), write)
         for encoding in ("mono8", "bgr8", "rgba8", "bayer_rggb8", "rgb16", "16SC1", "32FC1", "nv21")

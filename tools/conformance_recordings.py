@@ -366,6 +366,11 @@ RECORDINGS: dict[str, Recording] = {
         ),
         "mcap-ros2-zstd",
     ),
+    "row-padding": Recording(
+        "padding between the rows that is not zero, that changes, and that the last row lacks",
+        partial(_odd, "row-padding-garbage", "row-padding-varied", "row-padding-not-last"),
+        "mcap-ros2-zstd",
+    ),
     "several-streams": Recording(
         "several streams of one topic, verbatim messages between: order by ordinals",
         partial(_odd, "encoding-change", "size-change", "data-empty"),

@@ -16,8 +16,9 @@ from mp4ds.layouts.encodings import (
     MAX_SIDE,
     Encoding,
     Pixels,
-    padding_is_zero,
     pixel_view,
+    put_padding,
+    row_padding,
 )
 from mp4ds.layouts.kinds import LAYOUTS, LayoutKind
 from mp4ds.layouts.numbers import MAX_TABLE, SCALES
@@ -41,7 +42,8 @@ __all__ = [
     "bind",
     "fit",
     "layout_for",
-    "padding_is_zero",
     "pixel_view",
+    "put_padding",
+    "row_padding",
     "why_not",
 ]

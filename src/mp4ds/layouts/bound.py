@@ -146,7 +146,7 @@ def why_not(encoding_name: str, *, width: int, height: int, step: int, size: int
         width: Columns.
         height: Rows.
         step: Bytes per row.
-        size: Bytes of all rows.
+        size: Bytes of all rows; the last one may end with its pixels.
     """
     encoding = ENCODINGS.get(encoding_name)
     if encoding is None:
@@ -158,7 +158,7 @@ def why_not(encoding_name: str, *, width: int, height: int, step: int, size: int
     if width % encoding.even[0] or height % encoding.even[1]:
         return f"an image of {width}x{height} pixels, where {encoding.name} needs even sides"
     due = encoding.size(step, height)
-    if size != due:
+    if size not in (due, due - (step - width * encoding.pixel_bytes)):
         rows = "step x height" if encoding.rows == 1 else f"step x height x {encoding.rows}"
         return f"{size} bytes of pixels where {rows} says {due}"
     if width > MAX_SIDE or height > MAX_SIDE:

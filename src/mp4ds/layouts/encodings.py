@@ -188,10 +188,10 @@ def pixel_view(
     return pixels
 
 
-def padding_is_zero(
+def row_padding(
     data: memoryview, encoding: Encoding, *, width: int, height: int, step: int
-) -> bool:
-    """Whether all bytes between the rows are zero, which is what a rebuilt image has there.
+) -> bytes | None:
+    """The bytes after the pixels of each row; None where all rows have them, and all are zero.
 
     Args:
         data: Of an image for which `why_not` knows no reason.
@@ -202,7 +202,22 @@ def padding_is_zero(
     """
     row_bytes = width * encoding.pixel_bytes
     if step == row_bytes:
-        return True
+        return None
     count = encoding.shape(width, height)[0]
-    rows = np.frombuffer(data, np.uint8, count=step * count).reshape(count, step)
-    return not rows[:, row_bytes:].any()
+    whole = len(data) // step  # the last row may have none
+    rows = np.frombuffer(data, np.uint8, count=step * whole).reshape(whole, step)[:, row_bytes:]
+    return rows.tobytes() if whole < count or rows.any() else None
+
+
+def put_padding(data: bytearray | memoryview, padding: bytes, *, row_bytes: int, step: int) -> None:
+    """Write what `row_padding` gave after the pixels of each row.
+
+    Args:
+        data: All rows, to be changed.
+        padding: Of all rows, or of all but the last.
+        row_bytes: Of the pixels of a row.
+        step: Bytes per row.
+    """
+    whole = len(padding) // (step - row_bytes)
+    rows = np.frombuffer(data, np.uint8, count=step * whole).reshape(whole, step)
+    rows[:, row_bytes:] = np.frombuffer(padding, np.uint8).reshape(whole, step - row_bytes)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import binascii
 import re
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -15,12 +16,15 @@ from pydantic import BaseModel, ConfigDict, Field
 from mp4ds.layouts import MAX_SIDE
 from mp4ds.stamps import INT64_MAX, INT64_MIN
 
-FORMAT_VERSION = "1.0"
+FORMAT_VERSION = "1.1"
 MESSAGES_NAME = "messages.mcap"
 MAX_FRAMES = 2 * 10**7  # 92 hours at 60 Hz; bounds what a sidecar can make a reader allocate
 MAX_CAMERA_INFOS = 10**7
 MAX_VARIANTS = 256
 """Headers or calibrations of a stream: a topic with more is not modelled any further."""
+MAX_PADDING = 4 * 2**20
+"""Characters of all paddings of a stream: its headers stand in the part of a YAML file that is
+parsed as a whole."""
 
 Int64 = Annotated[int, Field(ge=INT64_MIN, le=INT64_MAX)]
 Time = Annotated[int, Field(ge=INT64_MIN, le=2**64 - 1)]
@@ -64,6 +68,11 @@ def decode_base64(text: str) -> bytes:
     if base64.b64encode(data).decode() != text:
         raise ValueError(f"{text[:20]!r} is not base64: it does not encode what it decodes to")
     return data
+
+
+def exceeds_padding(paddings: Iterable[str | None]) -> bool:
+    """Whether headers have more of it than one stream may."""
+    return sum(len(padding or "") for padding in paddings) > MAX_PADDING
 
 
 def parse_version(text: str) -> tuple[int, int]:

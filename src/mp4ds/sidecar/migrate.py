@@ -141,5 +141,13 @@ def _text(value: Any) -> str:
     return value
 
 
-MIGRATIONS: dict[str, Callable[[Document, str], Document]] = {"0": _from_0}
+def _from_1_0(old: Document, place: str) -> Document:
+    """Version 1.0: no header has padding."""
+    headers = old.get("headers")
+    if isinstance(headers, list) and any(isinstance(h, dict) and "padding" in h for h in headers):
+        raise ValueError("headers with padding are of version 1.1")
+    return {**old, "mp4ds": "1.1"}
+
+
+MIGRATIONS: dict[str, Callable[[Document, str], Document]] = {"0": _from_0, "1.0": _from_1_0}
 """Version that a step starts from -> the step."""

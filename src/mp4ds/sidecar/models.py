@@ -43,6 +43,7 @@ from mp4ds.sidecar.fields import (
     Uint64,
     Version,
     decode_base64,
+    exceeds_padding,
 )
 from mp4ds.sidecar.quality import Quality
 from mp4ds.sidecar.references import References
@@ -130,7 +131,7 @@ class Image(Model):
     encoding: str = Field(description="ROS image encoding.")
     width: Side = Field(description="Columns, pixels.")
     height: Side = Field(description="Rows, pixels.")
-    step: Uint32 = Field(description="Bytes per row; what exceeds the pixels is zero.")
+    step: Uint32 = Field(description="Bytes per row; what exceeds the pixels is padding.")
     is_bigendian: Annotated[int, Field(ge=0, le=255)] = Field(
         description="The byte as it stands; for samples of several bytes not 0 means big-endian."
     )
@@ -187,6 +188,9 @@ class Header(Model):
         "", description="Bytes of the body before the coded picture, hexadecimal."
     )
     png: PngFile | None = Field(None, description="How the file in the body is made.")
+    padding: Base64 | None = Field(
+        None, description="What follows the pixels of each row, deflated; absent: zeros."
+    )
 
 
 class Color(Model):
@@ -372,9 +376,13 @@ class StreamSidecar(Model):
             raise ValueError(f"no packets of codec {self.video.codec} are carried")
         if body == "jpeg" and self.profile == "lossless":
             raise ValueError("a stream with the body jpeg is not lossless")
+        if exceeds_padding(header.padding for header in self.headers):
+            raise ValueError("the headers have too much padding")
         for number, header in enumerate(self.headers):
             if (header.png is not None) != (body == "png"):
                 raise ValueError(f"headers.{number}.png is there for the body png, and only there")
+            if header.padding is not None and body != "pixels":
+                raise ValueError(f"headers.{number}.padding is there for the body pixels only")
 
     @property
     def layout(self) -> Layout:

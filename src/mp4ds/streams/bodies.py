@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import zlib
+
 import numpy as np
 import xxhash
 
 from mp4ds.coded import Refused, body_of, png, rvl, zlib_build, zlib_fingerprint
 from mp4ds.errors import FormatError
-from mp4ds.layouts import ENCODINGS, Picture, Pixels, pixel_view
+from mp4ds.layouts import ENCODINGS, Picture, Pixels, pixel_view, put_padding
 from mp4ds.sidecar import StreamSidecar
+from mp4ds.sidecar.fields import decode_base64
 from mp4ds.streams.rebuild import check_slots, decode_columns, form_for, template_of
 from mp4ds.video import ImageFile
 from mp4ds.wire import CodedFields, Fields, ImageFields, Template
@@ -38,6 +41,13 @@ class MessageRebuilder:
             png.PngRecipe(**header.png.model_dump(exclude={"deflate"})) if header.png else None
             for header in sidecar.headers
         ]
+        image = sidecar.image
+        self._row_bytes = image.width * self._encoding.pixel_bytes
+        rows = self._encoding.shape(image.width, image.height)[0]
+        self._padding_size = rows * (image.step - self._row_bytes)
+        self._paddings: dict[int, bytes | None] = {}
+        for variant in range(len(sidecar.headers)):  # so that a wrong one is told at once
+            self._padding(variant)
         self._jpeg = (
             ImageFile(self._encoding.name, "jpeg", quality=jpeg_quality)
             if sidecar.body == "jpeg"
@@ -115,7 +125,10 @@ class MessageRebuilder:
     def _with_pixels(self, index: int, picture: Picture) -> bytes | bytearray:
         image = self._sidecar.image
         template = self._templates[int(self.columns.variant[index])]
+        padding = self._padding(int(self.columns.variant[index]))
         size = self._encoding.size(image.step, image.height)
+        if padding is not None:
+            size += len(padding) - self._padding_size
         head, tail = template.around(self.columns.slots(index), size)
         if not template.keeps_body:
             head, tail = b"", b""
@@ -130,6 +143,9 @@ class MessageRebuilder:
             is_bigendian=bool(image.is_bigendian),
         )
         self._layout.to_pixels(picture, out)
+        if padding is not None:
+            body = memoryview(payload)[len(head) : len(head) + size]
+            put_padding(body, padding, row_bytes=self._row_bytes, step=image.step)
         if not template.keeps_body:
             return self._around(index, payload)
         if tail:
@@ -168,6 +184,28 @@ class MessageRebuilder:
         except ValueError as error:
             raise FormatError("column-invalid", f"{self._place} at digests", str(error)) from None
 
+    def _padding(self, variant: int) -> bytes | None:
+        """What follows the rows of pixels in messages of a header; None: zeros.
+
+        Raises:
+            FormatError: ``header-mismatch``: there are not as many bytes as the rows leave.
+        """
+        if variant not in self._paddings:
+            text = self._sidecar.headers[variant].padding
+            place = f"{self._place} at headers.{variant}.padding"
+            try:
+                padding = None if text is None else _inflated(text, self._padding_size)
+            except ValueError as error:
+                raise FormatError("header-mismatch", place, str(error)) from None
+            per_row = self._sidecar.image.step - self._row_bytes
+            dues = (self._padding_size, self._padding_size - per_row)
+            if padding is not None and (not per_row or len(padding) not in dues):
+                raise FormatError(
+                    "header-mismatch", place, f"has not the {dues[0]} bytes that rows leave"
+                )
+            self._paddings = {variant: padding}  # one of them: they may be large
+        return self._paddings[variant]
+
     def _make_templates(self) -> list[Template]:
         sidecar, image = self._sidecar, self._sidecar.image
         form = form_for(sidecar.channel.to_record(0), sidecar.wire, self._place)
@@ -184,3 +222,19 @@ class MessageRebuilder:
             place = f"{self._place} at headers.{number}.template"
             templates.append(template_of(form, header.template, header.frame_id, fields, place))
         return templates
+
+
+def _inflated(text: str, most: int) -> bytes:
+    """The bytes of base64 of a zlib stream, at most so many and one more.
+
+    Raises:
+        ValueError: It is none.
+    """
+    inflater = zlib.decompressobj()
+    try:
+        data = inflater.decompress(decode_base64(text), most + 1)
+    except zlib.error as error:
+        raise ValueError(f"cannot be inflated: {error}") from None
+    if len(data) <= most and (not inflater.eof or inflater.unused_data):
+        raise ValueError("is not one whole stream of zlib")
+    return data

@@ -18,7 +18,7 @@ from mp4ds.sidecar import (
     Quality,
     StreamSidecar,
 )
-from mp4ds.sidecar.fields import MAX_CAMERA_INFOS, MAX_FRAMES, MAX_VARIANTS
+from mp4ds.sidecar.fields import MAX_CAMERA_INFOS, MAX_FRAMES, MAX_VARIANTS, exceeds_padding
 from mp4ds.stamps import PresentationClock
 from mp4ds.streams.columns import columns_model, digests_model
 from mp4ds.streams.facts import FACTS, video_facts
@@ -56,6 +56,8 @@ class StreamJoin:
         """
         info = sidecar.camera_info
         if _identity(sidecar) != self._identity or not self._headers.has_room(sidecar.headers):
+            return False
+        if exceeds_padding(head.padding for head in (*self._headers.items, *sidecar.headers)):
             return False
         if len(self._columns) + sidecar.frames > MAX_FRAMES:
             return False

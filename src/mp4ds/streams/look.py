@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 from mp4ds.coded import PNG_ENCODINGS, PictureParser, Refused, depth, jpeg, packet_codec, png
-from mp4ds.layouts import ENCODINGS, Pixels, padding_is_zero, pixel_view, why_not
+from mp4ds.layouts import ENCODINGS, Pixels, pixel_view, row_padding, why_not
 from mp4ds.records import Channel, Message
 from mp4ds.sidecar.fields import Body
 from mp4ds.streams.columns import Unsuited
@@ -51,11 +52,13 @@ class Wrap:
         framing: Start codes and delimiters that an mp4 does not keep.
         prefix: Bytes before the coded picture.
         png: How its file was written.
+        padding: What stands between rows of pixels, deflated; None: zeros.
     """
 
     framing: str = ""
     prefix: bytes = b""
     png: png.PngRecipe | None = None
+    padding: bytes | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,9 +228,9 @@ def _raw_image(form: Form, parts: Parts, fields: ImageFields) -> Seen:
         raise Unsuited(reason)
     encoding = ENCODINGS[fields.encoding]
     size = {"width": fields.width, "height": fields.height, "step": fields.step}
-    if not padding_is_zero(parts.body, encoding, **size):
-        raise Unsuited("padding between its rows is not zero")
+    padding = row_padding(parts.body, encoding, **size)
+    wrap = Wrap() if padding is None else Wrap(padding=zlib.compress(padding))
     is_bigendian = fields.is_bigendian
     pixels = pixel_view(parts.body, encoding, **size, is_bigendian=bool(is_bigendian))
     key = StreamKey(form.wire, "pixels", "", fields.encoding, **size, is_bigendian=is_bigendian)
-    return Seen(key, form, parts, pixels=pixels)
+    return Seen(key, form, parts, wrap, pixels=pixels)

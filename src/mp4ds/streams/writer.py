@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from array import array
 from collections.abc import Callable
 from dataclasses import asdict
@@ -20,7 +21,7 @@ from mp4ds.sidecar import (
     Video,
     dump_document,
 )
-from mp4ds.sidecar.fields import FORMAT_VERSION, MAX_FRAMES
+from mp4ds.sidecar.fields import FORMAT_VERSION, MAX_FRAMES, exceeds_padding
 from mp4ds.sidecar.models import PngFile
 from mp4ds.stamps import PresentationClock
 from mp4ds.streams.columns import ColumnsWriter, Unsuited, digests_model
@@ -107,7 +108,7 @@ class StreamWriter:
         variant = self._heads.number(
             parts,
             memoryview(message.data),
-            describe=lambda template: _header(seen, template),
+            describe=lambda template: self._header(seen, template),
             extra=seen.wrap,
         )
         self._columns.append(message, parts, variant=variant, ordinal=ordinal)
@@ -167,22 +168,29 @@ class StreamWriter:
         facts = video_facts(self.video_path, made["codec"])
         return Video.model_validate({**made, **facts})
 
+    def _header(self, seen: Seen, template: str | None) -> Header:
+        """The model of a message's header.
+
+        Raises:
+            Unsuited: The headers would become too large.
+        """
+        fields, wrap = seen.parts.fields, seen.wrap
+        padding = None if wrap.padding is None else base64.b64encode(wrap.padding).decode()
+        if exceeds_padding((padding, *(head.padding for head in self._heads.items))):
+            raise Unsuited("too much padding between rows, another for each image")
+        return Header(
+            frame_id=seen.parts.frame_id,
+            format=fields.format if isinstance(fields, CodedFields) else None,
+            template=template,
+            framing=wrap.framing,
+            prefix=wrap.prefix.hex(),
+            png=_png_file(wrap.png) if wrap.png else None,
+            padding=padding,
+        )
+
     def abandon(self) -> None:
         """Stop writing; the caller removes the files."""
         self._track.abandon()
-
-
-def _header(seen: Seen, template: str | None) -> Header:
-    """The model of a message's header."""
-    fields, wrap = seen.parts.fields, seen.wrap
-    return Header(
-        frame_id=seen.parts.frame_id,
-        format=fields.format if isinstance(fields, CodedFields) else None,
-        template=template,
-        framing=wrap.framing,
-        prefix=wrap.prefix.hex(),
-        png=_png_file(wrap.png) if wrap.png else None,
-    )
 
 
 def _png_file(recipe: PngRecipe) -> PngFile:

@@ -1,0 +1,158 @@
+"""What stands after the pixels of rows: in the sidecar, exact in every profile."""
+
+from __future__ import annotations
+
+import base64
+import json
+import warnings
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import mp4ds
+from in_parts import InlineEngine
+from mp4ds import yamlio
+from mp4ds.bags import open_reader
+from mp4ds.packing import PackOptions
+from mp4ds.records import Message
+from round_trips import Compare, unpacked
+from sources import SOURCES, odd_scene
+from test_structure import ROOT
+
+TOPIC = "/odd/image"
+WIDTH, STEP = 32, 36
+
+
+@pytest.fixture(autouse=True)
+def engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: InlineEngine())
+
+
+def recording(folder: Path, trait: str, source: str = "mcap-ros2-none", **options: Any) -> Any:
+    (folder / "source").mkdir()
+    return SOURCES[source](folder / "source", odd_scene(trait, **options))
+
+
+@pytest.mark.parametrize("quality", ["lossless", "crf=20", "psnr=30"])
+@pytest.mark.parametrize(
+    "trait", ["row-padding-garbage", "row-padding-varied", "row-padding-not-last"]
+)
+@pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-none"])
+def test_padded_images_are_a_video(
+    trait: str, quality: str, source: str, tmp_path: Path, compare: Compare
+) -> None:
+    paths = recording(tmp_path, trait, source)
+    options = PackOptions(quality=quality, codec=None if quality == "lossless" else "h264")
+    summary = mp4ds.pack(paths, tmp_path / "dataset", options)
+    (topic,) = (topic for topic in summary.topics if topic.topic == TOPIC)
+    assert (topic.frames, topic.verbatim) == (8, {})
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    back = unpacked(tmp_path, "bag" if source == "bag-none" else "mcap")
+    if quality == "lossless":
+        assert compare(paths, back) == []
+        return
+    for before, after in zip(payloads(paths[0]), payloads(back), strict=True):
+        changed = np.flatnonzero(differs(before, after))
+        place = changed - len(before) + bodies_size(before)
+        assert (place >= 0).all()
+        assert (place % STEP < WIDTH).all()
+
+
+def payloads(path: Path) -> list[bytes]:
+    with open_reader(path) as reader:
+        return [
+            bytes(record.data)
+            for record in reader.records()
+            if isinstance(record, Message) and record.channel.topic == TOPIC
+        ]
+
+
+def differs(before: bytes, after: bytes) -> NDArray[np.bool_]:
+    assert len(before) == len(after)
+    return np.frombuffer(before, np.uint8) != np.frombuffer(after, np.uint8)
+
+
+def bodies_size(payload: bytes) -> int:
+    """Bytes of the image, whose length stands before it."""
+    for size in (24 * STEP, 24 * STEP - 4):
+        if payload[: len(payload) - size].endswith(size.to_bytes(4, "little")):
+            return size
+    raise AssertionError("no image")
+
+
+@pytest.mark.parametrize("window", [None, 4])
+def test_padding_beyond_a_bound_is_verbatim(
+    window: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compare: Compare
+) -> None:
+    """Of parts, those with too much of it together become two streams."""
+    monkeypatch.setattr("mp4ds.sidecar.fields.MAX_PADDING", 150)
+    paths = recording(tmp_path, "row-padding-varied")
+    summary = mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=window))
+    (topic,) = (topic for topic in summary.topics if topic.topic == TOPIC)
+    if window is None:
+        assert "too much padding between rows, another for each image" in topic.verbatim
+    assert 0 < topic.frames <= 8
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare(paths, unpacked(tmp_path, "mcap")) == []
+
+
+def deflated(data: bytes) -> str:
+    return base64.b64encode(zlib.compress(data)).decode()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        deflated(bytes(95)),
+        deflated(bytes(97)),
+        deflated(bytes(10**7)),
+        base64.b64encode(zlib.compress(b"junk" * 24)[:-5]).decode(),
+        base64.b64encode(zlib.compress(b"junk" * 24) + b"more").decode(),
+        base64.b64encode(b"junk").decode(),
+        "A",
+    ],
+)
+def test_a_wrong_padding_is_told(text: str, tmp_path: Path) -> None:
+    paths = recording(tmp_path, "row-padding-garbage")
+    mp4ds.pack(paths, tmp_path / "dataset")
+    path = tmp_path / "dataset" / "odd_image.yaml"
+    document = yamlio.load(path.read_bytes(), "it")
+    document["headers"][0]["padding"] = text
+    path.write_bytes(yamlio.dump(document))
+    (problem,) = mp4ds.validate(path, deep=True)
+    assert problem.code == "header-mismatch"
+    assert "headers.0.padding" in str(problem)
+
+
+# ---------------------------------------------------------------- version 1.0
+
+
+def test_datasets_of_version_1_0_are_read() -> None:
+    """The suite's cases of that version stay as they are."""
+    folder = ROOT / "conformance/cases/datasets"
+    old = [path for path in folder.iterdir() if b'mp4ds: "1.0"' in first_line(path)]
+    assert len(old) > 20
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert mp4ds.validate(folder / "bag") == []
+
+
+def first_line(folder: Path) -> bytes:
+    return b"\n".join((folder / "dataset.yaml").read_bytes().splitlines()[:2])
+
+
+def test_padding_is_no_key_of_version_1_0(tmp_path: Path) -> None:
+    paths = recording(tmp_path, "row-padding-garbage")
+    mp4ds.pack(paths, tmp_path / "dataset")
+    path = tmp_path / "dataset" / "odd_image.yaml"
+    document = yamlio.load(path.read_bytes(), "it")
+    assert document["mp4ds"] == "1.1"
+    path.write_bytes(yamlio.dump({**document, "mp4ds": "1.0"}))
+    (problem,) = mp4ds.validate(path)
+    assert problem.code == "migration-failed"
+    schema = json.loads((ROOT / "schemas/v1.0/stream.schema.json").read_text())
+    assert "padding" not in schema["$defs"]["Header"]["properties"]
