@@ -15,7 +15,7 @@ import pytest
 from rosbags.rosbag1 import Reader
 
 from conftest import DATA, real
-from mp4ds.bags import ros1
+from mp4ds.bags import open_sources, ros1
 from mp4ds.bags.ros1 import Ros1Reader, Ros1Writer
 from mp4ds.errors import (
     ConversionError,
@@ -408,6 +408,37 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
     ):
         path.write_bytes(data)
         refuse(path, problem)
+
+
+def test_messages_that_the_index_does_not_list_are_not_lost(tmp_path: Path) -> None:
+    path = tmp_path / "a.bag"
+    two = make_bag(path, [plain()], [[(0, 1, b"one"), (0, 2, b"two")]]).read_bytes()
+    for index in (len(two), 50):
+        path.write_bytes(bag_header(index, 0, 0) + two[4109:])
+        refuse(path, "its index does not list what it holds at byte 4109")
+    # the second message is in no index, and all of the index agrees on that
+    entry = two.index(stamp(2), two.index(b"\4\0\0\0op=\4"))
+    short = two[:entry] + two[entry + 12 :]
+    short = short.replace(number(24) + stamp(1), number(12) + stamp(1))
+    short = short.replace(b"count=\2", b"count=\1").replace(
+        number(0) + number(2), number(0) + number(1)
+    )
+    (index,) = struct.unpack_from("<Q", two, two.index(b"index_pos=") + 10)
+    path.write_bytes(bag_header(index - 12, 1, 1) + short[4109:])
+    refuse(path, "its index lists 1 messages of 2")
+    end = two[two.index(b"\4\0\0\0op=\6") - 4 :]
+    path.write_bytes(bag_header(index, 1, 2) + two[4109:] + end)
+    refuse(path, "its index lists a chunk twice")
+
+
+def test_a_time_that_ros_does_not_have_is_refused(tmp_path: Path) -> None:
+    late = 77 * 10**9 + 7
+    path = make_bag(tmp_path / "a.bag", [plain()], [[(0, 1, b"one"), (0, late, b"two")]])
+    path.write_bytes(path.read_bytes().replace(stamp(late), b"\xff" * 8))
+    refuse(path, "a time past 2^32 seconds")
+    with open_sources([path], salvage=True) as reader:
+        assert [bytes(record.data) for record in reader.records()] == [b"one"]
+        assert [loss.messages for loss in reader.losses] == [1]
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ headers stay as recorded, the index is kept in arrays, chunks unpack to their de
 
 from __future__ import annotations
 
+import os
 from array import array
 from collections import OrderedDict, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -38,8 +39,10 @@ from mp4ds.bags.ros1_records import (
     COPY_AGAIN,
     DAMAGE,
     MAGIC,
+    MAX_TIME,
     UINT32,
     check_bag,
+    count_messages,
     make_channel,
     payload,
     reason,
@@ -185,6 +188,9 @@ class Ros1Reader:
         self._bag.file.seek(chunk.datapos)
         packed = read_bytes(self._bag.file, chunk.datasize)
         unpacked = memoryview(chunk.decompressor(packed))
+        listed = sum(self._bag.chunk_infos[number].connection_counts.values())
+        if (found := count_messages(unpacked)) != listed:
+            raise ReaderError(f"its index lists {listed} messages of {found}")
         size = len(unpacked) + sum(map(len, self._chunks.values()))
         while len(self._chunks) > 1 and (len(self._chunks) >= CACHED_CHUNKS or size > CACHED_BYTES):
             size -= len(self._chunks.popitem(last=False)[1])
@@ -240,6 +246,7 @@ class _Bag(Reader):
         super().__init__(path)
         self.channels: dict[int, Channel] = {}
         self._index_start = self._index_end = 0
+        self._chunk_ends: dict[int, int] = {}  # by where they begin, with their index records
         # By connection: raw index entries; number of a chunk and of its entries, alternating.
         self._index_entries: defaultdict[int, bytearray] = defaultdict(bytearray)
         self._index_runs: defaultdict[int, array[int]] = defaultdict(partial(array, "I"))
@@ -267,6 +274,28 @@ class _Bag(Reader):
             self._index_end = self.file.tell()
         if self._goes_on():
             raise ReaderError("its header counts fewer chunks than its index lists")
+        self._check_unlisted()
+
+    def _check_unlisted(self) -> None:
+        """Refuse messages that the index does not list: they would be lost without a word."""
+        if len(self.chunks) < len(self.chunk_infos):
+            raise ReaderError("its index lists a chunk twice")
+        self.file.seek(len(MAGIC))
+        header = Header.read(self.file, RecordType.BAGHEADER)
+        place = read_uint32(self.file) + self.file.tell()
+        for start in sorted(self._chunk_ends):
+            self._check_between(place, start)
+            place = self._chunk_ends[start]
+        # a bag without chunks is read to its end: nothing else tells where its index is
+        end = header.get_uint64("index_pos") if self.chunks else self.file.seek(0, os.SEEK_END)
+        self._check_between(place, end)
+
+    def _check_between(self, place: int, end: int) -> None:
+        while place < end:
+            self.file.seek(place)
+            if Header.read(self.file).get_uint8("op") in (RecordType.CHUNK, RecordType.MSGDATA):
+                raise ReaderError(f"its index does not list what it holds at byte {place}")
+            place = read_uint32(self.file) + self.file.tell()
 
     def _goes_on(self) -> bool:
         """Whether a record follows the last one of the index that was read."""
@@ -331,6 +360,7 @@ class _Bag(Reader):
         unpack = partial(unpack_chunk, header.get_string("compression"), header.get_uint32("size"))
         size = read_uint32(self.file)
         start = self.file.tell()
+        self._chunk_ends[self.chunk_infos[len(self.chunks)].pos] = start + size
         self.file.seek(start + size)
         return Chunk(size, start, unpack)
 
@@ -350,6 +380,7 @@ class _Bag(Reader):
             or number not in self.channels
         ):
             raise ReaderError(f"the index of the chunk at byte {pos} contradicts that of the bag")
+        self._chunk_ends[pos] = self.file.tell()
         self._index_entries[number] += entries
         self._index_runs[number].extend((chunk, count))
 
@@ -362,5 +393,7 @@ class _Bag(Reader):
         runs = np.array(self._index_runs.pop(number, []), np.int64).reshape(-1, 2)
         chunks = np.repeat(runs[:, 0].astype(np.int32), runs[:, 1])
         times = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
+        if times.max(initial=0) >= MAX_TIME:
+            raise ReaderError("it has a message of a time past 2^32 seconds, which is none of ROS")
         order = np.lexsort((entries["offset"], chunks, times))
         return _Index(times[order], chunks[order], entries["offset"][order])

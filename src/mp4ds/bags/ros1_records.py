@@ -19,6 +19,8 @@ from mp4ds.errors import SourceError
 from mp4ds.records import Channel, Schema
 
 MAGIC = b"#ROSBAG V2.0\n"
+MAX_TIME = 2**32 * 10**9
+"""A ROS 1 time is two uint32, seconds and nanoseconds: from here on there are no times."""
 UINT32 = struct.Struct("<I")
 COPY_AGAIN = f"Copy it again, or repair it with `rosbag reindex`; {SALVAGE_REMEDY}"
 DAMAGE = (
@@ -35,6 +37,7 @@ DAMAGE = (
 """What reading a damaged bag raises: rosbags checks some of its input by assertions."""
 
 _TIME = struct.Struct("<II")
+_MESSAGE_OP = UINT32.pack(4) + b"op=" + bytes([RecordType.MSGDATA])
 _BASE64 = ";base64"  # marks a connection header field that is not UTF-8, as metadata must be
 
 
@@ -157,6 +160,22 @@ def payload(chunk: memoryview, offset: int, number: int, time: int) -> memoryvie
     if start + length > len(chunk):
         raise ReaderError("a message is longer than its chunk")
     return chunk[start : start + length]
+
+
+def count_messages(chunk: memoryview) -> int:
+    """How many messages an unpacked chunk holds, whatever the index says.
+
+    Raises:
+        struct.error: It ends within a record.
+    """
+    count = offset = 0
+    while offset < len(chunk):
+        (size,) = UINT32.unpack_from(chunk, offset)
+        offset += 4 + size
+        count += _MESSAGE_OP in bytes(chunk[offset - size : offset])
+        (length,) = UINT32.unpack_from(chunk, offset)
+        offset += 4 + length
+    return count
 
 
 def unpack_chunk(compression: str, size: int, data: bytes) -> bytes:

@@ -20,16 +20,45 @@ from rosbags.rosbag1 import Writer
 from rosbags.rosbag1.reader import RecordType
 from rosbags.rosbag1.writer import WriteChunk
 
-from mp4ds.bags.ros1_records import UINT32, join_header, make_header
+from mp4ds.bags.ros1_records import MAX_TIME, UINT32, join_header, make_header
 from mp4ds.errors import ConversionError, OptionError, TargetExistsError
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
-
-MAX_TIME = 2**32 * 10**9
-"""A ROS 1 time is two uint32, seconds and nanoseconds: from here on there are no times."""
 
 _MAX_PAYLOAD = 2**32 - 2**24  # lengths are uint32; leaves room for the rest of the chunk
 _CHUNK_BYTES = 2**20
 _MESSAGE_HEAD = struct.Struct("<II3sBI5sII5sIII")  # op, conn, time, and the payload's length
+
+
+def check_channel(channel: Channel) -> None:
+    """Refuse a channel that a bag cannot hold.
+
+    Raises:
+        ConversionError: It is not of ROS 1.
+    """
+    if channel.message_encoding != "ros1":
+        raise ConversionError(
+            channel.topic,
+            f"its messages are {channel.message_encoding or 'of no known encoding'}, "
+            "and a ROS 1 bag holds only those of ROS 1",
+            "Exclude the topic with --exclude, or unpack to mcap, which keeps it as it is.",
+        )
+
+
+def check_message(message: Message) -> None:
+    """Refuse a message that a bag cannot hold.
+
+    Raises:
+        ConversionError: It is too long, or of a time that ROS 1 does not have.
+    """
+    topic = message.channel.topic
+    if not 0 <= message.log_time < MAX_TIME:
+        raise ConversionError(
+            topic,
+            f"has a log time of {message.log_time} ns, and ROS 1 can hold 0 to 2^32 seconds",
+            "Unpack to mcap, which keeps it as it is.",
+        )
+    if len(message.data) > _MAX_PAYLOAD:
+        raise ConversionError(topic, "has a message of more bytes than a ROS 1 bag can hold")
 
 
 class Ros1Writer:
@@ -68,13 +97,7 @@ class Ros1Writer:
 
     def add_channel(self, channel: Channel) -> None:
         """Declare a channel. See `BagWriter.add_channel`."""
-        if channel.message_encoding != "ros1":
-            raise ConversionError(
-                channel.topic,
-                f"its messages are {channel.message_encoding or 'of no known encoding'}, "
-                "and a ROS 1 bag holds only those of ROS 1",
-                "Exclude the topic with --exclude, or unpack to mcap, which keeps it as it is.",
-            )
+        check_channel(channel)
         if channel.id not in self._numbers:
             self._numbers[channel.id] = self._bag.declare(*make_header(channel))
 
@@ -84,15 +107,7 @@ class Ros1Writer:
 
     def write(self, message: Message) -> None:
         """Append a message, payload verbatim."""
-        topic = message.channel.topic
-        if not 0 <= message.log_time < MAX_TIME:
-            raise ConversionError(
-                topic,
-                f"has a log time of {message.log_time} ns, and ROS 1 can hold 0 to 2^32 seconds",
-                "Unpack to mcap, which keeps it as it is.",
-            )
-        if len(message.data) > _MAX_PAYLOAD:
-            raise ConversionError(topic, "has a message of more bytes than a ROS 1 bag can hold")
+        check_message(message)
         if message.publish_time != message.log_time:
             self._omitted["publish times that differ from the log time"] += 1
         if message.sequence:

@@ -14,7 +14,15 @@ from mp4ds.bags.mcap_records import open_source
 from mp4ds.bags.ordering import HOLD_BYTES, HoldBack
 from mp4ds.bags.protocols import BagReader, Format
 from mp4ds.bags.ros1 import Ros1Reader
-from mp4ds.bags.ros1_records import DAMAGE, MAGIC, UINT32, make_channel, other_format, split_header
+from mp4ds.bags.ros1_records import (
+    DAMAGE,
+    MAGIC,
+    MAX_TIME,
+    UINT32,
+    make_channel,
+    other_format,
+    split_header,
+)
 from mp4ds.bags.salvage.losses import LossLog
 from mp4ds.bags.salvage.reader import FileSalvage
 from mp4ds.bags.salvage.ros1_framing import Ros1Framing, number, time
@@ -175,6 +183,9 @@ class _Pass:
         """A message; None where it is lost."""
         connection, log_time = number(frame.fields[b"conn"]), time(frame.fields[b"time"])
         channel = self._channels.get(connection)
+        if log_time >= MAX_TIME:
+            self._lose(offset, frame.size, "a message has a time past 2^32 seconds, none of ROS")
+            return None
         if channel is None:
             self._tally.stray(connection, log_time)
             problem = f"messages of connection {connection}, of which no record tells"
