@@ -222,6 +222,8 @@ def messages_by_channel(path):
     if not data.startswith(magic) or not data.endswith(magic):
         raise RefusedError("messages-unreadable", path)
     (at,) = struct.unpack_from("<Q", data, len(data) - 8 - 20)
+    if not at:
+        raise RefusedError("messages-unreadable", path)
     schemas, channels, counts, others = {}, {}, {}, (0, 0)
 
     def take(record, place):

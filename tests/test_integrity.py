@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import random
 import shutil
+import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -36,6 +37,7 @@ CHANGED_FILE = {"size-mismatch", "hash-mismatch"}
 
 compare = load_tool("compare").compare
 Document = dict[str, Any]
+MakePacked = Callable[[str], tuple[list[Path], Path]]
 
 
 @pytest.fixture(scope="module")
@@ -472,6 +474,65 @@ def test_messages_of_another_dataset(
 
 
 # ---------------------------------------------------------------- contradictions
+
+
+def test_messages_that_lost_their_index(dataset: Path) -> None:
+    path = dataset / "messages.mcap"
+    data = path.read_bytes()
+    (summary,) = struct.unpack_from("<Q", data, len(data) - 28)
+    path.write_bytes(data[:summary] + struct.pack("<BQQQI", 2, 20, 0, 0, 0) + data[:8])
+    agreed(dataset)
+    for deep in (False, True):
+        assert codes(dataset, deep=deep) == ["messages-unreadable"]
+    assert "has no index" in refused(dataset, "bag")
+
+
+@pytest.mark.parametrize(
+    ("source", "column", "value"),
+    [
+        ("bag-none", "log_time", 2**32 * 10**9),
+        ("rosbag2-sqlite3-v9", "log_time", -1),
+        ("mcap-ros2-zstd", "publish_time", -1),
+        ("mcap-ros2-zstd", "sequence", 2**32),
+    ],
+)
+def test_what_the_format_of_the_recording_cannot_hold(
+    source: str, column: str, value: int, packed: MakePacked, tmp_path: Path
+) -> None:
+    dataset = Path(shutil.copytree(packed(source)[1], tmp_path / "dataset"))
+
+    def change(document: Document) -> None:
+        values = document["columns"]
+        values[column] = dict(values.get(column, values["log_time"])) | {"start": value}
+
+    changed(dataset / f"{STEM}.yaml", change)
+    agreed(dataset)
+    for deep in (False, True):
+        assert codes(dataset, deep=deep) == ["message-invalid"]
+    refused(dataset, TARGETS[source])
+
+
+def test_deep_finds_all_that_plain_does(dataset: Path) -> None:
+    path = dataset / "messages.mcap"
+    path.write_bytes(bytes(path.stat().st_size))
+    assert codes(dataset, deep=False) == ["messages-unreadable"]
+    assert codes(dataset) == ["hash-mismatch", "messages-unreadable"]
+
+
+def test_an_index_that_tells_of_other_messages(dataset: Path) -> None:
+    path = dataset / "messages.mcap"
+    data = bytearray(path.read_bytes())
+    (at,) = struct.unpack_from("<Q", data, len(data) - 28)
+    while data[at] != 11:  # the statistics
+        at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
+    size = struct.unpack_from("<I", data, at + 9 + 42)[0]
+    for place, step in zip((at + 9 + 48, at + 9 + 58), (1, -1), strict=True):
+        (count,) = struct.unpack_from("<Q", data, place)
+        struct.pack_into("<Q", data, place, count + step)
+    assert size >= 20
+    path.write_bytes(data)
+    agreed(dataset)
+    assert codes(dataset) == ["messages-unreadable"]
 
 
 @pytest.mark.parametrize("frames", [7, 9])

@@ -148,8 +148,7 @@ def _broken(folder: Path) -> Iterator[Case]:
     with tempfile.TemporaryDirectory() as place:
         good = Path(place) / "good"
         _pack("changing", good)
-        manifest = yamlio.load((good / MANIFEST_NAME).read_bytes(), "")
-        for name, case in broken(manifest).items():
+        for name, case in broken(good).items():
             target = folder / "broken" / name
             shutil.copytree(good, target)
             document = yamlio.load((good / MANIFEST_NAME).read_bytes(), "")

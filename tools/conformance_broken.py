@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from conformance_files import Document, both, replacing, setting, without
@@ -23,15 +25,15 @@ class DatasetCase:
         shows: What is wrong, in words.
         codes: Of its problems.
         edit: Changes the manifest.
-        write: The manifest's bytes.
         files: Files that are added or replaced; None: removed.
+        write: The manifest's bytes.
     """
 
     shows: str
     codes: tuple[str, ...]
     edit: Edit = lambda document: None
-    write: Callable[[Document], bytes] = lambda document: yamlio.dump(document)
     files: Mapping[str, bytes | None] = field(default_factory=dict)
+    write: Callable[[Document], bytes] = lambda document: yamlio.dump(document)
 
 
 def _entry(name: str, **values: Any) -> Edit:
@@ -50,13 +52,27 @@ def _unlisted(name: str) -> Edit:
     return edit
 
 
-def broken(manifest: Document) -> dict[str, DatasetCase]:
+def _replaced(name: str, data: bytes) -> tuple[Edit, dict[str, bytes | None]]:
+    """Another file, of which the manifest knows."""
+    return _entry(name, size=len(data), sha256=hashlib.sha256(data).hexdigest()), {name: data}
+
+
+def _without_index(data: bytes) -> bytes:
+    """An MCAP file that ends behind its data."""
+    footer = struct.pack("<BQQQI", 2, 20, 0, 0, 0) + data[:8]
+    return data[: struct.unpack_from("<Q", data, len(data) - 28)[0]] + footer
+
+
+def broken(good: Path) -> dict[str, DatasetCase]:
     """All of them.
 
     Args:
-        manifest: Of the good dataset, a topic of which has two streams.
+        good: The good dataset, a topic of which has two streams.
     """
+    manifest = yamlio.load((good / "dataset.yaml").read_bytes(), "")
     first, second = manifest["streams"][:2]
+    early = yamlio.load((good / first["sidecar"]).read_bytes(), "")
+    early["columns"]["log_time"]["start"] = -1
     stream_lost = both(
         lambda document: document["streams"].remove(document["streams"][1]),
         _unlisted(second["sidecar"]),
@@ -109,6 +125,16 @@ def broken(manifest: Document) -> dict[str, DatasetCase]:
             ("messages-unreadable",),
             _entry(MESSAGES, size=len(_GARBAGE), sha256=hashlib.sha256(_GARBAGE).hexdigest()),
             files={MESSAGES: _GARBAGE},
+        ),
+        "messages-without-index": DatasetCase(
+            "messages.mcap has lost its index",
+            ("messages-unreadable",),
+            *_replaced(MESSAGES, _without_index((good / MESSAGES).read_bytes())),
+        ),
+        "message-invalid": DatasetCase(
+            "a log time that MCAP, the recording's format, cannot hold",
+            ("message-invalid",),
+            *_replaced(first["sidecar"], yamlio.dump(early)),
         ),
         "message-count": DatasetCase(
             "more messages than there are",

@@ -42,7 +42,7 @@ PARTS = {
     "dataset": ("messages-missing", "messages-unreadable"),
     "integrity": (
         *("size-mismatch", "hash-mismatch", "file-unlisted", "message-count"),
-        "scores-invalid",
+        *("scores-invalid", "message-invalid"),
     ),
 }
 """What an implementation may claim -> the problem codes that it then tells."""

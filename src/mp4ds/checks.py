@@ -8,18 +8,21 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
 from pydantic import ValidationError
 
+from mp4ds.bags import limits_of
 from mp4ds.dataset import Dataset, Stream
-from mp4ds.errors import FormatError, SourceError, SourceNotFoundError
+from mp4ds.errors import ConversionError, FormatError, SourceError, SourceNotFoundError
 from mp4ds.outputs import digest_file
-from mp4ds.records import Message
+from mp4ds.recorded import recorded_storage
+from mp4ds.records import Message, Record
 from mp4ds.remote import location
 from mp4ds.sidecar import (
     MANIFEST_NAME,
@@ -31,6 +34,8 @@ from mp4ds.sidecar import (
 )
 from mp4ds.sidecar.io import model_for, model_problems
 from mp4ds.streams.facts import wrong_facts
+
+_Checked = TypeVar("_Checked")
 
 
 @dataclass(frozen=True)
@@ -68,8 +73,14 @@ def validate(
         SourceNotFoundError: There is nothing at the path.
         SourceError: It is nothing that can be validated.
     """
-    path = location(path)
     report = progress or (lambda _: None)
+    found = _problems(location(path), False, report)
+    if deep:  # whatever the one way finds, so does the other, though it may be led elsewhere
+        found = [*_problems(location(path), True, report), *found]
+    return list(dict.fromkeys(found))
+
+
+def _problems(path: Path, deep: bool, report: Callable[[str], None]) -> list[Problem]:
     if not path.exists():
         raise SourceNotFoundError(path)
     if path.name == MANIFEST_NAME:
@@ -284,35 +295,92 @@ def _check_frames(stream: Stream, report: Callable[[str], None]) -> Iterator[Pro
 def _check_messages(
     folder: Path, manifest: Manifest, deep: bool, report: Callable[[str], None]
 ) -> list[Problem]:
-    """messages.mcap can be read, and all messages together are as many as were packed."""
+    """All messages together are as many as were packed, and can be unpacked again."""
     place = str(folder / MESSAGES_NAME)
     try:
         with Dataset(folder) as dataset:
-            in_videos = sum(_modelled(stream) for stream in dataset.streams)
             gaps = [Problem("messages-missing", topic, what) for topic, what in dataset.gaps()]
             if gaps:
                 return gaps
-            counted = dataset.recorded_count
+            total = sum(map(_modelled, dataset.streams)) + sum(dataset.recorded_counts.values())
+            if total != manifest.messages:
+                problem = f"and the videos hold {total} messages where the manifest says "
+                return [Problem("message-count", place, f"{problem}{manifest.messages}")]
+            records: Iterable[Record] = ()
             if deep:
                 report(f"reading {MESSAGES_NAME}")
-                counts = Counter(
-                    isinstance(record, Message) for record in dataset.recorded_records()
-                )
-                counted = counts[True]
+                records = _counted(dataset, place)
+            return list(_check_limits(dataset, manifest, records, place))
     except FormatError as error:
         return [Problem(error.code, error.place, error.problem)]
     except SourceError as error:
         return [Problem("messages-unreadable", place, str(error))]
-    total = in_videos + counted
-    if total != manifest.messages:
-        return [
-            Problem(
-                "message-count",
-                place,
-                f"and the videos hold {total} messages where the manifest says {manifest.messages}",
-            )
-        ]
-    return []
+
+
+def _counted(dataset: Dataset, place: str) -> Iterator[Record]:
+    """All of messages.mcap, of which the index must have told just that.
+
+    Raises:
+        FormatError: ``messages-unreadable``: another number of messages of a channel.
+    """
+    counts = Counter[int]()
+    for record in dataset.recorded_records():
+        if isinstance(record, Message):
+            counts[record.channel.id] += 1
+        yield record
+    told = dataset.recorded_counts
+    for key in counts.keys() | told.keys():
+        if counts[key] != told.get(key, 0):
+            problem = f"holds {counts[key]} messages of channel {key}, its index tells of "
+            raise FormatError("messages-unreadable", place, f"{problem}{told.get(key, 0)}")
+
+
+def _check_limits(
+    dataset: Dataset, manifest: Manifest, records: Iterable[Record], place: str
+) -> Iterator[Problem]:
+    """The format that the recording had can hold each channel and message, as unpacking wants.
+
+    Args:
+        dataset: The dataset.
+        manifest: Its manifest.
+        records: What is looked at of messages.mcap.
+        place: Its name.
+    """
+    storage = ""
+    if manifest.format == "rosbag2":
+        storage = recorded_storage(dataset.recorded_records())
+    check_channel, check_message = limits_of(manifest.format, storage)
+
+    def refusal(check: Callable[[_Checked], None], item: _Checked, place: str) -> list[Problem]:
+        try:
+            check(item)
+        except ConversionError as error:
+            return [Problem("message-invalid", place, str(error))]
+        return []
+
+    for channel in dataset.channels:
+        yield from refusal(check_channel, channel, channel.topic)
+    for stream in dataset.streams:
+        for message in _extremes(stream):
+            yield from refusal(check_message, message, str(stream.path))
+    refused: list[Problem] = []
+    for record in records:  # to the end: they are counted
+        if isinstance(record, Message) and not refused:
+            refused = refusal(check_message, record, place)
+    yield from refused
+
+
+def _extremes(stream: Stream) -> Iterator[Message]:
+    """Messages of the least and of the greatest times and numbers that a sidecar has."""
+    parts = [(stream.sidecar.channel, stream.rebuilder.columns)]
+    info, columns = stream.sidecar.camera_info, stream.camera_info_columns
+    if info and columns:
+        parts.append((info.channel, columns))
+    for model, part in parts:
+        values = part.log_time, part.publish_time, part.sequence
+        for end in (np.min, np.max):
+            log_time, publish_time, sequence = (int(end(column)) for column in values)
+            yield Message(model.to_record(0), log_time, publish_time, sequence, b"")
 
 
 def _modelled(stream: Stream) -> int:

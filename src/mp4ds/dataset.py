@@ -144,9 +144,9 @@ class Dataset:
         return self._file.unused_schemas
 
     @property
-    def recorded_count(self) -> int:
-        """Messages in messages.mcap as far as its index tells."""
-        return sum(self._file.counts().values())
+    def recorded_counts(self) -> dict[int, int]:
+        """Messages in messages.mcap by channel id, as its index tells."""
+        return self._file.counts()
 
     def verify_messages(self) -> None:
         """Compare messages.mcap with its SHA-256: not all that it holds has a checksum of its own.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mp4ds.bags.mcap import McapReader
 from mp4ds.errors import FormatError, SourceError
 from mp4ds.outputs import digest_file
-from mp4ds.records import Channel, Excerpt, Message, Record, Schema
+from mp4ds.records import Channel, Excerpt, Message, MetadataRecord, Record, Schema
 from mp4ds.sidecar import MESSAGES_NAME, Manifest
 from mp4ds.wire import WireError
 
@@ -50,32 +50,39 @@ class MessagesFile:
             raise FormatError("file-missing", path, "does not exist")
 
     @cached_property
-    def channels(self) -> list[Channel]:
-        """Its channels.
+    def _index(self) -> tuple[list[Channel], list[Schema], dict[int, int]]:
+        """Its channels, definitions that none refers to, and messages by channel id.
 
         Raises:
-            FormatError: ``file-missing``.
+            FormatError: ``file-missing``; ``messages-unreadable`` where it does not list them all.
+            SourceError: It is damaged, or no MCAP file.
         """
         if self.path is None:
-            return []
+            return [], [], {}
         self._check_there(self.path)
         with McapReader(self.path) as reader:
-            return list(reader.channels)
+            if not reader.has_whole_index:
+                raise FormatError(
+                    "messages-unreadable",
+                    self.path,
+                    "has no index of all that it holds; copy it again, or see `mcap recover`",
+                )
+            counts = {key: item.count for key, item in reader.stats().items()}
+            return list(reader.channels), list(reader.unused_schemas), counts
 
-    @cached_property
+    @property
+    def channels(self) -> list[Channel]:
+        """Its channels."""
+        return self._index[0]
+
+    @property
     def unused_schemas(self) -> list[Schema]:
         """Definitions that no channel refers to."""
-        if self.path is None:
-            return []
-        with McapReader(self.path) as reader:
-            return list(reader.unused_schemas)
+        return self._index[1]
 
     def counts(self) -> dict[int, int]:
-        """Messages by channel id, as far as its index tells."""
-        if self.path is None:
-            return {}
-        with McapReader(self.path) as reader:
-            return {key: item.count for key, item in reader.stats().items()}
+        """Messages by channel id, as its index tells."""
+        return self._index[2]
 
     def times(self) -> Mapping[int, NDArray[np.int64]]:
         """Sorted log times, nanoseconds, by channel id."""
@@ -97,6 +104,20 @@ class MessagesFile:
                 for record in reader.records(replace(excerpt, others=False)):
                     if isinstance(record, Message):
                         yield record
+
+
+def recorded_storage(records: Iterable[Record]) -> str:
+    """The storage that a rosbag2 source had; mcap, the default of ROS 2, where none is told.
+
+    Args:
+        records: All that is in messages.mcap; the folder's own record stands before its messages.
+    """
+    for record in records:
+        if isinstance(record, Message):
+            break
+        if isinstance(record, MetadataRecord) and record.name == "mp4ds:rosbag2":
+            return "sqlite3" if record.metadata.get("storage") == "sqlite3" else "mcap"
+    return "mcap"
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ The only package that imports rosbags and mcap.
 
 from __future__ import annotations
 
-from mp4ds.bags.formats import open_reader, open_sources, open_writer
+from mp4ds.bags.formats import limits_of, open_reader, open_sources, open_writer
 from mp4ds.bags.hashing import SourceHasher
 from mp4ds.bags.protocols import BagReader, BagWriter
 
@@ -13,6 +13,7 @@ __all__ = [
     "BagReader",
     "BagWriter",
     "SourceHasher",
+    "limits_of",
     "open_reader",
     "open_sources",
     "open_writer",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal, overload
 from mp4ds.bags.multi import MultiReader
 from mp4ds.bags.protocols import BagReader, BagWriter
 from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
+from mp4ds.records import Channel, Message
 from mp4ds.remote import remote
 
 if TYPE_CHECKING:
@@ -154,6 +155,28 @@ def _open_salvaged(paths: Sequence[Path]) -> SalvageReader:
     from mp4ds.bags.salvage.multi import MultiSalvage
 
     return MultiSalvage(openers)
+
+
+def limits_of(
+    target: str, storage: str
+) -> tuple[Callable[[Channel], None], Callable[[Message], None]]:
+    """What refuses channels, and what messages, that a format cannot hold, as its writer does.
+
+    Args:
+        target: ``bag``, ``rosbag2`` or ``mcap``.
+        storage: ``sqlite3`` or ``mcap``, for ``rosbag2``.
+    """
+    if target == "bag":
+        from mp4ds.bags import ros1_write
+
+        return ros1_write.check_channel, ros1_write.check_message
+    if target == "rosbag2" and storage == "sqlite3":
+        from mp4ds.bags import rosbag2_sqlite_write
+
+        return rosbag2_sqlite_write.check_channel, rosbag2_sqlite_write.check_message
+    from mp4ds.bags.mcap_write import check_message
+
+    return lambda _: None, check_message
 
 
 def open_writer(

@@ -164,13 +164,26 @@ class McapReader:
     def _between(self) -> Between | None:
         """What stands between the chunks, where excerpts can be read from these alone."""
         summary = self._summary
-        if summary is None or self._in_file_order or not summary.is_consistent:
+        if summary is None or self._in_file_order:
             return None
         if summary.chunks.held_in_time_order() > ordering.HOLD_BYTES:
+            return None
+        return self._found_between
+
+    @cached_property
+    def _found_between(self) -> Between | None:
+        """What stands between the chunks, where all fits together; None else."""
+        summary = self._summary
+        if summary is None or not summary.is_consistent:
             return None
         with closing(self._start_pass()) as stream:
             found = look_between(stream, summary)
         return found if found.is_sound else None
+
+    @property
+    def has_whole_index(self) -> bool:
+        """Whether the summary lists all channels, schemas and chunks, and how many messages."""
+        return self._found_between is not None
 
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """Read everything once, or a part of it. See `BagReader.records`."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -23,6 +22,19 @@ _COMPRESSIONS = {
     "lz4": CompressionType.LZ4,
     "none": CompressionType.NONE,
 }
+
+
+def check_message(message: Message) -> None:
+    """Refuse a message that MCAP cannot hold.
+
+    Raises:
+        ConversionError: A time is negative or beyond 64 bits, or the sequence number beyond 32.
+    """
+    times = message.log_time, message.publish_time
+    if not (min(times) >= 0 and max(times) < 2**64 and 0 <= message.sequence < 2**32):
+        raise ConversionError(
+            message.channel.topic, "has a time or sequence number that MCAP cannot hold"
+        )
 
 
 class McapWriter:
@@ -101,18 +113,14 @@ class McapWriter:
 
     def write(self, message: Message) -> None:
         """Append a message, payload verbatim."""
-        try:
-            self._writer.add_message(
-                self._channel_ids[message.channel.id],
-                message.log_time,
-                message.data,
-                message.publish_time,
-                message.sequence,
-            )
-        except struct.error:
-            raise ConversionError(
-                message.channel.topic, "has a time or sequence number that MCAP cannot hold"
-            ) from None
+        check_message(message)
+        self._writer.add_message(
+            self._channel_ids[message.channel.id],
+            message.log_time,
+            message.data,
+            message.publish_time,
+            message.sequence,
+        )
 
     def add_attachment(self, attachment: Attachment) -> None:
         """Append an attachment."""

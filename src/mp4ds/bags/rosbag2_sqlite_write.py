@@ -44,6 +44,39 @@ CREATE TABLE message_definitions(
 """
 
 
+def check_channel(channel: Channel) -> None:
+    """Refuse a channel that the tables cannot hold.
+
+    Raises:
+        ConversionError: It has no schema.
+    """
+    _schema_of(channel)
+
+
+def _schema_of(channel: Channel) -> Schema:
+    if channel.schema is None:
+        raise ConversionError(
+            channel.topic,
+            "has no schema, and rosbag2 wants the type of every topic",
+            "Unpack to mcap instead.",
+        )
+    return channel.schema
+
+
+def check_message(message: Message) -> None:
+    """Refuse a message that the tables cannot hold.
+
+    Raises:
+        ConversionError: Its log time is negative or beyond 63 bits.
+    """
+    if not 0 <= message.log_time <= _MAX_TIME:
+        raise ConversionError(
+            message.channel.topic,
+            f"has the log time {message.log_time}, which rosbag2 cannot hold",
+            "Unpack to mcap instead.",
+        )
+
+
 class SqliteWriter:
     """Writes one ``.db3`` file.
 
@@ -92,14 +125,9 @@ class SqliteWriter:
 
     def add_channel(self, channel: Channel) -> None:
         """Add a topic; channels that its row cannot tell apart share one."""
-        if channel.schema is None:
-            raise ConversionError(
-                channel.topic,
-                "has no schema, and rosbag2 wants the type of every topic",
-                "Unpack to mcap instead.",
-            )
+        schema = _schema_of(channel)
         qos, type_hash = channel.metadata.get(QOS_KEY, ""), channel.metadata.get(HASH_KEY, "")
-        self._add_definition(channel.schema, type_hash)
+        self._add_definition(schema, type_hash)
         self._keys |= channel.metadata.keys()
         others = len(channel.metadata.keys() - {QOS_KEY, HASH_KEY})
         if others:
@@ -121,12 +149,7 @@ class SqliteWriter:
 
     def write(self, message: Message) -> None:
         """Append a message, payload verbatim."""
-        if not 0 <= message.log_time <= _MAX_TIME:
-            raise ConversionError(
-                message.channel.topic,
-                f"has the log time {message.log_time}, which rosbag2 cannot hold",
-                "Unpack to mcap instead.",
-            )
+        check_message(message)
         if message.publish_time != message.log_time:
             self._left_out["publish times (sqlite3 storage keeps one time)"] += 1
         if message.sequence:

@@ -15,6 +15,7 @@ from mp4ds.dataset import Dataset, Stream
 from mp4ds.errors import FormatError, OptionError, WriteError
 from mp4ds.outputs import digest_file, staged
 from mp4ds.plan import FileNames, Selection
+from mp4ds.recorded import recorded_storage
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord
 from mp4ds.remote import RemotePath, location, remote
 from mp4ds.republish import KINDS, Reduction, Republished, Republisher, check_kind
@@ -181,13 +182,16 @@ def _unpack_recording(
     republisher = _republisher(dataset, to, options, selected)
     summary = UnpackSummary(target)
     total = dataset.manifest.messages if dataset.manifest else 0
+    storage = ""
+    if to == "rosbag2":
+        storage = options.storage or recorded_storage(dataset.recorded_records())
     with open_writer(
         path,
         to,
         name=target.name,
         profile=dataset.profile,
         library=dataset.manifest.library if dataset.manifest else "",
-        storage=(options.storage or _recorded_storage(dataset)) if to == "rosbag2" else "",
+        storage=storage,
     ) as writer:
         topics = _Topics(writer, converter, selected, summary)
         topics.declare(dataset, republisher)
@@ -304,16 +308,6 @@ def _write_other(
     ours = source == "rosbag2" and record.name.startswith(_OURS)
     if not ours or to == "rosbag2":
         writer.add_metadata(record)
-
-
-def _recorded_storage(dataset: Dataset) -> str:
-    """The storage that a rosbag2 source had; mcap, the default of ROS 2, for all others."""
-    for record in dataset.recorded_records():
-        if isinstance(record, MetadataRecord) and record.name == f"{_OURS}rosbag2":
-            return record.metadata.get("storage") or "mcap"
-        if isinstance(record, Message):
-            break  # a rosbag2 folder's own record comes before its messages
-    return "mcap"
 
 
 def _unpack_images(
