@@ -18,7 +18,7 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -590,7 +590,7 @@ def test_pack_never_replaces_what_it_did_not_make(
         target.symlink_to("elsewhere")
     with unchanged(tmp_path):
         result = call("pack", small_bag, "-o", target, "--force")
-        refused(result, 2, str(target), "--force does not replace it")
+        refused(result, 2, str(target), "--force does not replace")
 
 
 @pytest.mark.parametrize("to", ["bag", "mcap", "rosbag2", "images"])
@@ -789,16 +789,19 @@ def long_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def interrupted(folder: Path, *arguments: object) -> Result:
-    """A command that gets SIGINT as soon as it has begun to write."""
-    process = start(*arguments)
+def interrupted(
+    folder: Path, *arguments: object, numbers: Sequence[int] = (signal.SIGINT,), **options: Any
+) -> Result:
+    """A command that gets SIGINT, or other signals, as soon as it has begun to write."""
+    process = start(*arguments, **options)
     end = time.monotonic() + 30
     while not list(folder.glob(".*.part/*")):
         if process.poll() is not None or time.monotonic() > end:
             process.kill()
             pytest.fail(f"it did not begin: {process.communicate()}")
         time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
+    for number in numbers:
+        process.send_signal(number)
     out, err = process.communicate(timeout=30)
     return Result(process.returncode, out, err)
 
@@ -821,6 +824,28 @@ def test_interrupting_a_pack_leaves_what_was_there(
         assert result.code == 130
         assert "Traceback" not in result.err
         assert parsed(result)["exit_code"] == 130
+
+
+@pytest.mark.parametrize(
+    ("numbers", "is_ignored", "code"),
+    [
+        ([signal.SIGTERM], False, 143),
+        ([signal.SIGHUP], False, 129),
+        ([signal.SIGHUP] * 3, False, 129),
+        ([signal.SIGHUP, signal.SIGTERM], True, 143),
+    ],
+    ids=["SIGTERM", "SIGHUP", "SIGHUP thrice", "nohup"],
+)
+def test_a_lost_terminal_leaves_nothing(
+    numbers: list[int], is_ignored: bool, code: int, long_demo: Path, tmp_path: Path
+) -> None:
+    def ignore() -> None:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+    with unchanged(tmp_path):
+        arguments = ("pack", long_demo, "-o", tmp_path / "x", *SLOW)
+        options = {"numbers": numbers, "preexec_fn": ignore if is_ignored else None}
+        refused(interrupted(tmp_path, *arguments, **options), code, "ended")
 
 
 def test_interrupting_an_unpack(long_demo: Path, tmp_path: Path) -> None:

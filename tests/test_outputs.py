@@ -5,6 +5,9 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,14 +15,16 @@ import pytest
 from each import each, fresh
 from mp4ds.errors import Mp4dsError, TargetError, TargetExistsError, WriteError
 from mp4ds.outputs import as_write_error, check_target, digest_file, staged
+from mp4ds.owned import PAGE_SIGN, write_listing
 
 
-def anything(path: Path) -> bool:
-    return True
+def anything(path: Path) -> set[str]:
+    """Everything is ours."""
+    return {p.relative_to(path).as_posix() for p in path.rglob("*")} if path.is_dir() else {""}
 
 
-def nothing(path: Path) -> bool:
-    return False
+def nothing(path: Path) -> None:
+    return None
 
 
 def make(path: Path, kind: str, text: str = "new") -> None:
@@ -45,7 +50,7 @@ def only(folder: Path, *names: str) -> bool:
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
 def test_an_output_appears_at_the_end(kind: str, target: Path) -> None:
-    with staged(target, force=False, replaceable=nothing) as path:
+    with staged(target, force=False, owned=nothing) as path:
         assert not path.exists()
         assert path.name == target.name
         make(path, kind)
@@ -64,7 +69,7 @@ def test_what_goes_wrong_leaves_nothing(
         make(target, old, "old")
     with (  # noqa: PT012 - the body is what is tested
         pytest.raises(type(error)) as caught,
-        staged(target, force=bool(old), replaceable=anything) as path,
+        staged(target, force=bool(old), owned=anything) as path,
     ):
         make(path, kind)
         raise error
@@ -77,7 +82,7 @@ def test_what_goes_wrong_leaves_nothing(
 @each("old", ["file", "folder"])
 def test_force_replaces_what_may_be_replaced(kind: str, old: str, target: Path) -> None:
     make(target, old, "old")
-    with staged(target, force=True, replaceable=anything) as path:
+    with staged(target, force=True, owned=anything) as path:
         make(path, kind)
         assert read(target) == "old"
     assert read(target) == "new"
@@ -87,11 +92,11 @@ def test_force_replaces_what_may_be_replaced(kind: str, old: str, target: Path) 
 def test_nothing_is_replaced_unasked(target: Path) -> None:
     make(target, "file", "old")
     with pytest.raises(TargetExistsError, match="--force") as caught:
-        check_target(target, force=False, replaceable=anything)
+        check_target(target, force=False, owned=anything)
     assert isinstance(caught.value, FileExistsError)
     assert caught.value.path == target
     with pytest.raises(TargetError, match="not something that mp4ds wrote") as refused:
-        check_target(target, force=True, replaceable=nothing)
+        check_target(target, force=True, owned=nothing)
     assert not isinstance(refused.value, TargetExistsError)
     assert read(target) == "old"
 
@@ -99,25 +104,87 @@ def test_nothing_is_replaced_unasked(target: Path) -> None:
 def test_a_dangling_link_is_something(target: Path) -> None:
     target.symlink_to("nowhere")
     with pytest.raises(TargetExistsError):
-        check_target(target, force=False, replaceable=anything)
+        check_target(target, force=False, owned=anything)
 
 
-def test_force_replaces_a_link_and_not_what_it_points_to(target: Path) -> None:
+def test_a_link_is_not_replaced(target: Path) -> None:
     make(target.parent / "precious", "folder", "old")
     target.symlink_to("precious")
-    with staged(target, force=True, replaceable=Path.is_dir) as path:
-        make(path, "folder")
-    assert not target.is_symlink()
-    assert read(target) == "new"
+    with (
+        pytest.raises(TargetError, match=r"is a symbolic link.*Name .*precious itself"),
+        staged(target, force=True, owned=anything),
+    ):
+        pytest.fail("nothing may be made there")
+    assert target.is_symlink()
     assert read(target.parent / "precious") == "old"
+
+
+@pytest.mark.parametrize(
+    ("stranger", "told"),
+    [
+        ("notes.txt", "1 thing .*(notes.txt)"),
+        ("deep/notes.txt", "1 thing .*(deep/notes.txt)"),
+        ("labels/1.txt", r"1 thing .*\(labels/\)"),
+        ("empty/", r"1 thing .*\(empty/\)"),
+        ("link ->", r"1 thing .*\(link\)"),
+        ("deep/part ->", r"1 thing .*\(deep/part\)"),
+        ("a b c d e", r"5 things .*\(a, b, c, \.\.\.\)"),
+    ],
+)
+def test_what_mp4ds_did_not_write_keeps_the_rest_from_being_replaced(
+    stranger: str, told: str, target: Path
+) -> None:
+    make(target, "folder", "old")
+    if stranger.endswith(" ->"):
+        path = target / stranger[:-3]
+        path.unlink(missing_ok=True)
+        path.symlink_to(__file__)
+    elif stranger.endswith("/"):
+        (target / stranger).mkdir()
+    else:
+        for name in stranger.split():
+            (target / name).parent.mkdir(exist_ok=True)
+            (target / name).write_text("mine")
+    before = sorted(target.rglob("*"))
+    with (
+        pytest.raises(TargetError, match=told),
+        staged(target, force=True, owned=lambda _: {"deep/part"}),
+    ):
+        pytest.fail("nothing may be made there")
+    assert sorted(target.rglob("*")) == before
+    assert only(target.parent, "out")
+
+
+def test_what_appears_in_it_meanwhile_is_kept(target: Path) -> None:
+    make(target, "folder", "old")
+    with (  # noqa: PT012 - the body is what is tested
+        pytest.raises(TargetError, match=r"1 thing .*notes\.txt"),
+        staged(target, force=True, owned=lambda _: {"deep/part"}) as path,
+    ):
+        make(path, "folder")
+        (target / "notes.txt").write_text("mine")
+    assert read(target) == "old"
+    assert only(target, "deep", "notes.txt")
+
+
+def test_a_report_within_is_replaced_with_it(target: Path) -> None:
+    make(target, "folder", "old")
+    (target / "index.html").write_bytes(b"<!doctype html>" + PAGE_SIGN)
+    (target / "report" / "proxies").mkdir(parents=True)
+    (target / "report" / "proxies" / "left.mp4").touch()
+    write_listing(target / "report")
+    check_target(target, force=True, owned=lambda _: {"deep/part"})
+    (target / "report" / "proxies" / "mine.mp4").touch()
+    with pytest.raises(TargetError, match=r"\(report/proxies/mine\.mp4\)"):
+        check_target(target, force=True, owned=lambda _: {"deep/part"})
 
 
 def test_the_folder_must_exist(target: Path) -> None:
     with pytest.raises(TargetError, match="is no folder"):
-        check_target(target / "deep", force=False, replaceable=anything)
+        check_target(target / "deep", force=False, owned=anything)
     make(target, "file")
     with pytest.raises(TargetError, match="is no folder"):
-        check_target(target / "deep", force=False, replaceable=anything)
+        check_target(target / "deep", force=False, owned=anything)
 
 
 @each("source", ["out", "out/deep", "out/deep/part", ".", "link", "link/deep"])
@@ -130,7 +197,7 @@ def test_an_output_never_overlaps_with_its_source(
     monkeypatch.chdir(target.parent)
     with (
         pytest.raises(TargetError, match="overlaps with the source"),
-        staged(target, force=force, replaceable=anything, sources=[Path(source)]),
+        staged(target, force=force, owned=anything, sources=[Path(source)]),
     ):
         pytest.fail("nothing may be made there")
     assert read(target) == "old"
@@ -140,7 +207,7 @@ def test_an_output_never_overlaps_with_its_source(
 def test_an_output_may_stand_beside_its_source(target: Path) -> None:
     make(target.parent / "out.bag", "file", "old")
     sources = [target.parent / "out.bag"]
-    with staged(target, force=False, replaceable=nothing, sources=sources) as path:
+    with staged(target, force=False, owned=nothing, sources=sources) as path:
         make(path, "folder")
     assert only(target.parent, "out", "out.bag")
 
@@ -152,14 +219,14 @@ def test_a_folder_that_may_not_be_written(target: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr("tempfile.mkdtemp", refuse)
     with (
         pytest.raises(TargetError, match="Permission denied"),
-        staged(target, force=False, replaceable=nothing),
+        staged(target, force=False, owned=nothing),
     ):
         pytest.fail("nothing can be made there")
 
 
 @each("name", ["x" * 250, "\U0001f916" * 61 + ".bag", "a b", ".hidden", "-x"])
 def test_any_name_that_the_disk_takes(name: str, tmp_path: Path) -> None:
-    with staged(tmp_path / name, force=False, replaceable=nothing) as path:
+    with staged(tmp_path / name, force=False, owned=nothing) as path:
         make(path, "folder")
     assert only(tmp_path, name)
 
@@ -168,7 +235,7 @@ def test_any_name_that_the_disk_takes(name: str, tmp_path: Path) -> None:
 def test_a_disk_that_refuses(code: int, target: Path) -> None:
     with (  # noqa: PT012 - the body is what is tested
         pytest.raises(WriteError, match="the unfinished output was removed") as caught,
-        staged(target, force=False, replaceable=nothing) as path,
+        staged(target, force=False, owned=nothing) as path,
     ):
         make(path, "folder")
         raise OSError(code, os.strerror(code))
@@ -191,19 +258,22 @@ def test_other_errors_keep_their_class(target: Path) -> None:
 def test_a_move_that_fails_brings_the_old_back(
     old: str | None, target: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Where names cannot be exchanged."""
     if old:
         make(target, old, "old")
     rename = Path.rename
 
     def failing(self: Path, to: Path) -> Path:
-        if to == target and self.name == target.name:
+        if to == target and self.parent.name == "new":
             raise OSError(errno.EIO, "Input/output error")
         return rename(self, to)
 
     monkeypatch.setattr(Path, "rename", failing)
+    for name in ("exchange", "rename_to_new"):
+        monkeypatch.setattr(f"mp4ds.outputs.{name}", lambda *_: False)
     with (
         pytest.raises(Mp4dsError, match="Input/output error"),
-        staged(target, force=True, replaceable=anything) as path,
+        staged(target, force=True, owned=anything) as path,
     ):
         make(path, "folder")
     assert not old or read(target) == "old"
@@ -211,10 +281,130 @@ def test_a_move_that_fails_brings_the_old_back(
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
+@pytest.mark.parametrize("can", [False, True])
+def test_names_are_exchanged_at_once_where_that_can_be_done(
+    can: bool, kind: str, target: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make(target, "folder", "old")
+    renamed: list[Path] = []
+    rename = Path.rename
+
+    def watched(self: Path, to: Path) -> Path:
+        renamed.append(to)
+        return rename(self, to)
+
+    monkeypatch.setattr(Path, "rename", watched)
+    if not can:
+        monkeypatch.setattr("mp4ds.outputs.exchange", lambda *_: False)
+    elif sys.platform not in ("linux", "darwin"):
+        pytest.skip("this system exchanges no names")
+    with staged(target, force=True, owned=anything) as path:
+        make(path, kind)
+    assert read(target) == "new"
+    assert len(renamed) == (0 if can else 2)
+    assert only(target.parent, "out")
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+import mp4ds.outputs
+from mp4ds.outputs import staged
+
+target, moment = Path(sys.argv[1]), sys.argv[2]
+if moment == "between":
+    mp4ds.outputs.exchange = lambda *_: False
+    rename = Path.rename
+    def kill(self, to):
+        rename(self, to)
+        os.kill(os.getpid(), 9)
+    Path.rename = kill
+with staged(target, force=True, owned=lambda _: {""}) as path:
+    path.write_text("of the killed run")
+    if moment == "wait":
+        print("made", flush=True)
+        sys.stdin.read()
+    if moment == "within":
+        os.kill(os.getpid(), 9)
+"""
+
+
+def killed(target: Path, moment: str) -> None:
+    done = subprocess.run([sys.executable, "-c", KILLED, str(target), moment], check=False)
+    assert done.returncode == -signal.SIGKILL
+
+
+@pytest.mark.parametrize("name", ["out", "lock", "old", "x" * 250])
+@pytest.mark.parametrize("moment", ["within", "between"])
+def test_the_next_run_removes_what_a_killed_one_left(
+    moment: str, name: str, tmp_path: Path
+) -> None:
+    target = tmp_path / name
+    target.write_text("old")
+    killed(target, moment)
+    assert len(list(tmp_path.glob(".*.part"))) == 1
+    assert target.exists() == (moment == "within")
+    with pytest.raises(TargetExistsError), staged(target, force=False, owned=nothing):
+        pytest.fail("it is there")
+    assert target.read_text() == "old"  # also where it had no name when the run was killed
+    assert only(tmp_path, name)
+
+
+def test_what_is_at_work_or_not_ours_is_no_leftover(tmp_path: Path) -> None:
+    target = tmp_path / "out"
+    command = [sys.executable, "-c", KILLED, str(target), "wait"]
+    precious = tmp_path / "precious" / "out"
+    make(precious, "folder", "mine")
+    for number, files in enumerate((["notes"], ["lock", "new/notes"], ["lock", "new/out", "mine"])):
+        for name in files:
+            path = tmp_path / f".out.abcdefg{number}.part" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+    planted = tmp_path / ".out.abcdefg9.part"
+    planted.mkdir()
+    (planted / "lock").touch()
+    (planted / "old").symlink_to(precious.parent)
+    (tmp_path / ".out.abcdefg8.part").symlink_to(precious.parent)
+    before = sorted(tmp_path.rglob("*"))
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "made\n"
+        (at_work,) = set(tmp_path.glob(".*.part/new/out")) - set(before)
+        with staged(target, force=False, owned=nothing) as path:
+            path.write_text("of this run")
+        assert at_work.exists()
+        target.unlink()
+        process.communicate()
+    assert target.read_text() == "of the killed run"
+    target.unlink()
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_folders_are_synced(target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bytes and names of an output before its own name, and then that."""
+    synced: list[str] = []
+    fsync = os.fsync
+
+    def watched(handle: int) -> None:
+        synced.append(str(Path(f"/proc/self/fd/{handle}").readlink()))
+        fsync(handle)
+
+    if not Path("/proc/self/fd").is_dir():
+        pytest.skip("nothing tells what a descriptor is of")
+    monkeypatch.setattr("os.fsync", watched)
+    with staged(target, force=False, owned=nothing) as path:
+        make(path, "folder")
+    made = str(path)
+    assert synced == [f"{made}/deep/part", f"{made}/deep", made, str(target.parent)]
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
 def test_what_appeared_meanwhile_is_not_replaced(kind: str, target: Path) -> None:
     with (  # noqa: PT012 - the body is what is tested
         pytest.raises(TargetExistsError),
-        staged(target, force=False, replaceable=nothing) as path,
+        staged(target, force=False, owned=nothing) as path,
     ):
         make(path, kind)
         make(target, kind, "of another run")

@@ -157,6 +157,10 @@ def test_force_replaces_the_manifest_first(
     mp4ds.pack(source, url, FAST)
     stores.pipe_file(f"{url}/old.mp4", b"of another pack")
     stores.pipe_file(f"{url}2/cam.mp4", b"a neighbour")
+    with pytest.raises(TargetError, match=r"holds 1 thing that mp4ds did not write \(old\.mp4\)"):
+        mp4ds.pack(source, url, replace(FAST, force=True))
+    assert there(stores, url) == {*FILES, "old.mp4"}
+    stores.rm_file(f"{url}/old.mp4")
     s3.forget()
     mp4ds.pack(source, url, replace(FAST, force=True, exclude=["/cam/*"]))
     assert there(stores, url) == {"messages.mcap", "dataset.yaml"}
@@ -166,7 +170,7 @@ def test_force_replaces_the_manifest_first(
         for method, path, _ in s3.requests
         if method in ("PUT", "DELETE")
     ]
-    assert changes[1] == ("DELETE", "dataset.yaml")
+    assert changes[2] == ("DELETE", "dataset.yaml")
     assert changes[-2] == ("PUT", "dataset.yaml")
     assert changes[-1] == ("DELETE", ".mp4ds-upload")
     assert mp4ds.validate(url, deep=True) == []

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags import open_writer
+from mp4ds.bags import open_writer, recording_names
 from mp4ds.bags.definitions import ros1_channel
 from mp4ds.errors import OptionError
 from mp4ds.outputs import staged
@@ -65,7 +65,7 @@ def demo(output: Path | str = "demo.bag", *, seconds: float = 3.0, force: bool =
     channels = _channels()
     count = 0
     with (
-        staged(target, force=force, replaceable=Path.is_file) as path,
+        staged(target, force=force, owned=recording_names) as path,
         open_writer(
             path, "bag", name=target.name, profile="ros1", library="", storage=""
         ) as writer,

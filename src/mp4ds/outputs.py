@@ -1,7 +1,9 @@
 """Outputs appear under their final name only when whole.
 
 An output is made in a folder beside its target, on the same file system, and moved into
-place by one rename; whatever goes wrong before leaves nothing but the target as it was.
+place by one rename; whatever goes wrong before leaves nothing but the target as it was. What a
+killed run could not remove, the next run for the same target does: a lock tells that nobody is at
+work in it any more.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import re
 import shutil
 import socket
 import tempfile
@@ -16,20 +19,26 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 from mp4ds.errors import TargetError, TargetExistsError, WriteError
+from mp4ds.owned import Owned, check_replaceable
+from mp4ds.system import exchange, is_mine, lock, rename_to_new
+
+_LOCK, _NEW, _OLD = "lock", "new", "old"  # all there is in a folder where an output is made
+_SUFFIX = ".part"
 
 
 @contextmanager
 def staged(
-    target: Path, *, force: bool, replaceable: Callable[[Path], bool], sources: Sequence[Path] = ()
+    target: Path, *, force: bool, owned: Owned, sources: Sequence[Path] = ()
 ) -> Iterator[Path]:
     """Make an output under a temporary name and move it into place at the end.
 
     Args:
         target: The final name; its parent folder must exist.
         force: Replace an existing target.
-        replaceable: Whether an existing target is of the kind that may be replaced.
+        owned: Tells which files of an existing target mp4ds wrote.
         sources: What the output is made from: neither may stand in the other.
 
     Yields:
@@ -40,58 +49,148 @@ def staged(
         TargetError: It may not be written or replaced.
         WriteError: The disk refused.
     """
-    check_target(target, force=force, replaceable=replaceable, sources=sources)
+    _clear_leftovers(target)
+    check_target(target, force=force, owned=owned, sources=sources)
     try:
-        folder = Path(
-            tempfile.mkdtemp(prefix=f".{target.name[:60]}.", suffix=".part", dir=target.parent)
-        )
+        folder, held = _begun(target.parent, _prefix(target), _SUFFIX)
     except OSError as error:
+        if error.errno in _FULL:
+            raise WriteError(target, error) from None
         raise TargetError(
             target, f"cannot be written there: {error.strerror}", "Choose another folder."
         ) from None
     try:
-        path = folder / target.name
-        try:
-            yield path
-            sync(path)
-            move_into_place(path, target, folder, force=force)
-        except OSError as error:
-            raise as_write_error(error, target) from error
+        path = folder / _NEW / target.name
+        path.parent.mkdir()
+        yield path
+        sync(path)
+        old = folder / _OLD / target.name
+        move_into_place(path, target, old, force=force, owned=owned)
+    except OSError as error:
+        raise as_write_error(error, target) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+        held.close()
+
+
+@contextmanager
+def work_folder(parent: Path, prefix: str) -> Iterator[Path]:
+    """A folder of this run alone, which is removed at the end.
+
+    Those of killed runs are removed first.
+
+    Args:
+        parent: Where it is made.
+        prefix: How its name begins.
+
+    Raises:
+        OSError: The disk refused.
+    """
+    for path in _matching(parent, prefix):
+        _remove_abandoned(path)
+    folder, held = _begun(parent, prefix)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        held.close()
+
+
+def _begun(parent: Path, prefix: str, suffix: str = "") -> tuple[Path, IO[bytes]]:
+    """A new folder, and its lock, so that no other run takes it for abandoned."""
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=prefix, suffix=suffix, dir=parent))
+        try:
+            file = (folder / _LOCK).open("xb")
+            with suppress(BlockingIOError):
+                lock(file)
+                if (folder / _LOCK).exists():
+                    return folder, file
+            file.close()
+        except FileNotFoundError:
+            continue  # another run has removed it before it was locked, as it may above
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+
+
+def _matching(parent: Path, prefix: str, suffix: str = "") -> Iterator[Path]:
+    """The folders in which runs work, or did."""
+    name = re.compile(re.escape(prefix) + "[a-z0-9_]{8}" + re.escape(suffix))
+    with suppress(OSError):
+        for path in list(parent.iterdir()):
+            if name.fullmatch(path.name) and not path.is_symlink() and path.is_dir():
+                yield path
+
+
+def _remove_abandoned(folder: Path, before: Callable[[], None] = lambda: None) -> None:
+    """Remove what a killed run has left; not where another is at work, or nobody knows.
+
+    Args:
+        folder: Its folder.
+        before: Called before it is removed, if it is.
+    """
+    with suppress(OSError):
+        folder.rmdir()
+    with suppress(OSError), (folder / _LOCK).open("r+") as file:
+        if is_mine(folder.lstat(), folder.parent) and lock(file):
+            before()
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _prefix(target: Path) -> str:
+    return f".{target.name[:60]}."
+
+
+def _clear_leftovers(target: Path) -> None:
+    """Remove what killed runs for a target have left, as far as it can be told to be that."""
+
+    def give_back() -> None:
+        if os.path.lexists(old) and not os.path.lexists(target):
+            old.rename(target)
+
+    for folder in _matching(target.parent, _prefix(target), _SUFFIX):
+        old = folder / _OLD / target.name
+        with suppress(OSError):
+            parts = list(folder.iterdir())
+            inner = [path.name for part in parts if part.name != _LOCK for path in part.iterdir()]
+            # another target's long name may begin alike
+            if {part.name for part in parts} <= {_LOCK, _NEW, _OLD} and (
+                {*inner} <= {target.name} and not any(part.is_symlink() for part in parts)
+            ):
+                _remove_abandoned(folder, give_back)
 
 
 def check_target(
     target: Path,
     *,
     force: bool,
-    replaceable: Callable[[Path], bool],
+    owned: Owned,
     sources: Sequence[Path] = (),
 ) -> None:
     """Refuse a target early, before any work is done. See `staged`."""
-    _refuse_overlap(target, sources)
-    if not target.parent.is_dir():
-        raise TargetError(target, f"{target.parent} is no folder", "Make the folder first.")
+    check_place(target, sources)
     if not os.path.lexists(target):
         return
     if not force:
         raise TargetExistsError(target)
-    if not replaceable(target):
-        raise TargetError(
-            target,
-            "exists and is not something that mp4ds wrote, so --force does not replace it",
-            "Choose another name, or remove it yourself.",
-        )
+    check_replaceable(target, owned)
 
 
-def _refuse_overlap(target: Path, sources: Sequence[Path]) -> None:
-    """Keep a source from being written into, or replaced together with what is around it."""
+def check_place(target: Path, sources: Sequence[Path]) -> None:
+    """Keep a source from being written into, or replaced together with what is around it.
+
+    Raises:
+        TargetError: It would be, or there is no folder to write in.
+    """
     place = target.resolve()
     for source in (path.resolve() for path in sources):
         if place == source or source in place.parents or place in source.parents:
             raise TargetError(
                 target, f"overlaps with the source {source}", "Choose a place beside the source."
             )
+    if not target.parent.is_dir():
+        raise TargetError(target, f"{target.parent} is no folder", "Make the folder first.")
 
 
 def as_write_error(error: OSError, target: Path) -> OSError:
@@ -105,9 +204,9 @@ def as_write_error(error: OSError, target: Path) -> OSError:
 
 _BLOCK = 2**20
 _SEEN_SECONDS, _LOOK_SECONDS = 90.0, 1.0  # NFS keeps names and sizes for up to a minute
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 _WRITE_ERRNOS = {
-    errno.ENOSPC,
-    errno.EDQUOT,
+    *_FULL,
     errno.EFBIG,
     errno.EIO,
     errno.EROFS,
@@ -118,11 +217,13 @@ _WRITE_ERRNOS = {
 
 
 def sync(path: Path) -> None:
-    """Bring an output's bytes to the disk before its name is."""
-    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
-    for file in files:
-        with file.open("rb") as stream:
-            os.fsync(stream.fileno())
+    """Bring an output's bytes, and the names in its folders, to the disk before its own name is."""
+    for place in [*sorted(path.rglob("*"), reverse=True), path]:
+        if place.is_dir():
+            sync_folder(place)
+        elif place.is_file():
+            with place.open("rb") as stream:
+                os.fsync(stream.fileno())
 
 
 def write_synced(path: Path, data: bytes, *, replace: bool = True) -> None:
@@ -177,30 +278,43 @@ def is_seen(is_there: Callable[[], bool], *folders: Path) -> bool:
     return seen
 
 
-def move_into_place(path: Path, target: Path, folder: Path, *, force: bool) -> None:
-    """Give an output its final name.
+def move_into_place(path: Path, target: Path, old: Path, *, force: bool, owned: Owned) -> None:
+    """Give an output its final name, in exchange for what stands there.
 
     Args:
-        path: The output, whole.
+        path: The output, whole; afterwards what it replaced, where the system can exchange names.
         target: Its final name.
-        folder: Where what stands there is put meanwhile; on the same file system.
+        old: Where what it replaces is put on other systems; on the same file system.
         force: Replace what stands there.
+        owned: Tells which files of that mp4ds wrote.
 
     Raises:
         TargetExistsError: Something stands there and ``force`` is not set.
+        TargetError: Meanwhile something else was put there.
     """
-    old = folder / "replaced"
-    replaced = os.path.lexists(target)
-    if replaced and not force:
+    if not os.path.lexists(target):
+        try:
+            if not rename_to_new(path, target):
+                path.rename(target)
+        except FileExistsError:
+            raise TargetExistsError(target) from None
+    elif not force:
         raise TargetExistsError(target)  # it appeared meanwhile
-    if replaced:
-        target.rename(old)
+    else:
+        check_replaceable(target, owned)
+        if not exchange(path, target):
+            _replace(path, target, old)
+    sync_folder(target.parent)
+
+
+def _replace(path: Path, target: Path, old: Path) -> None:
+    old.parent.mkdir(exist_ok=True)
+    target.rename(old)
     try:
         path.rename(target)
     except OSError:
-        if replaced:
-            with suppress(OSError):
-                old.rename(target)
+        with suppress(OSError):
+            old.rename(target)
         raise
 
 

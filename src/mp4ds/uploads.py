@@ -6,21 +6,22 @@ not whole. Where an upload fails, what was made is kept, and the same command up
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, cast
 
 from mp4ds.errors import Mp4dsError, RemoteError, TargetError, TargetExistsError
 from mp4ds.outputs import write_synced
+from mp4ds.owned import Owned, refuse_not_ours, refuse_strangers
 from mp4ds.remote import RemotePath
+from mp4ds.system import lock
 
 Report = Callable[[str, int, int], None]
 """Called with the file that is being uploaded, bytes uploaded, and bytes in all."""
@@ -28,7 +29,7 @@ Report = Callable[[str, int, int], None]
 _STATE, _LOCK = "upload.json", "lock"
 _SAVE_SECONDS = 2.0
 _MARK = ".mp4ds-upload"
-_MARK_TEXT = b"mp4ds is making what is to be here, or was interrupted.\n"
+_MARK_TEXT = "mp4ds is making what is to be here, or was interrupted"
 
 
 class Upload:
@@ -58,6 +59,8 @@ class Upload:
         self._target = target
         self._is_folder = is_folder
         self._last = last
+        self._old: set[str] = set()  # names of what is to be replaced
+        self._was_begun = False
         self._mark = target / _MARK if is_folder else target.with_name(f"{target.name}{_MARK}")
         digest = hashlib.sha256(str(target).encode()).hexdigest()
         self.folder = _own_folder() / f"{target.name[:60]}-{digest[:16]}"
@@ -71,22 +74,20 @@ class Upload:
             TargetError: Another run is at work there.
         """
         self.folder.mkdir(exist_ok=True)
-        with (self.folder / _LOCK).open("w") as lock:
+        with (self.folder / _LOCK).open("w") as file:
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock(file)
             except BlockingIOError:
                 raise TargetError(
                     self._shown, "another mp4ds is making it here", "Wait for it, or end it."
                 ) from None
-            except OSError:
-                pass  # a file system without locks
             try:
                 yield
             finally:
                 if {path.name for path in self.folder.glob("*")} <= {_LOCK}:
                     shutil.rmtree(self.folder, ignore_errors=True)
 
-    def _check(self, *, force: bool, replaceable: Callable[[Path], bool]) -> None:
+    def _check(self, *, force: bool, owned: Owned) -> None:
         """Refuse a target early, before any work is done; see `outputs.check_target`.
 
         Leaves a mark there, which shows that it can be written to.
@@ -97,19 +98,38 @@ class Upload:
             RemoteError: The store does not answer.
         """
         now = self._now()
-        if now.exists() and not self._is_unfinished(now):
-            if not force:
+        self._old = set()
+        if now.exists():
+            if self._is_unfinished(now):
+                self._was_begun = True
+                names: Iterable[str] | None = self._marked().union(self._state().get("files", ()))
+            elif force:
+                names = owned(cast(Path, now))
+            else:
                 raise TargetExistsError(self._shown)
-            if not replaceable(cast(Path, now)):
-                raise TargetError(
-                    self._shown,
-                    "exists and is not something that mp4ds wrote, so --force does not replace it",
-                    "Choose another name, or remove it yourself.",
-                )
+            self._old = refuse_not_ours(self._shown, names)
+            if self._is_folder:
+                refuse_strangers(self._shown, self._there() - self._old)
+        self._leave_mark(self._old)
+
+    def _there(self) -> set[str]:
+        """Names of all files that are there, but for the mark."""
+        begin = len(self._target.url) + 1
+        return {path.url[begin:] for path in self._now().files() if path != self._mark}
+
+    def _leave_mark(self, names: Iterable[str]) -> None:
+        """Tell there what is being made, and which files of it may be replaced."""
         with tempfile.NamedTemporaryFile(dir=self.folder) as file:
-            file.write(_MARK_TEXT)
+            file.write(json.dumps({"about": _MARK_TEXT, "files": sorted(names)}).encode())
             file.flush()
             self._mark.upload(Path(file.name))
+
+    def _marked(self) -> set[str]:
+        """The names that the mark of an upload tells, which was not finished."""
+        try:
+            return set(map(str, json.loads(RemotePath(self._mark.url).read_bytes())["files"]))
+        except (OSError, ValueError, LookupError, TypeError):
+            return set()
 
     def _now(self) -> RemotePath:
         """The target as it is now."""
@@ -123,7 +143,7 @@ class Upload:
 
     def _leave(self) -> None:
         """Take the mark away again, where nothing was uploaded."""
-        if not self._state().get("begun"):
+        if not self._was_begun and not self._state().get("begun"):
             with suppress(Mp4dsError):
                 self._mark.remove()
 
@@ -133,7 +153,7 @@ class Upload:
         make: Callable[[Path], Mapping[str, Any]],
         *,
         force: bool,
-        replaceable: Callable[[Path], bool],
+        owned: Owned,
         report: Report | None = None,
     ) -> Mapping[str, Any]:
         """Make the output here, unless an earlier run did, and upload it.
@@ -142,7 +162,7 @@ class Upload:
             order: Tells what is asked for, as JSON has it: of the same, what was made is the same.
             make: Makes the output at a path, and returns what there is to tell of it.
             force: Replace what is there.
-            replaceable: Whether it is of the kind that may be replaced.
+            owned: Tells which files of it mp4ds wrote.
             report: Told of the upload.
 
         Returns:
@@ -153,7 +173,7 @@ class Upload:
             RemoteError: It could not be uploaded; what was made is kept here.
         """
         with self._claimed():
-            self._check(force=force, replaceable=replaceable)
+            self._check(force=force, owned=owned)
             try:
                 asked = order()
                 kept = self._kept(asked)
@@ -247,6 +267,8 @@ class Upload:
 
     def _send_files(self, state: dict[str, Any], report: Report | None) -> None:
         files, sent = self._files(), state["sent"]
+        if self._is_folder:
+            self._leave_mark({*files, *self._old})
         total, done, saved = sum(files.values()), 0, time.monotonic()
         sent = {name: tag for name, tag in sent.items() if self._is_sent(name, files[name], tag)}
         self._clear({self._place(name) for name in sent})
@@ -277,7 +299,7 @@ class Upload:
         """Remove what is to be replaced, first that by which it is recognised."""
         if not self._is_folder:
             return
-        old = [path for path in self._now().files() if path not in kept and path != self._mark]
+        old = {self._target / name for name in self._there() & self._old} - kept
         for path in sorted(old, key=lambda path: path != self._target / self._last):
             path.remove()
 

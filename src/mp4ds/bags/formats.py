@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal, overload
 from mp4ds.bags.multi import MultiReader
 from mp4ds.bags.protocols import BagReader, BagWriter
 from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
+from mp4ds.owned import begins_with
 from mp4ds.records import Channel, Message
 from mp4ds.remote import remote
 
@@ -69,6 +70,7 @@ _SALVAGERS: dict[str, Callable[[Path], Salvage]] = {
 }
 
 _MAGIC = {b"#ROSBAG V": "bag", b"\x89MCAP0\r\n": "mcap", b"SQLite format 3\0": "rosbag2"}
+_FILE_MAGIC = [magic for magic, name in _MAGIC.items() if name != "rosbag2"]
 _SUFFIXES = {".bag": "bag", ".mcap": "mcap", ".db3": "rosbag2"}
 
 
@@ -102,6 +104,19 @@ def format_of(path: Path) -> str:
         "is not a recording that mp4ds knows",
         "Give a ROS 1 .bag, a rosbag2 folder or an .mcap file.",
     )
+
+
+def recording_names(path: Path) -> set[str] | None:
+    """Names of a recording's files; see `mp4ds.owned.Owned`."""
+    from mp4ds.bags.rosbag2_metadata import METADATA_FILE, read_bag_info
+
+    if path.is_file():
+        return {""} if begins_with(path, *_FILE_MAGIC) else None
+    try:
+        info = read_bag_info(path / METADATA_FILE)
+    except SourceError:
+        return None
+    return {METADATA_FILE, *info.file_names} if info.file_names else None
 
 
 def open_reader(path: Path) -> BagReader:

@@ -22,6 +22,7 @@ from mp4ds.cli.options import (
 )
 from mp4ds.cli.output import print_json
 from mp4ds.cli.play_output import play_progress, print_play, tell
+from mp4ds.cli.process import ending_signals
 from mp4ds.errors import OptionError
 
 _DEFAULT_CLOCK_HZ = 100.0
@@ -216,7 +217,7 @@ def play(
 
 @contextmanager
 def _signals(stop: Callable[[], None]) -> Iterator[list[int]]:
-    """Ends the player at Ctrl-C and SIGTERM, after the message that is being sent."""
+    """Ends the player at Ctrl-C and the like, after the message that is being sent."""
     caught: list[int] = []
 
     def end(number: int, _: Any) -> None:
@@ -225,7 +226,7 @@ def _signals(stop: Callable[[], None]) -> Iterator[list[int]]:
         caught.append(number)
         stop()
 
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, *ending_signals())}
     try:
         yield caught
     finally:

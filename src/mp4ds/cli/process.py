@@ -24,13 +24,27 @@ def prepare_process() -> None:
     # no matrix is multiplied here, and idle threads cost time
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     warnings.showwarning = lambda message, *_, **__: complain(message)
-    # a batch system's way to interrupt: leave as tidily as after Ctrl-C
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    # a batch system's way to interrupt, and a terminal's that is lost: leave as after Ctrl-C
+    for number in ending_signals():
+        signal.signal(number, _end)
     _fill_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal may lack a topic's letters
     _allow_files()
+
+
+def ending_signals() -> list[signal.Signals]:
+    """The signals that end a command, besides Ctrl-C's; not those that nohup keeps away."""
+    names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # or Windows
+    numbers = [signal.Signals[name] for name in names]
+    return [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
+
+
+def _end(number: int, _: object) -> None:
+    if number != signal.SIGTERM:  # a lost terminal tells so more than once, also while tidying up
+        signal.signal(number, signal.SIG_IGN)
+    sys.exit(128 + number)
 
 
 def _fill_streams() -> None:

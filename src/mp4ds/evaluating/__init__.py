@@ -7,14 +7,14 @@ kept in the folder of the evaluation, so that the same call goes on where it was
 
 from __future__ import annotations
 
+import json
 import os
-import secrets
-import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from mp4ds._version import __version__
 from mp4ds.errors import SourceError
 from mp4ds.evaluating.camera import CameraTrial
 from mp4ds.evaluating.clips import Unfit
@@ -41,7 +41,8 @@ from mp4ds.evaluating.sources import Camera, Source, open_source
 from mp4ds.evaluating.tables import recommend
 from mp4ds.evaluating.trials import Trials
 from mp4ds.evaluating.work import versions_of
-from mp4ds.outputs import check_target
+from mp4ds.outputs import check_place, work_folder, write_synced
+from mp4ds.owned import refuse_not_ours
 from mp4ds.plan import FileNames, Selection
 from mp4ds.remote import remote
 from mp4ds.scoring import Ffmpeg, ScoringError, find_ffmpeg
@@ -64,6 +65,7 @@ __all__ = [
 
 _FOLDERS = ("cells", "pictures", "plots")
 _WORK = "work-"
+_NOTE_NAME = "mp4ds_evaluation.json"  # in folders that an evaluation has made
 
 
 def evaluate(
@@ -143,12 +145,16 @@ def _folder(source: Path, output: Path | str | None) -> Path:
     name = output or f"{source.name if source.is_dir() else source.stem}_evaluation"
     target = Path(os.path.abspath(name))  # noqa: PTH100 - keeps links, unlike resolve()
     sources = [] if remote(source) else [source]
-    check_target(target, force=True, replaceable=_is_evaluation, sources=sources)
+    check_place(target, sources)
+    if os.path.lexists(target) and not _is_evaluation(target):
+        refuse_not_ours(target, None)
     return target
 
 
 def _is_evaluation(path: Path) -> bool:
-    return path.is_dir() and ((path / _FOLDERS[0]).is_dir() or not any(path.iterdir()))
+    if any((path / name).is_symlink() for name in _FOLDERS):
+        return False
+    return path.is_dir() and ((path / _NOTE_NAME).is_file() or not any(path.iterdir()))
 
 
 @contextmanager
@@ -158,16 +164,12 @@ def _work_in(folder: Path) -> Iterator[Path]:
     It has a new name each time: workers of a cluster may still be at a trial of a run that was
     interrupted, and must not take another clip for theirs.
     """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_synced(folder / _NOTE_NAME, json.dumps({"mp4ds": __version__}).encode())
     for name in _FOLDERS:
-        (folder / name).mkdir(parents=True, exist_ok=True)
-    for old in folder.glob(f"{_WORK}*"):
-        shutil.rmtree(old, ignore_errors=True)  # of one that was killed
-    work = folder / f"{_WORK}{secrets.token_hex(4)}"
-    work.mkdir()
-    try:
+        (folder / name).mkdir(exist_ok=True)
+    with work_folder(folder, _WORK) as work:
         yield work
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
 
 
 def _origin(source: Source) -> int:

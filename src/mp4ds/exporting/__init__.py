@@ -16,6 +16,7 @@ from mp4ds.errors import OptionError
 from mp4ds.exporting.job import Job, Source
 from mp4ds.exporting.options import ExportOptions, ExportSummary
 from mp4ds.outputs import staged
+from mp4ds.owned import begins_with, listed_names
 from mp4ds.remote import location, remote
 
 __all__ = ["FORMATS", "ExportOptions", "ExportSummary", "export"]
@@ -87,7 +88,7 @@ def export(
             staged(
                 target,
                 force=chosen.force,
-                replaceable=_is_rerun_file if to in _FILES else _is_export,
+                owned=_rerun_names if to in _FILES else _export_names,
                 sources=[dataset.path for dataset in opened],
             )
         )
@@ -103,7 +104,9 @@ def export(
                 f"{_first_reason(summary) or 'it has no messages'}."
             )
         if path.is_dir():
-            note = {"mp4ds": __version__, **asdict(summary), "output": target.name}
+            files = sorted(p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file())
+            told = {**asdict(summary), "output": target.name, "files": files}
+            note = {"mp4ds": __version__, **told}
             (path / NOTE_NAME).write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
         return summary
 
@@ -157,9 +160,9 @@ def _first_reason(summary: ExportSummary) -> str:
     return ""
 
 
-def _is_export(path: Path) -> bool:
-    return path.is_dir() and ((path / NOTE_NAME).is_file() or not any(path.iterdir()))
+def _export_names(path: Path) -> set[str] | None:
+    return listed_names(path, NOTE_NAME)
 
 
-def _is_rerun_file(path: Path) -> bool:
-    return path.is_file() and path.suffix == _FILES["rerun"]
+def _rerun_names(path: Path) -> set[str] | None:
+    return {""} if begins_with(path, b"RRF") else None

@@ -18,7 +18,7 @@ from mp4ds.outputs import check_target, staged
 from mp4ds.packing.cameras import Exact
 from mp4ds.packing.coordinator import Coordinator, Run, claimed
 from mp4ds.packing.job import open_recording, outcome_options
-from mp4ds.packing.manifest import is_dataset
+from mp4ds.packing.manifest import dataset_files
 from mp4ds.packing.packer import until_in_reach
 from mp4ds.packing.planning import Means, plan_job
 from mp4ds.packing.report import PackOptions, PackProgress, PackSummary, TopicSummary
@@ -40,7 +40,6 @@ __all__ = [
     "PackSummary",
     "TopicSummary",
     "import_ros_mp4",
-    "is_dataset",
     "pack",
     "pack_each",
     "pack_share",
@@ -87,7 +86,7 @@ def _pack(
     store = remote(target)
     if store:
         pack_here = partial(_pack, paths)
-        return pack_to_store(paths, store, options, is_dataset, pack_here, progress)
+        return pack_to_store(paths, store, options, dataset_files, pack_here, progress)
     run = _plan(paths, target, options)
     if run.is_new and run.job.is_single and not options.cluster:
         return until_in_reach(partial(_pack_in_one_pass, run, progress))
@@ -215,7 +214,7 @@ def _checked(options: PackOptions) -> PackOptions:
 
 def _plan(paths: Sequence[Path], target: Path, options: PackOptions, *, recordings: int = 1) -> Run:
     """The pack of a recording: one that was begun before, or a new one."""
-    check_target(target, force=options.force, replaceable=is_dataset, sources=paths)
+    check_target(target, force=options.force, owned=dataset_files, sources=paths)
     place = Workplace.beside(target)
     job = None if options.restart else place.job()
     if job is not None:
@@ -232,7 +231,7 @@ def _plan(paths: Sequence[Path], target: Path, options: PackOptions, *, recordin
 def _pack_in_one_pass(run: Run, progress: Report | None, exact: Exact) -> PackSummary:
     with (
         run.job.open() as reader,
-        staged(run.target, force=run.force, replaceable=is_dataset, sources=run.paths) as folder,
+        staged(run.target, force=run.force, owned=dataset_files, sources=run.paths) as folder,
     ):
         folder.mkdir()
         try:

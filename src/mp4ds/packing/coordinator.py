@@ -22,7 +22,7 @@ from mp4ds.errors import (
 from mp4ds.outputs import is_seen, move_into_place, sync
 from mp4ds.packing.assemble import Assembler
 from mp4ds.packing.job import Job, Task, absolute
-from mp4ds.packing.manifest import folder_size, summarize, write_manifest
+from mp4ds.packing.manifest import dataset_files, folder_size, summarize, write_manifest
 from mp4ds.packing.part import RECORD_NAME, Part, read_record
 from mp4ds.packing.progress import JobProgress, Report
 from mp4ds.packing.report import PackSummary
@@ -236,7 +236,8 @@ class Coordinator:
                 write_manifest(part, reader, digests, run.job.options["quality"])
             sync(folder)
             summary = summarize(part, run.target, sum(source.size for source in run.job.sources))
-            move_into_place(folder, run.target, run.place.folder, force=run.force)
+            old = run.place.folder / "replaced" / run.target.name
+            move_into_place(folder, run.target, old, force=run.force, owned=dataset_files)
         except OSError as error:
             if isinstance(error, (SourceError, TargetError)):
                 raise

@@ -10,6 +10,7 @@ from mp4ds._version import __version__
 from mp4ds.bags import BagReader, BagWriter
 from mp4ds.bags.protocols import Format
 from mp4ds.coded import zlib_build
+from mp4ds.errors import FormatError, SourceError
 from mp4ds.outputs import digest_file
 from mp4ds.packing.part import Part
 from mp4ds.packing.report import PackSummary
@@ -27,6 +28,7 @@ from mp4ds.sidecar import (
     TimeRange,
     Verbatim,
     dump_document,
+    load_manifest,
 )
 from mp4ds.video import tool_versions
 from mp4ds.wire.transforms import TransformCollector
@@ -186,6 +188,11 @@ def folder_size(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.iterdir())
 
 
-def is_dataset(path: Path) -> bool:
-    """Whether a folder is one that pack made, or empty, and may be replaced when asked."""
-    return path.is_dir() and ((path / MANIFEST_NAME).is_file() or not any(path.iterdir()))
+def dataset_files(path: Path) -> set[str] | None:
+    """Names of a dataset's files, by its manifest; None where that is none, or not understood."""
+    try:
+        manifest = load_manifest(path / MANIFEST_NAME)
+    except (FormatError, SourceError, OSError):
+        return None
+    streams = {name for entry in manifest.streams for name in (entry.sidecar, entry.video)}
+    return {MANIFEST_NAME, *streams, *(entry.name for entry in manifest.files)}

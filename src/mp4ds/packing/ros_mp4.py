@@ -14,7 +14,7 @@ from mp4ds.bags.mcap_write import McapWriter
 from mp4ds.bags.protocols import Format
 from mp4ds.errors import FormatError, OptionError, SourceError, SourceNotFoundError
 from mp4ds.outputs import digest_file, staged
-from mp4ds.packing.manifest import is_dataset, summarize, write_manifest
+from mp4ds.packing.manifest import dataset_files, summarize, write_manifest
 from mp4ds.packing.part import Part, PartStream
 from mp4ds.packing.report import PackSummary
 from mp4ds.plan import FileNames
@@ -75,7 +75,7 @@ def import_ros_mp4(
             "mp4ds already."
         )
     with (
-        staged(target, force=force, replaceable=is_dataset, sources=[source, described]) as folder,
+        staged(target, force=force, owned=dataset_files, sources=[source, described]) as folder,
         unchanged(states),
     ):
         _check(source, described, old)

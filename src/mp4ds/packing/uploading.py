@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from mp4ds.errors import SourceNotFoundError
+from mp4ds.owned import Owned
 from mp4ds.packing.job import open_recording, outcome_options, tools
 from mp4ds.packing.report import PackOptions, PackProgress, PackSummary, TopicSummary
 from mp4ds.remote import RemotePath
@@ -24,7 +25,7 @@ def pack_to_store(
     paths: Sequence[Path],
     target: RemotePath,
     options: PackOptions,
-    replaceable: Callable[[Path], bool],
+    owned: Owned,
     pack: Pack,
     report: Report | None,
 ) -> PackSummary:
@@ -36,7 +37,7 @@ def pack_to_store(
         paths: The recordings.
         target: The dataset.
         options: How.
-        replaceable: Whether something is a dataset, which may be replaced when asked.
+        owned: Tells which files of a dataset that is there mp4ds wrote.
         pack: Makes it here.
         report: Told of progress.
 
@@ -52,7 +53,7 @@ def pack_to_store(
         lambda: _order(paths, options),
         make,
         force=options.force,
-        replaceable=replaceable,
+        owned=owned,
         report=_upload_report(report, target),
     )
     return _from_values(values, target)

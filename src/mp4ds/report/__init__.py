@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from mp4ds.dataset import Dataset
 from mp4ds.errors import FormatError, OptionError, SourceError, TargetExistsError
 from mp4ds.outputs import as_write_error, check_target, staged, write_synced
+from mp4ds.owned import is_page, listed_names, write_listing
 from mp4ds.remote import remote
 from mp4ds.report.cameras import Camera
 from mp4ds.report.page import (
@@ -29,8 +30,6 @@ from mp4ds.report.page import (
     INDEX_NAME,
     PROXIES_NAME,
     index_page,
-    is_our_folder,
-    is_our_index,
     write_folder,
 )
 from mp4ds.report.proxies import make_proxy, presentation_times, proxy_key, proxy_size, why_not_seen
@@ -180,11 +179,11 @@ def _check_place(folder: Path, *, force: bool) -> None:
     """
     if folder.exists():
         index = folder / INDEX_NAME
-        if os.path.lexists(index) and not is_our_index(index) and not force:
+        if os.path.lexists(index) and not is_page(index) and not force:
             raise TargetExistsError(index)
-        check_target(folder / FOLDER_NAME, force=True, replaceable=is_our_folder)
+        check_target(folder / FOLDER_NAME, force=True, owned=listed_names)
     else:
-        check_target(folder, force=False, replaceable=lambda _: False)
+        check_target(folder, force=False, owned=listed_names)
 
 
 def _write(
@@ -196,7 +195,7 @@ def _write(
 ) -> ReportSummary:
     target = folder / FOLDER_NAME
     problems: list[str] = []
-    with staged(target, force=True, replaceable=is_our_folder) as path:
+    with staged(target, force=True, owned=listed_names) as path:
         path.mkdir()
         proxies = _Proxies(old=target, new=path)
         cameras = []
@@ -210,6 +209,7 @@ def _write(
         proxies.write_keys()
         tell("topics")
         write_folder(path, dataset, cameras, _topics(dataset, problems), problems)
+        write_listing(path)
     write_synced(folder / INDEX_NAME, index_page())
     return _summary(dataset, folder, cameras, problems)
 

@@ -23,33 +23,13 @@ FOLDER_NAME = "report"
 DATA_NAME = "data.js"
 PROXIES_NAME = "proxies"
 
-_SIGN = b'<meta name="generator" content="mp4ds report">'
 _DATA_SIGN = b"/* made by mp4ds report */\n"
-_SIGN_WITHIN = 1000  # bytes
 _MOST_NOTES = 200
 
 
 def index_page() -> bytes:
     """index.html, the same for every dataset."""
     return (files("mp4ds.report") / "page" / INDEX_NAME).read_bytes()
-
-
-def is_our_index(path: Path) -> bool:
-    """Whether a file is the page of a report."""
-    return path.is_file() and _SIGN in _head(path)
-
-
-def is_our_folder(path: Path) -> bool:
-    """Whether a folder holds the data of a report, or nothing."""
-    if path.is_symlink() or not path.is_dir():
-        return False
-    data = path / DATA_NAME
-    return not any(path.iterdir()) or (data.is_file() and _head(data).startswith(_DATA_SIGN))
-
-
-def _head(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(_SIGN_WITHIN)
 
 
 def write_folder(

@@ -14,6 +14,7 @@ from mp4ds.dataset import Dataset
 from mp4ds.errors import FrameNotFoundError, OptionError
 from mp4ds.layouts import ENCODINGS, Pixels
 from mp4ds.outputs import staged
+from mp4ds.owned import begins_with
 from mp4ds.report.looks import Look
 from mp4ds.streams import Stream
 from mp4ds.streams.views import Resize, size_after
@@ -127,7 +128,7 @@ def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> St
         with staged(
             target.absolute(),
             force=options.force,
-            replaceable=_is_image,
+            owned=_image_names,
         ) as path:
             path.write_bytes(data)
         return StillSummary(
@@ -141,8 +142,8 @@ def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> St
         )
 
 
-def _is_image(path: Path) -> bool:
-    return path.is_file() and path.suffix.lower() in _SUFFIXES
+def _image_names(path: Path) -> set[str] | None:
+    return {""} if begins_with(path, b"\x89PNG", b"\xff\xd8\xff") else None
 
 
 def _chosen(dataset: Dataset, topic: str) -> Stream:

@@ -9,18 +9,19 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from mp4ds._version import __version__
-from mp4ds.bags import BagWriter, open_writer
+from mp4ds.bags import BagWriter, open_writer, recording_names
 from mp4ds.bags.convert import Converter
 from mp4ds.dataset import Dataset, Stream
 from mp4ds.errors import FormatError, OptionError, WriteError
 from mp4ds.outputs import digest_file, staged
+from mp4ds.owned import Owned
 from mp4ds.plan import FileNames, Selection
 from mp4ds.recorded import recorded_storage
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord
 from mp4ds.remote import RemotePath, location, remote
 from mp4ds.republish import KINDS, Reduction, Republished, Republisher, check_kind
 from mp4ds.sidecar import MANIFEST_NAME
-from mp4ds.unpacking.images import write_images
+from mp4ds.unpacking.images import image_names, write_images
 from mp4ds.unpacking.options import UnpackOptions, UnpackProgress, UnpackSummary
 from mp4ds.uploads import Upload
 
@@ -70,12 +71,9 @@ def unpack(
     with Dataset(dataset, jpeg_quality=chosen.jpeg_quality) as opened:
         given = location(output) if output else default_output(opened.path, to)
         target = Path(os.path.abspath(given))  # noqa: PTH100
-        replaceable = _is_image_folder if to == "images" else _is_recording
         if to != "images":
             opened.verify_messages()
-        with staged(
-            target, force=chosen.force, replaceable=replaceable, sources=[opened.path]
-        ) as path:
+        with staged(target, force=chosen.force, owned=_owned(to), sources=[opened.path]) as path:
             try:
                 if to == "images":
                     return _unpack_images(opened, path, target, chosen, progress)
@@ -140,7 +138,7 @@ def _unpack_to_store(
         lambda: _order(dataset, to, options),
         make,
         force=options.force,
-        replaceable=_is_image_folder if to == "images" else _is_recording,
+        owned=_owned(to),
     )
     again = {topic: Republished(**item) for topic, item in values["republished"].items()}
     return UnpackSummary(**{**values, "output": target, "republished": again})
@@ -154,16 +152,8 @@ def _order(dataset: Path | str, to: str, options: UnpackOptions) -> dict[str, ob
     return {"dataset": digest, "to": to, "options": asdict(options), "mp4ds": __version__}
 
 
-def _is_recording(path: Path) -> bool:
-    if path.is_dir():
-        return (path / "metadata.yaml").is_file() or not any(path.iterdir())
-    return path.is_file() and path.suffix in (".bag", ".mcap")
-
-
-def _is_image_folder(path: Path) -> bool:
-    if not path.is_dir():
-        return False
-    return not any(path.iterdir()) or any((p / "stamps.csv").is_file() for p in path.iterdir())
+def _owned(to: str) -> Owned:
+    return image_names if to == "images" else recording_names
 
 
 def _unpack_recording(
