@@ -195,3 +195,42 @@ def test_an_error_that_nobody_thought_of(
         assert told["error"].startswith("TypeError in cli/")
         assert told["exit_code"] == 1
         assert told["versions"]["mp4ds"] == mp4ds.__version__
+
+
+# ---------------------------------------------------------------- limits of the system
+
+WITHIN = """
+import resource, sys
+from pathlib import Path
+import mp4ds.checks, mp4ds.packing, mp4ds.unpacking
+from mp4ds.cli import main
+used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+limit = used + int(sys.argv.pop(1)) * 2**20
+resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+main()
+"""
+
+
+@LIMITED
+@pytest.mark.parametrize("mebibytes", [2, 24])
+@pytest.mark.parametrize("name", ["pack", "validate", "unpack"])
+def test_a_want_of_memory_is_no_damage(
+    mebibytes: int, name: str, recording: Path, dataset: Path, tmp_path: Path
+) -> None:
+    """Whatever ffmpeg says of it."""
+    places = {"RECORDING": recording, "DATASET": dataset}
+    places |= {f"OUT{end}": tmp_path / f"out{end}" for end in ("", ".mcap")}
+    words = [str(places.get(word, word)) for word in COMMANDS[name].split()]
+    done = subprocess.run(
+        [sys.executable, "-c", WITHIN, str(mebibytes), *words],
+        env={**os.environ, "PYTHONPATH": str(Path(mp4ds.__file__).parents[1])},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    if done.returncode or mebibytes < 8:
+        assert done.returncode == 1, done.stdout
+        assert done.stdout == ""
+        assert done.stderr.endswith("mp4ds: out of memory; try fewer --jobs\n"), done.stderr
+        assert list(tmp_path.iterdir()) == []

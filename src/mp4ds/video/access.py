@@ -27,6 +27,7 @@ from mp4ds.video.chains import Chains, Group, Piece
 from mp4ds.video.digest import packets_of_groups
 from mp4ds.video.pictures import PictureMaker
 from mp4ds.video.samples import SampleTable, Unindexed, read_sample_table
+from mp4ds.video.scarcity import raise_if_scarce
 
 _DECODERS = {
     "h264": "h264",
@@ -153,6 +154,7 @@ class FrameAccess:
             for frame in self._decoded(chain):
                 if frame.is_corrupt:
                     self._context = self._session = None
+                    raise_if_scarce()
                     raise self._damage(due, "is marked as corrupt")
                 number = due.pop(frame.pts, None) if frame.pts is not None else None
                 if number is not None:
@@ -160,6 +162,7 @@ class FrameAccess:
                 if not due:
                     return
         except FFmpegError as error:
+            raise_if_scarce(error)
             self._context = self._session = None
             raise self._damage(due, f"cannot be decoded: {error}") from None
         raise self._damage(due, "was not found")

@@ -15,6 +15,7 @@ from mp4ds.errors import VideoError
 from mp4ds.layouts import Picture
 from mp4ds.video.media import Media
 from mp4ds.video.pictures import PictureMaker
+from mp4ds.video.scarcity import raise_if_scarce
 
 _MOST_THREADS = 16  # that ffmpeg chooses of itself
 
@@ -176,6 +177,7 @@ class VideoDecoder:
         try:
             self._container.seek(tick, stream=self._stream)
         except (FFmpegError, OSError) as error:
+            raise_if_scarce(error)
             raise VideoError(
                 "decode-failed", self._path, f"frame {index} cannot be sought: {error}"
             ) from None
@@ -202,6 +204,7 @@ class VideoDecoder:
                 yield frame
                 number += 1
         except (FFmpegError, OSError) as error:
+            raise_if_scarce(error)
             raise VideoError(
                 "decode-failed", self._path, f"frame {number} cannot be decoded: {error}"
             ) from None
@@ -211,10 +214,12 @@ class VideoDecoder:
             for packet in self._container.demux(self._stream):
                 try:
                     frames = packet.decode()
-                except FFmpegError:
+                except FFmpegError as error:
+                    raise_if_scarce(error)
                     continue
                 yield from (frame for frame in frames if not frame.is_corrupt)
         except (FFmpegError, OSError) as error:
+            raise_if_scarce(error)
             raise VideoError("decode-failed", self._path, f"cannot be read: {error}") from None
 
     def close(self) -> None:

@@ -17,6 +17,7 @@ from mp4ds.stamps import TIMESCALE
 from mp4ds.video.codecs import Recipe
 from mp4ds.video.convert import Converter, picture_to_frame
 from mp4ds.video.hardware import HardwareError, device_for, refuse_if_unusable, surface_format
+from mp4ds.video.scarcity import raise_if_scarce
 from mp4ds.video.scheduling import ordinary_scheduling
 
 _TIME_BASE = Fraction(1, TIMESCALE)
@@ -85,8 +86,9 @@ class VideoEncoder:
         except MemoryError:  # which FFmpegError may be, too: no fault of the pictures
             self._container.close()
             raise
-        except (FFmpegError, ValueError):
+        except (FFmpegError, ValueError) as error:
             self._container.close()
+            raise_if_scarce(error)
             if recipe.hardware:
                 refuse_if_unusable(recipe.hardware, self.width, self.height)
             raise EncoderRefusedError(
@@ -138,6 +140,7 @@ class VideoEncoder:
         try:
             packets: Sequence[Any] = self._stream.encode(frame)
         except FFmpegError as error:
+            raise_if_scarce(error)
             if not self.recipe.hardware:
                 raise
             raise HardwareError(

@@ -18,6 +18,7 @@ from mp4ds.video.media import FFMPEG_NAMES, Media
 from mp4ds.video.pictures import PictureMaker
 from mp4ds.video.reader import FrameReader
 from mp4ds.video.samples import Unindexed, read_sample_table
+from mp4ds.video.scarcity import raise_if_scarce
 
 _SECOND = 1_000_000_000
 _LATEST = 2**63 // _SECOND - 1  # seconds
@@ -88,6 +89,7 @@ class VideoFile:
                 if not packet.is_discard:
                     ticks.append(packet.pts)
         except (FFmpegError, OSError) as error:
+            raise_if_scarce(error)
             raise VideoError("video-unreadable", self._path, f"cannot be read: {error}") from None
         return np.sort(np.array(ticks, np.int64)), np.sort(np.array(keys, np.int64))
 
@@ -150,6 +152,7 @@ class VideoFile:
             )
             self._frames = container.decode(self._stream)
         except (FFmpegError, OSError) as error:
+            raise_if_scarce(error)
             raise VideoError(
                 "decode-failed", self._path, f"frame {index} cannot be sought: {error}"
             ) from None
@@ -160,6 +163,7 @@ class VideoFile:
                 if frame.pts is not None and frame.pts >= tick:
                     return frame if frame.pts == tick else None
         except (FFmpegError, OSError) as error:
+            raise_if_scarce(error)
             raise VideoError(
                 "decode-failed", self._path, f"frame {index} cannot be decoded: {error}"
             ) from None

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mp4ds.coded import Refused
 from mp4ds.video.convert import Converter
+from mp4ds.video.scarcity import raise_if_scarce
 
 _FORMATS = {"mono8": "gray", "rgb8": "rgb24"}
 
@@ -38,6 +39,7 @@ class JpegDecoder:
         try:
             frames = [*context.decode(av.Packet(bytes(data))), *context.decode(None)]
         except FFmpegError as error:
+            raise_if_scarce(error)
             raise Refused(f"its JPEG does not decode: {error.strerror}") from None
         if len(frames) != 1 or frames[0].is_corrupt:
             raise Refused("its JPEG does not decode")

@@ -10,6 +10,7 @@ from av.error import FFmpegError
 
 from mp4ds.errors import RemoteError, VideoError
 from mp4ds.remote import remote
+from mp4ds.video.scarcity import raise_if_scarce
 
 FFMPEG_NAMES = {
     "h264": "h264",
@@ -52,6 +53,7 @@ class Media:
             self.container: Any = open_input(self._file or str(path.absolute()))
         except (FFmpegError, OSError) as error:
             self._close_file()
+            raise_if_scarce(error)
             reason = error.strerror or error
             raise VideoError("video-unreadable", path, f"is not an mp4: {reason}") from None
         except BaseException:

@@ -22,6 +22,7 @@ from mp4ds.coded.packets import plain_body
 from mp4ds.errors import VideoError
 from mp4ds.stamps import TIMESCALE
 from mp4ds.video.media import FFMPEG_NAMES, Media, open_input, pixel_format_of
+from mp4ds.video.scarcity import raise_if_scarce
 
 _TIME_BASE = Fraction(1, TIMESCALE)
 _LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.1, 30.0, 240.0  # Hz
@@ -201,7 +202,8 @@ def _probe(codec: str, parameters: bytes, plain: bytes) -> Any:
         )
     try:
         probe = open_input(io.BytesIO(data), container)
-    except (FFmpegError, OSError):
+    except (FFmpegError, OSError) as error:
+        raise_if_scarce(error)
         raise Refused("its first picture cannot be decoded") from None
     if not probe.streams.video or probe.streams.video[0].codec_context is None:
         probe.close()

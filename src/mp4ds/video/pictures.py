@@ -9,6 +9,7 @@ import av
 from mp4ds.errors import VideoError
 from mp4ds.layouts import Picture
 from mp4ds.video.convert import Converter, frame_to_picture
+from mp4ds.video.scarcity import raise_if_scarce
 
 
 class PictureMaker:
@@ -54,6 +55,7 @@ class PictureMaker:
         """
         name = "a frame" if number is None else f"frame {number}"
         if frame.is_corrupt:
+            raise_if_scarce()
             raise VideoError("decode-failed", self._path, f"has {name} that is marked as corrupt")
         if (frame.width, frame.height) != self.coded_size:
             width, height = self.coded_size

@@ -18,6 +18,7 @@ from mp4ds.video.codecs import Recipe
 from mp4ds.video.convert import Converter, picture_to_frame
 from mp4ds.video.depths import TEN_BITS, narrowed, samples
 from mp4ds.video.media import Media
+from mp4ds.video.scarcity import raise_if_scarce
 
 PLANES_FORMAT = "yuv420p"
 """Pixel format of the planes."""
@@ -93,6 +94,7 @@ def decoded_planes(path: Path) -> Iterator[Planes]:
                 )
             yield planes_of(frame)
     except FFmpegError as error:
+        raise_if_scarce(error)
         raise VideoError("decode-failed", path, f"cannot be decoded: {error}") from None
     finally:
         media.close()
@@ -156,5 +158,6 @@ def packet_sizes(path: Path) -> PacketSizes:
                 if packet.size:
                     (keys if packet.is_keyframe else others).append(packet.size)
     except (FFmpegError, OSError) as error:
+        raise_if_scarce(error)
         raise VideoError("video-unreadable", path, f"cannot be read: {error}") from None
     return PacketSizes(tuple(keys), tuple(others))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mp4ds.errors import VideoError
 from mp4ds.video.media import Media
+from mp4ds.video.scarcity import raise_if_scarce
 
 # where green, blue, red and alpha stand in a pixel of packed formats
 _PACKED = {
@@ -66,6 +67,7 @@ def raw_pictures(path: Path, *, is_gray: bool) -> Iterator[RawPicture]:
             yield _raw(frame, is_gray=is_gray)
             number += 1
     except (FFmpegError, OSError) as error:
+        raise_if_scarce(error)
         raise VideoError(
             "decode-failed", path, f"frame {number} cannot be decoded: {error}"
         ) from None

@@ -16,6 +16,7 @@ from mp4ds.layouts import MAX_SIDE, Encoding, Layout, Parameters, Picture, Pixel
 from mp4ds.video.codecs import Recipe, codecs_to_try, recipe_for
 from mp4ds.video.convert import Converter, picture_to_frame
 from mp4ds.video.encoder import EncoderRefusedError, coded_size, color_range, open_encoder
+from mp4ds.video.scarcity import raise_if_scarce
 
 NEAR = 1.02
 """A candidate that stands earlier is taken if it is larger by no more than this."""
@@ -95,7 +96,8 @@ def _packets(
             yield packet.pts, packet.size
     except MemoryError:
         raise
-    except (FFmpegError, ValueError):
+    except (FFmpegError, ValueError) as error:
+        raise_if_scarce(error)
         raise EncoderRefusedError(
             f"{recipe.encoder} does not take pictures of {columns}x{rows}"
         ) from None
