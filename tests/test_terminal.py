@@ -124,10 +124,10 @@ def test_a_status_line_is_no_markup(monkeypatch: pytest.MonkeyPatch) -> None:
 # ---------------------------------------------------------------- standard streams
 
 
-def run(words: str, where: str, folder: Path) -> subprocess.CompletedProcess[str]:
+def run(words: str, where: str, folder: Path, first: str = "") -> subprocess.CompletedProcess[str]:
     """A command as a process of its own, its streams as a shell is told."""
     return subprocess.run(
-        ["bash", "-c", f'"$PYTHON" -m mp4ds {words} {where}'],
+        ["bash", "-c", f'{first}"$PYTHON" -m mp4ds {words} {where}'],
         cwd=folder,
         env={
             **os.environ,
@@ -234,3 +234,24 @@ def test_a_want_of_memory_is_no_damage(
         assert done.stdout == ""
         assert done.stderr.endswith("mp4ds: out of memory; try fewer --jobs\n"), done.stderr
         assert list(tmp_path.iterdir()) == []
+
+
+@LIMITED
+def test_more_cameras_than_open_files(tmp_path: Path) -> None:
+    """Each has a file while it is packed; as many may be open as the system lets."""
+    made = scene("mono8", frames=8, with_info=False, width=16, height=12).messages
+    images = [message for message in made if "image" in message.topic]
+    messages = [replace(m, topic=f"/cam{number}") for number in range(48) for m in images]
+    write_mcap(tmp_path / "d.mcap", Scene(sorted(messages, key=lambda m: m.log_time)))
+    limits = "ulimit -Sn 40; ulimit -Hn 40; "
+    for parts in ("", " --gop 2 --window 2"):
+        done = run(f"pack d.mcap -o d --force{parts}", "", tmp_path, limits)
+        assert done.returncode == 1
+        assert "too many files are open at once; `ulimit -n` allows more" in done.stderr
+        assert not (tmp_path / "d").exists()
+    done = run("pack d.mcap -o d --restart", "", tmp_path, "ulimit -Sn 40; ")
+    assert done.returncode == 0, done.stderr
+    assert mp4ds.validate(tmp_path / "d", deep=True) == []
+    done = run("unpack d --to mcap -o again.mcap", "", tmp_path, limits)
+    assert done.returncode == 1
+    assert "too many files are open at once; `ulimit -n` allows more" in done.stderr

@@ -25,6 +25,7 @@ The exit code is the one that the command line ends with.
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,18 @@ def _restored(kind: type[Mp4dsError], args: tuple[Any, ...], fields: dict[str, A
 
 def _as_path(path: Path | str) -> Path:
     return Path(path) if isinstance(path, str) else path
+
+
+def reason_of(error: BaseException) -> str:
+    """What the system says of an error, and what helps; without a full stop."""
+    if getattr(error, "errno", None) in (errno.EMFILE, errno.ENFILE):
+        return "too many files are open at once; `ulimit -n` allows more"
+    return getattr(error, "strerror", None) or str(error)
+
+
+def sentence_of(error: OSError) -> str:
+    """An error of the system: where, and what; without a full stop."""
+    return f"{error.filename or 'a file'}: {reason_of(error)}"
 
 
 class SourceError(Mp4dsError, ValueError):
@@ -165,9 +178,8 @@ class WriteError(Mp4dsError, OSError):
 
     def __init__(self, path: Path | str, cause: BaseException) -> None:
         self.path = _as_path(path)
-        reason = getattr(cause, "strerror", None) or str(cause)
         super().__init__(
-            f"{path}: could not be written: {reason}. "
+            f"{path}: could not be written: {reason_of(cause)}. "
             "The source is untouched and the unfinished output was removed."
         )
 

@@ -17,13 +17,12 @@ import typer
 
 from mp4ds._version import __version__
 from mp4ds.cli.output import complain, print_json
-from mp4ds.errors import Mp4dsError
+from mp4ds.errors import Mp4dsError, sentence_of
 
 _AGAIN = "run the same command again to go on"
 _BAD_PATH = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EACCES, errno.EINVAL)
 _DEBUG = "MP4DS_DEBUG"
 _NO_MEMORY = "out of memory; try fewer --jobs"
-_NO_FILES = "too many files are open at once: allow more of them (`ulimit -n`), or try fewer --jobs"
 _MEMORY_REFUSED = ("can't start new thread", "failed to map segment", "Cannot allocate memory")
 _LONGEST = 500
 _PACKAGE = Path(__file__).parents[1]
@@ -45,7 +44,7 @@ def told_errors(as_json: bool) -> Iterator[None]:
     except OSError as error:
         # a path that the system itself refuses, wherever it was met
         code = 2 if error.errno in _BAD_PATH else 1
-        _fail(_refused(error), code, as_json)
+        _fail(sentence_of(error), code, as_json)
     except MemoryError:
         _fail(_NO_MEMORY, 1, as_json)
     except Exception as error:
@@ -53,12 +52,6 @@ def told_errors(as_json: bool) -> Iterator[None]:
         if any(words in str(error) for words in _MEMORY_REFUSED):
             _fail(_NO_MEMORY, 1, as_json)
         _fail(_unexpected(error), 1, as_json, versions=_versions())
-
-
-def _refused(error: OSError) -> str:
-    if error.errno == errno.EMFILE:
-        return _NO_FILES
-    return f"{error.filename or 'a file'}: {error.strerror or error}"
 
 
 def _fail(

@@ -20,7 +20,7 @@ from typing import Any
 
 from mp4ds.bags import BagReader
 from mp4ds.engine import give_back
-from mp4ds.errors import Mp4dsError
+from mp4ds.errors import Mp4dsError, sentence_of
 from mp4ds.outputs import write_synced
 from mp4ds.packing.cameras import Exact
 from mp4ds.packing.job import Job, Task, digest_source
@@ -179,7 +179,8 @@ def _outcome(tasks: Tasks, folder: str, name: str) -> dict[str, Any]:
         return {"error": ("MemoryError", "out of memory; try fewer --jobs")}
     except (Mp4dsError, OSError) as error:
         tasks.close()  # it may be damaged where it was read ahead
-        return {"error": (type(error).__name__, str(error)), "ready": True}
+        said = str(error) if isinstance(error, Mp4dsError) else sentence_of(error)
+        return {"error": (type(error).__name__, said), "ready": True}
     peak = _memory("VmHWM")
     give_back()
     return {

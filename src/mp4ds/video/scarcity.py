@@ -21,7 +21,7 @@ def raise_if_scarce(error: BaseException | None = None) -> None:
     """
     number = getattr(error, "errno", None)
     if number in _FILES:
-        raise OSError(number, os.strerror(number)) from None
+        raise OSError(number, os.strerror(number), getattr(error, "filename", None)) from None
     if number == errno.EAGAIN and "avcodec_open2" in str(error):  # of a thread
         raise MemoryError from None
     try:
