@@ -342,7 +342,7 @@ def test_large_payloads_are_not_deserialised() -> None:
     pixels = bytes(range(256)) * 64
     channel = ros1_channel(0, "/a", "sensor_msgs/Image", "/node")
     converter = Converter("ros2")
-    data = image_ros1(width=128, height=128, encoding="mono8", data=pixels, stamp=(2**32 - 1, 7))
+    data = image_ros1(width=128, height=128, encoding="mono8", data=pixels, stamp=(2**31 - 1, 7))
     made = converter.payload(channel, memoryview(data))
     assert isinstance(made, memoryview)
     assert Converter("ros1").payload(converter.channel(channel), made) == data
@@ -426,3 +426,46 @@ def test_unknown_targets() -> None:
         Converter("ros3")
     with pytest.raises(OptionError, match="foxy, galactic, humble"):
         Converter("ros2", distribution="noetic")
+
+
+# ---------------------------------------------------------------- times
+
+
+def stamped(kind: str, seconds: int, encoding: str) -> tuple[Channel, bytes]:
+    """A message with a time, in its header, in an array of messages, or by itself."""
+    store = typestore("ros1" if encoding == "ros1" else "ros2")
+    names = {"header": "sensor_msgs/msg/Imu", "nested": "nav_msgs/msg/Path"}
+    name = names.get(kind, "rosgraph_msgs/msg/Clock")
+    message = default_message(store, name)
+    seconds -= 2**32 if seconds >= 2**31 else 0  # the same bits
+    time = store.types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=5)
+    if kind == "alone":
+        message.clock = time
+    elif kind == "header":
+        message.header.stamp = time
+    else:
+        poses = [default_message(store, "geometry_msgs/msg/PoseStamped") for _ in range(2)]
+        message.poses = poses
+        poses[1].header.stamp = time
+        poses[0].pose.position.x = -1.0
+    made = (
+        store.serialize_ros1(message, name)
+        if encoding == "ros1"
+        else store.serialize_cdr(message, name)
+    )
+    schema = Schema(name.replace("/msg/", "/") if encoding == "ros1" else name, "", b"")
+    return Channel(0, "/a", encoding, schema, {}), bytes(made)
+
+
+@pytest.mark.parametrize("kind", ["header", "nested", "alone"])
+@pytest.mark.parametrize(
+    ("encoding", "target", "good", "bad"),
+    [("cdr", "ros1", 2**31 - 1, -1), ("ros1", "ros2", 2**31 - 1, 2**31)],
+)
+def test_times_that_the_target_cannot_hold(
+    kind: str, encoding: str, target: str, good: int, bad: int
+) -> None:
+    converter = Converter(target)
+    converter.payload(*stamped(kind, good, encoding))
+    with pytest.raises(ConversionError, match=f"topic /a: a message has a time of {bad} s, and"):
+        converter.payload(*stamped(kind, bad, encoding))

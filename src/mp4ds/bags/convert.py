@@ -18,6 +18,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys.msg import denormalize_msgtype, normalize_msgtype
 from rosbags.typesys.store import Typestore
 
+from mp4ds.bags.convert_times import Where, time_beyond, where_times_are
 from mp4ds.bags.typedefs import (
     BAD_DEFINITION,
     BAD_PAYLOAD,
@@ -59,6 +60,8 @@ _ROS1 = "ros1:"  # begins the keys that keep a ROS 1 connection header in ROS 2 
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 _REMEDY = "Exclude the topic with --exclude, or unpack to mcap, which keeps it as it is."
 
+_KEPT_AS_IT_IS = "Unpack to mcap, which keeps it as it is, or exclude the topic with --exclude."
+
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
@@ -70,6 +73,7 @@ class _Plan:
         store: The same with the header of ROS 2, which is what rosbags converts bytes by.
         schema: Definition for the target.
         digest: md5sum for ROS 1, type hash for ROS 2.
+        times: Where its messages have times.
     """
 
     name: str
@@ -77,6 +81,11 @@ class _Plan:
     store: Typestore
     schema: Schema
     digest: str
+    times: Where
+
+
+class _TimeBeyond(Exception):  # noqa: N818 - of a message; the topic is told by its caller
+    """A time that the target cannot hold; says so."""
 
 
 class Converter:
@@ -128,6 +137,8 @@ class Converter:
         plan = self._plan(channel)
         try:
             return self._convert(plan, memoryview(data))
+        except _TimeBeyond as beyond:
+            raise ConversionError(channel.topic, str(beyond), _KEPT_AS_IT_IS) from None
         except BAD_PAYLOAD:
             problem = f"a message does not parse as {channel.type_name}"
             raise ConversionError(channel.topic, problem, _REMEDY) from None
@@ -188,7 +199,7 @@ class Converter:
         store = make_store(types, self._ros2)
         store.get_msgdef(name)  # compiled now, to fail before any message
         made_schema = Schema(new_name, target.schema_encoding, definition.encode())
-        return _Plan(name, types, store, made_schema, digest)
+        return _Plan(name, types, store, made_schema, digest, where_times_are(types, name))
 
     def _convert(self, plan: _Plan, raw: memoryview) -> memoryview:
         to_ros1 = self._target is self._ros1
@@ -205,8 +216,15 @@ class Converter:
             end = _end(plan, raw, to_ros1=to_ros1)
             if not (0 < len(raw) - end <= MAX_TAIL and fields_of(plan.types, name)):
                 raise
-            converted = convert(raw[:end], name)
+            raw = raw[:end]
+            converted = convert(raw, name)
             self._omitted["messages with bytes after their end, which were left out"] += 1
+        seconds = time_beyond(plan.times, raw if to_ros1 else converted, name, store)
+        if seconds is not None:
+            has = f"{seconds} s, and ROS 1 can hold 0 to 2^32 seconds"
+            if not to_ros1:
+                has = f"{seconds + 2**32} s, and ROS 2 can hold -2^31 to 2^31 seconds"
+            raise _TimeBeyond(f"a message has a time of {has}")
         if not to_ros1 and HEADER in plan.types:
             self._omitted["messages with a header's sequence number, which ROS 2 has not"] += 1
         return converted
