@@ -821,7 +821,7 @@ def test_serving_until_interrupted(copy: Path) -> None:
 
 def test_what_a_camera_tells_of_its_calibrations(drive: Path) -> None:
     with mp4ds.open(drive) as dataset:
-        facts = Camera(dataset[COLOUR], COLOUR).facts(0, None)
+        facts = Camera(dataset[COLOUR], COLOUR).facts(0, None, "")
     (listed,) = facts["calibrations"]
     assert listed["from_frame"] == 0
     assert listed["distortion_model"] == "plumb_bob"

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ from report_scenes import (
     REPEATED,
     WIDTH,
     blocks,
+    many_cameras,
     pack_cameras,
     two_cameras,
 )
@@ -389,6 +391,137 @@ def test_the_calibration_grid_is_drawn(page: Tab) -> None:
     assert page.evaluate(painted) == 0
 
 
+# ---------------------------------------------------------------- many cameras
+
+STAMPLESS, ARRAY = 3, 14
+
+
+@pytest.fixture(scope="module")
+def array(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Many cameras, one of them without stamps; not to be changed."""
+    made = many_cameras(ARRAY, stampless=STAMPLESS)
+    folder = pack_cameras(tmp_path_factory.mktemp("array"), made)
+    report(folder)
+    return folder
+
+
+@pytest.fixture
+def wall(browser: Tab, array: Path) -> Tab:
+    """The page of many cameras."""
+    return show(browser, (array / "index.html").as_uri())
+
+
+def test_a_camera_without_stamps_bends_no_axis(wall: Tab) -> None:
+    for plot in ("delay", "offset", "interval"):
+        low, high = wall.evaluate(f"mp4dsReport.plots.{plot}.range()")
+        assert -100 < low < high < 100
+        without = f"mp4dsReport.plots.{plot}.canvas.parentElement.textContent"
+        assert f"camera_{STAMPLESS:02}/image_raw (no header stamps)" in wall.evaluate(without)
+    row = wall.evaluate(f"document.querySelectorAll('#timing tbody tr')[{STAMPLESS}].textContent")
+    assert row.count("no header stamps") == 2
+    assert wall.evaluate(f"mp4dsReport.player.cameras[{STAMPLESS}].stage.className") == "stage"
+
+
+def test_colours_of_many_cameras_can_be_told_apart(wall: Tab) -> None:
+    colours = wall.evaluate("mp4dsReport.player.cameras.map(camera => camera.colour)")
+    bgr = np.array([[int(text[at : at + 2], 16) for at in (5, 3, 1)] for text in colours])
+    lab = cv2.cvtColor((bgr[None] / 255).astype(np.float32), cv2.COLOR_BGR2Lab)[0]
+    apart = np.linalg.norm(lab[:, None] - lab[None], axis=2) + 1000 * np.eye(ARRAY)
+    assert apart.min() > 25
+    assert ((lab[:, 0] > 30) & (lab[:, 0] < 85)).all()  # on white and on black
+
+
+def test_a_camera_is_enlarged_and_others_are_hidden(wall: Tab) -> None:
+    width = "document.querySelectorAll('.camera')[%d].clientWidth"
+    usual, page = wall.evaluate(width % 5), wall.evaluate("find = document.body.clientWidth")
+    assert usual < page / 3
+    wall.evaluate("document.querySelectorAll('.stage')[5].click()")
+    assert wall.evaluate(width % 5) > 0.9 * page
+    assert wall.evaluate("mp4dsReport.player.lead.number") == 5
+    wall.press("Escape")
+    assert wall.evaluate(width % 5) == usual
+    wall.press("e")
+    assert wall.evaluate(width % 5) > 0.9 * page
+    wall.press("e")
+    for _ in range(ARRAY):  # the last one stays
+        wall.press("h")
+    shown = "mp4dsReport.player.cameras.filter(each => each.panel.clientWidth).map(c => c.number)"
+    [left] = wall.evaluate(shown)
+    wall.evaluate("mp4dsReport.player.go(5e8)")
+    assert wall.evaluate(SETTLED)
+    assert wall.evaluate("mp4dsReport.player.cameras.every(c => c.video.paused)")
+    wall.evaluate("document.querySelectorAll('#hidden button')[1].click()")
+    assert wall.evaluate(SETTLED)
+    assert wall.evaluate(shown) == sorted({1, left})
+    pictures = "[1, %d].map(n => mp4dsReport.player.cameras[n]).map(c => c.shown - c.frameAt(5e8))"
+    assert wall.evaluate(pictures % left) == [0, 0]
+    assert "camera_00" in wall.evaluate("document.querySelector('#hidden').textContent")
+
+
+def test_the_address_leads_to_a_time(wall: Tab) -> None:
+    for text in ("0.5", "0.25"):
+        wall.evaluate(
+            "new Promise(done => { addEventListener('hashchange', done, {once: true});"
+            f" location.hash = '#t={text}'; }}).then(() => 0)"
+        )
+        assert wall.evaluate("mp4dsReport.player.time") == float(text) * 1e9
+    wall.evaluate(
+        "new Promise(done => { addEventListener('hashchange', done, {once: true});"
+        " location.hash = '#t=%E0%A4%A'; }).then(() => 0)"
+    )
+    assert wall.evaluate("mp4dsReport.player.time") == 0.25e9
+    assert wall.problems == []
+
+
+def test_names_and_numbers_are_whole_on_a_phone(browser: Tab, array: Path) -> None:
+    size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": False}
+    browser.command("Emulation.setDeviceMetricsOverride", **size)
+    try:
+        show(browser, (array / "index.html").as_uri())
+        cut = browser.evaluate(
+            "[...document.querySelectorAll('h1, h3, .camera .kind, .camera dd, .clock, .facts dd,"
+            " .plot .value, .legend label')].filter(each => { const box ="
+            " each.getBoundingClientRect(); return each.scrollWidth > each.clientWidth + 1 &&"
+            " each.clientWidth || box.right > 390 || box.width < 1 || box.left < 0; })"
+            ".map(each => each.textContent)"
+        )
+        assert cut == []
+        stamp = browser.evaluate("mp4dsReport.player.cameras[0].values.stamp.clientHeight")
+        assert stamp < 25  # on one line
+        assert browser.evaluate("document.documentElement.scrollWidth") <= 390
+    finally:
+        browser.command("Emulation.clearDeviceMetricsOverride")
+
+
+def test_the_clock_waits_on_a_busy_machine(wall: Tab) -> None:
+    """What is on the screen, and the clock, at each step of playing on a slow processor."""
+    wall.evaluate(
+        "window.steps = []; mp4dsReport.player.listeners.push(() => { const p = mp4dsReport.player;"
+        " if (p.isPlaying) steps.push([performance.now(), p.time, ...p.cameras.map(c => c.shown)]);"
+        "}); window.positions = mp4dsReport.player.cameras.map(c => [...c.position]); 0"
+    )
+    wall.command("Emulation.setCPUThrottlingRate", rate=6)
+    try:
+        wall.evaluate("mp4dsReport.player.play()")
+        end = time.monotonic() + 60
+        while wall.evaluate("mp4dsReport.player.isPlaying") and time.monotonic() < end:
+            time.sleep(0.1)
+        assert wall.evaluate("mp4dsReport.player.time === mp4dsReport.player.end")
+    finally:
+        wall.command("Emulation.setCPUThrottlingRate", rate=1)
+    steps, positions = np.array(wall.evaluate("steps")), np.array(wall.evaluate("positions"))
+    cameras = np.arange(ARRAY)
+    shown = np.maximum(steps[:, 2:].astype(int), 0)
+    until = np.column_stack([positions, np.full(ARRAY, np.inf)])[cameras, shown + 1]
+    behind = (steps[:, 1:2] - until).max(axis=1)
+    first = shown == 0
+    ahead = np.where(first, 0, positions[cameras, shown] - steps[:, 1:2]).max(axis=1)
+    assert behind.max() <= 0.2e9 + 1
+    # a video runs on while the page itself stands still, and is brought back
+    lasted = np.diff(steps[:, 0], append=steps[-1, 0])
+    assert lasted[ahead > 0.3e9].sum() <= 0.25 * lasted.sum()
+
+
 # ---------------------------------------------------------------- sizes, names and troubles
 
 
@@ -415,6 +548,35 @@ def test_videos_of_10_bits_are_shown_as_they_are(browser: Tab, tmp_path: Path) -
     for number in (FRAMES - 1, 0, 5):
         page.evaluate(f"mp4dsReport.player.go({float(made.stamps[1][number] - made.base)})")
         assert_shows(page, made, 1, number)
+
+
+def test_lossless_rgb_plays_itself_to_the_bit(browser: Tab, tmp_path: Path) -> None:
+    drive = pack_cameras(tmp_path, two_cameras(), quality="lossless", codec="h264")
+    summary = report(drive)
+    assert [camera.plays for camera in summary.cameras] == ["proxy", "video"]
+    with ReportServer(summary.files, summary.start) as server:
+        thread = threading.Thread(target=server.serve)
+        thread.start()
+        try:
+            page = show(browser, server.url)
+            with mp4ds.open(drive) as dataset:
+                for number in (0, FRAMES - 1, 11):
+                    page.evaluate(
+                        f"mp4dsReport.player.go(mp4dsReport.player.cameras[1].position[{number}])"
+                    )
+                    assert page.evaluate(SETTLED)
+                    seen = page.evaluate(
+                        "(v => { const c = new OffscreenCanvas(v.videoWidth, v.videoHeight)"
+                        ".getContext('2d'); c.drawImage(v, 0, 0); return Array.from("
+                        "c.getImageData(0, 0, v.videoWidth, v.videoHeight).data); })"
+                        "(mp4dsReport.player.cameras[1].video)"
+                    )
+                    picture = np.array(seen, np.uint8).reshape(HEIGHT, WIDTH, 4)[..., :3]
+                    np.testing.assert_array_equal(picture, dataset[COLOUR][number].data)
+            page.open("about:blank", ready="true")
+        finally:
+            server.stop()
+            thread.join()
 
 
 def test_two_hours_at_60_hz(browser: Tab, drive: Path, tmp_path: Path) -> None:

@@ -7,16 +7,21 @@ from pathlib import Path
 
 from mp4ds.video.media import Media, pixel_format_of
 
-_YUV420 = frozenset({"yuv420p", "yuvj420p", "gray"})
+_8BIT = frozenset({"yuv420p", "yuv422p", "yuv444p", "gbrp"})
 _PLAYED = {
-    "h264": _YUV420,
-    "av1": _YUV420 | {"yuv420p10le", "gray10le"},
-    "vp9": frozenset({"yuv420p"}),
+    "h264": _8BIT
+    | {"yuvj420p", "yuvj422p", "yuvj444p", "gray"}
+    | {"yuv420p10le", "yuv422p10le", "yuv444p10le", "gray10le"},
+    "av1": frozenset({"yuv420p", "yuvj420p", "gray", "yuv420p10le", "gray10le"}),
+    "vp9": _8BIT,
 }
+"""What Chromium was seen to show as it is; others play less of it."""
+
+_FEW = ("hevc",)  # where the system or the graphics card decodes it
 
 
 def why_not_in_browsers(path: Path) -> str:
-    """Why no browser plays a video; empty if those that have its codec do.
+    """Why browsers do not play a video; empty if Chromium and its kin do.
 
     Args:
         path: An mp4.
@@ -28,7 +33,7 @@ def why_not_in_browsers(path: Path) -> str:
         context = media.track.codec_context
         name, pixel_format = context.codec.canonical_name, pixel_format_of(context)
     if name not in _PLAYED:
-        return f"no browser plays {name}"
+        return f"{'few browsers play' if name in _FEW else 'no browser plays'} {name}"
     if pixel_format not in _PLAYED[name]:
         return f"no browser plays {name} of the pixel format {pixel_format}"
     return ""
