@@ -81,12 +81,13 @@ class Camera:
             columns["ticks"] = pack_column(self.times)
         return columns
 
-    def facts(self, number: int, reference: Camera | None) -> dict[str, Any]:
+    def facts(self, number: int, reference: Camera | None, untimed: str) -> dict[str, Any]:
         """What the page shows of it besides its columns.
 
         Args:
             number: Of the camera on the page.
-            reference: The camera whose stamps it is compared with; None: itself.
+            reference: The camera whose stamps it is compared with; None: none.
+            untimed: Why its stamps are not compared; empty: they are.
         """
         sidecar = self.stream.sidecar
         return {
@@ -105,6 +106,7 @@ class Camera:
             "caption": self.caption,
             "shown": self._shown(),
             "timing": asdict(self.timing()),
+            "untimed": untimed,
             "offset": None if reference is None else _offset(self.stamps, reference.stamps),
             **self._calibrations(),
         }

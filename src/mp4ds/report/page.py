@@ -15,7 +15,7 @@ import numpy as np
 from mp4ds._version import __version__
 from mp4ds.dataset import Dataset
 from mp4ds.report.cameras import Camera
-from mp4ds.report.timing import axis_of
+from mp4ds.report.timing import axis_of, untimed
 from mp4ds.report.topics import TopicRow
 
 INDEX_NAME = "index.html"
@@ -84,19 +84,24 @@ def _facts(
     dataset: Dataset, cameras: list[Camera], topics: list[TopicRow], notes: list[str]
 ) -> dict[str, Any]:
     manifest = dataset.manifest
-    axis = axis_of([{"stamp": c.stamps, "log_time": c.log_times} for c in cameras])
+    both = [{"stamp": c.stamps, "log_time": c.log_times} for c in cameras]
+    axis, reasons = axis_of(both), untimed(both)
     columns = [c.stamps if axis == "stamp" else c.log_times for c in cameras]
     # at most: the page shows a frame from the latest time so far on
     base = min((int(times[0]) for times in columns), default=0)
-    reference = cameras[0] if len(cameras) > 1 else None
+    timed = [number for number, reason in enumerate(reasons) if not reason]
+    reference = timed[0] if len(timed) > 1 else None
     return {
         "name": dataset.path.resolve().name,
         "version": __version__,
         "axis": axis,
         "base": str(base),
         "summary": _summary(dataset, topics),
+        "reference": reference,
         "cameras": [
-            camera.facts(number, None if camera is reference else reference)
+            camera.facts(
+                number, cameras[timed[0]] if number in timed[1:] else None, reasons[number]
+            )
             for number, camera in enumerate(cameras)
         ],
         "topics": [{**asdict(row), "ratio": row.ratio} for row in topics],

@@ -12,6 +12,8 @@ from mp4ds.intervals import Floats, Integers, differences, intervals, lost_frame
 _MS = 1e6  # nanoseconds
 _WIDER = 2  # times the span of the log times, beyond which stamps are of several clocks
 _SLACK_NS = 10 * 10**9
+_DAY_NS = 86_400 * 10**9
+_NO_STAMPS, _OTHER_CLOCK = "no header stamps", "stamps of another clock"
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,25 @@ def nearest_offsets(stamps: Integers, reference: Integers) -> Floats:
     to_after = differences(stamps, ordered[after])
     to_before = differences(stamps, ordered[before])
     return np.where(np.abs(to_before) <= np.abs(to_after), to_before, to_after)
+
+
+def untimed(cameras: Sequence[Mapping[str, Integers]]) -> list[str]:
+    """Why the stamps of each camera cannot be compared with those of the others; empty: they can.
+
+    Args:
+        cameras: Columns ``stamp`` and ``log_time`` of each.
+    """
+    have_stamps = [bool(columns["stamp"].any()) for columns in cameras]
+    is_far = [
+        abs(float(np.median(differences(columns["log_time"], columns["stamp"])))) > _DAY_NS
+        for columns in cameras
+    ]
+    # where all are far from the record times, as in a simulation, they are near each other
+    pairs = list(zip(have_stamps, is_far, strict=True))
+    has_near = (True, False) in pairs
+    return [
+        _NO_STAMPS if not has else _OTHER_CLOCK if far and has_near else "" for has, far in pairs
+    ]
 
 
 def axis_of(cameras: Sequence[Mapping[str, Integers]]) -> str:

@@ -4,26 +4,31 @@
 var mp4dsPlayer = (() => {
   const {lastAtMost} = mp4dsColumns;
   const HELD = 2e9;       // a longer interval is waited through with the video paused
-  const SLACK = 0.2e9;    // that the clock may be ahead of the slowest video
-  const LATE = 500;       // ms after which a frame that was sought is taken for shown
+  const SLACK = 0.2e9;    // that the clock may be away from what the slowest video shows
+  const SLOWER = 500, FASTER = 2000;  // ms of waiting, and of none, that change the pace by e
+  const LEAST_PACE = 1 / 16;          // that browsers play at
+  const LATE = 500;       // ms after which a frame that was sought, and was there before, is taken for shown
+  const LOST = 5000;      // and another one, if the browser does not say that it is
 
   class Camera {
     constructor(facts, number, parts) {
       Object.assign(this, {facts, number, ...parts});
       this.shown = this.wanted = -1;
-      this.busy = this.isReady = this.isBroken = false;
+      this.busy = this.isReady = this.isBroken = this.isHidden = false;
     }
 
     /** Take the columns: stamp and logTime (BigInt64Array), position and ticks (numbers). */
     take(columns) {
       Object.assign(this, columns);
-      this.usual = (this.facts.timing.median_ms || 0) * 1e6;
+      const mean = (this.position.at(-1) - this.position[0]) / Math.max(1, this.frames - 1);
+      this.usual = this.facts.timing.median_ms ? this.facts.timing.median_ms * 1e6 : mean;
       if (this.video && this.ticks) this.open();
     }
 
     open() {
       const video = this.video;
       video.addEventListener("loadedmetadata", () => { this.isReady = true; if (this.wanted >= 0) this.seek(); });
+      for (const event of ["playing", "pause", "error"]) video.addEventListener(event, () => { this.isStarting = false; });
       video.addEventListener("seeked", () => this.seeked());
       video.addEventListener("error", () => {
         this.isBroken = true;
@@ -38,7 +43,8 @@ var mp4dsPlayer = (() => {
     watch() {
       this.video.requestVideoFrameCallback((_, metadata) => {
         this.isPresented = true;
-        this.show(this.frameOfTick(metadata.mediaTime * 1e6));
+        this.presented = this.frameOfTick(metadata.mediaTime * 1e6);
+        this.show(this.presented);
         this.watch();
       });
     }
@@ -48,9 +54,9 @@ var mp4dsPlayer = (() => {
       this.notice.hidden = false;
     }
 
-    get isPlayable() { return Boolean(this.isReady && !this.isBroken); }
+    get isPlayable() { return Boolean(this.isReady && !this.isBroken && !this.isHidden); }
     get frames() { return this.position.length; }
-    get isSettled() { return !this.video || this.isBroken || !this.ticks || this.wanted < 0 || (!this.busy && this.shown === this.wanted); }
+    get isSettled() { return !this.video || this.isHidden || this.isBroken || !this.ticks || this.wanted < 0 || (!this.busy && this.shown === this.wanted); }
 
     frameAt(time) { return lastAtMost(this.position, time); }
 
@@ -76,18 +82,19 @@ var mp4dsPlayer = (() => {
       return (this.ticks[n] + part * (this.ticks[next] - this.ticks[n])) / 1e6;
     }
 
-    /** The time at which the video is. */
-    timeNow() {
-      const tick = this.video.currentTime * 1e6, n = Math.max(0, lastAtMost(this.ticks, tick));
-      if (n + 1 >= this.frames) return this.position[n] + (tick - this.ticks[n]) * 1e3;
-      const part = (tick - this.ticks[n]) / (this.ticks[n + 1] - this.ticks[n]);
-      return this.position[n] + part * (this.position[n + 1] - this.position[n]);
+    /** How far the clock may go on from a time, by the frame on the screen. */
+    reach(time, slack) {
+      if (!this.isPlayable) return Infinity;
+      const due = Math.max(0, this.frameAt(time)), {shown} = this;
+      const isMoving = this.busy || this.isStarting || this.video.seeking;
+      if (shown < 0 || (isMoving && shown > due && this.position[shown] > time + slack)) return time;
+      return shown + 1 < this.frames ? this.position[shown + 1] + slack : Infinity;
     }
 
     /** Seek to a frame, or as soon as the seek before is done. */
     want(n) {
       this.wanted = n;
-      if (!this.video || !this.ticks || this.isBroken) this.show(n);
+      if (!this.video || !this.ticks || this.isBroken || this.isHidden) this.show(n);
       else if (this.isReady && !this.busy) this.seek();
     }
 
@@ -103,13 +110,13 @@ var mp4dsPlayer = (() => {
       if (!this.busy) return;
       this.busy = false;
       if (!this.video.paused) return;
-      if (this.wanted !== this.sought) { this.seek(); return; }
+      if (this.wanted !== this.sought && !this.isFollowing) { this.seek(); return; }
       const sought = this.sought;
       // no picture is presented where the one that is sought is on the screen already
       const settle = () => {
         if (!this.busy && !this.isPresented && this.sought === sought && this.video.paused) this.show(sought);
       };
-      if (this.video.requestVideoFrameCallback) setTimeout(settle, LATE); else settle();
+      if (this.video.requestVideoFrameCallback) setTimeout(settle, this.presented === sought ? LATE : LOST); else settle();
     }
 
     show(n) {
@@ -120,6 +127,7 @@ var mp4dsPlayer = (() => {
 
     /** Go along while the clock runs. */
     follow(time, speed) {
+      this.isFollowing = true;
       if (!this.isPlayable) { this.wanted = Math.max(0, this.frameAt(time)); this.show(this.wanted); return; }
       const n = this.frameAt(time), video = this.video;
       const until = n + 1 < this.frames ? this.position[n + 1] : this.position[n] + this.usual;
@@ -130,16 +138,26 @@ var mp4dsPlayer = (() => {
         return;
       }
       this.wanted = n;
-      const late = this.secondsAt(time) - video.currentTime;
-      if (video.paused) {
-        if (this.busy) return;
+      if (!video.requestVideoFrameCallback && !video.seeking) this.show(this.frameOfTick(video.currentTime * 1e6));
+      const late = this.secondsAt(time) - video.currentTime, far = Math.max(1, speed);
+      const isShown = this.shown >= n && this.position[this.shown] <= time + SLACK * far;
+      if (this.busy || video.seeking) return;
+      if (video.ended) {
+        if (this.shown !== n) this.want(n);
+      } else if (video.paused) {
+        if (isShown && late < -0.03) return;  // until the clock gets there
         if (Math.abs(late) > 0.03) video.currentTime = this.secondsAt(time);
-        this.rate(speed);
+        this.rate(0);  // until all have started
+        this.isStarting = true;
         video.play().catch(() => {});
-      } else if (Math.abs(late) > 0.3 * Math.max(1, speed)) {
-        if (!video.seeking) video.currentTime = this.secondsAt(time);
+      } else if (late < -0.15 * far) {  // the clock waits, for this one too if it shows too little
+        video.pause();
+        this.sought = -1;
+        if (!isShown) this.want(n);
+      } else if (late > 0.3 * far) {
+        video.currentTime = this.secondsAt(time);
       } else {
-        this.rate(speed * (1 + Math.max(-0.15, Math.min(0.15, late / Math.max(1, speed)))));
+        this.rate(speed * (1 + Math.max(-0.15, Math.min(0.15, late / far))));
       }
     }
 
@@ -148,9 +166,16 @@ var mp4dsPlayer = (() => {
       if (this.video.playbackRate !== rounded) this.video.playbackRate = rounded;
     }
 
+    /** Leave it out, or show it again at a time. */
+    hide(isHidden, time) {
+      this.isHidden = isHidden;
+      this.stop();
+      if (this.position) this.want(Math.max(0, this.frameAt(time)));
+    }
+
     stop() {
       if (this.video && !this.video.paused) this.video.pause();
-      this.busy = false;
+      this.busy = this.isFollowing = false;
       this.sought = -1;
     }
   }
@@ -186,6 +211,8 @@ var mp4dsPlayer = (() => {
       if (this.isPlaying || !this.cameras.length) return;
       if (this.time >= this.end) this.time = 0;
       this.isPlaying = true;
+      this.pace = 1;
+      this.current = LEAST_PACE;
       this.last = performance.now();
       requestAnimationFrame(now => this.advance(now));
       this.tell();
@@ -200,20 +227,28 @@ var mp4dsPlayer = (() => {
 
     toggle() { if (this.isPlaying) this.pause(); else this.play(); }
 
-    /** The clock runs on, but not away from a video that cannot keep up. */
+    /** The clock runs on, but not away from what a video shows: it waits, and then goes slower. */
     advance(now) {
       if (!this.isPlaying) return;
-      let next = this.time + Math.min(250, Math.max(0, now - this.last)) * 1e6 * this.speed;
+      const passed = Math.max(0, now - this.last), slack = SLACK * Math.max(1, this.speed);
+      let next = this.time + passed * 1e6 * this.speed * this.current, isLate = false;
       this.last = now;
       for (const camera of this.cameras) {
-        if (!camera.isPlayable || camera.video.paused || camera.video.ended) continue;
-        const isWaiting = camera.video.seeking || camera.video.readyState < 2;
-        const most = isWaiting ? this.time : camera.timeNow() + SLACK * Math.max(1, this.speed);
-        next = Math.min(next, Math.max(this.time, most));
+        if (!camera.position) continue;
+        const most = Math.max(this.time, camera.reach(this.time, slack));
+        if (most >= next) continue;
+        next = most;
+        isLate = true;
       }
+      const pace = this.pace * Math.exp(isLate ? -passed / SLOWER : passed / FASTER);
+      // until the page looks again, no video is to get further than that
+      this.pace = Math.max(LEAST_PACE, Math.min(1, pace, SLACK / 1e6 / (passed || 1)));
       this.time = Math.min(next, this.end);
       if (this.time >= this.end) { this.pause(); return; }
-      for (const camera of this.cameras) if (camera.position) camera.follow(this.time, this.speed);
+      for (const camera of this.cameras) if (camera.position) camera.follow(this.time, this.speed * this.current);
+      // videos that already play are not to run away from those that are about to
+      const isStarting = this.cameras.some(camera => camera.isStarting && camera.isPlayable);
+      this.current = isStarting ? LEAST_PACE : this.pace;
       this.tell();
       requestAnimationFrame(later => this.advance(later));
     }

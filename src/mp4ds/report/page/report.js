@@ -1,7 +1,9 @@
 /* Puts the page together. data.js and the columns of each camera call in here. */
 "use strict";
 var mp4dsReport = (() => {
-  const COLOURS = ["#3b82f6", "#f97316", "#10b981", "#a855f7", "#ef4444", "#14b8a6", "#eab308", "#ec4899"];
+  // each as far as can be from those before it, on light and on dark (farthest points in OKLab)
+  const COLOURS = ["#3b82f6", "#f97316", "#10b981", "#a855f7", "#ef4444", "#eab308", "#786020", "#c8b0e8", "#b00080", "#f830c0",
+    "#685898", "#5828f8", "#58e000", "#00d0f8", "#008800", "#008890", "#b07898", "#a09000", "#b03020", "#f880f8"];
   const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8];
   const {element} = mp4dsTables, find = id => document.getElementById(id);
   const report = {plots: {}};
@@ -22,7 +24,7 @@ var mp4dsReport = (() => {
     notice.hidden = Boolean(facts.video);
     const fit = element("div", {class: "fit"}, [...(video ? [video] : []), canvas, notice]);
     fit.style.aspectRatio = `${facts.width / facts.shown[0]} / ${facts.height / facts.shown[1]}`;
-    fit.style.maxWidth = `${62 * facts.width / facts.height}vh`;
+    fit.style.setProperty("--ratio", String(facts.width / facts.height));
     const values = {}, readout = element("dl", {class: "readout"});
     for (const [key, name] of [["frame", "Frame"], ["stamp", "Stamp"], ["delay", "Delay"], ["log", "Recorded"]]) {
       values[key] = element("dd");
@@ -33,12 +35,16 @@ var mp4dsReport = (() => {
     const head = element("header", {title: "Steps follow this camera"}, [dot, element("h3", {text: facts.name}),
       element("span", {class: "kind", text: `${facts.encoding} ${facts.width}×${facts.height} · ${facts.codec} ${facts.profile}`})]);
     if (facts.proxy) head.append(element("span", {class: "badge", text: "proxy", title: facts.note}));
-    const stage = element("div", {class: "stage"}, [fit]);
+    const close = element("button", {type: "button", class: "close", text: "×", title: "Hide this camera (h)", "aria-label": `Hide ${facts.name}`});
+    head.append(close);
+    const stage = element("div", {class: "stage", title: "Enlarge, or back (e)"}, [fit]);
     const panel = element("article", {class: "camera"}, [head, stage, readout]);
     if (facts.caption) panel.append(element("div", {class: "caption", text: `Shown ${facts.caption}`}));
     find("cameras").append(panel);
-    const camera = new mp4dsPlayer.Camera(facts, number, {video, canvas, notice, panel, stage, values, colour, isSeen: true, onShown: told});
+    const camera = new mp4dsPlayer.Camera(facts, number, {video, canvas, notice, panel, stage, close, values, colour, isSeen: true, onShown: told});
     head.addEventListener("click", () => lead(camera));
+    close.addEventListener("click", event => { event.stopPropagation(); hide(camera, true); });
+    stage.addEventListener("click", () => enlarge(camera));
     return camera;
   }
 
@@ -50,7 +56,7 @@ var mp4dsReport = (() => {
     values.stamp.title = mp4dsTables.dateText(camera.stamp[n]);
     values.log.textContent = mp4dsTables.stampText(camera.logTime[n]);
     values.log.title = mp4dsTables.dateText(camera.logTime[n]);
-    values.delay.textContent = `${mp4dsPlots.numberText(Number(camera.logTime[n] - camera.stamp[n]) / 1e6)} ms`;
+    values.delay.textContent = camera.facts.untimed || `${mp4dsPlots.numberText(Number(camera.logTime[n] - camera.stamp[n]) / 1e6)} ms`;
     drawGrid(camera);
   }
 
@@ -79,83 +85,53 @@ var mp4dsReport = (() => {
     context.stroke();
   }
 
+  /** Give a camera the width of the page, and take it from the others; again: give it back. */
+  function enlarge(camera) {
+    const isLarge = camera && camera.panel.classList.contains("large");
+    for (const each of player.cameras) each.panel.classList.toggle("large", each === camera && !isLarge);
+    if (camera && !isLarge) {
+      lead(camera);
+      camera.panel.scrollIntoView({block: "nearest"});
+    }
+    redraw();
+  }
+
+  /** Hide a camera, whose video then costs nothing, or show it again. */
+  function hide(camera, isHidden) {
+    const shown = player.cameras.filter(each => !each.isHidden && each !== camera);
+    if (isHidden && !shown.length) return;
+    camera.panel.hidden = isHidden;
+    camera.panel.classList.remove("large");
+    camera.hide(isHidden, player.time);
+    if (isHidden && player.lead === camera) lead(shown[0]);
+    arrange();
+  }
+
+  /** As many columns as the cameras that are shown need, and the names of the others. */
+  function arrange() {
+    const hidden = player.cameras.filter(camera => camera.isHidden), count = player.cameras.length - hidden.length;
+    find("cameras").style.setProperty("--columns", String(count <= 1 ? 1 : count <= 4 ? 2 : count <= 9 ? 3 : 4));
+    for (const camera of player.cameras) camera.close.hidden = count <= 1;
+    find("hidden").hidden = !hidden.length;
+    find("hidden").replaceChildren("Hidden:", ...hidden.map(camera => {
+      const dot = element("span", {class: "dot"}), show = element("button", {type: "button", title: "Show again"}, [dot, camera.facts.name]);
+      dot.style.background = camera.colour;
+      show.addEventListener("click", () => hide(camera, false));
+      return show;
+    }));
+    redraw();
+  }
+
+  function redraw() {
+    for (const plot of Object.values(report.plots)) plot.request();
+    for (const camera of player.cameras) { camera.gridKey = null; if (!camera.isHidden) drawGrid(camera); }
+    if (timeline) timeline.request();
+  }
+
   function lead(camera) {
     player.lead = camera;
     find("lead").value = String(camera.number);
     for (const each of player.cameras) each.panel.classList.toggle("lead", each === camera && player.cameras.length > 1);
-  }
-
-  // ------------------------------------------------------------ time line
-
-  class Timeline {
-    constructor(canvas) {
-      this.canvas = canvas;
-      view.listeners.push(() => this.request());
-      const timeAt = event => {
-        const box = canvas.getBoundingClientRect();
-        return view.from + Math.max(0, Math.min(1, (event.clientX - box.left) / box.width)) * (view.to - view.from);
-      };
-      let isDown = false, wasPlaying = false;
-      canvas.addEventListener("pointerdown", event => {
-        isDown = true;
-        wasPlaying = player.isPlaying;
-        player.pause();
-        canvas.setPointerCapture(event.pointerId);
-        player.go(timeAt(event));
-      });
-      canvas.addEventListener("pointermove", event => { if (isDown) player.go(timeAt(event)); });
-      canvas.addEventListener("pointerup", () => { isDown = false; if (wasPlaying) player.play(); });
-      canvas.addEventListener("dblclick", () => view.all());
-      canvas.addEventListener("wheel", event => {
-        event.preventDefault();
-        const span = view.to - view.from;
-        if (event.shiftKey || Math.abs(event.deltaX) > Math.abs(event.deltaY)) view.set(view.from + span * (event.deltaX || event.deltaY) / 1000, view.to + span * (event.deltaX || event.deltaY) / 1000);
-        else view.zoom(timeAt(event), Math.exp(event.deltaY / 300));
-      }, {passive: false});
-    }
-
-    request() {
-      if (this.pending) return;
-      this.pending = requestAnimationFrame(() => { this.pending = 0; this.draw(); });
-    }
-
-    /** The lanes change with the view alone; the line of the time moves over them. */
-    draw() {
-      const lanes = player.cameras.length, row = lanes > 8 ? 5 : 8, top = 18;
-      const [context, width, height] = mp4dsPlots.prepare(this.canvas, top + lanes * row + 4), colours = mp4dsPlots.theme();
-      const xOf = time => (time - view.from) / (view.to - view.from || 1) * width;
-      const marks = mp4dsPlots.ticks(view.from / 1e9, view.to / 1e9, width / 110), digits = mp4dsPlots.digitsOf(marks);
-      context.fillStyle = colours.text;
-      context.strokeStyle = colours.line;
-      context.textBaseline = "middle";
-      for (const mark of marks) {
-        const x = xOf(mark * 1e9), text = mp4dsPlots.timeText(mark, digits);
-        context.textAlign = x < 24 ? "left" : x > width - 24 ? "right" : "center";
-        context.fillText(text, x, 7);
-        context.beginPath(); context.moveTo(x, top - 3); context.lineTo(x, height); context.stroke();
-      }
-      player.cameras.forEach((camera, lane) => { if (camera.position) this.lane(context, camera, top + lane * row, row - 2, width, colours); });
-      const x = xOf(player.time);
-      context.fillStyle = colours.accent;
-      context.fillRect(x - 1, 0, 2, height);
-      context.beginPath(); context.arc(x, 5, 5, 0, 7); context.fill();
-    }
-
-    lane(context, camera, y, height, width, colours) {
-      const span = (view.to - view.from) / width, reach = Math.max(1.5 * camera.usual, span);
-      context.fillStyle = camera.colour;
-      let first = mp4dsColumns.lastAtMost(camera.position, view.from) + 1, from = -1;
-      const missing = [];
-      for (let px = 0; px <= width; px++) {
-        const time = view.from + (px + 1) * span, n = mp4dsColumns.lastAtMost(camera.position, time);
-        const isThere = px < width && n >= 0 && time - camera.position[n] <= reach;
-        if (isThere && from < 0) from = px;
-        if (!isThere && from >= 0) { context.fillRect(from, y, px - from, height); from = -1; }
-        if (n + 1 > first) { if (camera.lost.reduction.range(first, n + 1)[1] > 0) missing.push(px); first = n + 1; }
-      }
-      context.fillStyle = colours.warn;
-      for (const px of missing) context.fillRect(px, y, 1, height);
-    }
   }
 
   // ------------------------------------------------------------ plots
@@ -183,6 +159,12 @@ var mp4dsReport = (() => {
     return report.plots[name] = plot;
   }
 
+  /** Say under a plot which cameras would only bend its axis, and why. */
+  function leaveOut(plot, cameras) {
+    const names = cameras.map(({facts}) => `${facts.name} (${facts.untimed})`);
+    if (names.length) plot.canvas.after(element("p", {class: "hint", text: `Without ${names.join(", ")}`}));
+  }
+
   function addPlots() {
     const cameras = player.cameras.filter(camera => camera.position), shown = camera => () => camera.isSeen;
     const add = (plot, camera, y) => plot.add({name: camera.facts.name, colour: camera.colour, x: camera.position, y, shown: shown(camera)});
@@ -191,16 +173,22 @@ var mp4dsReport = (() => {
     const jitter = report.plots.jitter = new mp4dsPlots.Histogram(canvas, value, {unit: "ms"});
     const lost = timePlot("lost", "Lost frames (up), repeated or backward (down)", "frames", {stems: true});
     const delay = timePlot("delay", "Record time less header stamp", "ms");
+    const stampless = cameras.filter(camera => !camera.hasStamps), strange = cameras.filter(camera => camera.facts.untimed);
     for (const camera of cameras) {
+      if (!camera.facts.untimed) add(delay, camera, mp4dsColumns.delays(camera.logTime, camera.stamp));
+      if (!camera.hasStamps) continue;
       add(interval, camera, camera.interval);
       const median = camera.facts.timing.median_ms || 0;
       jitter.add({name: camera.facts.name, colour: camera.colour, y: camera.interval.map(value => value - median), shown: shown(camera)});
       add(lost, camera, camera.lost.values);
-      add(delay, camera, mp4dsColumns.delays(camera.logTime, camera.stamp));
     }
-    if (cameras.length > 1) {
-      const [reference, ...others] = cameras, offset = timePlot("offset", `Offset to ${reference.facts.name}`, "ms");
-      for (const camera of others) add(offset, camera, mp4dsColumns.offsets(camera.stamp, reference.stamp));
+    for (const plot of [interval, jitter, lost]) leaveOut(plot, stampless);
+    leaveOut(delay, strange);
+    const reference = player.cameras[data.reference];
+    if (reference) {
+      const offset = timePlot("offset", `Offset to ${reference.facts.name}`, "ms");
+      for (const camera of cameras) if (camera.facts.offset) add(offset, camera, mp4dsColumns.offsets(camera.stamp, reference.stamp));
+      leaveOut(offset, strange);
     }
     const measures = new Set(cameras.flatMap(camera => Object.keys(camera.scores)));
     for (const measure of measures) {
@@ -257,6 +245,19 @@ var mp4dsReport = (() => {
     return clean && Number.isFinite(seconds) ? seconds * 1e9 : null;
   }
 
+  /** The time that the address asks for by #t=, or null. */
+  function timeOfAddress() {
+    let asked = null;
+    try { asked = /^#t=(.+)$/.exec(decodeURIComponent(location.hash)); } catch { /* no text: it asks for nothing */ }
+    return asked && timeOf(asked[1]);
+  }
+
+  function goTo(time) {
+    player.pause();
+    player.go(time);
+    if (player.time < view.from || player.time > view.to) view.all();
+  }
+
   function addControls() {
     for (const speed of SPEEDS) find("speed").append(element("option", {value: speed, text: `${speed} ×`}));
     find("speed").value = "1";
@@ -272,26 +273,20 @@ var mp4dsReport = (() => {
     find("goto").addEventListener("submit", event => {
       event.preventDefault();
       const time = timeOf(find("goto-time").value);
-      if (time === null) return;
-      player.pause();
-      player.go(time);
-      if (player.time < view.from || player.time > view.to) view.all();
+      if (time !== null) goTo(time);
     });
+    addEventListener("hashchange", () => { const time = timeOfAddress(); if (time !== null) goTo(time); });
     document.addEventListener("keydown", event => {
       if (event.target.closest("input[type=text], select") || event.ctrlKey || event.metaKey || event.altKey) return;
       const far = event.shiftKey ? 10 : 1;
       const actions = {" ": () => player.toggle(), ArrowLeft: () => player.step(-far), ArrowRight: () => player.step(far),
-        Home: () => player.go(0), End: () => player.go(player.end), g: () => find("grid").click()};
+        Home: () => player.go(0), End: () => player.go(player.end), g: () => find("grid").click(),
+        e: () => player.lead && enlarge(player.lead), Escape: () => enlarge(null), h: () => player.lead && hide(player.lead, true)};
       const action = actions[event.key];
       if (!action) return;
       event.preventDefault();
       action();
     });
-    const redraw = () => {
-      for (const plot of Object.values(report.plots)) plot.request();
-      for (const camera of player.cameras) { camera.gridKey = null; drawGrid(camera); }
-      timeline.request();
-    };
     addEventListener("resize", redraw);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   }
@@ -312,7 +307,7 @@ var mp4dsReport = (() => {
         const scores = {};
         for (const [name, text] of Object.entries(packed.scores)) scores[name] = mp4dsColumns.decodeFloats(text);
         camera.take({
-          stamp, logTime, interval, scores, lost: {values: lost, reduction: new mp4dsPlots.Reduction(lost)},
+          stamp, logTime, interval, scores, hasStamps: stamp.some(Boolean), lost: {values: lost, reduction: new mp4dsPlots.Reduction(lost)},
           position: mp4dsColumns.positions(data.axis === "stamp" ? stamp : logTime, base),
           ticks: packed.ticks ? Float64Array.from(mp4dsColumns.decode(packed.ticks, count), Number) : null,
         });
@@ -328,14 +323,13 @@ var mp4dsReport = (() => {
     document.title = `${data.name} - mp4ds report`;
     find("name").textContent = data.name;
     find("footer").textContent = `mp4ds ${data.version}. Cameras are shown together by their ${data.axis === "stamp" ? "header stamps" : "record times"}.`;
-    const count = data.cameras.length;
-    find("cameras").style.setProperty("--columns", String(count <= 1 ? 1 : count <= 4 ? 2 : 3));
     const cameras = data.cameras.map(cameraPanel);
     player = report.player = new mp4dsPlayer.Player(cameras, 0);
+    arrange();
     await Promise.all(cameras.map(load));
     player.end = Math.max(0, ...cameras.map(camera => camera.position.at(-1)));
     view = report.view = new mp4dsPlots.View(player.end);
-    timeline = new Timeline(find("timeline"));
+    timeline = new mp4dsTimeline.Timeline(find("timeline"), player, view);
     const facts = data.summary;
     find("subtitle").textContent = [facts.start_text, facts.format && `from ${facts.format}`, (facts.sources || []).slice(0, 4).join(", ")].filter(Boolean).join(" · ");
     const length = facts.start ? Number(BigInt(facts.end) - BigInt(facts.start)) / 1e9 : player.end / 1e9;
@@ -350,8 +344,7 @@ var mp4dsReport = (() => {
     addLegend();
     addPlots();
     player.listeners.push(refresh);
-    const asked = /^#t=(.+)$/.exec(decodeURIComponent(location.hash));
-    player.go((asked && timeOf(asked[1])) || 0);
+    player.go(timeOfAddress() ?? 0);
   }
 
   /** What the page is about, called by report/data.js. */

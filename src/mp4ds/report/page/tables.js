@@ -73,7 +73,7 @@ var mp4dsTables = (() => {
   const NUMBER = {number: true};
 
   function timing(place, data) {
-    const reference = data.cameras.length > 1 ? data.cameras[0].name : "";
+    const reference = data.reference === null ? "" : data.cameras[data.reference].name;
     const head = [["Camera", {long: true}], ["Frames", NUMBER], ["Rate, Hz", NUMBER], ["Interval, ms", NUMBER], ["Jitter, ms", NUMBER],
       ["99 % within", NUMBER], ["Longest, ms", NUMBER], ["Lost", NUMBER], ["Repeated", NUMBER], ["Backward", NUMBER],
       ["seq missing", NUMBER], ["Record − stamp, ms", NUMBER]];
@@ -82,9 +82,9 @@ var mp4dsTables = (() => {
       const t = camera.timing, count = (value, more = "") => [grouped(value) + more, {bad: value > 0}];
       const row = [camera.name, grouped(t.frames), optional(t.rate_hz, 2), optional(t.median_ms, 3), optional(t.jitter_ms, 3), optional(t.p99_ms, 3),
         optional(t.longest_ms, 1), count(t.lost, t.gaps ? ` in ${grouped(t.gaps)} gaps` : ""), count(t.repeated), count(t.backward), t.seq_missing === null ? "" : count(t.seq_missing),
-        `${numberText(t.delay_median_ms)} (${numberText(t.delay_least_ms)} to ${numberText(t.delay_most_ms)})`];
+        camera.untimed || `${numberText(t.delay_median_ms)} (${numberText(t.delay_least_ms)} to ${numberText(t.delay_most_ms)})`];
       const offset = camera.offset;
-      if (reference) row.push(offset ? `${numberText(offset.median_ms)} (99 % within ${numberText(offset.p99_ms)})` : "reference");
+      if (reference) row.push(offset ? `${numberText(offset.median_ms)} (99 % within ${numberText(offset.p99_ms)})` : camera.untimed || "reference");
       return row;
     }));
     return "Interval is the median between header stamps, jitter the standard deviation. An interval of more than 1.5 medians counts as lost frames, unless shorter ones beside it make up for it; "
