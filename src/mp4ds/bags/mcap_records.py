@@ -20,6 +20,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
+from mp4ds.bags.inflate import ZSTD_PIECE, most_unpacked
 from mp4ds.errors import SourceError, SourceNotFoundError
 from mp4ds.remote import expect
 
@@ -178,10 +179,6 @@ class RecordStream:
                 data = self._stream.read(length)
             else:
                 data = self._read_in_pieces(length)
-        except zstandard.ZstdError as error:
-            raise SourceError(
-                self.path, f"its zstd compression is damaged: {error}", SALVAGE_REMEDY
-            ) from None
         except OSError as error:
             raise SourceError(self.path, f"cannot be read: {error.strerror or error}") from None
         if len(data) != length:
@@ -306,15 +303,18 @@ def unpack_chunk(body: bytes) -> bytes | memoryview:
 def _decompress(compression: str, data: memoryview, size: int) -> bytes | memoryview:
     if compression == "":
         return data
-    if size > MAX_RECORD_BYTES:
-        raise DamageError(f"a chunk promises {size} bytes")
+    if size > most_unpacked(len(data)):
+        raise DamageError(f"a chunk promises {size} bytes and has {len(data)}")
     if compression == "zstd":
         return unzstd(data, size)
     if compression == "lz4":
+        machine = lz4.frame.LZ4FrameDecompressor()
         try:
-            content: bytes = lz4.frame.decompress(data)
+            content: bytes = machine.decompress(data, max_length=size + 1)
         except RuntimeError as error:
             raise DamageError(f"the lz4 compression of a chunk is damaged: {error}") from None
+        if not machine.eof:
+            raise DamageError(f"the lz4 compression of a chunk does not end after {size} bytes")
         return content
     raise DamageError(f"a chunk is compressed by {compression!r}, and only zstd and lz4 are known")
 
@@ -335,8 +335,8 @@ def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
             return _unzstd_unsized(data)
         if size is not None and stated not in (-1, size):
             raise DamageError(f"zstd data holds {stated} bytes instead of {size}")
-        if stated > MAX_RECORD_BYTES:
-            raise DamageError(f"zstd data promises {stated} bytes")
+        if stated > most_unpacked(len(data)):
+            raise DamageError(f"zstd data promises {stated} bytes and has {len(data)}")
         return zstandard.ZstdDecompressor().decompress(
             data, max_output_size=size or 0, allow_extra_data=False
         )
@@ -346,10 +346,17 @@ def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
 
 def _unzstd_unsized(data: bytes | memoryview) -> bytes:
     decompressor = zstandard.ZstdDecompressor().decompressobj()
-    content = decompressor.decompress(data)
-    if not decompressor.eof or decompressor.unused_data:
+    content = bytearray()
+    most = most_unpacked(len(data))
+    used = 0
+    while used < len(data) and not decompressor.eof:
+        content += decompressor.decompress(data[used : used + ZSTD_PIECE])
+        used += ZSTD_PIECE
+        if len(content) > most:
+            raise DamageError(f"zstd data of {len(data)} bytes unpacks to more than {most}")
+    if not decompressor.eof or decompressor.unused_data or used < len(data):
         raise DamageError("zstd data is cut short, or holds more than one frame")
-    return content
+    return bytes(content)
 
 
 def chunk_records(content: bytes | memoryview) -> Iterator[tuple[int, int, memoryview]]:

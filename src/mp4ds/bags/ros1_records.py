@@ -14,6 +14,7 @@ import lz4.frame
 from rosbags.rosbag1 import ReaderError
 from rosbags.rosbag1.reader import Header, RecordType
 
+from mp4ds.bags.inflate import most_unpacked
 from mp4ds.bags.mcap_records import SALVAGE_REMEDY, open_source
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, Schema
@@ -192,6 +193,8 @@ def unpack_chunk(compression: str, size: int, data: bytes) -> bytes:
     if compression == "none":
         unpacked = data
     elif compression in ("bz2", "lz4"):
+        if size > most_unpacked(len(data)):
+            raise ReaderError(f"it promises {size} bytes and has {len(data)}")
         machine = BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
         try:
             unpacked = machine.decompress(data, max_length=size + 1)

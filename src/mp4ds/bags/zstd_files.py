@@ -6,15 +6,15 @@ import io
 import shutil
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import zstandard
 
+from mp4ds.bags.inflate import FILE_RATIO, ZSTD_PIECE, most_unpacked
 from mp4ds.bags.mcap_records import SALVAGE_REMEDY, open_source
 from mp4ds.errors import SourceError
 
 MAGIC = b"\x28\xb5\x2f\xfd"
-_PIECE_BYTES, _COPY_BYTES = 2**16, 2**22
+_COPY_BYTES = 2**22
 
 
 def is_zstd(path: Path) -> bool:
@@ -27,41 +27,96 @@ def is_zstd(path: Path) -> bool:
         return stream.read(len(MAGIC)) == MAGIC
 
 
-class ZstdFile:
-    """The content of a compressed file, read once from its start.
+class ZstdStream:
+    """The content of a compressed file, read once from its start, up to where it is damaged.
+
+    Args:
+        path: The compressed file.
+
+    Attributes:
+        consumed: Bytes of the file that were read.
+        problem: Why it ended before the file did, a phrase; empty where it did not.
+
+    Raises:
+        SourceError: It cannot be opened, or is empty.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = open_source(path)
+        self._frame = zstandard.ZstdDecompressor().decompressobj()
+        self._most = most_unpacked(path.stat().st_size, FILE_RATIO)
+        self._given = 0
+        self._is_within = False
+        self._left = bytearray()
+        self._ended = False
+        self.consumed = 0
+        self.problem = ""
+
+    def read(self, length: int, /) -> bytes:
+        """Read so many decompressed bytes; fewer at the end, or before damage."""
+        while len(self._left) < length and not self._ended:
+            piece = self._file.read(ZSTD_PIECE)
+            if not piece:
+                self._end("its zstd compression is cut short" if self._is_within else "")
+            self._take(piece)
+            self.consumed += len(piece)
+        data = bytes(self._left[:length])
+        del self._left[:length]
+        self._given += len(data)
+        return data
+
+    def _take(self, piece: bytes) -> None:
+        while piece:
+            try:
+                self._left += self._frame.decompress(piece)
+            except zstandard.ZstdError as error:
+                self._end(f"its zstd compression is damaged near byte {self.consumed}: {error}")
+                return
+            if self._given + len(self._left) > self._most:
+                self._end(f"it unpacks to more than {self._most} bytes, too many for its size")
+                return
+            self._is_within = not self._frame.eof
+            piece = b"" if self._is_within else self._frame.unused_data
+            if not self._is_within:
+                self._frame = zstandard.ZstdDecompressor().decompressobj()
+
+    def _end(self, problem: str) -> None:
+        self._ended, self.problem = True, problem
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class ZstdFile(ZstdStream):
+    """The content of a compressed file that is sound.
 
     Args:
         path: The compressed file.
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = open_source(path)
-        self._content: Any = zstandard.ZstdDecompressor().stream_reader(
-            self._file, read_across_frames=True, closefd=False
-        )
+        super().__init__(path)
+        self._path = path
 
     def read(self, length: int, /) -> bytes:
-        """Read so many decompressed bytes; fewer at the end only."""
-        data: bytes = self._content.read(length)
-        while len(data) < length:
-            more = self._content.read(length - len(data))
-            if not more:
-                break
-            data += more
+        """Read so many decompressed bytes; fewer at the end only.
+
+        Raises:
+            SourceError: It is damaged, cut short, or unpacks to too much.
+        """
+        data = super().read(length)
+        if self.problem and len(data) < length:
+            raise SourceError(self._path, self.problem, f"Copy it again; {SALVAGE_REMEDY}")
         return data
 
     def tell(self) -> int:
         """Bytes of the compressed file consumed."""
-        return self._file.tell()
+        return self.consumed
 
     def seek(self, offset: int, /) -> int:
         """Not possible."""
         raise io.UnsupportedOperation("seek")
-
-    def close(self) -> None:
-        """Close the file."""
-        self._content.close()
-        self._file.close()
 
 
 def copy_file(path: Path, target: Path) -> None:
@@ -92,25 +147,9 @@ def decompress_file(path: Path, target: Path) -> None:
     """Decompress a file into another one.
 
     Raises:
-        SourceError: The file is damaged or cut short.
+        SourceError: The file is damaged, cut short, or unpacks to too much.
         OSError: The target cannot be written.
     """
-    with closing(open_source(path)) as stream, target.open("wb") as output:
-        decompressor = zstandard.ZstdDecompressor()
-        frame = decompressor.decompressobj()
-        at_end = False
-        while piece := stream.read(_PIECE_BYTES):
-            while piece:
-                try:
-                    output.write(frame.decompress(piece))
-                except zstandard.ZstdError as error:
-                    problem = f"its zstd compression is damaged: {error}"
-                    raise SourceError(path, problem, SALVAGE_REMEDY) from None
-                at_end = frame.eof
-                piece = frame.unused_data if at_end else b""
-                if at_end:
-                    frame = decompressor.decompressobj()
-    if not at_end:
-        raise SourceError(
-            path, "its zstd compression is cut short", f"Copy the file anew; {SALVAGE_REMEDY}"
-        )
+    with closing(ZstdFile(path)) as stream, target.open("wb") as output:
+        while piece := stream.read(_COPY_BYTES):
+            output.write(piece)

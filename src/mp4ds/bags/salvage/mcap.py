@@ -20,7 +20,7 @@ from mp4ds.bags.salvage.mcap_pass import McapPass
 from mp4ds.bags.salvage.mcap_summary import SalvagedSummary, read_summary
 from mp4ds.bags.salvage.reader import FileSalvage
 from mp4ds.bags.salvage.window import Window
-from mp4ds.bags.salvage.zstd_stream import ZstdStream
+from mp4ds.bags.zstd_files import ZstdStream
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, ChannelStats, Message, Record, Schema
 

@@ -21,8 +21,8 @@ from mp4ds.bags.salvage.mcap import McapSalvage
 from mp4ds.bags.salvage.reader import Salvage
 from mp4ds.bags.salvage.rosbag2_files import StorageFile, find_storage, unreadable
 from mp4ds.bags.salvage.sqlite import SqliteSalvage
-from mp4ds.bags.salvage.zstd_stream import ZstdStream
 from mp4ds.bags.zstd_files import MAGIC as ZSTD_MAGIC
+from mp4ds.bags.zstd_files import ZstdStream
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, Loss, Message, MetadataRecord, Record, Schema
 

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import lz4.frame
 import zstandard
 
+from mp4ds.bags.inflate import ZSTD_PIECE, most_unpacked
+
 _PIECE = 2**12
 _SMALL_PIECE = 64
 """Bytes unpacked at a time from damaged data: the piece that shows the damage gives nothing."""
@@ -47,12 +49,14 @@ def unpack(compression: str, data: memoryview, size: int) -> Unpacked:
         compression: Its name: ``none`` or empty, ``bz2``, ``lz4`` or ``zstd``; where that is
             damaged, the data tells.
         data: As it is in the file, perhaps cut short.
-        size: Bytes that it should give; no more are unpacked.
+        size: Bytes that it should give; no more are unpacked, and no more than data of its
+            length may hold.
     """
     if compression in ("", "none"):
         content = bytes(data[:size])
         problem = "" if len(content) == size else "a chunk is cut short"
         return Unpacked(content, len(content), problem)
+    size = min(size, most_unpacked(len(data)))
     start = bytes(data[:4])
     found = next((name for magic, name in _MAGIC.items() if start.startswith(magic)), compression)
     if found not in _MACHINES:
@@ -171,11 +175,11 @@ class _Zstd:
     def decompress(self, data: memoryview, size: int) -> bytes:
         # It knows no limit: small pieces bound what comes of one.
         pieces: list[bytes] = []
-        for at in range(0, len(data), _PIECE):
+        for at in range(0, len(data), ZSTD_PIECE):
             if size < 0 or self._machine.eof:
                 self._not_fed = len(data) - at
                 break
-            pieces.append(self._machine.decompress(data[at : at + _PIECE]))
+            pieces.append(self._machine.decompress(data[at : at + ZSTD_PIECE]))
             size -= len(pieces[-1])
         return b"".join(pieces)
 
