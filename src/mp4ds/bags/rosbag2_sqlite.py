@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import sqlite3
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.mcap_records import SALVAGE_REMEDY, DamageError, open_source
+from mp4ds.bags.sqlite_open import Tables, open_tables
 from mp4ds.errors import SourceError
 from mp4ds.records import EVERYTHING, HASH_KEY, Channel, ChannelStats, Excerpt, Message, Schema
 
@@ -64,48 +64,23 @@ class SqliteReader:
         with closing(open_source(path, self._shown)) as stream:
             if stream.read(len(_MAGIC)) != _MAGIC:
                 raise SourceError(self._shown, "is not an sqlite3 database")
-        with self._connected() as connection:
-            self._check_columns(connection)
-            self._definitions = list(self._read_definitions(connection))
-            self._channels = {channel.id: channel for channel in self._read_topics(connection)}
-            self.tables: Mapping[str, str] = dict(self._read_tables(connection))
-            self.is_indexed = connection.execute(_TIME_INDEXES).fetchone() != (0,)
+        with self._opened() as tables:
+            self._check_columns(tables)
+            self._definitions = list(self._read_definitions(tables))
+            self._channels = {channel.id: channel for channel in self._read_topics(tables)}
+            self.tables: Mapping[str, str] = dict(self._read_tables(tables))
+            self.is_indexed = tables.select(_TIME_INDEXES).fetchone() != (0,)
 
-    @contextmanager
-    def _connected(self) -> Iterator[sqlite3.Connection]:
-        """A connection for reading only, whose errors name the file."""
-        pending = any(
-            side.exists() and side.stat().st_size
-            for side in (Path(f"{self.path}{suffix}") for suffix in ("-wal", "-journal"))
-        )
-        options = "mode=ro" if pending else "mode=ro&immutable=1"
-        index = Path(f"{self.path}-shm")  # sqlite makes one to read a -wal, and leaves it
-        had_index = index.exists()
-        connection = None
-        try:
-            connection = sqlite3.connect(
-                f"{self.path.absolute().as_uri()}?{options}", uri=True, check_same_thread=False
-            )
-            connection.text_factory = bytes  # verbatim, whether it is UTF-8 or not
-            yield connection
-        except (sqlite3.Error, UnicodeDecodeError) as error:
-            remedy = (
-                "It was not closed properly: open and close it once with the sqlite3 tool; "
-                + SALVAGE_REMEDY
-                if pending
-                else "If it was cut short, try `.recover` of the sqlite3 tool, or not at all; "
-                + SALVAGE_REMEDY
-            )
-            raise SourceError(self._shown, f"cannot be read as sqlite3: {error}", remedy) from None
-        finally:
-            if connection:
-                connection.close()
-            if not had_index:
-                index.unlink(missing_ok=True)
+    def _opened(self) -> AbstractContextManager[Tables]:
+        """Its tables, for one pass."""
+        return open_tables(self.path, self._shown)
 
-    def _columns(self, connection: sqlite3.Connection, table: str) -> list[str]:
-        rows = connection.execute(f"PRAGMA table_info({table})")
-        return [self._text(row[1], table) for row in rows]
+    def _columns(self, tables: Tables, table: str) -> list[str]:
+        columns = tables.columns(table)
+        if any(is_computed for _, is_computed in columns):
+            problem = f"computes a column of its table {table}, which no recording does"
+            raise SourceError(self._shown, problem, SALVAGE_REMEDY)
+        return [self._text(name, table) for name, _ in columns]
 
     def _text(self, value: Any, table: str) -> str:
         if isinstance(value, bytes):
@@ -117,10 +92,10 @@ class SqliteReader:
                 ) from None
         return "" if value is None else str(value)
 
-    def _check_columns(self, connection: sqlite3.Connection) -> None:
+    def _check_columns(self, tables: Tables) -> None:
         topics, messages = (
-            self._columns(connection, "topics"),
-            self._columns(connection, "messages"),
+            self._columns(tables, "topics"),
+            self._columns(tables, "messages"),
         )
         if not {*topics}.issuperset(_TOPIC_COLUMNS) or not {*messages} >= _MESSAGE_COLUMNS:
             raise SourceError(self._shown, "is a database, but not one of rosbag2")
@@ -132,10 +107,10 @@ class SqliteReader:
                 "Install a newer mp4ds.",
             )
 
-    def _read_definitions(self, connection: sqlite3.Connection) -> Iterator[tuple[Schema, str]]:
-        if not self._columns(connection, "message_definitions"):
+    def _read_definitions(self, tables: Tables) -> Iterator[tuple[Schema, str]]:
+        if not self._columns(tables, "message_definitions"):
             return
-        for name, encoding, data, type_hash in connection.execute(
+        for name, encoding, data, type_hash in tables.rows(
             "SELECT topic_type, encoding, encoded_message_definition, type_description_hash"
             " FROM message_definitions ORDER BY id"
         ):
@@ -144,10 +119,10 @@ class SqliteReader:
             schema = Schema(self._text(name, table), self._text(encoding, table), definition)
             yield schema, self._text(type_hash, table)
 
-    def _read_topics(self, connection: sqlite3.Connection) -> Iterator[Channel]:
-        columns = self._columns(connection, "topics")
+    def _read_topics(self, tables: Tables) -> Iterator[Channel]:
+        columns = self._columns(tables, "topics")
         extra = [name for name in columns if name not in _TOPIC_COLUMNS]
-        for row in connection.execute("SELECT * FROM topics ORDER BY id"):
+        for row in tables.rows("SELECT * FROM topics ORDER BY id"):
             fields = dict(zip(columns, row, strict=True))
             name, type_name, encoding = (
                 self._text(fields[column], "topics") for column in _TOPIC_COLUMNS[1:]
@@ -166,14 +141,15 @@ class SqliteReader:
             return exact[0] if exact else found[0][0]
         return Schema(type_name, "", b"")
 
-    def _read_tables(self, connection: sqlite3.Connection) -> Iterator[tuple[str, str]]:
+    def _read_tables(self, tables: Tables) -> Iterator[tuple[str, str]]:
         prefix = f"db3:{self._shown.name}"
-        for column in self._columns(connection, "schema"):
-            row = connection.execute(f'SELECT "{column}" FROM schema').fetchone()
+        for column in self._columns(tables, "schema"):
+            quoted = column.replace('"', '""')
+            row = next(tables.rows(f'SELECT "{quoted}" FROM schema LIMIT 1'), None)
             if row:
                 yield f"{prefix}:{column}", self._text(row[0], "schema")
-        if self._columns(connection, "metadata"):
-            for number, version, text in connection.execute(
+        if self._columns(tables, "metadata"):
+            for number, version, text in tables.rows(
                 "SELECT id, metadata_version, metadata FROM metadata ORDER BY id"
             ):
                 yield f"{prefix}:metadata:{number}", self._text(text, "metadata")
@@ -182,7 +158,7 @@ class SqliteReader:
         for number, (schema, type_hash) in enumerate(self._definitions, 1):
             if (schema.name, type_hash) not in hashes:
                 yield f"{prefix}:definition_hash:{number}:{schema.name}", type_hash
-        names = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+        names = tables.rows("SELECT name FROM sqlite_master WHERE type = 'table'")
         for name in sorted(self._text(row[0], "sqlite_master") for row in names):
             if name not in _KNOWN_TABLES and not name.startswith("sqlite_"):
                 yield f"{prefix}:other_table:{name}", "left out"
@@ -202,8 +178,8 @@ class SqliteReader:
     def start(self) -> int | None:
         """The earliest log time, nanoseconds; None without messages."""
         if self._start is None:
-            with self._connected() as connection:
-                row = connection.execute("SELECT MIN(timestamp) FROM messages").fetchone()
+            with self._opened() as tables:
+                row = tables.select("SELECT MIN(timestamp) FROM messages").fetchone()
             self._start = row[0] if isinstance(row[0], int) else None
         return self._start
 
@@ -220,15 +196,16 @@ class SqliteReader:
             yield from self._excerpt_records(excerpt)
 
     def _all_records(self) -> Iterator[Message]:
-        with self._connected() as connection:
+        with self._opened() as tables:
             self._rows_read = 0
             # Counted without the index, which may lack messages where it is damaged.
-            query = "SELECT COUNT(*) FROM messages NOT INDEXED"
-            (self._rows,) = connection.execute(query).fetchone()
+            # COUNT(*) would go on without a look at signals.
+            query = "SELECT COUNT(1) FROM messages NOT INDEXED"
+            (self._rows,) = tables.select(query).fetchone()
             # Ids first: sorting whole rows would copy the recording where no index helps.
-            for (row_id,) in connection.execute("SELECT id FROM messages ORDER BY timestamp, id"):
+            for (row_id,) in tables.select("SELECT id FROM messages ORDER BY timestamp, id"):
                 self._rows_read += 1
-                yield self._message(connection, row_id, f"message {self._rows_read}")
+                yield self._message(tables, row_id, f"message {self._rows_read}")
             if self._rows_read != self._rows:
                 raise self._bad_index()
 
@@ -237,12 +214,12 @@ class SqliteReader:
         unwanted = {channel.id for channel in channels if not excerpt.has_topic(channel.topic)}
         # A message of a topic id that is in no table is nobody's: everybody refuses it.
         column = "topic_id" if unwanted else "NULL"
-        with self._connected() as connection:
+        with self._opened() as tables:
             for where, times in _conditions(excerpt):
                 query = f"SELECT id, {column} FROM messages {where} ORDER BY timestamp, id"
-                for row_id, topic_id in connection.execute(query, times):
+                for row_id, topic_id in tables.select(query, times):
                     if topic_id not in unwanted:
-                        yield self._message(connection, row_id, f"message of id {row_id}")
+                        yield self._message(tables, row_id, f"message of id {row_id}")
 
     def _bad_index(self) -> SourceError:
         return SourceError(
@@ -251,10 +228,9 @@ class SqliteReader:
             f"Make it anew with `REINDEX` in the sqlite3 tool; {SALVAGE_REMEDY}",
         )
 
-    def _message(self, connection: sqlite3.Connection, row_id: int, place: str) -> Message:
-        row = connection.execute(
-            "SELECT topic_id, timestamp, data, typeof(data) FROM messages WHERE id = ?", (row_id,)
-        ).fetchone()
+    def _message(self, tables: Tables, row_id: int, place: str) -> Message:
+        query = "SELECT topic_id, timestamp, data, typeof(data) FROM messages WHERE id = ?"
+        row = next(tables.rows(query, (row_id,)), None)
         if row is None:
             raise self._bad_index()
         topic_id, timestamp, data, kind = row
@@ -282,8 +258,8 @@ class SqliteReader:
     def stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans by channel id."""
         stats = {channel_id: ChannelStats(0, 0, 0) for channel_id in self._channels}
-        with self._connected() as connection:
-            for topic_id, count, start, end in connection.execute(
+        with self._opened() as tables:
+            for topic_id, count, start, end in tables.select(
                 "SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp)"
                 " FROM messages NOT INDEXED GROUP BY topic_id"
             ):
@@ -294,8 +270,8 @@ class SqliteReader:
     def times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times by channel id, nanoseconds, sorted."""
         times: dict[int, array[int]] = {}
-        with self._connected() as connection:
-            for topic_id, timestamp in connection.execute(
+        with self._opened() as tables:
+            for topic_id, timestamp in tables.select(
                 "SELECT topic_id, timestamp FROM messages WHERE typeof(timestamp) = 'integer'"
             ):
                 times.setdefault(topic_id, array("q")).append(timestamp)
@@ -303,12 +279,12 @@ class SqliteReader:
 
     def first(self, channel: Channel) -> Message | None:
         """The channel's first message by log time, or None."""
-        with self._connected() as connection:
-            row = connection.execute(
+        with self._opened() as tables:
+            row = tables.select(
                 "SELECT id FROM messages WHERE topic_id = ? ORDER BY timestamp, id LIMIT 1",
                 (channel.id,),
             ).fetchone()
-            return self._message(connection, row[0], "the first message") if row else None
+            return self._message(tables, row[0], "the first message") if row else None
 
 
 def _conditions(excerpt: Excerpt) -> Iterator[tuple[str, list[int]]]:

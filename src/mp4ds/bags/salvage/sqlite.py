@@ -54,7 +54,7 @@ class SqliteSalvage(FileSalvage):
         super().__init__(path, shown)
         self._decompress = message_decompress
         self._expected = expected
-        self._rows, self._rows_read, self._given = 0, 0, 0
+        self._rows, self._rows_read, self._given, self._left = 0, 0, 0, 0
         self._small, self._problem = open_small_tables(path, self._shown)
         self._channels = {channel.id: channel for channel in self._small.channels}
         self.tables: Mapping[str, str] = self._small.tables
@@ -96,6 +96,7 @@ class SqliteSalvage(FileSalvage):
                 log.lost(None, None, self._problem).add(0, ())
             index = index_messages(database, log, self._expected)
             self._rows = len(index.times)
+            self._left = database.pages.bytes
             for message in self._messages(database, index, log):
                 self._given += 1
                 log.gave(message.log_time)
@@ -142,10 +143,11 @@ class SqliteSalvage(FileSalvage):
         topic = channel.topic
         if found.time < 0:
             raise _LostError(f"messages of {topic} with a time before 1970", [topic])
-        payload = database.payload(page, row)
+        payload = database.payload(page, row) if row.size <= self._left else None
         if payload is None:
             problem = f"messages of {topic} of which pages are damaged or missing"
             raise _LostError(problem, [topic])
+        self._left -= len(payload)
         data = payload[found.blob :]
         if self._decompress:
             try:

@@ -98,6 +98,11 @@ class Pages:
             return b""
         return self._at((number - 1) * self.size, self.size)
 
+    @property
+    def bytes(self) -> int:
+        """Bytes of all pages: rows that have more together claim the same ones."""
+        return self.count * self.size
+
     def offset(self, number: int) -> int:
         """Byte of the database where a page begins."""
         return (number - 1) * self.size

@@ -112,11 +112,13 @@ class Database:
 
     def rows(self, tree: Tree) -> Iterator[list[Value]]:
         """Key and values of the rows of a small table that can be read."""
-        count = 0
+        count, left = 0, self.pages.bytes
         for number in tree.leaves:
             page, rows, _ = self.leaf(number)
             for row in rows:
-                payload = self.payload(page, row) if row.size <= _MAX_SMALL_ROW else None
+                is_small = row.size <= min(_MAX_SMALL_ROW, left)
+                payload = self.payload(page, row) if is_small else None
+                left -= len(payload or b"")
                 found = values(payload) if payload is not None else None
                 count += 1
                 if found is not None and count <= _MAX_ROWS:
@@ -124,6 +126,8 @@ class Database:
 
     def payload(self, page: bytes, row: Row) -> bytes | None:
         """All bytes of a row; None where they are not all there."""
+        if row.size > self.pages.bytes:
+            return None
         pieces = [page[row.start : row.start + row.local]]
         left, number = row.size - row.local, row.overflow
         room = self.pages.usable - 4
