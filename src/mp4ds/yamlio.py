@@ -10,7 +10,7 @@ checksum of all bytes before it.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import xxhash
@@ -22,7 +22,10 @@ MAX_BYTES = 512 * 2**20  # a sidecar of a day at 60 Hz has about 100 MB
 MAX_STRUCTURE_BYTES = 16 * 2**20
 MAX_DEPTH = 32
 MAX_EVENTS = 10**6
+MAX_ALIASED = 10**4
 _MAX_DIGITS = 4300  # where Python stops converting
+_TEXT_OF_A_VALUE = 32  # characters that count as a value where an alias repeats them
+_PLAIN_TAGS = ("tag:yaml.org,2002:str", "!")
 
 _CHECKSUM = re.compile(rb'(?:\A|\n)checksum: "xxh64:([0-9a-f]{16})"\n\Z')
 _COLUMN = re.compile(rb"^( +)values: \|\n", re.MULTILINE)
@@ -143,7 +146,7 @@ def load(data: bytes, place: str) -> dict[str, Any]:
 
 def _parse(data: bytes, place: str) -> dict[str, Any]:
     try:
-        document = _build(yaml.parse(data.decode(), Loader=_Parser))
+        document = _build(yaml.parse(data.decode(), Loader=_Parser), _scalar, is_subset=True)
     except (yaml.YAMLError, ValueError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise FormatError(
@@ -154,61 +157,118 @@ def _parse(data: bytes, place: str) -> dict[str, Any]:
     return document
 
 
-def _build(events: Iterable[Any]) -> Any:
+def build(text: str, scalar: Callable[[Any], Any]) -> Any:
+    """Read a document of somebody else's YAML, in bounded time and memory.
+
+    Keys are texts, as they stand there. An alias counts as much as what it stands for.
+
+    Args:
+        text: One document.
+        scalar: Makes the value of a scalar's event.
+
+    Raises:
+        ValueError: It is no YAML, has tags but ``!!str``, keys that are no texts or stand twice,
+            or is too large or nested too deep.
+    """
+    try:
+        return _build(yaml.parse(text, Loader=_Parser), scalar, is_subset=False)
+    except yaml.YAMLError as error:
+        raise ValueError(" ".join(str(error).split())) from None
+
+
+class _Node:
+    """A map or list that is being read.
+
+    Attributes:
+        value: What was read of it.
+        key: Of a map, that of the next value; None where a key comes next.
+        anchor: Its name for aliases, if it has one.
+        before: Size of what stands before it.
+        height: Levels below it.
+    """
+
+    __slots__ = ("anchor", "before", "height", "key", "value")
+
+    def __init__(self, value: dict[str, Any] | list[Any], anchor: str | None, before: int) -> None:
+        self.value = value
+        self.key: str | None = None
+        self.anchor = anchor
+        self.before = before
+        self.height = 0
+
+
+def _build(events: Iterable[Any], scalar: Callable[[Any], Any], *, is_subset: bool) -> Any:
     """Build values from parser events: the loop has no recursion that input could exhaust."""
     root: list[Any] = []
-    open_nodes: list[dict[str, Any] | list[Any]] = [root]
-    keys: list[str | None] = [None]
-    for number, event in enumerate(events):
-        if number > MAX_EVENTS:
-            raise ValueError(f"has more than {MAX_EVENTS} values")
+    open_nodes = [_Node(root, None, 0)]
+    anchored: dict[str, tuple[Any, int, int]] = {}  # name -> value, size, height
+    size = aliased = 0
+    for event in events:
+        size += 1
         if isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
-            open_nodes.pop()
-            keys.pop()
+            done = open_nodes.pop()
+            open_nodes[-1].height = max(open_nodes[-1].height, done.height + 1)
+            if done.anchor is not None:
+                anchored[done.anchor] = done.value, size - done.before, done.height + 1
             continue
         if not isinstance(event, yaml.NodeEvent):
             continue
-        line = _line(event)
-        if isinstance(event, yaml.AliasEvent) or event.anchor is not None:
+        line, height = _line(event), 0
+        tag = getattr(event, "tag", None)
+        if is_subset and (isinstance(event, yaml.AliasEvent) or event.anchor is not None):
             raise ValueError(f"line {line}: anchors and aliases are not allowed")
-        if getattr(event, "tag", None) is not None:
+        if tag is not None and (is_subset or tag not in _PLAIN_TAGS):
             raise ValueError(f"line {line}: tags are not allowed")
-        value: Any = _scalar(event) if isinstance(event, yaml.ScalarEvent) else None
-        if isinstance(event, yaml.MappingStartEvent):
-            value = {}
-        elif isinstance(event, yaml.SequenceStartEvent):
-            value = []
-        _attach(open_nodes[-1], keys, value, line)
-        if isinstance(value, (dict, list)):
-            open_nodes.append(value)
-            keys.append(None)
-            if len(open_nodes) > MAX_DEPTH + 1:  # the first is around the document
-                raise ValueError(f"line {line}: is nested deeper than {MAX_DEPTH} levels")
+        parent = open_nodes[-1]
+        value: Any
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in anchored or _wants_key(parent):
+                raise ValueError(f"line {line}: alias {event.anchor!r} stands for no value")
+            value, weight, height = anchored[event.anchor]
+            size, aliased = size + weight, aliased + weight
+            if aliased > MAX_ALIASED:
+                raise ValueError(f"its aliases stand for more than {MAX_ALIASED} values")
+        elif isinstance(event, yaml.ScalarEvent):
+            as_text = tag == _PLAIN_TAGS[0] or (_wants_key(parent) and not is_subset)
+            value = event.value if as_text else scalar(event)
+            if event.anchor is not None:
+                anchored[event.anchor] = value, 1 + len(event.value) // _TEXT_OF_A_VALUE, 0
+        else:
+            value = {} if isinstance(event, yaml.MappingStartEvent) else []
+        _attach(parent, value, line)
+        parent.height = max(parent.height, height)
+        if size > MAX_EVENTS:
+            raise ValueError(f"has more than {MAX_EVENTS} values")
+        if isinstance(event, yaml.CollectionStartEvent):
+            open_nodes.append(_Node(value, event.anchor, size))
+            height = 0
+        if len(open_nodes) + height > MAX_DEPTH + 1:  # the first is around the document
+            raise ValueError(f"line {line}: is nested deeper than {MAX_DEPTH} levels")
     if len(root) != 1:
         raise ValueError("holds no document, or several")
     return root[0]
+
+
+def _wants_key(node: _Node) -> bool:
+    return isinstance(node.value, dict) and node.key is None
 
 
 def _line(event: Any) -> int:
     return int(event.start_mark.line) + 1
 
 
-def _attach(
-    parent: dict[str, Any] | list[Any], keys: list[str | None], value: Any, line: int
-) -> None:
-    if isinstance(parent, list):
-        parent.append(value)
-        return
-    key = keys[-1]
-    if key is not None:
-        parent[key] = value
-        keys[-1] = None
-        return
-    if not isinstance(value, str):
+def _attach(parent: _Node, value: Any, line: int) -> None:
+    if isinstance(parent.value, list):
+        parent.value.append(value)
+    elif parent.key is not None:
+        parent.value[parent.key] = value
+        parent.key = None
+    elif not isinstance(value, str):
         raise ValueError(f"line {line}: key {value!r} is not a string")
-    if value in parent:
+    elif value in parent.value:
         raise ValueError(f"line {line}: key {value!r} stands twice")
-    keys[-1] = value
+    else:
+        parent.key = value
 
 
 def _scalar(event: Any) -> Any:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import yaml
 
+from mp4ds import yamlio
 from mp4ds.bags.mcap_records import SALVAGE_REMEDY
 from mp4ds.errors import SourceError
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
@@ -29,21 +29,9 @@ TABLES_RECORD = "mp4ds:rosbag2:tables"
 _TOP_KEY = "rosbag2_bagfile_information"
 _MAX_BYTES = 64 * 2**20
 _STORAGES = {"db3": "sqlite3", "mcap": "mcap"}
-_BaseLoader: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _BaseDumper: type[Any] = yaml.SafeDumper
-
-
-class _Loader(_BaseLoader):  # type: ignore[misc]
-    """Takes scalars as rosbag2 does: a topic named ``on`` or ``12:30`` stays a string."""
-
-    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 (PyYAML's class attribute)
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:int", re.compile(r"-?(?:0|[1-9][0-9]*)$"), list("-0123456789")
-)
-_Loader.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile(r"(?:true|false)$"), list("tf"))
-_Loader.add_implicit_resolver("tag:yaml.org,2002:null", re.compile(r"(?:~|null|)$"), ["~", "n", ""])
+_INTEGER = re.compile(r"-?(?:0|[1-9][0-9]*)")
+_WORDS = {"": None, "null": None, "~": None, "true": True, "false": False}
 
 
 class _Dumper(_BaseDumper):  # type: ignore[misc]
@@ -104,6 +92,7 @@ class BagInfo:
         ros_distro: Name of the ROS distribution, empty where not told.
         custom_data: The user's own entries.
         topics: All topics.
+        counts: How many messages each storage file has, by its name; empty where not told.
     """
 
     text: str
@@ -114,6 +103,7 @@ class BagInfo:
     ros_distro: str
     custom_data: Mapping[str, str]
     topics: tuple[Topic, ...]
+    counts: Mapping[str, int]
 
 
 def read_bag_info(path: Path) -> BagInfo:
@@ -163,6 +153,7 @@ def parse_bag_info(text: str, path: Path) -> BagInfo:
                 "Install a newer mp4ds.",
             )
         names = tuple(_base_name(name, path) for name in info.get("relative_file_paths") or [])
+        topics = tuple(_topic(item) for item in info.get("topics_with_message_count") or [])
         return BagInfo(
             text=text,
             version=version,
@@ -173,7 +164,8 @@ def parse_bag_info(text: str, path: Path) -> BagInfo:
             custom_data={
                 _text(key): _text(value) for key, value in (info.get("custom_data") or {}).items()
             },
-            topics=tuple(_topic(item) for item in info.get("topics_with_message_count") or []),
+            topics=topics,
+            counts=_counts(info, names, topics),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         if isinstance(error, SourceError):
@@ -184,12 +176,19 @@ def parse_bag_info(text: str, path: Path) -> BagInfo:
 
 def _load(text: str, path: Path) -> Any:
     try:
-        value = yaml.load(text, Loader=_Loader)
-        json.dumps(value, default=str)  # refuses what holds itself, by an alias
-        return value
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise SourceError(path, f"is not valid YAML: {reason}", SALVAGE_REMEDY) from None
+        return yamlio.build(text, _scalar)
+    except ValueError as error:
+        raise SourceError(path, f"is not valid YAML: {error}", SALVAGE_REMEDY) from None
+
+
+def _scalar(event: Any) -> Any:
+    """Takes scalars as rosbag2 does: a topic named ``on`` or ``12:30`` stays a string."""
+    text: str = event.value
+    if event.style not in (None, ""):
+        return text
+    if text in _WORDS:
+        return _WORDS[text]
+    return int(text) if _INTEGER.fullmatch(text) else text
 
 
 def _text(value: Any) -> str:
@@ -204,6 +203,17 @@ def _base_name(name: Any, path: Path) -> str:
     if base in ("", ".", ".."):
         raise SourceError(path, f"names {name!r} as a file of the recording")
     return base
+
+
+def _counts(
+    info: Mapping[str, Any], names: Sequence[str], topics: Sequence[Topic]
+) -> Mapping[str, int]:
+    if len(names) == 1:
+        return {names[0]: sum(topic.count for topic in topics)}
+    try:
+        return {Path(str(item["path"])).name: int(item["message_count"]) for item in info["files"]}
+    except (KeyError, TypeError, ValueError):
+        return {}
 
 
 def _storage(identifier: str, names: tuple[str, ...], path: Path) -> str:
@@ -291,8 +301,8 @@ _POLICIES = {
 def parse_qos(text: str) -> list[dict[str, Any]] | None:
     """The QoS profiles of a topic as YAML values, None where the text is no list of them."""
     try:
-        profiles = yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, ValueError, RecursionError):
+        profiles = yamlio.build(text, _scalar) if text.strip() else None
+    except ValueError:
         return None
     if profiles is None:
         return []

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import sqlite3
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -115,7 +116,7 @@ def open_tables(path: Path, shown: Path) -> Iterator[Tables]:
         size = path.stat().st_size + beside
         tables = Tables(connection, size, shown)
         connection.execute("PRAGMA trusted_schema = OFF")
-        if hasattr(connection, "setlimit"):  # from Python 3.11 on
+        if sys.version_info >= (3, 11):
             most = min(max(size, _LEAST_LENGTH), 2**31 - 1)
             connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, most)
         tables.check_plain()

@@ -6,9 +6,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import yaml
 
 from mp4ds.bags.mcap_records import SALVAGE_REMEDY
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, BagInfo, read_bag_info
@@ -17,7 +14,6 @@ from mp4ds.errors import SourceError, SourceNotFoundError
 from mp4ds.records import Loss
 
 _NAME = re.compile(r"(?P<stem>.*?)(?:_(?P<number>\d+))?\.(?:db3|mcap)(?:\.zstd)?")
-_Loader: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,13 +125,4 @@ def _storage_file(path: Path, counts: Mapping[str, int]) -> StorageFile:
 
 def _counts(info: BagInfo | None) -> Mapping[str, int]:
     """Messages of each storage file by metadata.yaml, as far as it tells."""
-    if info is None:
-        return {}
-    if len(info.file_names) == 1:
-        return {info.file_names[0]: sum(topic.count for topic in info.topics)}
-    try:
-        document = yaml.load(info.text, Loader=_Loader)
-        files = document["rosbag2_bagfile_information"]["files"]
-        return {Path(str(item["path"])).name: int(item["message_count"]) for item in files}
-    except (yaml.YAMLError, KeyError, TypeError, ValueError):
-        return {}
+    return info.counts if info else {}

@@ -96,7 +96,7 @@ class SqliteSalvage(FileSalvage):
                 log.lost(None, None, self._problem).add(0, ())
             index = index_messages(database, log, self._expected)
             self._rows = len(index.times)
-            self._left = database.pages.bytes
+            self._left = database.pages.all_bytes
             for message in self._messages(database, index, log):
                 self._given += 1
                 log.gave(message.log_time)

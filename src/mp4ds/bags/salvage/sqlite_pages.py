@@ -99,7 +99,7 @@ class Pages:
         return self._at((number - 1) * self.size, self.size)
 
     @property
-    def bytes(self) -> int:
+    def all_bytes(self) -> int:
         """Bytes of all pages: rows that have more together claim the same ones."""
         return self.count * self.size
 

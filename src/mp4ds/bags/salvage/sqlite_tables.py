@@ -112,7 +112,7 @@ class Database:
 
     def rows(self, tree: Tree) -> Iterator[list[Value]]:
         """Key and values of the rows of a small table that can be read."""
-        count, left = 0, self.pages.bytes
+        count, left = 0, self.pages.all_bytes
         for number in tree.leaves:
             page, rows, _ = self.leaf(number)
             for row in rows:
@@ -126,7 +126,7 @@ class Database:
 
     def payload(self, page: bytes, row: Row) -> bytes | None:
         """All bytes of a row; None where they are not all there."""
-        if row.size > self.pages.bytes:
+        if row.size > self.pages.all_bytes:
             return None
         pieces = [page[row.start : row.start + row.local]]
         left, number = row.size - row.local, row.overflow
