@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from rosbags.interfaces import Nodetype
 from rosbags.typesys.msg import normalize_msgtype
 
+from mp4ds.bags.type_sizes import has_empty_items, sizes_of
 from mp4ds.bags.typedefs import (
     BAD_DEFINITION,
     BAD_PAYLOAD,
     MAX_TAIL,
-    fields_of,
     make_store,
     ros1_world,
     ros2_world,
@@ -23,9 +22,6 @@ from mp4ds.errors import OptionError
 from mp4ds.records import Channel
 from mp4ds.wire import WireError
 from mp4ds.wire.protobuf_objects import protobuf_decoder
-
-if TYPE_CHECKING:
-    from rosbags.interfaces.typing import Typesdict
 
 Decoder = Callable[[memoryview], Any]
 """Makes an object of a payload.
@@ -69,7 +65,7 @@ def _ros(channel: Channel) -> Decoder:
     name = normalize_msgtype(schema.name)
     try:
         types = types_of(schema, world)
-        if _has_empty_items(types):
+        if has_empty_items(types, sizes_of(types)):
             raise _undecodable(channel, f"{schema.name} has arrays of a type without fields")
         store = make_store(types, world)
         definition = store.get_msgdef(name)  # compiled now, to fail before any message
@@ -96,29 +92,6 @@ def _ros(channel: Channel) -> Decoder:
         return message
 
     return decode
-
-
-def _has_empty_items(types: Typesdict) -> bool:
-    """Whether a payload of a few bytes could claim any number of items."""
-    empty: set[str] = set()
-
-    def is_empty(desc: Any) -> bool:
-        if desc[0] == Nodetype.NAME:
-            return desc[1] in empty
-        return bool(desc[0] == Nodetype.ARRAY) and (not desc[1][1] or is_empty(desc[1][0]))
-
-    found = True
-    while found:  # what is made of empty ones alone is empty, too
-        found = False
-        for name in types.keys() - empty:
-            if all(is_empty(desc) for _, desc in fields_of(types, name)):
-                empty.add(name)
-                found = True
-    return any(
-        desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) and is_empty(desc[1][0])
-        for name in types
-        for _, desc in fields_of(types, name)
-    )
 
 
 def _json(channel: Channel) -> Decoder:

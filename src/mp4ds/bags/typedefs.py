@@ -19,6 +19,7 @@ from rosbags.typesys import (
 from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
+from mp4ds.bags.type_sizes import FILLER, BoundedStore, sizes_of
 from mp4ds.errors import OptionError
 from mp4ds.records import Schema
 
@@ -55,7 +56,12 @@ MAX_TAIL = 8
 """Bytes after a message that ROS overlooks; after more, the definition is that of another type."""
 BUILTIN = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
-_FILLER = "structure_needs_at_least_one_member"  # what empty messages hold in ROS 2
+_MAX_TEXT, _MAX_IDL, _MAX_LINES = 2**19, 2**17, 2**14
+_NO_CODE = re.compile(r'"(?:\\.|[^"\\])*"?|//.*|/[*](?:(?s:.*?)[*]/|(?s:.*))|\'\\?.\'')
+# rosbags' parser reads what stands in brackets a hundred times, and multiplies without a bound
+_SLOW_IDL = re.compile(r"[(][^()]*[(]|<[^<>;]*<[^<>;]*<|[*]|<<(?!\s*\d{1,2}\b)")
+_BRACKET = re.compile(r"[^\w\s]\s*[(]")
+_MAX_BRACKETS = 8
 _BYTES = {"byte": "uint8", "char": "uint8", "octet": "uint8"}
 _RULER = "=" * 80
 
@@ -101,6 +107,7 @@ def types_of(schema: Schema, world: World) -> Typesdict:
     Raises:
         KeyError: A type is defined nowhere.
         TypesysError: The definition does not parse.
+        ValueError: It is larger than those of messages.
     """
     name = normalize_msgtype(schema.name)
     found = _parse(schema, name)
@@ -109,15 +116,23 @@ def types_of(schema: Schema, world: World) -> Typesdict:
     # Time, duration and header are the world's own, whatever their definition is called.
     for builtin in (*BUILTIN, HEADER):
         found.pop(builtin, None)
-    return closure(found, name, world.standard)
+    types = closure(found, name, world.standard)
+    sizes_of(types)  # refuses what no message can follow
+    return types
 
 
 def _parse(schema: Schema, name: str) -> Typesdict:
+    if len(schema.data) > _MAX_TEXT or schema.data.count(b"\n") > _MAX_LINES:
+        raise ValueError("a definition longer than those of messages")
     text = schema.data.decode(errors="replace").replace("\r\n", "\n")
     if not schema.encoding:
         return {}
     if schema.encoding in ("ros2idl", "omgidl") or re.match(r"=+\nIDL: ", text):
         text = re.sub(r"(?m)^[ \t]*#.*$", "", text)  # what it includes stands beside it
+        code = _NO_CODE.sub("", text)
+        brackets = len(_BRACKET.findall(code))
+        if len(text) > _MAX_IDL or brackets > _MAX_BRACKETS or _SLOW_IDL.search(code):
+            raise ValueError("IDL that takes too long to parse")
         parts = re.split(r"(?m)^=+\n(?:IDL: .*\n)?", text)
         parsed = (get_types_from_idl(part) for part in parts if part.strip())
         return {key: value for types in parsed for key, value in types.items()}
@@ -146,7 +161,7 @@ def closure(types: Typesdict, root: str, standard: Typesdict) -> Typesdict:
 def fields_of(types: Typesdict, name: str) -> Fielddefs:
     """A type's fields, none for a type that is not known."""
     fields = types[name][1] if name in types else []
-    return [field for field in fields if field[0] != _FILLER]
+    return [field for field in fields if field[0] != FILLER]
 
 
 def same_wire(left: Typesdict, left_name: str, right: Typesdict, right_name: str) -> bool:
@@ -254,7 +269,5 @@ def _unbounded(desc: FieldDesc) -> FieldDesc:
 
 def make_store(types: Typesdict, world: World) -> Typestore:
     """A store of definitions with the header of a world."""
-    store = get_typestore(Stores.EMPTY)
     own = {name: found for name, found in types.items() if name not in (*BUILTIN, HEADER)}
-    store.register({HEADER: world.standard[HEADER], **own})
-    return store
+    return BoundedStore({HEADER: world.standard[HEADER], **own})
