@@ -57,6 +57,10 @@ class Facts(NamedTuple):
     tag: str
 
 
+class NoRangesError(Exception):
+    """A web server sends the whole file where a part of it is asked for."""
+
+
 class Store:
     """The file system of a URL.
 
@@ -85,6 +89,10 @@ class Store:
             options["config_kwargs"] = {"max_pool_connections": _AT_ONCE}
         try:
             self._fs: Any = url_to_fs(path.url, **options)[0]
+            if self.scheme in HTTP:
+                from mp4ds.remote.web import RangeFileSystem
+
+                self._fs = RangeFileSystem(**self._fs.storage_options)
         except ImportError as error:
             problem = f"{path}: URLs of {self.scheme}:// need more than is installed"
             remedy = f"Run: {INSTALL}." if self.scheme in _INSTALLED else f"{_text(error)}."
@@ -151,21 +159,9 @@ class Store:
             return
         try:
             with _sentences(path):
-                self._read_last_byte(path, size)
+                self._fs.cat_file(self._key(path), start=size - 1, end=size)
         except FileNotFoundError:
             raise _remote_error(path, "could not be read: it is gone") from None
-
-    def _read_last_byte(self, path: Place, size: int) -> None:
-        options = {"block_size": 1, "cache_type": "none", "size": size}
-        with self._fs.open(self._key(path), "rb", **options) as stream:
-            try:
-                stream.seek(size - 1)
-                stream.read(1)
-            except ValueError:
-                problem = "its web server does not serve parts of files (byte ranges)"
-                raise _refusal(
-                    path, f"cannot be read where it is: {problem}", "Download it first."
-                ) from None
 
     def names(self, path: Place) -> list[str]:
         """Names of what is directly in a folder; none where the store does not list."""
@@ -237,6 +233,11 @@ def _sentences(path: Place, done: str = "read") -> Iterator[None]:
         yield
     except Mp4dsError:
         raise
+    except NoRangesError:
+        problem = "its web server does not serve parts of files (byte ranges)"
+        raise _refusal(
+            path, f"cannot be read where it is: {problem}", "Download it first."
+        ) from None
     except Exception as error:
         verdict, reason = explained(error)
         if verdict == "missing" and done != "uploaded":
