@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-CHUNK_RATIO = 128
+CHUNK_RATIO = 256  # of lz4 it is 255
 """Times smaller than its content the data of a large chunk or message is at most."""
 
 FILE_RATIO = 1024

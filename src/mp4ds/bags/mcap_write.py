@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 
 from mp4ds._version import __version__
+from mp4ds.bags.inflate import most_unpacked
 from mp4ds.errors import ConversionError, OptionError
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
 
@@ -114,6 +115,29 @@ class McapWriter:
     def write(self, message: Message) -> None:
         """Append a message, payload verbatim."""
         check_message(message)
+        if 2 * len(message.data) > most_unpacked(0) and self._compresses_too_well(message.data):
+            with self._uncompressed():
+                self._add(message)
+        else:
+            self._add(message)
+
+    @staticmethod
+    def _compresses_too_well(data: bytes | memoryview) -> bool:
+        """Whether readers could take its chunk for one that claims more than it holds."""
+        return 2 * len(data) > most_unpacked(compressed_size([data]))
+
+    @contextmanager
+    def _uncompressed(self) -> Iterator[None]:
+        """The chunk that a message larger than it ends."""
+        name = "_Writer__compression"
+        before = getattr(self._writer, name)
+        setattr(self._writer, name, CompressionType.NONE)
+        try:
+            yield
+        finally:
+            setattr(self._writer, name, before)
+
+    def _add(self, message: Message) -> None:
         self._writer.add_message(
             self._channel_ids[message.channel.id],
             message.log_time,
