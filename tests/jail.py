@@ -18,8 +18,11 @@ import traceback
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+from mp4ds.records import Message
 
 MEMORY = 2 * 2**30
 """Bytes of address space that a reading may take."""
@@ -84,6 +87,22 @@ class Jail:
         """Open a sidecar or dataset, read a frame, all frames, and all messages."""
         return self._ask("read", path, False)
 
+    def records(self, path: Path, *, salvage: bool = False) -> Outcome:
+        """Read all messages of a recording, or what is there of a damaged one."""
+        return self._ask("salvage" if salvage else "records", path, False)
+
+    def converted(self, path: Path, to: str) -> Outcome:
+        """Convert all messages of a recording to ``ros1`` or ``ros2``."""
+        return self._ask(to, path, False)
+
+    def decoded(self, path: Path) -> Outcome:
+        """Decode all messages of a recording."""
+        return self._ask("decoded", path, False)
+
+    def unpacked(self, path: Path, to: str) -> Outcome:
+        """Pack a recording and unpack it to a format; both are made beside it."""
+        return self._ask(to, path, False)
+
     def _ask(self, task: str, path: Path, deep: bool) -> Outcome:
         stdin, stdout = self._process.stdin, self._process.stdout
         if stdin is None or stdout is None:
@@ -113,9 +132,54 @@ def _validate(path: str, deep: bool, found: dict[str, Any]) -> None:
     found["problems"] = [str(problem) for problem in problems]
 
 
+def _records(path: str, _deep: bool, found: dict[str, Any], *, salvage: bool = False) -> None:
+    from mp4ds.bags import open_sources
+
+    with open_sources([Path(path)], salvage=salvage) as reader:  # type: ignore[call-overload]
+        for record in reader.records():
+            found["messages"] += isinstance(record, Message)
+        if salvage:
+            found["problems"] = [loss.problem for loss in reader.losses]
+
+
+def _converted(path: str, _deep: bool, found: dict[str, Any], *, to: str) -> None:
+    from mp4ds.bags import open_sources
+    from mp4ds.bags.convert import Converter
+
+    converter = Converter(to)
+    with open_sources([Path(path)]) as reader:
+        for record in reader.records():
+            if isinstance(record, Message):
+                converter.channel(record.channel)
+                converter.payload(record.channel, record.data)
+                found["messages"] += 1
+
+
+def _decoded(path: str, _deep: bool, _found: dict[str, Any]) -> None:
+    from mp4ds.bags import open_sources
+    from mp4ds.recorded import as_recorded
+
+    with open_sources([Path(path)]) as reader:
+        messages = (record for record in reader.records() if isinstance(record, Message))
+        for message in as_recorded(messages, Path(path)):
+            _ = message.decoded
+
+
+def _unpacked(path: str, _deep: bool, _found: dict[str, Any], *, to: str) -> None:
+    import mp4ds
+
+    mp4ds.pack(path, f"{path}.packed")
+    mp4ds.unpack(f"{path}.packed", to, f"{path}.unpacked.{to}")
+
+
 _TASKS: dict[str, Callable[[str, bool, dict[str, Any]], None]] = {
     "read": _read,
     "validate": _validate,
+    "records": _records,
+    "salvage": partial(_records, salvage=True),
+    "decoded": _decoded,
+    **{to: partial(_converted, to=to) for to in ("ros1", "ros2")},
+    **{to: partial(_unpacked, to=to) for to in ("bag", "rosbag2")},
 }
 
 
@@ -162,8 +226,18 @@ def _in_child(request: list[Any]) -> dict[str, Any]:
     return found
 
 
+_IMPORTED = (
+    "jsonschema",
+    "rosbags.typesys.stores.ros1_noetic",
+    "rosbags.typesys.stores.ros2_humble",
+    "mp4ds.bags.convert",
+    "mp4ds.checks",
+    "mp4ds.dataset",
+)
+
+
 def _serve() -> None:
-    for module in ("jsonschema", "mp4ds.checks", "mp4ds.dataset"):
+    for module in _IMPORTED:
         importlib.import_module(module)  # once, for all children
 
     for line in sys.stdin:

@@ -42,6 +42,7 @@ class Server:
         fails: The status to fail with, instead of an answer.
         delay: Seconds that it waits before each answer.
         sent: Bytes of files that a plain one sent.
+        endless: Whether a plain one goes on sending after a range, without telling a length.
     """
 
     url: str
@@ -49,6 +50,7 @@ class Server:
     fails: Callable[[Request], int | None] = lambda _: None
     delay: float = 0.0
     sent: int = 0
+    endless: bool = False
 
     def heard(self, method: str, path: str, header: str | None) -> int | None:
         """Note a request; the status to fail with, if it is to fail."""
@@ -167,11 +169,14 @@ def web_server(folder: Path, *, ranges: bool = True) -> Iterator[Server]:
                 self.send_header("Content-Range", f"bytes {start}-{end - 1}/{size}")
             else:
                 self.send_response(200)
-            self.send_header("Content-Length", str(end - start))
+            if not (body and server.endless):
+                self.send_header("Content-Length", str(end - start))
             self.send_header("ETag", f'"{size}-{file.stat().st_mtime_ns}"')
             self.end_headers()
             if body:
                 self._send(file, start, end)
+            while body and server.endless and not self.close_connection and server.sent < 2**30:
+                self._send(file, 0, size)
 
         def _send(self, file: Path, start: int, end: int) -> None:
             with file.open("rb") as stream:

@@ -1,0 +1,496 @@
+"""Recordings from strangers: small files that claim much, read in bounded time and memory."""
+
+from __future__ import annotations
+
+import bz2
+import io
+import re
+import signal
+import sqlite3
+import struct
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import lz4.frame
+import pytest
+import zstandard
+from mcap.writer import CompressionType, Writer
+
+import mp4ds
+from jail import Jail, Outcome
+from mp4ds import yamlio
+from mp4ds.bags import inflate
+from mp4ds.bags.mcap import McapReader
+from mp4ds.bags.mcap_records import DamageError, unzstd
+from mp4ds.bags.mcap_write import McapWriter
+from mp4ds.bags.ros1_write import Ros1Writer
+from mp4ds.bags.rosbag2_metadata import parse_qos
+from mp4ds.errors import RemoteError
+from mp4ds.records import Channel, Message, Schema
+from remote_servers import web_server
+from test_bags_mcap import chunk, file_of
+
+MAX_SECONDS = 4.0
+MAX_MEMORY = 1000 * 2**20
+
+TOPICS = (
+    "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,"
+    " serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL)"
+)
+MESSAGES = (
+    "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL,"
+    " timestamp INTEGER NOT NULL, data BLOB NOT NULL)"
+)
+ENDLESS = "WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)"
+ENDLESS_TOPICS = (
+    f"CREATE VIEW topics AS {ENDLESS} SELECT id, 'a' AS name, 'b' AS type,"
+    " 'cdr' AS serialization_format FROM n"
+)
+PAGE = 512
+
+
+@pytest.fixture(scope="module")
+def jail() -> Iterator[Jail]:
+    with Jail() as opened:
+        yield opened
+
+
+def bounded(outcome: Outcome) -> Outcome:
+    assert outcome.ours or not outcome.error, outcome.text
+    assert outcome.seconds < MAX_SECONDS
+    assert outcome.peak < MAX_MEMORY
+    return outcome
+
+
+# ---------------------------------------------------------------- sqlite3
+
+
+def database(path: Path, *statements: str) -> Path:
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute(f"PRAGMA page_size = {PAGE}")
+        for statement in statements:
+            connection.execute(statement)
+    return path
+
+
+TOPIC = "INSERT INTO topics VALUES(1, '/a', 'b', 'cdr', '')"
+NOT_PLAIN = {
+    "endless-topics": ((ENDLESS_TOPICS, MESSAGES), "view or virtual table 'topics'"),
+    "endless-messages": (
+        (
+            TOPICS,
+            TOPIC,
+            f"CREATE VIEW messages AS {ENDLESS} SELECT id, 1 AS topic_id, id AS timestamp,"
+            " x'00' AS data FROM n",
+        ),
+        "view or virtual table 'messages'",
+    ),
+    "large-value": (
+        (
+            TOPICS,
+            TOPIC,
+            "CREATE VIEW messages AS SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp,"
+            " CAST(hex(zeroblob(999999999)) AS BLOB) AS data",
+        ),
+        "view or virtual table 'messages'",
+    ),
+    "virtual": (
+        (TOPICS, "CREATE VIRTUAL TABLE messages USING fts4(id, topic_id, timestamp, data)"),
+        "view or virtual table 'messages'",
+    ),
+    "generated": (
+        (
+            TOPICS,
+            TOPIC,
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp,"
+            " data BLOB AS (zeroblob(999999999)))",
+            "INSERT INTO messages VALUES(1, 1, 1)",
+        ),
+        "computes a column of its table messages",
+    ),
+    "listed-as-a-table": (
+        (
+            MESSAGES,
+            ENDLESS_TOPICS,
+            "PRAGMA writable_schema = ON",
+            "UPDATE sqlite_master SET type = 'table' WHERE name = 'topics'",
+        ),
+        "a.db3: ",
+    ),
+    "query-as-a-name": (
+        (
+            TOPICS,
+            MESSAGES,
+            f'CREATE TABLE schema("a"" FROM ({ENDLESS} SELECT COUNT(1) AS a FROM n) --" INTEGER)',
+            "INSERT INTO schema VALUES(1)",
+        ),
+        "",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", NOT_PLAIN)
+def test_a_database_is_read_from_plain_tables(name: str, tmp_path: Path, jail: Jail) -> None:
+    statements, problem = NOT_PLAIN[name]
+    path = database(tmp_path / "a.db3", *statements)
+    outcome = bounded(jail.records(path))
+    assert problem in outcome.text
+    assert bool(problem) == bool(outcome.error)
+    bounded(jail.records(path, salvage=True))
+
+
+def pages_of(path: Path, table: str) -> tuple[bytearray, int]:
+    """The file, and where the root page of a table begins."""
+    with closing(sqlite3.connect(path)) as connection:
+        query = "SELECT rootpage FROM sqlite_master WHERE name = ?"
+        (root,) = connection.execute(query, (table,)).fetchone()
+    return bytearray(path.read_bytes()), (root - 1) * PAGE
+
+
+def with_pages(path: Path, data: bytearray) -> None:
+    data[28:32] = struct.pack(">I", len(data) // PAGE)
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("table", ["topics", "messages"])
+def test_pages_that_are_found_by_many_ways(table: str, tmp_path: Path, jail: Jail) -> None:
+    fill = "INSERT INTO messages VALUES(1, 1, 1, x'00')"
+    path = database(tmp_path / "a.db3", TOPICS, MESSAGES, TOPIC, fill)
+    data, at = pages_of(path, table)
+    leaf = data[at : at + PAGE]
+    ways, levels = 80, 10
+    first = len(data) // PAGE + 1
+    for level in range(levels):
+        below = struct.pack(">I", first + level)
+        cell = PAGE - 5
+        page = b"\5\0\0" + struct.pack(">HHB", ways, cell, 0) + below
+        page += struct.pack(">H", cell) * ways
+        page = page.ljust(cell, b"\0") + below + b"\1"
+        if level == 0:
+            data[at : at + PAGE] = page
+        else:
+            data += page
+    with_pages(path, data + leaf)
+    outcome = bounded(jail.records(path))
+    assert "its tables list more than a file of its size can hold" in outcome.text
+    bounded(jail.records(path, salvage=True))
+
+
+def test_rows_that_share_their_pages(tmp_path: Path, jail: Jail) -> None:
+    fill = "INSERT INTO messages VALUES(1, 1, 1, zeroblob(10000000))"
+    path = database(tmp_path / "a.db3", TOPICS, MESSAGES, TOPIC, fill)
+    data, at = pages_of(path, "messages")
+    cell = data[at + 8 : at + 10]
+    data[at + 3 : at + 5] = struct.pack(">H", 80)
+    data[at + 8 : at + 168] = cell * 80
+    with_pages(path, data)
+    outcome = bounded(jail.records(path))
+    assert "its tables list more than a file of its size can hold" in outcome.text
+    # of different keys, for the salvage of pages
+    row = bytes(data[at + int.from_bytes(cell, "big") :][: PAGE - int.from_bytes(cell, "big")])
+    size = row.index(b"\1", 1)
+    starts = []
+    page = bytearray(data[at : at + PAGE])
+    for number in range(4):
+        start = PAGE - (number + 1) * len(row)
+        page[start : start + len(row)] = row[:size] + bytes([4 - number]) + row[size + 1 :]
+        starts.append(start)
+    page[3:5] = struct.pack(">H", 4)
+    page[8:16] = struct.pack(">4H", *reversed(starts))
+    data[at : at + PAGE] = page
+    with_pages(path, data)
+    outcome = bounded(jail.records(path, salvage=True))
+    assert outcome.messages == 1
+    assert "messages of /a of which pages are damaged or missing" in outcome.problems
+
+
+INTERRUPTED = """
+import signal, sys
+from pathlib import Path
+from mp4ds.bags import sqlite_open
+
+class Stop(BaseException):
+    pass
+
+def stop(*_):
+    raise Stop
+
+sqlite_open._LEAST_STEPS = 10**15
+path = Path(sys.argv[1])
+signal.signal(signal.SIGVTALRM, stop)
+try:
+    with sqlite_open.open_tables(path, path) as tables:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0.05)
+        tables.select(sys.argv[2]).fetchone()
+except Stop:
+    print("stopped")
+"""
+
+
+def test_a_query_hears_signals(tmp_path: Path) -> None:
+    path = database(tmp_path / "a.db3", TOPICS, MESSAGES)
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, path, f"{ENDLESS} SELECT COUNT(1) FROM n"],
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.stdout == "stopped\n", done.stderr
+    assert done.returncode == 0 != signal.SIGVTALRM
+
+
+# ---------------------------------------------------------------- YAML
+
+BRACKETS = "[" * 50_000
+ALIASES = "a0: &a0 [x, x]\n" + "".join(
+    f"a{number}: &a{number} [*a{number - 1}, *a{number - 1}]\n" for number in range(1, 60)
+)
+LONG_ALIASES = f"a: &a {'x' * 10**6}\nb: [{'*a, ' * 10**5}]\n"
+
+
+@pytest.mark.parametrize("text", [BRACKETS, ALIASES, LONG_ALIASES], ids=["deep", "wide", "long"])
+def test_yaml_that_grows(text: str, tmp_path: Path, jail: Jail) -> None:
+    """As metadata.yaml, and as the QoS profiles of a channel, which stay a text."""
+    folder = tmp_path / "a"
+    folder.mkdir()
+    (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  version: 5\nx: {text}")
+    (folder / "metadata.yaml").write_text(text)
+    database(folder / "a_0.db3", TOPICS, MESSAGES, TOPIC)
+    outcome = bounded(jail.records(folder))
+    assert "metadata.yaml: is not valid YAML: " in outcome.text
+    bounded(jail.records(folder, salvage=True))
+    path = recording(tmp_path / "b.mcap", "cdr", "std_msgs/msg/Bool", "", b"", {"qos": text})
+    outcome = bounded(jail.unpacked(path, "rosbag2"))
+    assert not outcome.error
+    assert parse_qos(text) is None
+
+
+def test_aliases_that_a_writer_may_have_left(tmp_path: Path) -> None:
+    def scalar(event: Any) -> Any:
+        return event.value
+
+    text = "a: &a {sec: 1, nsec: 2}\nb: [*a, *a]\nc: &c !!str 5\nd: *c\n5: null\n"
+    duration = {"sec": "1", "nsec": "2"}
+    expected = {"a": duration, "b": [duration, duration], "c": "5", "d": "5", "5": "null"}
+    assert yamlio.build(text, scalar) == expected
+    for wrong in ("a: &a [*a]", "a: *a", "? [a]\n: 1", "a: 1\na: 2", "a: !x 1", "a\n---\nb"):
+        with pytest.raises(ValueError, match=r"alias|key|tag|document"):
+            yamlio.build(wrong, scalar)
+
+
+# ---------------------------------------------------------------- definitions
+
+
+def recording(
+    path: Path,
+    encoding: str,
+    type_name: str,
+    definition: str,
+    payload: bytes,
+    metadata: dict[str, str] | None = None,
+) -> Path:
+    """An MCAP file of one message."""
+    kind = "ros2idl" if "module" in definition else f"{'ros1' if encoding == 'ros1' else 'ros2'}msg"
+    schema = Schema(type_name, kind if definition else "", definition.encode())
+    known = {f"offered_{key}_profiles": value for key, value in (metadata or {}).items()}
+    channel = Channel(1, "/a", encoding, schema, known)
+    with McapWriter(path, profile="ros1" if encoding == "ros1" else "ros2") as writer:
+        writer.add_channel(channel)
+        if payload:
+            writer.write(Message(channel, 1, 1, 0, payload))
+    return path
+
+
+NEXT = "\n" + "=" * 80 + "\nMSG: "
+MANY = struct.pack("<I", 2**32 - 1)
+CDR = b"\0\1\0\0"
+CONSTANT = "module a {{ module msg {{ const long X = {}; struct A {{ long x; }}; }}; }};"
+DEFINITIONS: dict[str, tuple[str, str, bytes]] = {
+    "empty-messages": ("ros1", "std_msgs/Empty[] x\n", MANY),
+    "small-messages": ("ros1", f"B[] x{NEXT}a/B\nuint8 x\n", MANY + bytes(100)),
+    "large-messages": (
+        "ros1",
+        f"B[] x{NEXT}a/B\nC[400] x\n{NEXT}a/C\nuint8 x\nuint8 y\n",
+        struct.pack("<I", 10**6) + bytes(10**6),
+    ),
+    "array": ("ros1", "uint8[4000000000] x\n", bytes(10)),
+    "array-of-texts": ("ros1", "string[4000000000] x\n", bytes(10)),
+    "array-of-messages": ("ros1", f"B[4000000000] x{NEXT}a/B\nuint8 x\n", bytes(10)),
+    "doubling": (
+        "ros1",
+        "B0 x\n"
+        + "".join(f"{NEXT}a/B{n}\nB{n + 1} x\nB{n + 1} y\n" for n in range(40))
+        + f"{NEXT}a/B40\nuint8 x\n",
+        bytes(10),
+    ),
+    "doubling-of-nothing": (
+        "ros1",
+        "B0 x\n"
+        + "".join(f"{NEXT}a/B{n}\nB{n + 1} x\nB{n + 1} y\n" for n in range(40))
+        + f"{NEXT}a/B40\nstd_msgs/Empty x\n",
+        bytes(10),
+    ),
+    "itself": ("ros1", "A[] x\n", bytes(10**6)),
+    "deep": (
+        "ros1",
+        "B0 x\n"
+        + "".join(f"{NEXT}a/B{n}\nB{n + 1} x\n" for n in range(500))
+        + f"{NEXT}a/B500\nuint8 x\n",
+        bytes(10),
+    ),
+    "many-fields": ("ros1", "".join(f"uint8 x{n}\n" for n in range(5500)), bytes(10)),
+    "cdr-messages": ("cdr", f"B[] x{NEXT}a/B\nuint8 x\n", CDR + MANY + bytes(100)),
+    "cdr-array": ("cdr", "uint8[4000000000] x\n", CDR + bytes(10)),
+    "idl-brackets": ("cdr", CONSTANT.format("((((((1))))))"), CDR + bytes(4)),
+    "idl-many-brackets": ("cdr", CONSTANT.format("(1)+(1)" + "+(1)" * 50), CDR + bytes(4)),
+    "idl-shift": ("cdr", CONSTANT.format("1 << 9000000000"), CDR + bytes(4)),
+    "idl-product": ("cdr", CONSTANT.format("9" + "*9" * 50), CDR + bytes(4)),
+}
+
+
+def test_definitions_that_claim_much(tmp_path: Path, jail: Jail) -> None:
+    for name, (encoding, definition, payload) in DEFINITIONS.items():
+        path = recording(tmp_path / f"{name}.mcap", encoding, "a/msg/A", definition, payload)
+        outcome = bounded(jail.converted(path, "ros2" if encoding == "ros1" else "ros1"))
+        assert outcome.error == "ConversionError", (name, outcome.text)
+        assert re.search("does not parse as|cannot be understood", outcome.text), name
+        outcome = bounded(jail.decoded(path))
+        assert outcome.error in ("OptionError", "SourceError"), (name, outcome.text)
+
+
+def test_what_a_definition_does_not_bound_is_packed(tmp_path: Path, jail: Jail) -> None:
+    path = recording(tmp_path / "a.mcap", *("cdr", "a/msg/A"), *DEFINITIONS["cdr-array"][1:])
+    outcome = bounded(jail.unpacked(path, "bag"))
+    assert "a message does not parse as a/msg/A" in outcome.text
+    with mp4ds.open(f"{path}.packed") as dataset:
+        (message,) = dataset.messages()
+        assert message.raw == DEFINITIONS["cdr-array"][2]
+
+
+# ---------------------------------------------------------------- compression
+
+
+def zstd_bomb(size: int, *, told: bool) -> bytes:
+    """A zstd frame of zeros: four bytes for each 128 KiB."""
+    block = 2**17
+    count = size // block
+    head = b"\x28\xb5\x2f\xfd" + (b"\xc0\x38" + struct.pack("<Q", size) if told else b"\0\x38")
+    zeros = struct.pack("<I", block << 3 | 2)  # the byte that is repeated, too
+    return head + zeros * (count - 1) + struct.pack("<I", block << 3 | 3)
+
+
+LARGE = 3 * 2**30
+
+
+def lz4_bomb(size: int) -> bytes:
+    piece = bytes(2**22)
+    machine = lz4.frame.LZ4FrameCompressor(block_size=lz4.frame.BLOCKSIZE_MAX4MB)
+    packed = [machine.begin(), *(machine.compress(piece) for _ in range(size // len(piece)))]
+    return b"".join([*packed, machine.flush()])
+
+
+CHUNKS: dict[str, tuple[Callable[[], bytes], str]] = {
+    "zstd": (lambda: chunk(zstd_bomb(LARGE, told=True), "zstd", size=LARGE), "promises"),
+    "zstd-untold": (lambda: chunk(zstd_bomb(LARGE, told=False), "zstd", size=LARGE), "promises"),
+    "zstd-small": (lambda: chunk(zstd_bomb(LARGE, told=False), "zstd", size=1000), "damaged"),
+    "lz4": (lambda: chunk(lz4_bomb(5 * 2**28), "lz4", size=1000), "after 1000 bytes"),
+}
+
+
+@pytest.mark.parametrize("name", CHUNKS)
+def test_chunks_that_unpack_to_much(name: str, tmp_path: Path, jail: Jail) -> None:
+    make, problem = CHUNKS[name]
+    path = tmp_path / "a.mcap"
+    path.write_bytes(file_of(make()))
+    assert problem in bounded(jail.records(path)).text
+    assert bounded(jail.records(path, salvage=True)).problems
+
+
+def test_a_bag_that_unpacks_to_much(tmp_path: Path, jail: Jail) -> None:
+    path = tmp_path / "a.bag"
+    channel = Channel(0, "/a", "ros1", Schema("a/A", "ros1msg", b"uint8[] x"), {"md5sum": "0" * 32})
+    with Ros1Writer(path, compression="bz2") as writer:
+        writer.add_channel(channel)
+        writer.write(Message(channel, 1, 1, 0, b"x" * 10))
+    data = path.read_bytes()
+    at = data.index(b"size=")
+    start = data.index(b"BZh") - 4
+    packed = bz2.compress(bytes(150 * 2**20))
+    end = start + 4 + int.from_bytes(data[start : start + 4], "little")
+    size = struct.pack("<I", 150 * 2**20)
+    made = data[: at + 5] + size + data[at + 9 : start] + struct.pack("<I", len(packed)) + packed
+    made += data[end:]
+    place = made.index(b"index_pos=") + 10
+    index = int.from_bytes(made[place : place + 8], "little") + len(made) - len(data)
+    path.write_bytes(made[:place] + struct.pack("<Q", index) + made[place + 8 :])
+    assert "promises 157286400 bytes and has" in bounded(jail.records(path)).text
+    problems = bounded(jail.records(path, salvage=True)).problems
+    assert any("unpacks to more than 134217728 bytes" in problem for problem in problems)
+
+
+@pytest.mark.parametrize("name", ["a.db3.zstd", "a.mcap.zstd"])
+def test_a_file_that_unpacks_to_much(name: str, tmp_path: Path, jail: Jail) -> None:
+    suffix = name.partition(".")[2].removesuffix(".zstd")
+    start = b"SQLite format 3\0"
+    if suffix == "mcap":
+        start = file_of()[:-50] + struct.pack("<BQ", 5, LARGE)
+    packed = zstandard.compress(start) + zstd_bomb(LARGE, told=False)
+    (tmp_path / name).write_bytes(packed)
+    storage = {"db3": "sqlite3"}.get(suffix, suffix)
+    (tmp_path / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  version: 5\n"
+        f"  storage_identifier: {storage}\n  relative_file_paths: [{name}]\n"
+        "  compression_format: zstd\n  compression_mode: FILE\n"
+    )
+    outcome = bounded(jail.records(tmp_path))
+    assert "it unpacks to more than 134217728 bytes, too many for its size" in outcome.text
+    bounded(jail.records(tmp_path, salvage=True))
+
+
+def test_a_message_that_unpacks_to_much() -> None:
+    for told in (True, False):
+        with pytest.raises(DamageError, match=r"promises|unpacks to more"):
+            unzstd(zstd_bomb(2**30, told=told))
+    assert unzstd(zstd_bomb(2**20, told=False)) == bytes(2**20)
+
+
+def test_what_is_written_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also a large black picture, whose chunk would look like a bomb."""
+    monkeypatch.setattr(inflate, "_ALWAYS", 2**20)
+    channel = Channel(1, "/a", "cdr", None)
+    payloads = [b"small", bytes(2**21), b"x" * 2**18, bytes(2**19 + 1), b"last"]
+    path = tmp_path / "a.mcap"
+    with McapWriter(path, profile="") as writer:
+        writer.add_channel(channel)
+        for number, payload in enumerate(payloads):
+            writer.write(Message(channel, number, 0, 0, payload))
+    with McapReader(path) as reader:
+        found = [bytes(item.data) for item in reader.records() if isinstance(item, Message)]
+    assert found == payloads
+    assert path.stat().st_size < 2**22
+    stream = io.BytesIO()
+    other = Writer(stream, compression=CompressionType.ZSTD)
+    other.start()
+    other.add_message(other.register_channel("/a", "cdr", 0), 1, bytes(2**21), 1)
+    other.finish()
+    path.write_bytes(stream.getvalue())
+    with pytest.raises(mp4ds.SourceError, match="promises"), McapReader(path) as reader:
+        list(reader.records())
+
+
+# ---------------------------------------------------------------- servers
+
+
+def test_a_web_server_that_never_ends(tmp_path: Path) -> None:
+    with (tmp_path / "a.bag").open("wb") as stream:
+        stream.truncate(2**24)
+    with web_server(tmp_path) as web:
+        web.endless = True
+        with pytest.raises(RemoteError, match=r"bytes came of \d+ from byte"):
+            mp4ds.pack(f"{web.url}/a.bag", tmp_path / "x")
+        assert web.sent < 2**28
