@@ -335,6 +335,13 @@ DEFINITIONS: dict[str, tuple[str, str, bytes]] = {
         + f"{NEXT}a/B40\nstd_msgs/Empty x\n",
         bytes(10),
     ),
+    "doubling-of-sequences": (
+        "ros1",
+        "B0 x\n"
+        + "".join(f"{NEXT}a/B{n}\nB{n + 1}[] x\nB{n + 1}[] y\n" for n in range(40))
+        + f"{NEXT}a/B40\ntime x\n",
+        bytes(8),
+    ),
     "itself": ("ros1", "A[] x\n", bytes(10**6)),
     "deep": (
         "ros1",

@@ -19,7 +19,7 @@ FILLER = "structure_needs_at_least_one_member"
 """Name of the field that empty messages have in ROS 2."""
 
 _MAX_PARTS = 5000  # fields of all types, with the items that rosbags' code spells out
-_MAX_STEPS = 2**16  # fields of a message whose sequences are empty
+_MAX_STEPS = 2**16  # fields of a message whose sequences have one item
 _MAX_IDLE = 2**8  # those of them without any byte: no payload is too short for more
 _MAX_DEPTH = 100
 _READING = (
@@ -38,7 +38,7 @@ class Size(NamedTuple):
 
     Attributes:
         least: Bytes, in any serialization.
-        steps: Fields, with those of its parts.
+        steps: Fields, with those of its parts, and of one item of each sequence.
         idle: Messages among them that have no bytes.
         depth: Levels of messages within messages, those in sequences too.
     """
@@ -158,7 +158,7 @@ def _size(types: Typesdict, name: str, sizes: dict[str, Size]) -> Size:
             part = Size(4, 1, 0, 0)
         depth = max(depth, part.depth + 1)
         if desc[0] == Nodetype.SEQUENCE:
-            part = Size(4, 1, 0, 0)
+            part = Size(4, part.steps, 0, 0)
         least += length * part.least
         steps += 1 + length * part.steps
         idle += length * part.idle
