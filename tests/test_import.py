@@ -572,6 +572,28 @@ def check_euroc_manifest(root: Path, dataset: Path) -> None:
     assert kept["MH_01/mav0/cam0/sensor.yaml"].decode() == SENSOR
 
 
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_sensors_as_opencv_writes_them(end: str, tmp_path: Path) -> None:
+    """Its header is no directive of YAML, and it tags matrices."""
+    root = euroc(tmp_path)
+    tagged = SENSOR.replace("T_BS:", "T_BS: !!opencv-matrix").replace(
+        "4\n  data", "4\n  dt: d\n  data"
+    )
+    text = f"%YAML:1.0\n---\n{tagged}".replace("\n", end)
+    (root / "mav0" / "cam0" / "sensor.yaml").write_bytes(text.encode())
+    (root / "mav0" / "cam1" / "sensor.yaml").write_text(f"%YAML:1.0\n{SENSOR}")
+    mp4ds.pack(root, tmp_path / "ds", folder())
+    with mp4ds.open(tmp_path / "ds") as dataset:
+        for stream in dataset.streams:
+            (calibration,) = stream.sidecar.camera_info.calibrations
+            assert calibration.k[0] == 458.654
+    assert [item.child for item in load_manifest(tmp_path / "ds/dataset.yaml").transforms] == [
+        *("cam0", "cam1")
+    ]
+    kept = attachments(tmp_path / "ds" / "messages.mcap")
+    assert kept["MH_01/mav0/cam0/sensor.yaml"] == text.encode()
+
+
 def test_euroc_tells_what_it_leaves_out(tmp_path: Path) -> None:
     root = euroc(tmp_path)
     save(root / "mav0" / "cam0" / "data" / "1.png", image(0))

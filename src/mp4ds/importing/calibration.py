@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,9 +29,20 @@ _MODELS = {
     "fisheye": ("equidistant", (4,)),
 }
 
+_OPENCV_HEADER = re.compile(rb"(?:\xef\xbb\xbf)?%YAML:1\.\d[ \t]*\r?\n(?:---[ \t]*\r?\n)?")
+_OPENCV_TAG = re.compile(rb"(?m)(?<=:)[ \t]*!!opencv-matrix(?=[ \t]*\r?$)")
+
+
+def _without_opencv(data: bytes) -> bytes:
+    """YAML without what only OpenCV's FileStorage writes: its directive, and a tag of matrices."""
+    if not (header := _OPENCV_HEADER.match(data)):
+        return data
+    lines = b"#\n" * header[0].count(b"\n")  # errors name the line
+    return lines + _OPENCV_TAG.sub(b"", data[header.end() :])
+
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The values of a small YAML file.
+    """The values of a small YAML file, which OpenCV may have written.
 
     Raises:
         SourceError: It is none, or uses more of YAML than maps, lists and plain values.
@@ -38,7 +50,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise SourceError(path, f"is larger than {_MAX_BYTES} bytes, and no calibration")
-        return yamlio.load(path.read_bytes(), str(path))
+        return yamlio.load(_without_opencv(path.read_bytes()), str(path))
     except FormatError as error:
         raise SourceError(path, error.problem) from None
     except OSError as error:
