@@ -20,10 +20,12 @@ import pytest
 from numpy.typing import NDArray
 from websockets.sync.client import connect
 
+from waiting import WATCHDOG_S
+
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
 )
-_SECONDS = 60
+_SECONDS = WATCHDOG_S
 
 
 class Tab:

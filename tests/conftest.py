@@ -65,6 +65,10 @@ def pytest_collection_finish() -> None:
 def pytest_configure() -> None:
     """Take Ctrl-C, and let what tests start take it, where a shell's `&` has it ignored."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    for name in ("SIGQUIT", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number and signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, lambda *_: None)  # which no program inherits
 
 
 @pytest.hookimpl(tryfirst=True)

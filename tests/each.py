@@ -25,12 +25,13 @@ def each(
     rows: Iterable[Any],
     *,
     ids: Names | None = None,
+    one_in: int = 1,
     parts: int = 1,
 ) -> Callable[[Test], Test]:
     """What `pytest.mark.parametrize` does, within one test; several of them multiply.
 
     Each case has an empty `tmp_path`, and what it changes by `monkeypatch` is put back after it;
-    it has its own of the fixtures that are `fresh`, too, and shares all others. Rows with the mark
+    it has its own of the fixtures that are `fresh`, too, and shares all others. Cases with the mark
     ``slow`` make up a test of their own, which has it. ``pytest --case TEXT`` takes only the cases
     with the text in their names.
 
@@ -38,14 +39,15 @@ def each(
         names: Arguments of the test, as `pytest.mark.parametrize` has them.
         rows: Their values; also `pytest.param`.
         ids: Names of values, instead of their own.
+        one_in: Of so many cases one is quick, at another place in each row; the others are slow.
         parts: Into how many tests the cases are divided, so that processes share them.
     """
     arguments = [n.strip() for n in names.split(",")] if isinstance(names, str) else [*names]
     axis = [_case(arguments, row, number, ids) for number, row in enumerate(rows)]
 
     def decorate(test: Test) -> Test:
-        inner, axes, divided = getattr(test, "each", (test, [], 1))
-        made = _test(inner, [axis, *axes], max(parts, divided))
+        inner, axes, before = getattr(test, "each", (test, [], (1, 1)))
+        made = _test(inner, [axis, *axes], (max(one_in, before[0]), max(parts, before[1])))
         marks = [m for m in getattr(test, "pytestmark", []) if m.args[:1] != (_CASES,)]
         made.pytestmark = [*marks, *made.pytestmark]  # type: ignore[attr-defined]
         return made
@@ -95,7 +97,7 @@ def _said(value: Any, otherwise: str, ids: Names | None) -> str:
     return str(getattr(value, "__name__", otherwise))
 
 
-def _test(inner: Test, axes: list[list[_Case]], parts: int) -> Test:
+def _test(inner: Test, axes: list[list[_Case]], share: tuple[int, int]) -> Test:
     """The test as pytest is to see it."""
     given = [name for axis in axes for name in axis[0].values] if all(axes) else []
     fixtures = {name: None for name in _needs(inner, inner) if name not in given}
@@ -110,8 +112,8 @@ def _test(inner: Test, axes: list[list[_Case]], parts: int) -> Test:
     kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
     wanted = [inspect.Parameter(name, kind) for name in {_CASES: None, **shared, "request": None}]
     run.__signature__ = inspect.Signature(wanted)  # type: ignore[attr-defined]
-    run.each = inner, axes, parts  # type: ignore[attr-defined]
-    return pytest.mark.parametrize(_CASES, [*_divided(axes, parts)])(run)
+    run.each = inner, axes, share  # type: ignore[attr-defined]
+    return pytest.mark.parametrize(_CASES, [*_divided(axes, *share)])(run)
 
 
 def _needs(function: Callable[..., Any], test: Test) -> Iterator[str]:
@@ -122,14 +124,14 @@ def _needs(function: Callable[..., Any], test: Test) -> Iterator[str]:
             yield from _needs(make, test)
 
 
-def _divided(axes: list[list[_Case]], parts: int) -> Iterator[Any]:
+def _divided(axes: list[list[_Case]], one_in: int, parts: int) -> Iterator[Any]:
     cases = [
         _Case(
             {name: value for case in row for name, value in case.values.items()},
             "-".join(case.name for case in row),
-            any(case.is_slow for case in row),
+            any(case.is_slow for case in row) or (number + number // one_in) % one_in > 0,
         )
-        for row in product(*axes)
+        for number, row in enumerate(product(*axes))
     ]
     for is_slow in (False, True):
         chosen = [case for case in cases if case.is_slow == is_slow]

@@ -18,6 +18,8 @@ from typing import Any
 
 import pytest
 
+from waiting import WATCHDOG_S
+
 INSTALLED = (
     "std_msgs/msg/Header",
     "std_msgs/msg/String",
@@ -322,7 +324,7 @@ class FakePeer:
 
     def publish(self, topic: str, kind: str, message: bytes, *, reliable: bool = True) -> None:
         publisher = self.advertise(topic, kind, reliable=reliable)
-        end = time.monotonic() + 10
+        end = time.monotonic() + WATCHDOG_S
         while not publisher.get_subscription_count() and time.monotonic() < end:
             time.sleep(0.005)
         publisher.publish(message)
@@ -333,7 +335,7 @@ class FakePeer:
             raise TypeError(f"{name} is of type {found.name}")
         replies: queue.Queue[Any] = queue.Queue()
         node.inbox.put(lambda: replies.put(callback(SimpleNamespace(**request), SimpleNamespace())))
-        return vars(replies.get(timeout=10))
+        return vars(replies.get(timeout=WATCHDOG_S))
 
 
 def _profile(reliable: bool, latched: bool, depth: int) -> QoSProfile:

@@ -13,7 +13,9 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-WAIT_S = 20.0
+from waiting import WATCHDOG_S
+
+WAIT_S = WATCHDOG_S
 PLAY, PAUSE = 0, 1
 
 

@@ -19,6 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import fake_rclpy
 from mp4ds.records import Channel, Schema
+from waiting import WATCHDOG_S
 
 LOOPBACK = (
     '<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/></Interfaces>'
@@ -67,7 +68,7 @@ def padded(payload: bytes) -> bytes:
 
 def until(condition: Callable[[], Any]) -> bool:
     """Wait for something that happens soon, on a busy machine later; returns whether it did."""
-    end = time.monotonic() + 30
+    end = time.monotonic() + WATCHDOG_S
     while not condition() and time.monotonic() < end:
         time.sleep(0.005)
     return bool(condition())
@@ -167,7 +168,7 @@ def dds_side(monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
         yield Side(DdsPublisher, {"domain": domain}, DdsPeer(process))
         assert process.stdin
         process.stdin.close()
-        process.wait(30)
+        process.wait(WATCHDOG_S)
 
 
 @contextmanager

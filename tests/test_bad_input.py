@@ -17,7 +17,6 @@ import signal
 import sqlite3
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,9 +27,11 @@ import pytest
 import mp4ds
 from coded_scenes import CODED
 from conftest import real
+from each import each, fresh
 from mp4ds.cli import app
 from scenes import ENCODINGS, IMAGE, START, Record, Scene, image_cdr, image_ros1, picture
 from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2
+from waiting import WATCHDOG_S, until
 
 Compare = Callable[..., list[str]]
 ROOT = Path(mp4ds.__file__).parents[1]
@@ -46,8 +47,13 @@ class Result:
     err: str
 
 
+def without_progress(err: str) -> str:
+    """What is told of the progress depends on how long it takes."""
+    return re.sub(r"^\d\d:\d\d:\d\d (un)?packing .*\n", "", err, flags=re.MULTILINE)
+
+
 def call(*arguments: object) -> Result:
-    """A command in this process: its exit code and what it wrote."""
+    """A command in this process: its exit code and what it wrote, but for its progress."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
@@ -55,7 +61,7 @@ def call(*arguments: object) -> Result:
             code: Any = 0
         except SystemExit as exit_:
             code = exit_.code or 0
-    return Result(code, out.getvalue(), err.getvalue())
+    return Result(code, out.getvalue(), without_progress(err.getvalue()))
 
 
 def start(*arguments: object, **options: Any) -> subprocess.Popen[str]:
@@ -71,10 +77,10 @@ def start(*arguments: object, **options: Any) -> subprocess.Popen[str]:
 
 
 def run(*arguments: object, **options: Any) -> Result:
-    """A command as a process of its own: its exit code and what it wrote."""
+    """A command as a process of its own: its exit code and what it wrote, but for its progress."""
     with start(*arguments, **options) as process:
-        out, err = process.communicate(timeout=60)
-    return Result(process.returncode, out, err)
+        out, err = process.communicate(timeout=WATCHDOG_S)
+    return Result(process.returncode, out, without_progress(err))
 
 
 def tree(folder: Path) -> dict[str, str]:
@@ -120,13 +126,13 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
+@fresh
 def small_bag(tmp_path: Path) -> Path:
     write_bag(tmp_path / "drive.bag", scene("mono8", frames=4))
     return tmp_path / "drive.bag"
 
 
-@pytest.fixture
+@fresh
 def small_dataset(packed_bag: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(packed_bag, tmp_path / "dataset"))
 
@@ -276,7 +282,7 @@ BAD_SOURCES: dict[str, tuple[Callable[[Path], Path], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", BAD_SOURCES)
+@each("name", BAD_SOURCES)
 def test_a_source_that_cannot_be_read(name: str, tmp_path: Path) -> None:
     make, word = BAD_SOURCES[name]
     path = make(tmp_path)
@@ -284,7 +290,7 @@ def test_a_source_that_cannot_be_read(name: str, tmp_path: Path) -> None:
         refused(call("pack", path, "-o", tmp_path / "dataset"), 2, word)
 
 
-@pytest.mark.parametrize("name", [n for n in BAD_SOURCES if not n.startswith("damaged")])
+@each("name", [n for n in BAD_SOURCES if not n.startswith("damaged")])
 def test_info_on_a_source_that_cannot_be_read(name: str, tmp_path: Path) -> None:
     make, word = BAD_SOURCES[name]
     path = make(tmp_path)
@@ -300,7 +306,7 @@ def test_the_real_command_says_the_same(name: str, tmp_path: Path) -> None:
         refused(run("pack", path, "-o", tmp_path / "dataset"), 2, word)
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "word"),
     [
         ("truncated.bag", "rosbag reindex"),
@@ -342,14 +348,8 @@ def test_a_dataset_that_is_packed_again(small_dataset: Path, tmp_path: Path) -> 
 
 def test_a_pipe_is_no_recording(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "drive.bag")
-    process = start("info", tmp_path / "drive.bag")
-    try:
-        out, err = process.communicate(timeout=8)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.communicate()
-        pytest.fail("it waits for a writer")
-    refused(Result(process.returncode, out, err), 2, "drive.bag")
+    # it waits for no writer
+    refused(run("info", tmp_path / "drive.bag"), 2, "drive.bag")
 
 
 # ---------------------------------------------------------------- sources that are unusual
@@ -378,8 +378,8 @@ EMPTY = Scene([], {"/cam/image_raw": IMAGE, "/chatter": "std_msgs/msg/String"})
 NO_IMAGES = only(scene("mono8"), "/imu", "/tf", "/cam/camera_info")
 
 
-@pytest.mark.parametrize("kind", ["bag", "mcap", "rosbag2"])
-@pytest.mark.parametrize("content", ["no-messages", "no-channels", "no-images"])
+@each("kind", ["bag", "mcap", "rosbag2"])
+@each("content", ["no-messages", "no-channels", "no-images"])
 def test_nothing_for_a_video(content: str, kind: str, tmp_path: Path, compare: Compare) -> None:
     made = {"no-messages": EMPTY, "no-channels": Scene([]), "no-images": NO_IMAGES}[content]
     name = {"bag": "bag-none", "mcap": "mcap-ros2-zstd", "rosbag2": "rosbag2-sqlite3-v9"}[kind]
@@ -451,7 +451,7 @@ def test_topics_that_map_to_one_file_name(kind: str, tmp_path: Path, compare: Co
     assert packed.out.count("stored as") >= 2
 
 
-@pytest.mark.parametrize(
+@each(
     "topics",
     [("/../x", "/..", "..", "/."), ("", "/"), ("/dataset", "/messages", "/con"), ("/ä", "/相机"),
      ("/a\nb", "/\x1b[31mred", "/[bold]", "/a[/b]"), ("/" + "x" * 300, "/" + "x" * 299 + "y")],
@@ -478,8 +478,8 @@ def test_a_terminal_that_cannot_show_a_topic(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- targets that may not be written
 
 
-@pytest.mark.parametrize("command", ["pack", "unpack", "demo"])
-@pytest.mark.parametrize("place", ["below-a-file", "no-parent", "exists", "dangling-link"])
+@each("command", ["pack", "unpack", "demo"])
+@each("place", ["below-a-file", "no-parent", "exists", "dangling-link"])
 def test_a_target_that_may_not_be_written(
     place: str, command: str, small_bag: Path, small_dataset: Path, tmp_path: Path
 ) -> None:
@@ -573,7 +573,7 @@ def test_pack_replaces_an_empty_folder_with_force_only(small_bag: Path, tmp_path
     assert mp4ds.validate(tmp_path / "empty") == []
 
 
-@pytest.mark.parametrize("what", ["folder", "file", "rosbag2", "link"])
+@each("what", ["folder", "file", "rosbag2", "link"])
 def test_pack_never_replaces_what_it_did_not_make(
     what: str, small_bag: Path, tmp_path: Path
 ) -> None:
@@ -593,7 +593,7 @@ def test_pack_never_replaces_what_it_did_not_make(
         refused(result, 2, str(target), "--force does not replace")
 
 
-@pytest.mark.parametrize("to", ["bag", "mcap", "rosbag2", "images"])
+@each("to", ["bag", "mcap", "rosbag2", "images"])
 def test_unpack_replaces_its_own_output_with_force_only(
     to: str, small_dataset: Path, tmp_path: Path
 ) -> None:
@@ -610,8 +610,8 @@ def test_unpack_replaces_its_own_output_with_force_only(
     assert len(list(tmp_path.iterdir())) == 2
 
 
-@pytest.mark.parametrize("to", ["bag", "mcap", "rosbag2", "images"])
-@pytest.mark.parametrize("what", ["folder", "dataset"])
+@each("to", ["bag", "mcap", "rosbag2", "images"])
+@each("what", ["folder", "dataset"])
 def test_unpack_never_replaces_a_folder_it_did_not_make(
     what: str, to: str, small_dataset: Path, tmp_path: Path
 ) -> None:
@@ -643,8 +643,8 @@ def test_what_is_replaced_stays_until_the_new_one_is_whole(
 # ---------------------------------------------------------------- a target that is the source
 
 
-@pytest.mark.parametrize("force", [False, True])
-@pytest.mark.parametrize("kind", ["bag", "rosbag2"])
+@each("force", [False, True])
+@each("kind", ["bag", "rosbag2"])
 def test_packing_onto_the_source(kind: str, force: bool, tmp_path: Path) -> None:
     name = {"bag": "bag-none", "rosbag2": "rosbag2-sqlite3-v9"}[kind]
     source = SOURCES[name](tmp_path, scene("mono8", frames=3))[0]
@@ -673,8 +673,8 @@ def test_packing_onto_a_dataset_that_holds_the_source(
         refused(call("pack", source, "-o", small_dataset, "--force"), 2, str(small_dataset))
 
 
-@pytest.mark.parametrize("name", ["messages.mcap", "cam_image_raw.mp4", "dataset.yaml", "new.mcap"])
-@pytest.mark.parametrize("to", ["bag", "mcap"])
+@each("name", ["messages.mcap", "cam_image_raw.mp4", "dataset.yaml", "new.mcap"])
+@each("to", ["bag", "mcap"])
 def test_unpacking_into_the_dataset(
     to: str, name: str, small_dataset: Path, tmp_path: Path
 ) -> None:
@@ -715,7 +715,7 @@ UNPACK_TARGETS = {
 }
 
 
-@pytest.mark.parametrize("job", ["pack", "pack-lossy", "demo", *UNPACK_TARGETS])
+@each("job", ["pack", "pack-lossy", "demo", *UNPACK_TARGETS])
 def test_a_disk_that_is_full_half_way(job: str, demo: Path, tmp_path: Path) -> None:
     with mounted(tmp_path / "disk", "size=512k") as disk, unchanged(demo):
         if job == "demo":
@@ -750,8 +750,8 @@ def test_a_full_disk_leaves_what_was_there(demo: Path, small_dataset: Path, tmp_
 CODED_KINDS = ["jpeg-444", "png-16-bit-cv2", "depth-32FC1-rvl", "video-h264", "video-vp9"]
 
 
-@pytest.mark.parametrize("to", ["dataset", "mcap"])
-@pytest.mark.parametrize("kind", CODED_KINDS)
+@each("to", ["dataset", "mcap"], one_in=2)
+@each("kind", CODED_KINDS)
 def test_a_disk_that_is_full_of_coded_pictures(kind: str, to: str, tmp_path: Path) -> None:
     recorded = CODED[kind](frames=24, width=320, height=240)
     (source,) = SOURCES["bag-none"](tmp_path, recorded)
@@ -794,16 +794,11 @@ def interrupted(
 ) -> Result:
     """A command that gets SIGINT, or other signals, as soon as it has begun to write."""
     process = start(*arguments, **options)
-    end = time.monotonic() + 30
-    while not list(folder.glob(".*.part/*")):
-        if process.poll() is not None or time.monotonic() > end:
-            process.kill()
-            pytest.fail(f"it did not begin: {process.communicate()}")
-        time.sleep(0.01)
+    until(lambda: list(folder.glob(".*.part/*")), process)
     for number in numbers:
         process.send_signal(number)
-    out, err = process.communicate(timeout=30)
-    return Result(process.returncode, out, err)
+    out, err = process.communicate(timeout=WATCHDOG_S)
+    return Result(process.returncode, out, without_progress(err))
 
 
 SLOW = ("--quality", "crf=20", "--preset", "2")
@@ -935,7 +930,7 @@ BAD_OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", BAD_OPTIONS)
+@each("name", BAD_OPTIONS)
 def test_an_option_that_is_wrong(
     name: str, small_bag: Path, small_dataset: Path, tmp_path: Path
 ) -> None:
@@ -964,7 +959,7 @@ def test_a_preset_that_is_wrong(codec: str, small_bag: Path, tmp_path: Path) -> 
         refused(run("pack", small_bag, "-o", tmp_path / "x", *options), 2, "'quick'")
 
 
-@pytest.mark.parametrize(
+@each(
     "arguments",
     [
         ("pack",),
@@ -1007,8 +1002,8 @@ NO_DATASETS: dict[str, Callable[[Path], Path]] = {
 }
 
 
-@pytest.mark.parametrize("command", ["unpack", "validate"])
-@pytest.mark.parametrize("name", NO_DATASETS)
+@each("command", ["unpack", "validate"])
+@each("name", NO_DATASETS)
 def test_what_is_no_dataset(name: str, command: str, tmp_path: Path) -> None:
     path = NO_DATASETS[name](tmp_path)
     options = ("--to", "mcap", "-o", tmp_path / "out.mcap") if command == "unpack" else ()
@@ -1057,7 +1052,7 @@ def parsed(result: Result) -> Any:
     return json.loads(result.out, parse_constant=refuse)
 
 
-@pytest.mark.parametrize("command", ["pack", "unpack", "images", "validate", "info", "demo"])
+@each("command", ["pack", "unpack", "images", "validate", "info", "demo"])
 def test_json_of_success(
     command: str, small_bag: Path, small_dataset: Path, tmp_path: Path
 ) -> None:
@@ -1093,7 +1088,7 @@ def test_json_of_info_on_a_dataset(what: str, small_dataset: Path) -> None:
     assert topics["/cam/image_raw"]["messages"] == 8
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "code"),
     [
         (("pack", "none.bag", "-o", "OUT"), 2),

@@ -15,6 +15,7 @@ import pytest
 from rosbags.rosbag1 import Reader
 
 from conftest import DATA, real
+from each import each
 from mp4ds.bags import open_sources, ros1
 from mp4ds.bags.ros1 import Ros1Reader, Ros1Writer
 from mp4ds.errors import (
@@ -214,7 +215,7 @@ def refuse(path: Path, problem: str) -> None:
     assert problem in str(caught.value)
 
 
-@pytest.mark.parametrize("name", REAL_BAGS)
+@each("name", REAL_BAGS)
 def test_real_bags(name: str, tmp_path: Path) -> None:
     path = real(name)
     with Ros1Reader(path) as reader:
@@ -441,7 +442,7 @@ def test_a_time_that_ros_does_not_have_is_refused(tmp_path: Path) -> None:
         assert [loss.messages for loss in reader.losses] == [1]
 
 
-@pytest.mark.parametrize(
+@each(
     "name", ["header_only_dummy_600chunks", "lfs_pointer", "truncated", "unindexed", "zero_bytes"]
 )
 def test_real_damage(name: str) -> None:
@@ -526,7 +527,7 @@ def test_what_a_bag_cannot_hold_is_counted(tmp_path: Path) -> None:
         assert rows(reader) == [(0, START, b"a"), (0, START, b"b"), (0, START, b"c")]
 
 
-@pytest.mark.parametrize("time", [0, 1, 10**9, 2**32 * 10**9 - 1])
+@each("time", [0, 1, 10**9, 2**32 * 10**9 - 1])
 def test_the_times_that_a_bag_can_hold(tmp_path: Path, time: int) -> None:
     with Ros1Writer(tmp_path / "a.bag") as writer:
         writer.add_channel(STRING)

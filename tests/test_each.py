@@ -71,6 +71,20 @@ def test_slow_cases_and_parts_are_tests_of_their_own(request: pytest.FixtureRequ
     assert seen == [0, 2, 4, 1, 3, 9]
 
 
+def test_one_case_in_several_is_quick(request: pytest.FixtureRequest) -> None:
+    seen = []
+
+    @each("name", "abc", one_in=3)
+    @each("n", range(3))
+    def test(name: str, n: int) -> None:
+        seen.append((name, n))
+
+    run(test, request)
+    assert seen == [("a", 0), ("b", 2), ("c", 1)]
+    run(test, request, 1)
+    assert len(set(seen)) == len(seen) == 9
+
+
 def test_what_is_skipped_in_every_case_is_skipped(request: pytest.FixtureRequest) -> None:
     @each("n", [1, 2])
     def test(n: int, least: int) -> None:

@@ -9,7 +9,9 @@ from collections.abc import Callable
 
 import pytest
 
+from each import each
 from mp4ds.engine import Workers
+from waiting import WATCHDOG_S, until
 
 COUNTS = [0, 1, 2, 5]
 
@@ -29,7 +31,7 @@ def threads() -> int:
     return threading.active_count()
 
 
-@pytest.mark.parametrize("count", COUNTS)
+@each("count", COUNTS)
 def test_jobs_of_a_key_run_in_order_and_all_run(count: int) -> None:
     done: dict[int, list[int]] = defaultdict(list)
     before = threads()
@@ -69,7 +71,7 @@ def test_without_threads_a_job_runs_at_once() -> None:
 
 
 def test_different_keys_run_side_by_side() -> None:
-    barrier = threading.Barrier(2, timeout=20)  # passed only by two at once
+    barrier = threading.Barrier(2, timeout=WATCHDOG_S)  # passed only by two at once
     with Workers(2) as workers:
         workers.submit(0, lambda: (barrier.wait(), None)[1])
         workers.submit(1, lambda: (barrier.wait(), None)[1])
@@ -83,16 +85,17 @@ def test_memory_is_bounded(count: int) -> None:
 
     def feed(workers: Workers) -> None:
         for number in range(20):
-            workers.submit(0, lambda: (go.wait(20), None)[1])
+            workers.submit(0, lambda: (go.wait(WATCHDOG_S), None)[1])
             submitted.append(number)
 
     with Workers(count) as workers:
         feeder = threading.Thread(target=feed, args=(workers,))
         feeder.start()
+        until(lambda: submitted)
         time.sleep(0.3)
-        assert 1 <= len(submitted) <= 4
+        assert len(submitted) <= 4
         go.set()
-        feeder.join(20)
+        feeder.join(WATCHDOG_S)
     assert len(submitted) == 20
 
 
@@ -101,10 +104,7 @@ def test_the_first_error_reaches_the_caller(count: int) -> None:
     before, ran = threads(), []
     with pytest.raises(BrokenError, match="first"), Workers(count) as workers:  # noqa: PT012
         workers.submit(0, fail("first"))
-        for number in range(1000):
-            time.sleep(0.001)
-            workers.submit(0, lambda number=number: ran.append(number))  # type: ignore[misc]
-        pytest.fail("a submit should have raised")
+        until(lambda: workers.submit(0, lambda: ran.append(1)))
     assert ran == []
     assert threads() == before
 
@@ -128,13 +128,13 @@ def test_an_error_of_the_caller_drops_what_has_not_begun() -> None:
 
     def first() -> None:
         started.set()
-        go.wait(20)
+        go.wait(WATCHDOG_S)
         ran.append("first")
 
     with pytest.raises(BrokenError, match="the caller's"), Workers(1) as workers:  # noqa: PT012
         workers.submit(0, first)
         workers.submit(0, lambda: ran.append("second"))
-        started.wait(20)
+        started.wait(WATCHDOG_S)
         threading.Timer(0.2, go.set).start()
         raise BrokenError("the caller's")
     assert ran == ["first"]
@@ -153,5 +153,5 @@ def test_the_callers_error_is_not_replaced_by_a_jobs(wait: float) -> None:
 
     with pytest.raises(BrokenError, match="the caller's"), Workers(1) as workers:  # noqa: PT012
         workers.submit(0, late)
-        started.wait(20)
+        started.wait(WATCHDOG_S)
         raise BrokenError("the caller's")

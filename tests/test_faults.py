@@ -25,6 +25,7 @@ from typing import Any
 import pytest
 
 import mp4ds
+from each import each, fresh
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.demo import demo
 from mp4ds.errors import Mp4dsError, PartsFailedError, SourceError, TargetError, WriteError
@@ -33,6 +34,7 @@ from mp4ds.packing.work import command
 from round_trips import Compare, unpacked
 from sources import SOURCES, scene
 from test_bad_input import NEEDS_ROOT, run, start, tree
+from waiting import WATCHDOG_S, until
 
 IN_PARTS = PackOptions(window=3, codec="h264")
 PARTS = ["00000-0", "00001-0"]
@@ -56,12 +58,12 @@ def recorded(folder: Path, kind: str = "bag-none") -> Path:
     return path
 
 
-@pytest.fixture
+@fresh
 def source(tmp_path: Path) -> Path:
     return recorded(tmp_path)
 
 
-@pytest.fixture
+@fresh
 def expected(source: Path, tmp_path: Path) -> dict[str, Any]:
     return undisturbed(source, tmp_path)
 
@@ -207,10 +209,8 @@ def test_a_disk_that_is_full_at_any_moment(
     assert REACHED[limit] <= reached
 
 
-@pytest.mark.parametrize(
-    "name", ["job.json", "part.json", "messages.mcap", "cam_image_raw.yaml", "dataset.yaml"]
-)
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EROFS], ids=errno.errorcode.get)
+@each("name", ["job.json", "part.json", "messages.mcap", "cam_image_raw.yaml", "dataset.yaml"])
+@each("code", [errno.ENOSPC, errno.EIO, errno.EROFS], ids=errno.errorcode.get)
 def test_a_file_that_the_disk_refuses(
     code: int,
     name: str,
@@ -300,7 +300,7 @@ class _BadSector(io.FileIO):
         return super().readall()
 
 
-@pytest.mark.parametrize("kind", ["bag-none", "bag-bz2", "mcap-ros2-zstd", "mcap-ros2-none"])
+@each("kind", ["bag-none", "bag-bz2", "mcap-ros2-zstd", "mcap-ros2-none"])
 def test_a_bad_sector(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compare: Compare
 ) -> None:
@@ -345,8 +345,8 @@ CHANGES: dict[str, Callable[[Path], object]] = {
 }
 
 
-@pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize("kind", KINDS)
+@each("change", CHANGES)
+@each("kind", KINDS)
 def test_a_source_that_changes_while_it_is_packed(
     kind: str, change: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -438,7 +438,7 @@ def test_a_process_that_finds_its_source_gone(
     assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == [PARTS[1]]
 
 
-@pytest.mark.parametrize(
+@each(
     ("harm", "sentence"),
     [
         ("raise MemoryError", "out of memory; try fewer --jobs"),
@@ -447,6 +447,7 @@ def test_a_process_that_finds_its_source_gone(
         ("os.abort()", "its process was ended by SIGABRT"),
         ("raise ArithmeticError('odd')", "its process ended with code 1: ArithmeticError: odd"),
     ],
+    one_in=2,
 )
 def test_a_task_that_ends_its_process(
     harm: str,
@@ -495,7 +496,7 @@ def test_a_work_folder_that_is_removed_meanwhile(
     assert ran == ["source-0", *PARTS]
 
 
-@pytest.mark.parametrize(
+@each(
     ("gone", "again"),
     [
         (".", ["source-0", *PARTS]),
@@ -667,27 +668,19 @@ def test_a_parallel_pack_that_is_interrupted(
     before = tree(long_bag.parent)
     arguments = ("pack", long_bag, "-o", tmp_path / "dataset", "--window", 10, "--codec", "h264")
     process = start(*arguments, "--jobs", 2)
-    end = time.monotonic() + 60
-    while not list((tmp_path / WORK).glob("parts/0*/part.json")):
-        if process.poll() is not None or time.monotonic() > end:
-            process.kill()
-            pytest.fail(f"it did not come to its second part: {process.communicate()}")
-        time.sleep(0.01)
+    until(lambda: list((tmp_path / WORK).glob("parts/0*/part.json")), process)
     children: list[int] = []
     while not children and process.poll() is None:
         children = _children(process.pid)
     for number in signals:
         process.send_signal(number)
         time.sleep(0.02)
-    _, err = process.communicate(timeout=30)
+    _, err = process.communicate(timeout=WATCHDOG_S)
     # one that comes while Python ends is the death of it; a shell calls that 130, too
     assert process.returncode in (code, -signal.SIGINT if len(signals) > 1 else code), err
     assert "Traceback" not in err
     assert AGAIN in err
-    end = time.monotonic() + 5
-    while any(map(_lives, children)) and time.monotonic() < end:
-        time.sleep(0.05)
-    assert not any(map(_lives, children))
+    until(lambda: not any(map(_lives, children)))
     assert leftovers(tmp_path) == [WORK]
     assert not (tmp_path / "dataset").exists()
     assert tree(long_bag.parent) == before
@@ -700,14 +693,9 @@ def test_a_parallel_pack_that_is_interrupted(
 
 def test_an_interruption_before_anything_is_finished(long_bag: Path, tmp_path: Path) -> None:
     process = start("pack", long_bag, "-o", tmp_path / "dataset", "--window", 20, "--jobs", 1)
-    end = time.monotonic() + 60
-    while not list((tmp_path / WORK).glob("parts/.0*")):
-        if process.poll() is not None or time.monotonic() > end:
-            process.kill()
-            pytest.fail(f"it did not begin a part: {process.communicate()}")
-        time.sleep(0.01)
+    until(lambda: list((tmp_path / WORK).glob("parts/.0*")), process)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
+    out, err = process.communicate(timeout=WATCHDOG_S)
     assert (process.returncode, out) == (130, "")
     assert "Traceback" not in err
     # unless the part was just then finished

@@ -15,6 +15,7 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
+from each import each, fresh
 from mp4ds import FormatError, Mp4dsError, SourceError, yamlio
 from scenes import Scene
 from sources import SOURCES, load_tool, scene
@@ -57,13 +58,13 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[li
     return make
 
 
-@pytest.fixture
+@fresh
 def dataset(packed: Callable[[str], tuple[list[Path], Path]], tmp_path: Path) -> Path:
     """A dataset of a bag, to be damaged."""
     return Path(shutil.copytree(packed("bag-none")[1], tmp_path / "dataset"))
 
 
-@pytest.fixture
+@fresh
 def two_cameras(tmp_path: Path) -> Path:
     """A dataset of two streams, to be damaged."""
     left = scene("mono8", with_info=False).messages
@@ -155,8 +156,8 @@ def found_in(folder: Path, name: str) -> str:
     return ""
 
 
-@pytest.mark.parametrize("name", FILES)
-@pytest.mark.parametrize("source", TARGETS)
+@each("name", FILES)
+@each("source", TARGETS)
 def test_a_flipped_bit_is_found(
     source: str,
     name: str,
@@ -200,7 +201,7 @@ def test_flipped_bits_of_metadata_are_found(
     assert wrong == []
 
 
-@pytest.mark.parametrize("text", [b"Lavf", b"VideoHandler", b"moov", b"mdat", b"ftyp", b"stsz"])
+@each("text", [b"Lavf", b"VideoHandler", b"moov", b"mdat", b"ftyp", b"stsz"])
 def test_flipped_bits_of_the_container_are_found(text: bytes, dataset: Path) -> None:
     path = dataset / f"{STEM}.mp4"
     data = bytearray(path.read_bytes())
@@ -271,8 +272,8 @@ def unsealed(document: Document) -> None:
     del document["video"]["size"], document["video"]["sha256"]
 
 
-@pytest.mark.parametrize("suffix", [".mp4", ".yaml"])
-@pytest.mark.parametrize("kind", CODED_KINDS)
+@each("suffix", [".mp4", ".yaml"], one_in=2)
+@each("kind", CODED_KINDS)
 def test_a_flipped_bit_of_coded_pictures_is_found(
     kind: str, suffix: str, coded: MakeCoded, tmp_path: Path
 ) -> None:
@@ -296,7 +297,7 @@ def coded_data(video: bytes) -> tuple[int, int]:
     return start + 4, start - 4 + int.from_bytes(video[start - 4 : start], "big")
 
 
-@pytest.mark.parametrize("kind", CODED_KINDS)
+@each("kind", CODED_KINDS, one_in=3)
 def test_digests_tell_of_each_coded_byte(kind: str, coded: MakeCoded, tmp_path: Path) -> None:
     """Although sidecar and manifest agree with the damaged video."""
     folder, video = copied(coded(kind)[1], tmp_path)
@@ -316,8 +317,8 @@ def test_digests_tell_of_each_coded_byte(kind: str, coded: MakeCoded, tmp_path: 
         assert any(f"[{code}]" in refused(folder) for code in found)
 
 
-@pytest.mark.parametrize("length", [0, 1, 40, 0.3, 0.9, -1])
-@pytest.mark.parametrize("kind", CODED_KINDS)
+@each("length", [0, 1, 40, 0.3, 0.9, -1])
+@each("kind", CODED_KINDS)
 def test_a_video_of_coded_pictures_that_was_cut_short(
     kind: str, length: float, coded: MakeCoded, tmp_path: Path
 ) -> None:
@@ -336,7 +337,7 @@ def test_a_video_of_coded_pictures_that_was_cut_short(
         refused(folder)
 
 
-@pytest.mark.parametrize(
+@each(
     ("kind", "key", "value"),
     [
         ("depth-16UC1-png", "prefix", "00" * 12),
@@ -437,7 +438,7 @@ def test_swapped_sidecars_whose_manifest_was_made_to_agree(two_cameras: Path) ->
     assert codes(two_cameras) == ["manifest-inconsistent"]
 
 
-@pytest.mark.parametrize("length", [0, 1, 40, 0.3, 0.9, -1])
+@each("length", [0, 1, 40, 0.3, 0.9, -1])
 def test_a_video_that_was_cut_short(length: float, dataset: Path) -> None:
     path = dataset / f"{STEM}.mp4"
     data = path.read_bytes()
@@ -450,7 +451,7 @@ def test_a_video_that_was_cut_short(length: float, dataset: Path) -> None:
         refused(dataset)
 
 
-@pytest.mark.parametrize("length", [0, 1, 40, 0.3, 0.9, -1])
+@each("length", [0, 1, 40, 0.3, 0.9, -1])
 def test_messages_that_were_cut_short(length: float, dataset: Path) -> None:
     path = dataset / "messages.mcap"
     data = path.read_bytes()

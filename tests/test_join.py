@@ -8,7 +8,7 @@ import signal
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -21,6 +21,7 @@ import pytest
 from coded_tools import ENCODINGS, IN_ORDER, hide, jpeg, superframe
 from coded_tools import encode as encode_packets
 from coded_tools import scene as packet_scene
+from each import each
 from mp4ds.errors import Mp4dsError, VideoError
 from mp4ds.stamps import MAX_GAP_NS, NS_PER_TICK
 from mp4ds.video import (
@@ -154,28 +155,32 @@ LEFT_OUT = {"h264": {"btrt"}, "h265": {"btrt"}, "av1": {"sdtp"}, "ffv1": set()}
 # ---------------------------------------------------------------- videos that are encoded here
 
 
-@pytest.fixture
-def joined(
-    request: pytest.FixtureRequest, elsewhere: Path, tmp_path: Path
-) -> tuple[Path, list[Path], dict[str, Any], tuple[str, str, bool]]:
-    kind: tuple[str, str, bool] = request.param
-    segments = [tmp_path / f"{number}.mp4" for number in range(3)]
-    told = make_segment(segments[0], kind, 0)
-    make_segment(segments[2], kind, 2)
-    segments[1] = elsewhere / f"{IDS[KINDS.index(kind)]}.mp4"
-    target = tmp_path / "joined.mp4"
-    ticks = (number * STEP for number in range(TOTAL))
-    assert join_segments(segments, ticks, target) == TOTAL
-    return target, segments, told, kind
+Kind = tuple[str, str, bool]
+Joined = Callable[[Kind], tuple[Path, list[Path], dict[str, Any]]]
+every_kind = each("kind", KINDS, ids=IDS)
 
 
-Joined = tuple[Path, list[Path], dict[str, Any], tuple[str, str, bool]]
-every_kind = pytest.mark.parametrize("joined", KINDS, ids=IDS, indirect=True)
+@pytest.fixture(scope="module")
+def joined(elsewhere: Path, tmp_path_factory: pytest.TempPathFactory) -> Joined:
+    """A joined video of a kind, its segments, and what a decoder is told; made once."""
+
+    @cache
+    def make(kind: Kind) -> tuple[Path, list[Path], dict[str, Any]]:
+        folder = tmp_path_factory.mktemp("joined")
+        segments = [folder / f"{number}.mp4" for number in range(3)]
+        told = make_segment(segments[0], kind, 0)
+        make_segment(segments[2], kind, 2)
+        segments[1] = elsewhere / f"{IDS[KINDS.index(kind)]}.mp4"
+        ticks = (number * STEP for number in range(TOTAL))
+        assert join_segments(segments, ticks, folder / "joined.mp4") == TOTAL
+        return folder / "joined.mp4", segments, told
+
+    return make
 
 
 @every_kind
-def test_pictures_are_those_of_the_segments(joined: Joined) -> None:
-    target, segments, told, kind = joined
+def test_pictures_are_those_of_the_segments(kind: Kind, joined: Joined) -> None:
+    target, segments, told = joined(kind)
     expected = [
         picture
         for path, length in zip(segments, LENGTHS, strict=True)
@@ -194,8 +199,8 @@ def test_pictures_are_those_of_the_segments(joined: Joined) -> None:
 
 
 @every_kind
-def test_the_file_is_as_one_encoder_writes_it(joined: Joined, tmp_path: Path) -> None:
-    target, segments, _, kind = joined
+def test_the_file_is_as_one_encoder_writes_it(kind: Kind, joined: Joined, tmp_path: Path) -> None:
+    target, segments, _ = joined(kind)
     uncut = tmp_path / "uncut.mp4"
     ticks = [number * STEP for number in range(TOTAL)]
     encode(uncut, recipe_of(kind), pictures_of(kind), kind[1], ticks=ticks, gop=GOP, threads=2)
@@ -213,8 +218,8 @@ def test_the_file_is_as_one_encoder_writes_it(joined: Joined, tmp_path: Path) ->
 
 
 @every_kind
-def test_one_segment_is_the_file_itself(joined: Joined, tmp_path: Path) -> None:
-    segment, kind = joined[1][0], joined[3]
+def test_one_segment_is_the_file_itself(kind: Kind, joined: Joined, tmp_path: Path) -> None:
+    segment = joined(kind)[1][0]
     target = tmp_path / "alone.mp4"
     assert join_segments([segment], [n * STEP for n in range(LENGTHS[0])], target) == LENGTHS[0]
     left_out = LEFT_OUT[recipe_of(kind).codec]
@@ -223,7 +228,7 @@ def test_one_segment_is_the_file_itself(joined: Joined, tmp_path: Path) -> None:
         assert target.read_bytes() == segment.read_bytes()
 
 
-@pytest.mark.parametrize("picture_format", [f for codec, f in LOSSLESS if codec == "ffv1"])
+@each("picture_format", [f for codec, f in LOSSLESS if codec == "ffv1"])
 def test_parts_that_end_at_key_frames_give_the_uncut_file(
     picture_format: str, tmp_path: Path
 ) -> None:
@@ -251,8 +256,8 @@ def ffmpeg_says(path: Path) -> tuple[int, str]:
 
 
 @every_kind
-def test_ffmpeg_reads_it_without_a_word(joined: Joined) -> None:
-    target, segments, told, _ = joined
+def test_ffmpeg_reads_it_without_a_word(kind: Kind, joined: Joined) -> None:
+    target, segments, told = joined(kind)
     if ffmpeg_says(segments[0])[0]:
         pytest.skip("this ffmpeg does not decode such videos")
     assert ffmpeg_says(target) == (0, "")
@@ -268,8 +273,8 @@ def test_ffmpeg_reads_it_without_a_word(joined: Joined) -> None:
 
 
 @every_kind
-def test_pyav_seeks_across_the_seams(joined: Joined) -> None:
-    target = joined[0]
+def test_pyav_seeks_across_the_seams(kind: Kind, joined: Joined) -> None:
+    target, _, _ = joined(kind)
     with av.open(str(target)) as container:
         stream = container.streams.video[0]
         assert stream.start_time == 0
@@ -282,8 +287,8 @@ def test_pyav_seeks_across_the_seams(joined: Joined) -> None:
             assert times == list(range(times[0], TOTAL * STEP, STEP))
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=IDS)
-@pytest.mark.parametrize("size", [(640, 360), (1920, 1200)])
+@each("kind", KINDS, ids=IDS, one_in=4)
+@each("size", [(640, 360), (1920, 1200)])
 def test_what_a_track_says_does_not_hang_on_threads(
     kind: tuple[str, str, bool], size: tuple[int, int], tmp_path: Path
 ) -> None:
@@ -317,7 +322,7 @@ def cut_at_keys(bodies: Sequence[tuple[bytes, bool]]) -> list[list[bytes]]:
     return parts
 
 
-@pytest.mark.parametrize("name", IN_ORDER)
+@each("name", IN_ORDER)
 def test_copied_packets_give_the_uncut_file(name: str, tmp_path: Path) -> None:
     codec = ENCODINGS[name].codec
     bodies = bodies_of(name)
@@ -393,7 +398,7 @@ def test_times_with_gaps(tmp_path: Path) -> None:
     assert (tmp_path / "joined.mp4").read_bytes() == (tmp_path / "uncut.mp4").read_bytes()
 
 
-@pytest.mark.parametrize("rate", [0.5, 10.0, 30.0, 120.0, None])
+@each("rate", [0.5, 10.0, 30.0, 120.0, None])
 def test_the_last_frame_lasts_as_the_rate_says(rate: float | None, tmp_path: Path) -> None:
     bodies = [jpeg(picture) for picture in packet_scene(6)]
 
@@ -447,7 +452,7 @@ DIFFERENCES: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", DIFFERENCES)
+@each("name", DIFFERENCES)
 def test_videos_that_cannot_be_one(name: str, tmp_path: Path) -> None:
     first, other, problem = DIFFERENCES[name]
     segments = [small(tmp_path / "a.mp4", **first), small(tmp_path / "b.mp4", **other)]
@@ -562,8 +567,8 @@ def empty_index(data: bytes) -> bytes:
     return data[:at] + bytes(4) + data[at + 4 :]
 
 
-@pytest.mark.parametrize("place", [0, 1])
-@pytest.mark.parametrize("fault", FAULTS)
+@each("place", [0, 1])
+@each("fault", FAULTS)
 def test_a_segment_that_cannot_be_read(fault: str, place: int, tmp_path: Path) -> None:
     segments = [small(tmp_path / "a.mp4"), small(tmp_path / "b.mp4")]
     segments[place].write_bytes(FAULTS[fault](segments[place].read_bytes()))
@@ -703,7 +708,7 @@ except OSError as error:
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="the system limits no files")
-@pytest.mark.parametrize("short", [1, 700, 5_000, 300_000, 2_000_000])
+@each("short", [1, 700, 5_000, 300_000, 2_000_000])
 def test_a_disk_that_is_full(short: int, tmp_path: Path) -> None:
     """In the packets, in the index at the end, and in its last byte."""
     segment = large(tmp_path / "a.mp4", 20, 100_000)
@@ -759,7 +764,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize("name", [*PLAYED_IDS, *(f"packets-{name}" for name in PACKETS_PLAYED)])
+@each("name", [*PLAYED_IDS, *(f"packets-{name}" for name in PACKETS_PLAYED)])
 def test_a_browser_plays_across_the_seams(name: str, seen: dict[str, Any]) -> None:
     path, result = seen[name]
     assert result is not None, "the browser did not come to this video in time"

@@ -9,16 +9,17 @@ import sys
 import termios
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from each import each, fresh
 from mp4ds.cli.keys import Keyboard, Keys
+from waiting import until
 
-WAIT_S = 20.0
 ESC = b"\x1b"
 
 
@@ -81,19 +82,12 @@ class Terminal:
         return not self.attributes[3] & (termios.ICANON | termios.ECHO)
 
 
-@pytest.fixture
+@fresh
 def terminal() -> Iterator[Terminal]:
     hand, fd = os.openpty()
     yield Terminal(hand, fd)
     for descriptor in {hand, fd}:
         os.close(descriptor)
-
-
-def wait(is_so: Callable[[], bool]) -> None:
-    end = time.monotonic() + WAIT_S
-    while not is_so():
-        assert time.monotonic() < end
-        time.sleep(0.005)
 
 
 # ---------------------------------------------------------------- keys
@@ -122,18 +116,18 @@ IGNORED = {
 }
 
 
-@pytest.mark.parametrize("name", KEYS)
+@each("name", KEYS)
 def test_each_key(name: str, terminal: Terminal) -> None:
     typed, call, rate = KEYS[name]
     controls = RecordedControls()
     with Keyboard(controls, fd=terminal.fd):
         terminal.type(typed)
-        wait(lambda: bool(controls.calls))
+        until(lambda: bool(controls.calls))
     assert controls.calls == [call]
     assert controls.rate == rate
 
 
-@pytest.mark.parametrize("name", KEYS)
+@each("name", KEYS)
 def test_a_key_that_comes_byte_by_byte(name: str, terminal: Terminal) -> None:
     typed, call, _ = KEYS[name]
     controls = RecordedControls()
@@ -142,11 +136,11 @@ def test_a_key_that_comes_byte_by_byte(name: str, terminal: Terminal) -> None:
             assert not controls.calls
             terminal.type(typed[n : n + 1])
             time.sleep(0.03)
-        wait(lambda: bool(controls.calls))
+        until(lambda: bool(controls.calls))
     assert controls.calls == [call]
 
 
-@pytest.mark.parametrize("name", IGNORED)
+@each("name", IGNORED)
 def test_other_keys_are_ignored(name: str, terminal: Terminal) -> None:
     controls = RecordedControls()
     with Keyboard(controls, fd=terminal.fd):
@@ -154,7 +148,7 @@ def test_other_keys_are_ignored(name: str, terminal: Terminal) -> None:
             terminal.type(IGNORED[name][n : n + 1000])
             time.sleep(0.02)
         terminal.type(b" ")
-        wait(lambda: bool(controls.calls))
+        until(lambda: bool(controls.calls))
     assert controls.calls == ["toggle_paused"]
 
 
@@ -164,7 +158,7 @@ def test_many_keys_at_once(terminal: Terminal) -> None:
     expected = [call for _, call, _ in KEYS.values()] * 100
     with Keyboard(controls, fd=terminal.fd):
         terminal.type(typed)
-        wait(lambda: len(controls.calls) >= len(expected))
+        until(lambda: len(controls.calls) >= len(expected))
     assert controls.calls == expected
 
 
@@ -172,14 +166,14 @@ def test_faster_and_slower_cancel(terminal: Terminal) -> None:
     controls = RecordedControls()
     with Keyboard(controls, fd=terminal.fd):
         terminal.type((ESC + b"[A") * 5)
-        wait(lambda: len(controls.calls) == 5)
+        until(lambda: len(controls.calls) == 5)
         assert controls.rate == pytest.approx(1.1**5)
         terminal.type((ESC + b"[B") * 5)
-        wait(lambda: len(controls.calls) == 10)
+        until(lambda: len(controls.calls) == 10)
     assert controls.rate == pytest.approx(1, abs=1e-8)
 
 
-@pytest.mark.parametrize("size", range(1, 6))
+@each("size", range(1, 6))
 def test_keys_wherever_they_are_cut(size: int) -> None:
     typed = b" " + ESC + b"[C" + ESC + b"[1;2A" + ESC + b"s" + ESC + ESC + b"OB" + b"\xc3\xa9b"
     keys = Keys()
@@ -220,7 +214,7 @@ def test_it_works_outside_of_the_main_thread(terminal: Terminal) -> None:
     def use() -> None:
         with Keyboard(controls, fd=terminal.fd):
             terminal.type(b" ")
-            wait(lambda: bool(controls.calls))
+            until(lambda: bool(controls.calls))
 
     thread = threading.Thread(target=use)
     thread.start()
@@ -233,7 +227,7 @@ def test_the_terminal_goes_away() -> None:
     hand, fd = os.openpty()
     with Keyboard(RecordedControls(), fd=fd):
         os.close(hand)
-        wait(lambda: "keys" not in [thread.name for thread in threading.enumerate()])
+        until(lambda: "keys" not in [thread.name for thread in threading.enumerate()])
     os.close(fd)
 
 
@@ -335,7 +329,7 @@ class Session:
         self._lines.extend(iter(self._shell.stderr.readline, ""))
 
     def expect(self, line: str, times: int = 1) -> None:
-        wait(lambda: sum(told.startswith(line) for told in self.lines) >= times)
+        until(lambda: sum(told.startswith(line) for told in self.lines) >= times)
 
     @property
     def lines(self) -> list[str]:
@@ -349,7 +343,7 @@ class Session:
         self._shell.stderr.close()
 
 
-@pytest.fixture
+@fresh
 def session(terminal: Terminal) -> Iterator[Session]:
     made = Session(terminal)
     yield made
@@ -358,7 +352,7 @@ def session(terminal: Terminal) -> Iterator[Session]:
     made.close()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT])
+@each("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT])
 def test_the_terminal_is_as_it_was_after_a_signal(
     number: signal.Signals, terminal: Terminal, session: Session
 ) -> None:
@@ -391,7 +385,7 @@ def test_ctrl_z_gives_the_terminal_back_and_fg_takes_it(
         assert not terminal.gives_keys
         terminal.type(b"fg\n")
         session.expect("fg", n)
-        wait(lambda: terminal.gives_keys)
+        until(lambda: terminal.gives_keys)
         terminal.type(b" ")
         session.expect("toggled", 2 * n)
 
@@ -408,6 +402,6 @@ def test_in_the_background_the_terminal_is_left_alone(terminal: Terminal, sessio
     assert Path(f"/proc/{session.job}/stat").read_text().split()[2] in "SR"
     terminal.type(b"fg\n")
     session.expect("fg")
-    wait(lambda: terminal.gives_keys)
+    until(lambda: terminal.gives_keys)
     terminal.type(b" ")
     session.expect("toggled")

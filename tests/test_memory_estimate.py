@@ -114,6 +114,7 @@ def measured(case: str, threads: int, frames: int) -> int:
 @each(
     ("case", "threads", "frames"),
     [*MEASURED, *(pytest.param(*row, marks=pytest.mark.slow) for row in MEASURED_SLOWLY)],
+    one_in=3,
 )
 def test_estimate_is_above_what_is_taken_but_not_far(case: str, threads: int, frames: int) -> None:
     found = recipe(*ASKED[case])

@@ -17,11 +17,14 @@ from pathlib import Path
 import pytest
 
 import mp4ds
+from each import each
 from mp4ds.cli.arguments import spelled
 from mp4ds.playing import PlayOptions, open_player
 from player_scenes import RecordingPublisher, make_drive, recorded
+from test_bad_input import call
+from waiting import WATCHDOG_S
 
-WAIT_S = 40.0
+WAIT_S = WATCHDOG_S
 pytest.importorskip("foxglove")
 
 
@@ -44,7 +47,7 @@ def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
         command(*arguments),
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=WATCHDOG_S,
         check=False,
         stdin=subprocess.DEVNULL,
     )
@@ -150,7 +153,7 @@ def test_the_clock_rate_may_follow_the_option() -> None:
     assert spelled(["pack", "--clock", "50"]) == ["pack", "--clock", "50"]
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "code", "words"),
     [
         (["{}", "--ros1", "--ros2"], 2, "--ros1 contradicts --ros2"),
@@ -164,10 +167,10 @@ def test_the_clock_rate_may_follow_the_option() -> None:
     ],
 )
 def test_errors_are_sentences(drive: Path, arguments: list[str], code: int, words: str) -> None:
-    done = run(*(argument.format(drive) for argument in arguments), "--port", "0")
-    assert done.returncode == code, done.stderr
-    assert words in done.stderr
-    assert "Traceback" not in done.stderr
+    done = call("play", *(argument.format(drive) for argument in arguments), "--port", "0")
+    assert done.code == code, done.err
+    assert words in done.err
+    assert "Traceback" not in done.err
 
 
 def test_nothing_sourced(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,7 +183,7 @@ def test_nothing_sourced(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         pass
 
 
-@pytest.mark.parametrize(
+@each(
     ("version", "modules", "kind"),
     [
         ("1", [], "ros1"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -13,10 +13,12 @@ from typing import Any
 import pytest
 
 import mp4ds
+from each import each
 from mp4ds.errors import FormatError, OptionError
 from mp4ds.playing import Player, PlayOptions, PlaySummary, open_player
 from mp4ds.playing.pace import FollowedClock
 from player_scenes import MS, START, Recorded, RecordingPublisher, make_drive, recorded
+from waiting import WATCHDOG_S, until
 
 FIRST = START
 CAMERA = "/camera/image_raw"
@@ -62,16 +64,9 @@ def running(
             yield player, publisher
         finally:
             player.stop()
-            thread.join(20)
+            thread.join(WATCHDOG_S)
     assert not thread.is_alive()
     assert not failures
-
-
-def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it does not come"
-        time.sleep(0.002)
 
 
 # ---------------------------------------------------------------- what is published
@@ -121,7 +116,7 @@ def test_what_begins_at_the_beginning_has_nothing_twice(
     assert sum(item[0] == "/tf_static" for item in published(publisher)) == 2
 
 
-@pytest.mark.parametrize(
+@each(
     ("options", "topics"),
     [
         ({"topics": ["/tf*"]}, {"/tf", "/tf_static"}),
@@ -143,7 +138,7 @@ def test_topics(
     assert set(summary.messages) == topics
 
 
-@pytest.mark.parametrize(
+@each(
     ("options", "words"),
     [
         ({"topics": ["/none"]}, "--topics '/none' matches no topic"),

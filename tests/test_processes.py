@@ -6,13 +6,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from mp4ds.engine import ProcessEngine
+from waiting import until
 
 DONE = "print(json.dumps({'done': True, 'pid': os.getpid()}), flush=True)"
 TASKS = {
@@ -146,8 +146,4 @@ def test_a_worker_ends_when_its_coordinator_is_killed(tmp_path: Path) -> None:
         pid = int(process.stdout.readline())
         process.send_signal(signal.SIGKILL)
         process.wait()
-        for _ in range(100):
-            if not is_alive(pid):
-                break
-            time.sleep(0.1)
-        assert not is_alive(pid)
+        until(lambda: not is_alive(pid))

@@ -28,12 +28,14 @@ from hypothesis import strategies as st
 from rich.cells import cell_len
 from rich.console import Console
 
+from each import each, fresh
 from mp4ds.cli.progress import Events, pack_progress, told_by
 from mp4ds.cli.progress_live import drawn, live_progress
 from mp4ds.cli.progress_log import Lines, Log, duration_text, left_text, percent_text, plain
 from mp4ds.cli.standing import JobStanding
 from mp4ds.demo import demo
 from mp4ds.packing import PackProgress
+from waiting import WATCHDOG_S, until
 
 HOUR = 3600.0
 HOSTILE = "/cam\x1b[31m\n\r\t\u202e\x00\x9b2J"
@@ -133,8 +135,8 @@ def jittered(work: Work, size: float) -> Work:
     return told_late
 
 
-@pytest.mark.parametrize("seconds", [60.0, 600.0, HOUR, 10 * HOUR, 100 * HOUR])
-@pytest.mark.parametrize("jitter", [0.0, 3.0])
+@each("seconds", [60.0, 600.0, HOUR, 10 * HOUR, 100 * HOUR])
+@each("jitter", [0.0, 3.0])
 def test_a_constant_pace_is_told_right_from_the_beginning(seconds: float, jitter: float) -> None:
     found = estimates(jittered(lambda now: now / seconds, jitter), seconds)
     assert found[0][0] <= max(12.0, 0.001 * seconds)
@@ -157,8 +159,8 @@ def test_half_the_pace_is_told_after_a_minute_or_two_percent(seconds: float) -> 
     assert worst(early, 2 * half) < 1.05
 
 
-@pytest.mark.parametrize("seconds", [1200.0, 10 * HOUR])
-@pytest.mark.parametrize("factor", [0.1, 3.0])
+@each("seconds", [1200.0, 10 * HOUR])
+@each("factor", [0.1, 3.0])
 def test_any_change_of_pace_is_followed(seconds: float, factor: float) -> None:
     first = 0.4 * seconds
     end = first + 0.6 * seconds / factor
@@ -198,8 +200,8 @@ def test_nothing_is_told_where_an_earlier_run_did_all_but_joining() -> None:
     assert job.seconds_left(0.0) == pytest.approx(joining_seconds())
 
 
-@pytest.mark.parametrize("seconds", [600.0, 10 * HOUR])
-@pytest.mark.parametrize("heard", [False, True], ids=["silent", "told-again"])
+@each("seconds", [600.0, pytest.param(10 * HOUR, marks=pytest.mark.slow)])
+@each("heard", [False, True], ids=["silent", "told-again"])
 def test_a_stall_makes_the_time_left_grow(seconds: float, heard: bool) -> None:
     job, begin, stall = JobStanding(), seconds / 2, 300.0
     for n in range(int(begin * 2)):
@@ -232,7 +234,7 @@ def test_a_stall_makes_the_time_left_grow(seconds: float, heard: bool) -> None:
         assert worst(found, seconds + stall, after=forgotten) < 1.05
 
 
-@pytest.mark.parametrize("spread", [0.0, 0.1, 0.3, 0.6])
+@each("spread", [0.0, 0.1, 0.3, 0.6])
 def test_work_told_in_large_steps_is_no_reason_for_wild_estimates(spread: float) -> None:
     """Many machines begin their parts at once, and tell of them at their end alone."""
     chance, machines, lasting, parts = random.Random(3), 50, 600.0, 500
@@ -594,7 +596,7 @@ def test_a_pack_does_not_fail_for_want_of_a_log() -> None:
     Lines(closed).write("one")
 
 
-@pytest.mark.parametrize(
+@each(
     ("seconds", "text"),
     [
         (0.0, "0 s"),
@@ -613,9 +615,7 @@ def test_durations(seconds: float, text: str) -> None:
     assert left_text(seconds) == (f"{text} left" if seconds else "")
 
 
-@pytest.mark.parametrize(
-    ("share", "text"), [(None, ""), (0, "0 %"), (0.29, "29 %"), (0.9999, "99 %"), (1, "100 %")]
-)
+@each(("share", "text"), [(None, ""), (0, "0 %"), (0.29, "29 %"), (0.9999, "99 %"), (1, "100 %")])
 def test_percents(share: float | None, text: str) -> None:
     assert percent_text(share) == text
 
@@ -775,7 +775,7 @@ class _Counting:
         self.calls.append(outcome)
 
 
-@pytest.mark.parametrize(
+@each(
     ("error", "outcome"),
     [
         (None, "done"),
@@ -792,7 +792,7 @@ def test_the_end_is_told_however_it_comes(error: type[BaseException] | None, out
         told_by(teller, tick_seconds=0.01) as take,
     ):
         take(told(0.5))
-        assert teller.ticked.wait(10)
+        assert teller.ticked.wait(WATCHDOG_S)
         if error is not None:
             raise error
     assert teller.calls[0] == "take"
@@ -872,7 +872,7 @@ def looks_right(lines: list[str], width: int, height: int) -> None:
         assert cell_len(line) <= width
 
 
-@pytest.fixture
+@fresh
 def drive() -> JobStanding:
     """A pack with 14 cameras at 30 %."""
     job = JobStanding()
@@ -901,7 +901,7 @@ def test_a_narrow_terminal_has_two_lines_of_all(drive: JobStanding, width: int) 
     assert lines[1].startswith("  parts 72/240  15.0 GB")
 
 
-@pytest.mark.parametrize("height", range(1, 24))
+@each("height", range(1, 24))
 def test_a_low_terminal_summarizes_topics(drive: JobStanding, height: int) -> None:
     lines = picture(drive, 120, height, 300.0)
     looks_right(lines, 120, height)
@@ -978,11 +978,8 @@ def test_a_live_terminal(terminal: tuple[int, Any]) -> None:
         for n in range(10):
             take(told(n / 10))
             time.sleep(0.01)
-        reader.join(10)
-    end = time.monotonic() + 10
-    while threading.active_count() >= threads:
-        assert time.monotonic() < end
-        time.sleep(0.01)
+        reader.join(WATCHDOG_S)
+    until(lambda: threading.active_count() < threads)
     text = b"".join(read).decode()
     assert "packing" in text
     assert "/cam0" in text
@@ -1065,14 +1062,11 @@ def test_the_command_on_a_terminal(
     )
     found: list[bytes] = []
     threading.Thread(target=lambda: found.extend(_all(shown_at)), daemon=True).start()
-    out, _ = process.communicate(timeout=60)
+    out, _ = process.communicate(timeout=WATCHDOG_S)
     assert process.returncode == 0
     assert "day" in out
     assert "\x1b" not in out
-    end = time.monotonic() + 10
-    while term == "xterm" and b"datasets" not in b"".join(found):
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    until(lambda: term != "xterm" or b"datasets" in b"".join(found))
     text = b"".join(found).decode()
     if term == "dumb":
         assert text == ""

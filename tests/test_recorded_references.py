@@ -67,7 +67,7 @@ def chains_of(path: Path, codec: str, recorded: Structures | None) -> list[Piece
     return found
 
 
-@each("name", RECIPES)
+@each("name", RECIPES, one_in=2)
 def test_recorded_and_parsed_chains_are_the_same(name: str, tmp_path: Path) -> None:
     recipe = RECIPES[name]
     path = written(tmp_path, recipe)

@@ -273,7 +273,7 @@ def check(clip: Clip, numbers: Sequence[int]) -> int:
     return left_out
 
 
-@each("name", RECIPES)
+@each("name", RECIPES, one_in=2)
 def test_frames_decode_from_what_they_refer_to(name: str) -> None:
     recipe = RECIPES[name]
     clip = encoded(recipe)
@@ -310,7 +310,7 @@ def test_what_reaches_across_key_packets_is_refused(name: str) -> None:
     assert all(reasons[first:following])
 
 
-@each("name", FILES)
+@each("name", FILES, one_in=2)
 def test_real_videos(name: str) -> None:
     path: Path = real(f"video/{name}")
     clip = read(str(path), most=60)

@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mp4ds
+from each import each
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.bags import open_sources
 from mp4ds.cli import app
@@ -61,7 +62,7 @@ def covered(ranges: Sequence[tuple[int, int]]) -> int:
 # ---------------------------------------------------------------- names
 
 
-@pytest.mark.parametrize(
+@each(
     ("url", "shown", "name", "parent", "child"),
     [
         ("s3://b/k/drive.mcap", "s3://b/k/drive.mcap", "drive.mcap", "s3://b/k", "s3://b/k/a b"),
@@ -212,7 +213,13 @@ def round_trip(
     assert compare(paths, unpacked(folder, own_target(source))) == []
 
 
-@pytest.mark.parametrize("source", SOURCES)
+def some(first: int) -> list[Any]:
+    """Every source, of which all but every third are slow."""
+    marks = [[] if n % 3 == first else [pytest.mark.slow] for n in range(len(SOURCES))]
+    return [pytest.param(name, marks=mark) for name, mark in zip(SOURCES, marks, strict=True)]
+
+
+@pytest.mark.parametrize("source", some(0))
 def test_every_source_in_a_store(
     source: str, tmp_path: Path, put: Put, compare: Compare, engine: InlineEngine
 ) -> None:
@@ -221,7 +228,7 @@ def test_every_source_in_a_store(
     round_trip(paths, [put(path) for path in paths], tmp_path, source, compare)
 
 
-@pytest.mark.parametrize("source", SOURCES)
+@pytest.mark.parametrize("source", some(1))
 def test_every_source_on_a_web_server(
     source: str, tmp_path: Path, web: Server, compare: Compare, engine: InlineEngine
 ) -> None:
@@ -454,8 +461,8 @@ def test_a_server_without_ranges(name: str, tmp_path: Path) -> None:
         assert web.sent < 2**26  # what is under way when the connection is closed
 
 
-@pytest.mark.parametrize("name", ["drive.bag", "drive.mcap"])
-@pytest.mark.parametrize("after", [3, 8, 20])
+@each("name", ["drive.bag", "drive.mcap"])
+@each("after", [3, 8, 20])
 def test_a_network_that_fails_is_no_damage(
     name: str, after: int, large: Path, tmp_path: Path
 ) -> None:

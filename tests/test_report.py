@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 import mp4ds
 from coded_scenes import CODED
+from each import each, fresh
 from mp4ds.errors import OptionError, SourceError, TargetError, TargetExistsError
 from mp4ds.info import info
 from mp4ds.intervals import lost_frames
@@ -57,6 +58,7 @@ from report_scenes import (
     two_cameras,
 )
 from sources import COMMON, ENCODINGS, Scene, scene
+from waiting import WATCHDOG_S
 
 INT64 = np.iinfo(np.int64)
 
@@ -67,7 +69,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return pack_cameras(tmp_path_factory.mktemp("report"), two_cameras())
 
 
-@pytest.fixture
+@fresh
 def copy(drive: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(drive, tmp_path / "drive"))
 
@@ -121,7 +123,7 @@ COLUMNS = {
 }
 
 
-@pytest.mark.parametrize("name", COLUMNS)
+@each("name", COLUMNS)
 def test_columns_come_back(name: str) -> None:
     values = COLUMNS[name]
     assert unpacked(pack_column(np.array(values, np.int64)), len(values)) == values
@@ -155,9 +157,7 @@ def test_figures_of_a_camera() -> None:
     assert (timing.delay_median_ms, timing.delay_least_ms, timing.delay_most_ms) == (4.5, 4.5, 4.5)
 
 
-@pytest.mark.parametrize(
-    ("stamps", "rate"), [([5], None), ([5, 5, 5], None), ([9, 8, 7], None), ([0, 10**9], 1.0)]
-)
+@each(("stamps", "rate"), [([5], None), ([5, 5, 5], None), ([9, 8, 7], None), ([0, 10**9], 1.0)])
 def test_figures_where_there_are_none(stamps: list[int], rate: float | None) -> None:
     column = np.array(stamps, np.int64)
     timing = timing_of(column, column, None)
@@ -234,7 +234,7 @@ LENSES = {
 }
 
 
-@pytest.mark.parametrize("name", LENSES)
+@each("name", LENSES)
 def test_the_grid_is_straight_without_distortion(name: str) -> None:
     """By OpenCV, which takes the distortion of each point away."""
     lens = LENSES[name]
@@ -259,7 +259,7 @@ def test_the_grid_of_rectified_images_is_that_of_p() -> None:
     assert all(len(set(line[0::2])) == 1 or len(set(line[1::2])) == 1 for line in overlay.lines)
 
 
-@pytest.mark.parametrize(
+@each(
     ("lens", "size", "problem"),
     [
         (calibration("plumb_bob", [], k=[0.0] * 9), (640, 480), "not calibrated"),
@@ -491,7 +491,7 @@ def test_no_code_of_the_page_makes_elements_of_text() -> None:
     assert not re.search(r"https?://", everything)
 
 
-@pytest.mark.parametrize("time_ns", [INT64.min, INT64.max, 0, -1])
+@each("time_ns", [INT64.min, INT64.max, 0, -1])
 def test_any_time_has_a_text(time_ns: int) -> None:
     assert "UTC" in utc_text(time_ns) or abs(time_ns) > 10**12
 
@@ -501,7 +501,7 @@ def test_any_time_has_a_text(time_ns: int) -> None:
 SOME = {*COMMON, "rgb16", "yuyv", "nv12", "8UC2", "32FC1", "64FC3", "bgra8", "bayer_gbrg16"}
 
 
-@pytest.mark.parametrize(
+@each(
     "encoding",
     [name if name in SOME else pytest.param(name, marks=pytest.mark.slow) for name in ENCODINGS],
 )
@@ -522,7 +522,7 @@ CODED_KINDS = [
 ]
 
 
-@pytest.mark.parametrize("kind", CODED_KINDS)
+@each("kind", CODED_KINDS)
 def test_coded_images_get_a_proxy(kind: str, tmp_path: Path) -> None:
     made = CODED[kind](frames=8, width=96, height=66)
     dataset = pack_cameras(tmp_path, made, quality="lossless")
@@ -548,7 +548,7 @@ def assert_proxy_shows(dataset: Path, width: int) -> None:
                     assert np.abs(found - blocks(look.picture(pixels))).mean() < 8
 
 
-@pytest.mark.parametrize(
+@each(
     ("image", "width", "size"),
     [
         ((1920, 1080), 640, (640, 360)),
@@ -594,7 +594,7 @@ def test_scores_are_plotted(copy: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
+@each(
     ("value", "problem"),
     [
         ({"/nowhere": {"vmaf": []}}, "none of"),
@@ -640,7 +640,7 @@ def test_a_topic_of_two_sizes_has_two_cameras(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- the server
 
 
-@pytest.fixture
+@fresh
 def server(tmp_path: Path) -> Iterator[ReportServer]:
     (tmp_path / "a b.mp4").write_bytes(bytes(range(256)) * 4)
     (tmp_path / "index.html").write_text("page")
@@ -658,7 +658,7 @@ def server(tmp_path: Path) -> Iterator[ReportServer]:
 def ask(
     server: ReportServer, path: str, method: str = "GET", **headers: str
 ) -> tuple[int, dict[str, str], bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=WATCHDOG_S)
     try:
         connection.request(method, urlsplit(server.root).path + path, headers=headers)
         answer = connection.getresponse()
@@ -667,7 +667,7 @@ def ask(
         connection.close()
 
 
-@pytest.mark.parametrize(
+@each(
     ("asked", "start", "end"),
     [
         ("bytes=0-", 0, 1024),
@@ -692,14 +692,12 @@ def test_ranges_that_are_not_there(server: ReportServer, asked: str) -> None:
     assert headers["Content-Range"] == "bytes */1024"
 
 
-@pytest.mark.parametrize("asked", ["bytes=-", "lines=1-2", "bytes=1-2,5-6", "bytes=a-b", "x" * 999])
+@each("asked", ["bytes=-", "lines=1-2", "bytes=1-2,5-6", "bytes=a-b", "x" * 999])
 def test_other_ranges_give_all(asked: str) -> None:
     assert byte_range(asked, 7) == (0, 7)
 
 
-@pytest.mark.parametrize(
-    "path", ["/", "/secret", "/../secret", "/d/../secret", "/%2e%2e/secret", "/d/", "/gone"]
-)
+@each("path", ["/", "/secret", "/../secret", "/d/../secret", "/%2e%2e/secret", "/d/", "/gone"])
 def test_nothing_else_is_served(server: ReportServer, path: str) -> None:
     status, _, body = ask(server, path)
     assert (status, body) == (404, b"")
@@ -732,7 +730,7 @@ def test_other_sites_and_users_get_nothing(server: ReportServer) -> None:
         assert headers["X-Content-Type-Options"] == "nosniff"
     with ReportServer({}, "/index.html") as other:
         path = urlsplit(other.url).path
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=WATCHDOG_S)
     for guess in ("/index.html", path, path.replace("/index.html", "")):
         connection.request("GET", guess)
         answer = connection.getresponse()
@@ -804,7 +802,7 @@ def test_serving_until_interrupted(copy: Path) -> None:
             assert line, process.stderr.read() if process.stderr else ""
         match = re.match(r"http://127\.0\.0\.1:(\d+)(/[\w-]{20,})/out%20put/index\.html ", line)
         assert match
-        connection = http.client.HTTPConnection("127.0.0.1", int(match[1]), timeout=20)
+        connection = http.client.HTTPConnection("127.0.0.1", int(match[1]), timeout=WATCHDOG_S)
         pages = ("/out%20put/index.html", "/out%20put/report/data.js", "/drive/front_image_raw.mp4")
         for path in pages:
             connection.request("GET", match[2] + path)
@@ -813,7 +811,7 @@ def test_serving_until_interrupted(copy: Path) -> None:
             assert answer.read()
         connection.close()
         process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 130
+        assert process.wait(WATCHDOG_S) == 130
     finally:
         process.kill()
         process.communicate()
@@ -844,6 +842,7 @@ def test_the_scene_is_as_it_says(drive: Path) -> None:
     assert int(np.argmax(np.diff(stamps)[: LOST + 1])) == LOST - 1
 
 
+@pytest.mark.slow
 def test_the_commands_of_its_page(tmp_path: Path) -> None:
     page = (Path(__file__).parents[1] / "docs" / "report.md").read_text()
     lines = [

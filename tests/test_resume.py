@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 import mp4ds
+from each import each, fresh
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.demo import demo
 from mp4ds.errors import (
@@ -35,14 +36,14 @@ IN_PARTS = PackOptions(window=3, codec="h264")
 PARTS = [f"0000{number}-0" for number in range(4)]
 
 
-@pytest.fixture
+@fresh
 def source(tmp_path: Path) -> Path:
     (tmp_path / "source").mkdir()
     (path,) = SOURCES["bag-none"](tmp_path / "source", scene("bayer_rggb8", frames=12))
     return path
 
 
-@pytest.fixture
+@fresh
 def expected(source: Path, tmp_path: Path) -> dict[str, Any]:
     mp4ds.pack(source, tmp_path / "whole", PackOptions(codec="h264"))
     return facts(tmp_path / "whole")
@@ -121,7 +122,7 @@ def test_where_nothing_was_finished_nothing_is_left(
     assert leftovers(tmp_path) == []
 
 
-@pytest.mark.parametrize(
+@each(
     ("options", "sentence"),
     [
         ({"codec": "ffv1"}, r"another --codec: 'h264', and now it is 'ffv1'.*--restart"),
@@ -145,7 +146,7 @@ def test_other_options_are_refused(
     assert leftovers(tmp_path) == [".dataset.mp4ds-part"]
 
 
-@pytest.mark.parametrize("change", ["longer", "touched", "byte", "missing"])
+@each("change", ["longer", "touched", "byte", "missing"])
 def test_a_changed_source_is_refused(
     change: str, tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -183,7 +184,7 @@ def test_restart_begins_anew(
     assert facts(tmp_path / "dataset") == expected
 
 
-@pytest.mark.parametrize("damage", ["record", "video", "sidecar", "missing"])
+@each("damage", ["record", "video", "sidecar", "missing"])
 def test_a_part_that_is_not_whole_is_made_again(
     damage: str,
     tmp_path: Path,
@@ -342,12 +343,12 @@ def test_summaries_are_in_the_order_of_the_sources(
 @pytest.fixture(scope="module")
 def long_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("long") / "drive.bag"
-    demo(path, seconds=12)
+    demo(path, seconds=6)
     return path
 
 
 @pytest.mark.parametrize(
-    "kills", [3, pytest.param(20, marks=pytest.mark.slow)], ids=["some", "storm"]
+    "kills", [2, pytest.param(20, marks=pytest.mark.slow)], ids=["some", "storm"]
 )
 def test_killed_at_random_moments_it_ends_as_if_it_had_not_been(
     kills: int, tmp_path: Path, long_bag: Path, compare: Compare
@@ -362,7 +363,7 @@ def test_killed_at_random_moments_it_ends_as_if_it_had_not_been(
     for _ in range(kills):
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         try:
-            process.wait(rng.uniform(0.3, 4))
+            process.wait(rng.uniform(0.3, 4))  # any moment will do
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGKILL)
             done += 1

@@ -9,7 +9,6 @@ import signal
 import stat
 import subprocess
 import sys
-import time
 import tracemalloc
 from collections.abc import Iterator
 from fractions import Fraction
@@ -22,6 +21,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from each import each
 from mp4ds.scoring import (
     MAX_PSNR,
     METRICS,
@@ -35,6 +35,7 @@ from mp4ds.scoring import (
     ssim,
     summary_of,
 )
+from waiting import WATCHDOG_S, until
 
 FRAMES = 8
 SIZES = [(64, 48), (160, 120), (322, 242)]
@@ -162,9 +163,9 @@ def vmaf_in(log: dict[str, Any]) -> NDArray[np.float64]:
 
 
 @needs_vmaf
-@pytest.mark.parametrize("bits", [8, 10])
-@pytest.mark.parametrize("crf", [15, 40])
-@pytest.mark.parametrize("size", [(320, 240), (480, 360)], ids=str)
+@each("bits", [8, 10])
+@each("crf", [15, 40])
+@each("size", [(320, 240), (480, 360)], ids=str)
 def test_vmaf_is_that_of_another_build(
     size: tuple[int, int], crf: int, bits: int, tmp_path: Path
 ) -> None:
@@ -185,8 +186,8 @@ def test_vmaf_is_that_of_another_build(
 
 
 @needs_vmaf
-@pytest.mark.parametrize("bits", [8, 10])
-@pytest.mark.parametrize("size", SIZES, ids=str)
+@each("bits", [8, 10])
+@each("size", SIZES, ids=str)
 def test_vmaf_is_that_of_the_same_build_on_files(
     size: tuple[int, int], bits: int, tmp_path: Path
 ) -> None:
@@ -205,8 +206,8 @@ def test_vmaf_is_that_of_the_same_build_on_files(
 
 
 @needs_vmaf
-@pytest.mark.parametrize("bits", [8, 10])
-@pytest.mark.parametrize("size", SIZES, ids=str)
+@each("bits", [8, 10])
+@each("size", SIZES, ids=str)
 def test_psnr_and_ssim_are_those_of_ffmpeg(
     size: tuple[int, int], bits: int, tmp_path: Path
 ) -> None:
@@ -317,7 +318,7 @@ def test_memory_is_that_of_a_few_frames() -> None:
 # ---------------------------------------------------------------- what goes wrong
 
 
-@pytest.mark.parametrize(
+@each(
     ("original", "made", "said"),
     [
         ([], [], "no frames"),
@@ -351,7 +352,7 @@ def program(folder: Path, script: str) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize(
+@each(
     ("script", "said"),
     [
         ("import sys; sys.exit('first\\nthe last line')", "the last line"),
@@ -447,18 +448,14 @@ def test_no_process_outlives_an_interrupted_one(number: signal.Signals) -> None:
     ) as process:
         assert process.stdout is not None
         assert process.stdout.readline().strip() == b"ready"
-        deadline = time.monotonic() + 20
-        while not (children := children_of(process.pid)) and time.monotonic() < deadline:
-            time.sleep(0.02)
-        assert children
+        children: list[int] = []
+        until(lambda: children.extend(children_of(process.pid)) or children)
         os.kill(process.pid, number)
         try:
-            process.wait(20)
+            process.wait(WATCHDOG_S)
         finally:
             process.kill()  # leaving waits for it
-    while any(map(runs, children)) and time.monotonic() < deadline + 20:
-        time.sleep(0.02)
-    assert not any(map(runs, children))
+    until(lambda: not any(map(runs, children)))
 
 
 def runs(pid: int) -> bool:

@@ -259,7 +259,7 @@ def images_for(name: str, layout: str, width: int, height: int) -> list[Pixels]:
     ]
 
 
-@each(("name", "layout_name"), PAIRS)
+@each(("name", "layout_name"), PAIRS, one_in=2)
 def test_every_layout_returns_through_every_codec(
     name: str, layout_name: str, tmp_path: Path
 ) -> None:
@@ -307,7 +307,7 @@ def test_lossy_files_are_tagged_as_bt709_full_range(
     assert found[0]["pix_fmt"] in (recipe.pixel_format, "yuvj420p")
 
 
-@each(("codec", "picture_format"), LOSSLESS)
+@each(("codec", "picture_format"), LOSSLESS, one_in=2)
 def test_lossless_files_are_tagged_too(codec: str, picture_format: str, tmp_path: Path) -> None:
     recipe = recipe_for(picture_format, lossless=True, codec=codec)
     encode(tmp_path / "v.mp4", recipe, noise(picture_format, 64, 16, 3), picture_format)
@@ -365,7 +365,7 @@ def test_a_coloured_scene_stays_near(codec: str, width: int, height: int, tmp_pa
         assert np.abs(bias).max() < 2
 
 
-@each("codec", LOSSY)
+@each("codec", LOSSY, one_in=4)
 @each("encoding", YUV)
 @each(("width", "height"), [(64, 48), (66, 47), (65, 47)])
 def test_yuv_is_coded_as_it_is(
