@@ -41,6 +41,7 @@ from mp4ds.video.image_files import read_image
 from test_version0 import FIXTURE, STAMPS, TOPICS, document, nanoseconds, write_text
 
 WIDTH, HEIGHT = 32, 24
+POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n%%EOF\n"
 START = 1_403_636_579_763_555_584
 Pixels = NDArray[Any]
 
@@ -784,6 +785,12 @@ BAD: dict[str, tuple[Callable[[Path], Any], list[str], str]] = {
         lambda root: next((root / CAM0 / "data").iterdir()).write_bytes(b"\x89PNG"),
         [],
         "cannot be read as an image",
+    ),
+    # Pillow runs Ghostscript for it, whatever the file is called
+    "postscript": (
+        lambda root: next((root / CAM0 / "data").iterdir()).write_bytes(POSTSCRIPT),
+        [],
+        "cannot identify image file",
     ),
     "other-layout": (lambda root: None, ["--layout", "tum"], "has not the layout tum"),
     "no-layout": (lambda root: None, ["--layout", "x"], "euroc, kitti, tum, plain"),

@@ -231,3 +231,21 @@ def test_closing_and_opening_again(tmp_path: Path) -> None:
         expected = dataset["clip"][5].data
     assert np.array_equal(dataset["clip"][5].data, expected)
     dataset.close()
+
+
+@pytest.mark.parametrize("kind", ["matroska", "playlist"])
+def test_nothing_but_an_mp4_is_read(kind: str, tmp_path: Path) -> None:
+    """Ffmpeg would guess what it is, and open what a playlist names."""
+    path = tmp_path / "video.mp4"
+    if kind == "playlist":
+        path.write_text(f"#EXTM3U\n#EXTINF:1,\n{tmp_path / 'other.mp4'}\n#EXT-X-ENDLIST\n")
+    else:
+        with av.open(str(path), "w", format=kind) as output:
+            stream = output.add_stream("ffv1", rate=30)
+            stream.width, stream.height, stream.pix_fmt = 16, 16, "gray"
+            frame = av.VideoFrame(16, 16, "gray")
+            frame.pts = 0
+            output.mux(stream.encode(frame))
+            output.mux(stream.encode(None))
+    with pytest.raises(mp4ds.VideoError, match="is not an mp4: Invalid data"):
+        mp4ds.open(path)

@@ -13,6 +13,7 @@ from av.error import FFmpegError
 
 from mp4ds.errors import SourceError
 from mp4ds.layouts import MAX_SIDE, Pixels
+from mp4ds.video.stills import STILL_FORMATS
 
 _HEAD = 64
 _NETPBM = re.compile(rb"P([56])" + 3 * rb"(?:\s|#[^\n]*\n)+([0-9]{1,9})" + rb"\s")
@@ -72,7 +73,7 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path) as image:
+            with Image.open(path, formats=STILL_FORMATS) as image:
                 width, height = image.size
                 return int(width), int(height)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
@@ -87,7 +88,7 @@ def _still(path: Path, head: bytes) -> tuple[str, Pixels]:
         # the sides are bounded here
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         try:
-            with Image.open(path) as image:
+            with Image.open(path, formats=STILL_FORMATS) as image:
                 _check_size(path, *image.size)
                 if getattr(image, "n_frames", 1) > 1:
                     raise SourceError(path, "holds several images", "Give each a file of its own.")

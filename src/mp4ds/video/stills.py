@@ -16,6 +16,9 @@ from mp4ds.layouts import MAX_SIDE
 STILL_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".webp")
 """Endings of the image files that are read."""
 
+STILL_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM", "WEBP")
+"""What may be in them, as Pillow calls it: it knows others, of which some run programs."""
+
 _GREY = ("1", "L", "LA")
 _COLOURS = ("RGB", "RGBA", "P", "CMYK", "YCbCr")
 
@@ -34,7 +37,7 @@ def read_still(path: Path) -> tuple[str, NDArray[np.uint8]]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(path) as image:
+            with Image.open(path, formats=STILL_FORMATS) as image:
                 if max(image.size) > MAX_SIDE:
                     raise SourceError(path, f"has sides of more than {MAX_SIDE} pixels")
                 if image.mode not in (*_GREY, *_COLOURS):
