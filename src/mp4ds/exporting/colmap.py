@@ -30,6 +30,7 @@ _HALF_PIXEL = 0.5  # COLMAP counts from the corner of a pixel, ROS and OpenCV fr
 def write(job: Job) -> None:
     """Write the format."""
     source = job.source
+    poses = _poses(job)  # first: no frame is decoded for a topic that cannot be taken
     cameras = that_png_holds(source.cameras, source.ledger)
     cameras = [of_different_times(camera, source.ledger) for camera in cameras]
     folder = job.path / _MODEL
@@ -58,8 +59,8 @@ def write(job: Job) -> None:
         values = " ".join(map(repr, found[1]))
         lines.append(f"{len(images)} {found[0]} {width} {height} {values}")
     (folder / "cameras.txt").write_text("\n".join([*lines, ""]), encoding="utf-8")
-    if job.options.poses:
-        _write_images(job, images)
+    if poses is not None:
+        _write_images(job, images, poses)
     else:
         job.note(
             "images.txt is not written: it needs the pose of each image (--poses TOPIC); "
@@ -137,15 +138,27 @@ def _between(
     return found
 
 
-def _write_images(job: Job, images: Sequence[tuple[int, Camera, Sequence[str]]]) -> None:
-    dataset = job.source.dataset
-    poses = Poses(dataset, job.options.poses or "")
+def _poses(job: Job) -> Poses | None:
+    """The poses that were asked for.
+
+    Raises:
+        OptionError: The topic is not there, of another type, or places no frame.
+    """
+    if not job.options.poses:
+        return None
+    poses = Poses(job.source.dataset, job.options.poses)
     if not poses.body:
         raise OptionError(
             f"--poses {poses.topic} does not say which frame it places, and a camera's pose "
             "needs it. Give an Odometry or a TransformStamped."
         )
-    tree = StaticTree(static_transforms(dataset))
+    return poses
+
+
+def _write_images(
+    job: Job, images: Sequence[tuple[int, Camera, Sequence[str]]], poses: Poses
+) -> None:
+    tree = StaticTree(static_transforms(job.source.dataset))
     track = Track.of(poses.rows())
     number = 0
     with (job.path / _MODEL / "images.txt").open("w", encoding="utf-8") as file:

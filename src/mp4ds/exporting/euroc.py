@@ -25,6 +25,7 @@ _POSE_HEAD = (
 def write(job: Job) -> None:
     """Write the format."""
     source = job.source
+    poses = Poses(source.dataset, job.options.poses) if job.options.poses else None
     cameras = that_png_holds(source.cameras, source.ledger)
     cameras = [of_different_times(camera, source.ledger) for camera in cameras]
     imus = topics_of(source.dataset, _IMU, source.chosen)
@@ -43,8 +44,7 @@ def write(job: Job) -> None:
         _write_rows(job, place, topic, _IMU_HEAD, imu_rows(source.dataset, topic))
         _write_sensor(job.path / place, "imu", topic, pose, [])
         job.note(f"{topic}: orientation and covariances have no place in an IMU's data.csv")
-    if job.options.poses:
-        poses = Poses(source.dataset, job.options.poses)
+    if poses is not None:
         job.note(f"{poses.topic}: of a message the position and orientation are held")
         rows = ((time, (*v[:3], v[6], *v[3:6])) for time, v in poses.rows())
         _write_rows(job, "mav0/pose0", poses.topic, _POSE_HEAD, rows)

@@ -30,6 +30,7 @@ def is_depth(camera: Camera) -> bool:
 def write(job: Job) -> None:
     """Write the format."""
     source = job.source
+    poses = Poses(source.dataset, job.options.poses) if job.options.poses else None
     cameras = that_png_holds(source.cameras, source.ledger)
     job.path.mkdir()
     for kind, wanted in (("rgb", False), ("depth", True)):
@@ -44,8 +45,7 @@ def write(job: Job) -> None:
         rows = ((time, values[3:]) for time, values in imu_rows(source.dataset, imus[0]))
         _write_rows(job, "accelerometer.txt", imus[0], "timestamp ax ay az", rows)
         job.note(f"{imus[0]}: TUM has the acceleration of an IMU only")
-    if job.options.poses:
-        poses = Poses(source.dataset, job.options.poses)
+    if poses is not None:
         job.note(f"{poses.topic}: of a message the position and orientation are held")
         head = "timestamp tx ty tz qx qy qz qw"
         _write_rows(job, "groundtruth.txt", poses.topic, head, poses.rows())
