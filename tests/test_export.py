@@ -40,6 +40,7 @@ from export_scenes import (
 from mp4ds import exporting
 from mp4ds.exporting.colmap import Track, model_of
 from mp4ds.exporting.euroc import distortion
+from mp4ds.exporting.job import Job
 from mp4ds.exporting.lerobot import nearest
 from mp4ds.exporting.motion import in_order
 from mp4ds.exporting.transforms import (
@@ -259,6 +260,19 @@ def test_colmap(dataset: Path, tmp_path: Path) -> None:
         assert row[8] == "2"
     assert (model / "points3D.txt").is_file()
     assert any(DEPTH in note and "cameras.txt" in note for note in summary.notes)
+
+
+@pytest.mark.parametrize("to", ["colmap", "euroc", "tum"])
+def test_an_unsuitable_topic_of_poses_is_refused_first(
+    to: str, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def decode(*_: object) -> None:
+        pytest.fail("frames are written before the topic is looked at")
+
+    monkeypatch.setattr(Job, "write_png_files", decode)
+    with pytest.raises(mp4ds.OptionError, match=f"--poses {IMU}"):
+        export(dataset, to, tmp_path / "out", poses=IMU)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_colmap_without_poses(dataset: Path, tmp_path: Path) -> None:
@@ -595,6 +609,12 @@ def test_rerun(dataset: Path, tmp_path: Path) -> None:
     assert path == "/tf/map/base/left_optical/left_image_raw"
     assert sorted(times[path]) == stamps_of(MADE, GREY)
     assert found["/imu/imu/linear_acceleration"] == 4 * FRAMES
+    assert sorted(times["/tf/odom/poses/odom"]) == stamps_of(MADE, ODOMETRY)
+    for joint in ("shoulder", "elbow"):
+        assert sorted(times[f"/joints/joint_states/{joint}/position"]) == stamps_of(MADE, JOINTS)
+    for topic in (ODOMETRY, JOINTS):
+        assert summary.messages[topic] == len(stamps_of(MADE, topic))
+        assert topic not in summary.left_out
 
 
 @pytest.mark.parametrize(("to", "library"), [("lerobot", "pyarrow"), ("rerun", "rerun")])

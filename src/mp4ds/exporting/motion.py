@@ -55,7 +55,7 @@ def imu_rows(dataset: Dataset, topic: str) -> Iterator[Row]:
         yield stamp_of(values.header), (turn.x, turn.y, turn.z, pull.x, pull.y, pull.z)
 
 
-_POSES: dict[str, Callable[[Any], tuple[Any, Any]]] = {
+POSES: dict[str, Callable[[Any], tuple[Any, Any]]] = {
     "geometry_msgs/PoseStamped": lambda m: (m.pose.position, m.pose.orientation),
     "geometry_msgs/PoseWithCovarianceStamped": lambda m: (
         m.pose.pose.position,
@@ -64,6 +64,7 @@ _POSES: dict[str, Callable[[Any], tuple[Any, Any]]] = {
     "nav_msgs/Odometry": lambda m: (m.pose.pose.position, m.pose.pose.orientation),
     "geometry_msgs/TransformStamped": lambda m: (m.transform.translation, m.transform.rotation),
 }
+"""Types of poses -> position and orientation of a message."""
 
 
 class Poses:
@@ -81,13 +82,13 @@ class Poses:
         self._dataset = dataset
         self.topic = topic
         name = ros_type(dataset, topic)
-        if name not in _POSES:
-            known = ", ".join(_POSES)
+        if name not in POSES:
+            known = ", ".join(POSES)
             raise OptionError(
                 f"--poses {topic} is {f'of type {name}' if name else 'no topic of ROS'} in "
                 f"{dataset.path}. Give one of {known}."
             )
-        self._parts = _POSES[name]
+        self._parts = POSES[name]
         first = next(dataset.messages([topic]), None)
         self.body = "" if first is None else str(getattr(first.decoded, "child_frame_id", ""))
 

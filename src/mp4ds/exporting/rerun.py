@@ -1,4 +1,4 @@
-"""Rerun: an .rrd file of videos or images, cameras, transforms and inertial measurements."""
+"""Rerun: an .rrd file of videos or images, cameras, transforms, poses, IMUs and joints."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from mp4ds.errors import OptionError
 from mp4ds.exporting.cameras import Camera, hold_calibration
 from mp4ds.exporting.job import Job
-from mp4ds.exporting.motion import ros_type, stamp_of, topics_of
+from mp4ds.exporting.motion import POSES, ros_type, stamp_of, topics_of
 from mp4ds.exporting.transforms import static_transforms
 from mp4ds.plan import FileNames
 from mp4ds.recorded import RecordedMessage
@@ -23,7 +23,8 @@ from mp4ds.wire.transforms import TransformCollector
 _CODECS = {"h264": "H264", "h265": "H265", "av1": "AV1"}
 _UNITS_IN_METRE = {"16UC1": 1000.0, "32FC1": 1.0}
 _TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
-_IMU = "sensor_msgs/Imu"
+_IMU, _JOINTS = "sensor_msgs/Imu", "sensor_msgs/JointState"
+_POSES_ALONE = ("geometry_msgs/PoseStamped", "geometry_msgs/TransformStamped")
 _STAMP, _RECORDED = "stamp", "recorded"
 _MOST_DEPTH = 64  # frames above each other
 
@@ -104,6 +105,11 @@ class _Writer:
                 self._source.ledger.hold(camera.topic, len(camera))
         for topic in topics_of(self._dataset, _IMU, self._source.chosen):
             self._write_imu(topic)
+        for kind in POSES:
+            for topic in topics_of(self._dataset, kind, self._source.chosen):
+                self._write_poses(topic, kind)
+        for topic in topics_of(self._dataset, _JOINTS, self._source.chosen):
+            self._write_joints(topic)
 
     # ------------------------------------------------------------ transforms
 
@@ -235,6 +241,42 @@ class _Writer:
         self._source.ledger.hold(topic, count)
         self._job.places[self._rerun.new_entity_path(parts)] = topic
         self._job.note(f"{topic}: orientation and covariances are not held")
+
+    # ------------------------------------------------------------ poses and joints
+
+    def _write_poses(self, topic: str, kind: str) -> None:
+        """Log poses as transforms of the topic's entity, below the frame that they are in."""
+        names = ["poses", *topic.strip("/").split("/")]
+        count, path = 0, ""
+        for message in self._dataset.messages([topic]):
+            values = message.decoded
+            at, turn = POSES[kind](values)
+            path = self._path(values.header.frame_id, *names)
+            self._at(stamp_of(values.header), message.log_time_ns)
+            value = self._transform((at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w))
+            self._log(path, value)
+            count += 1
+        self._source.ledger.hold(topic, count)
+        if path:
+            self._job.places[path] = topic
+        if kind not in _POSES_ALONE:
+            self._job.note(f"{topic}: of a message the position and orientation are held")
+
+    def _write_joints(self, topic: str) -> None:
+        """Log positions, velocities and efforts, a series of each joint."""
+        parts = ["joints", *topic.strip("/").split("/")]
+        count = 0
+        for message in self._dataset.messages([topic]):
+            values = message.decoded
+            self._at(stamp_of(values.header), message.log_time_ns)
+            for kind in ("position", "velocity", "effort"):
+                for number, value in enumerate(getattr(values, kind)):
+                    joint = values.name[number] if number < len(values.name) else number
+                    path = self._rerun.new_entity_path([*parts, str(joint), kind])
+                    self._log(path, self._rerun.Scalars([float(value)]))
+            count += 1
+        self._source.ledger.hold(topic, count)
+        self._job.places[self._rerun.new_entity_path(parts)] = topic
 
 
 def _name(frame: str) -> str:
