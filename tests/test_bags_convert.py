@@ -469,3 +469,18 @@ def test_times_that_the_target_cannot_hold(
     converter.payload(*stamped(kind, good, encoding))
     with pytest.raises(ConversionError, match=f"topic /a: a message has a time of {bad} s, and"):
         converter.payload(*stamped(kind, bad, encoding))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "target", "name"),
+    [
+        ("cdr", "ros1", "tf2_msgs/msg/TFMessage"),
+        ("ros1", "ros2", "tf2_msgs/TFMessage"),
+        ("cdr", "ros1", "geometry_msgs/msg/VelocityStamped"),
+    ],
+)
+def test_standard_types_need_no_definition(encoding: str, target: str, name: str) -> None:
+    """sqlite3 recordings have none."""
+    made = Converter(target).channel(Channel(0, "/a", encoding, Schema(name, "", b""), {}))
+    assert made.schema is not None
+    assert b"header" in made.schema.data

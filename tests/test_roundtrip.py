@@ -6,6 +6,8 @@ with the package.
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from conftest import DATA, real
 from definitions import PICTURES
 from each import each
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
+from mp4ds.records import Message
 from round_trips import (
     TARGETS,
     Compare,
@@ -147,6 +150,24 @@ def test_what_no_ros_can_hold_is_refused(
     for word in (f"topic {caught.value.topic}:", source.split("-")[1], "--exclude", "mcap"):
         assert word in str(caught.value)
     assert sorted(tmp_path.rglob("*")) == before
+    # what it names all at once is all there is to leave out
+    excluded = re.findall(r"--exclude (\S+?)(?=[ ,])", str(caught.value))
+    to, storage = TARGETS[target]
+    output = output_of(tmp_path, target)
+    options = mp4ds.UnpackOptions(storage=storage, exclude=excluded)
+    assert not mp4ds.unpack(tmp_path / "dataset", to, output, options).unconvertible
+    options = mp4ds.UnpackOptions(storage=storage, skip_unconvertible=True, force=True)
+    skipped = mp4ds.unpack(tmp_path / "dataset", to, output, options).unconvertible
+    assert set(skipped) == set(excluded)
+    with mp4ds.open(tmp_path / "dataset") as dataset:
+        due = Counter(
+            message.channel.topic
+            for message in dataset.records()
+            if isinstance(message, Message) and message.channel.topic in excluded
+        )
+    assert {topic: sum(why.values()) for topic, why in skipped.items()} == {
+        topic: due[topic] for topic in excluded
+    }
 
 
 FOXGLOVE_TOPICS = {"/camera/image", "/camera/calibration", "/tf", "/pose", "/log"}

@@ -170,6 +170,7 @@ class ConversionError(Mp4dsError, ValueError):
 
     def __init__(self, topic: str, problem: str, remedy: str = "") -> None:
         self.topic = topic
+        self.problem = problem
         super().__init__(f"topic {topic}: {problem}." + (f" {remedy}" if remedy else ""))
 
 

@@ -84,8 +84,11 @@ class World:
 
 
 def ros1_world() -> World:
-    """ROS 1 with the types of Noetic."""
-    return World("ROS 1", "ros1", "ros1msg", get_typestore(Stores.ROS1_NOETIC).fielddefs)
+    """ROS 1 with the types of Noetic, of which rosbags has all but those of tf2."""
+    tf2 = "tf2_msgs/msg/TFMessage"
+    standard = {tf2: get_typestore(Stores.ROS2_HUMBLE).fielddefs[tf2]}
+    standard.update(get_typestore(Stores.ROS1_NOETIC).fielddefs)
+    return World("ROS 1", "ros1", "ros1msg", standard)
 
 
 def ros2_world(distribution: str) -> World:
@@ -98,7 +101,10 @@ def ros2_world(distribution: str) -> World:
     if distribution not in known:
         names = ", ".join(known)
         raise OptionError(f"ROS 2 distribution {distribution!r} is not known. Use {names}.")
-    return World("ROS 2", "cdr", "ros2msg", get_typestore(known[distribution]).fielddefs)
+    # types that came later, too: a recording without definitions may have them
+    latest = get_typestore(Stores.LATEST).fielddefs
+    standard = {**latest, **get_typestore(known[distribution]).fielddefs}
+    return World("ROS 2", "cdr", "ros2msg", standard)
 
 
 def types_of(schema: Schema, world: World) -> Typesdict:

@@ -221,6 +221,10 @@ def unpack(
     max_rate: MaxRateOption = None,
     topics: TopicsOption = None,
     exclude: ExcludeOption = None,
+    skip_unconvertible: Annotated[
+        bool,
+        typer.Option("--skip-unconvertible", help="Leave out what OUT cannot hold, and count it."),
+    ] = False,
     force: ForceFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
@@ -243,6 +247,7 @@ def unpack(
             every=every,
             max_rate=max_rate,
             force=force,
+            skip_unconvertible=skip_unconvertible,
         )
         summary = run(dataset, to, output, options, progress=progress)
     if as_json:

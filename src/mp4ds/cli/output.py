@@ -225,6 +225,9 @@ def print_unpack(summary: UnpackSummary, noun: str) -> None:
     for topic, reasons in summary.as_recorded.items():
         for reason, count in reasons.items():
             say(f"{topic}: {count} messages as recorded: {reason}")
+    for topic, reasons in summary.unconvertible.items():
+        for reason, count in reasons.items():
+            say(f"{topic}: {count} messages left out: {reason}")
     for topic, count in summary.thinned.items():
         say(f"{topic}: {count} messages left out")
     if summary.converted:

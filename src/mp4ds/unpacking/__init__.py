@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -12,7 +13,12 @@ from mp4ds._version import __version__
 from mp4ds.bags import BagWriter, open_writer, recording_names
 from mp4ds.bags.convert import Converter
 from mp4ds.dataset import Dataset, Stream
-from mp4ds.errors import FormatError, OptionError, WriteError
+from mp4ds.errors import (
+    ConversionError,
+    FormatError,
+    OptionError,
+    WriteError,
+)
 from mp4ds.outputs import digest_file, staged
 from mp4ds.owned import Owned
 from mp4ds.plan import FileNames, Selection
@@ -183,7 +189,7 @@ def _unpack_recording(
         library=dataset.manifest.library if dataset.manifest else "",
         storage=storage,
     ) as writer:
-        topics = _Topics(writer, converter, selected, summary)
+        topics = _Topics(writer, converter, selected, summary, may_skip=options.skip_unconvertible)
         topics.declare(dataset, republisher)
         done = found = 0
         for record in dataset.records(republisher.sources if republisher else None):
@@ -239,7 +245,11 @@ class _Topics:
         converter: Converter,
         selected: Selection,
         summary: UnpackSummary,
+        *,
+        may_skip: bool,
     ) -> None:
+        self._may_skip = may_skip
+        self._refused: dict[int, str] = {}
         self._writer = writer
         self._converter = converter
         self._selected = selected
@@ -248,14 +258,21 @@ class _Topics:
         self._republished: set[int] = set()
 
     def declare(self, dataset: Dataset, republisher: Republisher | None) -> None:
-        """Declare the chosen channels, and the definitions that none refers to."""
+        """Declare the chosen channels, and the definitions that none refers to.
+
+        Raises:
+            ConversionError: The target cannot hold some of them; names all.
+        """
         for channel in dataset.channels:
             topic = channel.topic
             if self._selected(topic):
                 if republisher is None or not republisher.empties(channel):
-                    self._add(channel)
+                    self._try_to_add(channel)
             elif topic not in self._summary.left_out:
                 self._summary.left_out.append(topic)
+        if self._refused and not self._may_skip:
+            topics = {item.id: item.topic for item in dataset.channels}
+            raise _refusal({topics[number]: why for number, why in self._refused.items()})
         for channel in republisher.channels if republisher else ():
             self._republished.add(channel.id)
             self._channels[channel.id] = channel
@@ -263,6 +280,16 @@ class _Topics:
             self._summary.messages.setdefault(channel.topic, 0)
         for schema in dataset.unused_schemas:
             self._writer.add_schema(schema)
+
+    def _try_to_add(self, channel: Channel) -> None:
+        try:
+            self._add(channel)
+        except ConversionError as error:
+            self._refused[channel.id] = error.problem
+            if self._may_skip:
+                self._summary.unconvertible.setdefault(channel.topic, {}).setdefault(
+                    error.problem, 0
+                )
 
     def _add(self, channel: Channel) -> None:
         converted = self._converter.channel(channel)
@@ -276,16 +303,40 @@ class _Topics:
     def write(self, message: Message) -> bool:
         """Write a message of a chosen channel; returns whether it is of one."""
         source = message.channel
+        if source.id in self._refused:
+            return self._skip(source, self._refused[source.id])
         if source.id not in self._channels:
             if not self._selected(source.topic):
                 return False
             self._add(source)  # it was to have no message any more, and has one after all
         channel, payload = self._channels[source.id], message.data
-        if source.id not in self._republished:
-            payload = self._converter.payload(source, payload)
-        self._writer.write(replace(message, channel=channel, data=payload))
+        try:
+            if source.id not in self._republished:
+                payload = self._converter.payload(source, payload)
+            self._writer.write(replace(message, channel=channel, data=payload))
+        except ConversionError as error:
+            if not self._may_skip:
+                raise
+            return self._skip(source, error.problem)
         self._summary.messages[channel.topic] += 1
         return True
+
+    def _skip(self, source: Channel, problem: str) -> bool:
+        counts = self._summary.unconvertible.setdefault(source.topic, {})
+        counts[problem] = counts.get(problem, 0) + 1
+        return False
+
+
+def _refusal(problems: dict[str, str]) -> ConversionError:
+    """What to raise for topics that the target cannot hold; why by topic."""
+    first, *others = problems
+    listed = [problems[first], *(f"topic {topic}: {problems[topic]}" for topic in others)]
+    return ConversionError(
+        first,
+        "; ".join(listed),
+        "Exclude with " + " ".join(f"--exclude {shlex.quote(topic)}" for topic in problems) + ", "
+        "skip and count with --skip-unconvertible, or unpack to mcap, which keeps all as it is.",
+    )
 
 
 def _write_other(

@@ -26,6 +26,7 @@ class UnpackOptions:
         every: Only every so many frames of each stream, from its first one on.
         max_rate: Most frames of each stream in a second; None for all.
         force: Replace an existing target.
+        skip_unconvertible: Leave out and count what the target cannot hold.
     """
 
     storage: str | None = None
@@ -38,6 +39,7 @@ class UnpackOptions:
     every: int = 1
     max_rate: float | None = None
     force: bool = False
+    skip_unconvertible: bool = False
 
     @property
     def reduction(self) -> Reduction:
@@ -70,6 +72,8 @@ class UnpackSummary:
         republished: What became of the topics whose images are given in another form.
         as_recorded: Where another form was asked for, the camera topics of which messages stay
             as recorded: reason -> how many.
+        unconvertible: Topics of which messages are left out, as the target cannot hold them:
+            reason -> how many.
         thinned: Topics of which messages are left out, as fewer were asked for -> how many.
     """
 
@@ -81,3 +85,4 @@ class UnpackSummary:
     republished: dict[str, Republished] = field(default_factory=dict)
     as_recorded: dict[str, dict[str, int]] = field(default_factory=dict)
     thinned: dict[str, int] = field(default_factory=dict)
+    unconvertible: dict[str, dict[str, int]] = field(default_factory=dict)
