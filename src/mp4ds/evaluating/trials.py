@@ -20,6 +20,10 @@ from mp4ds.outputs import is_seen, write_synced
 from mp4ds.scoring import ScoringError, Summary
 
 _SHORT = 12  # digits of a digest in a name
+_MEASURED = (
+    *("encode_seconds", "encode_cpu_seconds", "decode_cpu_seconds"),
+    *("size", "frame_bytes"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,6 +185,10 @@ class Trials:
             if REFUSED in values:
                 return Failure(setting, str(values[REFUSED]))
             scores = {name: Summary(**score) for name, score in values["scores"].items()}
+            figures = [values[name] for name in _MEASURED]
+            figures += [figure for score in scores.values() for figure in asdict(score).values()]
+            if not all(isinstance(figure, (int, float)) for figure in figures):
+                return None
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
         if not (self._folder / self.picture(place, setting)).is_file():
@@ -214,5 +222,5 @@ class Trials:
             picture=self.picture(place, setting),
             whole_bytes=frame_bytes * clip.source_frames,
             whole_seconds=seconds / clip.frames * clip.source_frames,
-            machine=values.get("machine", ""),
+            machine=str(values.get("machine", "")),
         )

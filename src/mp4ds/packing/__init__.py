@@ -116,7 +116,7 @@ def pack_share(
     chosen = _checked(options or PackOptions())
     target = _absolute(dataset)
     store = remote(target)
-    run = _plan(_paths(sources), shared_folder(store) if store else target, chosen)
+    run = _plan(_paths(sources), shared_folder(store) if store else target, chosen, is_share=True)
     _pack_runs([run], chosen, progress, share=share)
 
 
@@ -212,11 +212,19 @@ def _checked(options: PackOptions) -> PackOptions:
     )
 
 
-def _plan(paths: Sequence[Path], target: Path, options: PackOptions, *, recordings: int = 1) -> Run:
+def _plan(
+    paths: Sequence[Path],
+    target: Path,
+    options: PackOptions,
+    *,
+    recordings: int = 1,
+    is_share: bool = False,
+) -> Run:
     """The pack of a recording: one that was begun before, or a new one."""
     check_target(target, force=options.force, owned=dataset_files, sources=paths)
     place = Workplace.beside(target)
-    job = None if options.restart else place.job()
+    shared = is_share or options.join or options.cluster is not None
+    job = None if options.restart else place.job(shared=shared)
     if job is not None:
         return Run(job, place, paths, target, options.force, is_new=False)
     if options.join:

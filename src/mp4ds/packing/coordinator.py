@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -23,7 +24,7 @@ from mp4ds.outputs import is_seen, move_into_place, sync
 from mp4ds.packing.assemble import Assembler
 from mp4ds.packing.job import Job, Task, absolute
 from mp4ds.packing.manifest import dataset_files, folder_size, summarize, write_manifest
-from mp4ds.packing.part import RECORD_NAME, Part, read_record
+from mp4ds.packing.part import Part, read_record
 from mp4ds.packing.progress import JobProgress, Report
 from mp4ds.packing.report import PackSummary
 from mp4ds.packing.spans import share
@@ -221,7 +222,7 @@ class Coordinator:
         """
         progress = self._progress[str(run.place.folder)]
         progress.report("joining", now=True)
-        folder = run.place.folder / "dataset"
+        folder = run.place.joined
         try:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
@@ -232,12 +233,13 @@ class Coordinator:
                     (source_name(path, where), *_digest(run.place, number))
                     for number, path in enumerate(reader.files)
                 ]
-                run.job.check_sources()
+                run.job.check_sources(reader.files)
                 write_manifest(part, reader, digests, run.job.options["quality"])
             sync(folder)
             summary = summarize(part, run.target, sum(source.size for source in run.job.sources))
-            old = run.place.folder / "replaced" / run.target.name
-            move_into_place(folder, run.target, old, force=run.force, owned=dataset_files)
+            move_into_place(
+                folder, run.target, run.place.replaced, force=run.force, owned=dataset_files
+            )
         except OSError as error:
             if isinstance(error, (SourceError, TargetError)):
                 raise
@@ -256,9 +258,8 @@ class Coordinator:
         tasks = [task for task in job.tasks if task.source is None]
         if tasks[0].whole:
             part = Part.load(parts / tasks[0].name)
-            for path in sorted(part.folder.iterdir()):
-                if path.name != RECORD_NAME:
-                    _link(path, folder / path.name)
+            for name in part.files:
+                _link(part.folder / name, folder / name)
             part.folder = folder
             return part
         selected = Selection(job.options["topics"], job.options["exclude"])
@@ -279,10 +280,11 @@ def _link(path: Path, new: Path) -> None:
 
 def _digest(place: Workplace, number: int) -> tuple[int, str]:
     folder = place.parts / f"source-{number}"
-    record = read_record(folder)
-    if record is None:
+    record = read_record(folder) or {}
+    size, sha256 = record.get("size"), str(record.get("sha256"))
+    if not isinstance(size, int) or not re.fullmatch("[0-9a-f]{64}", sha256):
         raise FormatError("file-missing", folder, "is gone, or damaged since it was made")
-    return record["size"], record["sha256"]
+    return size, sha256
 
 
 @contextmanager

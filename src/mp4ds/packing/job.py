@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,6 +24,10 @@ from mp4ds.source_files import SourceState, source_digest
 from mp4ds.streams import StreamSettings
 from mp4ds.video import tool_versions
 
+TASK_NAME = r"source-[0-9]{1,9}|whole-[0-9]{1,9}|[0-9]{5,9}-[0-9]{1,9}|all"
+"""Pattern of the names of tasks, which are those of folders."""
+
+_MOST_THREADS = 4096
 _OUTCOME_OPTIONS = (
     *("topics", "exclude", "quality", "codec", "preset", "transcode", "camera_info"),
     *("gop", "window", "salvage", "images"),
@@ -55,6 +60,10 @@ class Task:
     solo: bool = False
     whole: bool = False
 
+    def __post_init__(self) -> None:
+        if not re.fullmatch(TASK_NAME, self.name):
+            raise ValueError(f"{self.name!r} is not the name of a task")
+
     @property
     def excerpt(self) -> Excerpt:
         """What it reads."""
@@ -84,6 +93,7 @@ class Job:
         work: By topic, its messages and what one of them costs, in any unit.
         cameras: The topics of images.
         tools: Versions of what packs.
+        place: Inode of the folder in which it was begun; 0 before.
     """
 
     paths: list[str]
@@ -97,6 +107,7 @@ class Job:
     work: dict[str, tuple[int, float]]
     cameras: list[str]
     tools: dict[str, str]
+    place: int = 0
 
     def to_json(self) -> bytes:
         """The job's file."""
@@ -112,6 +123,7 @@ class Job:
             "work": self.work,
             "cameras": self.cameras,
             "tools": self.tools,
+            "place": self.place,
         }
         return dump_kept(values)
 
@@ -124,17 +136,41 @@ class Job:
         """
         values = load_kept(data)
         try:
-            return cls(
+            job = cls(
                 **{
                     **values,
                     "sources": [SourceState(**item) for item in values["sources"]],
                     "survey": Survey.from_values(values["survey"]),
                     "tasks": [_task(item) for item in values["tasks"]],
-                    "work": {topic: tuple(pair) for topic, pair in values["work"].items()},
+                    "work": {
+                        topic: (int(count), float(cost))
+                        for topic, (count, cost) in values["work"].items()
+                    },
                 }
             )
-        except (TypeError, LookupError, AttributeError) as error:
+            job._check()
+        except (TypeError, LookupError, AttributeError, ValueError) as error:
             raise ValueError(f"not a job of this version: {error}") from None
+        return job
+
+    def _check(self) -> None:
+        """Refuse what is never planned.
+
+        Raises:
+            ValueError: Says what.
+        """
+        names = {task.name for task in self.tasks}
+        numbers = (self.threads, self.workers, self.task_bytes)
+        if len(names) != len(self.tasks):
+            raise ValueError("tasks of one name")
+        if any(not 0 <= (task.source or 0) < len(self.sources) for task in self.tasks):
+            raise ValueError("a task of a file that is none of the recording")
+        if not all(isinstance(number, int) and number > 0 for number in numbers):
+            raise ValueError("no number of threads or bytes")
+        if max(self.threads, self.workers) > _MOST_THREADS:
+            raise ValueError("too many threads")
+        if set(self.options) != set(_OUTCOME_OPTIONS):
+            raise ValueError("other options")
 
     @property
     def is_single(self) -> bool:
@@ -159,12 +195,21 @@ class Job:
             images=None if images is None else ImageFolder(**images),
         )
 
-    def check_sources(self) -> None:
+    def check_sources(self, files: Sequence[Path] | None = None) -> None:
         """Refuse a recording that is not what it was when the job was planned.
+
+        Args:
+            files: Those that it consists of now, where that is known.
 
         Raises:
             SourceError: Names the file that changed.
         """
+        if files is not None and absolute(files) != [source.path for source in self.sources]:
+            raise SourceError(
+                location(self.paths[0]),
+                "consists of other files than when its packing began",
+                "Begin anew with --restart.",
+            )
         for source in self.sources:
             source.check()
 

@@ -31,5 +31,8 @@ def load_kept(data: bytes) -> dict[str, Any]:
     text, mark, rest = data.rpartition(_MARK)
     if not mark or rest != xxhash.xxh64_hexdigest(text).encode() + _END:
         raise ValueError("which is damaged, or another version's")
-    values: dict[str, Any] = json.loads(text + b"}")
+    try:
+        values: dict[str, Any] = json.loads(text + b"}")
+    except RecursionError:
+        raise ValueError("which is damaged") from None
     return values

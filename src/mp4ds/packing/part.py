@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -39,6 +40,7 @@ class Part:
 
     Attributes:
         folder: Where the files are.
+        files: Names of those that were saved.
         topics: What became of each topic, in the order of the recording.
         counts: Messages read by channel id.
         streams: In the order in which they began.
@@ -60,6 +62,7 @@ class Part:
     transforms: list[Transform] = field(default_factory=list)
     kept: int = 0
     losses: list[Loss] = field(default_factory=list)
+    files: list[str] = field(default_factory=list)
 
     @property
     def messages_path(self) -> Path:
@@ -113,10 +116,19 @@ class Part:
         if record is None:
             raise FormatError("file-missing", folder, "is gone, or damaged since it was made")
         try:
-            sidecars = [load_stream(folder / f"{stem}.yaml") for stem in record["streams"]]
-        except FormatError:
+            return cls._of(folder, record)
+        except (TypeError, LookupError, ValueError, AttributeError) as error:
             (folder / RECORD_NAME).unlink(missing_ok=True)  # to be made again
-            raise
+            if isinstance(error, FormatError):
+                raise
+            raise FormatError("file-missing", folder, f"is damaged: {error!r}") from None
+
+    @classmethod
+    def _of(cls, folder: Path, record: Mapping[str, Any]) -> Part:
+        names = [f"{stem}.yaml" for stem in record["streams"]]
+        if not record["files"].keys() >= set(names):
+            raise ValueError("a stream without a file")
+        sidecars = [load_stream(folder / name) for name in names]
         return cls(
             folder=folder,
             topics={item["topic"]: _topic(item) for item in record["topics"]},
@@ -128,6 +140,7 @@ class Part:
             transforms=[_transform(item) for item in record["transforms"]],
             kept=record["kept"],
             losses=[Loss(**{**item, "topics": tuple(item["topics"])}) for item in record["losses"]],
+            files=list(record["files"]),
         )
 
 
@@ -135,12 +148,20 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     """The record of a part; None where the part is not whole: a file is missing or cut short."""
     try:
         record: dict[str, Any] = load_kept((folder / RECORD_NAME).read_bytes())
-        sizes = record["files"].items()
-        if all((folder / name).stat().st_size == size for name, size in sizes):
+        topics = [_topic(item) for item in record.setdefault("topics", [])]
+        is_counted = all(
+            isinstance(t.messages, int) and isinstance(t.raw_bytes, int) for t in topics
+        )
+        if is_counted and all(_is_whole(folder, *item) for item in record["files"].items()):
             return record
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         pass
     return None
+
+
+def _is_whole(folder: Path, name: str, size: int) -> bool:
+    found = (folder / name).lstat()
+    return "/" not in name and stat.S_ISREG(found.st_mode) and found.st_size == size
 
 
 def _topic(item: Mapping[str, Any]) -> TopicSummary:

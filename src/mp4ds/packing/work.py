@@ -63,7 +63,7 @@ class Tasks:
     def run(self, folder: str, name: str, progress: Progress | None = None) -> None:
         """See `run_task`."""
         place = Workplace(Path(folder))
-        job = place.job()
+        job = place.job(shared=True)  # who runs the task has looked whose it is
         if job is None:
             raise Mp4dsError(f"{folder} holds no pack that was begun.")
         task = job.task(name)

@@ -2,27 +2,48 @@
 
 It stands beside the dataset, on the same file system, under a name that the dataset's tells, so
 that the same command finds it again. A task's result appears in it by one rename, when whole.
+
+Somebody else may have put a folder there: in a folder that users share, or by an archive that was
+unpacked. So nothing is read from it, written to it or removed from it unless all of it belongs to
+this user and has names that are made here, without any link; a job tells the inode of its folder,
+so that a copy is not taken for what was begun here; and how to encode is worked out again
+(`mp4ds.video.remade`). Trusted are other processes of the same user, and, where machines share the
+folder and see other inodes (--shard, --join, --cluster), whatever that user has put there.
 """
 
 from __future__ import annotations
 
 import errno
-import fcntl
+import os
+import re
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 from mp4ds.errors import OptionError, TargetError, WriteError
 from mp4ds.outputs import as_write_error, sync, sync_folder, write_synced
-from mp4ds.packing.job import Job, Task, tools
+from mp4ds.packing.job import TASK_NAME, Job, Task, tools
 from mp4ds.packing.part import read_record
 from mp4ds.remote import location
+from mp4ds.system import is_mine, lock
 
+_SUFFIX = ".mp4ds-part"
 _JOB_NAME = "job.json"
 _ANEW = "Begin anew with --restart."
 _FULL = (errno.ENOSPC, errno.EDQUOT)
+_NAMED = 3
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+
+_BEGUN = re.compile(rf"\.({TASK_NAME})\.[a-z0-9_]{{8}}")  # a result that is being made
+_NAMES = re.compile(  # from the folder on; of folders, with a slash at the end
+    r"lock|job\.json|\.job\.json\.[^/]+\.part|parts/|(dataset|replaced)/(.*/)?[^/]*"
+    rf"|parts/({TASK_NAME}|{_BEGUN.pattern})/(.*/)?[^/]*",
+    re.DOTALL,
+)
 
 
 class Workplace:
@@ -35,11 +56,13 @@ class Workplace:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.parts = folder / "parts"
+        self.joined = folder / "dataset"
+        self.replaced = folder / "replaced" / folder.name[1 : -len(_SUFFIX)]
 
     @classmethod
     def beside(cls, target: Path) -> Workplace:
         """That of a dataset, whether it exists or not."""
-        return cls(target.parent / f".{target.name}.mp4ds-part")
+        return cls(target.parent / f".{target.name}{_SUFFIX}")
 
     @contextmanager
     def claimed(self, *, shared: bool) -> Iterator[None]:
@@ -49,44 +72,115 @@ class Workplace:
             shared: Others may work on other tasks at the same time.
 
         Raises:
-            TargetError: Another pack is at work, or the folder cannot be made.
+            TargetError: Another pack is at work, the folder cannot be made, or holds what is not
+                made here.
             WriteError: The disk is full.
         """
         try:
-            self.parts.mkdir(parents=True, exist_ok=True)
-            lock = (self.folder / "lock").open("w")
+            self.folder.mkdir(mode=0o700, exist_ok=True)
+            self._check_folders()
+            self.parts.mkdir(exist_ok=True)
+            self._check_folders()
+            handle = os.open(self.folder / "lock", os.O_RDWR | os.O_CREAT | _NO_LINK, 0o600)
         except OSError as error:
+            if isinstance(error, TargetError):
+                raise
             if error.errno in _FULL:
                 self._remove_empty()
                 raise WriteError(self.folder, error) from None
             raise TargetError(
                 self.folder, f"cannot be made: {error.strerror}", "Choose another folder."
             ) from None
-        with lock:
+        with os.fdopen(handle, "r+b") as file:
             try:
-                fcntl.flock(lock, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+                lock(file, shared=shared)  # without locks, results appear whole all the same
             except BlockingIOError:
                 raise TargetError(
                     self.folder, "another mp4ds is at work there", "Wait for it, or end it."
                 ) from None
-            except OSError:
-                pass  # a file system without locks: results appear whole all the same
+            self._check()
+            self._give_back()
             yield
 
-    def job(self) -> Job | None:
-        """The job that was begun here, or None.
+    def _check_folders(self) -> None:
+        """Refuse a folder that somebody else has put there.
 
         Raises:
-            TargetError: It is damaged, or another version's.
+            TargetError: It is another user's, or a link.
         """
+        for path in (self.folder, self.parts):
+            with suppress(FileNotFoundError):
+                found = path.lstat()
+                if not stat.S_ISDIR(found.st_mode):
+                    raise TargetError(
+                        path, "is no folder, or a symbolic link", "Remove it; mp4ds makes its own."
+                    )
+                if not is_mine(found, self.folder.parent):
+                    raise TargetError(path, "belongs to another user", "Choose another folder.")
+
+    def _check(self) -> None:
+        """Refuse what is not made here.
+
+        Raises:
+            TargetError: Names some of it.
+        """
+        owner = self.folder.lstat().st_uid
+        strange: list[str] = []
+        waiting = [(self.folder, "")]
+        while waiting:
+            place, prefix = waiting.pop()
+            with suppress(FileNotFoundError), os.scandir(place) as entries:
+                for entry in entries:
+                    with suppress(FileNotFoundError):  # others finish tasks meanwhile
+                        found = entry.stat(follow_symlinks=False)
+                        is_folder = stat.S_ISDIR(found.st_mode)
+                        name = prefix + entry.name + "/" * is_folder
+                        is_plain = is_folder or stat.S_ISREG(found.st_mode)
+                        if not (is_plain and found.st_uid == owner and _NAMES.fullmatch(name)):
+                            strange.append(name)
+                        elif is_folder:
+                            waiting.append((Path(entry.path), name))
+        if strange:
+            listed = ", ".join(sorted(strange)[:_NAMED]) + ", ..." * (len(strange) > _NAMED)
+            raise TargetError(
+                self.folder,
+                f"holds {len(strange)} names that mp4ds did not make there: {listed}",
+                "See what they are; without the folder, packing begins anew.",
+            )
+
+    def _give_back(self) -> None:
+        """Give a dataset its name again whose replacement was killed between two renames."""
+        target = self.folder.parent / self.replaced.name
+        if self.replaced.exists() and not os.path.lexists(target):
+            self.replaced.rename(target)
+
+    def job(self, *, shared: bool) -> Job | None:
+        """The job that was begun here, or None.
+
+        Args:
+            shared: It may have been begun by another machine.
+
+        Raises:
+            TargetError: It is damaged, another version's, or of another folder.
+        """
+        self._check_folders()
+        path = self.folder / _JOB_NAME
         try:
-            data = (self.folder / _JOB_NAME).read_bytes()
-        except OSError:
+            if not stat.S_ISREG(path.lstat().st_mode):
+                raise TargetError(path, "is no file, or a symbolic link", "Remove it.")
+            data = path.read_bytes()
+        except OSError as error:
+            if isinstance(error, TargetError):
+                raise
             return None
         try:
             job = Job.from_json(data)
         except ValueError as error:
             raise TargetError(self.folder, f"holds an unfinished pack, {error}", _ANEW) from None
+        if not shared and job.place != self.folder.lstat().st_ino:
+            raise TargetError(
+                self.folder, "holds an unfinished pack that was not begun there", _ANEW
+            )
         if job.tools != tools():
             theirs = ", ".join(f"{name} {version}" for name, version in job.tools.items())
             raise TargetError(
@@ -96,10 +190,11 @@ class Workplace:
 
     def begin(self, job: Job) -> Job:
         """Keep a job, or take over the one that another has kept meanwhile."""
+        job = replace(job, place=self.folder.lstat().st_ino)
         try:
             write_synced(self.folder / _JOB_NAME, job.to_json(), replace=False)
         except FileExistsError:
-            return self.job() or job
+            return self.job(shared=True) or job
         except OSError as error:
             raise as_write_error(error, self.folder / _JOB_NAME) from None
         return job
@@ -175,8 +270,10 @@ class Workplace:
     def sweep(self) -> None:
         """Remove what tasks left that were ended; nobody else may be at work."""
         for place in self.parts.iterdir():
-            if place.name.startswith("."):
+            if _BEGUN.fullmatch(place.name):
                 shutil.rmtree(place, ignore_errors=True)
+        for path in self.folder.glob(f".{_JOB_NAME}.*.part"):
+            path.unlink(missing_ok=True)
 
     def clear(self) -> None:
         """Forget the job and all results.
@@ -199,5 +296,10 @@ class Workplace:
             self.folder.rmdir()
 
     def remove(self) -> None:
-        """Remove everything."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        """Remove everything that is made here."""
+        for place in (self.parts, self.joined, self.replaced.parent):
+            shutil.rmtree(place, ignore_errors=True)
+        with suppress(OSError):
+            for name in (_JOB_NAME, "lock"):
+                (self.folder / name).unlink(missing_ok=True)
+            self.folder.rmdir()

@@ -15,7 +15,7 @@ from mp4ds.streams.columns import Unsuited
 from mp4ds.streams.look import Seen, StreamKey
 from mp4ds.streams.target import OutOfReach, TargetPlan, target_plan
 from mp4ds.streams.tracks import PacketPlan, PicturePlan, StreamSettings, TrackPlan
-from mp4ds.video import Recipe, choose, recipe_for
+from mp4ds.video import choose, recipe_for, remade
 from mp4ds.video.codecs import AV1
 from mp4ds.video.encoder import EncoderRefusedError
 
@@ -183,14 +183,14 @@ def plan_from_values(values: Mapping[str, Any]) -> TrackPlan:
     """The plan that `plan_to_values` was given.
 
     Raises:
-        ValueError: It is none.
+        ValueError: It is none, or encodes as this version never does.
     """
     common = {name: values[name] for name in ("profile", "exact", "note")}
     if "recipe" not in values:
         return PacketPlan(**common)
     parameters = Parameters.from_values(values["parameters"])
     layout = bind(values["layout"], ENCODINGS[values["encoding"]], parameters)
-    recipe = Recipe(**values["recipe"])
+    recipe = remade(layout.pixel_format, values["recipe"])
     if "target" in values:
         return TargetPlan(layout, recipe, target=Target(**values["target"]), **common)
     return PicturePlan(layout, recipe, **common)

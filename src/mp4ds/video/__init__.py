@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mp4ds.video.codecs import Recipe, check_codec, recipe_for
+from mp4ds.video.codecs import Recipe, check_codec, recipe_for, remade
 from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.digest import VideoDigest, digest_video, packets_in_groups
 from mp4ds.video.encoder import VideoEncoder, tool_versions
@@ -46,6 +46,7 @@ __all__ = [
     "packets_in_groups",
     "read_sample_entry",
     "recipe_for",
+    "remade",
     "shown_format",
     "tool_versions",
 ]

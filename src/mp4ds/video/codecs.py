@@ -6,9 +6,11 @@ the figures.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import product
 from types import MappingProxyType
+from typing import Any
 
 from mp4ds.errors import OptionError
 from mp4ds.video.depths import TEN_BITS
@@ -288,6 +290,38 @@ def recipe_for(
         full_range=not is_yuv,
         hardware=name if name in HARDWARE else "",
     )
+
+
+def remade(pixel_format: str, values: Mapping[str, Any]) -> Recipe:
+    """The recipe that a file tells, made again: an encoder's options may write files, too.
+
+    Args:
+        pixel_format: Of the pictures.
+        values: The fields of a `Recipe`.
+
+    Raises:
+        ValueError: This version makes none that is the same.
+    """
+    lossless = bool(values["lossless"])
+    preset, crf = (values["options"].get(name) for name in ("preset", "crf"))
+    for name in _LOSSLESS[pixel_format] if lossless else (*_LOSSY, *HARDWARE):
+        known = preset if preset in _PRESETS[name] else None
+        if name in HARDWARE:
+            crfs: Iterable[int | None] = range(1, MAX_CRF[name] + 1)
+        else:
+            crfs = [None if crf is None else int(crf)]
+        for choice in product(crfs, {known, None}, (False, True)):
+            recipe = recipe_for(
+                pixel_format,
+                lossless=lossless,
+                codec=name,
+                crf=choice[0],
+                preset=choice[1],
+                varied=choice[2],
+            )
+            if asdict(recipe) == values:
+                return recipe
+    raise ValueError(f"{values['encoder']!r} is not used with such options")
 
 
 def _lossy(name: str, crf: int | None) -> tuple[_Coding, dict[str, str]]:
