@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import io
+import os
 import re
 import signal
 import sqlite3
@@ -12,6 +13,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ import mp4ds
 from jail import Jail, Outcome
 from mp4ds import yamlio
 from mp4ds.bags import inflate
+from mp4ds.bags.convert import Converter
 from mp4ds.bags.mcap import McapReader
 from mp4ds.bags.mcap_records import DamageError, unzstd
 from mp4ds.bags.mcap_write import McapWriter
@@ -312,6 +315,16 @@ CDR = b"\0\1\0\0"
 CONSTANT = "module a {{ module msg {{ const long X = {}; struct A {{ long x; }}; }}; }};"
 DEFINITIONS: dict[str, tuple[str, str, bytes]] = {
     "empty-messages": ("ros1", "std_msgs/Empty[] x\n", MANY),
+    "empty-in-small-messages": (
+        "ros1",
+        f"B[] x{NEXT}a/B\nuint8 x\nstd_msgs/Empty[4000] y\n",
+        struct.pack("<I", 10**6) + bytes(10**6),
+    ),
+    "empty-in-sequences": (
+        "ros1",
+        f"B[] x{NEXT}a/B\nstd_msgs/Empty[] y\n",
+        struct.pack("<I", 10**5) + struct.pack("<I", 2**32 - 1) * 10**5,
+    ),
     "small-messages": ("ros1", f"B[] x{NEXT}a/B\nuint8 x\n", MANY + bytes(100)),
     "large-messages": (
         "ros1",
@@ -368,6 +381,18 @@ def test_definitions_that_claim_much(tmp_path: Path, jail: Jail) -> None:
         assert re.search("does not parse as|cannot be understood", outcome.text), name
         outcome = bounded(jail.decoded(path))
         assert outcome.error in ("OptionError", "SourceError"), (name, outcome.text)
+
+
+def test_some_messages_without_bytes_are_converted() -> None:
+    definition = f"B[2] x\nB[] y{NEXT}a/B\nstd_msgs/Empty z\n"
+    for encoding, payload, expected in (
+        ("ros1", struct.pack("<I", 3), CDR + bytes(4) + struct.pack("<I", 3) + bytes(3)),
+        ("cdr", CDR + bytes(4) + struct.pack("<I", 3) + bytes(3), struct.pack("<I", 3)),
+    ):
+        schema = Schema("a/msg/A", "ros1msg" if encoding == "ros1" else "ros2msg", b"")
+        channel = Channel(1, "/a", encoding, replace(schema, data=definition.encode()), {})
+        converter = Converter("ros2" if encoding == "ros1" else "ros1")
+        assert bytes(converter.payload(channel, payload)) == expected
 
 
 def test_what_a_definition_does_not_bound_is_packed(tmp_path: Path, jail: Jail) -> None:
@@ -488,6 +513,40 @@ def test_what_is_written_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     path.write_bytes(stream.getvalue())
     with pytest.raises(mp4ds.SourceError, match="promises"), McapReader(path) as reader:
         list(reader.records())
+
+
+# ---------------------------------------------------------------- what is not what it seems
+
+
+def test_an_index_that_lists_messages_again(tmp_path: Path, jail: Jail) -> None:
+    path = tmp_path / "a.bag"
+    channel = Channel(0, "/a", "ros1", Schema("a/A", "ros1msg", b"uint8[] x"), {"md5sum": "0" * 32})
+    with Ros1Writer(path) as writer:
+        writer.add_channel(channel)
+        for _ in range(2):
+            writer.write(Message(channel, 1, 1, 0, b"x" * 10))
+    data = bytearray(path.read_bytes())
+    entries = data.index(b"ver=\1\0\0\0") + 8
+    entries = data.index(struct.pack("<I", 24), entries) + 4
+    data[entries + 12 : entries + 24] = data[entries : entries + 12]
+    path.write_bytes(data)
+    assert "its index lists a message twice" in bounded(jail.records(path)).text
+    assert bounded(jail.records(path, salvage=True)).messages == 2
+
+
+@pytest.mark.parametrize("name", ["metadata.yaml", "a_0.db3"])
+def test_files_of_a_folder_that_are_no_files(name: str, tmp_path: Path, jail: Jail) -> None:
+    database(tmp_path / "a_0.db3", TOPICS, MESSAGES, TOPIC)
+    (tmp_path / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: sqlite3\n"
+        "  relative_file_paths: [a_0.db3]\n"
+    )
+    assert not bounded(jail.records(tmp_path)).error
+    for make in (os.mkfifo, lambda path: path.symlink_to("/dev/zero")):
+        (tmp_path / name).unlink()
+        make(tmp_path / name)
+        assert f"{name}: is no regular file" in bounded(jail.records(tmp_path)).text
+        bounded(jail.records(tmp_path, salvage=True))
 
 
 # ---------------------------------------------------------------- servers

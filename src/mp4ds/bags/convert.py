@@ -19,7 +19,6 @@ from rosbags.typesys.msg import denormalize_msgtype, normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from mp4ds.bags.convert_times import Where, time_beyond, where_times_are
-from mp4ds.bags.type_sizes import has_empty_items, sizes_of
 from mp4ds.bags.typedefs import (
     BAD_DEFINITION,
     BAD_PAYLOAD,
@@ -189,8 +188,6 @@ class Converter:
     def _make_plan(self, schema: Schema) -> _Plan:
         target = self._target or self._source
         types = types_of(schema, self._source)
-        if has_empty_items(types, sizes_of(types)):
-            raise ValueError("an array of messages without fields")
         name = normalize_msgtype(schema.name)
         new_name = _RENAMED.get(name, name) if target is self._ros2 else name
         made = make_store(translate(types, name, new_name, target), target)

@@ -105,10 +105,12 @@ def open_source(path: Path, shown: Path | None = None) -> BinaryIO:
         shown: Its name in errors, where it is a decompressed copy.
 
     Raises:
-        SourceError: It is missing, unreadable, empty, or a git-lfs pointer.
+        SourceError: It is missing, unreadable, no regular file, empty, or a git-lfs pointer.
     """
     shown = shown or path
     try:
+        if not path.is_file() and not path.is_dir() and path.exists():
+            raise SourceError(shown, "is no regular file")  # to open a pipe could wait for ever
         stream = path.open("rb")
     except FileNotFoundError:
         raise SourceNotFoundError(shown) from None

@@ -51,15 +51,7 @@ from mp4ds.bags.ros1_records import (
 )
 from mp4ds.bags.ros1_write import Ros1Writer
 from mp4ds.errors import SourceError
-from mp4ds.records import (
-    EVERYTHING,
-    Channel,
-    ChannelStats,
-    Excerpt,
-    Message,
-    Record,
-    Schema,
-)
+from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Record, Schema
 from mp4ds.remote import expect
 
 __all__ = ["Ros1Reader", "Ros1Writer"]
@@ -395,5 +387,8 @@ class _Bag(Reader):
         times = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
         if times.max(initial=0) >= MAX_TIME:
             raise ReaderError("it has a message of a time past 2^32 seconds, which is none of ROS")
+        places = chunks.astype(np.int64) << 32 | entries["offset"]
+        if len(np.unique(places)) < len(places):
+            raise ReaderError("its index lists a message twice")
         order = np.lexsort((entries["offset"], chunks, times))
         return _Index(times[order], chunks[order], entries["offset"][order])

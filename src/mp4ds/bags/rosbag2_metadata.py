@@ -113,11 +113,13 @@ def read_bag_info(path: Path) -> BagInfo:
         SourceError: It cannot be read or understood.
     """
     try:
+        if not path.is_file():
+            raise SourceError(path, "is no regular file")
+        if path.stat().st_size > _MAX_BYTES:
+            raise SourceError(path, f"is larger than {_MAX_BYTES} bytes")
         data = path.read_bytes()
     except OSError as error:
         raise SourceError(path, f"cannot be read: {error.strerror}") from None
-    if len(data) > _MAX_BYTES:
-        raise SourceError(path, f"is larger than {_MAX_BYTES} bytes")
     if not data.strip():
         raise SourceError(
             path, "is empty", f"Make it anew with `ros2 bag reindex`; {SALVAGE_REMEDY}"

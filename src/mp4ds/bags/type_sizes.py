@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rosbags.interfaces import Msgdef, Nodetype
@@ -20,7 +21,7 @@ FILLER = "structure_needs_at_least_one_member"
 
 _MAX_PARTS = 5000  # fields of all types, with the items that rosbags' code spells out
 _MAX_STEPS = 2**16  # fields of a message whose sequences have one item
-_MAX_IDLE = 2**8  # those of them without any byte: no payload is too short for more
+_MAX_EMPTY = 2**16  # messages without any byte in one, besides two for each of its bytes
 _MAX_DEPTH = 100
 _READING = (
     "deserialize_cdr_le",
@@ -39,13 +40,11 @@ class Size(NamedTuple):
     Attributes:
         least: Bytes, in any serialization.
         steps: Fields, with those of its parts, and of one item of each sequence.
-        idle: Messages among them that have no bytes.
         depth: Levels of messages within messages, those in sequences too.
     """
 
     least: int
     steps: int
-    idle: int
     depth: int
 
 
@@ -79,7 +78,7 @@ def sizes_of(types: Typesdict) -> dict[str, Size]:
 
 
 def has_empty_items(types: Typesdict, sizes: dict[str, Size]) -> bool:
-    """Whether a payload of a few bytes could claim any number of items."""
+    """Whether there are arrays of messages without any byte."""
     return any(
         desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE)
         and desc[1][0][0] == Nodetype.NAME
@@ -92,7 +91,8 @@ def has_empty_items(types: Typesdict, sizes: dict[str, Size]) -> bool:
 class BoundedStore(Typestore):
     """A store whose types read no message of which the least bytes are not there.
 
-    So the items of a sequence are bounded by the bytes that are left, before they are read.
+    So the items of a sequence are bounded by the bytes that are left, before they are read;
+    those that have no bytes are counted.
 
     Args:
         types: Definitions, complete but for time and duration.
@@ -102,6 +102,8 @@ class BoundedStore(Typestore):
         super().__init__(empty)
         self._sizes = sizes_of({**self.fielddefs, **types})
         self.register(types)
+        self._data: object = None
+        self._empty_left = 0
 
     def get_msgdef(self, typename: str) -> Msgdef[object]:
         """See rosbags."""
@@ -109,11 +111,21 @@ class BoundedStore(Typestore):
         if found is None:
             found = super().get_msgdef(typename)
             least = self._sizes[typename].least
-            checked: dict[str, Any] = {
-                name: _checked(getattr(found, name), least) for name in _READING
-            }
+            check = partial(_checked, least=least) if least else self._counted
+            checked: dict[str, Any] = {name: check(getattr(found, name)) for name in _READING}
             found = self.cache[typename] = replace(found, **checked)
         return found
+
+    def _counted(self, read: Callable[..., Any]) -> Callable[..., Any]:
+        def counted(data: memoryview, *rest: Any) -> Any:
+            if data is not self._data:
+                self._data, self._empty_left = data, _MAX_EMPTY + 2 * len(data)
+            self._empty_left -= 1
+            if self._empty_left < 0:
+                raise SerdeError("a message in it claims too many without any byte")
+            return read(data, *rest)
+
+        return counted
 
 
 def _checked(read: Callable[..., Any], least: int) -> Callable[..., Any]:
@@ -146,23 +158,21 @@ def _spelled_out(desc: FieldDesc) -> int:
 
 
 def _size(types: Typesdict, name: str, sizes: dict[str, Size]) -> Size:
-    least, steps, idle, depth = 0, 1, 0, 0
+    least, steps, depth = 0, 1, 0
     for field, desc in types[name][1]:
         item, length = _item(desc), _length(desc)
         if field == FILLER:
             continue
-        part = Size(SIZEMAP.get(item[1][0], 1), 0, 0, 0)
+        part = Size(SIZEMAP.get(item[1][0], 1), 0, 0)
         if item[0] == Nodetype.NAME:
             part = sizes[str(item[1])]
         elif item[1][0] == "string":
-            part = Size(4, 1, 0, 0)
+            part = Size(4, 1, 0)
         depth = max(depth, part.depth + 1)
         if desc[0] == Nodetype.SEQUENCE:
-            part = Size(4, part.steps, 0, 0)
+            part = Size(4, part.steps, 0)
         least += length * part.least
         steps += 1 + length * part.steps
-        idle += length * part.idle
-    idle += not least
-    if steps > _MAX_STEPS or idle > _MAX_IDLE or depth > _MAX_DEPTH:
+    if steps > _MAX_STEPS or depth > _MAX_DEPTH:
         raise ValueError(f"{name} holds more than any message has")
-    return Size(least, steps, idle, depth)
+    return Size(least, steps, depth)
