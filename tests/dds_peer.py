@@ -20,6 +20,8 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
+from waiting import WATCHDOG_S
+
 
 def raw(kind: Any) -> Any:
     """A type whose messages keep the bytes that they came as."""
@@ -162,7 +164,7 @@ class Peer:
         self._seen[topic] = []
         return True
 
-    def received(self, topic: str, count: int, seconds: float = 30.0) -> list[Any]:
+    def received(self, topic: str, count: int, seconds: float = WATCHDOG_S) -> list[Any]:
         """Messages so far, when there are as many as asked for or time is up."""
         reader, seen = self._readers[topic], self._seen[topic]
         end = time.monotonic() + seconds
@@ -180,7 +182,7 @@ class Peer:
         self._seen[topic].clear()
         return True
 
-    def connected(self, topic: str, count: int, seconds: float = 30.0) -> int:
+    def connected(self, topic: str, count: int, seconds: float = WATCHDOG_S) -> int:
         """How many publishers a subscription has, waiting for as many as asked for."""
         end = time.monotonic() + seconds
         while True:
@@ -198,7 +200,7 @@ class Peer:
             time.sleep(0.002)
         return sizes
 
-    def publications(self, topic: str, seconds: float = 30.0) -> list[Any]:
+    def publications(self, topic: str, seconds: float = WATCHDOG_S) -> list[Any]:
         """What a publisher tells of itself."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -213,7 +215,7 @@ class Peer:
         if topic not in self._writers:
             dds = Topic(self._participant, topic, TYPES[kind])
             self._writers[topic] = DataWriter(self._participant, dds, qos=_qos(**qos))
-            end = time.monotonic() + 30
+            end = time.monotonic() + WATCHDOG_S
             while not self._writers[topic].matched_sub and time.monotonic() < end:
                 time.sleep(0.005)
             time.sleep(0.3)  # the other side has to find this one, too
@@ -234,7 +236,7 @@ class Peer:
         reader = DataReader(
             self._participant, Topic(self._participant, f"rr{name}Reply", back), qos=qos
         )
-        end = time.monotonic() + 30
+        end = time.monotonic() + WATCHDOG_S
         while time.monotonic() < end:
             if writer.get_matched_subscriptions() and reader.get_matched_publications():
                 break

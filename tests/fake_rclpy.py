@@ -303,7 +303,7 @@ class FakePeer:
         kinds = self._bus.kinds
         self._node.create_subscription(kinds[kind], topic, seen.append, qos, raw=True)
 
-    def received(self, topic: str, count: int, seconds: float = 10.0) -> list[bytes]:
+    def received(self, topic: str, count: int, seconds: float = WATCHDOG_S) -> list[bytes]:
         while not self._node.inbox.empty():
             self._node.inbox.get()()
         return self._seen[topic]

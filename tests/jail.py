@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from mp4ds.records import Message
+from waiting import WATCHDOG_S
 
 MEMORY = 2 * 2**30
 """Bytes of address space that a reading may take."""
@@ -77,7 +78,7 @@ class Jail:
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
                 pipe.close()
-        self._process.wait(timeout=10)
+        self._process.wait(timeout=WATCHDOG_S)
 
     def validate(self, path: Path, *, deep: bool = True) -> Outcome:
         """All problems of a sidecar or dataset."""

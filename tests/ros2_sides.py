@@ -110,10 +110,10 @@ class DdsPeer:
     def subscribe(self, topic: str, kind: str, **options: Any) -> None:
         self.ask("subscribe", f"rt{topic}", kind, **options)
 
-    def received(self, topic: str, count: int, seconds: float = 30.0) -> list[bytes]:
+    def received(self, topic: str, count: int, seconds: float = WATCHDOG_S) -> list[bytes]:
         return [base64.b64decode(raw) for raw, _ in self.fields(topic, count, seconds)]
 
-    def fields(self, topic: str, count: int, seconds: float = 30.0) -> Any:
+    def fields(self, topic: str, count: int, seconds: float = WATCHDOG_S) -> Any:
         return self.ask("received", f"rt{topic}", count, seconds)
 
     def forget(self, topic: str) -> None:

@@ -23,8 +23,10 @@ from typing import Any
 
 import pytest
 
+from waiting import WATCHDOG_S
+
 HERE = Path(__file__).parent
-SECONDS = 90.0  # nothing of this takes long, but machines may be busy
+SECONDS = WATCHDOG_S
 RECORD = "/usr/lib/rosbag/record"
 PLAY = "/usr/lib/rosbag/play"
 

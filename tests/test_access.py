@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mp4ds
+from each import each
 from mp4ds.coded.references import UnknownStructure
 from mp4ds.errors import VideoError
 from mp4ds.video.access import FrameAccess
@@ -75,7 +76,7 @@ def patterns(count: int) -> Iterator[list[int]]:
     yield [0]
 
 
-@pytest.mark.parametrize("name", [name for name in RECIPES if name not in ALIKE])
+@each("name", [name for name in RECIPES if name not in ALIKE], one_in=2)
 def test_it_is_the_same_frame(name: str, tmp_path: Path) -> None:
     recipe = RECIPES[name]
     path = written(tmp_path, recipe)
@@ -113,7 +114,7 @@ def read_last(path: Path, recipe: Recipe) -> None:
         list(access.pictures_of([FRAMES - 1]))
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@each("name", REFUSED)
 def test_unknown_structures_are_refused(name: str, tmp_path: Path) -> None:
     path = written(tmp_path, REFUSED[name])
     with pytest.raises(UnknownStructure):

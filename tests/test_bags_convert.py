@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
 
 from conftest import real
+from each import each
 from mp4ds.bags.convert import LATCHED_QOS, Converter
 from mp4ds.bags.definitions import ros1_channel
 from mp4ds.bags.ros1 import Ros1Reader
@@ -73,7 +74,7 @@ def values(item: Any) -> Any:
     return struct.pack("<d", item) if isinstance(item, float) else item
 
 
-@pytest.mark.parametrize("name", REAL_BAGS)
+@each("name", REAL_BAGS, one_in=2)
 def test_real_bags_to_ros2_and_back(name: str) -> None:
     to_ros2, to_ros1 = Converter("ros2"), Converter("ros1")
     known: dict[int, tuple[Channel, Any, Any]] = {}
@@ -175,7 +176,7 @@ def test_an_identity_that_does_not_fit_is_not_believed() -> None:
         assert made.metadata == {"md5sum": "992ce8a1687cec8c8bd883ec73ca41d1"}
 
 
-@pytest.mark.parametrize(
+@each(
     ("qos", "latching"),
     [
         (LATCHED_QOS, "1"),
@@ -351,7 +352,7 @@ def test_large_payloads_are_not_deserialised() -> None:
     assert bytes(converter.payload(float32, nan))[4:] == nan
 
 
-@pytest.mark.parametrize(
+@each(
     ("encoding", "schema", "target", "problem"),
     [
         ("protobuf", Schema("foxglove.RawImage", "protobuf", b""), "ros1", "messages are protobuf"),

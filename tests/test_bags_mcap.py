@@ -18,6 +18,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import IndexType, Writer
 
 from conftest import real
+from each import each
 from mp4ds.bags import ordering
 from mp4ds.bags.mcap import McapReader, McapWriter
 from mp4ds.bags.mcap_records import DamageError, unzstd
@@ -142,7 +143,7 @@ def check_index(reader: McapReader, got: list[Message]) -> None:
         assert (first and fields(first)) == (expected and fields(expected))
 
 
-@pytest.mark.parametrize("name", REAL_FILES)
+@each("name", REAL_FILES)
 def test_real_recordings(name: str) -> None:
     check_against_library(real(name))
 
@@ -193,8 +194,8 @@ def scene() -> list[Record]:
     ]
 
 
-@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
-@pytest.mark.parametrize("chunk_size", [1, 4096, 10**7])
+@each("compression", ["zstd", "lz4", "none"])
+@each("chunk_size", [1, 4096, 10**7])
 def test_round_trip(tmp_path: Path, compression: str, chunk_size: int) -> None:
     path = tmp_path / "a.mcap"
     written = write_all(path, scene(), compression=compression, chunk_size=chunk_size)
@@ -346,7 +347,7 @@ def test_compressed_payloads(tmp_path: Path) -> None:
         list(McapReader(path, message_decompress=unzstd).records())
 
 
-@pytest.mark.parametrize(
+@each(
     ("data", "problem"),
     [
         (zstandard.compress(b"abc")[:-1], "damaged"),
@@ -492,7 +493,7 @@ DAMAGED: dict[str, tuple[bytes, str]] = {
 }
 
 
-@pytest.mark.parametrize("name", DAMAGED)
+@each("name", DAMAGED)
 def test_damage_has_a_sentence(tmp_path: Path, name: str) -> None:
     data, problem = DAMAGED[name]
     path = tmp_path / "a.mcap"

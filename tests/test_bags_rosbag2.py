@@ -18,6 +18,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader as RosbagsReader
 
 from conftest import real
+from each import each
 from mp4ds.bags.rosbag2 import Rosbag2Reader, Rosbag2Writer
 from mp4ds.bags.rosbag2_metadata import RECORD, TABLES_RECORD, native_qos, parse_bag_info
 from mp4ds.bags.rosbag2_sqlite import SqliteReader
@@ -112,7 +113,7 @@ def check_index(reader: Rosbag2Reader, got: list[Message]) -> None:
     assert all(m.channel in reader.channels for m in got)
 
 
-@pytest.mark.parametrize("name", FOLDERS)
+@each("name", FOLDERS)
 def test_real_recordings(name: str) -> None:
     path = real(name)
     reader, records = read(path)
@@ -134,8 +135,8 @@ def test_real_recordings(name: str) -> None:
     check_index(reader, got)
 
 
-@pytest.mark.parametrize("name", FOLDERS)
-@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+@each("name", FOLDERS)
+@each("storage", ["sqlite3", "mcap"])
 def test_real_recordings_round_trip(name: str, storage: str, tmp_path: Path) -> None:
     reader, records = read(real(name))
     target = tmp_path / "out"
@@ -279,8 +280,8 @@ def source_record(version: int, **more: Any) -> MetadataRecord:
     return MetadataRecord(RECORD, {"metadata.yaml": text, "storage": "sqlite3", "files": ""})
 
 
-@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-@pytest.mark.parametrize("version", [None, *range(2, 10)])
+@each("storage", ["sqlite3", "mcap"])
+@each("version", [None, *range(2, 10)])
 def test_round_trip(tmp_path: Path, storage: str, version: int | None) -> None:
     folder = tmp_path / "made"
     qos = NEW_QOS if version == 9 else "" if version and version < 4 else OLD_QOS
@@ -506,8 +507,8 @@ def compress_files(folder: Path, spelling: str = "FILE") -> None:
     edit(folder, change)
 
 
-@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-@pytest.mark.parametrize("spelling", ["file", "FILE"])
+@each("storage", ["sqlite3", "mcap"])
+@each("spelling", ["file", "FILE"])
 def test_compressed_files(tmp_path: Path, storage: str, spelling: str) -> None:
     folder = split(tmp_path, storage, [scene()[:25], scene()[25:]])
     compress_files(folder, spelling)
@@ -640,7 +641,7 @@ METADATA_FAULTS: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", METADATA_FAULTS)
+@each("name", METADATA_FAULTS)
 def test_metadata_that_cannot_be_followed(tmp_path: Path, name: str) -> None:
     change, problem = METADATA_FAULTS[name]
     write(tmp_path / "a", "sqlite3", scene())
@@ -649,7 +650,7 @@ def test_metadata_that_cannot_be_followed(tmp_path: Path, name: str) -> None:
         Rosbag2Reader(tmp_path / "a")
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "problem"),
     [
         (b"", "is empty"),
@@ -746,7 +747,7 @@ DATABASE_FAULTS = {
 }
 
 
-@pytest.mark.parametrize("name", DATABASE_FAULTS)
+@each("name", DATABASE_FAULTS)
 def test_a_database_that_cannot_be_read(tmp_path: Path, name: str) -> None:
     statements, problem = DATABASE_FAULTS[name]
     path = database(tmp_path / "a.db3", *statements)

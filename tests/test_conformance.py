@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 import mp4ds
+from each import each
 from mp4ds import yamlio
 from mp4ds.conformance import conformance_dump
 from mp4ds.errors import FormatError, VideoError
@@ -29,6 +30,7 @@ from mp4ds.sidecar.models import CODECS
 from mp4ds.video.raw import RawPicture, raw_pictures
 from mp4ds.wire import WIRES
 from sources import load_tool
+from waiting import WATCHDOG_S
 
 SUITE = Path(__file__).parents[1] / "conformance"
 CASES = SUITE / "cases"
@@ -47,7 +49,12 @@ def run(
     *command: str | Path, env: dict[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        list(map(str, command)), capture_output=True, text=True, check=False, timeout=600, env=env
+        list(map(str, command)),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=WATCHDOG_S,
+        env=env,
     )
 
 
@@ -65,7 +72,7 @@ def streams() -> Iterator[Case]:
 # ---------------------------------------------------------------- readers
 
 
-@pytest.mark.parametrize("case", LISTED["cases"], ids=ids)
+@each("case", LISTED["cases"], ids=ids)
 def test_mp4ds_reads_what_is_expected(case: Case) -> None:
     found = load_tool("conformance").dump(CASES / case["path"])
     assert found == (expected(case) if "expected" in case else {"problems": case["problems"]})
@@ -112,6 +119,7 @@ def has_ffmpeg() -> bool:
     return bool(re.search("libdav1d|libaom-av1|libgav1", decoders))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_ffmpeg(), reason="needs ffmpeg's command line with an AV1 decoder")
 def test_a_second_reader_passes() -> None:
     reader = (sys.executable, SUITE / "reader.py", "{file}")
@@ -156,7 +164,7 @@ def test_the_runner_lets_right_answers_pass(tmp_path: Path) -> None:
     assert "not shown: streams.planes" in done.stdout
 
 
-@pytest.mark.parametrize(
+@each(
     "change",
     [
         "found['streams'][0]['columns']['stamp'][1] = '0'",
@@ -194,7 +202,7 @@ def test_the_runner_sees_a_problem_too_many(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout
 
 
-@pytest.mark.parametrize(
+@each(
     ("at", "passes"),
     [("columns.stamp", True), ("columns.stamp.values", True), (None, True), ("columns", False)],
 )
@@ -290,7 +298,7 @@ def integers(value: Any) -> Iterator[int]:
         yield value
 
 
-@pytest.mark.parametrize("path", sorted(CASES.rglob("*.json")), ids=lambda path: path.stem)
+@each("path", sorted(CASES.rglob("*.json")), ids=lambda path: path.stem)
 def test_the_json_can_be_read_in_any_language(path: Path) -> None:
     def refuse(name: str) -> None:
         raise AssertionError(f"{name} is no JSON")

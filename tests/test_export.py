@@ -20,6 +20,7 @@ import yaml
 from PIL import Image
 
 import mp4ds
+from each import each
 from export_scenes import (
     COLOUR,
     DEPTH,
@@ -167,7 +168,7 @@ def test_tum(dataset: Path, tmp_path: Path) -> None:
     assert acceleration[:, 3] == pytest.approx([9.81] * 4 * FRAMES)
 
 
-@pytest.mark.parametrize(
+@each(
     ("time", "text"),
     [
         (1_700_000_000_000_000_007, "1700000000.000000007"),
@@ -294,7 +295,7 @@ def lens(model: str, d: list[float]) -> Calibration:
     )
 
 
-@pytest.mark.parametrize(
+@each(
     ("model", "d", "colmap", "euroc"),
     [
         ("plumb_bob", [0.0] * 5, ("PINHOLE", []), "radial-tangential"),
@@ -654,7 +655,7 @@ def test_the_command(dataset: Path, tmp_path: Path) -> None:
     assert not (out / "rgb").exists()
 
 
-@pytest.mark.parametrize(
+@each(
     ("to", "options", "words"),
     [
         ("nuscenes", {}, "format 'nuscenes' is not known"),

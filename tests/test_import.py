@@ -30,6 +30,7 @@ from typer.testing import CliRunner
 
 import mp4ds
 from conftest import real
+from each import each
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.cli import app
 from mp4ds.errors import SourceError
@@ -153,7 +154,7 @@ EXACT: dict[str, tuple[Callable[[Path], Any], str, Pixels]] = {
 }
 
 
-@pytest.mark.parametrize("name", EXACT)
+@each("name", EXACT)
 def test_files_are_read_to_the_bit(name: str, tmp_path: Path) -> None:
     write, encoding, expected = EXACT[name]
     write(tmp_path / name)
@@ -207,7 +208,7 @@ def test_what_cannot_be_had_as_it_is_is_refused(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- times
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     [
         "1305031102.175304",
@@ -240,9 +241,7 @@ def test_dates_are_exact() -> None:
     assert read("1970-01-01 00:00:00") == 0
 
 
-@pytest.mark.parametrize(
-    "text", ["", "x", "-1", "nan", "inf", "1e99", "0x10", "1_000", "2147483648"]
-)
+@each("text", ["", "x", "-1", "nan", "inf", "1e99", "0x10", "1_000", "2147483648"])
 def test_what_is_no_time_is_refused(text: str) -> None:
     with pytest.raises(times.NoTimeError):
         times.of_unit("s", Counter())(text)
@@ -285,7 +284,7 @@ CASES: dict[str, tuple[list[str], str | None, dict[str, str], list[int]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", CASES)
+@each("case", CASES)
 def test_times_of_plain_folders(case: str, tmp_path: Path) -> None:
     names, listed, options, expected = CASES[case]
     pictures = plain(tmp_path / "images", names)
@@ -425,7 +424,7 @@ def test_an_import_goes_on_unless_the_images_have_changed(
     assert leftovers(tmp_path) == []
 
 
-@pytest.mark.parametrize(
+@each(
     ("model", "values", "name", "due"),
     [
         ("plumb_bob", [1, 2, 3, 4], "plumb_bob", [1, 2, 3, 4, 0]),
@@ -802,7 +801,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], list[str], str]] = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
+@each("case", BAD)
 def test_bad_folders_are_refused_in_a_sentence(case: str, tmp_path: Path) -> None:
     spoiled, options, words = BAD[case]
     root = euroc(tmp_path)
@@ -865,7 +864,7 @@ PLAIN_BAD: dict[str, tuple[list[str], dict[str, str], list[str], str]] = {
 }
 
 
-@pytest.mark.parametrize("case", PLAIN_BAD)
+@each("case", PLAIN_BAD)
 def test_bad_plain_folders_are_refused(
     case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,6 +21,7 @@ from rosbags.highlevel import AnyReader
 import mp4ds
 from coded_scenes import CODED
 from definitions import PICTURES
+from each import each
 from mp4ds.packing import PackOptions
 from mp4ds.unpacking import UnpackOptions
 from pictures import CAREFUL, pixels
@@ -81,8 +82,8 @@ def colour(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene]:
 # ---------------------------------------------------------------- frames
 
 
-@pytest.mark.parametrize("encoding", COMMON)
-@pytest.mark.parametrize(
+@each("encoding", COMMON, one_in=2)
+@each(
     ("variant", "shape"),
     [
         ("bag-none", {}),
@@ -115,7 +116,7 @@ def test_frames_are_the_pixels_that_were_recorded(
                 assert frame.intrinsics.k[0] == pytest.approx(0.9 * values["width"])
 
 
-@pytest.mark.parametrize("encoding", COMMON)
+@each("encoding", COMMON)
 def test_frames_of_a_lossy_dataset_are_near(encoding: str, tmp_path: Path) -> None:
     source = scene(encoding, frames=4, noisy=False, width=96, height=64)
     with mp4ds.open(packed(tmp_path, source, quality="crf=10")) as dataset:
@@ -131,7 +132,7 @@ def test_frames_of_a_lossy_dataset_are_near(encoding: str, tmp_path: Path) -> No
 SHAPES: list[dict[str, Any]] = [{"width": 63, "height": 47}, {"pad": 3}, {"big_endian": True}]
 
 
-@pytest.mark.parametrize("encoding", [name for name in ENCODINGS if name not in COMMON])
+@each("encoding", [name for name in ENCODINGS if name not in COMMON], one_in=2)
 def test_frames_of_every_other_encoding(encoding: str, tmp_path: Path) -> None:
     shape = SHAPES[ENCODINGS.index(encoding) % 3]
     source = scene(encoding, **shape)
@@ -169,7 +170,7 @@ PNG_ENCODINGS = {
 }
 
 
-@pytest.mark.parametrize("name", PNG_ENCODINGS)
+@each("name", PNG_ENCODINGS)
 def test_frames_of_png_files_are_their_pixels(name: str, tmp_path: Path) -> None:
     source = CODED[name](frames=5)
     with mp4ds.open(packed(tmp_path, source)) as dataset:
@@ -202,7 +203,7 @@ def test_frames_of_rvl_are_those_of_png(encoding: str, tmp_path: Path) -> None:
 JPEGS = ["jpeg-rgb", "jpeg-gray", "jpeg-444", "jpeg-422", "jpeg-progressive", "jpeg-restart"]
 
 
-@pytest.mark.parametrize("name", [*JPEGS, "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"])
+@each("name", [*JPEGS, "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"])
 def test_frames_of_jpeg_files(name: str, tmp_path: Path) -> None:
     source = CODED[name](frames=5)
     with mp4ds.open(packed(tmp_path, source)) as dataset:
@@ -232,7 +233,7 @@ PACKETS = [
 ]
 
 
-@pytest.mark.parametrize("name", PACKETS)
+@each("name", PACKETS)
 def test_frames_of_packets(name: str, tmp_path: Path) -> None:
     source = CODED[name](frames=12)
     codec = "h265" if "265" in name else name.split("-")[1]
@@ -273,7 +274,7 @@ def test_numbers_and_slices(colour: tuple[Path, Scene]) -> None:
         assert stream[np.int64(3)].index == 3  # type: ignore[call-overload]
 
 
-@pytest.mark.parametrize("number", [12, -13, 10**9, -(10**9), 2**70])
+@each("number", [12, -13, 10**9, -(10**9), 2**70])
 def test_numbers_out_of_range(number: int, colour: tuple[Path, Scene]) -> None:
     with mp4ds.open(colour[0]) as dataset:
         with pytest.raises(IndexError, match=f"12 frames, and no frame {number}"):
@@ -321,11 +322,11 @@ def test_columns(colour: tuple[Path, Scene]) -> None:
 # ---------------------------------------------------------------- opening
 
 
-@pytest.mark.parametrize(
+@each(
     "place",
     [".", "dataset.yaml", "cam_image_raw.mp4", "cam_image_raw.yaml"],
 )
-@pytest.mark.parametrize("kind", [str, Path])
+@each("kind", [str, Path])
 def test_all_that_can_be_opened(
     place: str, kind: Callable[[Path], Any], colour: tuple[Path, Scene]
 ) -> None:
@@ -344,7 +345,7 @@ def test_relative_paths(colour: tuple[Path, Scene], monkeypatch: pytest.MonkeyPa
             assert len(dataset[TOPIC][:2]) == 2
 
 
-@pytest.mark.parametrize("topic", ["/imu", "/cam", "", "cam/image_raw", "/cam/camera_info"])
+@each("topic", ["/imu", "/cam", "", "cam/image_raw", "/cam/camera_info"])
 def test_a_wrong_topic_lists_the_right_ones(topic: str, colour: tuple[Path, Scene]) -> None:
     with mp4ds.open(colour[0]) as dataset, pytest.raises(KeyError, match="there are: /cam/image_r"):
         dataset[topic]
@@ -442,9 +443,9 @@ def recalibrated(first_new: int, *, frames: int = 8, delay: int = 90_000) -> Sce
     return source
 
 
-@pytest.mark.parametrize("first_new", [0, 3, 5])
-@pytest.mark.parametrize("delay", [90_000, 0, -1, 40_000_000])
-@pytest.mark.parametrize("variant", ["bag-none", "mcap-ros2-lz4"])
+@each("first_new", [0, 3, 5])
+@each("delay", [90_000, 0, -1, 40_000_000])
+@each("variant", ["bag-none", "mcap-ros2-lz4"])
 def test_the_calibration_that_held(
     first_new: int, delay: int, variant: str, tmp_path: Path
 ) -> None:
@@ -506,7 +507,7 @@ def test_frame_ids_that_change(tmp_path: Path) -> None:
         assert dataset["/odd/image"][3].frame_id == ""
 
 
-@pytest.mark.parametrize("trait", ["stamp-zero", "stamp-repeated", "stamp-backward", "log-equal"])
+@each("trait", ["stamp-zero", "stamp-repeated", "stamp-backward", "log-equal"])
 def test_frames_are_found_by_number_whatever_the_times(trait: str, tmp_path: Path) -> None:
     with mp4ds.open(packed(tmp_path, odd_scene(trait))) as dataset:
         stream = dataset["/odd/image"]

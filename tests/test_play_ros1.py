@@ -24,6 +24,7 @@ from player_scenes import MS, START, STEP, make_drive
 from roscore import PLAY, RECORD, Core, Process, python, wait_until
 from roscore import _core as _core
 from roscore import roscore as roscore
+from waiting import WATCHDOG_S
 
 NS = 10**9
 Digests = Mapping[str, Sequence[str]]
@@ -68,7 +69,7 @@ def published(core: Core, command: list[str], topics: Iterable[str], count: int)
         assert receiver.silence() == []
     finally:
         recorder.send_signal(signal.SIGINT)
-        recorder.wait(60)
+        recorder.wait(WATCHDOG_S)
         receiver.end()
     return [by_topic(told), digests(bag)]
 
@@ -153,11 +154,11 @@ def test_two_players_in_step(roscore: Core, tmp_path: Path, leader: str) -> None
             command = [PLAY, "--quiet", "--bags", str(bag), *options]
         assert roscore.run(*command)[0] == 0
         told = receiver.take(45)
-        assert follower.wait(60) == 0  # it ends soon after the leader
+        assert follower.wait(WATCHDOG_S) == 0  # it ends soon after the leader
     finally:
         if follower.poll() is None:
             follower.terminate()
-        follower.wait(60)
+        follower.wait(WATCHDOG_S)
         roscore.run("rosparam", "delete", "/use_sim_time")
     arrivals: dict[int, list[float]] = defaultdict(list)
     for message, stamp in zip(told, stamps(told), strict=True):
@@ -201,7 +202,7 @@ def playing(core: Core, dataset: Path) -> Iterator[tuple[subprocess.Popen[str], 
     finally:
         if player.poll() is None:
             player.terminate()
-        player.wait(60)
+        player.wait(WATCHDOG_S)
 
 
 def test_pause_service(roscore: Core, drive: Path) -> None:
@@ -219,7 +220,7 @@ def test_pause_service(roscore: Core, drive: Path) -> None:
 def test_ends_with_its_node(roscore: Core, drive: Path) -> None:
     with playing(roscore, drive) as (player, _, node):
         assert roscore.run("rosnode", "kill", node)[0] == 0
-        assert player.wait(60) == 0
+        assert player.wait(WATCHDOG_S) == 0
     assert node not in roscore.nodes()
 
 
@@ -227,7 +228,7 @@ def test_ends_with_its_node(roscore: Core, drive: Path) -> None:
 def test_signals(roscore: Core, drive: Path, number: signal.Signals) -> None:
     with playing(roscore, drive) as (player, _, node):
         player.send_signal(number)
-        assert player.wait(60) == 128 + number
+        assert player.wait(WATCHDOG_S) == 128 + number
     assert node not in roscore.nodes()  # it has signed off
 
 

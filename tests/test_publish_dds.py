@@ -25,6 +25,7 @@ from mp4ds.publishers.dds_types import dds_name, dds_topic, message_type
 from mp4ds.publishers.qos import Qos
 from mp4ds.records import Channel, Schema
 from ros2_sides import KINDS, STORE, Side, channel, connect, dds_side, message, padded, until
+from waiting import WATCHDOG_S
 
 STRING = "std_msgs/msg/String"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -239,7 +240,7 @@ def test_messages_of_a_type_that_dds_cannot_have_are_published(
         assert told["type"] == "pkg::msg::dds_::Own_"
         until(lambda: publisher.subscribers(recorded))
         publisher.publish(recorded, b"\0\1\0\0anything", 0)
-        assert heard.acquire(timeout=30)
+        assert heard.acquire(timeout=WATCHDOG_S)
         with pytest.raises(ConversionError, match="big-endian"):
             publisher.publish(recorded, b"\0\0\0\0anything", 0)
 
@@ -255,8 +256,8 @@ def test_empty_messages_of_ros1_are_published(side: Side) -> None:
         until(lambda: publisher.subscribers(recorded))
         publisher.publish(recorded, converter.payload(source, b""), 0)
         publisher.publish(recorded, b"\0\1\0\0", 0)
-        assert heard.acquire(timeout=30)
-        assert heard.acquire(timeout=30)
+        assert heard.acquire(timeout=WATCHDOG_S)
+        assert heard.acquire(timeout=WATCHDOG_S)
 
 
 @pytest.mark.parametrize("payload", [b"", b"\0\1\0", b"\0\1\0\0", b"\0\1\0\0\xff\xff\xff\xffab\0"])
@@ -278,7 +279,7 @@ def test_a_topic_may_have_two_types(side: Side) -> None:
             publisher.advertise(recorded)
             until(lambda: publisher.subscribers(recorded))  # noqa: B023 (called at once)
             publisher.publish(recorded, message(recorded.type_name, 1), 0)
-            assert heard.acquire(timeout=30)
+            assert heard.acquire(timeout=WATCHDOG_S)
 
 
 def test_a_quality_of_service_that_makes_no_sense_is_told(side: Side) -> None:

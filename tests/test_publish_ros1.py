@@ -25,6 +25,7 @@ from roscore import HERE, PLAY, RECORD, Core, Process, python, wait_until
 from roscore import _core as _core
 from roscore import roscore as roscore
 from sources import SOURCES, scene, typestore
+from waiting import WATCHDOG_S
 
 STRING = "std_msgs/msg/String"
 CAMERA = ("/cam/image_raw", "/cam/camera_info")
@@ -95,7 +96,7 @@ def test_every_message_arrives_in_order(roscore: Core, recording: Path, tmp_path
         assert published.ask("close") < 3
     finally:
         recorder.send_signal(signal.SIGINT)
-        recorder.wait(60)
+        recorder.wait(WATCHDOG_S)
     assert receiver.silence() == []
     got = defaultdict(list)
     for message in told:
@@ -209,7 +210,7 @@ def test_latched_as_rosbag_play_does(roscore: Core, tmp_path: Path) -> None:
         first.end()
     finally:
         player.terminate()
-        player.wait(60)
+        player.wait(WATCHDOG_S)
 
 
 # ---------------------------------------------------------------- clock, listening, remote control
@@ -302,7 +303,7 @@ def test_slow_subscriber_holds_up_nobody(roscore: Core, tmp_path: Path) -> None:
     assert 10 <= published.ask("dropped") <= 18
     started = time.monotonic()
     assert 2 < published.ask("close") < 20
-    assert published.popen.wait(60) == 0
+    assert published.popen.wait(WATCHDOG_S) == 0
     assert time.monotonic() - started < 30
     slow.resume()
 
@@ -417,7 +418,7 @@ def test_killed_node(roscore: Core, recording: Path) -> None:
         assert roscore.uri in sentence
         assert "shut down" in sentence
     assert published.ask("close") < 3
-    assert published.popen.wait(60) == 0
+    assert published.popen.wait(WATCHDOG_S) == 0
 
 
 # ---------------------------------------------------------------- no ROS

@@ -20,6 +20,7 @@ from mp4ds.publishers.qos import Qos, load_overrides, offered_qos, recorded_qos
 from mp4ds.publishers.ros2 import RclpyPublisher
 from mp4ds.records import Channel, Schema
 from ros2_sides import KINDS, SIDES, Side, channel, connect, message, padded, until
+from waiting import WATCHDOG_S
 
 STRING = "std_msgs/msg/String"
 
@@ -161,7 +162,7 @@ def test_topics_of_others_are_heard_whatever_their_type(
         for number in range(3):
             side.peer.publish("/trigger", kind, message(kind, number), reliable=reliable)
         for _ in range(3):
-            assert count.acquire(timeout=30)
+            assert count.acquire(timeout=WATCHDOG_S)
         assert not count.acquire(timeout=0.1)
 
 

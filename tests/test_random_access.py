@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 import mp4ds
 from coded_scenes import CODED
+from each import each
 from mp4ds.demo import demo
 from mp4ds.layouts import ENCODINGS as KNOWN
 from mp4ds.packing import PackOptions
@@ -65,7 +66,7 @@ def same(one: NDArray[Any], other: NDArray[Any]) -> bool:
 # ---------------------------------------------------------------- by number
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
+@each("encoding", ENCODINGS, one_in=2)
 def test_frames_of_every_encoding(encoding: str, tmp_path: Path) -> None:
     source = scene(encoding, frames=FRAMES)
     expected = recorded(source)
@@ -83,7 +84,7 @@ def test_frames_of_every_encoding(encoding: str, tmp_path: Path) -> None:
         assert same(stream.read(ORDER, format="native"), np.stack([expected[i] for i in ORDER]))
 
 
-@pytest.mark.parametrize("name", ["jpeg-rgb", "png-16-bit-cv2-9", "depth-16UC1-rvl", "video-h264",
+@each("name", ["jpeg-rgb", "png-16-bit-cv2-9", "depth-16UC1-rvl", "video-h264",
                                   "video-h265", "video-av1", "video-vp9"])  # fmt: skip
 def test_frames_of_coded_messages(name: str, tmp_path: Path) -> None:
     with mp4ds.open(packed(tmp_path, CODED[name](frames=FRAMES))) as dataset:
@@ -96,10 +97,8 @@ def test_frames_of_coded_messages(name: str, tmp_path: Path) -> None:
         assert same(stream.read(order, format="native"), np.stack([every[i] for i in order]))
 
 
-@pytest.mark.parametrize(
-    ("quality", "codec"), [("visual", None), ("crf=30", None), ("crf=30", "av1-10bit")]
-)
-@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8", "bayer_grbg8", "nv12"])
+@each(("quality", "codec"), [("visual", None), ("crf=30", None), ("crf=30", "av1-10bit")])
+@each("encoding", ["rgb8", "bgr8", "mono8", "bayer_grbg8", "nv12"])
 def test_frames_of_a_lossy_video_are_those_of_unpack(
     encoding: str, quality: str, codec: str | None, tmp_path: Path
 ) -> None:
@@ -132,9 +131,7 @@ def test_numbers_out_of_range(index: int, colour: mp4ds.Stream) -> None:
             ask([0, index])
 
 
-@pytest.mark.parametrize(
-    "indices", [["1"], [1.0], [None], np.array([0.5]), 3, np.array(3), np.array([True, False])]
-)
+@each("indices", [["1"], [1.0], [None], np.array([0.5]), 3, np.array(3), np.array([True, False])])
 def test_what_is_no_number(indices: Any, colour: mp4ds.Stream) -> None:
     for ask in (colour.get, colour.read):
         with pytest.raises(TypeError):
@@ -175,7 +172,7 @@ def test_into_an_array_of_ones_own(colour: mp4ds.Stream) -> None:
     assert np.array_equal(small, colour.read([2, 9, 2], resize=0.25))
 
 
-@pytest.mark.parametrize(
+@each(
     ("out", "problem"),
     [
         (np.zeros((3, 48, 64, 3), np.uint8), r"uint8 \(3, 48, 64, 3\) where .* \(2, 48, 64, 3\)"),
@@ -226,7 +223,7 @@ def distance(one: NDArray[Any], other: NDArray[Any]) -> float:
     return float(np.abs(one.astype(float) - other.astype(float)).mean() / np.iinfo(one.dtype).max)
 
 
-@pytest.mark.parametrize("encoding", LIGHT)
+@each("encoding", LIGHT)
 def test_formats_of_every_encoding(encoding: str, tmp_path: Path) -> None:
     source = scene(encoding, frames=2, width=64, height=48, noisy=False)
     bits = 8 * np.dtype(KNOWN[encoding].dtype).itemsize
@@ -257,7 +254,7 @@ def test_formats_of_every_encoding(encoding: str, tmp_path: Path) -> None:
             assert np.array_equal(stream.read([number])[0], rgb.data)
 
 
-@pytest.mark.parametrize("encoding", DATA)
+@each("encoding", DATA)
 def test_numbers_are_no_colours(encoding: str, tmp_path: Path) -> None:
     source = scene(encoding, frames=4)
     data = recorded(source)[0]
@@ -273,7 +270,7 @@ def test_numbers_are_no_colours(encoding: str, tmp_path: Path) -> None:
         assert frame.encoding == encoding
 
 
-@pytest.mark.parametrize("name", ["BGR", "", "rgb8", None])
+@each("name", ["BGR", "", "rgb8", None])
 def test_no_such_format(name: Any, colour: mp4ds.Stream) -> None:
     with pytest.raises(mp4ds.OptionError, match="native, rgb, bgr, gray"):
         colour.get([0], format=name)
@@ -282,8 +279,8 @@ def test_no_such_format(name: Any, colour: mp4ds.Stream) -> None:
 # ---------------------------------------------------------------- sizes
 
 
-@pytest.mark.parametrize("size", [(16, 12), (32, 24), (40, 30), (7, 48), (64, 5)])
-@pytest.mark.parametrize("name", ["native", "rgb", "bgr", "gray"])
+@each("size", [(16, 12), (32, 24), (40, 30), (7, 48), (64, 5)])
+@each("name", ["native", "rgb", "bgr", "gray"])
 def test_smaller(size: tuple[int, int], name: str, colour: mp4ds.Stream) -> None:
     """By area, as OpenCV does it."""
     (whole,) = colour.read([3], format=name)
@@ -324,7 +321,7 @@ def test_parts(colour: mp4ds.Stream) -> None:
     assert np.abs(small.astype(int) - expected).max() <= 2
 
 
-@pytest.mark.parametrize("encoding", [*(name for name in ENCODINGS if name.startswith("bayer"))])
+@each("encoding", [*(name for name in ENCODINGS if name.startswith("bayer"))])
 def test_a_part_of_a_mosaic_is_a_mosaic(encoding: str, tmp_path: Path) -> None:
     source = scene(encoding, frames=4)
     data = recorded(source)[0]
@@ -343,7 +340,7 @@ def test_a_part_of_a_mosaic_is_a_mosaic(encoding: str, tmp_path: Path) -> None:
         assert stream.read([0], resize=0.5).shape == (1, 24, 32, 3)
 
 
-@pytest.mark.parametrize("encoding", YUV)
+@each("encoding", YUV)
 def test_camera_yuv_is_not_cut(encoding: str, tmp_path: Path) -> None:
     with mp4ds.open(packed(tmp_path, scene(encoding, frames=4))) as dataset:
         stream = dataset[TOPIC]
@@ -354,8 +351,8 @@ def test_camera_yuv_is_not_cut(encoding: str, tmp_path: Path) -> None:
         assert np.array_equal(part, stream.read([0])[0][3:10, 1:10])
 
 
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 4), (5, 1), (2, 2), (3, 3), (63, 47)])
-@pytest.mark.parametrize("encoding", [name for name in ENCODINGS if name.startswith("bayer")])
+@each(("width", "height"), [(1, 1), (1, 4), (5, 1), (2, 2), (3, 3), (63, 47)])
+@each("encoding", [name for name in ENCODINGS if name.startswith("bayer")])
 def test_mosaics_of_odd_sizes(encoding: str, width: int, height: int) -> None:
     rng = np.random.default_rng(0)
     data = picture(encoding, frame=0, width=width, height=height, rng=rng)
@@ -367,7 +364,7 @@ def test_mosaics_of_odd_sizes(encoding: str, width: int, height: int) -> None:
         assert rgb[row, column, channel] == data[row, column]
 
 
-@pytest.mark.parametrize(
+@each(
     "options",
     [
         *({"resize": value} for value in (0, -1.0, float("nan"), float("inf"), True, "2", 1e9,
@@ -575,6 +572,7 @@ def test_times_of_frames_are_those_of_the_scene(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- documentation
 
 
+@pytest.mark.slow
 def test_the_page_on_frames_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its snippets, one after the other, on what its commands make."""
     page = (Path(__file__).parents[1] / "docs" / "frames.md").read_text()

@@ -17,6 +17,7 @@ from rosbags.highlevel import AnyReader
 
 import mp4ds
 from conftest import real
+from each import each
 from foxglove_scenes import FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.bags.decoding import decoder_of
 from mp4ds.records import Channel, Schema
@@ -65,7 +66,7 @@ def check_value(own: Any, value: Any) -> None:
 # ---------------------------------------------------------------- all sources
 
 
-@pytest.mark.parametrize("variant", SOURCES)
+@each("variant", SOURCES, one_in=2)
 def test_messages_of_every_source(variant: str, tmp_path: Path) -> None:
     source = scene("mono8", frames=6)
     (tmp_path / "source").mkdir()
@@ -92,7 +93,7 @@ def test_messages_of_every_source(variant: str, tmp_path: Path) -> None:
                 assert not is_typed or name == record.msgtype.replace("/msg/", "/")
 
 
-@pytest.mark.parametrize("variant", [name for name in FOXGLOVE_SOURCES if "flat" not in name])
+@each("variant", [name for name in FOXGLOVE_SOURCES if "flat" not in name])
 def test_messages_of_foxglove(variant: str, tmp_path: Path) -> None:
     source = foxglove_scene(partial(scene, "rgb8"), frames=6, width=64, height=48)
     dataset = packed(tmp_path, FOXGLOVE_SOURCES[variant](tmp_path, source))
@@ -175,7 +176,7 @@ REAL = [
 ]
 
 
-@pytest.mark.parametrize("name", REAL)
+@each("name", REAL)
 def test_real_recordings(name: str, tmp_path: Path) -> None:
     """Every message decodes, to what rosbags itself makes of it."""
     path = real(f"bags/{name}.bag")
@@ -219,7 +220,7 @@ def channel(encoding: str, name: str = "", schema: bytes = b"", kind: str = "") 
     return Channel(0, "/odd", encoding, Schema(name, kind, schema) if name else None)
 
 
-@pytest.mark.parametrize(
+@each(
     ("odd", "problem"),
     [
         (channel("flatbuffer", "foxglove.Log", b"", "flatbuffer"), "they are flatbuffer encoding"),
@@ -245,7 +246,7 @@ def test_topics_that_cannot_be_decoded(odd: Channel, problem: str) -> None:
         decoder_of(odd)
 
 
-@pytest.mark.parametrize("encoding", ["ros1", "cdr", "json", "protobuf"])
+@each("encoding", ["ros1", "cdr", "json", "protobuf"])
 def test_any_bytes(encoding: str) -> None:
     """An object or a WireError, whatever the bytes are."""
     from foxglove_wire import SERIALIZATIONS

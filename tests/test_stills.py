@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import mp4ds
+from each import each
 from mp4ds.errors import FrameNotFoundError, OptionError, TargetExistsError
 from mp4ds.report.looks import Look
 from mp4ds.report.stills import StillOptions, frames, number_at, parse_sheet, spread, time_of
@@ -37,7 +38,7 @@ def read(path: Path) -> np.ndarray[Any, Any]:
 # ---------------------------------------------------------------- times
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "time"),
     [
         ("+0", START),
@@ -55,7 +56,7 @@ def test_times_as_they_are_written(text: str, time: int) -> None:
     assert time_of(text, START) == time
 
 
-@pytest.mark.parametrize(
+@each(
     "text", ["", "now", "1e9", "+", "+1.0000000001", "2023-13-14T22:13:20", "1.5 s", "12:30", "٣"]
 )
 def test_what_is_no_time(text: str) -> None:
@@ -98,7 +99,7 @@ def test_a_frame_is_saved_as_it_is(drive: Path, tmp_path: Path) -> None:
 SOME = {*COMMON, "rgb16", "yuyv", "8UC2", "32FC1", "bgra8", "bayer_gbrg16"}
 
 
-@pytest.mark.parametrize(
+@each(
     "encoding",
     [name if name in SOME else pytest.param(name, marks=pytest.mark.slow) for name in ENCODINGS],
 )
@@ -122,7 +123,7 @@ def test_every_encoding_can_be_looked_at(encoding: str, tmp_path: Path) -> None:
     assert png.dtype == (np.uint16 if is_wide else np.uint8)
 
 
-@pytest.mark.parametrize("encoding", ["bayer_rggb8", "mono16", "16UC1", "rgb8"])
+@each("encoding", ["bayer_rggb8", "mono16", "16UC1", "rgb8"])
 def test_exact_samples(encoding: str, tmp_path: Path) -> None:
     dataset = pack_cameras(tmp_path, scene(encoding, frames=4), quality="lossless")
     frames(dataset, tmp_path / "out.png", StillOptions(at="#3", exact=True))
@@ -147,7 +148,7 @@ def test_another_size(drive: Path, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- sheets
 
 
-@pytest.mark.parametrize(
+@each(
     ("count", "wanted", "numbers"),
     [
         (3, 20, [0, 1, 2]),
@@ -193,7 +194,7 @@ def test_a_sheet_that_is_too_large(drive: Path, tmp_path: Path) -> None:
         frames(drive, tmp_path / "a.png", StillOptions(topic=COLOUR, sheet=(20, 1), resize=20.0))
 
 
-@pytest.mark.parametrize("text", ["5", "0x4", "5x", "x4", "5x4x3", "-1x3", "1000x1"])
+@each("text", ["5", "0x4", "5x", "x4", "5x4x3", "-1x3", "1000x1"])
 def test_what_is_no_sheet(text: str) -> None:
     with pytest.raises(OptionError, match="--sheet"):
         parse_sheet(text)
@@ -202,7 +203,7 @@ def test_what_is_no_sheet(text: str) -> None:
 # ---------------------------------------------------------------- options and the command
 
 
-@pytest.mark.parametrize(
+@each(
     "options",
     [
         {},

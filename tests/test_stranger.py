@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import xxhash
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 
 import stranger
 from coded_scenes import CODED
+from each import each
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from mp4ds.layouts import ENCODINGS, LAYOUTS, Encoding, fit
 from mp4ds.packing import pack
@@ -116,7 +116,7 @@ CASES: dict[str, Case] = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@each("case", CASES, one_in=3)
 def test_a_reader_that_knows_the_spec_alone_gives_every_message(case: str, tmp_path: Path) -> None:
     make, write = CASES[case]
     (source,) = write(tmp_path, make(frames=8, width=192, height=128))

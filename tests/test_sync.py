@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import mp4ds
+from each import each, fresh
 from mp4ds.sync import match, synchronize
 from sources import (
     IMAGE,
@@ -161,7 +162,7 @@ def cameras(**stamps: Sequence[int]) -> Scene:
     return Scene(sorted(records, key=lambda record: record.log_time))
 
 
-@pytest.fixture
+@fresh
 def three(tmp_path: Path) -> Path:
     made = cameras(
         left=[0, 100, 200, 300, 400, 500],
@@ -205,7 +206,7 @@ def test_streams_of_one_topic_are_told_by_name(tmp_path: Path) -> None:
             dataset.sync(["/odd/image"], tolerance_ns=0)
 
 
-@pytest.mark.parametrize(
+@each(
     ("topics", "options", "problem"),
     [
         (["/none"], {"tolerance_ns": 1}, "no stream '/none'; there are: /left/image, /right"),

@@ -29,8 +29,10 @@ torch = pytest.importorskip("torch")
 
 from torch.utils.data import DataLoader, Subset  # noqa: E402
 
+from each import each  # noqa: E402
 from mp4ds.torch import FrameDataset, FrameStream, SampleError  # noqa: E402
 from mp4ds.torch.windows import rows_of, windows  # noqa: E402
+from waiting import WATCHDOG_S  # noqa: E402
 
 LEFT, RIGHT = BOTH = ["/left/image_raw", "/right/image_raw"]
 FRAMES, GOP = 24, 6
@@ -357,7 +359,7 @@ def test_nothing_matches(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- options
 
 
-@pytest.mark.parametrize(
+@each(
     ("options", "sentence"),
     [
         ({"topics": ["/up"]}, "has no stream '/up'; there are: /"),
@@ -420,9 +422,12 @@ WORKERS = [(0, None), (2, "fork"), (2, "spawn")]
 
 def loader(dataset: Any, workers: int, method: str | None, **options: Any) -> Any:
     return DataLoader(
-        dataset, num_workers=workers, multiprocessing_context=method, timeout=60 * bool(workers),
+        dataset,
+        num_workers=workers,
+        multiprocessing_context=method,
+        timeout=WATCHDOG_S * bool(workers),
         **options,
-    )  # fmt: skip
+    )
 
 
 def failure(batches: Any) -> Exception:
@@ -553,7 +558,7 @@ def test_damage_is_named(damaged: Path, workers: int, method: str | None) -> Non
     assert isinstance(error, mp4ds.Mp4dsError)
 
 
-@pytest.mark.parametrize(
+@each(
     "error",
     [
         mp4ds.SourceError("drive", "is odd", "Fix it."),
@@ -670,8 +675,8 @@ def test_a_kept_sample_does_not_keep_others(drives: list[Path]) -> None:
         assert image.permute(1, 2, 0).is_contiguous()
 
 
-@pytest.mark.parametrize("length", [1, 4, 7, 100])
-@pytest.mark.parametrize("keys", [[0], [0, 1, 2, 3], [0, 6, 12, 18], [0, 5, 6, 20], []])
+@each("length", [1, 4, 7, 100])
+@each("keys", [[0], [0, 1, 2, 3], [0, 6, 12, 18], [0, 5, 6, 20], []])
 def test_windows_are_a_partition(drives: list[Path], length: int, keys: list[int]) -> None:
     for topics in ([LEFT], BOTH):
         collection = FrameDataset(drives[:2], topics=topics)._collection
@@ -709,7 +714,7 @@ def test_torchcodec_gives_the_same_frames(drives: list[Path]) -> None:
 
 
 @pytest.mark.usefixtures("torchcodec")
-@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "av1-10bit"])
+@each("codec", ["h264", "h265", "av1", "av1-10bit"])
 def test_torchcodec_gives_lossy_videos_their_contrast_or_nothing(
     codec: str, tmp_path: Path
 ) -> None:
@@ -745,6 +750,7 @@ def test_the_example_learns(drives: list[Path]) -> None:
     assert errors[2] < errors[0]
 
 
+@pytest.mark.slow
 def test_the_tutorial_runs(tmp_path: Path) -> None:
     demo(tmp_path / "demo.bag", seconds=1.2)
     for name in ("drive", "drive2"):

@@ -24,6 +24,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 import mp4ds
+from each import each
 from mp4ds.info import info
 from mp4ds.sidecar.migrate import migrate
 from mp4ds.stamps import decode_column
@@ -282,7 +283,7 @@ def camera(**changes: Any) -> Document:
     return broken(camera_info={key: value for key, value in content.items() if value is not ...})
 
 
-@pytest.mark.parametrize(
+@each(
     ("content", "word"),
     [
         (broken(camera_info=...), "camera_info"),
@@ -337,7 +338,7 @@ def test_broken_files_are_refused_in_a_sentence(
     assert [problem.code for problem in problems] == ["migration-failed"]
 
 
-@pytest.mark.parametrize(
+@each(
     "content",
     [camera(K=[0.0] * 8), camera(P=[0.0] * 9), camera(width=0), camera(width=10**6)],
 )

@@ -12,6 +12,7 @@ from mcap.writer import Writer
 
 import mp4ds
 from coded_scenes import CODED
+from each import each, fresh
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.demo import demo
@@ -32,7 +33,7 @@ ONE_ENCODER = TASK_BYTES + 40 * 2**20
 """Bytes that hold the encoder of either of the demo's cameras, not both."""
 
 
-@pytest.fixture(autouse=True)
+@fresh
 def engine(monkeypatch: pytest.MonkeyPatch) -> InlineEngine:
     inline = InlineEngine()
     monkeypatch.setattr("mp4ds.packing._engine", lambda *_: inline)
@@ -63,7 +64,7 @@ def compare_packs(
     assert compare(paths, unpacked(folder, own_target(source))) == []
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
+@each("encoding", ENCODINGS, one_in=3)
 def test_every_encoding(
     encoding: str, tmp_path: Path, compare: Compare, engine: InlineEngine
 ) -> None:
@@ -72,7 +73,7 @@ def test_every_encoding(
     compare_packs(tmp_path, source, recorded, compare, engine)
 
 
-@pytest.mark.parametrize("source", SOURCES)
+@each("source", SOURCES, one_in=2)
 def test_every_source(source: str, tmp_path: Path, compare: Compare, engine: InlineEngine) -> None:
     recorded = scene("bayer_gbrg8", frames=10)
     (tmp_path / "source").mkdir()
@@ -83,8 +84,8 @@ def test_every_source(source: str, tmp_path: Path, compare: Compare, engine: Inl
     assert leftovers(tmp_path) == []
 
 
-@pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-zstd"])
-@pytest.mark.parametrize("name", CODED)
+@each("source", ["bag-none", "mcap-ros2-zstd"], one_in=4)
+@each("name", CODED)
 def test_coded_images(
     name: str, source: str, tmp_path: Path, compare: Compare, engine: InlineEngine
 ) -> None:
@@ -95,7 +96,7 @@ def test_coded_images(
     assert compare(paths, unpacked(tmp_path, own_target(source))) == []
 
 
-@pytest.mark.parametrize("trait", TRAITS)
+@each("trait", TRAITS)
 def test_odd_messages(trait: str, tmp_path: Path, compare: Compare, engine: InlineEngine) -> None:
     (tmp_path / "source").mkdir()
     paths = SOURCES["mcap-ros2-zstd"](tmp_path / "source", odd_scene(trait))
@@ -104,8 +105,8 @@ def test_odd_messages(trait: str, tmp_path: Path, compare: Compare, engine: Inli
     assert compare(paths, unpacked(tmp_path, "mcap")) == []
 
 
-@pytest.mark.parametrize("source", list(FOXGLOVE_SOURCES)[::2])
-@pytest.mark.parametrize("name", ["raw-rgb8", "raw-padded", "jpeg-cut-one", "video-h264-mid-gop"])
+@each("source", list(FOXGLOVE_SOURCES)[::2])
+@each("name", ["raw-rgb8", "raw-padded", "jpeg-cut-one", "video-h264-mid-gop"])
 def test_foxglove_messages(
     name: str, source: str, tmp_path: Path, compare: Compare, engine: InlineEngine
 ) -> None:
@@ -116,7 +117,7 @@ def test_foxglove_messages(
     assert compare(paths, unpacked(tmp_path, "mcap")) == []
 
 
-@pytest.mark.parametrize("codec", ["av1", "av1-10bit", "h264", "h265"])
+@each("codec", ["av1", "av1-10bit", "h264", "h265"])
 def test_a_lossy_profile(
     codec: str, tmp_path: Path, compare: Compare, engine: InlineEngine
 ) -> None:
@@ -140,7 +141,7 @@ def test_a_lossy_profile(
     assert max(error) < 12
 
 
-@pytest.mark.parametrize("groups", [1, 2])
+@pytest.mark.parametrize("groups", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_groups_of_cameras_and_one_without_images(
     groups: int, tmp_path: Path, compare: Compare, engine: InlineEngine
 ) -> None:
