@@ -133,7 +133,7 @@ INVALID: dict[str, FileCase] = {
     "version-absent": FileCase("no version", edit=without("mp4ds"), code="version-unsupported"),
     "version-number": FileCase(
         "a version without quotes",
-        write=replacing(b'mp4ds: "1.0"', b"mp4ds: 1.0"),
+        write=replacing(b'mp4ds: "1.1"', b"mp4ds: 1.1"),
         code="version-unsupported",
     ),
     "version-major": FileCase(

@@ -63,7 +63,9 @@ def load_document(path: Path) -> dict[str, Any]:
     version = version_of(document)
     if version is None:
         raise FormatError(
-            "version-unsupported", path, 'has no version such as `mp4ds: "1.0"`, in quotes'
+            "version-unsupported",
+            path,
+            f'has no version such as `mp4ds: "{FORMAT_VERSION}"`, in quotes',
         )
     try:
         found = parse_version(version)
