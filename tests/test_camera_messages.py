@@ -377,7 +377,7 @@ def test_narrow_images_in_a_lossy_profile(
         ]
         return
     assert done.frames(TOPIC) == (12, 12)
-    assert 38 < least_psnr(done, TOPIC) < 90
+    assert 37 < least_psnr(done, TOPIC) < 90  # 37.3 of 10 bits by the SVT-AV1 of PyAV 19
 
 
 def test_narrow_images_in_a_lossless_h265_video_become_another(

@@ -83,7 +83,8 @@ def _x264_rgb(pixel_format: str) -> _Coding:
 
 
 def _x265_lossless(pixel_format: str) -> _Coding:
-    options = {"x265-params": f"{_X265}:lossless=1:{_QUIET}"}
+    # what it takes for another scene in noise differs by version: key frames without need
+    options = {"x265-params": f"{_X265}:scenecut=0:lossless=1:{_QUIET}"}
     # several times slower than the others, and hardly ever smaller than they with folded bits
     return _Coding("libx265", pixel_format, options, "veryfast", tried=False)
 
