@@ -628,6 +628,10 @@ def test_a_damaged_result_is_made_again(tmp_path: Path) -> None:
     results[1].write_text("[1")
     again = evaluate(path, QUICK, output=tmp_path / "out")
     assert (again.tried, again.known) == (2, 0)
+    (result,) = (place for place in results if "original" not in place.name)
+    result.write_text(json.dumps({**json.loads(result.read_text()), "size": "large"}))
+    again = evaluate(path, QUICK, output=tmp_path / "out")
+    assert (again.tried, again.known) == (1, 1)
     assert again.cameras[0].cells[0].size == first.cameras[0].cells[0].size
 
 

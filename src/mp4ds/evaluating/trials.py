@@ -185,7 +185,7 @@ class Trials:
             if REFUSED in values:
                 return Failure(setting, str(values[REFUSED]))
             scores = {name: Summary(**score) for name, score in values["scores"].items()}
-            figures = [values[name] for name in _MEASURED]
+            figures = [values[name] for name in _MEASURED] if setting else []  # else not encoded
             figures += [figure for score in scores.values() for figure in asdict(score).values()]
             if not all(isinstance(figure, (int, float)) for figure in figures):
                 return None
