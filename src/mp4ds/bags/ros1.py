@@ -42,6 +42,7 @@ from mp4ds.bags.ros1_records import (
     MAX_TIME,
     UINT32,
     check_bag,
+    check_between,
     count_messages,
     make_channel,
     payload,
@@ -276,18 +277,11 @@ class _Bag(Reader):
         header = Header.read(self.file, RecordType.BAGHEADER)
         place = read_uint32(self.file) + self.file.tell()
         for start in sorted(self._chunk_ends):
-            self._check_between(place, start)
+            check_between(self.file, place, start)
             place = self._chunk_ends[start]
         # a bag without chunks is read to its end: nothing else tells where its index is
         end = header.get_uint64("index_pos") if self.chunks else self.file.seek(0, os.SEEK_END)
-        self._check_between(place, end)
-
-    def _check_between(self, place: int, end: int) -> None:
-        while place < end:
-            self.file.seek(place)
-            if Header.read(self.file).get_uint8("op") in (RecordType.CHUNK, RecordType.MSGDATA):
-                raise ReaderError(f"its index does not list what it holds at byte {place}")
-            place = read_uint32(self.file) + self.file.tell()
+        check_between(self.file, place, end)
 
     def _goes_on(self) -> bool:
         """Whether a record follows the last one of the index that was read."""
@@ -391,4 +385,7 @@ class _Bag(Reader):
         if len(np.unique(places)) < len(places):
             raise ReaderError("its index lists a message twice")
         order = np.lexsort((entries["offset"], chunks, times))
-        return _Index(times[order], chunks[order], entries["offset"][order])
+        index = _Index(times[order], chunks[order], entries["offset"][order])
+        if np.logical_and.reduce([column[1:] == column[:-1] for column in index]).any():
+            raise ReaderError("its index lists a message twice")
+        return index

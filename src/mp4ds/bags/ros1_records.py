@@ -9,10 +9,11 @@ import struct
 from bz2 import BZ2Decompressor
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import BinaryIO
 
 import lz4.frame
 from rosbags.rosbag1 import ReaderError
-from rosbags.rosbag1.reader import Header, RecordType
+from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 
 from mp4ds.bags.inflate import most_unpacked
 from mp4ds.bags.mcap_records import SALVAGE_REMEDY, open_source
@@ -177,6 +178,19 @@ def count_messages(chunk: memoryview) -> int:
         (length,) = UINT32.unpack_from(chunk, offset)
         offset += 4 + length
     return count
+
+
+def check_between(file: BinaryIO, place: int, end: int) -> None:
+    """Refuse messages between two bytes of a bag, where the index lists none.
+
+    Raises:
+        ReaderError: There are some, or something that is no record.
+    """
+    while place < end:
+        file.seek(place)
+        if Header.read(file).get_uint8("op") in (RecordType.CHUNK, RecordType.MSGDATA):
+            raise ReaderError(f"its index does not list what it holds at byte {place}")
+        place = read_uint32(file) + file.tell()
 
 
 def unpack_chunk(compression: str, size: int, data: bytes) -> bytes:
