@@ -19,6 +19,7 @@ from rosbags.rosbag2 import Reader as RosbagsReader
 
 from conftest import real
 from each import each
+from mp4ds.bags import open_sources
 from mp4ds.bags.rosbag2 import Rosbag2Reader, Rosbag2Writer
 from mp4ds.bags.rosbag2_metadata import RECORD, TABLES_RECORD, native_qos, parse_bag_info
 from mp4ds.bags.rosbag2_sqlite import SqliteReader
@@ -490,6 +491,25 @@ def test_a_missing_file_is_named(tmp_path: Path, storage: str) -> None:
     file.unlink()
     with pytest.raises(SourceError, match=rf"{file.name}, which its metadata.yaml names"):
         Rosbag2Reader(folder)
+
+
+def test_a_file_that_is_not_named_is_not_left_out(tmp_path: Path) -> None:
+    folder = split(tmp_path, "sqlite3", [scene()[:2], scene()[2:]])
+    path = folder / "metadata.yaml"
+    text = path.read_text()
+    edit(folder, lambda info: info["relative_file_paths"].pop())
+    with pytest.raises(SourceError, match=r"which its metadata.yaml does not name"):
+        Rosbag2Reader(folder)
+    path.write_text(text)
+    compress_files(folder)
+    with Rosbag2Reader(folder) as reader:
+        whole = len(messages(reader.records()))
+    for file in folder.glob("*.zstd"):  # as ROS 2 leaves them that has played it
+        plain = zstandard.ZstdDecompressor().decompressobj().decompress(file.read_bytes())
+        file.with_suffix("").write_bytes(plain)
+    for salvage in (False, True):
+        with open_sources([folder], salvage=salvage) as opened:
+            assert len(messages(opened.records())) == whole
 
 
 def compress_files(folder: Path, spelling: str = "FILE") -> None:

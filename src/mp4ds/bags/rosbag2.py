@@ -24,7 +24,7 @@ from mp4ds.bags.rosbag2_metadata import (
     parse_bag_info,
     read_bag_info,
 )
-from mp4ds.bags.rosbag2_parts import SharedChannels, consecutive
+from mp4ds.bags.rosbag2_parts import SharedChannels, consecutive, unlisted_storage
 from mp4ds.bags.rosbag2_sqlite import SqliteReader
 from mp4ds.bags.rosbag2_write import Rosbag2Writer
 from mp4ds.bags.zstd_files import ZstdFile, copy_file, decompress_file, is_zstd
@@ -311,6 +311,13 @@ def _folder_info(path: Path) -> BagInfo:
             path,
             f"is incomplete: {missing[0]}{more}, which its {METADATA_FILE} names, is missing",
             f"Add what is missing, or run `ros2 bag reindex` to go without it, or {_GO_ON}",
+        )
+    unlisted = [] if remote(path) else unlisted_storage(path, info.file_names)
+    if unlisted:
+        raise SourceError(
+            path,
+            f"has {unlisted[0]}, which its {METADATA_FILE} does not name",
+            f"Move it away, or run `ros2 bag reindex` to add it; {SALVAGE_REMEDY}",
         )
     return info
 

@@ -2,14 +2,43 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Protocol
 
 from mp4ds.bags.ordering import HoldBack
 from mp4ds.bags.rosbag2_metadata import BagInfo
 from mp4ds.records import QOS_KEY, Channel, Message, Record, Schema
+
+STORAGE_NAME = re.compile(r"(?P<stem>.*?)(?:_(?P<number>\d+))?\.(?:db3|mcap)(?:\.zstd)?")
+"""How storage files are named: after the recording, with a number."""
+
+
+def unlisted_storage(folder: Path, listed: Collection[str]) -> list[str]:
+    """Storage files of a recording that its metadata.yaml does not list.
+
+    Args:
+        folder: The recording.
+        listed: Those that it lists.
+    """
+
+    def stem(name: str) -> str:
+        match = STORAGE_NAME.fullmatch(name)
+        return match["stem"] if match else name
+
+    there = [file.name for file in folder.iterdir() if file.is_file()]
+    stems = {stem(name) for name in listed if name in there}
+    return [
+        name
+        for name in there
+        if STORAGE_NAME.fullmatch(name)
+        and name not in listed
+        and f"{name}.zstd" not in listed  # ROS 2 leaves what it decompressed to play it
+        and (not stems or stem(name) in stems)
+    ]
 
 
 class StorageReader(Protocol):

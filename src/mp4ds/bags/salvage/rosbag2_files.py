@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from mp4ds.bags.mcap_records import SALVAGE_REMEDY
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, BagInfo, read_bag_info
+from mp4ds.bags.rosbag2_parts import STORAGE_NAME, unlisted_storage
 from mp4ds.bags.zstd_files import is_zstd
 from mp4ds.errors import SourceError, SourceNotFoundError
 from mp4ds.records import Loss
-
-_NAME = re.compile(r"(?P<stem>.*?)(?:_(?P<number>\d+))?\.(?:db3|mcap)(?:\.zstd)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,14 +88,12 @@ def unreadable(name: str, error: SourceError, messages: int | None) -> Loss:
 
 def _names(folder: Path, info: BagInfo | None, losses: list[Loss]) -> Sequence[str]:
     """Storage files in reading order: those that are listed, and those that should be."""
-    there = [file.name for file in folder.iterdir() if file.is_file() and _is_storage(file.name)]
     listed = list(info.file_names) if info else []
     counts = _counts(info)
     for name in listed:
-        if name not in there and not (folder / name).is_file():
+        if not (folder / name).is_file():
             losses.append(Loss(name, None, None, "is missing", counts.get(name)))
-    stems = {_stem(name) for name in listed if name in there}
-    others = [name for name in there if name not in listed and (not stems or _stem(name) in stems)]
+    others = unlisted_storage(folder, listed)
     if info:
         for name in sorted(others, key=_number):
             losses.append(Loss(name, None, None, f"is not listed in {METADATA_FILE}; was read", 0))
@@ -105,17 +101,8 @@ def _names(folder: Path, info: BagInfo | None, losses: list[Loss]) -> Sequence[s
     return sorted([*found, *others], key=_number) if others else found
 
 
-def _is_storage(name: str) -> bool:
-    return _NAME.fullmatch(name) is not None
-
-
-def _stem(name: str) -> str:
-    match = _NAME.fullmatch(name)
-    return match["stem"] if match else name
-
-
 def _number(name: str) -> tuple[str, int, str]:
-    match = _NAME.fullmatch(name)
+    match = STORAGE_NAME.fullmatch(name)
     return (match["stem"], int(match["number"] or 0), name) if match else (name, 0, name)
 
 
