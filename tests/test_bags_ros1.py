@@ -411,6 +411,12 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
         refuse(path, problem)
 
 
+def end_of_chunk(data: bytes) -> int:
+    """The byte after the first chunk of a bag."""
+    head = 4109 + 4 + struct.unpack_from("<I", data, 4109)[0]
+    return int(head + 4 + struct.unpack_from("<I", data, head)[0])
+
+
 def test_messages_that_the_index_does_not_list_are_not_lost(tmp_path: Path) -> None:
     path = tmp_path / "a.bag"
     two = make_bag(path, [plain()], [[(0, 1, b"one"), (0, 2, b"two")]]).read_bytes()
@@ -427,6 +433,10 @@ def test_messages_that_the_index_does_not_list_are_not_lost(tmp_path: Path) -> N
     (index,) = struct.unpack_from("<Q", two, two.index(b"index_pos=") + 10)
     path.write_bytes(bag_header(index - 12, 1, 1) + short[4109:])
     refuse(path, "its index lists 1 messages of 2")
+    none = two[: end_of_chunk(two)] + connection(0, *plain())
+    none += two[two.index(b"\4\0\0\0op=\6") - 4 :].replace(b"count=\1", b"count=\0")
+    path.write_bytes(bag_header(end_of_chunk(two), 1, 1) + none[4109:])
+    refuse(path, "its index lists 0 messages of 2")
     twice = two[:entry] + two[entry - 12 : entry] + two[entry + 12 :]
     path.write_bytes(bag_header(index, 1, 1) + twice[4109:])
     refuse(path, "its index lists a message twice")

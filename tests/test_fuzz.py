@@ -21,7 +21,7 @@ from mp4ds import Mp4dsError
 from mp4ds.bags import open_sources
 from sources import SOURCES, scene
 
-COUNT = 900
+COUNT = 400
 
 
 @pytest.fixture(scope="module")

@@ -111,6 +111,9 @@ class Ros1Reader:
         try:
             self._bag.open()
             self._index = self._bag.take_index()
+            for number, info in enumerate(self._bag.chunk_infos):
+                if not any(info.connection_counts.values()):
+                    self._chunk(number)  # nobody else will see whether it holds messages
         except DAMAGE as error:
             self._close()
             raise SourceError(path, f"is damaged: {reason(error)}", COPY_AGAIN) from None
