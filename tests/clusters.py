@@ -7,30 +7,25 @@ import os
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 from types import TracebackType
 from urllib.parse import urlsplit
 
+from distributed import Client
+
+from waiting import WATCHDOG_S, until
+
 HERE = Path(__file__).parent
-SECONDS = 60.0
+
+WITH_NANNY = ("--nthreads", "1")
+"""Arguments of a worker as Dask has it: another process that imports all starts it anew."""
 
 _LOOPBACK = ("--host", "127.0.0.1", "--no-dashboard")
 
 OTHER_VERSION = "import mp4ds._version\nmp4ds._version.__version__ = '0.0.1'\n"
 """A sitecustomize.py that makes a worker one of another mp4ds."""
-
-
-def wait_until(true: Callable[[], bool], seconds: float = SECONDS) -> None:
-    """Wait for something, but not for ever."""
-    deadline = time.monotonic() + seconds
-    while not true():
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"not in {seconds:g} s")
-        time.sleep(0.02)
 
 
 class RealCluster:
@@ -49,7 +44,7 @@ class RealCluster:
         folder: Path,
         *,
         workers: int = 2,
-        arguments: tuple[str, ...] = ("--nthreads", "1"),
+        arguments: tuple[str, ...] = ("--nthreads", "1", "--no-nanny"),
         config: dict[str, str] | None = None,
         path: Path = HERE,
     ) -> None:
@@ -61,7 +56,7 @@ class RealCluster:
         file = folder / "scheduler.json"
         self.scheduler = self._start("dask_scheduler", "--port", "0", "--scheduler-file", str(file))
         try:
-            wait_until(lambda: file.exists() and bool(file.read_text()))
+            until(lambda: file.exists() and bool(file.read_text()))
             self.address: str = json.loads(file.read_text())["address"]
             for _ in range(workers):
                 self.add_worker()
@@ -83,12 +78,18 @@ class RealCluster:
         arguments = ("--local-directory", str(self._folder), *self._arguments)
         self.workers.append(self._start("dask_worker", self.address, *arguments))
 
+    def is_idle(self) -> bool:
+        """Whether its workers run nothing, not even for one who has gone."""
+        with Client(self.address, set_as_default=False) as client:
+            running = client.run(lambda dask_worker: dask_worker.state.executing_count)
+            return not any(running.values())
+
     def end(self) -> None:
         """End what still runs; the nannies of workers end these."""
         for process in (*self.workers, self.scheduler):
             process.terminate()
             try:
-                process.wait(20)
+                process.wait(WATCHDOG_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()

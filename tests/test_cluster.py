@@ -21,12 +21,14 @@ import pytest
 from distributed import Security
 
 import cluster_tasks
-from clusters import RealCluster, Relay, wait_until
+from clusters import WITH_NANNY, RealCluster, Relay
+from each import each
 from mp4ds.engine import Engine, Outcome
 from mp4ds.engine import cluster_access as access
 from mp4ds.engine.cluster import ClusterEngine
 from mp4ds.engine.cluster_access import Connection
 from mp4ds.errors import ClusterError, OptionError
+from waiting import WATCHDOG_S, until
 
 MIB = 2**20
 
@@ -41,7 +43,7 @@ def _settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RealCluster]:
     """One that no test harms."""
-    with RealCluster(tmp_path_factory.mktemp("cluster")) as cluster:
+    with RealCluster(tmp_path_factory.mktemp("cluster"), arguments=WITH_NANNY) as cluster:
         yield cluster
 
 
@@ -173,8 +175,7 @@ def test_a_task_leaves_no_memory_behind(cluster: RealCluster, tmp_path: Path) ->
 
 def test_tasks_of_a_killed_worker_run_on_another(tmp_path: Path) -> None:
     names = numbered(8)
-    arguments = ("--nthreads", "1", "--no-nanny")
-    with RealCluster(tmp_path / "dask", arguments=arguments) as cluster:
+    with RealCluster(tmp_path / "dask") as cluster:
         engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
         outcomes = engine.run(tasks_in(tmp_path, *names), lambda *_: None)
         done = [next(outcomes)]
@@ -184,7 +185,7 @@ def test_tasks_of_a_killed_worker_run_on_another(tmp_path: Path) -> None:
         def is_at_work() -> bool:
             return any(not path.with_suffix("").exists() for path in tmp_path.glob(mine))
 
-        wait_until(is_at_work)
+        until(is_at_work)
         victim.kill()
         unfinished = [p.stem for p in tmp_path.glob(mine) if not p.with_suffix("").exists()]
         done += outcomes
@@ -202,7 +203,7 @@ def test_a_task_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
         "DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION": "1.0",
     }
     # more workers than it kills: on a loaded machine a nanny may not bring one back
-    with RealCluster(tmp_path / "dask", workers=4, config=config) as cluster:
+    with RealCluster(tmp_path / "dask", workers=4, arguments=WITH_NANNY, config=config) as cluster:
         engine = ClusterEngine(cluster_tasks.die, cluster.address, task_bytes=300 * MIB)
         found = errors(run(engine, tasks_in(tmp_path, "deadly", *numbered(6))))
     assert set(found) == {"deadly"}
@@ -222,7 +223,7 @@ def test_a_lost_scheduler_is_an_error_and_the_next_one_goes_on(tmp_path: Path) -
         begun = time.monotonic()
         with pytest.raises(ClusterError, match="run the same command again to go on"):
             list(outcomes)
-        assert time.monotonic() - begun < 30
+        assert time.monotonic() - begun < WATCHDOG_S
     kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("0??")}
     assert 0 < len(kept) < len(names)
     with RealCluster(tmp_path / "dask-2", workers=1) as cluster:
@@ -295,7 +296,7 @@ def test_time_between_two_runs_is_no_waiting(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- ways to a cluster
 
 
-@pytest.mark.parametrize(
+@each(
     "address",
     [
         *("", "slrum", "127.0.0.1:8786", "tcp://127.0.0.1", "tcp://:8786", "tcp://host:99999"),
@@ -307,7 +308,7 @@ def test_other_addresses_are_refused(address: str) -> None:
         ClusterEngine(cluster_tasks.write, address, task_bytes=MIB)
 
 
-@pytest.mark.parametrize(
+@each(
     ("address", "module", "package"),
     [("tcp://127.0.0.1:1", "distributed", "distributed"), ("local", "distributed", "distributed")]
     + [("local", "cryptography", "cryptography")]
@@ -333,11 +334,11 @@ def test_nobody_at_the_address(address: str, tmp_path: Path) -> None:
     begun = time.monotonic()
     with pytest.raises(ClusterError, match="no Dask scheduler could be reached"):
         run(engine, tasks_in(tmp_path, "a"))
-    assert time.monotonic() - begun < 30
+    assert time.monotonic() - begun < WATCHDOG_S
 
 
 @pytest.mark.usefixtures("impatient")
-@pytest.mark.parametrize(
+@each(
     ("says", "problem"),
     [
         (b"", "no Dask scheduler could be reached"),
@@ -364,7 +365,7 @@ def test_another_server_at_the_address(says: bytes, problem: str, tmp_path: Path
         begun = time.monotonic()
         with pytest.raises(ClusterError, match=problem):
             run(engine, tasks_in(tmp_path, "a"))
-        assert time.monotonic() - begun < 30
+        assert time.monotonic() - begun < WATCHDOG_S
         thread.join()
     for connection in kept:
         connection.close()
@@ -389,7 +390,7 @@ def test_a_cluster_on_this_machine(tmp_path: Path) -> None:
     assert not errors(run(engine, tasks_in(tmp_path, *numbered(4))))
     workers = {int(path.suffix.removeprefix(".by-")) for path in started(tmp_path)}
     assert os.getpid() not in workers
-    wait_until(lambda: not any(map(is_alive, workers)))
+    until(lambda: not any(map(is_alive, workers)))
 
 
 def heard(port: int, said: bytes, context: ssl.SSLContext | None) -> bytes:
@@ -417,7 +418,7 @@ def test_strangers_do_not_reach_a_cluster_on_this_machine() -> None:
     before = listening()
     with Connection("local", 2) as connection:
         client, _ = connection.way()
-        client.wait_for_workers(2, timeout=60)
+        client.wait_for_workers(2, timeout=WATCHDOG_S)
         assert client.submit(os.getpid).result() != os.getpid()
         found = listening() - before
         assert found
@@ -481,7 +482,7 @@ def batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Batch]:
     with dask.config.set({**settings, "distributed.deploy.lost-worker-timeout": "100 ms"}):
         yield system
     assert sorted(set(system.numbers("jobs"))) == sorted(set(system.numbers("cancelled")))
-    wait_until(lambda: not any(map(is_alive, system.numbers("jobs"))))
+    until(lambda: not any(map(is_alive, system.numbers("jobs"))))
 
 
 def test_jobs_of_a_batch_system_run_the_tasks(batch: Batch, tmp_path: Path) -> None:
@@ -530,7 +531,7 @@ def test_what_the_batch_system_refuses_is_told(batch: Batch, tmp_path: Path) -> 
         run(engine, tasks_in(tmp_path, "a", "b"))
 
 
-@pytest.mark.parametrize("system", access.BATCH_SYSTEMS)
+@each("system", access.BATCH_SYSTEMS)
 def test_a_batch_system_that_is_not_there(system: str, tmp_path: Path) -> None:
     settings = {
         "cores": 1,
@@ -545,7 +546,7 @@ def test_a_batch_system_that_is_not_there(system: str, tmp_path: Path) -> None:
         run(engine, tasks_in(tmp_path, "a"))
 
 
-@pytest.mark.parametrize("system", access.BATCH_SYSTEMS)
+@each("system", access.BATCH_SYSTEMS)
 def test_a_batch_system_that_is_not_set_up(system: str, tmp_path: Path) -> None:
     engine = ClusterEngine(cluster_tasks.write, system, task_bytes=MIB)
     with pytest.raises(OptionError, match=rf"--cluster {system}: .*jobqueue.yaml"):

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 import mp4ds
-from clusters import OTHER_VERSION, RealCluster, wait_until
+from clusters import OTHER_VERSION, RealCluster
 from mp4ds.engine import Outcome
 from mp4ds.errors import ClusterError, Mp4dsError, OptionError
 from mp4ds.evaluating import EvaluateOptions, Evaluation
@@ -26,6 +26,7 @@ from mp4ds.evaluating.engines import Engines
 from mp4ds.evaluating.work import command, run_task
 from mp4ds.scoring import ScoringError
 from sources import scene, write_bag
+from waiting import WATCHDOG_S, until
 
 CRF = "20:40:4"
 NOBODY = "tcp://127.0.0.1:1"
@@ -118,7 +119,8 @@ def test_it_finds_the_same(
     assert any(note.startswith("not tried: h265") for note in camera.notes)
     assert any("side by side" in note for note in camera.notes)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        *("cells", "evaluation.csv", "evaluation.json", "index.html", "pictures", "plots")
+        *("cells", "evaluation.csv", "evaluation.json", "index.html"),
+        *("mp4ds_evaluation.json", "pictures", "plots"),
     ]
     # what is known needs no cluster
     again = mp4ds.evaluate(bag, replace(QUICK, cluster=NOBODY), output=tmp_path / "out")
@@ -141,6 +143,7 @@ def test_what_one_machine_began_a_cluster_ends(
     assert ",another," in (tmp_path / "out" / "evaluation.csv").read_text()
 
 
+@pytest.mark.slow
 def test_rates_are_searched_on_a_cluster(cluster: RealCluster, bag: Path, tmp_path: Path) -> None:
     options = replace(QUICK, codecs=["x264"], crf=["24"], rates=[5], target="psnr_y=35")
     here = mp4ds.evaluate(bag, options, output=tmp_path / "here")
@@ -154,29 +157,30 @@ def test_rates_are_searched_on_a_cluster(cluster: RealCluster, bag: Path, tmp_pa
 # ---------------------------------------------------------------- what goes wrong
 
 
+@pytest.mark.slow
 def test_a_killed_worker_does_not_matter(
     bag: Path, expected: dict[str, Any], tmp_path: Path
 ) -> None:
-    arguments = ("--nthreads", "1", "--no-nanny")
-    with RealCluster(tmp_path / "dask", arguments=arguments) as cluster:
+    with RealCluster(tmp_path / "dask") as cluster:
         victim = cluster.workers[0]
         with at_work(bag, tmp_path, cluster) as process:
-            wait_until(lambda: bool(measured(tmp_path)) and bool(trials_of(victim)))
+            until(lambda: bool(measured(tmp_path)) and bool(trials_of(victim)))
             orphans = trials_of(victim)
             victim.kill()
-            _, stderr = process.communicate(timeout=180)
+            _, stderr = process.communicate(timeout=WATCHDOG_S)
         assert process.returncode == 0, stderr
-        wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in orphans))
+        until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in orphans))
     found = mp4ds.evaluate(bag, QUICK, output=tmp_path / "out")
     assert (found.tried, found.known) == (0, 2 * SETTINGS + 1)
     assert facts(found) == expected
 
 
+@pytest.mark.slow
 def test_a_lost_scheduler_is_told(bag: Path, expected: dict[str, Any], tmp_path: Path) -> None:
     with RealCluster(tmp_path / "dask") as lost, at_work(bag, tmp_path, lost) as process:
-        wait_until(lambda: len(measured(tmp_path)) >= 2)
+        until(lambda: len(measured(tmp_path)) >= 2)
         lost.scheduler.kill()
-        _, stderr = process.communicate(timeout=60)
+        _, stderr = process.communicate(timeout=WATCHDOG_S)
     assert process.returncode == 1
     assert "Traceback" not in stderr
     assert "the connection to the Dask scheduler was lost" in " ".join(stderr.split())
@@ -186,20 +190,21 @@ def test_a_lost_scheduler_is_told(bag: Path, expected: dict[str, Any], tmp_path:
     assert facts(found) == expected
 
 
+@pytest.mark.slow
 def test_one_that_is_interrupted_leaves_the_cluster_idle(
     cluster: RealCluster, bag: Path, expected: dict[str, Any], tmp_path: Path
 ) -> None:
     with at_work(bag, tmp_path, cluster) as process:
-        wait_until(lambda: len(measured(tmp_path)) >= 2)
+        until(lambda: len(measured(tmp_path)) >= 2)
         process.send_signal(signal.SIGINT)
-        _, stderr = process.communicate(timeout=60)
+        _, stderr = process.communicate(timeout=WATCHDOG_S)
     assert process.returncode == 130
     assert not re.search("distributed|dask|Traceback|Warning", stderr)
     assert "run the same command again to go on" in " ".join(stderr.split())
     assert not list((tmp_path / "out").glob("work*"))
-    time.sleep(3)
+    until(cluster.is_idle)
     idle = measured(tmp_path)
-    time.sleep(2)
+    time.sleep(1)
     assert measured(tmp_path) == idle
     assert len(idle) < 2 * SETTINGS + 1
     assert all(p.poll() is None for p in (cluster.scheduler, *cluster.workers))
@@ -208,6 +213,7 @@ def test_one_that_is_interrupted_leaves_the_cluster_idle(
     assert facts(found) == expected
 
 
+@pytest.mark.slow
 def test_workers_of_another_version_are_refused(bag: Path, tmp_path: Path) -> None:
     (tmp_path / "sitecustomize.py").write_text(OTHER_VERSION)
     with (
@@ -283,7 +289,7 @@ def test_a_trial_may_be_run_twice_at_once(
         ) -> Generator[Outcome, None, None]:
             for task in tasks:
                 both = [subprocess.Popen(command(task), stdin=subprocess.PIPE) for _ in range(2)]
-                assert [process.wait(60) for process in both] == [0, 0]
+                assert [process.wait(WATCHDOG_S) for process in both] == [0, 0]
                 for process in both:
                     process.communicate()
                 yield Outcome(task)

@@ -14,12 +14,13 @@ from typing import Any
 import pytest
 
 import mp4ds
-from clusters import OTHER_VERSION, RealCluster, wait_until
+from clusters import OTHER_VERSION, RealCluster
 from in_parts import facts, leftovers
 from mp4ds.errors import PartsFailedError
 from mp4ds.packing import PackOptions
 from round_trips import Compare, unpacked
 from sources import SOURCES, scene
+from waiting import WATCHDOG_S, until
 
 FRAMES = 120
 WINDOW = 3
@@ -85,28 +86,29 @@ def test_the_command_line_says_nothing_of_dask(
     cluster: RealCluster, source: Path, expected: dict[str, Any], tmp_path: Path
 ) -> None:
     with command(source, tmp_path, cluster) as process:
-        _, stderr = process.communicate(timeout=120)
+        _, stderr = process.communicate(timeout=WATCHDOG_S)
     assert process.returncode == 0, stderr
     assert not re.search("distributed|dask|Traceback|Warning", stderr)
     assert facts(tmp_path / "dataset") == expected
 
 
+@pytest.mark.slow
 def test_a_killed_worker_does_not_matter(
     source: Path, expected: dict[str, Any], tmp_path: Path
 ) -> None:
-    arguments = ("--nthreads", "1", "--no-nanny")
     with (
-        RealCluster(tmp_path / "dask", arguments=arguments) as cluster,
+        RealCluster(tmp_path / "dask") as cluster,
         command(source, tmp_path, cluster) as process,
     ):
-        wait_until(lambda: len(finished(tmp_path)) >= 2)
+        until(lambda: len(finished(tmp_path)) >= 2)
         cluster.workers[0].kill()
         assert len(finished(tmp_path)) < PARTS
-        _, stderr = process.communicate(timeout=120)
+        _, stderr = process.communicate(timeout=WATCHDOG_S)
     assert process.returncode == 0, stderr
     assert facts(tmp_path / "dataset") == expected
 
 
+@pytest.mark.slow
 def test_a_lost_scheduler_is_told_and_another_goes_on(
     cluster: RealCluster, source: Path, expected: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -114,9 +116,9 @@ def test_a_lost_scheduler_is_told_and_another_goes_on(
         RealCluster(tmp_path / "dask") as lost,
         command(source, tmp_path, lost) as process,
     ):
-        wait_until(lambda: len(finished(tmp_path)) >= 2)
+        until(lambda: len(finished(tmp_path)) >= 2)
         lost.scheduler.kill()
-        _, stderr = process.communicate(timeout=60)
+        _, stderr = process.communicate(timeout=WATCHDOG_S)
     assert process.returncode == 1
     assert "Traceback" not in stderr
     said = " ".join(stderr.split())  # as it is folded to the terminal's width
@@ -131,7 +133,10 @@ def test_a_lost_scheduler_is_told_and_another_goes_on(
     assert leftovers(tmp_path) == []
 
 
-@pytest.mark.parametrize(("sign", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
+@pytest.mark.parametrize(
+    ("sign", "code"),
+    [(signal.SIGINT, 130), pytest.param(signal.SIGKILL, -9, marks=pytest.mark.slow)],
+)
 def test_a_command_that_ended_leaves_the_cluster_idle(
     sign: int,
     code: int,
@@ -141,16 +146,16 @@ def test_a_command_that_ended_leaves_the_cluster_idle(
     tmp_path: Path,
 ) -> None:
     with command(source, tmp_path, cluster) as process:
-        wait_until(lambda: len(finished(tmp_path)) >= 2)
+        until(lambda: len(finished(tmp_path)) >= 2)
         process.send_signal(sign)
-        _, stderr = process.communicate(timeout=60)
+        _, stderr = process.communicate(timeout=WATCHDOG_S)
     assert process.returncode == code
     assert "Traceback" not in stderr
     if sign == signal.SIGINT:
         assert "run the same command again to go on" in " ".join(stderr.split())
-    time.sleep(3)
+    until(cluster.is_idle)
     idle = finished(tmp_path)
-    time.sleep(2)
+    time.sleep(1)
     assert finished(tmp_path) == idle
     assert len(idle) < PARTS
     assert all(p.poll() is None for p in (cluster.scheduler, *cluster.workers))

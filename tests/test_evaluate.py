@@ -11,7 +11,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,6 +24,7 @@ from PIL import Image
 
 import mp4ds
 from coded_scenes import CODED, VERBATIM
+from each import each
 from mp4ds.demo import demo
 from mp4ds.errors import OptionError, SourceError, TargetError
 from mp4ds.evaluating import (
@@ -54,6 +54,7 @@ from mp4ds.unpacking import UnpackOptions
 from mp4ds.video.planes import PacketSizes, packet_sizes
 from scenes import PERIOD, TRAITS, Scene, odd_scene
 from sources import ENCODINGS, SOURCES, scene, write_bag
+from waiting import WATCHDOG_S, until
 
 ROOT = Path(__file__).parents[1]
 TOPIC = "/cam/image_raw"
@@ -79,7 +80,7 @@ def recording(folder: Path, encoding: str = "rgb8", source: str = "bag-none", **
 # ---------------------------------------------------------------- options
 
 
-@pytest.mark.parametrize(
+@each(
     ("texts", "values"),
     [
         (["18"], (18,)),
@@ -93,7 +94,7 @@ def test_crfs(texts: list[str], values: tuple[int, ...]) -> None:
     assert parse_crfs(texts) == values
 
 
-@pytest.mark.parametrize("text", ["", "a", "16:", "25:16", "0", "64", "16:25:0", "-3", "16-25"])
+@each("text", ["", "a", "16:", "25:16", "0", "64", "16:25:0", "-3", "16-25"])
 def test_no_crfs(text: str) -> None:
     with pytest.raises(OptionError, match="--crf"):
         parse_crfs([text])
@@ -123,7 +124,7 @@ def test_a_codec_has_only_its_crfs() -> None:
     assert max(item.crf for item in settings if item.codec == "h264") == 51
 
 
-@pytest.mark.parametrize(
+@each(
     ("changed", "said"),
     [
         ({"codecs": ["vp9"]}, "--codecs 'vp9'"),
@@ -170,7 +171,7 @@ def test_clips_of_a_time() -> None:
             chosen(times, origin, replace(given, start=start))
 
 
-@pytest.mark.parametrize("rate", [0.7, 2, 5, 7.5, 10])
+@each("rate", [0.7, 2, 5, 7.5, 10])
 def test_clips_of_fewer_frames_a_second(rate: float) -> None:
     times = at_hertz(10, 200)
     found = chosen_at_rate(times, rate, 12)
@@ -184,8 +185,8 @@ def test_clips_of_fewer_frames_a_second(rate: float) -> None:
 # ---------------------------------------------------------------- search, recommendation
 
 
-@pytest.mark.parametrize("largest", [51, 63])
-@pytest.mark.parametrize("curve", [1.0, 2.0, 0.3])
+@each("largest", [51, 63])
+@each("curve", [1.0, 2.0, 0.3])
 def test_the_search_finds_the_largest_crf(largest: int, curve: float) -> None:
     def score(crf: int) -> float:
         return float(100 - 40 * (crf / largest) ** curve)
@@ -293,7 +294,7 @@ KINDS: dict[str, Callable[[Path, Path], Path]] = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@each("kind", KINDS, one_in=2)
 def test_what_was_made_of_a_recording(kind: str, tmp_path: Path) -> None:
     source = KINDS[kind](tmp_path, recording(tmp_path))
     found = evaluate(source, replace(QUICK, fps=1e9 / PERIOD), output=tmp_path / "out")
@@ -313,8 +314,8 @@ def test_recordings(source: str, tmp_path: Path) -> None:
     assert camera.raw_bytes == 96 * 64
 
 
-@pytest.mark.parametrize(
-    "encoding", ["mono8", "bgr8", "bayer_rggb8", "yuv422", "yuv422_yuy2", "nv12", "8UC3"]
+@each(
+    "encoding", ["mono8", "bgr8", "bayer_rggb8", "yuv422", "yuv422_yuy2", "nv12", "8UC3"], one_in=3
 )
 def test_the_videos_are_those_of_a_pack(encoding: str, tmp_path: Path) -> None:
     """To the byte of their packets: a recommendation can be packed with."""
@@ -344,7 +345,7 @@ def test_the_videos_are_those_of_a_pack_by_codec(codec: str, tmp_path: Path) -> 
     assert packet_sizes(tmp_path / "drive" / "cam_image_raw.mp4").total == tried.size
 
 
-@pytest.mark.parametrize("encoding", ["16UC1", "mono16", "32FC1", "rgba8"])
+@each("encoding", ["16UC1", "mono16", "32FC1", "rgba8"])
 def test_cameras_that_are_no_light_are_left_out(encoding: str, tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=f"{TOPIC} has {encoding} images"):
         evaluate(recording(tmp_path, encoding), QUICK, output=tmp_path / "out")
@@ -405,7 +406,7 @@ def clips_of(path: Path, folder: Path) -> tuple[dict[str, Clip | str], dict[str,
         return found, source.left_out
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
+@each("encoding", ENCODINGS)
 def test_every_encoding_is_tried_or_told(encoding: str, tmp_path: Path) -> None:
     ((_, found),) = clips_of(recording(tmp_path, encoding), tmp_path)[0].items()
     if isinstance(found, str):
@@ -419,7 +420,7 @@ def test_every_encoding_is_tried_or_told(encoding: str, tmp_path: Path) -> None:
     assert len({plane.tobytes() for plane, _, _ in frames}) == 10
 
 
-@pytest.mark.parametrize("name", CODED)
+@each("name", CODED)
 def test_every_coded_image_is_tried_or_told(name: str, tmp_path: Path) -> None:
     write_bag(tmp_path / "drive.bag", CODED[name]())
     clips, left_out = clips_of(tmp_path / "drive.bag", tmp_path)
@@ -436,7 +437,7 @@ def test_every_coded_image_is_tried_or_told(name: str, tmp_path: Path) -> None:
         assert made[0].frames + made[0].other_frames == 10
 
 
-@pytest.mark.parametrize("trait", TRAITS)
+@each("trait", TRAITS)
 def test_every_oddity_is_tried_or_told(trait: str, tmp_path: Path) -> None:
     write_bag(tmp_path / "drive.bag", odd_scene(trait))
     ((_, found),) = clips_of(tmp_path / "drive.bag", tmp_path)[0].items()
@@ -661,10 +662,10 @@ def test_a_killed_one_goes_on(number: signal.Signals, tmp_path: Path) -> None:
         *("--threads", "1", "--target", "psnr_y=20"),
     ]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        assert wait_for(lambda: len(list(out.glob("cells/*.json"))) >= 2)
+        until(lambda: len(list(out.glob("cells/*.json"))) >= 2, process)
         os.kill(process.pid, number)
-        _, said = process.communicate(timeout=60)
-    assert wait_for(lambda: not any(str(out) in line for line in command_lines()))
+        _, said = process.communicate(timeout=WATCHDOG_S)
+    until(lambda: not any(str(out) in line for line in command_lines()))
     if number == signal.SIGINT:
         assert process.returncode == 130
         assert "run the same command again" in said
@@ -672,15 +673,6 @@ def test_a_killed_one_goes_on(number: signal.Signals, tmp_path: Path) -> None:
     again = evaluate(path, replace(QUICK, crf=["20:22"]), output=out)
     assert again.known >= min(known, 2)
     assert again.tried + again.known == 4
-
-
-def wait_for(condition: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline:
-        if condition():
-            return True
-        time.sleep(0.05)
-    return False
 
 
 def command_lines() -> list[str]:
@@ -735,7 +727,7 @@ def test_where_nothing_reaches_the_target(tmp_path: Path) -> None:
 def run(*command: str, cwd: Path, code: int = 0) -> str:
     bin_folder = str(Path(sys.executable).parent)
     done = subprocess.run(
-        command, cwd=cwd, capture_output=True, text=True, timeout=600, check=False,
+        command, cwd=cwd, capture_output=True, text=True, timeout=WATCHDOG_S, check=False,
         env={**os.environ, "PATH": f"{bin_folder}:{os.environ['PATH']}"},
     )  # fmt: skip
     assert done.returncode == code, done.stdout + done.stderr
@@ -764,6 +756,7 @@ def commands_in(name: str) -> list[str]:
     return [line for block in blocks for line in block.splitlines() if line.startswith("mp4ds ")]
 
 
+@pytest.mark.slow
 @needs_vmaf
 def test_the_commands_of_the_page(tmp_path: Path) -> None:
     lines = commands_in("evaluate.md")

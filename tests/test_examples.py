@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 
 import mp4ds
+from each import each
 from mp4ds.demo import demo
 from sources import SOURCES, scene
+from waiting import WATCHDOG_S
 
 ROOT = Path(__file__).parents[1]
 
@@ -25,7 +27,7 @@ def run(*command: str, cwd: Path) -> str:
         cwd=cwd,
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=WATCHDOG_S,
         check=False,
         env={**os.environ, "PATH": f"{bin_folder}:{os.environ['PATH']}"},
     )
@@ -98,7 +100,7 @@ def test_readme_python(demo_dataset: Path, tmp_path: Path) -> None:
     run(sys.executable, "-c", code, cwd=tmp_path)
 
 
-@pytest.mark.parametrize(
+@each(
     "command",
     [
         *("pack", "unpack", "export", "play", "evaluate", "report", "frames", "validate", "info"),

@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mp4ds
 from definitions import PACKET
+from each import each
 from mp4ds.dataset import Dataset
 from mp4ds.packing import PackOptions
 from mp4ds.records import Message
@@ -130,8 +131,8 @@ def check(found: Sequence[Read], name: str, *, ros1: bool) -> None:
                 assert psnr(image[2:-2, 2:-2], expected[2:-2, 2:-2]) > 18
 
 
-@pytest.mark.parametrize("to", ["rosbag2", "bag"])
-@pytest.mark.parametrize("name", CASES)
+@each("to", ["rosbag2", "bag"])
+@each("name", CASES)
 def test_a_subscriber_sees_the_images(packed: Callable[[str], Packed], name: str, to: str) -> None:
     made = packed(name)
     summary, messages = made.unpack(to, "ffmpeg")
@@ -186,7 +187,7 @@ def test_the_messages_are_those_of_a_public_library(
     assert {message.metadata["digest"] for message in found} == {digest}
 
 
-@pytest.mark.parametrize(
+@each(
     ("first", "skipped", "expected"),
     [
         (8, (), range(6, FRAMES)),

@@ -16,6 +16,7 @@ from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoder
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoder
 
 from definitions import CALIBRATION, CODED_VIDEO, LOG, RAW_IMAGE, TRANSFORM
+from each import each
 from foxglove_scenes import CAMERA_TYPES, FOXGLOVE, FOXGLOVE_SOURCES
 from foxglove_wire import SERIALIZATIONS, as_bytes, flatbuffer_module, message_class
 from pictures import picture, pixels
@@ -62,10 +63,8 @@ def same(given: Any, found: Any) -> bool:
     return np.array_equal(np.asarray(given, float), np.asarray(found, float))
 
 
-@pytest.mark.parametrize("name", SCENES)
-@pytest.mark.parametrize(
-    "source", [s for s in FOXGLOVE_SOURCES if s.startswith(("mcap-protobuf", "mcap-foxglove"))]
-)
+@each("name", SCENES)
+@each("source", [s for s in FOXGLOVE_SOURCES if s.startswith(("mcap-protobuf", "mcap-foxglove"))])
 def test_protobuf_and_ros2(source: str, name: str, tmp_path: Path) -> None:
     for record, schema, _, decoded in written(tmp_path, source, name):
         kind = record.msgtype.rpartition("/")[2]
@@ -99,8 +98,8 @@ def test_protobuf_fields_stand_where_they_should(tmp_path: Path) -> None:
                 assert standard.FromString(data).data == packet
 
 
-@pytest.mark.parametrize("name", SCENES)
-@pytest.mark.parametrize("source", ["mcap-json", "mcap-json-python"])
+@each("name", SCENES)
+@each("source", ["mcap-json", "mcap-json-python"])
 def test_json(source: str, name: str, tmp_path: Path) -> None:
     for record, schema, data, _ in written(tmp_path, source, name):
         value, rules = json.loads(data), json.loads(schema.data)
@@ -120,7 +119,7 @@ def test_json(source: str, name: str, tmp_path: Path) -> None:
             assert ("\u00fc".encode() in data) == (source == "mcap-json")
 
 
-@pytest.mark.parametrize("name", SCENES)
+@each("name", SCENES)
 def test_flatbuffers(name: str, tmp_path: Path) -> None:
     for record, schema, data, _ in written(tmp_path, "mcap-flatbuffer", name):
         kind = record.msgtype.rpartition("/")[2]
@@ -142,7 +141,7 @@ def test_flatbuffers(name: str, tmp_path: Path) -> None:
             assert root.Translation().Z() == 1
 
 
-@pytest.mark.parametrize("name", FOXGLOVE)
+@each("name", FOXGLOVE)
 def test_every_scene_is_the_same_in_every_serialization(name: str) -> None:
     made = FOXGLOVE[name](frames=3, width=32, height=16)
     for record in made.messages:

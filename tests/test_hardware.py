@@ -20,6 +20,7 @@ from av.error import FFmpegError
 from typer.testing import CliRunner
 
 import mp4ds
+from each import each
 from in_parts import InlineEngine, leftovers
 from mp4ds.cli import app
 from mp4ds.errors import OptionError
@@ -71,8 +72,8 @@ def recording(folder: Path) -> list[Path]:
 # ---------------------------------------------------------------- what they are given
 
 
-@pytest.mark.parametrize("picture_format", ["gray", "rgb24", "bgr24", "yuv420p"])
-@pytest.mark.parametrize("name", HARDWARE)
+@each("picture_format", ["gray", "rgb24", "bgr24", "yuv420p"])
+@each("name", HARDWARE)
 def test_a_reader_sees_what_the_software_encoder_makes(name: str, picture_format: str) -> None:
     own = recipe_for(picture_format, lossless=False, codec=name, crf=20)
     other = recipe_for(picture_format, lossless=False, codec=name.split("-")[0], crf=20)
@@ -86,7 +87,7 @@ def test_a_reader_sees_what_the_software_encoder_makes(name: str, picture_format
     assert own.options.get("chroma_sample_location") == ("center" if centred else None)
 
 
-@pytest.mark.parametrize("name", HARDWARE)
+@each("name", HARDWARE)
 def test_a_larger_crf_is_less_quality(name: str) -> None:
     found = HARDWARE[name]
     values = [int(found.options(crf)[found.scale]) for crf in range(1, found.most + 1)]
@@ -157,7 +158,7 @@ def declares() -> Callable[[str, dict[str, str]], list[str]]:
     return wrong
 
 
-@pytest.mark.parametrize("name", HARDWARE)
+@each("name", HARDWARE)
 def test_the_encoder_declares_every_option(
     name: str, declares: Callable[[str, dict[str, str]], list[str]]
 ) -> None:
@@ -187,7 +188,7 @@ def test_pictures_for_a_device_are_the_same_samples() -> None:
     assert np.array_equal(frame.to_ndarray(), other.to_ndarray())
 
 
-@pytest.mark.parametrize("name", HARDWARE)
+@each("name", HARDWARE)
 def test_memory_grows_with_pictures(name: str) -> None:
     recipe = recipe_for("rgb24", lossless=False, codec=name, crf=20)
     small, large = (encoder_bytes(recipe, *size, 1) for size in ((640, 480), (1920, 1080)))
@@ -197,7 +198,7 @@ def test_memory_grows_with_pictures(name: str) -> None:
 # ---------------------------------------------------------------- where they are not there
 
 
-@pytest.mark.parametrize("name", HARDWARE)
+@each("name", HARDWARE)
 def test_one_sentence_says_what_is_missing(name: str) -> None:
     found = HARDWARE[name]
     if not (said := why_not(name)):
@@ -391,7 +392,7 @@ def test_grids_and_names() -> None:
 # ---------------------------------------------------------------- on a device
 
 
-@pytest.mark.parametrize("name", HARDWARE)
+@each("name", HARDWARE)
 def test_on_a_device(name: str, tmp_path: Path) -> None:
     if said := why_not(name):
         pytest.skip(said)

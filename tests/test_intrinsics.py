@@ -24,6 +24,7 @@ from typer.testing import CliRunner
 import mp4ds
 import mp4ds.intrinsics
 from conftest import real
+from each import each
 from foxglove_scenes import FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.cli import app
 from mp4ds.intrinsics import Camera, Intrinsics, ListedCalibration, effective, intrinsics
@@ -103,7 +104,7 @@ def check_focused(camera: Camera, made: Scene) -> None:
         assert (item.binning, item.roi, item.k_effective, item.p_effective) == (None,) * 4
 
 
-@pytest.mark.parametrize("source", SOME_SOURCES)
+@each("source", SOME_SOURCES)
 def test_recordings_of_every_kind(source: str, tmp_path: Path) -> None:
     made = focused(scene("mono8"))
     path = SOURCES[source](tmp_path, made)[0]
@@ -115,7 +116,7 @@ def test_recordings_of_every_kind(source: str, tmp_path: Path) -> None:
     check_focused(camera, made)
 
 
-@pytest.mark.parametrize("source", FOXGLOVE_SOURCES)
+@each("source", FOXGLOVE_SOURCES)
 def test_recordings_of_foxglove(source: str, tmp_path: Path) -> None:
     made = focused(foxglove_scene(partial(scene, "mono8"), frames=8, width=64, height=48))
     camera = camera_of(intrinsics(FOXGLOVE_SOURCES[source](tmp_path, made)[0]))
@@ -303,7 +304,7 @@ def test_effective_matrices_of_image_geometry() -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
+@each(
     ("binning", "roi", "same"),
     [
         ((0, 0), (0, 0, 0, 0), True),
@@ -456,7 +457,7 @@ def test_errors_are_those_of_info(options: list[str], tmp_path: Path) -> None:
 # ---------------------------------------------------------------- real recordings
 
 
-@pytest.mark.parametrize(
+@each(
     "name",
     [
         "bags/fiducials_aruco_marker_raspicam.bag",

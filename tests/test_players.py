@@ -26,11 +26,13 @@ from numpy.typing import NDArray
 import mp4ds
 from coded_scenes import CODED
 from definitions import PICTURES
+from each import each
 from mp4ds.packing import PackOptions
 from mp4ds.video import VideoDecoder
 from pictures import CAREFUL
 from scenes import Record, Scene
 from sources import SOURCES, scene
+from waiting import WATCHDOG_S
 
 WIDTH, HEIGHT, FRAMES = 96, 66, 12
 CHROMIUM = next(
@@ -226,7 +228,7 @@ def ffprobe(path: Path, *options: str) -> Any:
     return json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
 
 
-@pytest.mark.parametrize("name", CASES)
+@each("name", CASES, one_in=2)
 def test_ffprobe_knows_all(name: str, datasets: dict[str, Path]) -> None:
     case, path = CASES[name], video_of(datasets[name])
     found = ffprobe(path, "-count_frames", "-show_streams", "-show_format")
@@ -246,7 +248,7 @@ def test_ffprobe_knows_all(name: str, datasets: dict[str, Path]) -> None:
     assert tags == [case.range, case.matrix, *others]
 
 
-@pytest.mark.parametrize("name", CASES)
+@each("name", CASES, one_in=2)
 def test_ffprobe_reads_the_times(name: str, datasets: dict[str, Path]) -> None:
     path = video_of(datasets[name])
     frames = ffprobe(path, "-show_entries", "frame=best_effort_timestamp,pict_type")["frames"]
@@ -285,7 +287,7 @@ def untile(picture: NDArray[Any]) -> NDArray[Any]:
     return mosaic
 
 
-@pytest.mark.parametrize("name", [name for name in CASES if CASES[name].raw])
+@each("name", [name for name in CASES if CASES[name].raw])
 def test_ffmpeg_has_the_pixels_of_a_lossless_video(name: str, datasets: dict[str, Path]) -> None:
     """Without mp4ds: by ffmpeg, and the words of the spec."""
     case, path = CASES[name], video_of(datasets[name])
@@ -303,9 +305,7 @@ def test_ffmpeg_has_the_pixels_of_a_lossless_video(name: str, datasets: dict[str
 DECODERS = {"h265": "hevc", "ffmpeg": "h264", "av1": "libdav1d"}
 
 
-@pytest.mark.parametrize(
-    "name", [name for name, case in CASES.items() if case.is_packets and not case.options]
-)
+@each("name", [name for name, case in CASES.items() if case.is_packets and not case.options])
 def test_ffmpeg_decodes_packets_as_if_they_had_just_been_recorded(
     name: str, datasets: dict[str, Path]
 ) -> None:
@@ -323,7 +323,7 @@ def test_ffmpeg_decodes_packets_as_if_they_had_just_been_recorded(
 SHOWN = [name for name, case in CASES.items() if case.codec != "ffv1" and not case.raw]
 
 
-@pytest.mark.parametrize("name", SHOWN)
+@each("name", SHOWN)
 def test_ffmpeg_shows_the_same_colours(name: str, datasets: dict[str, Path]) -> None:
     """Where it is told in which way to interpolate; versions round in their own ways."""
     place = "in_h_chr_pos=0:in_v_chr_pos=128:" if CASES[name].is_left else ""
@@ -345,7 +345,7 @@ def blocks(picture: NDArray[Any]) -> NDArray[np.float64]:
 # ---------------------------------------------------------------- PyAV
 
 
-@pytest.mark.parametrize("name", CASES)
+@each("name", CASES)
 def test_pyav_plays_and_seeks(name: str, datasets: dict[str, Path]) -> None:
     ticks = expected_ticks(datasets[name])
     with av.open(str(video_of(datasets[name]))) as container:
@@ -523,7 +523,7 @@ def browse(videos: dict[str, Path], jobs: dict[str, list[float]], profile: Path)
             start_new_session=True,  # a group of its own, to be ended as a whole
         )
         try:
-            end = time.monotonic() + 90
+            end = time.monotonic() + WATCHDOG_S
             while not server.done.wait(0.1) and time.monotonic() < end and browser.poll() is None:
                 pass
         finally:
@@ -558,7 +558,7 @@ def middle_times(dataset: Path) -> list[float]:
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize("name", PLAYED)
+@each("name", PLAYED)
 def test_a_browser_plays_it(name: str, played: dict[str, Any], datasets: dict[str, Path]) -> None:
     assert name in played, "the browser did not come to this video in time"
     result = played[name]
@@ -571,7 +571,7 @@ def test_a_browser_plays_it(name: str, played: dict[str, Any], datasets: dict[st
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize("name", PLAYED)
+@each("name", PLAYED)
 def test_a_browser_shows_the_right_frames_in_the_right_colours(
     name: str, played: dict[str, Any], datasets: dict[str, Path]
 ) -> None:

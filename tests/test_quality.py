@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 import mp4ds
 from coded_scenes import CODED
 from definitions import IMAGE
+from each import each
 from in_parts import InlineEngine, leftovers
 from mp4ds import yamlio
 from mp4ds.demo import demo
@@ -135,9 +136,7 @@ def test_scores_that_may_be_asked_for() -> None:
             parse_quality(text)
 
 
-@pytest.mark.parametrize(
-    ("gop", "frames"), [(1, 60), (10, 60), (25, 50), (60, 60), (120, 120), (1000, 240)]
-)
+@each(("gop", "frames"), [(1, 60), (10, 60), (25, 50), (60, 60), (120, 120), (1000, 240)])
 def test_windows_are_whole_groups_of_pictures(
     gop: int, frames: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -160,7 +159,7 @@ def test_the_search_ends_after_a_few_encodings() -> None:
     assert (reached, tried) == (score(crf) >= 30.2, 2)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@each("seed", range(8))
 def test_the_course_of_the_crf_keeps_mean_and_windows(seed: int) -> None:
     """Scenes of any difficulty: the mean is what is asked for, and no window far below it."""
     rng = np.random.default_rng(seed)
@@ -195,7 +194,7 @@ def test_the_course_of_the_crf_keeps_mean_and_windows(seed: int) -> None:
 CHANGING = [0.0, 0.0, 8.0, 8.0, 0.0, 0.0]
 
 
-@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "av1-10bit"])
+@each("codec", ["h264", "h265", "av1", "av1-10bit"])
 def test_every_window_has_the_score(codec: str, tmp_path: Path) -> None:
     """Windows of other difficulty have another crf, and one video."""
     preset = "12" if codec.startswith("av1") else "ultrafast"

@@ -36,6 +36,7 @@ from report_scenes import (
     pack_cameras,
     two_cameras,
 )
+from waiting import WATCHDOG_S
 
 pytestmark = pytest.mark.browser
 
@@ -222,7 +223,7 @@ def test_cameras_play_in_step(speed: float, page: Tab, recorded: Recorded) -> No
         " due: p.cameras.map(c => c.frameAt(p.time))}))(mp4dsReport.player)"
     )
     seen = []
-    end = time.monotonic() + 30
+    end = time.monotonic() + WATCHDOG_S
     while time.monotonic() < end:
         found = page.evaluate(state)
         seen.append(found)
@@ -244,7 +245,7 @@ def test_cameras_play_in_step(speed: float, page: Tab, recorded: Recorded) -> No
 
 def test_playing_ends_at_the_end(page: Tab, recorded: Recorded) -> None:
     page.evaluate("mp4dsReport.player.go(mp4dsReport.player.end - 2e8); mp4dsReport.player.play()")
-    end = time.monotonic() + 30
+    end = time.monotonic() + WATCHDOG_S
     while page.evaluate("mp4dsReport.player.isPlaying") and time.monotonic() < end:
         time.sleep(0.05)
     assert page.evaluate("mp4dsReport.player.time === mp4dsReport.player.end")
@@ -503,7 +504,7 @@ def test_the_clock_waits_on_a_busy_machine(wall: Tab) -> None:
     wall.command("Emulation.setCPUThrottlingRate", rate=6)
     try:
         wall.evaluate("mp4dsReport.player.play()")
-        end = time.monotonic() + 60
+        end = time.monotonic() + WATCHDOG_S
         while wall.evaluate("mp4dsReport.player.isPlaying") and time.monotonic() < end:
             time.sleep(0.1)
         assert wall.evaluate("mp4dsReport.player.time === mp4dsReport.player.end")
@@ -699,7 +700,7 @@ def test_troubles_are_told(browser: Tab, drive: Path, tmp_path: Path) -> None:
     (copy / "front_image_raw.mp4").write_bytes(b"no video at all")
     show(browser, (copy / "index.html").as_uri())
     notices = "[...document.querySelectorAll('.nothing')].map(n => n.hidden ? '' : n.textContent)"
-    end = time.monotonic() + 20
+    end = time.monotonic() + WATCHDOG_S
     while not all(browser.evaluate(notices)) and time.monotonic() < end:
         time.sleep(0.05)
     depth, colour = browser.evaluate(notices)

@@ -24,6 +24,7 @@ import pytest
 import mp4ds
 from coded_scenes import CODED, MakeScene
 from definitions import CODED_VIDEO, COMPRESSED, IMAGE, PACKET
+from each import each
 from encoders import cv, nal_units
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.errors import ConversionError, FormatError, OptionError
@@ -301,7 +302,7 @@ def in_turn(*tables: Sequence[str]) -> list[Any]:
     return found
 
 
-@pytest.mark.parametrize(("name", "kind", "to"), in_turn([*FATES], KINDS, [*TARGETS]))
+@each(("name", "kind", "to"), in_turn([*FATES], KINDS, [*TARGETS]), one_in=2)
 def test_every_camera_as_every_kind(packed: Pack, name: str, kind: str, to: str) -> None:
     made = packed(name, SOURCE_OF[to])
     summary, messages = made.unpack(to, kind)
@@ -313,8 +314,10 @@ FOXGLOVE_TARGETS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("name", "kind", "source_and_target"), in_turn([*FOXGLOVE_FATES], KINDS, FOXGLOVE_TARGETS)
+@each(
+    ("name", "kind", "source_and_target"),
+    in_turn([*FOXGLOVE_FATES], KINDS, FOXGLOVE_TARGETS),
+    one_in=2,
 )
 def test_foxglove_cameras_as_every_kind(
     packed: Pack, name: str, kind: str, source_and_target: str
@@ -330,8 +333,8 @@ def test_foxglove_cameras_as_every_kind(
     check(made, summary, messages, name, kind, to, fate)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", ["foxglove-raw-mono8", "foxglove-jpeg-rgb", "foxglove-video-h264"])
+@each("kind", KINDS, one_in=2)
+@each("name", ["foxglove-raw-mono8", "foxglove-jpeg-rgb", "foxglove-video-h264"])
 def test_foxglove_cameras_of_ros2(packed: Pack, name: str, kind: str) -> None:
     made = packed(name, "mcap-foxglove-ros2")
     summary, messages = made.unpack("bag", kind)
@@ -398,9 +401,9 @@ ENCODINGS = [
 ]
 
 
-@pytest.mark.parametrize("target", ["bag", "mcap"])
-@pytest.mark.parametrize("kind", ["png", "jpeg"])
-@pytest.mark.parametrize("encoding", ENCODINGS)
+@each("target", ["bag", "mcap"], one_in=4)
+@each("kind", ["png", "jpeg"])
+@each("encoding", ENCODINGS)
 def test_files_of_every_encoding(encoding: str, kind: str, target: str, tmp_path: Path) -> None:
     """A subscriber is given what was recorded, or something that looks like it."""
     made = Packed(tmp_path, scene(encoding, noisy=False, frames=3), "mcap-ros2-none")
@@ -435,7 +438,7 @@ def test_files_of_every_encoding(encoding: str, kind: str, target: str, tmp_path
             assert psnr(file_picture(data), original) > 33
 
 
-@pytest.mark.parametrize(
+@each(
     ("encoding", "kind", "ros1", "ros2"),
     [
         ("rgb8", "jpeg", "rgb8; jpeg compressed bgr8", None),
@@ -460,8 +463,8 @@ def test_formats_are_those_of_the_transport(
         assert {message.value.format for message in found} == {told}
 
 
-@pytest.mark.parametrize("quality", [5, 60, 95])
-@pytest.mark.parametrize("name", ["raw-bgr8", "raw-mono8"])
+@each("quality", [5, 60, 95])
+@each("name", ["raw-bgr8", "raw-mono8"])
 def test_jpeg_quality(packed: Pack, name: str, quality: int) -> None:
     """Files are as good as libjpeg's of that quality, with full chroma."""
     made = packed(name, "mcap-ros2-zstd")
@@ -498,8 +501,8 @@ def test_the_encoding_in_a_format_tells_a_mosaic(extension: str, tmp_path: Path)
 # ---------------------------------------------------------------- files stay as they are
 
 
-@pytest.mark.parametrize("to", ["bag", "mcap"])
-@pytest.mark.parametrize(
+@each("to", ["bag", "mcap"])
+@each(
     ("name", "source", "kind"),
     [
         ("foxglove-jpeg-progressive", "mcap-protobuf", "jpeg"),
@@ -585,8 +588,8 @@ def test_transcoded_jpeg_as_video(packed: Pack) -> None:
 # ---------------------------------------------------------------- video without decoding
 
 
-@pytest.mark.parametrize("codec", ["h264", "h265", "av1"])
-@pytest.mark.parametrize("encoding", ["rgb8", "bayer_rggb8"])
+@each("codec", ["h264", "h265", "av1"])
+@each("encoding", ["rgb8", "bayer_rggb8"])
 def test_lossy_video(encoding: str, codec: str, tmp_path: Path) -> None:
     options = PackOptions(quality="crf=18", codec=codec, gop=3)
     made = Packed(tmp_path, scene(encoding, noisy=False), "bag-none", options)
@@ -623,7 +626,7 @@ def check_stand_alone(codec: str, found: Sequence[Read]) -> None:
     assert all(map(np.array_equal, whole[keys[-1] :], tail))
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "codec"),
     [
         ("ffmpeg-libx264", "h264"),
@@ -815,8 +818,8 @@ CHANGES = [
 ]
 
 
-@pytest.mark.parametrize("source", ["bag-none", "mcap-ros1-zstd", "mcap-ros2-zstd"])
-@pytest.mark.parametrize(("name", "kind"), CHANGES)
+@each("source", ["bag-none", "mcap-ros1-zstd", "mcap-ros2-zstd"])
+@each(("name", "kind"), CHANGES)
 def test_channels_of_ros1(packed: Pack, name: str, kind: str, source: str) -> None:
     made = packed(name, source)
     for to in ("bag", "mcap") if source != "mcap-ros2-zstd" else ("bag",):
@@ -834,8 +837,8 @@ def test_channels_of_ros1(packed: Pack, name: str, kind: str, source: str) -> No
             assert [message.value.header.seq for message in found] == expected
 
 
-@pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-zstd"])
-@pytest.mark.parametrize(("name", "kind"), CHANGES)
+@each("source", ["bag-none", "mcap-ros2-zstd"])
+@each(("name", "kind"), CHANGES)
 def test_channels_of_ros2(packed: Pack, name: str, kind: str, source: str) -> None:
     made = packed(name, source)
     to = "rosbag2" if source == "bag-none" else "mcap"
@@ -941,7 +944,7 @@ def test_stamps_beyond_32_bits_have_no_place_in_ros(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- topics
 
 
-@pytest.mark.parametrize(
+@each(
     ("topic", "type_name", "kind", "expected"),
     [
         ("/cam/image_raw", "sensor_msgs/Image", "jpeg", "/cam/image_raw/compressed"),
@@ -990,7 +993,7 @@ def test_no_topic_is_taken_twice() -> None:
 # ---------------------------------------------------------------- options, errors, command line
 
 
-@pytest.mark.parametrize(
+@each(
     ("to", "options", "problem"),
     [
         ("mcap", {"images": "bmp"}, "--images 'bmp' is not known. Use raw, jpeg, png, compressed"),
@@ -1008,7 +1011,7 @@ def test_options_that_contradict(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "kind"),
     [
         ("raw-mono8", "compressed-video"),
@@ -1020,7 +1023,7 @@ def test_options_that_contradict(
         ("depth-16UC1-png", "png"),
     ],
 )
-@pytest.mark.parametrize("with_sum", [True, False])
+@each("with_sum", [True, False])
 def test_a_damaged_video_is_refused(name: str, kind: str, with_sum: bool, tmp_path: Path) -> None:
     made = Packed(tmp_path, SCENES[name](), "mcap-ros2-zstd")
     (video,) = (tmp_path / "dataset").glob("*.mp4")
@@ -1042,8 +1045,8 @@ def without_sum(sidecar: Path) -> None:
     sidecar.write_text("".join(kept_), "utf-8")
 
 
-@pytest.mark.parametrize("frames", [5, 9])
-@pytest.mark.parametrize("kind", ["compressed-video", "jpeg"])
+@each("frames", [5, 9])
+@each("kind", ["compressed-video", "jpeg"])
 def test_a_video_of_other_frames_is_refused(
     packed: Pack, kind: str, frames: int, tmp_path: Path
 ) -> None:

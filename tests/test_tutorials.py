@@ -25,9 +25,11 @@ from typing import Any
 import pytest
 import typer
 
+from each import each
 from mp4ds.cli import app
 from mp4ds.cli.arguments import spelled
 from test_examples import ROOT
+from waiting import WATCHDOG_S
 
 DOCS = ROOT / "docs"
 PAGES = sorted((DOCS / "tutorials").glob("*.md"))
@@ -82,7 +84,7 @@ def run_command(command: str, folder: Path) -> Done:
         cwd=folder,
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=WATCHDOG_S,
         check=False,
         env={**os.environ, "PATH": f"{bin_folder}:{os.environ['PATH']}"},
     )
@@ -122,7 +124,7 @@ def assert_printed(said: str, printed: str) -> None:
         assert any(due in found for found in lines), f"{line}\n\n{printed}"
 
 
-@pytest.mark.parametrize("page", [*PAGES, DOCS / "exporting.md"], ids=lambda page: page.stem)
+@each("page", [*PAGES, DOCS / "exporting.md"], ids=lambda page: page.stem, one_in=3)
 def test_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     blocks = blocks_of(page)
@@ -184,7 +186,7 @@ def invocations(text: str) -> Iterator[tuple[str, list[str]]]:
                 yield found[1], re.findall(r"(?<![\w-])--?[a-z][a-z0-9-]*", found[2])
 
 
-@pytest.mark.parametrize(
+@each(
     "page",
     [ROOT / "README.md", *sorted(DOCS.rglob("*.md")), *sorted((ROOT / "spec").glob("*.md"))],
     ids=lambda page: str(page.relative_to(ROOT)),

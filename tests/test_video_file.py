@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 import mp4ds
 from conftest import real
+from each import each
 from pictures import CAREFUL, picture
 from sources import SOURCES, scene
 
@@ -80,7 +81,7 @@ def near(one: NDArray[Any], other: NDArray[Any]) -> bool:
     return int(np.abs(one.astype(int) - other).max()) <= 2
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@each("kind", KINDS)
 def test_frames_of_every_kind(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "a walk.mp4"
     write_video(path, kind)
@@ -137,10 +138,12 @@ def test_names(suffix: str, tmp_path: Path) -> None:
         assert dataset["clip"].stamps[0] == 0
 
 
-@pytest.mark.parametrize("name", ["sam2_02_cups.mp4", "var_fps_video.mp4", "h264_10bits.mp4",
-                                  "lerobot_aloha_insertion_human_yuv444.mp4"])  # fmt: skip
+VIDEOS = ["sam2_02_cups", "var_fps_video", "h264_10bits", "lerobot_aloha_insertion_human_yuv444"]
+
+
+@each("name", VIDEOS, one_in=2)
 def test_real_videos(name: str) -> None:
-    path = real("video") / name
+    path = real("video") / f"{name}.mp4"
     times, pixels = decoded(path)
     with mp4ds.open(path) as dataset:
         video = dataset[path.stem]
