@@ -480,8 +480,6 @@ def test_a_topic_that_changes_its_size(variant: str, tmp_path: Path) -> None:
     with mp4ds.open(packed(tmp_path, odd_scene("size-change"), variant)) as dataset:
         assert dataset.topics == ["/odd/image"]
         assert len(dataset.streams) == 2
-        with pytest.raises(mp4ds.OptionError, match="odd_image, odd_image-2"):
-            dataset["/odd/image"]
         large, small = dataset["odd_image"], dataset["odd_image-2"]
         assert [len(large), len(small)] == [4, 4]
         assert large[0].data.shape == (24, 32)
@@ -489,15 +487,70 @@ def test_a_topic_that_changes_its_size(variant: str, tmp_path: Path) -> None:
         assert large.topic == small.topic == "/odd/image"
         assert max(large.stamps) < min(small.stamps)
 
+        whole = dataset["/odd/image"]
+        assert isinstance(whole, mp4ds.TopicFrames)
+        assert whole is dataset["/odd/image"]
+        assert whole.encoding == "mono8", "all have it in common"
+        for name in ("image_size", "shape"):
+            with pytest.raises(mp4ds.OptionError, match=r"32x24 mono8, 32x12 mono8.*odd_image-2"):
+                getattr(whole, name)
+        with pytest.raises(mp4ds.OptionError, match=r"resize=\(width, height\)"):
+            whole.read([0, 1])
+        with pytest.raises(mp4ds.OptionError, match="changes its size"):
+            whole.read([0, 5], resize=0.5)
+        with pytest.raises(mp4ds.OptionError, match="32x12 of /odd/image"):
+            whole.get([6], crop=(0, 0, 32, 24))
+        halves = whole.get([0, 7], resize=0.5)
+        assert [frame.data.shape for frame in halves] == [(12, 16), (6, 16)]
+        assert [frame.data.shape for frame in whole.get([0], crop=(0, 0, 32, 24))] == [(24, 32)]
 
-def test_a_topic_that_changes_its_encoding(tmp_path: Path) -> None:
-    with mp4ds.open(packed(tmp_path, odd_scene("encoding-change"))) as dataset:
-        found = {stream.sidecar.image.encoding: stream for stream in dataset.streams}
-        assert {name: len(stream) for name, stream in found.items()} == {
-            "mono8": 6,
-            "bayer_rggb8": 2,
-        }
-        assert found["bayer_rggb8"].stamps.tolist() == [START + n * PERIOD for n in (2, 5)]
+        out = np.empty((3, 6, 8, 3), np.uint8)
+        assert whole.read([7, 0, 7], resize=(8, 6), out=out) is out
+        expected = [small.read([3], resize=(8, 6))[0], large.read([0], resize=(8, 6))[0]]
+        assert np.array_equal(out, [expected[0], expected[1], expected[0]])
+
+
+@each("publishers", [1, 2])
+def test_frames_of_a_topic_that_changes_come_as_recorded(publishers: int, tmp_path: Path) -> None:
+    """In all ways of asking; of one publisher where the times do not tell the order."""
+    messages = [
+        replace(record, publisher=number // 2 % publishers)
+        if publishers > 1
+        else replace(record, log_time=START)
+        for number, record in enumerate(odd_scene("encoding-change").messages)
+    ]
+    recorded = [record.ros1 or b"" for record in messages if record.topic == "/odd/image"]
+    encodings = ["bayer_rggb8" if number % 3 == 2 else "mono8" for number in range(8)]
+    with mp4ds.open(packed(tmp_path, Scene(messages))) as dataset:
+        found = {stream.encoding: 0 for stream in dataset.streams}
+        for stream in dataset.streams:
+            found[stream.encoding] += len(stream)
+        assert found == {"mono8": 6, "bayer_rggb8": 2}
+        whole = dataset["/odd/image"]
+        stamps = [START + number * PERIOD for number in range(8)]
+        assert whole.stamps.tolist() == stamps
+        every = list(whole)
+        for frame, payload in zip(every, recorded, strict=True):
+            assert payload.endswith(frame.data.tobytes())
+        assert [frame.encoding for frame in every] == encodings
+        assert [frame.index for frame in every] == list(range(8))
+
+        asked = [5, 0, -1, 5, 2]
+        for frame, number in zip(whole.get(asked), asked, strict=True):
+            assert (frame.index, frame.stamp_ns) == (number % 8, stamps[number])
+            assert np.array_equal(frame.data, every[number].data)
+        some = list(whole.between(stamps[1], stamps[6], format="gray"))
+        assert [frame.stamp_ns for frame in some] == stamps[1:6]
+        assert {frame.encoding for frame in some} == {"mono8"}
+        assert whole.at(stamps[2] + 1).index == 2
+        assert [frame.frame_id for frame in every] == [whole[n].frame_id for n in range(8)]
+
+        assert (whole.image_size, len(whole)) == ((32, 24), 8)
+        grey = whole.read(range(8), format="gray")
+        assert all(np.array_equal(grey[n], every[n].data) for n in (0, 1, 3, 4, 6, 7))
+        for ask in (lambda: whole.encoding, lambda: whole.read([0], format="native")):
+            with pytest.raises(mp4ds.OptionError, match="mono8, 32x24 bayer_rggb8"):
+                ask()
 
 
 def test_frame_ids_that_change(tmp_path: Path) -> None:

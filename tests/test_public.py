@@ -48,6 +48,7 @@ NAMES = [
     "Sync",
     "TargetError",
     "TargetExistsError",
+    "TopicFrames",
     "UnpackOptions",
     "UnpackSummary",
     "VersionError",

@@ -18,7 +18,7 @@ from mp4ds.errors import FrameNotFoundError, OptionError, TargetExistsError
 from mp4ds.report.looks import Look
 from mp4ds.report.stills import StillOptions, frames, number_at, parse_sheet, spread, time_of
 from report_scenes import COLOUR, DEPTH, FRAMES, HEIGHT, WIDTH, blocks, pack_cameras, two_cameras
-from sources import COMMON, ENCODINGS, scene
+from sources import COMMON, ENCODINGS, odd_scene, scene
 
 START = 1_700_000_000_123_456_789
 
@@ -94,6 +94,17 @@ def test_a_frame_is_saved_as_it_is(drive: Path, tmp_path: Path) -> None:
     assert (saved.index, saved.stamp_ns) == (frame.index, frame.stamp_ns)
     assert saved.log_time_ns == frame.log_time_ns
     assert summary.size == (WIDTH, HEIGHT)
+
+
+def test_a_frame_of_a_topic_that_changes_its_size(tmp_path: Path) -> None:
+    dataset = pack_cameras(tmp_path, odd_scene("size-change"), quality="lossless")
+    summary = frames(dataset, tmp_path / "out.png", StillOptions(at="#5"))
+    with mp4ds.open(dataset) as opened:
+        whole = opened["/odd/image"]
+        assert summary.frames[0].stamp_ns == whole.stamps[5]
+        assert np.array_equal(read(tmp_path / "out.png")[..., 0], whole[5].data)
+    with pytest.raises(OptionError, match="odd_image, odd_image-2"):
+        frames(dataset, tmp_path / "sheet.png", StillOptions(sheet=(2, 2)))
 
 
 SOME = {*COMMON, "rgb16", "yuyv", "8UC2", "32FC1", "bgra8", "bayer_gbrg16"}

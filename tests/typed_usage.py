@@ -139,6 +139,10 @@ def batches(path: str) -> NDArray[Any]:
             found: mp4ds.RecordedMessage = message
             use(found.topic, found.type_name, found.log_time_ns - found.publish_time_ns)
             use(found.decoded.angular_velocity, len(found.raw))
+        for whole in (dataset[topic] for topic in dataset.topics):
+            if isinstance(whole, mp4ds.TopicFrames):
+                parts: list[mp4ds.Stream] = whole.streams
+                use(parts, whole.read([0, -1], resize=(32, 24)))
         videos: list[mp4ds.Video] = dataset.videos
         use([video.topic for video in videos])
         return out

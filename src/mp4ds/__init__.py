@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from mp4ds.checks import Problem, validate
-    from mp4ds.dataset import Dataset, Frame, Frames, Stream, Video
+    from mp4ds.dataset import Dataset
     from mp4ds.dataset import open_dataset as open
     from mp4ds.errors import (
         ClusterError,
@@ -59,12 +59,13 @@ if TYPE_CHECKING:
     )
     from mp4ds.playing import PlayOptions, PlaySummary, play
     from mp4ds.recorded import RecordedMessage
+    from mp4ds.streams import Frame, Frames, Stream, TopicFrames, Video
     from mp4ds.sync import Sync
     from mp4ds.unpacking import UnpackOptions, UnpackSummary, unpack
 
 _HOMES = {
     "checks": ("Problem", "validate"),
-    "dataset": ("Dataset", "Frame", "Frames", "Stream", "Video"),
+    "dataset": ("Dataset",),
     "errors": (
         "ClusterError",
         "ConversionError",
@@ -89,6 +90,7 @@ _HOMES = {
     "exporting": ("ExportOptions", "ExportSummary", "export"),
     "playing": ("PlayOptions", "PlaySummary", "play"),
     "recorded": ("RecordedMessage",),
+    "streams": ("Frame", "Frames", "Stream", "TopicFrames", "Video"),
     "sync": ("Sync",),
     "unpacking": ("UnpackOptions", "UnpackSummary", "unpack"),
 }
@@ -123,6 +125,7 @@ __all__ = [
     "Sync",
     "TargetError",
     "TargetExistsError",
+    "TopicFrames",
     "UnpackOptions",
     "UnpackSummary",
     "VersionError",

@@ -29,11 +29,11 @@ from mp4ds.recorded import MessagesFile, RecordedMessage, as_recorded
 from mp4ds.records import Channel, Excerpt, Message, Record, Schema
 from mp4ds.remote import location
 from mp4ds.sidecar import MANIFEST_NAME, MESSAGES_NAME, Manifest, load_manifest
-from mp4ds.streams import Frame, Frames, Stream, Video
+from mp4ds.streams import Stream, TopicFrames, Video
 from mp4ds.streams.choices import Choice, everything, last_of, since
 from mp4ds.sync import Sync, synchronize
 
-__all__ = ["Dataset", "Frame", "Frames", "ImageChannel", "Stream", "Video", "open_dataset"]
+__all__ = ["Dataset", "ImageChannel", "Stream", "Video", "open_dataset"]
 
 _VIDEOS = (".mp4", ".m4v", ".mov")
 
@@ -41,9 +41,10 @@ _VIDEOS = (".mp4", ".m4v", ".mov")
 class Dataset:
     """A folder that `mp4ds pack` made, or one video with its sidecar.
 
-    ``dataset["/topic"]`` is a topic's stream, ``"/topic" in dataset`` tells whether there is
-    one, and iteration gives all streams. Where a topic changes its size or encoding and so has
-    several, each is found by its file's name without ending.
+    ``dataset["/topic"]`` has a topic's frames, ``"/topic" in dataset`` tells whether it has any,
+    and iteration gives all streams. Where a topic changes its size or encoding and so has several
+    streams, ``dataset["/topic"]`` is a `TopicFrames`: the frames of all of them in the order of
+    recording. Each stream is also found by its file's name without ending.
 
     Attributes:
         path: The folder, or the video or sidecar.
@@ -97,24 +98,27 @@ class Dataset:
 
     @property
     def topics(self) -> list[str]:
-        """Topics that have a stream."""
+        """Topics that have frames."""
         return list(dict.fromkeys(stream.topic for stream in self._all))
 
+    @cached_property
+    def _by_name(self) -> dict[str, Stream]:
+        """The frames of each topic, and the streams by the names of their files."""
+        found = {stream.path.stem: stream for stream in self._all}
+        for topic in self.topics:
+            streams = [stream for stream in self._all if stream.topic == topic]
+            whole = TopicFrames(streams) if len(streams) > 1 else streams[0]
+            found[topic] = cast(Stream, whole)  # as `_all` does
+        return found
+
     def __getitem__(self, topic: str) -> Stream:
-        found = [stream for stream in self._all if topic in (stream.topic, stream.path.stem)]
-        if not found:
+        if topic not in self._by_name:
             known = ", ".join(self.topics) or "none"
             raise KeyError(f"{self.path} has no stream {topic!r}; there are: {known}")
-        if len(found) > 1:
-            stems = ", ".join(stream.path.stem for stream in found)
-            raise OptionError(
-                f"{topic} changes its size or encoding and has {len(found)} streams; "
-                f"choose one of {stems}"
-            )
-        return found[0]
+        return self._by_name[topic]
 
     def __contains__(self, topic: object) -> bool:
-        return any(topic in (stream.topic, stream.path.stem) for stream in self._all)
+        return topic in self._by_name
 
     def __iter__(self) -> Iterator[Stream]:
         return iter(self._all)
@@ -228,19 +232,19 @@ class Dataset:
         """Frames of several topics that were taken at the same time, by their header stamps.
 
         Args:
-            topics: Topics, or names of streams; None: all streams.
+            topics: Topics, or names of streams; None: all topics. Numbers of frames are those of
+                ``dataset[topic]``.
             tolerance_ns: Most nanoseconds between a frame and that of the reference.
             reference: One of the topics, with whose frames those of the others are matched;
                 None: the one with the fewest frames, of several the first.
 
         Raises:
-            OptionError: There is no such topic, or one has several streams, or the tolerance is
-                negative.
+            OptionError: There is no such topic, or the tolerance is negative.
         """
         if isinstance(topics, str):
             raise OptionError(f"topics is a list of topics, such as [{topics!r}]")
         if topics is None:
-            topics = [self._name(stream) for stream in self._all]
+            topics = self.topics
         try:
             stamps = {topic: self[topic].stamps for topic in topics}
         except KeyError as error:
@@ -248,11 +252,6 @@ class Dataset:
         if len(stamps) < len(topics):
             raise OptionError(f"a topic stands twice among {', '.join(topics)}")
         return synchronize(stamps, tolerance_ns=tolerance_ns, reference=reference)
-
-    def _name(self, stream: Stream) -> str:
-        """What gives just this stream: its topic, or the name of its file."""
-        alike = sum(stream.topic in (other.topic, other.path.stem) for other in self._all)
-        return stream.topic if alike == 1 else stream.path.stem
 
     def records(
         self,

@@ -16,7 +16,7 @@ from mp4ds.layouts import ENCODINGS, Pixels
 from mp4ds.outputs import staged
 from mp4ds.owned import begins_with
 from mp4ds.report.looks import Look
-from mp4ds.streams import Stream
+from mp4ds.streams import Stream, TopicFrames
 from mp4ds.streams.views import Resize, size_after
 from mp4ds.video import ImageFile, encoding_as
 from mp4ds.video.sheets import Page
@@ -123,7 +123,10 @@ def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> St
             pixels, encoding = _sheet(stream, numbers, options.sheet, options.resize), "rgb8"
         else:
             numbers = [number_at(stream, options.at or "")]
-            pixels, encoding = _still(stream, numbers[0], kind, options)
+            source = (stream, numbers[0])
+            if isinstance(stream, TopicFrames):
+                source = stream.place_of(numbers[0])
+            pixels, encoding = _still(*source, kind, options)
         data = ImageFile(encoding, kind, quality=_QUALITY).encode(pixels)
         with staged(
             target.absolute(),
@@ -152,10 +155,10 @@ def _chosen(dataset: Dataset, topic: str) -> Stream:
             return dataset[topic]
         except KeyError as error:
             raise OptionError(f"{error.args[0]}.") from None
-    if len(dataset.streams) != 1:
+    if len(dataset.topics) != 1:
         known = ", ".join(dataset.topics) or "none"
         raise OptionError(f"{dataset.path} has several cameras or none: give --topic of {known}.")
-    return dataset.streams[0]
+    return dataset[dataset.topics[0]]
 
 
 # ---------------------------------------------------------------- which

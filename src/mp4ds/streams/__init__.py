@@ -13,6 +13,7 @@ from mp4ds.streams.planning import needs_trial, plan_from_values, plan_to_values
 from mp4ds.streams.reader import Stream
 from mp4ds.streams.rebuild import CameraInfoRebuilder
 from mp4ds.streams.target import OutOfReachError, TargetPlan
+from mp4ds.streams.topic_frames import TopicFrames
 from mp4ds.streams.tracks import PicturePlan, StreamSettings, TrackPlan
 from mp4ds.streams.video_file import Video
 from mp4ds.streams.writer import StreamWriter
@@ -35,6 +36,7 @@ __all__ = [
     "StreamSettings",
     "StreamWriter",
     "TargetPlan",
+    "TopicFrames",
     "TrackPlan",
     "Unsuited",
     "Video",

@@ -17,12 +17,12 @@ from mp4ds.records import Channel, Message
 from mp4ds.sidecar import Calibration, StreamSidecar, load_stream
 from mp4ds.streams.bodies import MessageRebuilder
 from mp4ds.streams.choices import Choice, everything, unbroken
-from mp4ds.streams.frames import Frames
+from mp4ds.streams.decoded import DecodedFrames
 from mp4ds.streams.rebuild import CameraInfoRebuilder, DecodedColumns, message_at
 from mp4ds.video import FrameReader, PacketReader, VideoDecoder, open_frames
 
 
-class Stream(Frames):
+class Stream(DecodedFrames):
     """One camera topic (of one geometry), as a sequence of frames. See `Frames`.
 
     Args:
@@ -144,7 +144,7 @@ class Stream(Frames):
         return self.sidecar.frames
 
     def pictures_of(self, indices: Sequence[int]) -> Iterator[tuple[int, Picture]]:
-        """See `Frames.pictures_of`."""
+        """See `DecodedFrames.pictures_of`."""
         if not len(indices):
             return iter(())
         if self._reader is None:

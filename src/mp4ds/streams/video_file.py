@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from mp4ds.layouts import Picture, Pixels
 from mp4ds.sidecar import Calibration
-from mp4ds.streams.frames import Frames
+from mp4ds.streams.decoded import DecodedFrames
 from mp4ds.video import FrameReader, VideoFile, open_file_frames
 
 
-class Video(Frames):
+class Video(DecodedFrames):
     """The frames of an mp4 that has no sidecar. See `Frames`.
 
     Its topic is the file's name without ending. Frames are ``rgb8``, as the video's colours are
@@ -80,7 +80,7 @@ class Video(Frames):
         return len(self._times)
 
     def pictures_of(self, indices: Sequence[int]) -> Iterator[tuple[int, Picture]]:
-        """See `Frames.pictures_of`."""
+        """See `DecodedFrames.pictures_of`."""
         if self._reader is None:
             self._reader = self._open_reader()
         return self._reader.pictures_of(indices)
