@@ -28,14 +28,16 @@ from mp4ds.sidecar import (
     MANIFEST_NAME,
     MESSAGES_NAME,
     Manifest,
+    StreamEntry,
     StreamSidecar,
     load_document,
     schema_text,
 )
-from mp4ds.sidecar.io import model_for, model_problems
+from mp4ds.sidecar.io import model_problems
 from mp4ds.streams.facts import wrong_facts
 
 _Checked = TypeVar("_Checked")
+_Model = TypeVar("_Model", StreamSidecar, Manifest)
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,8 @@ def _problems(path: Path, deep: bool, report: Callable[[str], None]) -> list[Pro
             "is neither a dataset, a sidecar nor a video of one",
             "Give a dataset folder, a .yaml sidecar, or an .mp4 beside its sidecar.",
         )
-    return _validate_file(sidecar, "stream") or _validate_stream(sidecar, deep, report)
+    _, problems = _read(sidecar, "stream", StreamSidecar)
+    return problems or _validate_stream(sidecar, deep, report)
 
 
 def _datasets_in(folder: Path) -> list[Path]:
@@ -114,29 +117,28 @@ def _datasets_in(folder: Path) -> list[Path]:
     return found
 
 
-def _validate_file(path: Path, kind: str) -> list[Problem]:
-    """Tiers schema and model of one YAML file."""
+def _read(path: Path, kind: str, model: type[_Model]) -> tuple[_Model | None, list[Problem]]:
+    """Tiers schema and model of one YAML file; there is no model where there is a problem."""
     try:
         document = load_document(path)
     except FormatError as error:
-        return [Problem(error.code, error.place, error.problem)]
+        return None, [Problem(error.code, error.place, error.problem)]
     if document["kind"] != kind:
-        return [Problem("kind-unknown", str(path), f"is no {kind}")]
+        return None, [Problem("kind-unknown", str(path), f"is no {kind}")]
     problems = [
         Problem("schema-invalid", f"{path} at {'.'.join(map(str, error.absolute_path))}", reason)
         for error in _schema_validator(kind).iter_errors(document)
         for reason in [_shortened(error.message)]
     ]
     if problems:
-        return problems
+        return None, problems
     try:
-        model_for(document).model_validate(document)
+        return model.model_validate(document), []
     except ValidationError as error:
-        return [
+        return None, [
             Problem("model-invalid", f"{path} at {place}", reason)
             for place, reason in model_problems(error)
         ]
-    return []
 
 
 def _shortened(text: str) -> str:
@@ -151,19 +153,16 @@ def _schema_validator(kind: str) -> Any:
 
 
 def _validate_dataset(folder: Path, deep: bool, report: Callable[[str], None]) -> list[Problem]:
-    problems = _validate_file(folder / MANIFEST_NAME, "dataset")
-    if problems:
+    manifest, problems = _read(folder / MANIFEST_NAME, "dataset", Manifest)
+    if manifest is None:
         return problems
-    manifest = Manifest.model_validate(load_document(folder / MANIFEST_NAME))
     problems = list(_check_files(folder, manifest, deep, report))
     for entry in manifest.streams:
-        sidecar_problems = _validate_file(folder / entry.sidecar, "stream")
-        if not sidecar_problems:
-            sidecar_problems = [
-                *_check_entry(folder, manifest, entry.sidecar),
-                *_validate_stream(folder / entry.sidecar, deep, report),
-            ]
-        problems += sidecar_problems
+        sidecar, found = _read(folder / entry.sidecar, "stream", StreamSidecar)
+        problems += found
+        if sidecar is not None:
+            problems += _check_entry(folder, entry, sidecar)
+            problems += _validate_stream(folder / entry.sidecar, deep, report)
     problems += _check_listed(folder, manifest)
     if not problems:
         problems += _check_messages(folder, manifest, deep, report)
@@ -211,10 +210,8 @@ def _check_listed(folder: Path, manifest: Manifest) -> Iterator[Problem]:
             yield Problem("file-unlisted", str(path), "is not listed in the manifest")
 
 
-def _check_entry(folder: Path, manifest: Manifest, name: str) -> Iterator[Problem]:
+def _check_entry(folder: Path, entry: StreamEntry, sidecar: StreamSidecar) -> Iterator[Problem]:
     """A sidecar says the same as the manifest."""
-    sidecar = StreamSidecar.model_validate(load_document(folder / name))
-    entry = next(entry for entry in manifest.streams if entry.sidecar == name)
     for what, own, listed in (
         ("topic", sidecar.channel.topic, entry.topic),
         ("video", sidecar.video.file, entry.video),
@@ -224,7 +221,7 @@ def _check_entry(folder: Path, manifest: Manifest, name: str) -> Iterator[Proble
             yield Problem(
                 "manifest-inconsistent",
                 str(folder / MANIFEST_NAME),
-                f"says {what} {listed} for {name}, which says {own}",
+                f"says {what} {listed} for {entry.sidecar}, which says {own}",
             )
 
 
