@@ -339,6 +339,7 @@ QUALITIES: dict[str, dict[str, Any]] = {
 @each(
     ("quality", "encoding"),
     share([(quality, name) for name in ENCODINGS for quality in QUALITIES], len(QUALITIES)),
+    one_in=2,
 )
 def test_raw_images_in_a_lossy_profile(
     quality: str, encoding: str, tmp_path: Path, compare: Compare

@@ -265,6 +265,7 @@ def test_workers_may_come_late(tmp_path: Path) -> None:
         timer.join()
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_was_lost_between_two_runs(tmp_path: Path) -> None:
     with (
         RealCluster(tmp_path / "dask", workers=1) as cluster,

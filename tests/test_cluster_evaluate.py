@@ -128,6 +128,7 @@ def test_it_finds_the_same(
     assert facts(again) == expected
 
 
+@pytest.mark.slow
 def test_what_one_machine_began_a_cluster_ends(
     cluster: RealCluster, bag: Path, expected: dict[str, Any], tmp_path: Path
 ) -> None:

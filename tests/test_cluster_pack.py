@@ -163,6 +163,7 @@ def test_a_command_that_ended_leaves_the_cluster_idle(
     assert facts(tmp_path / "dataset") == expected
 
 
+@pytest.mark.slow
 def test_workers_of_another_version_are_refused(source: Path, tmp_path: Path) -> None:
     (tmp_path / "sitecustomize.py").write_text(OTHER_VERSION)
     with (

@@ -248,7 +248,7 @@ def failing_open(
         yield
 
 
-@pytest.mark.parametrize("size", ["300k", "1400k"])
+@pytest.mark.parametrize("size", [pytest.param("300k", marks=pytest.mark.slow), "1400k"])
 def test_the_real_command_on_a_full_disk(size: str, tmp_path: Path, compare: Compare) -> None:
     (tmp_path / "source").mkdir()
     bag = tmp_path / "source" / "drive.bag"

@@ -558,7 +558,7 @@ def middle_times(dataset: Path) -> list[float]:
 
 
 @pytest.mark.browser
-@each("name", PLAYED)
+@each("name", PLAYED, one_in=2)
 def test_a_browser_plays_it(name: str, played: dict[str, Any], datasets: dict[str, Path]) -> None:
     assert name in played, "the browser did not come to this video in time"
     result = played[name]

@@ -1048,7 +1048,7 @@ def test_events_of_a_pack_in_one_go(drives: list[Path], tmp_path: Path) -> None:
     assert found[-2]["tasks_total"] == 0
 
 
-@pytest.mark.parametrize("term", ["xterm", "dumb"])
+@pytest.mark.parametrize("term", ["xterm", pytest.param("dumb", marks=pytest.mark.slow)])
 def test_the_command_on_a_terminal(
     term: str, drives: list[Path], tmp_path: Path, terminal: tuple[int, Any]
 ) -> None:

@@ -31,7 +31,9 @@ steady = settings(
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
-BOTH = pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-none"])
+BOTH = pytest.mark.parametrize(
+    "source", ["bag-none", pytest.param("mcap-ros2-none", marks=pytest.mark.slow)]
+)
 
 # text that UTF-8 can hold; ROS 1 counts its bytes, CDR ends it with one of zero
 Texts = st.sampled_from(["cam", "", "/cam/optical"]) | st.text(

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 import mp4ds
 from chromium import Tab, chromium
 from conftest import real
+from each import each
 from mp4ds.intervals import intervals, lost_frames
 from mp4ds.report import ReportOptions, report
 from mp4ds.report.looks import Look
@@ -260,7 +261,7 @@ REAL = {
 }
 
 
-@pytest.mark.parametrize("name", REAL)
+@each("name", REAL, one_in=3)
 def test_every_frame_of_real_recordings(name: str, browser: Tab, tmp_path: Path) -> None:
     mp4ds.pack(real(name), tmp_path / "real")
     summary = report(tmp_path / "real")

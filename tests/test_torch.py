@@ -644,6 +644,7 @@ def test_epochs_differ_and_repeat(drives: list[Path]) -> None:
     assert sorted(mixed) == sorted(order(0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("workers", "method", "ranks"), [(0, None, 3), (2, "fork", 2), (1, "spawn", 1)]
 )
@@ -744,6 +745,7 @@ def test_torchcodec_refuses_what_it_would_show_wrongly(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- example and tutorial
 
 
+@pytest.mark.slow
 def test_the_example_learns(drives: list[Path]) -> None:
     out = run(sys.executable, str(ROOT / "examples/train.py"), str(drives[0]), "3", cwd=ROOT)
     errors = [float(line.split("error ")[1].split(",")[0]) for line in out.splitlines()[1:]]
