@@ -34,7 +34,7 @@ from each import each
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.cli import app
 from mp4ds.errors import SourceError
-from mp4ds.importing import times
+from mp4ds.importing import ImageFolder, open_images, times
 from mp4ds.importing.calibration import ros_calibration
 from mp4ds.importing.geometry import quaternion
 from mp4ds.sidecar import load_manifest
@@ -299,6 +299,66 @@ def test_times_of_plain_folders(case: str, tmp_path: Path) -> None:
         for frame, pixels in zip(stream, pictures, strict=True):
             assert (frame.encoding, frame.frame_id) == ("mono8", "camera")
             assert np.array_equal(frame.data, pixels)
+
+
+@each(
+    ("names", "cameras"),
+    [
+        (("color_{}.jpg", "depth_{}.png"), ["/color/image_raw/compressed", "/depth/image_raw"]),
+        (("frame-{:06}.depth.png", "frame-{:06}.rgb.png"), ["/depth/image_raw", "/rgb/image_raw"]),
+        (("{}.jpg", "{}.png"), ["/jpg/image_raw/compressed", "/png/image_raw"]),
+        (("cam0_{}.png", "cam1_{}.png"), ["/cam0/image_raw", "/cam1/image_raw"]),
+        (("{}.png", "{}_mask.png"), ["/camera/image_raw", "/mask/image_raw"]),
+    ],
+)
+def test_a_rate_is_that_of_each_camera(
+    names: tuple[str, str], cameras: list[str], tmp_path: Path
+) -> None:
+    for number in range(8, 11):
+        for name in names:
+            save(tmp_path / name.format(number), image(number, 3 if name.endswith("jpg") else 1))
+    with open_images(tmp_path, ImageFolder(rate="30")) as reader:
+        times = reader.times()
+        found = {channel.topic: times[channel.id].tolist() for channel in reader.channels}
+    assert found == {topic: [0, 33333333, 66666667] for topic in cameras}
+
+
+@each(
+    "names",
+    [
+        ["a.png", "b.png", "c.png"],
+        ["img_1.png", "img_2.png", "dsc_3.png", "dsc_4.png"],
+        ["1.jpg", "2.jpg", "3.png", "4.png"],
+        [f"{number:04x}.png" for number in range(32)],
+        ["cam1.png", "cam2.png", "cam3.png"],
+        ["large_1.png", "large_2.png", "small_3.png", "small_4.png"],
+    ],
+)
+def test_a_rate_is_that_of_one_camera(names: list[str], tmp_path: Path) -> None:
+    for name in names:
+        pixels = image(1, 3 if name.endswith("jpg") else 1)
+        save(tmp_path / name, pixels[:8] if "small" in name else pixels)
+    with open_images(tmp_path, ImageFolder(rate="30")) as reader:
+        assert sum(map(len, reader.times().values())) == len(names)
+        assert len(set(np.concatenate(list(reader.times().values())).tolist())) == len(names)
+
+
+@each(
+    ("names", "options", "words"),
+    [
+        (["color_1.png", "color_2.png", "depth_1.png", "depth_3.png"], [], "not the same numbers"),
+        (["1.png", "2_deep.png", "3.png", "4_deep.png"], [], "--stamps FILE"),
+        (["1.png", "deep1.png", "2.png", "deep2.png"], ["--encoding", "16UC1"], "camera, deep"),
+    ],
+)
+def test_images_whose_times_no_rate_tells(
+    names: list[str], options: list[str], words: str, tmp_path: Path
+) -> None:
+    for name in names:
+        save(tmp_path / "in" / name, image(1, dtype="u2" if "deep" in name else "u1"))
+    arguments = ("import", "images", tmp_path / "in", "--rate", 5, "-o", tmp_path / "ds")
+    refused(run(*arguments, *options), words)
+    assert not (tmp_path / "ds").exists()
 
 
 def test_a_plain_folder_round_trip(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ class ImageFolder:
     Attributes:
         layout: ``euroc``, ``kitti``, ``tum`` or ``plain``; None: the one that the folder has.
         stamps: Of plain folders, the file with the times of the images.
-        rate: Of plain folders without times, images per second, such as ``20`` or ``30000/1001``.
+        rate: Of plain folders without times, images per second, such as ``20`` or ``30000/1001``;
+            of each camera, where the names tell several.
         unit: Of times that are whole numbers: ``s``, ``ms``, ``us`` or ``ns``; None: nanoseconds,
             if they have enough digits to be.
         calibration: A YAML file of ROS's camera_calibration, for all cameras of a folder that

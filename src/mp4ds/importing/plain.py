@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.errors import OptionError, SourceError
+from mp4ds.importing.kinds import by_camera
 from mp4ds.importing.options import ImageFolder
 from mp4ds.importing.scene import (
     Camera,
@@ -41,7 +42,7 @@ def _in_order(path: Path) -> tuple[list[tuple[int, str]], str]:
 
 
 def find_plain(folder: Path, options: ImageFolder) -> Scene:
-    """The images of a folder, as those of one camera.
+    """The images of a folder: of one camera, or of several where a rate tells their times.
 
     Raises:
         SourceError: There are none, or nothing tells their times.
@@ -53,16 +54,15 @@ def find_plain(folder: Path, options: ImageFolder) -> Scene:
     images = images_in(folder)
     if not images:
         raise SourceError(folder, "holds no images" + _elsewhere(folder))
-    if options.stamps:
-        files, stamps = _by_list(scene, images, Path(options.stamps), options.unit)
-    elif options.rate:
+    if options.rate:
+        scene.cameras += _by_rate(folder, images, options)
         files = images
-        try:
-            stamps = at_rate(len(files), options.rate)
-        except NoTimeError as error:
-            raise OptionError(f"--rate: {error}") from None
     else:
-        files, stamps = images, _by_name(scene, images, options.unit)
+        if options.stamps:
+            files, stamps = _by_list(scene, images, Path(options.stamps), options.unit)
+        else:
+            files, stamps = images, _by_name(scene, images, options.unit)
+        scene.cameras.append(_camera("", files, stamps, options))
     if unused := len(images) - len(set(files)):
         scene.skipped["images without a time"] = unused
     read = {Path(path).resolve() for path in (options.stamps, options.calibration) if path}
@@ -70,16 +70,38 @@ def find_plain(folder: Path, options: ImageFolder) -> Scene:
     others = [path for path in others if path.suffix.lower() not in STILL_SUFFIXES]
     if others:
         scene.skipped[f"files in {folder.resolve().name} that are no images"] = len(others)
-    camera = Camera(
-        options.topic or _TOPIC,
-        options.frame_id if options.frame_id is not None else _FRAME,
+    scene.files.append(folder)
+    return scene
+
+
+def _camera(
+    name: str, files: list[Path], stamps: NDArray[np.int64], options: ImageFolder
+) -> Camera:
+    return Camera(
+        options.topic or (f"/{name}/image_raw" if name else _TOPIC),
+        options.frame_id if options.frame_id is not None else name or _FRAME,
         files,
         stamps,
         encoding=options.encoding,
     )
-    scene.cameras.append(camera)
-    scene.files.append(folder)
-    return scene
+
+
+def _by_rate(folder: Path, images: list[Path], options: ImageFolder) -> list[Camera]:
+    """The cameras whose images are in a folder, all from the same time on."""
+    found = by_camera(folder, images)
+    given = [key for key in ("topic", "frame_id", "encoding") if getattr(options, key) is not None]
+    if len(found) > 1 and given:
+        raise OptionError(
+            f"--{given[0].replace('_', '-')} is for the images of one camera, and {folder} holds "
+            f"those of {', '.join(found)}. Put each into a folder of its own."
+        )
+    try:
+        return [
+            _camera(name, files, at_rate(len(files), options.rate or ""), options)
+            for name, files in found.items()
+        ]
+    except NoTimeError as error:
+        raise OptionError(f"--rate: {error}") from None
 
 
 def _elsewhere(folder: Path) -> str:

@@ -68,6 +68,19 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         SourceError: It is no image.
     """
+    return _header(path)[:2]
+
+
+def image_kind(path: Path) -> str:
+    """Size and kind of pixels of an image file, in words, by its header.
+
+    Raises:
+        SourceError: It is no image.
+    """
+    return "{}x{} {}".format(*_header(path))
+
+
+def _header(path: Path) -> tuple[int, int, str]:
     from PIL import Image
 
     try:
@@ -75,7 +88,7 @@ def image_size(path: Path) -> tuple[int, int]:
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path, formats=STILL_FORMATS) as image:
                 width, height = image.size
-                return int(width), int(height)
+                return int(width), int(height), _ENCODINGS.get(image.mode, image.mode)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         reason = getattr(error, "strerror", None) or error
         raise SourceError(path, f"cannot be read as an image: {reason}") from None
