@@ -389,6 +389,9 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
     refuse(path, "git lfs pull")
     path.write_bytes(b"#ROSBAG V2.0\n" + bytes(5000))
     refuse(path, "is not an MCAP file")
+    for magic in (b"\x89MCAP0\n", b"\x89MCAP0\r\r\n"):
+        path.write_bytes(magic + bytes(5000))
+        refuse(path, "line ends were converted.* --salvage")
     refuse(tmp_path, "cannot be read")
 
 

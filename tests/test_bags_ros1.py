@@ -395,7 +395,7 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
     for data, problem in (
         (b"", "is empty"),
         (b"not a bag at all", "is not a ROS 1 bag"),
-        (b"#ROSBAG V2.0\r\n", "is not a ROS 1 bag"),
+        (b"#ROSBAG V2.0\r\n", "is a ROS 1 bag whose line ends were converted"),
         (b"#ROSBAG V1.2\n", "version 1.2, and only 2.0 is read. Rewrite it with `rosbag filter"),
         (b"#ROSRECORD V1.1\n", "version 1.1"),
         (b"version https://git-lfs.github.com/spec/v1\noid", "is a git-lfs pointer"),

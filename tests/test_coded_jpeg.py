@@ -110,7 +110,12 @@ def test_fill_bytes_before_markers() -> None:
     ("data", "reason"),
     [
         (b"", "no JPEG"),
-        (b"\x89PNG", "no JPEG"),
+        (b"\x89PNG\r\n\x1a\n", "a PNG image, and no JPEG"),
+        (b"RIFF\0\0\0\0WEBPVP8 ", "a WebP image"),
+        (b"BM\x36\0\0\0\0\0\0\0", "a BMP image"),
+        (b"II*\0", "a TIFF image"),
+        (b"\0\0\0\x1cftypavif", "an AVIF image"),
+        (b"BMnothing of a picture", "no JPEG: it has no start"),
         (b"\0" + BASE, "no JPEG"),
         (b"\xff\xd8\xff\xd9", "no picture"),
         (BASE[:FRAME_HEADER] + BASE[FRAME_HEADER + 19 :], "before its frame header"),

@@ -230,6 +230,11 @@ def test_other_serializations_are_refused(encoding: str, start: bytes) -> None:
     assert str(caught.value)
 
 
+def test_compressed_messages_are_told() -> None:
+    with pytest.raises(WireError, match=r"compressed by zstd.* pack the folder"):
+        wire_of("cdr", memoryview(bytes.fromhex("28b52ffd00")))
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_strings_that_are_none(name: str) -> None:
     payload = bytearray(

@@ -29,6 +29,7 @@ from mp4ds.recorded import MessagesFile, RecordedMessage, as_recorded
 from mp4ds.records import Channel, Excerpt, Message, Record, Schema
 from mp4ds.remote import location
 from mp4ds.sidecar import MANIFEST_NAME, MESSAGES_NAME, Manifest, load_manifest
+from mp4ds.source_files import HOW_TO_OPEN, video_at
 from mp4ds.streams import Stream, TopicFrames, Video
 from mp4ds.streams.choices import Choice, everything, last_of, since
 from mp4ds.sync import Sync, synchronize
@@ -75,11 +76,11 @@ class Dataset:
         self.manifest: Manifest | None = None
         holds_one = (self.path / MANIFEST_NAME).exists()
         if not holds_one and self.path.suffix not in (".yaml", ".yml", ".mp4"):
-            raise SourceError(
-                self.path,
-                "is no dataset",
-                "Give a folder that `mp4ds pack` made, or a sidecar beside its video.",
-            )
+            problem = "is no dataset"
+            remedy = "Give a folder that `mp4ds pack` made, or a sidecar beside its video."
+            if video := video_at(self.path):
+                problem, remedy = f"is {video}, and no dataset", HOW_TO_OPEN
+            raise SourceError(self.path, problem, remedy)
         if self.path.is_dir():
             self.manifest = load_manifest(self.path / MANIFEST_NAME)
             sidecars = [self.path / entry.sidecar for entry in self.manifest.streams]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +24,34 @@ from mp4ds.remote import location, remote, spelled
 _SAMPLE = 2**16
 _SIDES = ("-wal", "-journal")
 """What sqlite puts beside a database that is being written to: its latest changes."""
+
+
+_CONTAINERS = [
+    (re.compile(start, re.DOTALL), name)
+    for start, name in (
+        (rb"RIFF.{4}AVI ", "an AVI video"),
+        (rb"\x1a\x45\xdf\xa3", "a Matroska or WebM video"),
+        (rb".{4}ftyp(?!avi|hei|hev|mif|msf)", "an MP4 video"),
+        (rb"FLV\x01", "an FLV video"),
+        (rb"\x30\x26\xb2\x75\x8e\x66\xcf\x11", "a WMV video"),
+        (rb"\x00\x00\x01\xba", "an MPEG video"),
+    )
+]
+HOW_TO_OPEN = (
+    "`mp4ds.open` reads the frames of an .mp4 or .mov, without packing; "
+    "`ffmpeg -i VIDEO -c copy VIDEO.mp4` makes one of others."
+)
+"""What to do with a video that is given instead of a recording or dataset."""
+
+
+def video_at(path: Path) -> str:
+    """What kind of video a file is, with its article; empty if it is none or cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(16)
+    except OSError:
+        return ""
+    return next((name for begin, name in _CONTAINERS if begin.match(start)), "")
 
 
 def is_folder(path: Path) -> bool:

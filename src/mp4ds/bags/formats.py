@@ -13,6 +13,7 @@ from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
 from mp4ds.owned import begins_with
 from mp4ds.records import Channel, Message
 from mp4ds.remote import remote
+from mp4ds.source_files import HOW_TO_OPEN, video_at
 
 if TYPE_CHECKING:
     from mp4ds.bags.salvage.reader import Salvage, SalvageReader
@@ -99,11 +100,10 @@ def format_of(path: Path) -> str:
             return name
     if path.suffix in _SUFFIXES:
         return _SUFFIXES[path.suffix]
-    raise SourceError(
-        path,
-        "is not a recording that mp4ds knows",
-        "Give a ROS 1 .bag, a rosbag2 folder or an .mcap file.",
-    )
+    remedy = "Give a ROS 1 .bag, a rosbag2 folder or an .mcap file."
+    if video := video_at(path):
+        raise SourceError(path, f"is {video}, and no recording", f"{remedy} {HOW_TO_OPEN}")
+    raise SourceError(path, "is not a recording that mp4ds knows", remedy)
 
 
 def recording_names(path: Path) -> set[str] | None:

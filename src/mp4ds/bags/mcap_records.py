@@ -45,9 +45,7 @@ OF_SUMMARY = frozenset(
     }
 )
 SALVAGE_REMEDY = "`mp4ds pack --salvage` packs what can be read."
-CUT_SHORT_REMEDY = (
-    "The recording was cut short: recover it with `mcap recover`, or not at all; " + SALVAGE_REMEDY
-)
+CUT_SHORT_REMEDY = f"The recording was cut short: use `mcap recover`; without it, {SALVAGE_REMEDY}"
 
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 _PIECE_BYTES = 16 * 2**20
@@ -126,6 +124,15 @@ def open_source(path: Path, shown: Path | None = None) -> BinaryIO:
     raise SourceError(shown, "is a git-lfs pointer, not the recording", "Run `git lfs pull`.")
 
 
+def other_begin(path: Path, kind: str, magic: bytes, start: bytes) -> SourceError:
+    """The error for a file that does not begin with the magic bytes of its kind."""
+    if start.startswith(magic.rstrip()):
+        problem = f"is {kind} whose line ends were converted, as copying it as text does"
+        return SourceError(path, problem, f"Copy it again as binary; {SALVAGE_REMEDY}")
+    remedy = f"If it is a damaged one, {SALVAGE_REMEDY}"
+    return SourceError(path, f"is not {kind}: it does not begin like one", remedy)
+
+
 class RecordStream:
     """One pass over the records of an MCAP file.
 
@@ -167,9 +174,10 @@ class RecordStream:
     def read_magic(self) -> None:
         """Read the magic bytes that begin and end a file."""
         at_start = self._offset == 0
-        if self.read(len(MAGIC)) != MAGIC:
-            if at_start:
-                raise SourceError(self.path, "is not an MCAP file: its first bytes are others")
+        found = self.read(len(MAGIC))
+        if found != MAGIC and at_start:
+            raise other_begin(self.path, "an MCAP file", MAGIC, found)
+        if found != MAGIC:
             raise self.cut_short()
 
     def read(self, length: int) -> bytes:

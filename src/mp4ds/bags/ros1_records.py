@@ -16,7 +16,7 @@ from rosbags.rosbag1 import ReaderError
 from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 
 from mp4ds.bags.inflate import most_unpacked
-from mp4ds.bags.mcap_records import SALVAGE_REMEDY, open_source
+from mp4ds.bags.mcap_records import SALVAGE_REMEDY, open_source, other_begin
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, Schema
 
@@ -69,7 +69,7 @@ def check_bag(path: Path) -> int:
         raise SourceError(
             path,
             "is not indexed: the recording was cut short",
-            f"Reindex it with `rosbag reindex` first, or not at all; {SALVAGE_REMEDY}",
+            f"Reindex it with `rosbag reindex` first; without that, {SALVAGE_REMEDY}",
         )
     if index > size:
         problem = f"is cut short: its index should begin at byte {index}, and it has {size} bytes"
@@ -91,7 +91,7 @@ def other_format(path: Path, start: bytes) -> SourceError:
             f"is a ROS 1 bag of version {version[1].decode()}, and only 2.0 is read",
             "Rewrite it with `rosbag filter OLD NEW True` of ROS 1 first.",
         )
-    return SourceError(path, "is not a ROS 1 bag: its first bytes are others")
+    return other_begin(path, "a ROS 1 bag", MAGIC, start)
 
 
 def reason(error: BaseException) -> str:

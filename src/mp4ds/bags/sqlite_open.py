@@ -127,7 +127,7 @@ def open_tables(path: Path, shown: Path) -> Iterator[Tables]:
         remedy = (
             "It was not closed properly: open and close it once with the sqlite3 tool; "
             if beside
-            else "If it was cut short, try `.recover` of the sqlite3 tool, or not at all; "
+            else "If it was cut short, try `.recover` of the sqlite3 tool; without that, "
         )
         problem = f"cannot be read as sqlite3: {error}"
         raise SourceError(shown, problem, remedy + SALVAGE_REMEDY) from None

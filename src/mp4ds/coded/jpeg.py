@@ -20,6 +20,21 @@ _FILL = re.compile(rb"\xff*")
 _MAX_SEGMENTS = 2**16
 _MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 
+_OTHER_IMAGES = [
+    (re.compile(start, re.DOTALL), name)
+    for start, name in (
+        (rb"\x89PNG\r\n\x1a\n", "a PNG image"),
+        (rb"RIFF.{4}WEBP", "a WebP image"),
+        (rb"BM.{4}\0{4}", "a BMP image"),
+        (rb"II[*+]\0|MM\0[*+]", "a TIFF image"),
+        (rb"GIF8[79]a", "a GIF image"),
+        (rb"\0\0\0\x0cjP  |\xff\x4f\xff\x51", "a JPEG 2000 image"),
+        (rb"\0\0\0\x0cJXL |\xff\x0a", "a JPEG XL image"),
+        (rb".{4}ftypavi[fs]", "an AVIF image"),
+        (rb".{4}ftyp(?:hei|hev|mif1|msf1)", "a HEIF image"),
+    )
+]
+
 # sampling factors of Y, Cb and Cr, horizontal then vertical, that decoders know -> its name
 _SAMPLINGS = {
     (0x11, 0x11, 0x11): "444",
@@ -73,7 +88,10 @@ def parse(data: bytes | memoryview) -> JpegInfo:
     """
     data = memoryview(data)
     if bytes(data[:2]) != b"\xff\xd8":
-        raise Refused("it is no JPEG: it does not begin with an image")
+        name = next((name for start, name in _OTHER_IMAGES if start.match(data)), "")
+        if name:
+            raise Refused(f"it is {name}, and no JPEG")
+        raise Refused("it is no JPEG: it has no start-of-image marker")
     info: JpegInfo | None = None
     scans = 0
     offset = 2

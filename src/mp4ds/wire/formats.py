@@ -24,6 +24,7 @@ _ROS = {
         RosWire("cdr-be", b"\x00\x00\x00\x00", ">", ros2=True),
     )
 }
+_ZSTD = b"\x28\xb5\x2f\xfd"  # begins what zstd compressed
 _FOXGLOVE: Mapping[str, type[Fields]] = {
     "foxglove.RawImage": ImageFields,
     "foxglove.CompressedImage": CodedFields,
@@ -98,7 +99,12 @@ def wire_of(message_encoding: str, data: memoryview) -> str:
         for wire in _ROS.values():
             if wire.ros2 and data[:4] == wire.prefix:
                 return wire.name
-        raise WireError(f"its CDR encapsulation {bytes(data[:4]).hex()} is not the plain one")
+        if data[:4] == _ZSTD:
+            raise WireError(
+                "it is compressed by zstd, as rosbag2 does in its compression mode MESSAGE: pack "
+                "the folder with its metadata.yaml"
+            )
+        raise WireError(f"its CDR encapsulation is {bytes(data[:4]).hex()}, which is not plain CDR")
     raise WireError(f"serialization {message_encoding!r} is not modelled")
 
 
