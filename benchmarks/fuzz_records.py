@@ -158,7 +158,7 @@ def changed_bag(data: bytes, rng: random.Random) -> bytes:
     else:
         at = rng.randrange(len(inside))
         inside[at] = _changed_message(*inside[at], rng)
-    return _build_bag(chunks, connections)
+    return build_bag(chunks, connections)
 
 
 def _is_connection(fields: Fields, key: bytes) -> bool:
@@ -189,7 +189,8 @@ def _changed_message(fields: Fields, body: bytes, rng: random.Random) -> tuple[F
     return fields, odd_payload(body, rng)
 
 
-def _build_bag(chunks: list[tuple[bytes, list[Record]]], connections: list[Record]) -> bytes:
+def build_bag(chunks: list[tuple[bytes, list[Record]]], connections: list[Record]) -> bytes:
+    """A bag of these chunks, each with its compression, and an index that fits."""
     at, pieces, infos = 4096 + 13, [], []
     for compression, inside in chunks:
         entries: dict[bytes, list[bytes]] = {}

@@ -869,13 +869,18 @@ def test_an_unfinished_transaction_is_refused(tmp_path: Path) -> None:
         Rosbag2Reader(path)
 
 
-def test_a_damaged_index_loses_no_message(tmp_path: Path) -> None:
+@pytest.mark.parametrize("times", [None, "timestamp + 1"], ids=["fewer", "others"])
+def test_a_damaged_index_loses_no_message(times: str | None, tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     database(path, "PRAGMA writable_schema = ON")
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("PRAGMA writable_schema = ON")
-        # An index that was made over fewer messages than there are.
+        # An index that was made over fewer messages than there are, or over others.
         connection.execute("CREATE TABLE other(timestamp)")
+        if times:
+            connection.execute(
+                f"INSERT INTO other(rowid, timestamp) SELECT id, {times} FROM messages"
+            )
         connection.execute("CREATE INDEX other_idx ON other(timestamp)")
         connection.execute(
             "UPDATE sqlite_master SET rootpage = (SELECT rootpage FROM sqlite_master"

@@ -17,6 +17,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import fuzz
 import fuzz_kinds
+import fuzz_records
+import fuzz_rules
 from mp4ds import Mp4dsError
 from mp4ds.bags import open_sources
 from sources import SOURCES, scene
@@ -105,6 +107,23 @@ def test_a_rule_that_is_broken_is_found(
     wanted = {name: kinds[name] for name in ("bag-none", "video-bag-none")}
     _, findings = fuzz.run(wanted, count=24, seed=0, seconds=120.0, around=tmp_path)
     assert any(rule in finding.what for finding, _ in findings)
+
+
+def test_a_connection_that_is_defined_anew_is_salvaged_as_two(tmp_path: Path) -> None:
+    def connection(topic: bytes) -> tuple[Any, bytes]:
+        return [(b"op", b"\7"), (b"conn", bytes(4)), (b"topic", topic)], b""
+
+    def message(second: int) -> tuple[Any, bytes]:
+        time = (b"time", second.to_bytes(8, "little"))
+        return [(b"op", b"\2"), (b"conn", bytes(4)), time], b"data"
+
+    records = [message(1), connection(b"/b"), message(2), connection(b"/b"), message(3)]
+    path, out = tmp_path / "drive.bag", tmp_path / "out"
+    path.write_bytes(fuzz_records.build_bag([(b"lz4", records)], [connection(b"/a")]))
+    out.mkdir()
+    keys = fuzz_rules.read(path, salvage=True)
+    assert [key[0][0] for key in keys] == ["/a", "/b", "/b"]
+    assert fuzz_rules._check_pack(path, out, keys, "", salvage=True, deep=True)
 
 
 def test_metadata_with_a_list_that_holds_itself(tmp_path: Path) -> None:

@@ -203,9 +203,15 @@ class SqliteReader:
             query = "SELECT COUNT(1) FROM messages NOT INDEXED"
             (self._rows,) = tables.select(query).fetchone()
             # Ids first: sorting whole rows would copy the recording where no index helps.
-            for (row_id,) in tables.select("SELECT id FROM messages ORDER BY timestamp, id"):
+            query = "SELECT id, timestamp FROM messages ORDER BY timestamp, id"
+            before = None
+            for row in tables.select(query):
                 self._rows_read += 1
-                yield self._message(tables, row_id, f"message {self._rows_read}")
+                message = self._message(tables, row[0], f"message {self._rows_read}")
+                if row == before or row[1] != message.log_time:  # one twice, another not at all
+                    raise self._bad_index()
+                before = row
+                yield message
             if self._rows_read != self._rows:
                 raise self._bad_index()
 

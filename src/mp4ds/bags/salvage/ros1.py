@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -122,6 +123,7 @@ class _Pass:
         self._scan = Scan(window, self._framing, self._lose)
         self._next_listed = 0
         self._contradicted: set[int] = set()
+        self._others: dict[tuple[object, ...], Channel] = {}
         self.found = 0
         self.is_at_new_chunk = False
         self.earliest: int | None = None
@@ -202,9 +204,11 @@ class _Pass:
             return connection in self._channels
         topic = frame.fields.get(b"topic", header.get(b"topic", b""))
         channel = make_channel(connection, topic, header)
-        if self._channels.setdefault(connection, channel) != channel:
-            if is_sure:
-                self._channels[connection] = channel
+        if self._channels.setdefault(connection, channel).identity != channel.identity:
+            if is_sure:  # a channel of its own: messages may have been given of the other one
+                key = connection, channel.identity
+                other = replace(channel, id=2**32 + len(self._others))
+                self._channels[connection] = self._others.setdefault(key, other)
             problem = f"records of connection {connection} ({channel.topic}) contradict each other"
             if connection not in self._contradicted:
                 self._contradicted.add(connection)
