@@ -1,6 +1,8 @@
-"""What starting costs: importing, the command line's help, and loading a long sidecar.
+"""What starting costs: importing, the command line, a short pack, and loading a long sidecar.
 
     python benchmarks/startup.py [--frames N] [--rounds N]
+
+The pack is of a recording of 0.2 s, two cameras; what it imports is then imported alone.
 
 The sidecars hold 432,000 frames, two hours at 60 Hz, with jittered stamps and log times and a
 digest per frame, and are loaded through all tiers: YAML with its checksum, the shipped JSON
@@ -12,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from statistics import median
 
@@ -25,6 +27,16 @@ COMMANDS = {
     'python -c "import mp4ds; mp4ds.pack"': ("-c", "import mp4ds; mp4ds.pack"),
     'python -c "import mp4ds; mp4ds.open"': ("-c", "import mp4ds; mp4ds.open"),
 }
+MODULES = """
+import sys
+from contextlib import suppress
+from mp4ds.cli import main
+with suppress(SystemExit):
+    main()
+specs = {name: getattr(module, "__spec__", None) for name, module in sys.modules.items()}
+known = (name for name, spec in specs.items() if spec and spec.name == name)
+print(*(name for name in known if name.replace(".", "").isidentifier()))
+"""
 SIDECARS = {
     "ros1": "ROS 1: log time, stamp, seq",
     "ros2": "ROS 2 MCAP: log and publish time, sequence, stamp",
@@ -42,16 +54,30 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     options = parser.parse_args()
     print_machine()
-    print_table(("command", "CPU ms", "more than bare python"), commands(options.rounds))
+    with tempfile.TemporaryDirectory(prefix="mp4ds-benchmark-") as folder:
+        rows = commands({**COMMANDS, **pack_commands(Path(folder))}, options.rounds)
+        print_table(("command", "CPU ms", "more than bare python"), rows)
     print(f"\nLoading a sidecar of {options.frames} frames, CPU ms, median of {options.rounds}:")
     print_table(("sidecar", "MB", *STEPS), sidecars(options.frames, options.rounds))
 
 
-def commands(rounds: int) -> Iterator[tuple[object, ...]]:
+def pack_commands(folder: Path) -> dict[str, tuple[str, ...]]:
+    """A short pack on the command line, and the imports of it alone."""
+    source, dataset = str(folder / "short.bag"), str(folder / "dataset")
+    python("-m", "mp4ds", "demo", source, "--seconds", "0.2")
+    arguments = ("pack", source, "--output", dataset, "--force")
+    names = python("-c", MODULES, *arguments).output.splitlines()[-1].split()
+    return {
+        "python -m mp4ds pack SHORT": ("-m", "mp4ds", *arguments),
+        "... its imports alone": ("-c", f"import {', '.join(names)}"),
+    }
+
+
+def commands(named: Mapping[str, tuple[str, ...]], rounds: int) -> Iterator[tuple[object, ...]]:
     """CPU time of each command; they take turns."""
-    cpu: dict[str, list[float]] = {name: [] for name in COMMANDS}
+    cpu: dict[str, list[float]] = {name: [] for name in named}
     for number in range(rounds + 1):
-        for name, arguments in COMMANDS.items():
+        for name, arguments in named.items():
             run = python(*arguments)
             if number:  # the first one fills caches and compiles
                 cpu[name].append(1000 * run.cpu)

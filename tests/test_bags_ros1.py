@@ -17,7 +17,8 @@ from rosbags.rosbag1 import Reader
 from conftest import DATA, real
 from each import each
 from mp4ds.bags import open_sources, ros1
-from mp4ds.bags.ros1 import Ros1Reader, Ros1Writer
+from mp4ds.bags.ros1 import Ros1Reader
+from mp4ds.bags.ros1_write import Ros1Writer
 from mp4ds.errors import (
     ConversionError,
     OptionError,

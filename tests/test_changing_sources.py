@@ -14,7 +14,8 @@ from PIL import Image
 import mp4ds
 from in_parts import InlineEngine, leftovers
 from mp4ds.errors import SourceError
-from mp4ds.packing import import_ros_mp4, ros_mp4, work
+from mp4ds.packing import ros_mp4, work
+from mp4ds.packing.ros_mp4 import import_ros_mp4
 from sources import SOURCES, scene
 from test_version0 import FIXTURE
 

@@ -403,7 +403,9 @@ def use_harmed(monkeypatch: pytest.MonkeyPatch, name: str, harm: str) -> None:
         "work.Tasks.run = harmed\n"
         "sys.exit(work._main())"
     )
-    monkeypatch.setattr("mp4ds.packing.command", lambda task: [sys.executable, "-c", code, *task])
+    monkeypatch.setattr(
+        "mp4ds.packing.work.command", lambda task: [sys.executable, "-c", code, *task]
+    )
 
 
 @pytest.mark.parametrize("jobs", [1, 3])
@@ -475,7 +477,7 @@ def test_processes_that_cannot_begin_for_want_of_memory(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     limit = ["prlimit", f"--as={megabytes * 2**20}"]
-    monkeypatch.setattr("mp4ds.packing.command", lambda task: [*limit, *command(task)])
+    monkeypatch.setattr("mp4ds.packing.work.command", lambda task: [*limit, *command(task)])
     with pytest.raises(PartsFailedError, match=r"Part source-0: its process ended") as caught:
         mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, jobs=1))
     assert "\n" not in str(caught.value)

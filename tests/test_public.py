@@ -16,6 +16,7 @@ import pytest
 import mp4ds
 from each import each
 from mp4ds import errors
+from mp4ds.demo import demo
 
 ROOT = Path(__file__).parents[1]
 NAMES = [
@@ -240,6 +241,25 @@ def test_importing_is_cheap() -> None:
 def test_what_is_used_is_imported(code: str, absent: list[str]) -> None:
     loaded = python(f"import mp4ds, sys; {code}; print(*sys.modules)").split()
     assert [name for name in absent if name in loaded] == []
+
+
+def test_a_short_pack_imports_what_its_recording_needs(tmp_path: Path) -> None:
+    """A short pack is mostly imports: other formats, codecs, folders, scores and parts wait."""
+    source, dataset = tmp_path / "short.bag", tmp_path / "dataset"
+    demo(source, seconds=0.1)
+    code = f"mp4ds.pack({str(source)!r}, {str(dataset)!r})"
+    loaded = python(f"import mp4ds, sys; {code}; print(*sys.modules)").split()
+    assert (dataset / "dataset.yaml").is_file()
+    assert {"mp4ds.bags.ros1", "mp4ds.streams.writer"} <= set(loaded)
+    others = [
+        *("typer", "rich", "jsonschema", "google.protobuf", "sqlite3", "fsspec", "PIL"),
+        *("rosbags.rosbag2", "mp4ds.bags.mcap", "mp4ds.bags.rosbag2", "mp4ds.bags.definitions"),
+        *("mp4ds.importing.layouts", "mp4ds.scoring.ffmpeg", "mp4ds.streams.target"),
+        *("mp4ds.streams.frames", "mp4ds.packing.coordinator", "mp4ds.packing.ros_mp4"),
+        *("mp4ds.coded.av1_references", "mp4ds.coded.vp9", "mp4ds.wire.protobuf"),
+        *("mp4ds.video.access", "mp4ds.video.join", "mp4ds.engine.processes"),
+    ]
+    assert [name for name in others if name in loaded] == []
 
 
 def test_importing_changes_nothing() -> None:

@@ -49,14 +49,8 @@ if TYPE_CHECKING:
     from mp4ds.evaluating import EvaluateOptions, Evaluation, evaluate
     from mp4ds.exporting import ExportOptions, ExportSummary, export
     from mp4ds.importing import ImageFolder
-    from mp4ds.packing import (
-        PackOptions,
-        PackSummary,
-        import_ros_mp4,
-        pack,
-        pack_each,
-        pack_share,
-    )
+    from mp4ds.packing import PackOptions, PackSummary, pack, pack_each, pack_share
+    from mp4ds.packing.ros_mp4 import import_ros_mp4
     from mp4ds.playing import PlayOptions, PlaySummary, play
     from mp4ds.recorded import RecordedMessage
     from mp4ds.streams import Frame, Frames, Stream, TopicFrames, Video
@@ -85,7 +79,8 @@ _HOMES = {
         "WriteError",
     ),
     "importing": ("ImageFolder",),
-    "packing": ("PackOptions", "PackSummary", "import_ros_mp4", "pack", "pack_each", "pack_share"),
+    "packing": ("PackOptions", "PackSummary", "pack", "pack_each", "pack_share"),
+    "packing.ros_mp4": ("import_ros_mp4",),
     "evaluating": ("EvaluateOptions", "Evaluation", "evaluate"),
     "exporting": ("ExportOptions", "ExportSummary", "export"),
     "playing": ("PlayOptions", "PlaySummary", "play"),

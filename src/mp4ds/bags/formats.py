@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, overload
 
-from mp4ds.bags.multi import MultiReader
 from mp4ds.bags.protocols import BagReader, BagWriter
 from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
 from mp4ds.owned import begins_with
@@ -158,6 +157,8 @@ def open_sources(paths: Sequence[Path], *, salvage: bool = False) -> BagReader:
         return _open_salvaged(paths)
     if len(paths) == 1:
         return open_reader(paths[0])
+    from mp4ds.bags.multi import MultiReader
+
     return MultiReader([partial(open_reader, path) for path in paths])
 
 

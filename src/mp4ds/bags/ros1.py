@@ -50,12 +50,9 @@ from mp4ds.bags.ros1_records import (
     split_header,
     unpack_chunk,
 )
-from mp4ds.bags.ros1_write import Ros1Writer
 from mp4ds.errors import SourceError
 from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Record, Schema
 from mp4ds.remote import expect
-
-__all__ = ["Ros1Reader", "Ros1Writer"]
 
 CACHED_CHUNKS = 8
 CACHED_BYTES = 64 * 2**20

@@ -7,10 +7,13 @@ options are wrong; 130 interrupted.
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
+from copy import copy
 from pathlib import Path
 from typing import Annotated, NoReturn, Optional
 
 import typer
+from typer.main import get_command_name
 
 from mp4ds._version import __version__
 from mp4ds.cli.arguments import parse_resize, parse_share, parse_size, spelled
@@ -342,8 +345,25 @@ def demo(
         say(f"{output}: {messages} messages")
 
 
+def _app_for(arguments: Sequence[str]) -> typer.Typer:
+    """The command line with the one command that is asked for: building all takes its time."""
+    name = arguments[0] if arguments else ""
+    asked = [
+        command
+        for command in app.registered_commands
+        if command.callback and get_command_name(command.callback.__name__) == name
+    ]
+    if not asked:
+        return app
+    one = copy(app)
+    one.registered_commands, one.registered_groups = asked, []
+    return one
+
+
 def main() -> NoReturn:
     """Run the command line and exit."""
     arguments = spelled(sys.argv[1:])
     prepare_process()
-    sys.exit(exit_code_of(lambda: app(args=arguments), as_json="--json" in arguments))
+    sys.exit(
+        exit_code_of(lambda: _app_for(arguments)(args=arguments), as_json="--json" in arguments)
+    )

@@ -9,7 +9,6 @@ import re
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from importlib import metadata
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -87,6 +86,8 @@ def _unexpected(error: Exception) -> str:
 
 def _versions() -> dict[str, str]:
     """What is at work, and the version of each."""
+    from importlib import metadata
+
     found = {"mp4ds": __version__, "Python": platform.python_version()}
     with suppress(metadata.PackageNotFoundError):
         for requirement in metadata.requires("mp4ds") or ():

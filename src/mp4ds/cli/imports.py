@@ -142,7 +142,7 @@ def ros_mp4(
 
     The video is not encoded anew: its packets are copied.
     """
-    from mp4ds.packing import import_ros_mp4
+    from mp4ds.packing.ros_mp4 import import_ros_mp4
 
     with told_errors(as_json):
         summary = import_ros_mp4(video, sidecar, output, force=force)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -23,6 +24,7 @@ def prepare_process() -> None:
     """Make the process ready, before numpy is imported."""
     # no matrix is multiplied here, and idle threads cost time
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    gc.set_threshold(20_000)  # imports make many objects and no garbage
     warnings.showwarning = lambda message, *_, **__: complain(message)
     # a batch system's way to interrupt, and a terminal's that is lost: leave as after Ctrl-C
     for number in ending_signals():

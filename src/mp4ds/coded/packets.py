@@ -10,14 +10,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 from mp4ds.coded import annexb, av1, jpeg, png
-from mp4ds.coded.av1 import Av1Pictures
 from mp4ds.coded.base import Refused
-from mp4ds.coded.h264 import H264Pictures
-from mp4ds.coded.h265 import H265Pictures
 from mp4ds.coded.pictures import NoPicture, Picture
-from mp4ds.coded.vp9 import Vp9Pictures
+
+if TYPE_CHECKING:
+    from mp4ds.coded.av1 import Av1Pictures
+    from mp4ds.coded.h264 import H264Pictures
+    from mp4ds.coded.h265 import H265Pictures
+    from mp4ds.coded.vp9 import Vp9Pictures
 
 PACKET_CODECS = ("mjpeg", "png", "h264", "h265", "av1", "vp9")
 """Codecs whose packets a video track takes as they are."""
@@ -154,14 +157,41 @@ def _png_size(body: memoryview) -> tuple[int, int]:
     return info.width, info.height
 
 
+# each imports its parser when it is needed: a topic is of one codec
+
+
+def _h264() -> _Units:
+    from mp4ds.coded.h264 import H264Pictures
+
+    return _Units(H264Pictures())
+
+
+def _h265() -> _Units:
+    from mp4ds.coded.h265 import H265Pictures
+
+    return _Units(H265Pictures())
+
+
+def _av1() -> _Whole:
+    from mp4ds.coded.av1 import Av1Pictures
+
+    return _Whole(Av1Pictures(), delimited=True)
+
+
+def _vp9() -> _Whole:
+    from mp4ds.coded.vp9 import Vp9Pictures
+
+    return _Whole(Vp9Pictures(), delimited=False)
+
+
 _PARSERS: MappingProxyType[str, Callable[[], _Stills | _Units | _Whole]] = MappingProxyType(
     {
         "mjpeg": lambda: _Stills(_jpeg_size),
         "png": lambda: _Stills(_png_size),
-        "h264": lambda: _Units(H264Pictures()),
-        "h265": lambda: _Units(H265Pictures()),
-        "av1": lambda: _Whole(Av1Pictures(), delimited=True),
-        "vp9": lambda: _Whole(Vp9Pictures(), delimited=False),
+        "h264": _h264,
+        "h265": _h265,
+        "av1": _av1,
+        "vp9": _vp9,
     }
 )
 

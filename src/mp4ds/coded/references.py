@@ -11,11 +11,8 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Protocol
 
-from mp4ds.coded.av1_references import Av1References
 from mp4ds.coded.base import Refused
 from mp4ds.coded.coded_frame import CodedFrame, UnknownStructure
-from mp4ds.coded.nal_references import H264References, H265References
-from mp4ds.coded.vp9 import split_superframe
 
 __all__ = ["CodedFrame", "ReferenceParser", "UnknownStructure"]
 
@@ -114,6 +111,8 @@ class _Chained:
 
 def _vp9_is_key(data: memoryview) -> bool:
     """Whether a packet begins with a key frame (VP9, 6.2)."""
+    from mp4ds.coded.vp9 import split_superframe
+
     shown = 0
     keys = []
     for frame in split_superframe(data):
@@ -142,6 +141,27 @@ def _ffv1_is_key(data: memoryview) -> bool:
     return int.from_bytes(data[:2], "big") >= _FFV1_KEY
 
 
+# each imports its parser when it is needed: a video is of one codec
+
+
+def _h264(configuration: bytes) -> _Parser:
+    from mp4ds.coded.nal_references import H264References
+
+    return H264References(configuration)
+
+
+def _h265(configuration: bytes) -> _Parser:
+    from mp4ds.coded.nal_references import H265References
+
+    return H265References(configuration)
+
+
+def _av1(configuration: bytes) -> _Parser:
+    from mp4ds.coded.av1_references import Av1References
+
+    return Av1References(configuration)
+
+
 def _vp9(_: bytes) -> _Parser:
     return _Chained(_vp9_is_key)
 
@@ -152,9 +172,9 @@ def _ffv1(_: bytes) -> _Parser:
 
 _PARSERS: Mapping[str, Callable[[bytes], _Parser]] = MappingProxyType(
     {
-        **dict.fromkeys(("h264", "avc1", "avc3"), H264References),
-        **dict.fromkeys(("h265", "hevc", "hvc1", "hev1"), H265References),
-        **dict.fromkeys(("av1", "av01"), Av1References),
+        **dict.fromkeys(("h264", "avc1", "avc3"), _h264),
+        **dict.fromkeys(("h265", "hevc", "hvc1", "hev1"), _h265),
+        **dict.fromkeys(("av1", "av01"), _av1),
         **dict.fromkeys(("vp9", "vp09"), _vp9),
         **dict.fromkeys(("ffv1", "FFV1"), _ffv1),
         **dict.fromkeys(("mjpeg", "jpeg", "png"), _Intra),

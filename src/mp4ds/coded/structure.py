@@ -14,7 +14,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.coded.av1_references import split_temporal_unit
 from mp4ds.coded.coded_frame import CodedFrame, UnknownStructure
 from mp4ds.coded.references import ReferenceParser
 
@@ -226,6 +225,8 @@ def frame_bytes(codec: str, packet: bytes, *, part: int, parts: int, key: bool) 
     """
     if codec not in SPLIT_CODECS:
         return packet
+    from mp4ds.coded.av1_references import split_temporal_unit
+
     found = split_temporal_unit(packet)
     if len(found) != parts:
         raise UnknownStructure(f"it holds {len(found)} coded frames, {parts} are due")

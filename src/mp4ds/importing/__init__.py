@@ -6,7 +6,18 @@ and gives a `Scene`; `ImagesReader` makes the messages of ROS 2 that a driver wo
 
 from __future__ import annotations
 
-from mp4ds.importing.layouts import open_images
-from mp4ds.importing.options import ImageFolder
+from typing import TYPE_CHECKING
+
+from mp4ds.lazily import names_of
+
+if TYPE_CHECKING:
+    from mp4ds.importing.layouts import open_images
+    from mp4ds.importing.options import ImageFolder
+else:
+    __getattr__ = names_of(
+        __name__,
+        layouts="open_images",
+        options="ImageFolder",
+    )
 
 __all__ = ["ImageFolder", "open_images"]

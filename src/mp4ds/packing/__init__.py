@@ -11,35 +11,35 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from mp4ds.engine import Engine, ProcessEngine
 from mp4ds.errors import FormatError, OptionError, SourceError, TargetExistsError, WriteError
 from mp4ds.outputs import check_target, staged
 from mp4ds.packing.cameras import Exact
-from mp4ds.packing.coordinator import Coordinator, Run, claimed
 from mp4ds.packing.job import open_recording, outcome_options
 from mp4ds.packing.manifest import dataset_files
 from mp4ds.packing.packer import until_in_reach
 from mp4ds.packing.planning import Means, plan_job
 from mp4ds.packing.report import PackOptions, PackProgress, PackSummary, TopicSummary
-from mp4ds.packing.ros_mp4 import import_ros_mp4
+from mp4ds.packing.run import Run
 from mp4ds.packing.single import pack_in_one_pass
-from mp4ds.packing.uploading import pack_to_store, shared_folder
-from mp4ds.packing.work import command
 from mp4ds.packing.workplace import Workplace
 from mp4ds.plan import parse_quality
 from mp4ds.remote import RemotePath, location, remote
-from mp4ds.scoring import find_ffmpeg
 from mp4ds.sidecar import MANIFEST_NAME, load_manifest
 from mp4ds.source_files import source_size
 from mp4ds.video import check_codec, check_hardware
+
+if TYPE_CHECKING:
+    from mp4ds.engine import Engine
+
+# a short pack is mostly imports: what only divided packs, URLs and scores need is left to them
 
 __all__ = [
     "PackOptions",
     "PackProgress",
     "PackSummary",
     "TopicSummary",
-    "import_ros_mp4",
     "pack",
     "pack_each",
     "pack_share",
@@ -85,6 +85,8 @@ def _pack(
 ) -> PackSummary:
     store = remote(target)
     if store:
+        from mp4ds.packing.uploading import pack_to_store
+
         pack_here = partial(_pack, paths)
         return pack_to_store(paths, store, options, dataset_files, pack_here, progress)
     run = _plan(paths, target, options)
@@ -116,7 +118,11 @@ def pack_share(
     chosen = _checked(options or PackOptions())
     target = _absolute(dataset)
     store = remote(target)
-    run = _plan(_paths(sources), shared_folder(store) if store else target, chosen, is_share=True)
+    if store:
+        from mp4ds.packing.uploading import shared_folder
+
+        target = shared_folder(store)
+    run = _plan(_paths(sources), target, chosen, is_share=True)
     _pack_runs([run], chosen, progress, share=share)
 
 
@@ -205,6 +211,8 @@ def _checked(options: PackOptions) -> PackOptions:
     if not (options.cluster or options.join):  # else others encode, or did
         check_hardware(options.codec)
     if quality.target and quality.target.metric == "vmaf" and not options.join:
+        from mp4ds.scoring import find_ffmpeg
+
         find_ffmpeg()  # says how to get one before anything is read
     images = options.images.absolute() if options.images else None
     return replace(
@@ -258,6 +266,8 @@ def _pack_runs(
     share: tuple[int, int] | None = None,
 ) -> list[PackSummary]:
     """Run the tasks of packs, and make their datasets unless only a share of the tasks is run."""
+    from mp4ds.packing.coordinator import Coordinator, claimed
+
     summaries = {}
     with claimed(runs, shared=share is not None):
         for run in runs:
@@ -283,6 +293,9 @@ def _engine(runs: Sequence[Run], options: PackOptions) -> Engine:
         from mp4ds.packing.work import run_task
 
         return ClusterEngine(run_task, options.cluster, task_bytes=_task_bytes(runs))
+    from mp4ds.engine import ProcessEngine
+    from mp4ds.packing.work import command
+
     means = Means.of(options)
     return ProcessEngine(command, min((means.slots(run.job) for run in runs), default=1))
 

@@ -6,11 +6,9 @@ import re
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mp4ds import errors
 from mp4ds.engine import Engine, Outcome
 from mp4ds.errors import (
     FormatError,
@@ -22,11 +20,12 @@ from mp4ds.errors import (
 )
 from mp4ds.outputs import is_seen, move_into_place, sync
 from mp4ds.packing.assemble import Assembler
-from mp4ds.packing.job import Job, Task, absolute
+from mp4ds.packing.job import Task
 from mp4ds.packing.manifest import dataset_files, folder_size, summarize, write_manifest
 from mp4ds.packing.part import Part, read_record
 from mp4ds.packing.progress import JobProgress, Report
 from mp4ds.packing.report import PackSummary
+from mp4ds.packing.run import Run
 from mp4ds.packing.spans import share
 from mp4ds.packing.workplace import Workplace
 from mp4ds.plan import Selection
@@ -36,71 +35,6 @@ _LISTED = 10
 _JOINED_AT_ONCE = 4  # more would only wait for the disk
 _SHARED = "all machines must share the folder of the dataset"
 _KEPT = "interrupted; what is finished is kept: run the same command again to go on"
-
-
-@dataclass
-class Run:
-    """One recording being packed by tasks.
-
-    Attributes:
-        job: What is to be done.
-        place: Where its parts are made.
-        paths: What is to be packed, as it was given.
-        target: The dataset.
-        force: Replace an existing dataset.
-        is_new: Whether the job was planned just now.
-        failures: Name and sentence of each task that failed.
-        exit_code: What the first of them asks for.
-    """
-
-    job: Job
-    place: Workplace
-    paths: Sequence[Path]
-    target: Path
-    force: bool
-    is_new: bool
-    failures: list[tuple[str, str]] = field(default_factory=list)
-    exit_code: int = 1
-
-    def begin(self, options: dict[str, object], *, anew: bool, alone: bool) -> None:
-        """Take the place over; it is held.
-
-        Args:
-            options: Those that decide what comes out.
-            anew: Forget what is there.
-            alone: Nobody else is at work there.
-
-        Raises:
-            OptionError: An unfinished pack with other options is there.
-            SourceError: The recording has changed since.
-        """
-        if anew and alone:
-            self.place.clear()
-        if self.is_new:
-            self.job = self.place.begin(self.job)
-        self.place.check(self.job, options, absolute(self.paths))
-        if alone:
-            self.place.sweep()
-
-    @property
-    def missing(self) -> list[Task]:
-        """The tasks whose results are not there."""
-        return [task for task in self.job.tasks if not self.place.is_done(task)]
-
-    def fail(self, name: str, kind: str, sentence: str) -> None:
-        """Take notice of a task that failed."""
-        if not self.failures:
-            self.exit_code = getattr(getattr(errors, kind, None), "exit_code", 1)
-        self.failures.append((name, sentence))
-
-    def raise_failures(self) -> None:
-        """Report the tasks that failed.
-
-        Raises:
-            PartsFailedError: There are some.
-        """
-        if self.failures:
-            raise PartsFailedError(self.target, self.failures, len(self.job.tasks), self.exit_code)
 
 
 class Coordinator:

@@ -11,7 +11,7 @@ from typing import Any
 from mp4ds._version import __version__
 from mp4ds.bags import BagReader, open_sources
 from mp4ds.errors import OptionError, SourceError
-from mp4ds.importing import ImageFolder, open_images
+from mp4ds.importing import ImageFolder
 from mp4ds.packing.cameras import Exact
 from mp4ds.packing.kept import dump_kept, load_kept
 from mp4ds.packing.packer import PartSettings
@@ -266,6 +266,8 @@ def open_recording(
         raise OptionError("--salvage goes with recordings, not with a folder of images.")
     if len(paths) != 1:
         raise OptionError(f"One folder of images is read at a time, and {len(paths)} were given.")
+    from mp4ds.importing import open_images
+
     return open_images(paths[0], images)
 
 

@@ -25,7 +25,6 @@ from mp4ds.packing.survey import (
 from mp4ds.pairing import choose_pairs, pair_camera_infos
 from mp4ds.plan import Quality, Selection, parse_quality
 from mp4ds.records import Channel
-from mp4ds.scoring import vmaf_bytes
 from mp4ds.source_files import SourceState
 from mp4ds.streams import (
     Looker,
@@ -300,6 +299,8 @@ def _encoder_bytes(decision: Decision, threads: int) -> int:
             size = plan.layout.picture_size(decision.key.width, decision.key.height)
             needed = encoder_bytes(plan.recipe, *size, threads)
             if isinstance(plan, TargetPlan) and plan.target.metric == "vmaf":
+                from mp4ds.scoring import vmaf_bytes
+
                 # a window is scored when its encoder is gone
                 needed = max(needed, vmaf_bytes(*size, threads))
             return needed

@@ -6,19 +6,34 @@ process: the optional package imageio-ffmpeg brings one, or one on the PATH is t
 
 from __future__ import annotations
 
-from mp4ds.scoring.errors import ScoringError
-from mp4ds.scoring.ffmpeg import VMAF_MODEL, Ffmpeg, find_ffmpeg, vmaf_bytes
-from mp4ds.scoring.measures import MAX_PSNR, psnr, ssim
-from mp4ds.scoring.scorer import (
-    SMALLEST,
-    Scorer,
-    YuvFrame,
-    psnr_scores,
-    ssim_scores,
-    vmaf_scores,
-)
-from mp4ds.scoring.scores import METRICS, Scores, Summary, summary_of
-from mp4ds.scoring.search import largest_crf
+from typing import TYPE_CHECKING
+
+from mp4ds.lazily import names_of
+
+if TYPE_CHECKING:
+    from mp4ds.scoring.errors import ScoringError
+    from mp4ds.scoring.ffmpeg import VMAF_MODEL, Ffmpeg, find_ffmpeg, vmaf_bytes
+    from mp4ds.scoring.measures import MAX_PSNR, psnr, ssim
+    from mp4ds.scoring.scorer import (
+        SMALLEST,
+        Scorer,
+        YuvFrame,
+        psnr_scores,
+        ssim_scores,
+        vmaf_scores,
+    )
+    from mp4ds.scoring.scores import METRICS, Scores, Summary, summary_of
+    from mp4ds.scoring.search import largest_crf
+else:
+    __getattr__ = names_of(
+        __name__,
+        errors="ScoringError",
+        ffmpeg="VMAF_MODEL Ffmpeg find_ffmpeg vmaf_bytes",
+        measures="MAX_PSNR psnr ssim",
+        scorer="SMALLEST Scorer YuvFrame psnr_scores ssim_scores vmaf_scores",
+        scores="METRICS Scores Summary summary_of",
+        search="largest_crf",
+    )
 
 __all__ = [
     "MAX_PSNR",

@@ -13,8 +13,14 @@ from mp4ds.layouts import ENCODINGS, Parameters, bind, layout_for
 from mp4ds.plan import Target, visual_setting
 from mp4ds.streams.columns import Unsuited
 from mp4ds.streams.look import Seen, StreamKey
-from mp4ds.streams.target import OutOfReach, TargetPlan, target_plan
-from mp4ds.streams.tracks import PacketPlan, PicturePlan, StreamSettings, TrackPlan
+from mp4ds.streams.tracks import (
+    OutOfReach,
+    PacketPlan,
+    PicturePlan,
+    StreamSettings,
+    TargetPlan,
+    TrackPlan,
+)
 from mp4ds.video import choose, recipe_for, remade
 from mp4ds.video.codecs import AV1
 from mp4ds.video.encoder import EncoderRefusedError
@@ -101,6 +107,8 @@ def _target_plans(
     rate: float | None,
 ) -> list[TrackPlan]:
     """A plan that keeps a score, and one for images that cannot have it."""
+    from mp4ds.streams.target import target_plan
+
     key = samples[0].key
     is_jpeg = key.body == "jpeg"
     try:

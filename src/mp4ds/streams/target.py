@@ -6,60 +6,32 @@ import shutil
 import tempfile
 from array import array
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.errors import Mp4dsError
 from mp4ds.plan import Target
-from mp4ds.records import Channel
 from mp4ds.scoring import SMALLEST, largest_crf
 from mp4ds.sidecar import Quality as Measured
 from mp4ds.stamps import TIMESCALE
 from mp4ds.streams.crf_control import FALLS, CrfControl
 from mp4ds.streams.look import Seen, StreamKey
-from mp4ds.streams.tracks import PicturePlan, StreamSettings, Track, picture_facts
+from mp4ds.streams.tracks import (
+    OutOfReach,
+    PicturePlan,
+    StreamSettings,
+    TargetPlan,
+    picture_facts,
+)
 from mp4ds.streams.windows import WindowCoder, window_frames
 from mp4ds.video import join_segments
 from mp4ds.video.codecs import LEAST_CRF, MAX_CRF
 
 _MOST_SEARCHED = 5  # encodings of the samples
 _USUAL_RATE = 30.0
-
-
-class OutOfReach(Exception):  # noqa: N818 - no error: the stream is made lossless
-    """A score that frames do not have with any crf; says how far they are from it."""
-
-
-class OutOfReachError(Mp4dsError):
-    """A stream that was begun cannot have the score that was asked for.
-
-    Args:
-        channel: Of its messages.
-        key: Of its messages.
-        reason: What was tried.
-    """
-
-    def __init__(self, channel: Channel, key: StreamKey, reason: str) -> None:
-        self.stream = (channel.id, key)
-        self.reason = reason
-        super().__init__(
-            f"{channel.topic}: {reason}. Ask for less, or pack it with --quality lossless."
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TargetPlan(PicturePlan):
-    """Pictures, encoded here until they have a score. See `TrackPlan`."""
-
-    target: Target
-
-    def open(self, path: Path, seen: Seen, settings: StreamSettings, rate: float | None) -> Track:
-        """See `TrackPlan.open`."""
-        return _TargetTrack(self, path, seen.key, settings, rate)
 
 
 def target_plan(
@@ -158,7 +130,7 @@ def _far_off(target: Target, due: float, made: str) -> str:
     return f"{target} is out of reach: {made}{limit}"
 
 
-class _TargetTrack:
+class TargetTrack:
     """See `Track`.
 
     The frames of a window are kept on disk as planes. When it is full it is encoded, decoded and

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mp4ds.coded import Refused
+from mp4ds.errors import Mp4dsError
 from mp4ds.layouts import ENCODINGS, Layout, layout_for
-from mp4ds.plan import Quality
+from mp4ds.plan import Quality, Target
+from mp4ds.records import Channel
 from mp4ds.sidecar import Color, LayoutParameters
 from mp4ds.streams.columns import Unsuited
 from mp4ds.streams.look import Seen, StreamKey
@@ -127,6 +129,40 @@ class PicturePlan:
     def open(self, path: Path, seen: Seen, settings: StreamSettings, rate: float | None) -> Track:
         """See `TrackPlan.open`."""
         return _PictureTrack(self, path, seen.key, settings, rate)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TargetPlan(PicturePlan):
+    """Pictures, encoded here until they have a score. See `TrackPlan`."""
+
+    target: Target
+
+    def open(self, path: Path, seen: Seen, settings: StreamSettings, rate: float | None) -> Track:
+        """See `TrackPlan.open`."""
+        from mp4ds.streams.target import TargetTrack
+
+        return TargetTrack(self, path, seen.key, settings, rate)
+
+
+class OutOfReach(Exception):  # noqa: N818 - no error: the stream is made lossless
+    """A score that frames do not have with any crf; says how far they are from it."""
+
+
+class OutOfReachError(Mp4dsError):
+    """A stream that was begun cannot have the score that was asked for.
+
+    Args:
+        channel: Of its messages.
+        key: Of its messages.
+        reason: What was tried.
+    """
+
+    def __init__(self, channel: Channel, key: StreamKey, reason: str) -> None:
+        self.stream = (channel.id, key)
+        self.reason = reason
+        super().__init__(
+            f"{channel.topic}: {reason}. Ask for less, or pack it with --quality lossless."
+        )
 
 
 def _recipes(plan: PicturePlan) -> Iterator[Recipe]:

@@ -28,8 +28,7 @@ from mp4ds.streams.columns import ColumnsWriter, Unsuited, digests_model
 from mp4ds.streams.facts import video_facts
 from mp4ds.streams.headers import Heads
 from mp4ds.streams.look import Seen
-from mp4ds.streams.target import OutOfReach, OutOfReachError
-from mp4ds.streams.tracks import StreamSettings, TrackPlan
+from mp4ds.streams.tracks import OutOfReach, OutOfReachError, StreamSettings, TrackPlan
 from mp4ds.wire import CodedFields
 
 

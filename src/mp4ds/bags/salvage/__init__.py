@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from mp4ds.bags.protocols import BagReader
-from mp4ds.bags.salvage.reader import SalvageReader
-from mp4ds.records import Loss
+from mp4ds.lazily import names_of
+
+if TYPE_CHECKING:
+    from mp4ds.bags.protocols import BagReader
+    from mp4ds.bags.salvage.reader import SalvageReader
+    from mp4ds.records import Loss
+else:
+    __getattr__ = names_of(__name__, reader="SalvageReader")
 
 __all__ = ["SalvageReader", "losses_of"]
 
