@@ -493,12 +493,14 @@ def test_jobs_of_a_batch_system_run_the_tasks(batch: Batch, tmp_path: Path) -> N
     assert len(batch.numbers("jobs")) == 2
 
 
+@pytest.mark.slow
 def test_there_are_not_more_jobs_than_tasks(batch: Batch, tmp_path: Path) -> None:
     engine = ClusterEngine(cluster_tasks.write, "slurm", task_bytes=MIB)
     assert not errors(run(engine, tasks_in(tmp_path, "a")))
     assert len(batch.numbers("jobs")) == 1
 
 
+@pytest.mark.slow
 def test_runs_of_one_connection_share_its_jobs(batch: Batch, tmp_path: Path) -> None:
     with Connection("slurm", 2) as connection:
         assert batch.numbers("jobs") == []
@@ -510,6 +512,7 @@ def test_runs_of_one_connection_share_its_jobs(batch: Batch, tmp_path: Path) -> 
         assert batch.numbers("cancelled") == []
 
 
+@pytest.mark.slow
 def test_a_job_that_ended_is_submitted_again(
     batch: Batch, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

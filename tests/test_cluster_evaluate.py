@@ -106,6 +106,7 @@ def trials_of(worker: subprocess.Popen[bytes]) -> list[int]:
 # ---------------------------------------------------------------- results
 
 
+@pytest.mark.slow
 def test_it_finds_the_same(
     cluster: RealCluster, bag: Path, expected: dict[str, Any], tmp_path: Path
 ) -> None:

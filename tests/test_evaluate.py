@@ -294,7 +294,7 @@ KINDS: dict[str, Callable[[Path, Path], Path]] = {
 }
 
 
-@each("kind", KINDS, one_in=2)
+@each("kind", KINDS, one_in=4)
 def test_what_was_made_of_a_recording(kind: str, tmp_path: Path) -> None:
     source = KINDS[kind](tmp_path, recording(tmp_path))
     found = evaluate(source, replace(QUICK, fps=1e9 / PERIOD), output=tmp_path / "out")
@@ -306,7 +306,7 @@ def test_what_was_made_of_a_recording(kind: str, tmp_path: Path) -> None:
     assert 25 < camera.cells[0].scores["psnr_y"].mean < 60
 
 
-@pytest.mark.parametrize("source", ["bag-split", "rosbag2-sqlite3-v9", "mcap-unindexed"])
+@each("source", ["bag-split", "rosbag2-sqlite3-v9", "mcap-unindexed"], one_in=3)
 def test_recordings(source: str, tmp_path: Path) -> None:
     path = recording(tmp_path, "bayer_grbg8", source)
     (camera,) = evaluate(path, QUICK, output=tmp_path / "out").cameras
@@ -330,6 +330,7 @@ def test_the_videos_are_those_of_a_pack(encoding: str, tmp_path: Path) -> None:
     assert packet_sizes(tmp_path / "drive" / "cam_image_raw.mp4").total == tried.size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("codec", ["svtav1", "x265"])
 def test_the_videos_are_those_of_a_pack_by_codec(codec: str, tmp_path: Path) -> None:
     path = recording(tmp_path, "rgb8")
@@ -351,6 +352,7 @@ def test_cameras_that_are_no_light_are_left_out(encoding: str, tmp_path: Path) -
         evaluate(recording(tmp_path, encoding), QUICK, output=tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_odd_sides(tmp_path: Path) -> None:
     (camera,) = evaluate(
         recording(tmp_path, "rgb8", width=97), QUICK, output=tmp_path / "out"
@@ -610,6 +612,7 @@ def test_the_same_again_tries_nothing(whole: Evaluation, bag: Path) -> None:
     assert again.cameras == whole.cameras
 
 
+@pytest.mark.slow
 def test_a_larger_grid_tries_what_is_new(tmp_path: Path) -> None:
     path = recording(tmp_path)
     first = evaluate(path, QUICK, output=tmp_path / "out")
@@ -636,6 +639,7 @@ def test_a_damaged_result_is_made_again(tmp_path: Path) -> None:
     assert again.cameras[0].cells[0].size == first.cameras[0].cells[0].size
 
 
+@pytest.mark.slow
 def test_an_interrupted_one_goes_on(tmp_path: Path) -> None:
     path = recording(tmp_path)
     options = replace(QUICK, crf=["20", "30", "40"])
@@ -653,7 +657,9 @@ def test_an_interrupted_one_goes_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
+)
 def test_a_killed_one_goes_on(number: signal.Signals, tmp_path: Path) -> None:
     path, out = recording(tmp_path), tmp_path / "out"
     command = [

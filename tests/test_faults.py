@@ -661,8 +661,11 @@ def _lives(pid: int) -> bool:
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="there is no /proc here")
 @pytest.mark.parametrize(
     ("signals", "code"),
-    [([signal.SIGINT], 130), ([signal.SIGTERM], 143), ([signal.SIGINT] * 4, 130)],
-    ids=["ctrl-c", "sigterm", "ctrl-c again and again"],
+    [
+        pytest.param([signal.SIGINT], 130, id="ctrl-c"),
+        pytest.param([signal.SIGTERM], 143, id="sigterm", marks=pytest.mark.slow),
+        pytest.param([signal.SIGINT] * 4, 130, id="ctrl-c again and again", marks=pytest.mark.slow),
+    ],
 )
 def test_a_parallel_pack_that_is_interrupted(
     signals: list[signal.Signals], code: int, long_bag: Path, tmp_path: Path

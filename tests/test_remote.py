@@ -237,6 +237,7 @@ def test_every_source_on_a_web_server(
     round_trip(paths, urls, tmp_path, source, compare)
 
 
+@pytest.mark.slow
 def test_windows_are_packed_by_other_processes(tmp_path: Path, put: Put, compare: Compare) -> None:
     write_bag(tmp_path / "drive.bag", scene("mono8", frames=6))
     mp4ds.pack(put(tmp_path / "drive.bag"), tmp_path / "dataset", PackOptions(window=3, jobs=1))

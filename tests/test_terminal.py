@@ -91,7 +91,13 @@ COMMANDS = {
 }
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] if name == "evaluate" else [])
+        for name in COMMANDS
+    ],
+)
 def test_topics_steer_no_terminal(
     name: str, recording: Path, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -356,8 +356,8 @@ var mp4dsReport = (() => {
   /** Resolves when every camera shows the frame that it should. */
   report.settled = async () => {
     await report.ready;
-    for (let tries = 0; tries < 600 && !player.isSettled; tries++) await new Promise(resolve => setTimeout(resolve, 25));
-    return player.isSettled;
+    while (!player.isSettled) await new Promise(resolve => setTimeout(resolve, 25));
+    return true;
   };
 
   return report;
