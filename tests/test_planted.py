@@ -227,6 +227,7 @@ def test_another_recording_in_a_planted_job_is_refused(
         lambda record: record.update(losses=[{"x": 1}]),
         lambda record: record.update(counts={"x": 1}),
         lambda record: record.update(transforms=[3]),
+        lambda record: record.update(span=[0, 2**65]),
     ],
 )
 def test_a_record_that_was_planted_is_no_part(

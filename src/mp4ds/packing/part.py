@@ -13,7 +13,14 @@ from mp4ds.outputs import write_synced
 from mp4ds.packing.kept import dump_kept, load_kept
 from mp4ds.packing.report import TopicSummary
 from mp4ds.records import Channel, Loss
-from mp4ds.sidecar import MESSAGES_NAME, StreamSidecar, load_stream
+from mp4ds.sidecar import (
+    MESSAGES_NAME,
+    LossEntry,
+    StaticTransform,
+    StreamSidecar,
+    TimeRange,
+    load_stream,
+)
 from mp4ds.wire.transforms import Transform
 
 RECORD_NAME = "part.json"
@@ -129,7 +136,7 @@ class Part:
         if not record["files"].keys() >= set(names):
             raise ValueError("a stream without a file")
         sidecars = [load_stream(folder / name) for name in names]
-        return cls(
+        part = cls(
             folder=folder,
             topics={item["topic"]: _topic(item) for item in record["topics"]},
             counts={int(key): count for key, count in record["counts"].items()},
@@ -142,6 +149,13 @@ class Part:
             losses=[Loss(**{**item, "topics": tuple(item["topics"])}) for item in record["losses"]],
             files=list(record["files"]),
         )
+        if part.span:  # what no manifest takes is damage, too, and the part is made again
+            TimeRange(start=part.span[0], end=part.span[1])
+        for loss in part.losses:
+            LossEntry.from_record(loss)
+        for transform in part.transforms:
+            StaticTransform.from_record(transform)
+        return part
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
