@@ -532,15 +532,48 @@ def test_a_png_of_depths_stays_byte_for_byte(packed: Pack) -> None:
 @pytest.mark.parametrize("name", ["jpeg-exif-trailing", "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"])
 def test_unpacked_images_are_the_recorded_files(packed: Pack, name: str, tmp_path: Path) -> None:
     made = packed(name, "mcap-ros2-zstd")
-    options = UnpackOptions(image_format="jpeg")
-    mp4ds.unpack(made.folder / "dataset", "images", tmp_path / "images", options)
+    mp4ds.unpack(made.folder / "dataset", "images", tmp_path / "images")
     (folder,) = (tmp_path / "images").iterdir()
     found = [path.read_bytes() for path in sorted(folder.glob("*.jpg"))]
     assert found == [record.values["data"] for record in made.cameras]
     rows = (folder / "stamps.csv").read_text("utf-8").splitlines()[1:]
     for row, record in zip(rows, made.cameras, strict=True):
         header = record.values["header"]
-        assert row.split(",")[1:] == [str(header["stamp"]), str(record.log_time), "cam"]
+        name, *rest = row.split(",")
+        assert name in {path.name for path in folder.glob("*.jpg")}
+        assert rest == [str(header["stamp"]), str(record.log_time), "cam"]
+
+
+JPEG_KINDS = [
+    *("jpeg-rgb", "jpeg-420", "jpeg-422", "jpeg-444", "jpeg-gray", "jpeg-progressive"),
+    *("jpeg-restart", "jpeg-no-huffman-tables", "jpeg-exif-trailing"),
+    "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8",
+]
+
+
+@each("name", JPEG_KINDS)
+def test_jpeg_pixels_are_those_of_opencv(packed: Pack, name: str) -> None:
+    """By number, in order, as raw messages and as PNG: what cv2.imdecode gives."""
+    made = packed(name, "mcap-ros2-zstd")
+    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    due = [
+        cv2.imdecode(np.frombuffer(record.values["data"], np.uint8), flags)
+        for record in made.cameras
+    ]
+    rgb = [image if image.ndim == 2 else image[:, :, ::-1] for image in due]
+    with mp4ds.open(made.folder / "dataset") as dataset:
+        stream = dataset[made.topic]
+        assert np.array_equal(stream[3].data, rgb[3])
+        shown = stream.read([5, 0, 1])[1]
+        assert np.array_equal(shown, np.broadcast_to(rgb[0].T, shown.T.shape).T)
+        assert all(np.array_equal(frame.data, rgb[frame.index]) for frame in stream)
+    raw = made.unpack("mcap", "raw", topics=[made.topic])[1]
+    assert [bytes(message.value.data) for message in raw] == [image.tobytes() for image in rgb]
+    target = made.folder / "as_png"
+    options = UnpackOptions(image_format="png", force=True)
+    mp4ds.unpack(made.folder / "dataset", "images", target, options)
+    for path, image in zip(sorted(target.rglob("*.png")), due, strict=True):
+        assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), image)
 
 
 def test_unpacked_jpeg_images_have_the_quality(packed: Pack, tmp_path: Path) -> None:

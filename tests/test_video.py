@@ -20,7 +20,9 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from coded_tools import jpeg
 from each import each
+from mp4ds.coded import Refused
 from mp4ds.errors import OptionError, VideoError
 from mp4ds.layouts import CHROMA_SHIFTS, ENCODINGS, bind, fit, layout_for
 from mp4ds.video import (
@@ -34,6 +36,7 @@ from mp4ds.video import (
 )
 from mp4ds.video.codecs import lossless_codecs
 from mp4ds.video.encoder import EncoderRefusedError
+from mp4ds.video.jpeg import jpeg_pixels
 from mp4ds.video.planes import PlaneMaker
 from pictures import BAYER, picture
 from pixel_kinds import KINDS, PAIRS, as_message, bits_of, rounded, suited, values
@@ -873,3 +876,23 @@ def test_a_better_jpeg_is_larger() -> None:
 def test_there_is_no_such_quality(quality: int) -> None:
     with pytest.raises(OptionError, match="use 1 to 100"):
         ImageFile("rgb8", "jpeg", quality=quality)
+
+
+# ---------------------------------------------------------------- JPEG
+
+
+def test_jpeg_files_that_do_not_decode_are_refused() -> None:
+    pixels = np.arange(48 * 64 * 3, dtype=np.uint8).reshape(48, 64, 3)
+    good = jpeg(pixels)
+    assert jpeg_pixels(good, (64, 48))[1].shape == (48, 64, 3)
+    at = good.index(b"\xff\xc0") + 5
+    huge = good[:at] + b"\xff\xdc\xff\xdc" + good[at + 4 :]
+    for data, reason in [
+        (huge, "has 65500x65500 pixels"),  # before 13 GB are asked for
+        (good[: len(good) // 2], "does not decode: image file is truncated"),
+        (b"\xff\xd8\xff\xd9", "does not decode"),
+        (b"", "does not decode"),
+        (jpeg(np.zeros((48, 64, 4), np.uint8), "CMYK"), "colours of another kind"),
+    ]:
+        with pytest.raises(Refused, match=reason):
+            jpeg_pixels(data, (64, 48))

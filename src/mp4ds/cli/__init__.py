@@ -207,8 +207,12 @@ def unpack(
         typer.Option("--storage", help="sqlite3 or mcap, for rosbag2; as recorded, or mcap."),
     ] = None,
     image_format: Annotated[
-        str, typer.Option("--image-format", help="png (exact) or jpeg, for images.")
-    ] = "png",
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            "--image-format",
+            help="png (exact) or jpeg, for images; JPEG files as recorded, else png.",
+        ),
+    ] = None,
     images: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(

@@ -13,7 +13,7 @@ from mp4ds.records import Channel, Message
 from mp4ds.sidecar.fields import Body
 from mp4ds.streams.columns import Unsuited
 from mp4ds.streams.headers import Forms
-from mp4ds.video import JpegDecoder
+from mp4ds.video import jpeg_pixels
 from mp4ds.wire import CodedFields, Form, ImageFields, Parts
 
 _MAX_PNG_REFUSALS = 20  # in a row
@@ -98,7 +98,7 @@ class Looker:
         self._parsers: dict[str, PictureParser] = {}
         self._png: png.PngRecipe | None = None
         self._png_refusals = 0
-        self._jpeg = JpegDecoder() if transcode else None
+        self._transcode = transcode
 
     def look(self, message: Message) -> Seen:
         """What a message holds.
@@ -150,10 +150,10 @@ class Looker:
     def _jpeg_image(self, form: Form, parts: Parts) -> Seen:
         found = jpeg.parse(parts.body)
         encoding = "mono8" if found.components == 1 else "rgb8"
-        if self._jpeg is None:
+        if not self._transcode:
             key = _coded_key(form, "packet", "mjpeg", encoding, found.width, found.height)
             return Seen(key, form, parts)
-        pixels = self._jpeg.decode(parts.body, encoding)
+        _, pixels = jpeg_pixels(parts.body, (found.width, found.height))
         key = _coded_key(form, "jpeg", "", encoding, found.width, found.height)
         return Seen(key, form, parts, pixels=pixels)
 

@@ -102,7 +102,7 @@ def _check(to: str, options: UnpackOptions) -> None:
         raise OptionError(f"--storage {options.storage!r} is not known. Use sqlite3 or mcap.")
     if options.storage and to != "rosbag2":
         raise OptionError(f"--storage goes with --to rosbag2, not with --to {to}.")
-    if options.image_format not in ("png", "jpeg"):
+    if options.image_format not in (None, "png", "jpeg"):
         raise OptionError(f"--image-format {options.image_format!r} is not known. Use png or jpeg.")
     if options.images not in (None, *KINDS):
         raise OptionError(f"--images {options.images!r} is not known. Use {', '.join(KINDS)}.")

@@ -8,21 +8,26 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mp4ds.dataset import Stream
-from mp4ds.republish import Reduction, image_files
+from mp4ds.republish import Reduction, holds_files, image_files
 
 _STAMPS_NAME = "stamps.csv"
 _HEAD = ["file", "stamp_ns", "log_time_ns", "frame_id"]
 
 
 def write_images(
-    stream: Stream, folder: Path, *, image_format: str, jpeg_quality: int, reduction: Reduction
+    stream: Stream,
+    folder: Path,
+    *,
+    image_format: str | None,
+    jpeg_quality: int,
+    reduction: Reduction,
 ) -> Iterator[None]:
     """Write one file per frame, called by its number, and stamps.csv that tells the times of each.
 
     Args:
         stream: The stream.
         folder: Where to write; empty.
-        image_format: ``png`` or ``jpeg``.
+        image_format: ``png`` or ``jpeg``; None for JPEG files as they were recorded, else PNG.
         jpeg_quality: Of JPEG files that are made, 1 to 100.
         reduction: How much smaller or fewer they are.
 
@@ -30,6 +35,9 @@ def write_images(
         After each file.
     """
     columns, headers = stream.rebuilder.columns, stream.sidecar.headers
+    if image_format is None:
+        keeps = reduction.size_of(stream) is None and holds_files(stream.sidecar, "jpeg")
+        image_format = "jpeg" if keeps else "png"
     suffix = "jpg" if image_format == "jpeg" else "png"
     digits = len(str(len(stream) - 1))
     with (folder / _STAMPS_NAME).open("w", newline="") as file:

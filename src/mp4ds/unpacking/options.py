@@ -17,7 +17,8 @@ class UnpackOptions:
         storage: ``sqlite3`` or ``mcap``, for rosbag2; None for what the source had.
         topics: Globs of the topics to unpack; empty for all.
         exclude: Globs of topics to leave out.
-        image_format: ``png`` or ``jpeg``, for images.
+        image_format: ``png`` or ``jpeg``, for images; None for JPEG files as they were recorded,
+            and PNG for all else.
         images: How camera messages are given: one of `mp4ds.republish.KINDS`, or None for as
             they were recorded.
         jpeg_quality: Of JPEG files that are made, 1 to 100.
@@ -32,7 +33,7 @@ class UnpackOptions:
     storage: str | None = None
     topics: Sequence[str] = ()
     exclude: Sequence[str] = ()
-    image_format: str = "png"
+    image_format: str | None = None
     images: str | None = None
     jpeg_quality: int = 95
     resize: float | tuple[int, int] | None = None

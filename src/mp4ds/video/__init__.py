@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mp4ds.video.hardware import HARDWARE, HardwareError, check_hardware
     from mp4ds.video.images import ImageFile
     from mp4ds.video.join import SegmentsDifferError, join_segments
-    from mp4ds.video.jpeg import JpegDecoder
+    from mp4ds.video.jpeg import jpeg_pixels
     from mp4ds.video.memory import encoder_bytes
     from mp4ds.video.packets import PacketReader, PacketWriter
     from mp4ds.video.reader import FrameReader, open_frames
@@ -33,7 +33,7 @@ else:
         hardware="HARDWARE HardwareError check_hardware",
         images="ImageFile",
         join="SegmentsDifferError join_segments",
-        jpeg="JpegDecoder",
+        jpeg="jpeg_pixels",
         memory="encoder_bytes",
         packets="PacketReader PacketWriter",
         reader="FrameReader open_frames",
@@ -48,7 +48,6 @@ __all__ = [
     "FrameReader",
     "HardwareError",
     "ImageFile",
-    "JpegDecoder",
     "PacketReader",
     "PacketWriter",
     "Recipe",
@@ -65,6 +64,7 @@ __all__ = [
     "encoder_bytes",
     "encoding_as",
     "join_segments",
+    "jpeg_pixels",
     "open_file_frames",
     "open_frames",
     "packets_in_groups",

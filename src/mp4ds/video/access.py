@@ -25,6 +25,7 @@ from mp4ds.remote import expect
 from mp4ds.sidecar import References
 from mp4ds.video.chains import Chains, Group, Piece
 from mp4ds.video.digest import packets_of_groups
+from mp4ds.video.jpeg import JpegDecoder
 from mp4ds.video.pictures import PictureMaker
 from mp4ds.video.samples import SampleTable, Unindexed, read_sample_table
 from mp4ds.video.scarcity import raise_if_scarce
@@ -35,7 +36,6 @@ _DECODERS = {
     "av1": "libdav1d",
     "vp9": "vp9",
     "ffv1": "ffv1",
-    "mjpeg": "mjpeg",
 }
 CODECS_OF_ENTRIES = {  # codecs by the four letters of their sample entry
     **dict.fromkeys(("avc1", "avc3"), "h264"),
@@ -213,6 +213,8 @@ class FrameAccess:
         self._session = _Session(group)
 
     def _new_context(self) -> Any:
+        if self._codec == "mjpeg":
+            return JpegDecoder(self._maker.coded_size)
         context: Any = av.CodecContext.create(_DECODERS[self._codec], "r")
         if self.table.configuration:
             context.extradata = self.table.configuration

@@ -13,6 +13,7 @@ from av.error import FFmpegError
 
 from mp4ds.errors import VideoError
 from mp4ds.layouts import Picture
+from mp4ds.video.jpeg import JpegDecoder
 from mp4ds.video.media import Media
 from mp4ds.video.pictures import PictureMaker
 from mp4ds.video.scarcity import raise_if_scarce
@@ -67,6 +68,7 @@ class VideoDecoder:
             full_range=full_range,
             fast_colour=fast_colour,
         )
+        self._jpeg = JpegDecoder(coded_size) if codec == "mjpeg" else None
         self._ticks: np.ndarray[tuple[int], np.dtype[np.int64]] | None = None
         self._media = Media(path)
         self._container = self._media.container
@@ -200,7 +202,7 @@ class VideoDecoder:
     def _decoded(self, first: int) -> Iterator[av.VideoFrame]:
         number = first
         try:
-            for frame in self._container.decode(self._stream):
+            for frame in self._frames_from_here():
                 yield frame
                 number += 1
         except (FFmpegError, OSError) as error:
@@ -209,11 +211,17 @@ class VideoDecoder:
                 "decode-failed", self._path, f"frame {number} cannot be decoded: {error}"
             ) from None
 
+    def _frames_from_here(self) -> Iterator[av.VideoFrame]:
+        if self._jpeg is None:
+            yield from self._container.decode(self._stream)
+        else:
+            yield from self._jpeg.frames(self._container.demux(self._stream))
+
     def _decodable(self) -> Iterator[av.VideoFrame]:
         try:
             for packet in self._container.demux(self._stream):
                 try:
-                    frames = packet.decode()
+                    frames = self._jpeg.decode(packet) if self._jpeg else packet.decode()
                 except FFmpegError as error:
                     raise_if_scarce(error)
                     continue

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import VideoError
 from mp4ds.layouts import MAX_SIDE, Picture
 from mp4ds.video.access import FrameAccess
+from mp4ds.video.jpeg import JpegDecoder
 from mp4ds.video.media import FFMPEG_NAMES, Media
 from mp4ds.video.pictures import PictureMaker
 from mp4ds.video.reader import FrameReader
@@ -150,7 +151,10 @@ class VideoFile:
             container.seek(
                 int(self._keys[group] if group >= 0 else self._ticks[0]), stream=self._stream
             )
-            self._frames = container.decode(self._stream)
+            if self.codec == "mjpeg":
+                self._frames = JpegDecoder(self.size).frames(container.demux(self._stream))
+            else:
+                self._frames = container.decode(self._stream)
         except (FFmpegError, OSError) as error:
             raise_if_scarce(error)
             raise VideoError(

@@ -1,51 +1,84 @@
-"""Decoding single JPEG files."""
+"""JPEG files as libjpeg decodes them: to the pixels that OpenCV and image_transport have, too."""
 
 from __future__ import annotations
 
+import errno
+import io
+import struct
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import av
 import numpy as np
-from av.error import FFmpegError
+from av.error import InvalidDataError
 from numpy.typing import NDArray
 
 from mp4ds.coded import Refused
-from mp4ds.video.convert import Converter
-from mp4ds.video.scarcity import raise_if_scarce
 
+_ENCODINGS = {"L": "mono8", "RGB": "rgb8"}
 _FORMATS = {"mono8": "gray", "rgb8": "rgb24"}
 
 
+def jpeg_pixels(data: bytes | memoryview, size: tuple[int, int]) -> tuple[str, NDArray[np.uint8]]:
+    """The pixels of a file, turned by no tag and converted by no profile.
+
+    Args:
+        data: The file.
+        size: Its width and height; nothing larger is unpacked.
+
+    Returns:
+        The ROS encoding, ``mono8`` or ``rgb8``, and pixels of shape (H, W) or (H, W, 3).
+
+    Raises:
+        Refused: It does not decode, or is of another size or kind.
+    """
+    from PIL.JpegImagePlugin import JpegImageFile
+
+    try:
+        with JpegImageFile(io.BytesIO(data)) as image:
+            if image.mode not in _ENCODINGS:
+                raise ValueError(f"it has colours of another kind ({image.mode})")
+            if image.size != size:
+                raise ValueError(f"it has {image.width}x{image.height} pixels")
+            return _ENCODINGS[image.mode], np.asarray(image)
+    except MemoryError:
+        raise
+    except (OSError, SyntaxError, ValueError, EOFError, LookupError, struct.error) as error:
+        raise Refused(f"its JPEG does not decode: {error}") from None
+
+
 class JpegDecoder:
-    """Decodes the JPEG files of one topic; not to be shared between threads."""
+    """Takes the place of ffmpeg's decoder of JPEG files, as much of it as is used.
 
-    def __init__(self) -> None:
-        self._converter = Converter("smpte170m")  # what JFIF says
+    Args:
+        size: Width and height of the frames.
+    """
 
-    def decode(self, data: bytes | memoryview, encoding: str) -> NDArray[np.uint8]:
-        """The pixels of a file.
+    def __init__(self, size: tuple[int, int]) -> None:
+        self._size = size
 
-        Args:
-            data: The file.
-            encoding: ``mono8`` or ``rgb8``.
-
-        Returns:
-            Shape (H, W) or (H, W, 3).
+    def decode(self, packet: Any) -> list[av.VideoFrame]:
+        """The frame of a packet; none of the empty one that ends a video.
 
         Raises:
-            Refused: It does not decode.
+            InvalidDataError: It does not decode.
         """
-        context: Any = av.CodecContext.create("mjpeg", "r")
+        if packet is None or not packet.size:
+            return []
         try:
-            frames = [*context.decode(av.Packet(bytes(data))), *context.decode(None)]
-        except FFmpegError as error:
-            raise_if_scarce(error)
-            raise Refused(f"its JPEG does not decode: {error.strerror}") from None
-        if len(frames) != 1 or frames[0].is_corrupt:
-            raise Refused("its JPEG does not decode")
-        frame = self._converter.convert(frames[0], _FORMATS[encoding])
-        plane: Any = frame.planes[0]
-        rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
-        if encoding == "mono8":
-            return rows[: frame.height, : frame.width]
-        return rows[: frame.height, : 3 * frame.width].reshape(frame.height, frame.width, 3)
+            encoding, pixels = jpeg_pixels(bytes(packet), self._size)
+        except Refused as error:
+            raise InvalidDataError(errno.EINVAL, str(error)) from None
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), _FORMATS[encoding])
+        frame.pts = packet.pts
+        if packet.time_base:
+            frame.time_base = packet.time_base
+        return [frame]
+
+    def frames(self, packets: Iterable[Any]) -> Iterator[av.VideoFrame]:
+        """The frames of packets, in order."""
+        for packet in packets:
+            yield from self.decode(packet)
+
+    def flush_buffers(self) -> None:
+        """There is nothing to forget."""
