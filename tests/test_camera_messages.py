@@ -481,6 +481,20 @@ def test_jpeg_files_are_kept_unless_asked(quality: str, tmp_path: Path, compare:
     assert any("--transcode" in note for note in summary.notes)
 
 
+def test_what_grows_is_explained(tmp_path: Path) -> None:
+    """The same JPEG file again and again is one to zstd, and a packet each to a video."""
+    recorded = with_data(
+        CODED["jpeg-format-plain"](frames=40),
+        lambda _: pillow(still("rgb8", 0), "JPEG", quality=100),
+    )
+    for name, grows in [("mcap-ros2-zstd", True), ("mcap-ros2-none", False)]:
+        (tmp_path / name).mkdir()
+        paths = SOURCES[name](tmp_path / name, recorded)
+        summary = mp4ds.pack(paths, tmp_path / name / "dataset")
+        assert (summary.dataset_bytes > 1.05 * summary.source_bytes) == grows
+        assert ("those that repeat" in summary.larger) == grows
+
+
 def test_transcoding_without_loss_is_refused(tmp_path: Path) -> None:
     paths = SOURCES["bag-none"](tmp_path, CODED["jpeg-rgb"](frames=2))
     with pytest.raises(mp4ds.OptionError, match="--transcode"):

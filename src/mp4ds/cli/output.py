@@ -187,6 +187,8 @@ def print_pack(summary: PackSummary) -> None:
         f"{size_text(summary.dataset_bytes)} "
         f"({ratio:.2f} times smaller), of which messages.mcap {size_text(summary.messages_bytes)}"
     )
+    if summary.larger:
+        say(f"larger than its source: {summary.larger}")
 
 
 def _loss_text(loss: Loss) -> str:

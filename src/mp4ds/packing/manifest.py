@@ -33,6 +33,8 @@ from mp4ds.sidecar import (
 from mp4ds.video import tool_versions
 from mp4ds.wire.transforms import TransformCollector
 
+_LARGER = 1.05  # than its source: more is to be explained
+
 
 class Recorded(Protocol):
     """What a manifest tells of a recording. See `BagReader`."""
@@ -171,16 +173,35 @@ def summarize(part: Part, target: Path, source_bytes: int) -> PackSummary:
             topic.notes.append(str(video.quality))
         if stream.is_renamed:
             topic.notes.append(f"stored as {video.file}: the plain name was taken")
+    dataset_bytes, messages_bytes = folder_size(part.folder), part.messages_path.stat().st_size
     return PackSummary(
         dataset=target,
         topics=list(part.topics.values()),
         source_bytes=source_bytes,
-        dataset_bytes=folder_size(part.folder),
-        messages_bytes=part.messages_path.stat().st_size,
+        dataset_bytes=dataset_bytes,
+        messages_bytes=messages_bytes,
         left_out=list(part.left_out),
         skipped=dict(part.skipped),
         losses=part.losses,
+        larger=_why_larger(part, source_bytes, dataset_bytes, messages_bytes),
     )
+
+
+def _why_larger(part: Part, source_bytes: int, dataset_bytes: int, messages_bytes: int) -> str:
+    """A sentence where a dataset takes more than its source by more than 5 %; else empty."""
+    if dataset_bytes <= _LARGER * source_bytes:
+        return ""
+    raw = sum(topic.raw_bytes for topic in part.topics.values())
+    if raw <= source_bytes:
+        return "a recording this small takes less than the index, definitions and sidecars"
+    if 2 * messages_bytes > dataset_bytes:
+        return "the source's own compression (bz2, say) packs small messages closer than zstd does"
+    if any(stream.sidecar.body == "packet" for stream in part.streams):
+        return (
+            "JPEG files and video packets are kept as they are, those that repeat, too, which the "
+            "source's own compression stores once"
+        )
+    return "the source's own compression packs its images closer than a video does"
 
 
 def folder_size(folder: Path) -> int:

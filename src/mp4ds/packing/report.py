@@ -187,6 +187,7 @@ class PackSummary:
         left_out: Topics left out on request.
         skipped: What the source holds and no dataset can: a phrase -> how many.
         losses: What could not be read of a damaged recording.
+        larger: Why the dataset is larger than its source, where it is by more than 5 %.
     """
 
     dataset: Path
@@ -197,3 +198,4 @@ class PackSummary:
     left_out: list[str]
     skipped: dict[str, int]
     losses: list[Loss] = field(default_factory=list)
+    larger: str = ""
