@@ -35,7 +35,7 @@ try() (
   PYTHON=$python bash examples/quickstart.sh
   .venv/bin/python -m pip install --quiet --editable '.[test]'
   .venv/bin/python -m pip list --format freeze
-  .venv/bin/pytest -n auto -q -m "not slow and not network" "$@"
+  .venv/bin/pytest -n auto --dist worksteal -q -m "not slow and not network" "$@"
 )
 
 failed=0
