@@ -71,7 +71,7 @@ EVEN |= {("full", "32FC1")}
 """Where the two are of about one size, so that either may be taken."""
 
 
-@each(("content", "encoding", "source", "shape"), share(RAW, 3))
+@each(("content", "encoding", "source", "shape"), share(RAW, 6))
 def test_raw_images(
     content: str, encoding: str, source: str, shape: str, tmp_path: Path, compare: Compare
 ) -> None:
@@ -160,7 +160,7 @@ EVEN_PNG = {"png-rgb-cv2", "png-rgb-cv2-9", "png-rgb-pillow", "png-called-jpeg"}
 STREAMS = {"jpeg-mixed-sizes": 2, "video-h264-resized": 2}
 
 
-@each(("name", "source"), share([(name, s) for name in CODED for s in CODED_SOURCES], 3))
+@each(("name", "source"), share([(name, s) for name in CODED for s in CODED_SOURCES], 6))
 def test_coded_pictures(name: str, source: str, tmp_path: Path, compare: Compare) -> None:
     recorded = CODED[name]()
     topic = image_topic(recorded)

@@ -213,6 +213,7 @@ def test_a_task_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
     assert "300 MiB" in sentence
 
 
+@pytest.mark.slow
 def test_a_lost_scheduler_is_an_error_and_the_next_one_goes_on(tmp_path: Path) -> None:
     names = numbered(8)
     with RealCluster(tmp_path / "dask") as cluster:

@@ -408,7 +408,7 @@ def use_harmed(monkeypatch: pytest.MonkeyPatch, name: str, harm: str) -> None:
     )
 
 
-@pytest.mark.parametrize("jobs", [1, 3])
+@pytest.mark.parametrize("jobs", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_a_process_that_is_killed_again_and_again(
     jobs: int,
     tmp_path: Path,

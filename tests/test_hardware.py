@@ -358,6 +358,7 @@ def test_packing_and_unpacking(
     assert leftovers(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_evaluating(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stand_in: str) -> None:
     code = (
         f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"

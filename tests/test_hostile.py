@@ -1227,7 +1227,7 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
 }
 
 
-@each("name", FORGED, one_in=3)
+@each("name", FORGED, one_in=6)
 def test_a_forged_sidecar_of_coded_pictures(
     name: str, pairs: Callable[[str], Path], tmp_path: Path, jail: Jail
 ) -> None:

@@ -764,7 +764,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.browser
-@each("name", [*PLAYED_IDS, *(f"packets-{name}" for name in PACKETS_PLAYED)], one_in=3)
+@each("name", [*PLAYED_IDS, *(f"packets-{name}" for name in PACKETS_PLAYED)], one_in=6)
 def test_a_browser_plays_across_the_seams(name: str, seen: dict[str, Any]) -> None:
     path, result = seen[name]
     assert result is not None, "the browser did not come to this video in time"

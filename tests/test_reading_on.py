@@ -231,7 +231,7 @@ def test_chosen_packets(name: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- of a decoder
 
 
-@each("codec", ["h264", "h265", "av1", "ffv1"], one_in=2)
+@each("codec", ["h264", "h265", "av1", "ffv1"], one_in=4)
 def test_pictures_of_any_frames(codec: str, tmp_path: Path) -> None:
     options = {"quality": "visual"} if codec == "av1" else {}
     made = scene("mono8", frames=90, width=32, height=16)

@@ -302,7 +302,7 @@ def in_turn(*tables: Sequence[str]) -> list[Any]:
     return found
 
 
-@each(("name", "kind", "to"), in_turn([*FATES], KINDS, [*TARGETS]), one_in=2)
+@each(("name", "kind", "to"), in_turn([*FATES], KINDS, [*TARGETS]), one_in=4)
 def test_every_camera_as_every_kind(packed: Pack, name: str, kind: str, to: str) -> None:
     made = packed(name, SOURCE_OF[to])
     summary, messages = made.unpack(to, kind)

@@ -241,6 +241,7 @@ def test_a_want_of_memory_is_no_damage(
         assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @LIMITED
 def test_more_cameras_than_open_files(tmp_path: Path) -> None:
     """Each has a file while it is packed; as many may be open as the system lets."""
