@@ -176,6 +176,7 @@ PLANTED: dict[str, Callable[[Any], object]] = {
     "threads": _set("threads", 10**9),
     "options": lambda values: values["options"].pop("salvage"),
     "work": _set("work", {"/cam": "x"}),
+    "source": lambda values: values["sources"][0].update(path=[]),
     "nothing": lambda values: values.clear() or values.update(x=1),
 }
 

@@ -163,6 +163,9 @@ class Job:
         numbers = (self.threads, self.workers, self.task_bytes)
         if len(names) != len(self.tasks):
             raise ValueError("tasks of one name")
+        paths = [*self.paths, *(source.path for source in self.sources)]
+        if not all(isinstance(path, str) and "\0" not in path for path in paths):
+            raise ValueError("a file whose name is none")
         if any(not 0 <= (task.source or 0) < len(self.sources) for task in self.tasks):
             raise ValueError("a task of a file that is none of the recording")
         if not all(isinstance(number, int) and number > 0 for number in numbers):
