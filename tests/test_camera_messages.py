@@ -401,7 +401,7 @@ TRANSCODED = [
 LEAST = {
     **dict.fromkeys(("jpeg-gray", "jpeg-pillow-gray", "jpeg-format-mono8"), 38),
     "jpeg-mixed-sizes": 31,
-    "jpeg-422": 29,
+    "jpeg-422": 28,
     "jpeg-444": 25,
 }
 """dB, of a lossy video and a JPEG file of quality 95; 33 for others, whose colours are halved."""
