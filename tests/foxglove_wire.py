@@ -29,6 +29,13 @@ from scenes import Record, typestore
 # ---------------------------------------------------------------- protobuf
 
 
+def _is_list(field: Any) -> bool:
+    """Whether a field is repeated; protobuf told it by a label before version 6.31."""
+    if hasattr(field, "is_repeated"):
+        return bool(field.is_repeated)
+    return bool(field.label == field.LABEL_REPEATED)
+
+
 def message_class(msgtype: str) -> type[Message]:
     """The protobuf class of ``foxglove_msgs/msg/X``, generated from Foxglove's schemas."""
     name = msgtype.rpartition("/")[2]
@@ -66,7 +73,7 @@ def fill(message: Message, values: Mapping[str, Any]) -> Message:
         elif field.message_type:
             getattr(message, field.name).SetInParent()
             fill(getattr(message, field.name), given)
-        elif field.is_repeated:
+        elif _is_list(field):
             getattr(message, field.name).extend(float(number) for number in given)
         elif field.type == FieldDescriptor.TYPE_BYTES:
             setattr(message, field.name, as_bytes(given))
@@ -115,7 +122,7 @@ def _json_value(message: Mapping[str, Any], field: FieldDescriptor) -> Any:
         return {"sec": given // 10**9, "nsec": given % 10**9}
     if field.message_type:
         return {f.name: _json_value(given or {}, f) for f in field.message_type.fields}
-    if field.is_repeated:
+    if _is_list(field):
         return [float(number) for number in given]
     if field.type == FieldDescriptor.TYPE_BYTES:
         return base64.b64encode(as_bytes(given)).decode()
@@ -155,7 +162,7 @@ def json_schema(descriptor: Descriptor) -> dict[str, Any]:
         else:
             rule = {"type": "number" if field.type == FieldDescriptor.TYPE_DOUBLE else "integer"}
         rules["properties"][field.name] = (
-            {"type": "array", "items": rule} if field.is_repeated else rule
+            {"type": "array", "items": rule} if _is_list(field) else rule
         )
     return rules
 
@@ -181,7 +188,7 @@ def _table(builder: flatbuffers.Builder, descriptor: Descriptor, values: Mapping
             children[field.name] = builder.CreateString(given or "")
         elif field.type == FieldDescriptor.TYPE_BYTES:
             children[field.name] = builder.CreateByteVector(as_bytes(given))
-        elif field.is_repeated:
+        elif _is_list(field):
             children[field.name] = builder.CreateNumpyVector(np.asarray(given, float))
         else:
             children[field.name] = given
