@@ -76,7 +76,7 @@ def patterns(count: int) -> Iterator[list[int]]:
     yield [0]
 
 
-@each("name", [name for name in RECIPES if name not in ALIKE], one_in=2)
+@each("name", [name for name in RECIPES if name not in ALIKE], one_in=4)
 def test_it_is_the_same_frame(name: str, tmp_path: Path) -> None:
     recipe = RECIPES[name]
     path = written(tmp_path, recipe)

@@ -750,7 +750,7 @@ def test_a_full_disk_leaves_what_was_there(demo: Path, small_dataset: Path, tmp_
 CODED_KINDS = ["jpeg-444", "png-16-bit-cv2", "depth-32FC1-rvl", "video-h264", "video-vp9"]
 
 
-@each("to", ["dataset", "mcap"], one_in=2)
+@each("to", ["dataset", "mcap"], one_in=6)
 @each("kind", CODED_KINDS)
 def test_a_disk_that_is_full_of_coded_pictures(kind: str, to: str, tmp_path: Path) -> None:
     recorded = CODED[kind](frames=24, width=320, height=240)

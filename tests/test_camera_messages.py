@@ -71,7 +71,7 @@ EVEN |= {("full", "32FC1")}
 """Where the two are of about one size, so that either may be taken."""
 
 
-@each(("content", "encoding", "source", "shape"), share(RAW, 6))
+@each(("content", "encoding", "source", "shape"), share(RAW, 6), one_in=3)
 def test_raw_images(
     content: str, encoding: str, source: str, shape: str, tmp_path: Path, compare: Compare
 ) -> None:
@@ -160,7 +160,7 @@ EVEN_PNG = {"png-rgb-cv2", "png-rgb-cv2-9", "png-rgb-pillow", "png-called-jpeg"}
 STREAMS = {"jpeg-mixed-sizes": 2, "video-h264-resized": 2}
 
 
-@each(("name", "source"), share([(name, s) for name in CODED for s in CODED_SOURCES], 6))
+@each(("name", "source"), share([(name, s) for name in CODED for s in CODED_SOURCES], 6), one_in=2)
 def test_coded_pictures(name: str, source: str, tmp_path: Path, compare: Compare) -> None:
     recorded = CODED[name]()
     topic = image_topic(recorded)
@@ -246,7 +246,7 @@ FILES: dict[str, Rewrite] = {
 }
 
 
-@each("name", FILES, one_in=2)
+@each("name", FILES, one_in=4)
 def test_files_of_many_encoders(name: str, tmp_path: Path, compare: Compare) -> None:
     recorded = with_data(CODED["jpeg-format-plain"](), FILES[name])
     done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag")
@@ -267,7 +267,7 @@ FOXGLOVE_EXPECTED: Mapping[str, tuple[int, int]] = {
 FOXGLOVE_CASES = [(name, source) for name in FOXGLOVE for source in FOXGLOVE_SOURCES]
 
 
-@each(("name", "source"), share(FOXGLOVE_CASES, len(FOXGLOVE_SOURCES)))
+@each(("name", "source"), share(FOXGLOVE_CASES, len(FOXGLOVE_SOURCES)), one_in=2)
 def test_foxglove_messages(name: str, source: str, tmp_path: Path, compare: Compare) -> None:
     done = journey(tmp_path, FOXGLOVE_SOURCES[source], FOXGLOVE[name](), "mcap")
     assert compare(done.sources, done.output) == []
@@ -339,7 +339,7 @@ QUALITIES: dict[str, dict[str, Any]] = {
 @each(
     ("quality", "encoding"),
     share([(quality, name) for name in ENCODINGS for quality in QUALITIES], len(QUALITIES)),
-    one_in=2,
+    one_in=4,
 )
 def test_raw_images_in_a_lossy_profile(
     quality: str, encoding: str, tmp_path: Path, compare: Compare
@@ -362,7 +362,7 @@ def test_raw_images_in_a_lossy_profile(
         assert compare(done.sources, done.output) == []
 
 
-@each("quality", QUALITIES)
+@each("quality", QUALITIES, one_in=3)
 @each("size", [(16, 16), (34, 18), (48, 32), (48, 200), (62, 62), (64, 16)])
 def test_narrow_images_in_a_lossy_profile(
     size: tuple[int, int], quality: str, tmp_path: Path, compare: Compare
@@ -410,6 +410,7 @@ LEAST = {
 @each(
     ("name", "quality"),
     share([(name, quality) for name in TRANSCODED for quality in QUALITIES], len(QUALITIES)),
+    one_in=2,
 )
 def test_jpeg_files_that_are_transcoded(
     name: str, quality: str, tmp_path: Path, compare: Compare

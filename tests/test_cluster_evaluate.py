@@ -280,6 +280,7 @@ def test_encoders_have_one_thread_on_a_cluster() -> None:
 # ---------------------------------------------------------------- trials
 
 
+@pytest.mark.slow
 def test_a_trial_may_be_run_twice_at_once(
     bag: Path, expected: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -133,10 +133,8 @@ def test_a_lost_scheduler_is_told_and_another_goes_on(
     assert leftovers(tmp_path) == []
 
 
-@pytest.mark.parametrize(
-    ("sign", "code"),
-    [(signal.SIGINT, 130), pytest.param(signal.SIGKILL, -9, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("sign", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
 def test_a_command_that_ended_leaves_the_cluster_idle(
     sign: int,
     code: int,

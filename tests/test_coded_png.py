@@ -102,7 +102,7 @@ def test_opencv(size: tuple[int, int], channels: int, dtype: Any) -> None:
         check(by_opencv(pixels, cv2.IMWRITE_PNG_COMPRESSION, level))
 
 
-@each("strategy", range(5))
+@each("strategy", range(5), one_in=4)
 @each("filters", [8, 16, 32, 64, 128, 248, 56])
 def test_opencv_with_strategies_and_filters(strategy: int, filters: int) -> None:
     pixels = picture(60, 80, 3, np.uint8)

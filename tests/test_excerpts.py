@@ -156,7 +156,7 @@ def test_stats_of_two_parts() -> None:
 # ---------------------------------------------------------------- all kinds of sources
 
 
-@each("name", SOURCES)
+@each("name", SOURCES, one_in=2)
 @each("seed", [0, 1])
 def test_parts_of_every_source(name: str, seed: int, tmp_path: Path) -> None:
     paths = SOURCES[name](tmp_path, scene("mono8", frames=24))
@@ -197,7 +197,7 @@ def test_spans_without_messages(name: str, tmp_path: Path) -> None:
         assert list(reader.records(Excerpt(topics=frozenset({"/none"}), others=False))) == []
 
 
-@each("name", REAL_BAGS)
+@each("name", REAL_BAGS, one_in=2)
 def test_parts_of_real_bags(name: str) -> None:
     with open_reader(real(name)) as reader:
         assert reader.is_indexed
@@ -475,7 +475,7 @@ ARRANGED: dict[str, list[tuple[str, int]]] = {
 }
 
 
-@each("name", ARRANGED)
+@each("name", ARRANGED, one_in=2)
 @each("hold", [None, 3900])
 def test_chunks_in_any_order(
     name: str, hold: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

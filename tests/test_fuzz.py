@@ -23,7 +23,7 @@ from mp4ds import Mp4dsError
 from mp4ds.bags import open_sources
 from sources import SOURCES, scene
 
-COUNT = 400
+COUNT = 150
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,8 @@ def test_an_input_is_made_again_by_its_seed(kinds: dict[str, Any], tmp_path: Pat
 def test_what_may_not_happen_is_found(
     harm: Any, told: str, kinds: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fuzz, "SECONDS", 1)
+    if told.startswith("_TookTooLong"):
+        monkeypatch.setattr(fuzz, "SECONDS", 1)
     kind = fuzz.Kind(kinds["bag-none"].make, harm)
     _, findings = fuzz.run({"bad": kind}, count=1, seed=0, seconds=60.0, around=tmp_path)
     (found,) = [finding.what for finding, _ in findings]

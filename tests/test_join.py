@@ -157,7 +157,7 @@ LEFT_OUT = {"h264": {"btrt"}, "h265": {"btrt"}, "av1": {"sdtp"}, "ffv1": set()}
 
 Kind = tuple[str, str, bool]
 Joined = Callable[[Kind], tuple[Path, list[Path], dict[str, Any]]]
-every_kind = each("kind", KINDS, ids=IDS)
+every_kind = each("kind", KINDS, ids=IDS, one_in=2)
 
 
 @pytest.fixture(scope="module")
@@ -287,7 +287,7 @@ def test_pyav_seeks_across_the_seams(kind: Kind, joined: Joined) -> None:
             assert times == list(range(times[0], TOTAL * STEP, STEP))
 
 
-@each("kind", KINDS, ids=IDS, one_in=4)
+@each("kind", KINDS, ids=IDS, one_in=8)
 @each("size", [(640, 360), (1920, 1200)])
 def test_what_a_track_says_does_not_hang_on_threads(
     kind: tuple[str, str, bool], size: tuple[int, int], tmp_path: Path

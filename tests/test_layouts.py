@@ -76,7 +76,7 @@ def through(layout: Layout, pixels: np.ndarray, out: np.ndarray | None = None) -
 # ---------------------------------------------------------------- exact layouts
 
 
-@each("kind", KINDS)
+@each("kind", KINDS, one_in=2)
 @each(("name", "layout"), GENERAL)
 def test_the_general_layout_gives_all_pixels_back(name: str, layout: str, kind: str) -> None:
     encoding = ENCODINGS[name]
@@ -96,7 +96,7 @@ def test_the_general_layout_gives_all_pixels_back(name: str, layout: str, kind: 
                 assert bits_of(through(general, view, target)) == bits_of(pixels)
 
 
-@each("seed", range(4))
+@each("seed", range(4), one_in=2)
 @each(("name", "layout"), WITH_PARAMETERS)
 def test_a_fitted_layout_gives_the_samples_back(name: str, layout: str, seed: int) -> None:
     encoding = ENCODINGS[name]

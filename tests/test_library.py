@@ -132,7 +132,7 @@ def test_frames_of_a_lossy_dataset_are_near(encoding: str, tmp_path: Path) -> No
 SHAPES: list[dict[str, Any]] = [{"width": 63, "height": 47}, {"pad": 3}, {"big_endian": True}]
 
 
-@each("encoding", [name for name in ENCODINGS if name not in COMMON], one_in=2)
+@each("encoding", [name for name in ENCODINGS if name not in COMMON], one_in=4)
 def test_frames_of_every_other_encoding(encoding: str, tmp_path: Path) -> None:
     shape = SHAPES[ENCODINGS.index(encoding) % 3]
     source = scene(encoding, **shape)

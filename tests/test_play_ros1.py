@@ -78,8 +78,8 @@ def published(core: Core, command: list[str], topics: Iterable[str], count: int)
     ("name", "pace"),
     [
         ("roboto_tiny_dvs", ["--immediate"]),
-        ("librealsense_depth_color", ["--immediate"]),
-        ("ecto_ros_camera_info", ["--immediate"]),
+        pytest.param("librealsense_depth_color", ["--immediate"], marks=pytest.mark.slow),
+        pytest.param("ecto_ros_camera_info", ["--immediate"], marks=pytest.mark.slow),
         ("youliangtan_object_pose", ["--rate", "6"]),
     ],
 )
@@ -135,7 +135,7 @@ def test_clock(roscore: Core, drive: Path) -> None:
     assert len(times) > 30
 
 
-@pytest.mark.parametrize("leader", ["rosbag", "mp4ds"])
+@pytest.mark.parametrize("leader", ["rosbag", pytest.param("mp4ds", marks=pytest.mark.slow)])
 def test_two_players_in_step(roscore: Core, tmp_path: Path, leader: str) -> None:
     """The leader goes on for longer: rosbag play's last /clock is before its last message."""
     bag = make_drive(tmp_path / "first.bag", frames=25)

@@ -228,7 +228,7 @@ def ffprobe(path: Path, *options: str) -> Any:
     return json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
 
 
-@each("name", CASES, one_in=2)
+@each("name", CASES, one_in=4)
 def test_ffprobe_knows_all(name: str, datasets: dict[str, Path]) -> None:
     case, path = CASES[name], video_of(datasets[name])
     found = ffprobe(path, "-count_frames", "-show_streams", "-show_format")
@@ -564,7 +564,7 @@ def middle_times(dataset: Path) -> list[float]:
 
 
 @pytest.mark.browser
-@each("name", PLAYED, one_in=2)
+@each("name", PLAYED, one_in=4)
 def test_a_browser_plays_it(name: str, played: dict[str, Any], datasets: dict[str, Path]) -> None:
     assert name in played, "the browser did not come to this video in time"
     result = played[name]

@@ -27,7 +27,7 @@ from scenes import START, Record, Scene, image_cdr, image_ros1, odd_scene
 from sources import SOURCES, load_tool
 
 steady = settings(
-    max_examples=60,
+    max_examples=30,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )

@@ -289,6 +289,7 @@ def test_the_package_says_that_it_is_typed() -> None:
     assert Path(mp4ds.__file__).with_name("py.typed").is_file()
 
 
+@pytest.mark.slow
 def test_a_typed_program_passes_mypy(tmp_path: Path) -> None:
     pytest.importorskip("mypy")
     usage = ROOT / "tests" / "typed_usage.py"

@@ -66,7 +66,7 @@ def same(one: NDArray[Any], other: NDArray[Any]) -> bool:
 # ---------------------------------------------------------------- by number
 
 
-@each("encoding", ENCODINGS, one_in=2)
+@each("encoding", ENCODINGS, one_in=4)
 def test_frames_of_every_encoding(encoding: str, tmp_path: Path) -> None:
     source = scene(encoding, frames=FRAMES)
     expected = recorded(source)
@@ -97,7 +97,7 @@ def test_frames_of_coded_messages(name: str, tmp_path: Path) -> None:
         assert same(stream.read(order, format="native"), np.stack([every[i] for i in order]))
 
 
-@each(("quality", "codec"), [("visual", None), ("crf=30", None), ("crf=30", "av1-10bit")])
+@each(("quality", "codec"), [("visual", None), ("crf=30", None), ("crf=30", "av1-10bit")], one_in=3)
 @each("encoding", ["rgb8", "bgr8", "mono8", "bayer_grbg8", "nv12"])
 def test_frames_of_a_lossy_video_are_those_of_unpack(
     encoding: str, quality: str, codec: str | None, tmp_path: Path

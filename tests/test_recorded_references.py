@@ -451,6 +451,7 @@ def test_damage_is_told_as_such(packed: Path, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- at URLs
 
 
+@pytest.mark.slow
 def test_what_is_fetched_of_a_remote_video(tmp_path: Path) -> None:
     """One frame of a group of 60: a fraction of what has to be fetched without references."""
     recorded = scene("mono8", frames=64, width=640, height=480)

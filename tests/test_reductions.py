@@ -106,7 +106,7 @@ def frames_of(made: Packed, resize: Any, topic: str | None = None) -> list[mp4ds
         (name, TARGETS[number % 3], SIZES[number % len(SIZES)] if number % 2 else 0.5)
         for number, name in enumerate(RESIZED)
     ],
-    one_in=2,
+    one_in=4,
 )
 def test_images_are_those_of_the_frames(
     packed: Callable[..., Packed], name: str, to: str, resize: Any

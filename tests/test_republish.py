@@ -302,7 +302,7 @@ def in_turn(*tables: Sequence[str]) -> list[Any]:
     return found
 
 
-@each(("name", "kind", "to"), in_turn([*FATES], KINDS, [*TARGETS]), one_in=4)
+@each(("name", "kind", "to"), in_turn([*FATES], KINDS, [*TARGETS]), one_in=12)
 def test_every_camera_as_every_kind(packed: Pack, name: str, kind: str, to: str) -> None:
     made = packed(name, SOURCE_OF[to])
     summary, messages = made.unpack(to, kind)
@@ -401,7 +401,7 @@ ENCODINGS = [
 ]
 
 
-@each("target", ["bag", "mcap"], one_in=4)
+@each("target", ["bag", "mcap"], one_in=8)
 @each("kind", ["png", "jpeg"])
 @each("encoding", ENCODINGS)
 def test_files_of_every_encoding(encoding: str, kind: str, target: str, tmp_path: Path) -> None:
@@ -453,6 +453,7 @@ def test_files_of_every_encoding(encoding: str, kind: str, target: str, tmp_path
         ("yuv422", "jpeg", "rgb8; jpeg compressed bgr8", None),
         ("8UC3", "jpeg", "8UC3; jpeg compressed ", None),
     ],
+    one_in=2,
 )
 def test_formats_are_those_of_the_transport(
     encoding: str, kind: str, ros1: str, ros2: str | None, tmp_path: Path
@@ -1055,6 +1056,7 @@ def test_options_that_contradict(
         ("depth-16UC1-png", "raw"),
         ("depth-16UC1-png", "png"),
     ],
+    one_in=2,
 )
 @each("with_sum", [True, False])
 def test_a_damaged_video_is_refused(name: str, kind: str, with_sum: bool, tmp_path: Path) -> None:

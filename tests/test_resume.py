@@ -347,9 +347,8 @@ def long_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    "kills", [1, pytest.param(20, marks=pytest.mark.slow)], ids=["once", "storm"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [1, 20], ids=["once", "storm"])
 def test_killed_at_random_moments_it_ends_as_if_it_had_not_been(
     kills: int, tmp_path: Path, long_bag: Path, compare: Compare
 ) -> None:

@@ -116,7 +116,7 @@ CASES: dict[str, Case] = {
 }
 
 
-@each("case", CASES, one_in=3)
+@each("case", CASES, one_in=6)
 def test_a_reader_that_knows_the_spec_alone_gives_every_message(case: str, tmp_path: Path) -> None:
     make, write = CASES[case]
     (source,) = write(tmp_path, make(frames=8, width=192, height=128))

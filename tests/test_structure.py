@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pydantic
 import pytest
 
 from each import each
@@ -134,6 +135,13 @@ def test_the_picture_of_the_code_names_every_module() -> None:
 # ---------------------------------------------------------------- generated and released
 
 
+writes_schemas = pytest.mark.skipif(
+    tuple(int(part) for part in pydantic.VERSION.split(".")[:2]) < (2, 11),
+    reason="schemas are written by pydantic 2.11 or newer; older ones word them otherwise",
+)
+
+
+@writes_schemas
 def test_what_is_generated_is_up_to_date() -> None:
     done = run(sys.executable, "tools/generate.py", "--check")
     assert done.returncode == 0, done.stdout + done.stderr
@@ -147,6 +155,7 @@ def test_a_released_schema_is_there(kind: str) -> None:
     assert schema["additionalProperties"] is False
 
 
+@writes_schemas
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_schema_of_an_unreleased_version_is_the_draft(kind: str) -> None:
     """From the release on it is frozen; the draft goes on under the next version."""

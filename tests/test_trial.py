@@ -106,7 +106,7 @@ def test_an_encoder_that_refuses() -> None:
 # ---------------------------------------------------------------- choices
 
 
-@each("encoding", ENCODINGS, one_in=2)
+@each("encoding", ENCODINGS, one_in=4)
 def test_some_layout_is_chosen_for_every_encoding(encoding: str) -> None:
     samples = scene(encoding)
     first, again = chosen(samples, encoding), chosen(samples, encoding)
@@ -251,7 +251,7 @@ def test_pictures_beyond_the_bounds_are_not_tried() -> None:
     assert chosen([ramp], "mono16", codec="ffv1").recipe.pixel_format == "gray16le"
 
 
-@each("encoding", ["mono8", "rgb8", "uyvy", "bayer_rggb8", "nv12"], one_in=2)
+@each("encoding", ["mono8", "rgb8", "uyvy", "bayer_rggb8", "nv12"], one_in=3)
 def test_large_images_are_tried_in_part(encoding: str) -> None:
     """The estimate is for the whole."""
     samples = scene(encoding, 3, width=1602, height=1202)

@@ -141,7 +141,7 @@ def test_names(suffix: str, tmp_path: Path) -> None:
 VIDEOS = ["sam2_02_cups", "var_fps_video", "h264_10bits", "lerobot_aloha_insertion_human_yuv444"]
 
 
-@each("name", VIDEOS, one_in=2)
+@each("name", VIDEOS, one_in=4)
 def test_real_videos(name: str) -> None:
     path = real("video") / f"{name}.mp4"
     times, pixels = decoded(path)

@@ -64,7 +64,7 @@ def compare_packs(
     assert compare(paths, unpacked(folder, own_target(source))) == []
 
 
-@each("encoding", ENCODINGS, one_in=3)
+@each("encoding", ENCODINGS, one_in=6)
 def test_every_encoding(
     encoding: str, tmp_path: Path, compare: Compare, engine: InlineEngine
 ) -> None:
@@ -73,7 +73,7 @@ def test_every_encoding(
     compare_packs(tmp_path, source, recorded, compare, engine)
 
 
-@each("source", SOURCES, one_in=2)
+@each("source", SOURCES, one_in=4)
 def test_every_source(source: str, tmp_path: Path, compare: Compare, engine: InlineEngine) -> None:
     recorded = scene("bayer_gbrg8", frames=10)
     (tmp_path / "source").mkdir()
@@ -84,7 +84,7 @@ def test_every_source(source: str, tmp_path: Path, compare: Compare, engine: Inl
     assert leftovers(tmp_path) == []
 
 
-@each("source", ["bag-none", "mcap-ros2-zstd"], one_in=4)
+@each("source", ["bag-none", "mcap-ros2-zstd"], one_in=10)
 @each("name", CODED)
 def test_coded_images(
     name: str, source: str, tmp_path: Path, compare: Compare, engine: InlineEngine
@@ -96,7 +96,7 @@ def test_coded_images(
     assert compare(paths, unpacked(tmp_path, own_target(source))) == []
 
 
-@each("trait", TRAITS)
+@each("trait", TRAITS, one_in=3)
 def test_odd_messages(trait: str, tmp_path: Path, compare: Compare, engine: InlineEngine) -> None:
     (tmp_path / "source").mkdir()
     paths = SOURCES["mcap-ros2-zstd"](tmp_path / "source", odd_scene(trait))
@@ -105,7 +105,7 @@ def test_odd_messages(trait: str, tmp_path: Path, compare: Compare, engine: Inli
     assert compare(paths, unpacked(tmp_path, "mcap")) == []
 
 
-@each("source", list(FOXGLOVE_SOURCES)[::2])
+@each("source", list(FOXGLOVE_SOURCES)[::2], one_in=3)
 @each("name", ["raw-rgb8", "raw-padded", "jpeg-cut-one", "video-h264-mid-gop"])
 def test_foxglove_messages(
     name: str, source: str, tmp_path: Path, compare: Compare, engine: InlineEngine
@@ -141,7 +141,8 @@ def test_a_lossy_profile(
     assert max(error) < 12
 
 
-@pytest.mark.parametrize("groups", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("groups", [1, 2])
 def test_groups_of_cameras_and_one_without_images(
     groups: int, tmp_path: Path, compare: Compare, engine: InlineEngine
 ) -> None:

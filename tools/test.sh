@@ -2,6 +2,7 @@
 # Makes a virtual environment in .venv, installs the package with its test tools, and tests it.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+unset PYTHONDONTWRITEBYTECODE # or each of some hundred processes compiles all modules anew
 [ -x .venv/bin/python ] || "${PYTHON:-python3}" -m venv .venv
 .venv/bin/python -m pip install --quiet --editable '.[test]'
 .venv/bin/ruff check .

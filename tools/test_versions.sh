@@ -7,6 +7,7 @@
 #   PYTHONS="3.10 3.13" DEPENDENCIES=lowest bash tools/test_versions.sh tests/test_video_file.py
 set -euo pipefail
 cd "$(dirname "$0")/.."
+unset PYTHONDONTWRITEBYTECODE # as in tools/test.sh
 work=$PWD/build/versions
 mkdir -p "$work"
 [ -x "$work/uv/bin/uv" ] || { python3 -m venv "$work/uv" && "$work/uv/bin/pip" install --quiet uv; }
