@@ -407,6 +407,7 @@ def test_compressed_payloads_do_not_parse() -> None:
         Converter("ros1").payload(Channel(0, channel.topic, "cdr", own, {}), message.data)
 
 
+@pytest.mark.slow
 def test_every_standard_type_converts() -> None:
     """All of Noetic's types, with default values, against rosbags' own serialisation."""
     store = get_typestore(Stores.ROS1_NOETIC)

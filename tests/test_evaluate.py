@@ -624,6 +624,7 @@ def test_a_larger_grid_tries_what_is_new(tmp_path: Path) -> None:
     assert (other.tried, other.known) == (2, 0)
 
 
+@pytest.mark.slow
 def test_a_damaged_result_is_made_again(tmp_path: Path) -> None:
     path = recording(tmp_path)
     first = evaluate(path, QUICK, output=tmp_path / "out")
