@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from mp4ds.errors import FormatError, OptionError, SourceError, TargetExistsError, WriteError
 from mp4ds.outputs import check_target, staged
@@ -85,14 +85,35 @@ def _pack(
 ) -> PackSummary:
     store = remote(target)
     if store:
-        from mp4ds.packing.uploading import pack_to_store
-
-        pack_here = partial(_pack, paths)
-        return pack_to_store(paths, store, options, dataset_files, pack_here, progress)
+        return _pack_to_store(paths, store, options, progress)
     run = _plan(paths, target, options)
     if run.is_new and run.job.is_single and not options.cluster:
         return until_in_reach(partial(_pack_in_one_pass, run, progress))
     return _pack_runs([run], options, progress)[0]
+
+
+def _pack_to_store(
+    paths: Sequence[Path], store: RemotePath, options: PackOptions, progress: Report | None
+) -> PackSummary:
+    """Pack on this machine, then upload."""
+    from mp4ds.uploads import uploaded
+
+    shown = cast(Path, store)
+
+    def make(local: Path) -> PackSummary:
+        report = progress and (lambda state: progress(replace(state, dataset=shown)))
+        return _pack(paths, local, replace(options, force=True), report)
+
+    def tell(name: str, done: int, total: int) -> None:
+        if progress:
+            share = done / total if total else None
+            progress(PackProgress(shown, "uploading", share, 0, total, done, {}, note=name))
+
+    owned = dataset_files
+    summary = uploaded(
+        store, make, last=MANIFEST_NAME, force=options.force, owned=owned, report=tell
+    )
+    return replace(summary, dataset=shown)
 
 
 def pack_share(
@@ -119,9 +140,9 @@ def pack_share(
     target = _absolute(dataset)
     store = remote(target)
     if store:
-        from mp4ds.packing.uploading import shared_folder
+        from mp4ds.uploads import local_path
 
-        target = shared_folder(store)
+        target = local_path(store)
     run = _plan(_paths(sources), target, chosen, is_share=True)
     _pack_runs([run], chosen, progress, share=share)
 

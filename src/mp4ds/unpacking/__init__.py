@@ -6,10 +6,10 @@ import os
 import shlex
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
-from mp4ds._version import __version__
 from mp4ds.bags import BagWriter, open_writer, recording_names
 from mp4ds.bags.convert import Converter
 from mp4ds.dataset import Dataset, Stream
@@ -19,17 +19,16 @@ from mp4ds.errors import (
     OptionError,
     WriteError,
 )
-from mp4ds.outputs import digest_file, staged
+from mp4ds.outputs import staged
 from mp4ds.owned import Owned
 from mp4ds.plan import FileNames, Selection
 from mp4ds.recorded import recorded_storage
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord
 from mp4ds.remote import RemotePath, location, remote
-from mp4ds.republish import KINDS, Reduction, Republished, Republisher, check_kind
-from mp4ds.sidecar import MANIFEST_NAME
+from mp4ds.republish import KINDS, Reduction, Republisher, check_kind
 from mp4ds.unpacking.images import image_names, write_images
 from mp4ds.unpacking.options import UnpackOptions, UnpackProgress, UnpackSummary
-from mp4ds.uploads import Upload
+from mp4ds.uploads import uploaded
 
 __all__ = ["UnpackOptions", "UnpackProgress", "UnpackSummary", "default_output", "unpack"]
 
@@ -129,33 +128,20 @@ def _unpack_to_store(
     options: UnpackOptions,
     progress: Callable[[UnpackProgress], None] | None,
 ) -> UnpackSummary:
-    """Unpack on this machine, then upload; what an earlier run could not upload is not made again.
+    """Unpack on this machine, then upload."""
 
-    Raises:
-        RemoteError: It could not be uploaded; it is kept here.
-        Mp4dsError: As `unpack`.
-    """
+    def make(local: Path) -> UnpackSummary:
+        return unpack(dataset, to, local, replace(options, force=True), progress=progress)
 
-    def make(local: Path) -> dict[str, object]:
-        return asdict(unpack(dataset, to, local, options, progress=progress)) | {"output": ""}
-
-    last = "metadata.yaml" if to == "rosbag2" else ""
-    values = Upload(target, is_folder=to in ("rosbag2", "images"), last=last).run(
-        lambda: _order(dataset, to, options),
+    summary = uploaded(
+        target,
         make,
+        is_folder=to in ("rosbag2", "images"),
+        last="metadata.yaml" if to == "rosbag2" else "",
         force=options.force,
         owned=_owned(to),
     )
-    again = {topic: Republished(**item) for topic, item in values["republished"].items()}
-    return UnpackSummary(**{**values, "output": target, "republished": again})
-
-
-def _order(dataset: Path | str, to: str, options: UnpackOptions) -> dict[str, object]:
-    """What tells whether an output is what the same command would make now."""
-    with Dataset(dataset) as opened:
-        path = opened.path / MANIFEST_NAME if opened.manifest else opened.streams[0].path
-        digest = digest_file(path)[1]
-    return {"dataset": digest, "to": to, "options": asdict(options), "mp4ds": __version__}
+    return replace(summary, output=cast(Path, target))
 
 
 def _owned(to: str) -> Owned:
