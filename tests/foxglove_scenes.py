@@ -1,9 +1,10 @@
-"""Cameras that publish Foxglove's schemas, as protobuf, JSON, flatbuffers and ROS 2 messages.
+"""Cameras that publish Foxglove's schemas, as protobuf and ROS 2 messages.
 
 `FOXGLOVE` names scenes, `FOXGLOVE_SOURCES` writes any of them as an MCAP file::
 
     paths = FOXGLOVE_SOURCES["mcap-protobuf"](folder, FOXGLOVE["raw-bgr8"](frames=10))
-    paths = FOXGLOVE_SOURCES["mcap-json"](folder, foxglove_scene(partial(scene, "bgr8", pad=3)))
+    made = foxglove_scene(partial(scene, "bgr8", pad=3))
+    paths = FOXGLOVE_SOURCES["mcap-foxglove-ros2"](folder, made)
 
 Nothing here uses mp4ds, so that its tests have an independent source.
 """

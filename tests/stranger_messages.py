@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
-import re
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -21,13 +19,6 @@ from stranger import Array
 ROS_TYPES = {
     stranger.quoted(row[0])[0]: [field.partition(": ")[::2] for field in row[1].split(", ")]
     for row in stranger.tables("Message types")[0]
-}
-# field ids are those of Foxglove's published FlatBuffers schemas
-FLATBUFFER_IDS: dict[str, dict[str, Any]] = {
-    "foxglove.RawImage": {"texts": (1, 4), "data": 6},
-    "foxglove.CompressedImage": {"texts": (1, 3), "data": 2},
-    "foxglove.CompressedVideo": {"texts": (1, 3), "data": 2},
-    "foxglove.CameraCalibration": {"texts": (), "data": None},
 }
 NUMBERS = {"uint8": "B", "int32": "i", "uint32": "I", "uint64": "Q", "float64": "d"}
 
@@ -210,10 +201,6 @@ def filled(
     name = channel["schema"]["name"]
     if wire == "protobuf":
         return _protobuf(base64.b64decode(channel["schema"]["base64"]), name, blank, times, body)
-    if wire == "json":
-        return _json(blank.decode(), times, body)
-    if wire == "flatbuffer":
-        return _flatbuffer(name, blank, times, body)
     return _ros(wire, name.replace("/msg/", "/"), blank, times, columns, n, body)
 
 
@@ -311,43 +298,3 @@ def _protobuf(schema: bytes, name: str, blank: bytes, times: tuple[int, int], bo
             at += size
         out += blank[begin:at]
     return out
-
-
-def _json(blank: str, times: tuple[int, int], body: bytes) -> bytes:
-    assert json.loads(blank)["timestamp"] == {"sec": 0, "nsec": 0}
-
-    def time(found: re.Match[str]) -> str:
-        text = found.group()
-        for key, value in zip(("sec", "nsec"), times, strict=True):
-            text = re.sub(rf'("{key}"\s*:\s*)0', rf"\g<1>{value}", text)
-        return text
-
-    out = re.sub(r'"timestamp"\s*:\s*\{[^}]*\}', time, blank)
-    data = base64.b64encode(body).decode()
-    return re.sub(r'("data"\s*:\s*")"', rf'\g<1>{data}"', out).encode()
-
-
-def _flatbuffer(name: str, blank: bytes, times: tuple[int, int], body: bytes) -> bytes:
-    ids = FLATBUFFER_IDS[name]
-    (table,) = struct.unpack_from("<I", blank)
-    vtable = table - struct.unpack_from("<i", blank, table)[0]
-
-    def place(number: int) -> int:
-        (length,) = struct.unpack_from("<H", blank, vtable)
-        entry = 4 + 2 * number
-        return struct.unpack_from("<H", blank, vtable + entry)[0] if entry < length else 0
-
-    out = bytearray(blank)
-    struct.pack_into("<II", out, table + place(0), *times)
-    if ids["data"] is None:
-        return bytes(out)
-    at = table + place(ids["data"])
-    data = at + struct.unpack_from("<I", blank, at)[0]
-    struct.pack_into("<I", out, data, len(body))
-    for number in ids["texts"]:
-        if place(number):
-            at = table + place(number)
-            (offset,) = struct.unpack_from("<I", blank, at)
-            if at + offset > data:
-                struct.pack_into("<I", out, at, offset + len(body))
-    return bytes(out[: data + 4]) + body + bytes(out[data + 4 :])

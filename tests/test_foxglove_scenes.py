@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import base64
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoder
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoder
 
-from definitions import CALIBRATION, CODED_VIDEO, LOG, RAW_IMAGE, TRANSFORM
+from definitions import CODED_VIDEO, RAW_IMAGE
 from each import each
-from foxglove_scenes import CAMERA_TYPES, FOXGLOVE, FOXGLOVE_SOURCES
-from foxglove_wire import SERIALIZATIONS, as_bytes, flatbuffer_module, message_class
+from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
+from foxglove_wire import SERIALIZATIONS, as_bytes, message_class
 from pictures import picture, pixels
 from scenes import Record, instant
 from sources import SOURCES
@@ -96,49 +93,6 @@ def test_protobuf_fields_stand_where_they_should(tmp_path: Path) -> None:
                 assert data[:2] != b"\x0a\x0c"
             else:
                 assert standard.FromString(data).data == packet
-
-
-@each("name", SCENES)
-@each("source", ["mcap-json", "mcap-json-python"])
-def test_json(source: str, name: str, tmp_path: Path) -> None:
-    for record, schema, data, _ in written(tmp_path, source, name):
-        value, rules = json.loads(data), json.loads(schema.data)
-        jsonschema.Draft7Validator.check_schema(rules)
-        jsonschema.validate(value, rules)
-        assert schema.name == rules["title"]
-        assert (b'": ' in data) == (source == "mcap-json-python")
-        stamp = record.values["timestamp"]
-        assert value["timestamp"] == {"sec": stamp // 10**9, "nsec": stamp % 10**9}
-        if record.msgtype in CAMERA_TYPES.values():
-            assert base64.b64decode(value["data"]) == as_bytes(record.values["data"])
-            assert value["frame_id"] == "cam"
-        if record.msgtype == CALIBRATION:
-            assert value["K"] == [57.6, 0, 31.5, 0, 57.6, 23.5, 0, 0, 1]
-        if record.msgtype == LOG:
-            assert value["message"] == record.values["message"]
-            assert ("\u00fc".encode() in data) == (source == "mcap-json")
-
-
-@each("name", SCENES)
-def test_flatbuffers(name: str, tmp_path: Path) -> None:
-    for record, schema, data, _ in written(tmp_path, "mcap-flatbuffer", name):
-        kind = record.msgtype.rpartition("/")[2]
-        assert schema.data[4:8] == b"BFBS"
-        root = getattr(flatbuffer_module(kind), kind).GetRootAs(data)
-        stamp = root.Timestamp()
-        assert stamp.Sec() * 10**9 + stamp.Nsec() == record.values["timestamp"]
-        if record.msgtype in CAMERA_TYPES.values():
-            assert root.DataAsNumpy().tobytes() == as_bytes(record.values["data"])
-            assert root.FrameId() == b"cam"
-        if record.msgtype == RAW_IMAGE:
-            assert root.Step() == record.values["step"]
-            assert root.Encoding().decode() == record.values["encoding"]
-        elif record.msgtype == CALIBRATION:
-            assert root.KAsNumpy().tolist() == record.values["k"]
-            assert root.DistortionModel() == b"plumb_bob"
-        elif record.msgtype == TRANSFORM:
-            assert root.Rotation().W() == -0.5
-            assert root.Translation().Z() == 1
 
 
 @each("name", FOXGLOVE)

@@ -888,8 +888,6 @@ KINDS: dict[str, tuple[str, Scene]] = {
     "metres": ("bag-none", scene("32FC1", content="millimetres", frames=6)),
     "yuv": ("bag-none", scene("nv12", frames=6)),
     "protobuf": ("mcap-protobuf", FOXGLOVE["jpeg-rgb"](frames=6)),
-    "json": ("mcap-json", FOXGLOVE["jpeg-rgb"](frames=6)),
-    "flatbuffer": ("mcap-flatbuffer", FOXGLOVE["jpeg-rgb"](frames=6)),
     "transcoded": ("bag-none", CODED["jpeg-rgb"](frames=6)),
 }
 
@@ -1193,7 +1191,7 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
     "format-huge": ("jpeg", header(format="x" * 2**22), NOT_AS_RECORDED),
     **{
         f"template-{kind}-{name}": (kind, header(template=value), BAD_YAML | NOT_AS_RECORDED)
-        for kind in ("h264", "protobuf", "json", "flatbuffer")
+        for kind in ("h264", "protobuf")
         for name, value in {
             "empty": "",
             "zeros": "A" * 400,
@@ -1206,12 +1204,11 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
     },
     # definitions that are read to find the fields
     **{
-        f"schema-{kind}-{name}": (
-            kind,
+        f"schema-protobuf-{name}": (
+            "protobuf",
             put("channel", "schema", "base64", value=base64.b64encode(value).decode()),
             BAD_DOCUMENT | NOT_AS_RECORDED,
         )
-        for kind in ("protobuf", "flatbuffer")
         for name, value in {
             "empty": b"",
             "zeros": bytes(300),

@@ -136,18 +136,17 @@ def test_foxglove_messages_of_ros_go_to_any_other(
 
 @each("camera", [*FOXGLOVE_CAMERAS, "webp"], one_in=3)
 @each("target", [*TARGETS][:3])
-@each("source", ["mcap-protobuf", "mcap-json", "mcap-flatbuffer"])
 def test_what_no_ros_can_hold_is_refused(
-    source: str, target: str, camera: str, tmp_path: Path, compare: Compare
+    target: str, camera: str, tmp_path: Path, compare: Compare
 ) -> None:
-    done = journey(tmp_path, FOXGLOVE_SOURCES[source], FOXGLOVE[camera](), "mcap")
+    done = journey(tmp_path, FOXGLOVE_SOURCES["mcap-protobuf"], FOXGLOVE[camera](), "mcap")
     assert compare(done.sources, done.output) == []
     done.output.unlink()
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(mp4ds.ConversionError) as caught:
         unpacked(tmp_path, target)
     assert caught.value.topic in FOXGLOVE_TOPICS
-    for word in (f"topic {caught.value.topic}:", source.split("-")[1], "--exclude", "mcap"):
+    for word in (f"topic {caught.value.topic}:", "protobuf", "--exclude", "mcap"):
         assert word in str(caught.value)
     assert sorted(tmp_path.rglob("*")) == before
     # what it names all at once is all there is to leave out

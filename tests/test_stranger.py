@@ -111,7 +111,7 @@ CASES: dict[str, Case] = {
         f"{name}-{source}": (FOXGLOVE[name], FOXGLOVE_SOURCES[source])
         for name in ("raw-padded", "jpeg-rgb", "video-h264")
         for source in FOXGLOVE_SOURCES
-        if name == "raw-padded" or source in ("mcap-json", "mcap-flatbuffer", "mcap-foxglove-ros2")
+        if name == "raw-padded" or source == "mcap-foxglove-ros2"
     },
 }
 

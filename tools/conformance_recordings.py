@@ -338,7 +338,7 @@ RECORDINGS: dict[str, Recording] = {
             _foxglove("raw-padded"),
             f"mcap-{name}",
         )
-        for name in ("protobuf-unknown-field", "json-python", "flatbuffer", "foxglove-ros2")
+        for name in ("protobuf-unknown-field", "foxglove-ros2")
     },
     "foxglove-video": Recording(
         "H.264 packets in protobuf whose fields stand in another order",

@@ -102,7 +102,7 @@ class ChannelModel(Model):
     """The channel that the messages were recorded on."""
 
     topic: str = Field(description="Topic name as the source spells it.")
-    message_encoding: str = Field(description="ros1, cdr, protobuf, json or flatbuffer.")
+    message_encoding: str = Field(description="ros1, cdr or protobuf.")
     schema_: SchemaModel | None = Field(None, alias="schema", description="Message definition.")
     metadata: dict[str, str] = Field(
         default_factory=dict, description="Connection header, QoS, type hash; verbatim."

@@ -130,8 +130,6 @@ class MessageRebuilder:
         if padding is not None:
             size += len(padding) - self._padding_size
         head, tail = template.around(self.columns.slots(index), size)
-        if not template.keeps_body:
-            head, tail = b"", b""
         payload = bytearray(len(head) + size + len(tail))
         payload[: len(head)] = head
         out = pixel_view(
@@ -146,8 +144,6 @@ class MessageRebuilder:
         if padding is not None:
             body = memoryview(payload)[len(head) : len(head) + size]
             put_padding(body, padding, row_bytes=self._row_bytes, step=image.step)
-        if not template.keeps_body:
-            return self._around(index, payload)
         if tail:
             payload[len(payload) - len(tail) :] = tail
         return payload
@@ -155,7 +151,7 @@ class MessageRebuilder:
     def _around(self, index: int, body: bytes | bytearray) -> bytes:
         template = self._templates[int(self.columns.variant[index])]
         head, tail = template.around(self.columns.slots(index), len(body))
-        return b"".join((head, template.encode_body(memoryview(body)), tail))
+        return b"".join((head, body, tail))
 
     def _verified(self, index: int, payload: bytes | bytearray) -> bytes | bytearray:
         if self._digests is None or xxhash.xxh64_intdigest(payload) == self._digests[index]:

@@ -39,23 +39,7 @@ def _protobuf(type_name: str, schema: bytes) -> Form:
     return ProtobufForm(type_name, schema)
 
 
-def _json(type_name: str, schema: bytes) -> Form:
-    from mp4ds.wire.jsonform import JsonForm
-
-    return JsonForm(type_name, schema)
-
-
-def _flatbuffer(type_name: str, schema: bytes) -> Form:
-    from mp4ds.wire.flatbuffer import FlatbufferForm
-
-    return FlatbufferForm(type_name, schema)
-
-
-_OTHERS: Mapping[str, Callable[[str, bytes], Form]] = {
-    "protobuf": _protobuf,
-    "json": _json,
-    "flatbuffer": _flatbuffer,
-}
+_OTHERS: Mapping[str, Callable[[str, bytes], Form]] = {"protobuf": _protobuf}
 
 WIRES = (*_ROS, *_OTHERS)
 """Serializations, by the names that sidecars use (spec/registry.md, "Wires")."""
@@ -67,7 +51,7 @@ def kind_of(channel: Channel) -> type[Fields] | None:
     Returns:
         The class of their fields; None for a channel that is none of a camera's.
     """
-    if channel.message_encoding in _OTHERS:
+    if channel.message_encoding not in ("ros1", "cdr"):
         return _FOXGLOVE.get(channel.type_name)
     entry = LAYOUTS.get(_ros_type(channel.type_name))
     return entry[0] if entry else None

@@ -99,8 +99,7 @@ class Parts:
         pts: Presentation time of a packet; None where the type has none.
         frame_id: As UTF-8.
         fields: The rest of what it says.
-        body: Pixels or coded picture, a view into the payload where it stands there as it is;
-            empty for a calibration.
+        body: Pixels or coded picture, a view into the payload; empty for a calibration.
         blank: The message with stamp, seq, pts and body blank.
     """
 
@@ -123,13 +122,7 @@ class Slots:
 
 
 class Template(Protocol):
-    """A blank whose slots are found.
-
-    Attributes:
-        keeps_body: Whether the body stands in the payload as it is.
-    """
-
-    keeps_body: bool
+    """A blank whose slots are found."""
 
     def around(self, slots: Slots, body_size: int) -> tuple[bytes, bytes]:
         """The bytes before and after the body.
@@ -148,10 +141,6 @@ class Template(Protocol):
 
         What follows a body may be aligned by its length.
         """
-        ...
-
-    def encode_body(self, body: memoryview) -> bytes | memoryview:
-        """The body as it stands in the payload."""
         ...
 
 
@@ -186,16 +175,9 @@ class Form(Protocol):
 
 def prove(template: Template, parts: Parts, data: memoryview) -> bool:
     """Whether a message's template and parts give the message's bytes again."""
-    body = template.encode_body(parts.body)
     head, tail = template.around(Slots(parts.stamp, parts.seq, parts.pts), len(parts.body))
-    end = len(data) - len(tail)
-    return (
-        len(head) + len(body) == end
-        and data[: len(head)] == head
-        and data[end:] == tail
-        # a body that stands in the payload as it is needs no comparison; views compare slowly
-        and (template.keeps_body or bytes(data[len(head) : end]) == body)
-    )
+    end = len(data) - len(tail)  # the body itself is a view of what is there
+    return len(head) + len(parts.body) == end and data[: len(head)] == head and data[end:] == tail
 
 
 def join_stamp(sec: int, nanosec: int) -> int:

@@ -1,4 +1,4 @@
-"""What Foxglove's camera messages have in common in every serialization.
+"""What Foxglove's camera messages hold, whatever their serialization.
 
 Fields and their meaning: docs.foxglove.dev, "Foxglove schemas".
 """

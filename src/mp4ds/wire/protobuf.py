@@ -158,8 +158,6 @@ class ProtobufForm:
 class ProtobufTemplate:
     """A blank in protobuf. See `mp4ds.wire.forms.Template`."""
 
-    keeps_body = True
-
     def __init__(self, pieces: Pieces) -> None:
         self._pieces = pieces
 
@@ -172,10 +170,6 @@ class ProtobufTemplate:
     def padding(self, body_size: int) -> int:
         """See `Template.padding`: never."""
         return 0
-
-    def encode_body(self, body: memoryview) -> memoryview:
-        """See `Template.encode_body`."""
-        return body
 
 
 def _declared(type_name: str, schema: bytes, kinds: Mapping[str, Kind]) -> Mapping[int, _Declared]:

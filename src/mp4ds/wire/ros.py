@@ -255,8 +255,6 @@ class RosForm:
 class RosTemplate:
     """A blank of a ROS serialization. See `mp4ds.wire.forms.Template`."""
 
-    keeps_body = True
-
     def __init__(self, blank: bytes, places: _Places, kept: int | None) -> None:
         self._places = places
         split = len(blank) if places.body is None else places.body
@@ -272,10 +270,6 @@ class RosTemplate:
     def padding(self, body_size: int) -> int:
         """See `Template.padding`."""
         return 0 if self._kept is None else (self._kept - body_size) % _ALIGNMENT
-
-    def encode_body(self, body: memoryview) -> memoryview:
-        """See `Template.encode_body`."""
-        return body
 
 
 def _take(reader: Reader, code: str, *, terminated: bool) -> Any:
