@@ -69,6 +69,7 @@ class Assembler:
         Raises:
             FormatError: A file of it is damaged.
         """
+        part.check_counts(self._reader.channels)
         for stream in part.streams:
             self._add_stream(part, stream)
         self._chains.setdefault(chain, []).append(part)
@@ -159,7 +160,6 @@ class Assembler:
             chains = [self._records(parts) for parts in self._chains.values()]
             for record in heapq.merge(*chains, key=_time_of):
                 if isinstance(record, Message):
-                    whole.kept += 1
                     writer.add_channel(record.channel)
                     writer.write(record)
                 elif isinstance(record, Attachment):
@@ -170,8 +170,6 @@ class Assembler:
 
     def _records(self, parts: Sequence[Part]) -> Iterator[Message | Attachment | MetadataRecord]:
         for part in parts:
-            if not part.kept:
-                continue
             try:
                 with McapReader(part.messages_path) as reader:
                     for record in reader.records():

@@ -192,6 +192,8 @@ class Coordinator:
         tasks = [task for task in job.tasks if task.source is None]
         if tasks[0].whole:
             part = Part.load(parts / tasks[0].name)
+            with job.open() as reader:
+                part.check_counts(reader.channels)
             for name in part.files:
                 _link(part.folder / name, folder / name)
             part.folder = folder

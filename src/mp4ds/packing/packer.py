@@ -152,11 +152,9 @@ class Packer:
     def _take(self, record: Record, workers: Workers) -> None:
         part = self._part
         if isinstance(record, Attachment):
-            part.kept += 1
             self._verbatim.add_attachment(record)
             return
         if not isinstance(record, Message):
-            part.kept += 1
             self._verbatim.add_metadata(record)
             return
         channel = record.channel
@@ -177,6 +175,5 @@ class Packer:
             self._keep(record)
 
     def _keep(self, message: Message) -> None:
-        self._part.kept += 1
         self._verbatim.add_channel(message.channel)
         self._verbatim.write(message)

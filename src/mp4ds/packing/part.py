@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import stat
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter
 
 from mp4ds.errors import FormatError
 from mp4ds.outputs import write_synced
@@ -55,7 +59,6 @@ class Part:
         left_out: Topics left out on request.
         skipped: What the source holds and no dataset can: a phrase -> how many.
         transforms: Static transforms, the latest of each child frame.
-        kept: Messages, attachments and metadata records in messages.mcap.
         losses: What could not be read of a damaged recording.
     """
 
@@ -67,7 +70,6 @@ class Part:
     left_out: dict[str, None] = field(default_factory=dict)
     skipped: dict[str, int] = field(default_factory=dict)
     transforms: list[Transform] = field(default_factory=list)
-    kept: int = 0
     losses: list[Loss] = field(default_factory=list)
     files: list[str] = field(default_factory=list)
 
@@ -98,7 +100,6 @@ class Part:
             "left_out": list(self.left_out),
             "skipped": self.skipped,
             "transforms": [asdict(transform) for transform in self.transforms],
-            "kept": self.kept,
             "losses": [asdict(loss) for loss in self.losses],
             "files": {
                 path.name: path.stat().st_size
@@ -121,33 +122,34 @@ class Part:
         """
         record = read_record(folder)
         if record is None:
-            raise FormatError("file-missing", folder, "is gone, or damaged since it was made")
+            raise _damaged(folder)
         try:
-            return cls._of(folder, record)
-        except (TypeError, LookupError, ValueError, AttributeError) as error:
+            return cls._of(folder, _reads().validate_python(record))
+        except ValueError as error:
             (folder / RECORD_NAME).unlink(missing_ok=True)  # to be made again
             if isinstance(error, FormatError):
                 raise
-            raise FormatError("file-missing", folder, f"is damaged: {error!r}") from None
+            raise _damaged(folder) from None
 
     @classmethod
-    def _of(cls, folder: Path, record: Mapping[str, Any]) -> Part:
-        names = [f"{stem}.yaml" for stem in record["streams"]]
-        if not record["files"].keys() >= set(names):
+    def _of(cls, folder: Path, record: _Record) -> Part:
+        if not record.files.keys() >= {f"{stem}.yaml" for stem in record.streams}:
             raise ValueError("a stream without a file")
-        sidecars = [load_stream(folder / name) for name in names]
+        sidecars = [load_stream(folder / f"{stem}.yaml") for stem in record.streams]
+        names = {MESSAGES_NAME, *(f"{stem}.yaml" for stem in record.streams)}
+        if record.files.keys() != names | {sidecar.video.file for sidecar in sidecars}:
+            raise ValueError("a file of no stream")
         part = cls(
             folder=folder,
-            topics={item["topic"]: _topic(item) for item in record["topics"]},
-            counts={int(key): count for key, count in record["counts"].items()},
-            streams=[PartStream(*pair) for pair in zip(record["streams"], sidecars, strict=True)],
-            span=tuple(record["span"]) if record["span"] else None,
-            left_out=dict.fromkeys(record["left_out"]),
-            skipped=record["skipped"],
-            transforms=[_transform(item) for item in record["transforms"]],
-            kept=record["kept"],
-            losses=[Loss(**{**item, "topics": tuple(item["topics"])}) for item in record["losses"]],
-            files=list(record["files"]),
+            topics={topic.topic: topic for topic in record.topics},
+            counts=record.counts,
+            streams=[PartStream(*pair) for pair in zip(record.streams, sidecars, strict=True)],
+            span=record.span,
+            left_out=dict.fromkeys(record.left_out),
+            skipped=record.skipped,
+            transforms=record.transforms,
+            losses=record.losses,
+            files=list(record.files),
         )
         if part.span:  # what no manifest takes is damage, too, and the part is made again
             TimeRange(start=part.span[0], end=part.span[1])
@@ -157,14 +159,55 @@ class Part:
             StaticTransform.from_record(transform)
         return part
 
+    def check_counts(self, channels: Iterable[Channel]) -> None:
+        """Refuse a record that counts messages otherwise by topic than by channel.
+
+        Args:
+            channels: All of the recording.
+
+        Raises:
+            FormatError: It does; the part is made again.
+        """
+        found: Counter[str] = Counter()
+        for channel in channels:
+            found[channel.topic] += self.counts.get(channel.id, 0)
+        told = {name: topic.messages for name, topic in self.topics.items() if topic.messages}
+        if told != {name: count for name, count in found.items() if count}:
+            self.forget()
+            raise _damaged(self.folder)
+
+
+@dataclass(frozen=True, slots=True)
+class _Record:
+    """What the record of a part holds."""
+
+    topics: list[TopicSummary]
+    counts: dict[int, int]
+    streams: list[str]
+    span: tuple[int, int] | None
+    left_out: list[str]
+    skipped: dict[str, int]
+    transforms: list[Transform]
+    losses: list[Loss]
+    files: dict[str, int]
+
+
+@cache
+def _reads() -> TypeAdapter[_Record]:
+    return TypeAdapter(_Record)
+
+
+def _damaged(folder: Path) -> FormatError:
+    return FormatError("file-missing", folder, "is gone, or damaged since it was made")
+
 
 def read_record(folder: Path) -> dict[str, Any] | None:
     """The record of a part; None where the part is not whole: a file is missing or cut short."""
     try:
         record: dict[str, Any] = load_kept((folder / RECORD_NAME).read_bytes())
-        topics = [_topic(item) for item in record.setdefault("topics", [])]
+        topics = record.setdefault("topics", [])
         is_counted = all(
-            isinstance(t.messages, int) and isinstance(t.raw_bytes, int) for t in topics
+            isinstance(t["messages"], int) and isinstance(t["raw_bytes"], int) for t in topics
         )
         if is_counted and all(_is_whole(folder, *item) for item in record["files"].items()):
             return record
@@ -176,13 +219,3 @@ def read_record(folder: Path) -> dict[str, Any] | None:
 def _is_whole(folder: Path, name: str, size: int) -> bool:
     found = (folder / name).lstat()
     return "/" not in name and stat.S_ISREG(found.st_mode) and found.st_size == size
-
-
-def _topic(item: Mapping[str, Any]) -> TopicSummary:
-    verbatim = {reason: (count, first) for reason, (count, first) in item["verbatim"].items()}
-    return TopicSummary(**{**item, "verbatim": verbatim})
-
-
-def _transform(item: Mapping[str, Any]) -> Transform:
-    lists = {key: tuple(value) for key, value in item.items() if isinstance(value, list)}
-    return Transform(**{**item, **lists})
