@@ -279,6 +279,27 @@ def test_without_an_index_the_file_is_read(tmp_path: Path, chunked: bool) -> Non
     check_against_library(path)
 
 
+def test_a_summary_that_begins_among_the_data_tells_nothing(tmp_path: Path) -> None:
+    """Else a channel that stands behind its messages would be known before them."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer: Any = Writer(stream, use_chunking=False, enable_crcs=False)
+        writer.start()
+        channel = writer.register_channel("/a", "cdr", 0)
+        writer.add_message(channel, 5, b"x", 5)
+        writer.finish()
+    data = bytearray(path.read_bytes())
+    header = struct.unpack_from("<Q", data, 9)[0]
+    place = 17 + header
+    assert data[place] == 4  # the channel
+    data[place] = 0x90  # a private record
+    struct.pack_into("<Q", data, len(data) - 28, place)
+    path.write_bytes(data)
+    assert McapReader(path).channels == []
+    with pytest.raises(SourceError, match="message 1 is of channel 1, which is not defined"):
+        messages(McapReader(path).records())
+
+
 def test_an_index_that_does_not_add_up_is_not_used(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:

@@ -229,6 +229,12 @@ def test_another_recording_in_a_planted_job_is_refused(
         lambda record: record.update(counts={"x": 1}),
         lambda record: record.update(transforms=[3]),
         lambda record: record.update(span=[0, 2**65]),
+        lambda record: record["topics"][0].update(messages=record["topics"][0]["messages"] + 28),
+        lambda record: record["topics"][0].update(frames=[]),
+        lambda record: record["topics"][0].update(notes=7),
+        lambda record: record.update(skipped=0.5),
+        lambda record: record.update(left_out=3),
+        lambda record: record["files"].pop("messages.mcap"),
     ],
 )
 def test_a_record_that_was_planted_is_no_part(

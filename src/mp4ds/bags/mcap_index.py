@@ -53,7 +53,6 @@ class Summary:
         statistics: The statistics record, if there is one.
         chunks: The chunks that it lists.
         private: How many records of each private opcode it holds.
-        has_data: Whether it holds records that belong into the data section.
     """
 
     offset: int
@@ -62,7 +61,6 @@ class Summary:
     statistics: mcap_records.Statistics | None = None
     chunks: ChunkTable = field(default_factory=ChunkTable)
     private: Counter[int] = field(default_factory=Counter)
-    has_data: bool = False
 
     @property
     def start(self) -> int | None:
@@ -82,7 +80,7 @@ class Summary:
     def is_consistent(self) -> bool:
         """Whether its parts agree that it lists all channels, schemas and chunks."""
         statistics = self.statistics
-        if statistics is None or self.has_data:
+        if statistics is None:
             return False
         counts = statistics.channel_message_counts
         schemas = {channel.schema_id for channel in self.channels.values()} - {0}
@@ -165,7 +163,7 @@ def read_summary(stream: RecordStream) -> Summary | None:
     """Read the summary section of a file, leaving the stream anywhere.
 
     Returns:
-        The summary, or None where the file has none.
+        The summary, or None where the file has none, or it does not begin where the footer says.
 
     Raises:
         SourceError: The file does not end as an MCAP file does.
@@ -190,6 +188,8 @@ def read_summary(stream: RecordStream) -> Summary | None:
         opcode, body = stream.next()
         if opcode == Opcode.FOOTER:
             break
+        if opcode not in OF_SUMMARY and opcode < PRIVATE_OPCODE:
+            return None  # what stands between records of the data tells of no whole file
         _add(summary, opcode, body)
     summary.chunks.finish()
     return summary
@@ -208,5 +208,3 @@ def _add(summary: Summary, opcode: int, body: bytes) -> None:
         summary.statistics = parse(mcap_records.Statistics, body)
     elif opcode >= PRIVATE_OPCODE:
         summary.private[opcode] += 1
-    elif opcode not in OF_SUMMARY:
-        summary.has_data = True
