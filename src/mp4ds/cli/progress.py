@@ -1,7 +1,7 @@
 """What `mp4ds pack` tells of its progress, always on stderr.
 
-On a terminal a live display; in a log file a line now and then, once a pack has taken 10 s; with
-``--json`` one event per line, each a JSON object in ASCII:
+On a terminal bars; in a log file a line now and then, once a pack has taken 10 s; with ``--json``
+one event per line, each a JSON object in ASCII:
 
 ``{"event": "start", "time": ..., "dataset": ...}``
     Before the first ``progress``. Nothing is told of a pack that fails before it begins.
@@ -25,8 +25,8 @@ On a terminal a live display; in a log file a line now and then, once a pack has
     ``bytes_total``         integer, bytes of the source files
     ``bytes_written``       integer, bytes of the dataset so far
     ``topics``              object: topic of a camera -> ``{"done": integer, "total": integer
-                            or null, "hz": number or null}``: messages, and messages a second
-    ``seconds_left``        number, of the whole job; null where too little is known
+                            or null}``, messages
+    ``seconds_left``        integer, until all is packed; null where too little is known
     ======================  ===============================================================
 
 ``{"event": "end", "time": ..., "outcome": ..., "seconds": ...}``
@@ -38,28 +38,35 @@ keys that they do not know.
 
 from __future__ import annotations
 
-import json
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from datetime import datetime, timezone
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from mp4ds.cli.progress_log import Lines, Log
-from mp4ds.cli.standing import DatasetStanding, JobStanding
+from mp4ds.cli.progress_lines import Events, Lines, Log
+from mp4ds.cli.standing import (
+    PACE_SECONDS,
+    Job,
+    amounts,
+    count_text,
+    packed_share,
+    phase_text,
+    plain,
+)
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from mp4ds.packing import PackProgress
 
-_EVENT_SECONDS, _SILENCE_SECONDS = 1.0, 10.0
 _TICK_SECONDS = 1.0
+
+Take = Callable[["PackProgress"], None]
 
 
 @contextmanager
-def pack_progress(as_json: bool, *, whole: bool = True) -> Iterator[Callable[[PackProgress], None]]:
+def pack_progress(as_json: bool, *, whole: bool = True) -> Iterator[Take]:
     """Tell of the progress of packs while the context lasts, on stderr.
 
     Args:
@@ -70,19 +77,70 @@ def pack_progress(as_json: bool, *, whole: bool = True) -> Iterator[Callable[[Pa
         What takes the progress, several times a second.
     """
     stream = sys.stderr
-    job = JobStanding(whole=whole)
     if not as_json and stream.isatty():
         from rich.console import Console
 
-        from mp4ds.cli.progress_live import live_progress
-
         console = Console(stderr=True)
         if not console.is_dumb_terminal:
-            with live_progress(job, console) as take:
+            with on_terminal(console, whole=whole) as take:
                 yield take
             return
+    job = Job(whole=whole)
     teller = (Events if as_json else Log)(job, Lines(stream))
     with told_by(teller, tick_seconds=_TICK_SECONDS) as take:
+        yield take
+
+
+@contextmanager
+def on_terminal(console: Console, *, whole: bool = True) -> Iterator[Take]:
+    """Show bars while the context lasts: of all, and of each camera or dataset."""
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = [
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=20),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[told]}", markup=False),
+    ]
+    job = Job(whole=False)
+    with Progress(
+        *columns,
+        *([TimeRemainingColumn()] if whole else []),
+        console=console,
+        transient=True,
+        speed_estimate_period=PACE_SECONDS,
+        refresh_per_second=2,
+    ) as bars:
+        rows: dict[object, Any] = {}
+
+        def show(key: object, name: str, share: float | None, told: str) -> None:
+            if key not in rows:
+                rows[key] = bars.add_task(name, total=None, completed=share or 0, told=told)  # type: ignore[arg-type]
+            total = None if share is None else 1.0
+            bars.update(rows[key], description=name, total=total, completed=share, told=told)
+
+        def take(state: PackProgress) -> None:
+            job.take(state)
+            states = list(job.states.values())
+            name = f"packing {len(states)} datasets"
+            if len(states) == 1:
+                name = phase_text(state) or f"packing {plain(state.dataset.name)}"
+            show(None, name, job.share, "  ".join(amounts(states)))
+            if len(states) > 1:
+                for one in states:
+                    told = "  ".join(filter(None, (phase_text(one), *amounts([one]))))
+                    show(one.dataset, f"  {plain(one.dataset.name)}", packed_share(one), told)
+                return
+            for topic, (done, total) in state.topics.items():
+                share = min(1.0, done / total) if total else None
+                show(topic, f"  {plain(topic)}", share, count_text(done, total))
+
         yield take
 
 
@@ -100,7 +158,7 @@ class Teller(Protocol):
 
 
 @contextmanager
-def told_by(teller: Teller, *, tick_seconds: float) -> Iterator[Callable[[PackProgress], None]]:
+def told_by(teller: Teller, *, tick_seconds: float) -> Iterator[Take]:
     """Let a job be told of while the context lasts, on from silence to its end."""
     lock, stop = threading.Lock(), threading.Event()
 
@@ -128,97 +186,3 @@ def told_by(teller: Teller, *, tick_seconds: float) -> Iterator[Callable[[PackPr
         stop.set()
         thread.join()
         teller.end(outcome)
-
-
-class Events:
-    """Tells of a job by events in JSON.
-
-    Args:
-        job: Where it stands.
-        lines: Take the events.
-        clock: Seconds; does not go back.
-        now: The time of day, with its zone.
-    """
-
-    def __init__(
-        self,
-        job: JobStanding,
-        lines: Lines,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-        now: Callable[[], datetime] = lambda: datetime.now(timezone.utc),
-    ) -> None:
-        self._job = job
-        self._lines = lines
-        self._clock = clock
-        self._now = now
-        self._began: float | None = None
-        self._told: dict[Path, float] = {}
-        self._waiting: dict[Path, DatasetStanding] = {}
-        self._last: DatasetStanding | None = None
-
-    def take(self, state: PackProgress) -> None:
-        """See `Teller.take`."""
-        clock = self._clock()
-        self._job.take(state, clock)
-        if self._began is None:
-            self._began = clock
-            self._write("start", dataset=str(state.dataset))
-        self._last = self._job.dataset(state.dataset)
-        told = self._told.get(state.dataset)
-        if told is None or clock - told >= _EVENT_SECONDS:
-            self._tell(self._last, clock)
-        else:
-            self._waiting[state.dataset] = self._last
-
-    def tick(self) -> None:
-        """See `Teller.tick`."""
-        clock = self._clock()
-        for dataset, one in list(self._waiting.items()):
-            if clock - self._told[dataset] >= _EVENT_SECONDS:
-                self._tell(one, clock)
-        if self._last is not None and clock - max(self._told.values()) >= _SILENCE_SECONDS:
-            self._tell(self._last, clock)
-
-    def end(self, outcome: str) -> None:
-        """See `Teller.end`."""
-        if self._began is None:
-            return
-        clock = self._clock()
-        for one in list(self._waiting.values()):
-            self._tell(one, clock)
-        self._write("end", outcome=outcome, seconds=round(clock - self._began, 3))
-
-    def _tell(self, one: DatasetStanding, clock: float) -> None:
-        state, left = one.state, self._job.seconds_left(clock)
-        self._told[state.dataset] = clock
-        self._waiting.pop(state.dataset, None)
-        rates = one.topic_rates(clock)
-        self._write(
-            "progress",
-            dataset=str(state.dataset),
-            phase=state.phase,
-            note=state.note,
-            done=_rounded(one.phase_share, 6),
-            job_done=_rounded(self._job.share, 6),
-            tasks_done=state.tasks_done,
-            tasks_total=state.tasks_total,
-            tasks_before=state.tasks_before,
-            failed=state.failed,
-            bytes_read=state.bytes_read,
-            bytes_total=state.bytes_total,
-            bytes_written=state.bytes_written,
-            topics={
-                topic: {"done": done, "total": total, "hz": _rounded(rates[topic], 2)}
-                for topic, (done, total) in state.topics.items()
-            },
-            seconds_left=_rounded(left, 1),
-        )
-
-    def _write(self, event: str, **values: Any) -> None:
-        now = self._now().isoformat(timespec="milliseconds")
-        self._lines.write(json.dumps({"event": event, "time": now, **values}))
-
-
-def _rounded(value: float | None, digits: int) -> float | None:
-    return None if value is None else round(value, digits)

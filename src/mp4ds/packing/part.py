@@ -6,11 +6,8 @@ import stat
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
-
-from pydantic import TypeAdapter
 
 from mp4ds.errors import FormatError
 from mp4ds.outputs import write_synced
@@ -24,6 +21,7 @@ from mp4ds.sidecar import (
     StreamSidecar,
     TimeRange,
     load_stream,
+    of_types,
 )
 from mp4ds.wire.transforms import Transform
 
@@ -124,7 +122,7 @@ class Part:
         if record is None:
             raise _damaged(folder)
         try:
-            return cls._of(folder, _reads().validate_python(record))
+            return cls._of(folder, of_types(_Record, record))
         except ValueError as error:
             (folder / RECORD_NAME).unlink(missing_ok=True)  # to be made again
             if isinstance(error, FormatError):
@@ -190,11 +188,6 @@ class _Record:
     transforms: list[Transform]
     losses: list[Loss]
     files: dict[str, int]
-
-
-@cache
-def _reads() -> TypeAdapter[_Record]:
-    return TypeAdapter(_Record)
 
 
 def _damaged(folder: Path) -> FormatError:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mp4ds.sidecar.columns import Column, Columns, Digests
-from mp4ds.sidecar.fields import FORMAT_VERSION, MESSAGES_NAME
+from mp4ds.sidecar.fields import FORMAT_VERSION, MESSAGES_NAME, of_types
 from mp4ds.sidecar.io import (
     MANIFEST_NAME,
     dump_document,
@@ -74,5 +74,6 @@ __all__ = [
     "load_manifest",
     "load_stream",
     "names_dataset",
+    "of_types",
     "schema_text",
 ]

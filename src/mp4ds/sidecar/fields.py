@@ -8,13 +8,15 @@ from __future__ import annotations
 import base64
 import binascii
 import re
-from collections.abc import Iterable
-from typing import Annotated, Any, Literal
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from mp4ds.layouts import MAX_SIDE
 from mp4ds.stamps import INT64_MAX, INT64_MIN
+
+T = TypeVar("T")
 
 FORMAT_VERSION = "1.1"
 MESSAGES_NAME = "messages.mcap"
@@ -90,3 +92,13 @@ def parse_version(text: str) -> tuple[int, int]:
 def document_of(model: BaseModel) -> dict[str, Any]:
     """JSON-like values of a model, without the keys that have their default."""
     return model.model_dump(mode="json", by_alias=True, exclude_defaults=True)
+
+
+def of_types(kind: type[T], values: Mapping[str, Any]) -> T:
+    """A dataclass from values as JSON has them.
+
+    Raises:
+        ValueError: A value is missing, or not of its field's type.
+    """
+    adapter: TypeAdapter[T] = TypeAdapter(kind)
+    return adapter.validate_python(values)
