@@ -38,7 +38,10 @@ def packed(folder: Path, sources: list[Path], **options: Any) -> Path:
 def check_fields(message: Any, values: Mapping[str, Any]) -> None:
     """An object has the values that were sent; names are lower case there, times nanoseconds."""
     found = message if isinstance(message, dict) else None
-    names = list(found) if found else [name for name in dir(message) if not name.startswith("_")]
+    if descriptor := getattr(message, "DESCRIPTOR", None):
+        names = [field.name for field in descriptor.fields]
+    else:
+        names = [name for name in found or dir(message) if not name.startswith("_")]
     lower = {name.lower(): name for name in names}
     for name, value in values.items():
         if name == "seq" and "seq" not in lower:

@@ -291,6 +291,7 @@ def _local_cluster(tasks: int) -> Iterator[LocalCluster]:
             security=Security.temporary(),
             dashboard_address=None,
             scheduler_kwargs={"dashboard_address": f"{_LOOPBACK}:0"},
+            worker_dashboard_address=f"{_LOOPBACK}:0",
             local_directory=folder,
             silence_logs=logging.CRITICAL,
         ) as cluster,
