@@ -42,7 +42,6 @@ from mp4ds import exporting
 from mp4ds.exporting.colmap import Track, model_of
 from mp4ds.exporting.euroc import distortion
 from mp4ds.exporting.job import Job
-from mp4ds.exporting.lerobot import nearest
 from mp4ds.exporting.motion import in_order
 from mp4ds.exporting.transforms import (
     inverse,
@@ -51,6 +50,7 @@ from mp4ds.exporting.transforms import (
     rotation_matrix,
 )
 from mp4ds.exporting.tum import seconds
+from mp4ds.intervals import nearest
 from mp4ds.sidecar import Calibration
 from scenes import PERIOD, Record, Scene, scene
 

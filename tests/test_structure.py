@@ -74,7 +74,7 @@ def imports_of(path: Path) -> frozenset[str]:
     return frozenset(found)
 
 
-# Each package is known to one room only.
+# Each package is known to these rooms only: no other module may import it, a new one neither.
 HOMES = {
     "rosbags": ("bags",),
     "mcap": ("bags",),
@@ -82,6 +82,9 @@ HOMES = {
     "lz4": ("bags",),
     "sqlite3": ("bags",),
     "av": ("video",),
+    "dask": ("engine",),
+    "dask_jobqueue": ("engine",),
+    "distributed": ("engine",),
     "fsspec": ("remote",),
     "PIL": ("video",),
     "google": ("wire",),
@@ -91,6 +94,7 @@ HOMES = {
     "rclpy": ("publishers",),
     "cyclonedds": ("publishers",),
     "foxglove": ("publishers",),
+    "torch": ("torch",),
     "pyarrow": ("exporting",),
     "rerun": ("exporting",),
     "yaml": ("yamlio.py", "bags", "publishers"),

@@ -19,6 +19,23 @@ def differences(later: Integers, earlier: Integers) -> Floats:
     return np.where(np.abs(rough) < 2.0**62, exact.astype(np.float64), rough)
 
 
+def nearest(times: Integers, wanted: Integers) -> Integers:
+    """Places of the times that are nearest to others.
+
+    Of two equally near ones it is the earlier, of several equal ones the first.
+
+    Args:
+        times: Increasing or equal, at least one.
+        wanted: What is looked for, of any shape.
+    """
+    after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    is_later = np.abs(differences(times[after], wanted)) < np.abs(
+        differences(wanted, times[before])
+    )
+    return np.searchsorted(times, times[np.where(is_later, after, before)])
+
+
 def intervals(times: Integers) -> Floats:
     """Nanoseconds from each frame to the next, shape (frames - 1,)."""
     return differences(times[1:], times[:-1])

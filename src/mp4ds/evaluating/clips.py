@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import SourceError
 from mp4ds.evaluating.options import EvaluateOptions
 from mp4ds.evaluating.sources import Camera, Shot
+from mp4ds.intervals import nearest
 from mp4ds.layouts import ENCODINGS, Layout, layout_for
 from mp4ds.outputs import write_synced
 from mp4ds.stamps import NS_PER_TICK, PresentationClock
@@ -136,12 +137,8 @@ def chosen_at_rate(times: NDArray[np.int64], rate: float, frames: int) -> list[i
     start, end = int(times[0]), int(times[-1])
     count = min(frames, int((end - start) / period) + 1)
     begin = (start + end - (count - 1) * period) / 2
-    due = begin + period * np.arange(count)
-    after = np.clip(np.searchsorted(times, due), 1, max(1, len(times) - 1))
-    after = np.minimum(after, len(times) - 1)
-    before = np.maximum(after - 1, 0)
-    nearer = np.where(due - times[before] <= times[after] - due, before, after)
-    return [int(index) for index in np.unique(nearer)]
+    due = np.rint(begin + period * np.arange(count)).astype(np.int64)
+    return [int(index) for index in np.unique(nearest(times, due))]
 
 
 # ---------------------------------------------------------------- the frames

@@ -17,6 +17,7 @@ from mp4ds.exporting.cameras import Camera
 from mp4ds.exporting.job import Job, Source
 from mp4ds.exporting.motion import Vectors, in_order
 from mp4ds.exporting.statistics import Statistics, merged
+from mp4ds.intervals import nearest
 from mp4ds.plan import FileNames
 from mp4ds.stamps import TIMESCALE
 from mp4ds.video import PacketReader, VideoEncoder, join_segments, recipe_for
@@ -133,21 +134,6 @@ def _shown(source: Source) -> list[Camera]:
         raise OptionError(
             f"{source.dataset.path} has no camera for LeRobot: its videos show colours of 8 bits."
         )
-    return found
-
-
-def nearest(times: Integers, wanted: Integers) -> Integers:
-    """Places of the times that are nearest to others; of two equally near ones the earlier.
-
-    Args:
-        times: Increasing or equal, at least one.
-        wanted: What is looked for.
-    """
-    after = np.clip(np.searchsorted(times, wanted), 1, max(1, len(times) - 1))
-    if len(times) == 1:
-        return np.zeros(len(wanted), np.int64)
-    is_later = times[after] - wanted < wanted - times[after - 1]
-    found: Integers = np.where(is_later, after, after - 1).astype(np.int64)
     return found
 
 

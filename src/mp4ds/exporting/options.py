@@ -8,9 +8,10 @@ from pathlib import Path
 
 from mp4ds.errors import OptionError
 from mp4ds.republish import Reduction
+from mp4ds.video.codecs import MAX_CRF
 
 PIXELS = ("seen", "native", "rgb", "gray")
-_MOST_CRF = {"av1": 63, "h264": 51, "h265": 51}
+_CODECS = ("av1", "h264", "h265")
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,9 @@ class ExportOptions:
     def __post_init__(self) -> None:
         if self.pixels not in PIXELS:
             raise OptionError(f"--pixels {self.pixels!r} is not known. Use {', '.join(PIXELS)}.")
-        if self.codec not in _MOST_CRF:
-            raise OptionError(f"--codec {self.codec!r} is not known. Use {', '.join(_MOST_CRF)}.")
-        most = _MOST_CRF[self.codec]
+        if self.codec not in _CODECS:
+            raise OptionError(f"--codec {self.codec!r} is not known. Use {', '.join(_CODECS)}.")
+        most = MAX_CRF[self.codec]
         if not 0 <= self.crf <= most:
             raise OptionError(f"--crf {self.crf} is not from 0 to {most}, as {self.codec} has it.")
         if self.fps is not None and not 1 <= self.fps <= 1000:

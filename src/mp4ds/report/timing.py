@@ -7,7 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mp4ds.intervals import Floats, Integers, differences, intervals, lost_frames, usual_interval
+from mp4ds.intervals import (
+    Floats,
+    Integers,
+    differences,
+    intervals,
+    lost_frames,
+    nearest,
+    usual_interval,
+)
 
 _MS = 1e6  # nanoseconds
 _WIDER = 2  # times the span of the log times, beyond which stamps are of several clocks
@@ -96,11 +104,7 @@ def nearest_offsets(stamps: Integers, reference: Integers) -> Floats:
         reference: Of the camera that it is compared with, at least one; in any order.
     """
     ordered = np.sort(reference)
-    after = np.minimum(np.searchsorted(ordered, stamps, side="left"), len(ordered) - 1)
-    before = np.maximum(after - 1, 0)
-    to_after = differences(stamps, ordered[after])
-    to_before = differences(stamps, ordered[before])
-    return np.where(np.abs(to_before) <= np.abs(to_after), to_before, to_after)
+    return differences(stamps, ordered[nearest(ordered, stamps)])
 
 
 def untimed(cameras: Sequence[Mapping[str, Integers]]) -> list[str]:

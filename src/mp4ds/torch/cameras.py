@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mp4ds.dataset import Stream, Video
 from mp4ds.errors import FormatError, Mp4dsError, OptionError, VideoError
+from mp4ds.intervals import nearest
 from mp4ds.torch.codec import TorchcodecReader
 from mp4ds.torch.errors import SampleError
 from mp4ds.torch.pictures import Pictures, View
@@ -103,11 +104,7 @@ class Camera:
     def nearest(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
         """The frames whose stamps are nearest to times; the first of several such."""
         stamps = self.stamps[self._order]
-        after = np.clip(np.searchsorted(stamps, times), 0, len(stamps) - 1)
-        before = np.maximum(after - 1, 0)
-        is_before = np.abs(times - stamps[before]) <= np.abs(stamps[after] - times)
-        chosen = stamps[np.where(is_before, before, after)]
-        return self._order[np.searchsorted(stamps, chosen)].astype(np.int64)
+        return self._order[nearest(stamps, times)].astype(np.int64)
 
     @cached_property
     def key_frames(self) -> NDArray[np.int64]:
