@@ -101,7 +101,7 @@ def problems(dataset: Path) -> list[str]:
 def brightness(path: str) -> list[tuple[int, float]]:
     """Stamp and mean of every frame of the first stream."""
     with mp4ds.open(path) as dataset:
-        stream: mp4ds.Stream = dataset["/cam/image_raw"]
+        stream: mp4ds.Frames = dataset["/cam/image_raw"]
         last: mp4ds.Frame = stream[-1]
         some: list[mp4ds.Frame] = stream[2:7:2]
         stamps: NDArray[np.int64] = stream.stamps

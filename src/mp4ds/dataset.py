@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +29,7 @@ from mp4ds.records import Channel, Excerpt, Message, Record, Schema
 from mp4ds.remote import location
 from mp4ds.sidecar import MANIFEST_NAME, MESSAGES_NAME, Manifest, load_manifest
 from mp4ds.source_files import HOW_TO_OPEN, video_at
-from mp4ds.streams import Stream, TopicFrames, Video
+from mp4ds.streams import Frames, Stream, TopicFrames, Video
 from mp4ds.streams.choices import Choice, everything, last_of, since
 from mp4ds.sync import Sync, synchronize
 
@@ -93,9 +92,8 @@ class Dataset:
         self.videos: list[Video] = []
 
     @property
-    def _all(self) -> list[Stream]:
-        # a video of others has all of a stream but what its sidecar gives
-        return [*self.streams, *(cast(Stream, video) for video in self.videos)]
+    def _all(self) -> list[Stream | Video]:
+        return [*self.streams, *self.videos]
 
     @property
     def topics(self) -> list[str]:
@@ -103,16 +101,16 @@ class Dataset:
         return list(dict.fromkeys(stream.topic for stream in self._all))
 
     @cached_property
-    def _by_name(self) -> dict[str, Stream]:
+    def _by_name(self) -> dict[str, Frames]:
         """The frames of each topic, and the streams by the names of their files."""
-        found = {stream.path.stem: stream for stream in self._all}
-        for topic in self.topics:
-            streams = [stream for stream in self._all if stream.topic == topic]
-            whole = TopicFrames(streams) if len(streams) > 1 else streams[0]
-            found[topic] = cast(Stream, whole)  # as `_all` does
+        found: dict[str, Frames] = {one.path.stem: one for one in self._all}
+        found |= {video.topic: video for video in self.videos}
+        for topic in dict.fromkeys(stream.topic for stream in self.streams):
+            streams = [stream for stream in self.streams if stream.topic == topic]
+            found[topic] = TopicFrames(streams) if len(streams) > 1 else streams[0]
         return found
 
-    def __getitem__(self, topic: str) -> Stream:
+    def __getitem__(self, topic: str) -> Frames:
         if topic not in self._by_name:
             known = ", ".join(self.topics) or "none"
             raise KeyError(f"{self.path} has no stream {topic!r}; there are: {known}")
@@ -121,7 +119,7 @@ class Dataset:
     def __contains__(self, topic: object) -> bool:
         return topic in self._by_name
 
-    def __iter__(self) -> Iterator[Stream]:
+    def __iter__(self) -> Iterator[Stream | Video]:
         return iter(self._all)
 
     def __len__(self) -> int:

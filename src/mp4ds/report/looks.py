@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mp4ds.errors import VideoError
 from mp4ds.layouts import ENCODINGS, Pixels
-from mp4ds.streams import Stream
+from mp4ds.streams import Frames, Stream
 from mp4ds.streams.views import view_of
 from mp4ds.video import encoding_as
 
@@ -37,7 +37,7 @@ class Look:
         caption: What else than the image is shown; empty for plain light.
     """
 
-    def __init__(self, stream: Stream, size: tuple[int, int]) -> None:
+    def __init__(self, stream: Frames, size: tuple[int, int]) -> None:
         encoding = ENCODINGS[stream.encoding]
         self._is_light = encoding_as(encoding, "rgb") is not None
         self._view = view_of(
@@ -98,7 +98,7 @@ def pictures_in_order(stream: Stream) -> Iterator[tuple[int, Pixels | None]]:
                 yield index, make(found)
 
 
-def _sampled(stream: Stream) -> list[Pixels]:
+def _sampled(stream: Frames) -> list[Pixels]:
     """Pixels of a few frames, of which a part stands for the whole."""
     numbers = sorted(set(np.linspace(0, len(stream) - 1, _SAMPLES).astype(int).tolist()))
     found = []

@@ -16,7 +16,7 @@ from mp4ds.layouts import ENCODINGS, Pixels
 from mp4ds.outputs import staged
 from mp4ds.owned import begins_with
 from mp4ds.report.looks import Look
-from mp4ds.streams import Stream, TopicFrames
+from mp4ds.streams import Frames, TopicFrames
 from mp4ds.streams.views import Resize, size_after
 from mp4ds.video import ImageFile, encoding_as
 from mp4ds.video.sheets import Page
@@ -149,7 +149,7 @@ def _image_names(path: Path) -> set[str] | None:
     return {""} if begins_with(path, b"\x89PNG", b"\xff\xd8\xff") else None
 
 
-def _chosen(dataset: Dataset, topic: str) -> Stream:
+def _chosen(dataset: Dataset, topic: str) -> Frames:
     if topic:
         try:
             return dataset[topic]
@@ -186,7 +186,7 @@ def spread(count: int, wanted: int) -> list[int]:
     return [(2 * number + 1) * count // (2 * wanted) for number in range(wanted)]
 
 
-def number_at(stream: Stream, text: str) -> int:
+def number_at(stream: Frames, text: str) -> int:
     """Number of the frame that is nearest to a time, or that was asked for by number.
 
     Raises:
@@ -245,7 +245,7 @@ def _nanoseconds(seconds: int, fraction: str | None) -> int:
 # ---------------------------------------------------------------- how
 
 
-def _still(stream: Stream, number: int, kind: str, options: StillOptions) -> tuple[Pixels, str]:
+def _still(stream: Frames, number: int, kind: str, options: StillOptions) -> tuple[Pixels, str]:
     """Pixels of one frame, and their encoding."""
     if options.exact:
         return stream.get([number])[0].data, stream.encoding
@@ -261,7 +261,7 @@ def _still(stream: Stream, number: int, kind: str, options: StillOptions) -> tup
 
 
 def _sheet(
-    stream: Stream, numbers: list[int], sheet: tuple[int, int], resize: Resize
+    stream: Frames, numbers: list[int], sheet: tuple[int, int], resize: Resize
 ) -> NDArray[np.uint8]:
     """All frames on one picture, each with its number and time."""
     width, height = stream.image_size
