@@ -851,7 +851,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], list[str], str]] = {
         [],
         "cannot identify image file",
     ),
-    "other-layout": (lambda root: None, ["--layout", "tum"], "has not the layout tum"),
+    "other-layout": (lambda root: None, ["--layout", "tum"], "is not laid out as tum is"),
     "no-layout": (lambda root: None, ["--layout", "x"], "euroc, kitti, tum, plain"),
     "stamps": (lambda root: None, ["--stamps", "x"], "--stamps is for plain folders"),
     "frame-id": (lambda root: None, ["--frame-id", "x"], "--frame-id is for plain folders"),
@@ -900,7 +900,7 @@ PLAIN_BAD: dict[str, tuple[list[str], dict[str, str], list[str], str]] = {
     "bad-encoding": (["a.png"], {}, ["--rate", "2", "--encoding", "x"], "--encoding 'x'"),
     "other-encoding": (["a.png"], {}, ["--rate", "2", "--encoding", "rgb8"], "cannot be rgb8"),
     "jpeg-encoding": (["a.jpg"], {}, ["--rate", "2", "--encoding", "mono8"], "JPEG"),
-    "no-topic": (["a.png"], {}, ["--rate", "2", "--topic", "/"], "is no topic"),
+    "no-topic": (["a.png"], {}, ["--rate", "2", "--topic", "/"], "is not a topic name"),
     "other-size": (
         ["a.png"],
         {"c": ROS_CALIBRATION.replace("32", "33", 1)},

@@ -174,7 +174,7 @@ class SourceState:
             raise SourceError(
                 path,
                 "has changed since its packing began",
-                "Begin anew with --restart, or give the file back as it was.",
+                "Start over with --restart, or give the file back as it was.",
             )
 
 

@@ -84,5 +84,5 @@ MemoryOption = Annotated[
     typer.Option("--memory", metavar="SIZE", help="Such as 8G; half of the machine's by default."),
 ]
 RestartFlag = Annotated[
-    bool, typer.Option("--restart", help="Begin anew where an unfinished run was left.")
+    bool, typer.Option("--restart", help="Start over where an unfinished run was left.")
 ]

@@ -182,10 +182,11 @@ def print_pack(summary: PackSummary) -> None:
     if not any(topic.files for topic in summary.topics):
         say("no topic became a video: all messages are in messages.mcap as they were")
     ratio = summary.source_bytes / summary.dataset_bytes
+    change = f"{ratio:.2f} times smaller" if ratio >= 1 else f"{1 / ratio:.2f} times as large"
     say(
         f"{summary.dataset}: {size_text(summary.source_bytes)} -> "
         f"{size_text(summary.dataset_bytes)} "
-        f"({ratio:.2f} times smaller), of which messages.mcap {size_text(summary.messages_bytes)}"
+        f"({change}), of which messages.mcap {size_text(summary.messages_bytes)}"
     )
     if summary.larger:
         say(f"larger than its source: {summary.larger}")

@@ -70,7 +70,7 @@ def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
         layout = LAYOUTS[name]
         _check_for(name, layout, options)
         if not layout.matches(folder):
-            raise SourceError(folder, f"has not the layout {name}", "Leave out --layout.")
+            raise SourceError(folder, f"is not laid out as {name} is", "Leave out --layout.")
         scene = layout.find(folder, options)
     except OSError as error:
         if isinstance(error, SourceError):
@@ -91,7 +91,7 @@ def _check(options: ImageFolder) -> None:
     if options.encoding is not None and options.encoding not in ENCODINGS:
         raise OptionError(f"--encoding {options.encoding!r} is not one of {', '.join(ENCODINGS)}.")
     if options.topic is not None and not options.topic.strip("/"):
-        raise OptionError(f"--topic {options.topic!r} is no topic.")
+        raise OptionError(f"--topic {options.topic!r} is not a topic name.")
 
 
 def _check_for(name: str, layout: FolderLayout, options: ImageFolder) -> None:

@@ -211,7 +211,7 @@ class Job:
             raise SourceError(
                 location(self.paths[0]),
                 "consists of other files than when its packing began",
-                "Begin anew with --restart.",
+                "Start over with --restart.",
             )
         for source in self.sources:
             source.check()

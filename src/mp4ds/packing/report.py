@@ -43,7 +43,7 @@ class PackOptions:
         join: Only make the dataset of what `mp4ds.packing.pack_share` packed.
         keep_going: Go on with the other parts where one fails, and report all failures at the end.
         salvage: Pack what can be read of a damaged recording.
-        restart: Begin anew where an unfinished pack was left.
+        restart: Start over where an unfinished pack was left.
         force: Replace an existing dataset.
         images: How a folder of images is read as a recording; None for recordings.
     """

@@ -33,7 +33,7 @@ from mp4ds.system import is_mine, lock
 
 _SUFFIX = ".mp4ds-part"
 _JOB_NAME = "job.json"
-_ANEW = "Begin anew with --restart."
+_ANEW = "Start over with --restart."
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _NAMED = 3
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
@@ -145,7 +145,7 @@ class Workplace:
             raise TargetError(
                 self.folder,
                 f"holds {len(strange)} names that mp4ds did not make there: {listed}",
-                "See what they are; without the folder, packing begins anew.",
+                "See what they are; without the folder, packing starts over.",
             )
 
     def _give_back(self) -> None:
