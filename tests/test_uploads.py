@@ -367,6 +367,19 @@ def test_an_unpack_is_uploaded(
     assert not any(path.endswith(".mp4ds-upload") for path in stores.find(folder_url[5:]))
 
 
+def test_a_file_stays_where_its_replacement_fails(
+    packed_bag: Path, folder_url: str, stores: Any, s3: Server
+) -> None:
+    url = f"{folder_url}/again.bag"
+    mp4ds.unpack(packed_bag, "bag", url)
+    before = stores.cat(url)
+    s3.fails = refusing("again.bag")
+    with pytest.raises(TargetError, match=r"What was made is kept in"):
+        mp4ds.unpack(packed_bag, "bag", url, UnpackOptions(force=True, exclude=["/imu"]))
+    assert there(stores, folder_url) == {"again.bag"}
+    assert stores.cat(url) == before
+
+
 def test_images_are_uploaded(
     packed_bag: Path, folder_url: str, stores: Any, s3: Server, tmp_path: Path
 ) -> None:

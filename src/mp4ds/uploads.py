@@ -124,7 +124,7 @@ def _claimed(folder: Path, target: RemotePath) -> Iterator[None]:
 
 
 def _replaced(target: RemotePath, *, is_folder: bool, force: bool, owned: Owned) -> set[str]:
-    """Names of the files to replace; see `outputs.check_target`."""
+    """Names of the files to replace, empty that of a file; see `outputs.check_target`."""
     shown, now = cast(Path, target), RemotePath(target.url)
     if not now.exists():
         return set()
@@ -132,7 +132,7 @@ def _replaced(target: RemotePath, *, is_folder: bool, force: bool, owned: Owned)
         raise TargetExistsError(shown)
     old = refuse_not_ours(shown, owned(cast(Path, now)))
     if not is_folder:
-        return set()
+        return {""}
     begin = len(target.url) + 1
     there = {path.url[begin:] for path in now.files()}
     refuse_strangers(shown, there - old)
@@ -147,7 +147,7 @@ def _probe(path: RemotePath) -> None:
 
 
 def _send(local: Path, target: RemotePath, old: set[str], last: str, report: Report | None) -> None:
-    for name in sorted(old, key=lambda name: name != last):
+    for name in sorted(old - {""}, key=lambda name: name != last):
         (target / name).remove()
     files, done = _files(local, last), 0
     try:
@@ -157,7 +157,7 @@ def _send(local: Path, target: RemotePath, old: set[str], last: str, report: Rep
             _place(target, name).upload(local / name)
             done += size
     except BaseException:
-        for name in files:
+        for name in files if "" not in old else ():  # a file that is not replaced stays
             with suppress(Mp4dsError):
                 _place(target, name).remove()
         raise
