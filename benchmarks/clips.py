@@ -381,7 +381,7 @@ def _demo_frames(count: int) -> Iterator[av.VideoFrame]:
     from rosbags.rosbag1 import Reader
     from rosbags.typesys import Stores, get_typestore
 
-    from mp4ds.demo import CAMERA_HZ, demo
+    from mp4ds.plugins.demo import CAMERA_HZ, demo
 
     store = get_typestore(Stores.ROS1_NOETIC)
     with tempfile.TemporaryDirectory() as folder:

@@ -139,7 +139,7 @@ def sizes(
     common: dict[str, Any],
 ) -> Iterator[tuple[object, ...]]:
     """Measured and estimated memory of each case, MB."""
-    from mp4ds.video.memory import encoder_bytes
+    from mp4ds.video.trial import encoder_bytes
 
     for name in names:
         for size in pictures:
@@ -195,7 +195,7 @@ def _measure(name: str, **arguments: Any) -> dict[str, Any]:
 
 
 def _recipe(case: Case) -> Any:
-    from mp4ds.video import recipe_for
+    from mp4ds.video.codecs import recipe_for
 
     return recipe_for(
         case.picture_format,
@@ -217,7 +217,7 @@ class Scene:
     """
 
     def __init__(self, picture_format: str, width: int, height: int, noise: float) -> None:
-        from mp4ds.layouts import CHROMA_SHIFTS
+        from mp4ds.messages.arrangements import CHROMA_SHIFTS
 
         bits = _DEEP.get(picture_format, 8)
         if picture_format.startswith("gbr"):
@@ -310,7 +310,7 @@ def _child(
     finish: bool = False,
 ) -> dict[str, Any]:
     """Encode; leaves the encoder open unless it is to be finished."""
-    from mp4ds.video import VideoEncoder
+    from mp4ds.video.encoder import VideoEncoder
 
     case = CASES[name]
     recipe = _recipe(case)

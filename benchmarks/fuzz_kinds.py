@@ -9,13 +9,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import xxhash
 
 import mp4ds
-import mp4ds.packing.coordinator
 from fuzz_bytes import damaged
 from fuzz_dataset import MANIFEST, Good, changed_dataset
 from fuzz_mcap import changed_mcap, changed_mcap_records
@@ -30,8 +30,8 @@ from fuzz_records import (
 from fuzz_rules import BrokenRuleError, check_dataset, check_recording
 from in_parts import InlineEngine
 from mp4ds import Mp4dsError
-from mp4ds.packing import PackOptions
-from mp4ds.packing.part import Part
+from mp4ds.packing.manifest import PartRecord
+from mp4ds.packing.options import PackOptions
 from mp4ds.packing.workplace import Workplace
 from scenes import Scene
 from sources import SOURCES, scene
@@ -237,7 +237,7 @@ def _check_work(folder: Path, out: Path, rng: random.Random, *, source: Path) ->
         if job is not None:
             [place.is_done(task) for task in job.tasks]
     with suppress(Mp4dsError):
-        Part.load(place.parts / "00000-0")
+        PartRecord.load(place.parts / "00000-0")
     if rng.random() < 0.25:
         _pack(source, out / "drive", InlineEngine())
         if problems := mp4ds.validate(out / "drive", deep=True):
@@ -247,6 +247,6 @@ def _check_work(folder: Path, out: Path, rng: random.Random, *, source: Path) ->
 
 
 def _pack(source: Path, target: Path, engine: InlineEngine) -> None:
-    packing: Any = mp4ds.packing
+    packing: Any = import_module("mp4ds.packing.pack")
     packing._engine = lambda *_: engine
     mp4ds.pack(source, target, _PACK)

@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 
 import mp4ds
 from mp4ds import Mp4dsError
-from mp4ds.bags import open_sources
-from mp4ds.info import info
-from mp4ds.packing import PackOptions
+from mp4ds.bags.formats import open_sources
+from mp4ds.packing.options import PackOptions
+from mp4ds.plugins.info import info
 from mp4ds.records import Channel, Excerpt, Loss, Message
 
 Key = tuple[Any, ...]

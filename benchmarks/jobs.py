@@ -81,7 +81,7 @@ def sidecars(dataset: str) -> list[Path]:
 
 def video_of(path: Path) -> Any:
     """What a sidecar says of its video."""
-    from mp4ds.sidecar import load_stream
+    from mp4ds.format.sidecars import load_stream
 
     return load_stream(path).video
 
@@ -107,7 +107,7 @@ def decode(dataset: str, frames: str) -> dict[str, Any]:
         ``cpu`` seconds, and whether each image, in a video or verbatim, is ``exact``: the bytes
         of its pixels, so that one NaN is not another.
     """
-    from mp4ds.dataset import Dataset
+    from mp4ds.dataset.dataset import Dataset
     from recordings import times
 
     cpu = Cpu()
@@ -152,7 +152,7 @@ def recipes(source: str, folder: str, frames: str, codecs: list[str | None]) -> 
         ``results`` of `pack` with those of `decode` as ``decoded``.
     """
     import mp4ds
-    from mp4ds.dataset import Dataset
+    from mp4ds.dataset.dataset import Dataset
 
     _ = mp4ds.pack, Dataset  # imported before anything is measured
     results: list[dict[str, Any]] = []
@@ -185,9 +185,10 @@ def bare(dataset: str, frames: str, output: str, threads: int) -> dict[str, Any]
 
     import av
 
-    from mp4ds.layouts import ENCODINGS, NO_PARAMETERS, Parameters, bind
-    from mp4ds.sidecar import load_stream
-    from mp4ds.video.convert import Converter, picture_to_frame
+    from mp4ds.format.sidecars import load_stream
+    from mp4ds.messages.encodings import ENCODINGS, NO_PARAMETERS, Parameters
+    from mp4ds.messages.layouts import bind
+    from mp4ds.video.pixels import PictureConverter, picture_to_frame
 
     sidecar = load_stream(sidecars(dataset)[0])
     video, values = sidecar.video, sidecar.video.parameters
@@ -195,7 +196,7 @@ def bare(dataset: str, frames: str, output: str, threads: int) -> dict[str, Any]
         Parameters.from_values(values.model_dump(exclude_none=True)) if values else NO_PARAMETERS
     )
     layout = bind(video.layout, ENCODINGS[sidecar.image.encoding], parameters)
-    converter, coded = Converter(), video.pixel_format or layout.pixel_format
+    converter, coded = PictureConverter(), video.pixel_format or layout.pixel_format
     stamps = sidecar.columns.stamp.decode(sidecar.frames)
     ticks = ((stamps - stamps[0]) // 1000).tolist()
     prepared = []
@@ -248,22 +249,20 @@ def write_sidecar(path: str, frames: int, kind: str) -> dict[str, Any]:
         kind: ``ros1``; ``ros2`` with publish times and sequence numbers; or ``ros1-info``
             with a CameraInfo per frame.
     """
-    from mp4ds.records import Channel, Message, Schema
-    from mp4ds.sidecar import (
+    from mp4ds.dataset.rebuild import ColumnsWriter
+    from mp4ds.format.fields import FORMAT_VERSION, Digests
+    from mp4ds.format.models import (
         Calibration,
         CameraInfo,
         ChannelModel,
-        Digests,
         Header,
         Image,
         StreamSidecar,
-        Video,
-        dump_document,
+        VideoModel,
     )
-    from mp4ds.sidecar.fields import FORMAT_VERSION
-    from mp4ds.streams.columns import ColumnsWriter
-    from mp4ds.wire import Parts
-    from mp4ds.wire.forms import ImageFields
+    from mp4ds.format.sidecars import dump_document
+    from mp4ds.messages.wire import ImageFields, Parts
+    from mp4ds.records import Channel, Message, Schema
     from recordings import times
 
     ros1 = kind.startswith("ros1")
@@ -318,7 +317,7 @@ def write_sidecar(path: str, frames: int, kind: str) -> dict[str, Any]:
         wire="ros1" if ros1 else "cdr-le",
         image=Image(encoding="bayer_rggb8", width=1280, height=720, step=1280, is_bigendian=0),
         headers=[Header(frame_id="camera")],
-        video=Video(
+        video=VideoModel(
             file="camera.mp4",
             layout="mosaic8",
             codec="h264",
@@ -343,8 +342,9 @@ def load_sidecar(path: str, rounds: int) -> dict[str, Any]:
     """
     from jsonschema import Draft202012Validator
 
-    from mp4ds.sidecar import StreamSidecar, load_document, schema_text
-    from mp4ds.streams.rebuild import decode_columns
+    from mp4ds.dataset.rebuild import decode_columns
+    from mp4ds.format.models import StreamSidecar
+    from mp4ds.format.sidecars import load_document, schema_text
 
     steps: dict[str, list[float]] = {}
     for _ in range(rounds):

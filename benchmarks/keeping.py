@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mp4ds.plan import visual_setting
-from mp4ds.stamps import TIMESCALE
-from mp4ds.video import Recipe, VideoEncoder, recipe_for
-from mp4ds.video.convert import Converter
+from mp4ds.times import TIMESCALE
+from mp4ds.video.codecs import Recipe, recipe_for
+from mp4ds.video.encoder import VideoEncoder
+from mp4ds.video.pixels import PictureConverter
 from mp4ds.video.planes import packet_sizes
 
 Frames = NDArray[np.uint8]  # shape (frames, H, W, 3)
@@ -133,7 +134,7 @@ def _as_video(
         encoder.write(picture, number * TIMESCALE // _HZ)
     encoder.close()
     size = packet_sizes(path).frame_bytes(GOP)
-    converter = Converter(recipe.matrix)
+    converter = PictureConverter(recipe.matrix)
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         stream.thread_count = 1
@@ -148,7 +149,7 @@ def _filtered(
 ) -> Iterator[tuple[NDArray[np.uint8], ...]]:
     """Planes of the frames, converted as the package does, through ffmpeg's filters."""
     height, width = frames.shape[1:3]
-    graph, converter = Graph(), Converter()
+    graph, converter = Graph(), PictureConverter()
     nodes = [
         graph.add_buffer(width=width, height=height, format="yuv420p", time_base=Fraction(1, _HZ))
     ]

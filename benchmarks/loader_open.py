@@ -170,7 +170,7 @@ def many_datasets(folder: Path, count: int) -> Path:
 
 def long_dataset(folder: Path, streams: int, frames: int) -> Path:
     """A dataset of many frames."""
-    from mp4ds.sidecar import MANIFEST_NAME, load_manifest
+    from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
 
     long = folder / f"long-{streams}x{frames}"
     if long.exists():
@@ -197,7 +197,7 @@ def lengthen(path: Path, frames: int, number: int) -> Any:
         frames: How many it gets.
         number: Of the stream, for other jitter in each.
     """
-    from mp4ds.sidecar import load_stream
+    from mp4ds.format.sidecars import load_stream
 
     sidecar = load_stream(path)
     video = path.parent / sidecar.video.file
@@ -217,8 +217,8 @@ def lengthen(path: Path, frames: int, number: int) -> Any:
 
 
 def _repeat(video: Path, count: int, stamps: Any, log_times: Any) -> None:
-    from mp4ds.stamps import PresentationClock
-    from mp4ds.video.join import join_segments
+    from mp4ds.times import PresentationClock
+    from mp4ds.video.packets import join_segments
 
     frames = len(stamps)
     if frames % count:
@@ -231,7 +231,7 @@ def _repeat(video: Path, count: int, stamps: Any, log_times: Any) -> None:
 
 
 def _columns(stamps: Any, log_times: Any) -> Any:
-    from mp4ds.streams.columns import columns_model
+    from mp4ds.dataset.rebuild import columns_model
 
     published = stamps + np.random.default_rng(1).integers(500_000, 1_500_000, len(stamps))
     numbers = np.arange(len(stamps))
@@ -248,7 +248,7 @@ def _columns(stamps: Any, log_times: Any) -> Any:
 
 
 def _digests(count: int, seed: int) -> Any:
-    from mp4ds.sidecar import Digests
+    from mp4ds.format.fields import Digests
 
     words = np.random.default_rng(seed).integers(0, 2**63, count)
     text = words.astype(">u8").tobytes().hex()
@@ -261,15 +261,15 @@ def _digests(count: int, seed: int) -> Any:
 
 
 def _with_digest(video: Any, path: Path) -> Any:
-    from mp4ds.outputs import digest_file
+    from mp4ds.files.outputs import digest_file
 
     size, sha256 = digest_file(path)
     return video.model_copy(update={"size": size, "sha256": sha256})
 
 
 def _write_manifest(folder: Path, manifest: Any, sidecars: list[Any]) -> None:
-    from mp4ds.outputs import digest_file
-    from mp4ds.sidecar import MANIFEST_NAME
+    from mp4ds.files.outputs import digest_file
+    from mp4ds.format.sidecars import MANIFEST_NAME
 
     frames = sidecars[0].frames
     files = []
@@ -282,6 +282,6 @@ def _write_manifest(folder: Path, manifest: Any, sidecars: list[Any]) -> None:
 
 
 def _dump(model: Any, path: Path) -> None:
-    from mp4ds.sidecar import dump_document
+    from mp4ds.format.sidecars import dump_document
 
     path.write_bytes(dump_document(model))

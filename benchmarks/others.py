@@ -25,9 +25,11 @@ from av.video.frame import VideoFrame
 from numpy.typing import NDArray
 from PIL import Image
 
-from mp4ds.coded import rvl
-from mp4ds.layouts import ENCODINGS, Picture, bind
-from mp4ds.video.convert import Converter, frame_to_picture, picture_to_frame
+from mp4ds.messages import depth
+from mp4ds.messages.arrangements import Picture
+from mp4ds.messages.encodings import ENCODINGS
+from mp4ds.messages.layouts import bind
+from mp4ds.video.pixels import PictureConverter, frame_to_picture, picture_to_frame
 
 _TIME_BASE = Fraction(1, 30)
 _GOOD_PNG = {"pred": "mixed"}  # a filter chosen for each row, as libpng does
@@ -143,7 +145,7 @@ def _video(
 ) -> Way:
     """An mp4 of a lossless encoder."""
     path = folder / f"{name}.mp4"
-    converter = Converter()
+    converter = PictureConverter()
     frames = [
         picture_to_frame(picture, clip.pixel_format, pixel_format, converter)
         for picture in clip.pictures
@@ -174,9 +176,9 @@ def _video(
 
 def rvl_files(clip: NDArray[Any]) -> Way:
     """Each frame as an RVL file; numpy's speed says nothing of RVL's."""
-    files = [rvl.encode(np.ascontiguousarray(frame)) for frame in clip]
+    files = [depth.encode_rvl(np.ascontiguousarray(frame)) for frame in clip]
     for frame, file in zip(clip, files, strict=True):
-        _check("RVL", frame, rvl.decode(file))
+        _check("RVL", frame, depth.decode_rvl(file))
     return Way("RVL", sum(map(len, files)))
 
 

@@ -124,8 +124,8 @@ def write_recording(path: Path, *, cameras: int, frames: int, width: int, height
 def _pack(source: str, target: str, **options: Any) -> dict[str, Any]:
     """Pack, and tell what each task and the phases took."""
     import mp4ds
-    from mp4ds import packing
-    from mp4ds.engine import Outcome, ProcessEngine
+    from mp4ds.packing import pack
+    from mp4ds.packing.engine import Outcome, ProcessEngine
 
     tasks: list[dict[str, Any]] = []
     marks = {"begin": time.monotonic()}
@@ -138,7 +138,7 @@ def _pack(source: str, target: str, **options: Any) -> dict[str, Any]:
                 marks["packed"] = time.monotonic()
                 yield outcome
 
-    packing.ProcessEngine = Recorded  # type: ignore[attr-defined,misc]
+    pack.ProcessEngine = Recorded  # type: ignore[attr-defined,misc]
     mp4ds.pack(source, target, mp4ds.PackOptions(**options))
     marks["end"] = time.monotonic()
     own, children = (
@@ -253,7 +253,7 @@ def compare_lengths(folder: Path, options: argparse.Namespace) -> None:
 
 def measure_cameras(folder: Path, options: argparse.Namespace) -> None:
     """Peak memory of many large cameras within a bound."""
-    from mp4ds.cli.arguments import parse_size
+    from mp4ds.options import parse_size
 
     source = folder / "drive.bag"
     size = write_recording(

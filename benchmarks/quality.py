@@ -31,8 +31,7 @@ import numpy as np
 import clips
 import mp4ds
 from measure import parse_size, print_machine, print_table
-from mp4ds.streams.crf_control import CrfControl
-from mp4ds.streams.windows import WindowCoder
+from mp4ds.packing.target import CrfControl, WindowCoder
 from recordings import write_mcap
 
 HERTZ = 30.0

@@ -225,7 +225,7 @@ def measured(way: Callable[[], Opener], path: Path) -> tuple[float, int, int]:
 
 def by_mp4ds(spans: int) -> Opener:
     """Our reader, in one pass or in several spans."""
-    from mp4ds.bags import open_reader
+    from mp4ds.bags.formats import open_reader
     from mp4ds.records import EVERYTHING, Excerpt, Message
 
     @contextmanager

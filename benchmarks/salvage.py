@@ -33,7 +33,7 @@ from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
 from measure import print_table
-from mp4ds.bags import open_sources
+from mp4ds.bags.formats import open_sources
 from mp4ds.errors import SourceError
 from mp4ds.records import Message
 

@@ -18,11 +18,12 @@ from pathlib import Path
 import clips
 from measure import parse_size, print_machine, print_table
 from mp4ds.plan import visual_setting
-from mp4ds.scoring import Scorer, find_ffmpeg
-from mp4ds.stamps import TIMESCALE
-from mp4ds.video import VideoEncoder, recipe_for
-from mp4ds.video.codecs import LOSSY_GOP
+from mp4ds.times import TIMESCALE
+from mp4ds.video.codecs import LOSSY_GOP, recipe_for
+from mp4ds.video.encoder import VideoEncoder
+from mp4ds.video.libvmaf import find_ffmpeg
 from mp4ds.video.planes import PLANES_FORMAT, PlaneMaker, Planes, decoded_planes
+from mp4ds.video.scores import Scorer
 
 SIZES = ((320, 240), (640, 480), (960, 540))
 _HERTZ = 30

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import mp4ds
-from mp4ds.packing import PackOptions
+from mp4ds.packing.options import PackOptions
 from sources import SOURCES, load_tool, scene
 
 NETWORKS = {

@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from mp4ds.engine import Outcome
 from mp4ds.errors import Mp4dsError
+from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, load_stream
+from mp4ds.packing.engine import Outcome
 from mp4ds.packing.work import run_task
-from mp4ds.sidecar import MANIFEST_NAME, load_manifest, load_stream
 
 
 class InlineEngine:
-    """Runs tasks one after the other; see `mp4ds.engine.Engine`.
+    """Runs tasks one after the other; see `mp4ds.packing.engine.Engine`.
 
     Args:
         fails: Whether a task is to fail, by its name.

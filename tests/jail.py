@@ -134,7 +134,7 @@ def _validate(path: str, deep: bool, found: dict[str, Any]) -> None:
 
 
 def _records(path: str, _deep: bool, found: dict[str, Any], *, salvage: bool = False) -> None:
-    from mp4ds.bags import open_sources
+    from mp4ds.bags.formats import open_sources
 
     with open_sources([Path(path)], salvage=salvage) as reader:  # type: ignore[call-overload]
         for record in reader.records():
@@ -144,8 +144,8 @@ def _records(path: str, _deep: bool, found: dict[str, Any], *, salvage: bool = F
 
 
 def _converted(path: str, _deep: bool, found: dict[str, Any], *, to: str) -> None:
-    from mp4ds.bags import open_sources
     from mp4ds.bags.convert import Converter
+    from mp4ds.bags.formats import open_sources
 
     converter = Converter(to)
     with open_sources([Path(path)]) as reader:
@@ -157,8 +157,8 @@ def _converted(path: str, _deep: bool, found: dict[str, Any], *, to: str) -> Non
 
 
 def _decoded(path: str, _deep: bool, _found: dict[str, Any]) -> None:
-    from mp4ds.bags import open_sources
-    from mp4ds.recorded import as_recorded
+    from mp4ds.bags.formats import open_sources
+    from mp4ds.dataset.messages import as_recorded
 
     with open_sources([Path(path)]) as reader:
         messages = (record for record in reader.records() if isinstance(record, Message))
@@ -209,7 +209,7 @@ def _in_child(request: list[Any]) -> dict[str, Any]:
         os.close(receiver)
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
-        signal.alarm(5 * SECONDS)  # for one that waits and does not compute
+        signal.alarm(30 * SECONDS)  # for one that waits: on a busy machine, too
         with os.fdopen(sender, "w") as pipe:
             json.dump(_run(*request), pipe)
         os._exit(0)
@@ -232,8 +232,8 @@ _IMPORTED = (
     "rosbags.typesys.stores.ros1_noetic",
     "rosbags.typesys.stores.ros2_humble",
     "mp4ds.bags.convert",
-    "mp4ds.checks",
-    "mp4ds.dataset",
+    "mp4ds.dataset.checks",
+    "mp4ds.dataset.dataset",
 )
 
 

@@ -1,6 +1,6 @@
 """Pixels of every encoding: what the tests of layouts and of their codecs share.
 
-Arrays are what `mp4ds.layouts.pixel_view` gives of a message, made here from bytes.
+Arrays are what `mp4ds.messages.encodings.pixel_view` gives of a message, made here from bytes.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.layouts import ENCODINGS, LAYOUTS, Encoding, Layout, Parameters, bind, fit, pixel_view
+from mp4ds.messages.encodings import ENCODINGS, Encoding, Parameters, pixel_view
+from mp4ds.messages.layouts import LAYOUTS, Layout, bind, fit
 
 Pixels = NDArray[Any]
 

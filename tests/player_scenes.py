@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from mp4ds.bags import open_reader, open_writer
-from mp4ds.bags.definitions import ros1_channel
+from mp4ds.bags.convert import ros1_channel
+from mp4ds.bags.formats import open_reader, open_writer
+from mp4ds.messages.serializations import form_of
+from mp4ds.messages.wire import ImageFields, Slots
 from mp4ds.records import Channel, Message
-from mp4ds.wire import ImageFields, Slots, form_of
 
 
 @dataclass

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mp4ds
-from mp4ds.packing import PackOptions
+from mp4ds.packing.options import PackOptions
 from scenes import Record, Scene
 from sources import SOURCES, scene
 

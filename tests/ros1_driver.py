@@ -17,7 +17,7 @@ from typing import Any
 
 from mp4ds.bags.formats import open_reader
 from mp4ds.errors import Mp4dsError
-from mp4ds.publishers.ros1 import RospyPublisher
+from mp4ds.plugins.publishing.ros1 import RospyPublisher
 from mp4ds.records import Channel, Message
 
 

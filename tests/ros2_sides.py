@@ -150,7 +150,7 @@ class Side:
 def dds_side(monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
     """Cyclone DDS on loopback, in a domain where no other test is."""
     pytest.importorskip("cyclonedds")
-    from mp4ds.publishers.dds import DdsPublisher
+    from mp4ds.plugins.publishing.dds import DdsPublisher
 
     domain = random.SystemRandom().randrange(200)
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
@@ -174,7 +174,7 @@ def dds_side(monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
 @contextmanager
 def rclpy_side(monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
     """rclpy as it would be with a ROS 2 that is sourced."""
-    from mp4ds.publishers.ros2 import RclpyPublisher
+    from mp4ds.plugins.publishing.ros2 import RclpyPublisher
 
     bus = fake_rclpy.install(monkeypatch)
     yield Side(RclpyPublisher, {}, fake_rclpy.FakePeer(bus))

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import mp4ds
-from mp4ds.packing import PackOptions
-from mp4ds.unpacking import UnpackOptions
+from mp4ds.packing.options import PackOptions
+from mp4ds.unpacking.unpack import UnpackOptions
 from scenes import Scene
 from sources import Source
 

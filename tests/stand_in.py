@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from mp4ds.video import codecs, hardware
-from mp4ds.video.hardware import HARDWARE, HardwareEncoder
+from mp4ds.video import codecs, encoder
+from mp4ds.video.codecs import HARDWARE, HardwareEncoder
 
 NAME = "h264-vaapi"  # it has no presets
 STAND_IN = HardwareEncoder("h264", "libx264", "nothing", {"bf": "0"}, "crf", 51)
@@ -12,4 +12,4 @@ KNOWN = {**HARDWARE, NAME: STAND_IN}
 
 def stand_in_here() -> None:
     """Take it for the device in this process, from now on."""
-    hardware.HARDWARE = codecs.HARDWARE = KNOWN  # type: ignore[misc]
+    encoder.HARDWARE = codecs.HARDWARE = KNOWN  # type: ignore[misc]

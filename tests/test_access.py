@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 import mp4ds
 from each import each
-from mp4ds.coded.references import UnknownStructure
 from mp4ds.errors import VideoError
+from mp4ds.messages.coded import UnknownStructure
 from mp4ds.video.access import FrameAccess
 from sources import SOURCES, scene
 from test_references import (

@@ -28,7 +28,7 @@ import mp4ds
 from coded_scenes import CODED
 from conftest import real
 from each import each, fresh
-from mp4ds.cli import app
+from mp4ds.cli import app_for
 from scenes import ENCODINGS, IMAGE, START, Record, Scene, image_cdr, image_ros1, picture
 from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2
 from waiting import WATCHDOG_S, until
@@ -57,7 +57,7 @@ def call(*arguments: object) -> Result:
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            app([str(argument) for argument in arguments])
+            app_for()([str(argument) for argument in arguments])
             code: Any = 0
         except SystemExit as exit_:
             code = exit_.code or 0

@@ -16,8 +16,7 @@ from rosbags.typesys.msg import normalize_msgtype
 
 from conftest import real
 from each import each
-from mp4ds.bags.convert import LATCHED_QOS, Converter
-from mp4ds.bags.definitions import ros1_channel
+from mp4ds.bags.convert import LATCHED_QOS, Converter, ros1_channel
 from mp4ds.bags.ros1 import Ros1Reader
 from mp4ds.errors import ConversionError, OptionError
 from mp4ds.records import Channel, Schema
@@ -377,7 +376,7 @@ def test_what_cannot_be_converted(
         Converter(target).channel(Channel(0, "/a", encoding, schema, {}))
     assert str(caught.value).startswith("topic /a: ")
     assert problem in str(caught.value)
-    assert "Exclude the topic with --exclude, or unpack to mcap" in str(caught.value)
+    assert "Exclude the topic with `exclude`, or unpack to mcap" in str(caught.value)
 
 
 @pytest.mark.parametrize("target", ["ros1", "ros2"])

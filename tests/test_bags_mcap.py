@@ -19,20 +19,13 @@ from mcap.writer import IndexType, Writer
 
 from conftest import real
 from each import each
-from mp4ds.bags import ordering
-from mp4ds.bags.mcap import McapReader, McapWriter
+from mp4ds.bags import protocols
+from mp4ds.bags.mcap import McapReader
 from mp4ds.bags.mcap_records import DamageError, unzstd
-from mp4ds.bags.zstd_files import ZstdFile
+from mp4ds.bags.mcap_write import McapWriter
+from mp4ds.bags.rosbag2_files import ZstdFile
 from mp4ds.errors import ConversionError, OptionError, SourceError, SourceNotFoundError
-from mp4ds.records import (
-    Attachment,
-    Channel,
-    ChannelStats,
-    Message,
-    MetadataRecord,
-    Record,
-    Schema,
-)
+from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record, Schema
 
 REAL_FILES = (
     "corrupt/sample_ok.mcap",
@@ -243,7 +236,7 @@ def test_messages_come_in_log_time_order(tmp_path: Path) -> None:
 
 
 def test_what_is_held_back_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ordering, "HOLD_BYTES", 40)
+    monkeypatch.setattr(protocols, "HOLD_BYTES", 40)
     written = messages(write_all(tmp_path / "a.mcap", disordered(), chunk_size=300))
     got = messages(read(tmp_path / "a.mcap")[1])
     assert sorted(map(fields, got)) == sorted(map(fields, written))

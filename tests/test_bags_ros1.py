@@ -16,7 +16,8 @@ from rosbags.rosbag1 import Reader
 
 from conftest import DATA, real
 from each import each
-from mp4ds.bags import open_sources, ros1
+from mp4ds.bags import ros1
+from mp4ds.bags.formats import open_sources
 from mp4ds.bags.ros1 import Ros1Reader
 from mp4ds.bags.ros1_write import Ros1Writer
 from mp4ds.errors import (
@@ -26,14 +27,7 @@ from mp4ds.errors import (
     SourceNotFoundError,
     TargetExistsError,
 )
-from mp4ds.records import (
-    Attachment,
-    Channel,
-    ChannelStats,
-    Message,
-    MetadataRecord,
-    Schema,
-)
+from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Schema
 from sources import START, scene, write_bag
 
 COMPRESSIONS = ("none", "bz2", "lz4")

@@ -498,7 +498,7 @@ def test_what_grows_is_explained(tmp_path: Path) -> None:
 
 def test_transcoding_without_loss_is_refused(tmp_path: Path) -> None:
     paths = SOURCES["bag-none"](tmp_path, CODED["jpeg-rgb"](frames=2))
-    with pytest.raises(mp4ds.OptionError, match="--transcode"):
+    with pytest.raises(mp4ds.OptionError, match="`transcode`"):
         mp4ds.pack(paths, tmp_path / "dataset", mp4ds.PackOptions(transcode=True))
     assert not (tmp_path / "dataset").exists()
 

@@ -14,8 +14,9 @@ from PIL import Image
 import mp4ds
 from in_parts import InlineEngine, leftovers
 from mp4ds.errors import SourceError
-from mp4ds.packing import ros_mp4, work
-from mp4ds.packing.ros_mp4 import import_ros_mp4
+from mp4ds.packing import work
+from mp4ds.plugins.importing import ros_mp4
+from mp4ds.plugins.importing.ros_mp4 import import_ros_mp4
 from sources import SOURCES, scene
 from test_version0 import FIXTURE
 
@@ -119,7 +120,7 @@ def test_a_source_that_changes_while_it_is_packed_in_parts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, file = recording("bag-none", tmp_path / "source")
-    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: InlineEngine())
+    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: InlineEngine())
     make = work.Tasks._pack
 
     def changing(*arguments: Any) -> None:

@@ -23,11 +23,10 @@ from distributed import Security
 import cluster_tasks
 from clusters import WITH_NANNY, RealCluster, Relay
 from each import each
-from mp4ds.engine import Engine, Outcome
-from mp4ds.engine import cluster_access as access
-from mp4ds.engine.cluster import ClusterEngine
-from mp4ds.engine.cluster_access import Connection
 from mp4ds.errors import ClusterError, OptionError
+from mp4ds.packing.engine import Engine, Outcome
+from mp4ds.plugins import cluster as access
+from mp4ds.plugins.cluster import ClusterEngine, Connection
 from waiting import WATCHDOG_S, until
 
 MIB = 2**20
@@ -554,7 +553,7 @@ def test_a_batch_system_that_is_not_there(system: str, tmp_path: Path) -> None:
 @each("system", access.BATCH_SYSTEMS)
 def test_a_batch_system_that_is_not_set_up(system: str, tmp_path: Path) -> None:
     engine = ClusterEngine(cluster_tasks.write, system, task_bytes=MIB)
-    with pytest.raises(OptionError, match=rf"--cluster {system}: .*jobqueue.yaml"):
+    with pytest.raises(OptionError, match=rf"`cluster` {system}: .*jobqueue.yaml"):
         run(engine, tasks_in(tmp_path, "a"))
 
 

@@ -19,12 +19,11 @@ import pytest
 
 import mp4ds
 from clusters import OTHER_VERSION, RealCluster
-from mp4ds.engine import Outcome
-from mp4ds.errors import ClusterError, Mp4dsError, OptionError
-from mp4ds.evaluating import EvaluateOptions, Evaluation
-from mp4ds.evaluating.engines import Engines
-from mp4ds.evaluating.work import command, run_task
-from mp4ds.scoring import ScoringError
+from mp4ds.errors import ClusterError, Mp4dsError, OptionError, ScoringError
+from mp4ds.packing.engine import Outcome
+from mp4ds.plugins.evaluating.options import EvaluateOptions
+from mp4ds.plugins.evaluating.results import Evaluation
+from mp4ds.plugins.evaluating.trials import Engines, command, run_task
 from sources import scene, write_bag
 from waiting import WATCHDOG_S, until
 
@@ -98,7 +97,7 @@ def trials_of(worker: subprocess.Popen[bytes]) -> list[int]:
     for path in Path(f"/proc/{worker.pid}/task").glob("*/children"):
         for pid in path.read_text().split():
             with suppress(OSError):
-                if b"mp4ds.evaluating.work" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                if b"mp4ds.plugins.evaluating.trials" in Path(f"/proc/{pid}/cmdline").read_bytes():
                     found.append(int(pid))
     return found
 
@@ -243,15 +242,15 @@ class Elsewhere:
 def test_results_that_are_not_seen(
     bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mp4ds.outputs._SEEN_SECONDS", 0.1)
-    monkeypatch.setattr("mp4ds.outputs._LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("mp4ds.files.outputs._SEEN_SECONDS", 0.1)
+    monkeypatch.setattr("mp4ds.files.outputs._LOOK_SECONDS", 0.01)
     monkeypatch.setattr(Engines, "engine", lambda *_: Elsewhere())
     with pytest.raises(ScoringError, match=r"not seen in .*cells; all machines must share"):
         mp4ds.evaluate(bag, QUICK, output=tmp_path / "out")
 
 
 def test_nobody_at_the_address(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mp4ds.engine.cluster_access._CONNECT_SECONDS", 1.0)
+    monkeypatch.setattr("mp4ds.plugins.cluster._CONNECT_SECONDS", 1.0)
     with pytest.raises(ClusterError, match="no Dask scheduler could be reached"):
         mp4ds.evaluate(bag, replace(QUICK, cluster=NOBODY), output=tmp_path / "out")
     assert not list((tmp_path / "out").glob("work*"))
@@ -260,8 +259,8 @@ def test_nobody_at_the_address(bag: Path, tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"cluster": "slrum"}, "--cluster 'slrum' is neither"),
-        ({"cluster": NOBODY, "jobs": 2}, "--jobs is for this machine"),
+        ({"cluster": "slrum"}, "`cluster` 'slrum' is neither"),
+        ({"cluster": NOBODY, "jobs": 2}, "`jobs` is for this machine"),
     ],
 )
 def test_options_that_are_wrong(

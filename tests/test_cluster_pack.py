@@ -17,7 +17,7 @@ import mp4ds
 from clusters import OTHER_VERSION, RealCluster
 from in_parts import facts, leftovers
 from mp4ds.errors import PartsFailedError
-from mp4ds.packing import PackOptions
+from mp4ds.packing.options import PackOptions
 from round_trips import Compare, unpacked
 from sources import SOURCES, scene
 from waiting import WATCHDOG_S, until

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from coded_tools import ENCODINGS, encode, refusal
 from each import each
-from mp4ds.coded.annexb import (
+from mp4ds.video.nal import (
     MAX_UNITS,
     MAX_ZEROS,
     join,

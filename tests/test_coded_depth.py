@@ -12,8 +12,8 @@ from rosbags.rosbag1 import Reader
 from coded_tools import mutations, refusal
 from conftest import real
 from each import each
-from mp4ds.coded import depth
-from mp4ds.coded.rvl import encode as encode_rvl
+from mp4ds.messages import depth
+from mp4ds.messages.depth import encode_rvl
 
 HEADERS = {
     "millimetres": bytes.fromhex("0000000038a9e04ea17f0000"),  # floats that nobody set
@@ -41,20 +41,20 @@ def test_comes_back(header: str, coding: str) -> None:
     for frame in range(3):
         body = png_of(room(frame)) if coding == "png" else encode_rvl(room(frame))
         data = HEADERS[header] + body
-        image = depth.decode(memoryview(data), hint)
+        image = depth.decode_depth(memoryview(data), hint)
         assert image.header == HEADERS[header]
         assert np.array_equal(image.pixels, room(frame))
         assert image.pixels.dtype == np.uint16
         assert (image.recipe is None) == (coding == "rvl")
-        assert depth.rebuild(image) == data
+        assert depth.rebuild_depth(image) == data
         assert hint is None or image.recipe == hint
         hint = image.recipe
 
 
 def test_a_png_without_the_header() -> None:
-    image = depth.decode(png_of(room()))
+    image = depth.decode_depth(png_of(room()))
     assert image.header == b""
-    assert depth.rebuild(image) == png_of(room())
+    assert depth.rebuild_depth(image) == png_of(room())
 
 
 @each(
@@ -75,7 +75,7 @@ def test_a_png_without_the_header() -> None:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_refusals(data: bytes, reason: str) -> None:
-    found = refusal(depth.decode, data)
+    found = refusal(depth.decode_depth, data)
     assert found
     assert any(part in found for part in reason.split("|"))
 
@@ -83,8 +83,8 @@ def test_refusals(data: bytes, reason: str) -> None:
 @pytest.mark.parametrize("body", [png_of(room()), encode_rvl(room())], ids=["png", "rvl"])
 def test_damage_is_refused_or_comes_back(body: bytes) -> None:
     for damaged in mutations(HEADERS["metres"] + body, 300):
-        if not refusal(depth.decode, damaged):
-            assert depth.rebuild(depth.decode(damaged)) == damaged
+        if not refusal(depth.decode_depth, damaged):
+            assert depth.rebuild_depth(depth.decode_depth(damaged)) == damaged
 
 
 def test_real_recording() -> None:
@@ -96,9 +96,9 @@ def test_real_recording() -> None:
         start = payload.index(b"\x89PNG") - depth.HEADER_BYTES
         (size,) = struct.unpack_from("<I", payload, start - 4)
         data = payload[start : start + size]
-        image = depth.decode(data)
+        image = depth.decode_depth(data)
         assert image.pixels.shape == (240, 424)
-        assert depth.rebuild(image) == data
+        assert depth.rebuild_depth(image) == data
         expected = cv2.imdecode(np.frombuffer(data[12:], np.uint8), cv2.IMREAD_UNCHANGED)
         assert expected is not None
         assert np.array_equal(image.pixels, expected)

@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Reader
 from coded_tools import decodes, jpeg, mutations, refusal, scene
 from conftest import real
 from each import each
-from mp4ds.coded.jpeg import parse
+from mp4ds.messages.jpeg import parse
 
 PICTURE = next(scene(1))
 BASE = jpeg(PICTURE, subsampling=2)

@@ -23,8 +23,9 @@ from coded_tools import (
 )
 from conftest import real
 from each import each
-from mp4ds.coded import PACKET_CODECS, PictureParser, Refused, annexb, av1, h264, h265, vp9
-from mp4ds.coded.pictures import REORDERED, NoPicture
+from mp4ds.messages.coded import REORDERED, NoPicture, Refused
+from mp4ds.video import av1, h264, h265, nal, vp9
+from mp4ds.video.coded_messages import PACKET_CODECS, PictureParser
 
 VIDEO = [name for name in IN_ORDER if ENCODINGS[name].codec in ("h264", "h265", "av1", "vp9")]
 UNITS = {"h264": h264, "h265": h265}
@@ -41,8 +42,8 @@ def first_refused(codec: str, bodies: list[bytes]) -> int | None:
 
 def without(codec: str, body: bytes, *kinds: int) -> bytes:
     """A body without NAL units of some types."""
-    units = annexb.split(body)[0]
-    return annexb.join_plain([u for u in units if UNITS[codec].unit_type(u) not in kinds])
+    units = nal.split(body)[0]
+    return nal.join_plain([u for u in units if UNITS[codec].unit_type(u) not in kinds])
 
 
 @each("name", IN_ORDER)
@@ -182,9 +183,9 @@ def test_parameters_sent_apart(codec: str) -> None:
     """They are kept in mind; the packet that holds nothing else is no frame."""
     kinds = (7, 8) if codec == "h264" else (32, 33, 34)
     body = encode(ENCODINGS[codec], frames=1)[0].data
-    units = annexb.split(body)[0]
+    units = nal.split(body)[0]
     is_parameter = [UNITS[codec].unit_type(unit) in kinds for unit in units]
-    alone = annexb.join_plain([u for u, chosen in zip(units, is_parameter, strict=True) if chosen])
+    alone = nal.join_plain([u for u, chosen in zip(units, is_parameter, strict=True) if chosen])
     parser = PictureParser(codec)
     assert "parameter sets were not sent" in refusal(parser.parse, without(codec, body, *kinds))
     assert parser.parameters == b""
@@ -229,19 +230,19 @@ def test_a_part_of_a_picture() -> None:
     packets = encode(ENCODINGS["h264-slices"], frames=2)
     parser = PictureParser("h264")
     parser.parse(packets[0].data)
-    slices = annexb.split(packets[1].data)[0]
+    slices = nal.split(packets[1].data)[0]
     assert len(slices) > 2
-    assert "part of one" in refusal(parser.parse, annexb.join_plain(slices[-2:]))
+    assert "part of one" in refusal(parser.parse, nal.join_plain(slices[-2:]))
 
 
 def test_fields_are_refused() -> None:
     interlaced = Encoding("h264", "libx264", {"bf": "0", "x264-params": "interlaced=1"})
     body = encode(interlaced, frames=1)[0].data
-    sps = next(u for u in annexb.split(body)[0] if h264.unit_type(u) == h264.SPS)
+    sps = next(u for u in nal.split(body)[0] if h264.unit_type(u) == h264.SPS)
     assert not h264.parse_sps(sps).frames_only
     parser = PictureParser("h264")
     assert parser.parse(body).height == 48  # a whole picture, although fields could be coded
-    units = annexb.split(body)[0]
+    units = nal.split(body)[0]
     at = next(n for n, unit in enumerate(units) if h264.unit_type(unit) == h264.IDR)
     bits = bin(int.from_bytes(b"\1" + units[at], "big"))[3:]
     # first_mb 0, slice type, PPS 0, then frame_num of four bits and the flag
@@ -249,7 +250,7 @@ def test_fields_are_refused() -> None:
     assert bits[9 : 9 + 7] == "0001000"  # slice type 7: I
     field = bits[:place] + "1" + bits[place + 1 :]
     units[at] = int(field, 2).to_bytes(len(units[at]), "big")
-    assert "field" in refusal(PictureParser("h264").parse, annexb.join_plain(units))
+    assert "field" in refusal(PictureParser("h264").parse, nal.join_plain(units))
 
 
 def test_a_picture_that_is_not_shown() -> None:
@@ -373,7 +374,7 @@ def test_damage_is_refused_or_read(name: str) -> None:
 @each("name", ["h264-hrd", "h264-matrix", "h264-10bit", "h265-gray12"])
 def test_every_cut_of_parameters_is_refused_or_read(name: str) -> None:
     codec = ENCODINGS[name].codec
-    units = annexb.split(encode(ENCODINGS[name], frames=1)[0].data)[0]
+    units = nal.split(encode(ENCODINGS[name], frames=1)[0].data)[0]
     sps = next(u for u in units if UNITS[codec].unit_type(u) in (h264.SPS, h265.SPS))
     whole = UNITS[codec].parse_sps(sps)
     assert (whole.width, whole.height) == (64, 48)

@@ -26,8 +26,8 @@ from rosbags.rosbag1 import Reader
 from coded_tools import mutations, refusal
 from conftest import real
 from each import each
-from mp4ds.coded import png
-from mp4ds.coded.png_filters import RULES, filter_rows, find_rule, unfilter
+from mp4ds.messages import png
+from mp4ds.messages.png import RULES, filter_rows, find_rule, unfilter
 
 Pixels = NDArray[Any]
 SIZES = [(1, 1), (1, 40), (40, 1), (2, 3), (7, 5), (120, 160)]
@@ -274,7 +274,7 @@ def test_tied_filters_of_libpng(data: st.DataObject) -> None:
 
 
 def test_a_tall_picture_is_unfiltered_in_bands(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mp4ds.coded.png_filters._FRONT_BYTES", 1)
+    monkeypatch.setattr("mp4ds.messages.png._FRONT_BYTES", 1)
     data = by_opencv(picture(200, 9, 3, np.uint8), cv2.IMWRITE_PNG_COMPRESSION, 6)
     assert max(zlib.decompress(idat(data))[:: 9 * 3 + 1]) > 2
     check(data)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from coded_tools import mutations, refusal
 from each import each
-from mp4ds.coded import Refused
-from mp4ds.coded.rvl import decode, encode
+from mp4ds.messages.coded import Refused
+from mp4ds.messages.depth import decode_rvl, encode_rvl
 
 Depth = NDArray[np.uint16]
 
@@ -81,8 +81,8 @@ SHAPES = [(1, 1), (1, 7), (7, 1), (3, 5), (48, 64)]
 def test_like_the_reference(shape: tuple[int, int], filled: float, top: int) -> None:
     depth = random_depth(shape, filled, top)
     data = reference(depth)
-    assert encode(depth) == data
-    found = decode(memoryview(data))
+    assert encode_rvl(depth) == data
+    found = decode_rvl(memoryview(data))
     assert found.dtype == np.uint16
     assert np.array_equal(found, depth)
 
@@ -97,13 +97,13 @@ SMALL: Any = arrays(
 @settings(deadline=None)
 @given(SMALL)
 def test_any_image_comes_back(depth: Depth) -> None:
-    assert encode(depth) == reference(depth)
-    assert np.array_equal(decode(encode(depth)), depth)
+    assert encode_rvl(depth) == reference(depth)
+    assert np.array_equal(decode_rvl(encode_rvl(depth)), depth)
 
 
 def test_a_view_of_a_larger_image() -> None:
     depth = random_depth((20, 20), 0.7, 5000)[::2, 3:11]
-    assert encode(depth) == reference(depth)
+    assert encode_rvl(depth) == reference(depth)
 
 
 @each(
@@ -129,10 +129,10 @@ def test_a_view_of_a_larger_image() -> None:
 )
 def test_refusals(data: bytes, reason: str) -> None:
     if not reason:
-        assert decode(data).tolist() == [[1, 2]]
+        assert decode_rvl(data).tolist() == [[1, 2]]
         return
     with pytest.raises(Refused, match=reason):
-        decode(data)
+        decode_rvl(data)
 
 
 def test_what_decodes_alike_is_not_the_same_bytes() -> None:
@@ -142,9 +142,9 @@ def test_what_decodes_alike_is_not_the_same_bytes() -> None:
         coded(2, 1, 0, 2, 2, 2) + bytes(4),  # words after the end
         struct.pack("<II", 1, 1) + packed([0, 9, 0, 2]),  # a number with a group of nothing
     ):
-        assert encode(decode(data)) != data
+        assert encode_rvl(decode_rvl(data)) != data
 
 
 def test_damage_is_refused_or_read() -> None:
     for damaged in mutations(reference(random_depth((9, 14), 0.6, 3000)), 600):
-        refusal(decode, damaged)
+        refusal(decode_rvl, damaged)

@@ -21,14 +21,13 @@ import pytest
 import mp4ds
 from each import each
 from mp4ds import yamlio
-from mp4ds.conformance import conformance_dump
 from mp4ds.errors import FormatError, VideoError
-from mp4ds.layouts import LAYOUTS
-from mp4ds.sidecar import FORMAT_VERSION
-from mp4ds.sidecar.fields import Body
-from mp4ds.sidecar.models import CODECS
-from mp4ds.video.raw import RawPicture, raw_pictures
-from mp4ds.wire import WIRES
+from mp4ds.format.fields import FORMAT_VERSION, Body
+from mp4ds.format.models import VIDEO_CODECS
+from mp4ds.messages.layouts import LAYOUTS
+from mp4ds.messages.serializations import WIRES
+from mp4ds.plugins.conformance import conformance_dump
+from mp4ds.video.planes import RawPicture, raw_pictures
 from sources import load_tool
 from waiting import WATCHDOG_S
 
@@ -256,7 +255,7 @@ def test_every_problem_code_has_a_case() -> None:
 def test_the_datasets_cover_the_format() -> None:
     seen = list(streams())
     assert {stream["layout"] for stream in seen} == set(LAYOUTS)
-    assert {stream["codec"] for stream in seen} == set(CODECS)
+    assert {stream["codec"] for stream in seen} == set(VIDEO_CODECS)
     assert {stream["body"] for stream in seen} == set(Body.__args__)  # type: ignore[attr-defined]
     assert {stream["wire"] for stream in seen} == set(WIRES)
     profiles = {"lossless", "crf=30", "crf=22", "crf=1", "psnr=41"}
@@ -376,7 +375,7 @@ def test_a_stream_that_does_not_decode_is_told_without_planes(
         yield from itertools.islice(raw_pictures(path, is_gray=False), 1)
         raise VideoError("decode-failed", path, "frame 1 cannot be decoded")
 
-    monkeypatch.setattr("mp4ds.conformance.raw_pictures", fail)
+    monkeypatch.setattr("mp4ds.plugins.conformance.raw_pictures", fail)
     found = conformance_dump(CASES / "sidecars" / "valid" / "packets.yaml")
     (stream,) = found["streams"]
     assert stream["planes"] is None

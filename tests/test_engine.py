@@ -10,7 +10,7 @@ from collections.abc import Callable
 import pytest
 
 from each import each
-from mp4ds.engine import Workers
+from mp4ds.packing.engine import Workers
 from waiting import WATCHDOG_S, until
 
 COUNTS = [0, 1, 2, 5]

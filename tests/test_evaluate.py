@@ -25,33 +25,39 @@ from PIL import Image
 import mp4ds
 from coded_scenes import CODED, VERBATIM
 from each import each
-from mp4ds.demo import demo
-from mp4ds.errors import OptionError, SourceError, TargetError
-from mp4ds.evaluating import (
-    EvaluateOptions,
-    EvaluateProgress,
-    Evaluation,
-    Setting,
-    Target,
-    evaluate,
-)
-from mp4ds.evaluating.clips import (
+from mp4ds.errors import OptionError, ScoringError, SourceError, TargetError
+from mp4ds.messages.encodings import ENCODINGS as ENCODING_TABLE
+from mp4ds.packing.options import PackOptions
+from mp4ds.plugins.demo import demo
+from mp4ds.plugins.evaluating.clips import (
     Clip,
     ClipFile,
     Unfit,
     chosen,
     chosen_at_rate,
     make_clip,
+    open_source,
 )
-from mp4ds.evaluating.options import grid_of, parse_crfs, parse_target
-from mp4ds.evaluating.results import Cell
-from mp4ds.evaluating.sources import open_source
-from mp4ds.evaluating.tables import pareto, reachable_score, recommend
-from mp4ds.layouts import ENCODINGS as ENCODING_TABLE
-from mp4ds.packing import PackOptions
-from mp4ds.scoring import ScoringError, Summary, largest_crf
-from mp4ds.unpacking import UnpackOptions
+from mp4ds.plugins.evaluating.evaluate import evaluate
+from mp4ds.plugins.evaluating.options import (
+    EvaluateOptions,
+    ScoreGoal,
+    Setting,
+    grid_of,
+    parse_crfs,
+    parse_target,
+)
+from mp4ds.plugins.evaluating.results import (
+    Cell,
+    EvaluateProgress,
+    Evaluation,
+    pareto,
+    reachable_score,
+    recommend,
+)
+from mp4ds.unpacking.unpack import UnpackOptions
 from mp4ds.video.planes import PacketSizes, packet_sizes
+from mp4ds.video.scores import ScoreSummary, largest_crf
 from scenes import PERIOD, TRAITS, Scene, odd_scene
 from sources import ENCODINGS, SOURCES, scene, write_bag
 from waiting import WATCHDOG_S, until
@@ -96,15 +102,15 @@ def test_crfs(texts: list[str], values: tuple[int, ...]) -> None:
 
 @each("text", ["", "a", "16:", "25:16", "0", "64", "16:25:0", "-3", "16-25"])
 def test_no_crfs(text: str) -> None:
-    with pytest.raises(OptionError, match="--crf"):
+    with pytest.raises(OptionError, match="`crf`"):
         parse_crfs([text])
 
 
 def test_targets() -> None:
-    assert parse_target("99") == Target("vmaf", 99)
+    assert parse_target("99") == ScoreGoal("vmaf", 99)
     assert str(parse_target("psnr_y=42.5")) == "psnr_y=42.5"
     for text in ("", "vmaf", "vmaf=", "=3", "psnr=40", "vmaf=0", "vmaf=101", "vmaf=nan"):
-        with pytest.raises(OptionError, match="--target"):
+        with pytest.raises(OptionError, match="`target`"):
             parse_target(text)
 
 
@@ -127,15 +133,15 @@ def test_a_codec_has_only_its_crfs() -> None:
 @each(
     ("changed", "said"),
     [
-        ({"codecs": ["vp9"]}, "--codecs 'vp9'"),
-        ({"codecs": []}, "--codecs"),
-        ({"presets": ["fastest"]}, "--presets 'fastest'"),
+        ({"codecs": ["vp9"]}, "`codecs` 'vp9'"),
+        ({"codecs": []}, "`codecs`"),
+        ({"presets": ["fastest"]}, "`presets` 'fastest'"),
         ({"codecs": ["x264"], "crf": ["60"]}, "0 settings"),
-        ({"frames": 0}, "--frames 0"),
-        ({"rates": [-1.0]}, "--rates -1"),
-        ({"duration": float("nan")}, "--duration"),
-        ({"start": -1.0}, "--start -1"),
-        ({"hours": 0.0}, "--hours 0"),
+        ({"frames": 0}, "`frames` 0"),
+        ({"rates": [-1.0]}, "`rates` -1"),
+        ({"duration": float("nan")}, "`duration`"),
+        ({"start": -1.0}, "`start` -1"),
+        ({"hours": 0.0}, "`hours` 0"),
     ],
 )
 def test_options_that_are_wrong(changed: dict[str, Any], said: str, tmp_path: Path) -> None:
@@ -218,7 +224,7 @@ def test_the_search_ends_where_scores_do_not_fall_steadily() -> None:
 
 
 def cell(crf: int, score: float, size: float, cpu: float, preset: str = "fast") -> Cell:
-    summary = Summary(score, score, score, score)
+    summary = ScoreSummary(score, score, score, score)
     return Cell(
         Setting("h264", preset, crf), 2 * cpu, cpu, 100, 1, size, size, 1, {"vmaf": summary},
         "none.png", 1, 1,
@@ -230,26 +236,26 @@ def test_the_smallest_and_the_fastest_that_reach_the_target_are_recommended() ->
         cell(10, 99.9, 90, 9), cell(20, 99.6, 50, 8), cell(20, 99.55, 70, 2, "veryfast"),
         cell(30, 99.4, 20, 1),
     ]  # fmt: skip
-    smallest, fastest = recommend([(cells, 99.5)], Target())
+    smallest, fastest = recommend([(cells, 99.5)], ScoreGoal())
     assert (smallest.why, smallest.setting) == ("smallest", cells[1].setting)
     assert (fastest.why, fastest.setting) == ("fastest", cells[2].setting)
     assert smallest.options == "--quality crf=20 --codec h264 --preset fast"
-    assert recommend([(cells, 99.95)], Target()) == []
-    other = [replace(item, scores={"vmaf": Summary(99, 99, 99, 99)}) for item in cells]
+    assert recommend([(cells, 99.95)], ScoreGoal()) == []
+    other = [replace(item, scores={"vmaf": ScoreSummary(99, 99, 99, 99)}) for item in cells]
     other[0] = cells[0]
-    both = recommend([(cells, 99.5), (other, 99.5)], Target())
+    both = recommend([(cells, 99.5), (other, 99.5)], ScoreGoal())
     assert {item.setting for item in both} == {cells[0].setting}
 
 
 def test_the_target_keeps_from_the_ceiling() -> None:
-    assert reachable_score(Target("vmaf", 99.5), 99.9) == 99.5
-    assert reachable_score(Target("vmaf", 99.5), 99.65) == pytest.approx(99.45)
-    assert reachable_score(Target("psnr_y", 42), 60) == 42
+    assert reachable_score(ScoreGoal("vmaf", 99.5), 99.9) == 99.5
+    assert reachable_score(ScoreGoal("vmaf", 99.5), 99.65) == pytest.approx(99.45)
+    assert reachable_score(ScoreGoal("psnr_y", 42), 60) == 42
 
 
 def test_the_front_has_what_nothing_is_better_than() -> None:
     cells = [cell(1, 90, 5, 1), cell(2, 95, 5, 1), cell(3, 80, 1, 1), cell(4, 94, 9, 1)]
-    assert pareto(cells, [item.kbps for item in cells], Target()) == [2, 1]
+    assert pareto(cells, [item.kbps for item in cells], ScoreGoal()) == [2, 1]
 
 
 def test_a_frame_of_a_long_video_is_reckoned_without_the_key_frames_of_a_clip() -> None:
@@ -710,9 +716,9 @@ def no_ffmpeg() -> None:
 
 
 def test_without_libvmaf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mp4ds.evaluating.find_ffmpeg", no_ffmpeg)
+    monkeypatch.setattr("mp4ds.plugins.evaluating.evaluate.find_ffmpeg", no_ffmpeg)
     path = recording(tmp_path)
-    with pytest.raises(ScoringError, match="--target psnr_y"):
+    with pytest.raises(ScoringError, match="`target` psnr_y"):
         evaluate(path, replace(QUICK, target="vmaf=99.5"), output=tmp_path / "out")
     found = evaluate(path, QUICK, output=tmp_path / "out")
     (camera,) = found.cameras

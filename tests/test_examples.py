@@ -13,7 +13,7 @@ import pytest
 
 import mp4ds
 from each import each
-from mp4ds.demo import demo
+from mp4ds.plugins.demo import demo
 from sources import SOURCES, scene
 from waiting import WATCHDOG_S
 

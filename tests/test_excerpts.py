@@ -20,11 +20,10 @@ from rosbags.rosbag1 import Reader as BagReader
 
 from conftest import real
 from each import each
-from mp4ds.bags import ordering
-from mp4ds.bags.formats import open_reader, open_sources
+from mp4ds.bags import protocols
+from mp4ds.bags.formats import MultiReader, open_reader, open_sources
 from mp4ds.bags.mcap import McapReader
-from mp4ds.bags.multi import MultiReader
-from mp4ds.bags.ordering import Part, merged
+from mp4ds.bags.protocols import SourcePart, merged
 from mp4ds.errors import SourceError
 from mp4ds.records import (
     EVERYTHING,
@@ -483,7 +482,7 @@ def test_chunks_in_any_order(
     path = tmp_path / "a.mcap"
     written = write_channels(path, ARRANGED[name])
     if hold:
-        monkeypatch.setattr(ordering, "HOLD_BYTES", hold)
+        monkeypatch.setattr(protocols, "HOLD_BYTES", hold)
     with McapReader(path) as reader:
         # What fits in time order is in time order, in one pass, too.
         assert reader.is_indexed == (hold is None or name not in ("all at once", "shuffled"))
@@ -739,14 +738,14 @@ def test_parts_wait_until_their_time_has_come() -> None:
     times = {"a": (5, 5, 9), "b": (0, 5, 5, 7), "c": (5,), "d": (8, 10)}
     opened: list[str] = []
 
-    def part(name: str) -> Part:
+    def part(name: str) -> SourcePart:
         def records() -> Iterator[Record]:
             opened.append(name)
             yield MetadataRecord(name, {})
             for time in times[name]:
                 yield Message(channel, time, 0, 0, name.encode())
 
-        return Part(min(times[name]), records)
+        return SourcePart(min(times[name]), records)
 
     found = []
     for record in merged([part(name) for name in times]):

@@ -38,20 +38,19 @@ from export_scenes import (
     pose_at,
     stamps_of,
 )
-from mp4ds import exporting
-from mp4ds.exporting.colmap import Track, model_of
-from mp4ds.exporting.euroc import distortion
-from mp4ds.exporting.job import Job
-from mp4ds.exporting.motion import in_order
-from mp4ds.exporting.transforms import (
+from mp4ds.format.models import Calibration
+from mp4ds.plugins.exporting.colmap import PoseTrack, model_of
+from mp4ds.plugins.exporting.euroc import distortion
+from mp4ds.plugins.exporting.job import ExportJob
+from mp4ds.plugins.exporting.motion import (
+    in_order,
     inverse,
     pose_matrix,
     quaternion_of,
     rotation_matrix,
 )
-from mp4ds.exporting.tum import seconds
-from mp4ds.intervals import nearest
-from mp4ds.sidecar import Calibration
+from mp4ds.plugins.exporting.tum import seconds
+from mp4ds.times import nearest
 from scenes import PERIOD, Record, Scene, scene
 
 MADE = drive()
@@ -270,8 +269,8 @@ def test_an_unsuitable_topic_of_poses_is_refused_first(
     def decode(*_: object) -> None:
         pytest.fail("frames are written before the topic is looked at")
 
-    monkeypatch.setattr(Job, "write_png_files", decode)
-    with pytest.raises(mp4ds.OptionError, match=f"--poses {IMU}"):
+    monkeypatch.setattr(ExportJob, "write_png_files", decode)
+    with pytest.raises(mp4ds.OptionError, match=f"`poses` {IMU}"):
         export(dataset, to, tmp_path / "out", poses=IMU)
     assert list(tmp_path.iterdir()) == []
 
@@ -345,7 +344,7 @@ def test_quaternions_and_matrices() -> None:
 def test_poses_between_two() -> None:
     half = 0.5**0.5
     rows = [(200, (2.0, 0, 0, 0, 0, -half, -half)), (100, (1.0, 0, 0, 0, 0, 0, 1.0))]
-    track = Track.of(iter(rows))
+    track = PoseTrack.of(iter(rows))
     assert track.at(99) is None
     assert track.at(201) is None
     middle = track.at(150)
@@ -623,8 +622,7 @@ def test_a_library_that_is_missing(
     to: str, library: str, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, library, None)
-    monkeypatch.delitem(sys.modules, "mp4ds.exporting.lerobot_tables", raising=False)
-    monkeypatch.delattr(exporting, "lerobot_tables", raising=False)
+    monkeypatch.delitem(sys.modules, f"mp4ds.plugins.exporting.{to}", raising=False)
     with pytest.raises(mp4ds.OptionError, match=re.escape(f"pip install 'mp4ds[{to}]'")):
         mp4ds.export(dataset, to, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
@@ -659,19 +657,19 @@ def test_the_command(dataset: Path, tmp_path: Path) -> None:
     ("to", "options", "words"),
     [
         ("nuscenes", {}, "format 'nuscenes' is not known"),
-        ("kitti", {"poses": ODOMETRY}, "--poses goes with"),
-        ("euroc", {"fps": 30}, "--fps goes with lerobot"),
-        ("euroc", {"poses": IMU}, "--poses /imu is of type sensor_msgs/Imu"),
+        ("kitti", {"poses": ODOMETRY}, "`poses` goes with"),
+        ("euroc", {"fps": 30}, "`fps` goes with lerobot"),
+        ("euroc", {"poses": IMU}, "`poses` /imu is of type sensor_msgs/Imu"),
         ("euroc", {"poses": "/none"}, "no topic of ROS"),
         ("euroc", {"topics": ["/nothing*"]}, "matches no topic"),
         ("tum", {"topics": ["/chatter"]}, "TUM can hold no topic"),
-        ("kitti", {"crf": 20}, "--crf goes with lerobot"),
-        ("lerobot", {"codec": "ffv1"}, "--codec 'ffv1' is not known"),
+        ("kitti", {"crf": 20}, "`crf` goes with lerobot"),
+        ("lerobot", {"codec": "ffv1"}, "`codec` 'ffv1' is not known"),
         ("lerobot", {"codec": "h264", "crf": 60}, "not from 0 to 51"),
-        ("lerobot", {"pixels": "gray"}, "--pixels gray is not"),
-        ("euroc", {"pixels": "pink"}, "--pixels 'pink' is not known"),
-        ("euroc", {"tolerance_ns": -1}, "--sync is the most milliseconds"),
-        ("euroc", {"every": 0}, "--every 0"),
+        ("lerobot", {"pixels": "gray"}, "`pixels` gray is not"),
+        ("euroc", {"pixels": "pink"}, "`pixels` 'pink' is not known"),
+        ("euroc", {"tolerance_ns": -1}, "`tolerance_ns` is the most time"),
+        ("euroc", {"every": 0}, "`every` 0"),
     ],
 )
 def test_bad_options(

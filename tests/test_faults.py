@@ -27,10 +27,10 @@ import pytest
 import mp4ds
 from each import each, fresh
 from in_parts import InlineEngine, facts, leftovers
-from mp4ds.demo import demo
 from mp4ds.errors import Mp4dsError, PartsFailedError, SourceError, TargetError, WriteError
-from mp4ds.packing import PackOptions
+from mp4ds.packing.options import PackOptions
 from mp4ds.packing.work import command
+from mp4ds.plugins.demo import demo
 from round_trips import Compare, unpacked
 from sources import SOURCES, scene
 from test_bad_input import NEEDS_ROOT, run, start, tree
@@ -75,7 +75,7 @@ def undisturbed(source: Path, folder: Path) -> dict[str, Any]:
 
 
 def use(monkeypatch: pytest.MonkeyPatch, engine: InlineEngine) -> InlineEngine:
-    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: engine)
+    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: engine)
     return engine
 
 
@@ -443,8 +443,8 @@ def test_a_process_that_finds_its_source_gone(
 @each(
     ("harm", "sentence"),
     [
-        ("raise MemoryError", "out of memory; try fewer --jobs"),
-        ("bytearray(2**60)", "out of memory; try fewer --jobs"),
+        ("raise MemoryError", "out of memory; try fewer `jobs`"),
+        ("bytearray(2**60)", "out of memory; try fewer `jobs`"),
         ("sys.exit(3)", "its process ended with code 3"),
         ("os.abort()", "its process was ended by SIGABRT"),
         ("raise ArithmeticError('odd')", "its process ended with code 1: ArithmeticError: odd"),

@@ -16,12 +16,11 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import mp4ds
 from definitions import PACKET
 from each import each
-from mp4ds.dataset import Dataset
-from mp4ds.packing import PackOptions
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.rebuild import Choice, DecodedColumns, everything
+from mp4ds.packing.options import PackOptions
 from mp4ds.records import Message
-from mp4ds.republish import Republisher
-from mp4ds.streams.choices import Choice, everything
-from mp4ds.streams.rebuild import DecodedColumns
+from mp4ds.unpacking.republish import Republisher
 from pictures import picture
 from republished import SMOOTH, Read, psnr
 from scenes import scene

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import mp4ds
-from mp4ds.packing import PackOptions
-from mp4ds.report import ReportOptions, report
+from mp4ds.packing.options import PackOptions
+from mp4ds.plugins.reporting.report import ReportOptions, report
 from sources import SOURCES, scene
 from test_bad_input import call, refused, unchanged
 

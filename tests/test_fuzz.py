@@ -21,7 +21,7 @@ import fuzz_kinds
 import fuzz_records
 import fuzz_rules
 from mp4ds import Mp4dsError
-from mp4ds.bags import open_sources
+from mp4ds.bags.formats import open_sources
 from sources import SOURCES, scene
 
 COUNT = 150
@@ -37,7 +37,7 @@ def _filled(size: int) -> str:
 @pytest.fixture(scope="module")
 def kinds(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mp4ds.packing._engine", None)  # the making of work folders replaces it
+        patch.setattr("mp4ds.packing.pack._engine", None)  # the making of work folders replaces it
         yield fuzz.make_kinds(tmp_path_factory.mktemp("good"))
 
 

@@ -22,22 +22,17 @@ from typer.testing import CliRunner
 import mp4ds
 from each import each
 from in_parts import InlineEngine, leftovers
-from mp4ds.cli import app
-from mp4ds.errors import OptionError
-from mp4ds.evaluating import EvaluateOptions, Setting, evaluate
-from mp4ds.evaluating.options import first_guess, grid_of
-from mp4ds.packing import PackOptions, _checked
-from mp4ds.video import (
-    VideoEncoder,
-    check_codec,
-    codecs,
-    encoder_bytes,
-    hardware,
-    join_segments,
-    recipe_for,
-)
-from mp4ds.video.encoder import EncoderRefusedError
-from mp4ds.video.hardware import HARDWARE, HardwareError, check_hardware
+from mp4ds.cli import app_for
+from mp4ds.errors import EncoderRefusedError, HardwareError, OptionError
+from mp4ds.packing.options import PackOptions
+from mp4ds.packing.pack import _checked
+from mp4ds.plugins.evaluating.evaluate import evaluate
+from mp4ds.plugins.evaluating.options import EvaluateOptions, Setting, first_guess, grid_of
+from mp4ds.video import codecs, encoder
+from mp4ds.video.codecs import HARDWARE, check_codec, recipe_for
+from mp4ds.video.encoder import VideoEncoder, check_hardware, hardware_error
+from mp4ds.video.packets import join_segments
+from mp4ds.video.trial import encoder_bytes
 from round_trips import unpacked
 from scenes import scene
 from sources import SOURCES
@@ -59,7 +54,7 @@ def why_not(name: str) -> str:
 
 @pytest.fixture
 def stand_in(monkeypatch: pytest.MonkeyPatch) -> str:
-    for module in (hardware, codecs):
+    for module in (encoder, codecs):
         monkeypatch.setattr(module, "HARDWARE", KNOWN)
     return NAME
 
@@ -109,7 +104,7 @@ def test_what_is_refused() -> None:
                 check_codec(name, None, lossless=False, crf=crf)
         with pytest.raises(OptionError, match=r"lossless packing\. Use ffv1, h264, h265"):
             check_codec(name, None, lossless=True)
-        with pytest.raises(OptionError, match="goes with --quality visual or crf=N"):
+        with pytest.raises(OptionError, match="goes with `quality` visual or crf=N"):
             check_codec(name, None, lossless=False, varied=True)
     check_codec("h265-nvenc", "p7", lossless=False)
     with pytest.raises(OptionError, match="Use one of p1, p2, p3, p4, p5, p6, p7"):
@@ -203,17 +198,17 @@ def test_one_sentence_says_what_is_missing(name: str) -> None:
     found = HARDWARE[name]
     if not (said := why_not(name)):
         pytest.skip(f"{name} is there")
-    end = f"; --codec {found.codec} needs no device."
+    end = f"; `codec` {found.codec} needs no device."
     assert said.endswith(end)
     assert "\n" not in said
     assert found.needs in said
     if found.encoder not in av.codecs_available:
         assert said == (
-            f"--codec {name}: PyAV {av.__version__} was built without {found.encoder}. It needs "
+            f"`codec` {name}: PyAV {av.__version__} was built without {found.encoder}. It needs "
             f"{found.needs}, and a PyAV whose ffmpeg has {found.encoder}{end}"
         )
     else:
-        assert said.startswith(f"--codec {name}: {found.encoder} could not be opened: ")
+        assert said.startswith(f"`codec` {name}: {found.encoder} could not be opened: ")
     assert said == why_not(name)  # ffmpeg is silent about what it said before
 
 
@@ -223,9 +218,9 @@ def test_the_sentence_without_a_driver_of_nvidia(name: str) -> None:
     if "libcuda" not in said:
         pytest.skip(said or f"{name} is there")
     assert said == (
-        f"--codec {name}: {found.encoder} could not be opened: Cannot load libcuda.so.1. "
+        f"`codec` {name}: {found.encoder} could not be opened: Cannot load libcuda.so.1. "
         f"It needs an NVIDIA graphics card that encodes {found.codec}, with its driver; "
-        f"--codec {found.codec} needs no device."
+        f"`codec` {found.codec} needs no device."
     )
 
 
@@ -254,12 +249,12 @@ def test_nothing_is_begun_without_it(absent: str, tmp_path: Path) -> None:
     paths = recording(tmp_path)
     before = sorted(tmp_path.rglob("*"))
     command = ["pack", *map(str, paths), "-o", str(tmp_path / "d"), "--quality", "visual"]
-    done = CliRunner().invoke(app, [*command, "--codec", absent])
+    done = CliRunner().invoke(app_for(), [*command, "--codec", absent])
     assert done.exit_code == 1
     assert done.stderr.startswith(f"mp4ds: --codec {absent}: PyAV ")
     assert done.stderr.count("\n") == 1
     command = ["evaluate", str(paths[0]), "-o", str(tmp_path / "e"), "--codecs", f"x264,{absent}"]
-    done = CliRunner().invoke(app, command)
+    done = CliRunner().invoke(app_for(), command)
     assert done.exit_code == 1
     assert done.stderr.startswith(f"mp4ds: --codec {absent}: PyAV ")
     assert sorted(tmp_path.rglob("*")) == before
@@ -275,7 +270,7 @@ def test_other_machines_may_have_it(absent: str) -> None:
 
 def test_a_score_is_not_kept_with_it(tmp_path: Path) -> None:
     options = PackOptions(quality="psnr=40", codec="h264-nvenc")
-    with pytest.raises(OptionError, match="use --codec h264, or find the crf by mp4ds evaluate"):
+    with pytest.raises(OptionError, match="use `codec` h264, or find the crf by mp4ds evaluate"):
         mp4ds.pack(tmp_path / "none.bag", tmp_path / "d", options)
 
 
@@ -293,7 +288,7 @@ def refusing(sizes: list[tuple[int, int]], tried: list[Any]) -> Callable[..., No
     def open_once(codec: str, width: int, height: int) -> None:
         tried.append((width, height))
         if (width, height) in sizes:
-            raise HardwareError(codec, "refused")
+            raise hardware_error(codec, "refused")
 
     return open_once
 
@@ -303,7 +298,7 @@ def refusing(sizes: list[tuple[int, int]], tried: list[Any]) -> Callable[..., No
     [
         ([(64, 48)], EncoderRefusedError, "does not take pictures of 64x48"),
         ([(64, 48), (640, 480)], HardwareError, "refused"),
-        ([], HardwareError, "too many at a time. Give fewer --jobs; --codec h264 needs no device"),
+        ([], HardwareError, "too many at a time. Give fewer `jobs`; `codec` h264 needs no device"),
     ],
 )
 def test_pictures_and_devices_are_told_apart(
@@ -316,7 +311,7 @@ def test_pictures_and_devices_are_told_apart(
         raise FFmpegError(5, "no")
 
     monkeypatch.setattr("mp4ds.video.encoder.open_encoder", fail)
-    monkeypatch.setattr(hardware, "_open_once", refusing(refused, []))
+    monkeypatch.setattr(encoder, "_open_once", refusing(refused, []))
     with pytest.raises(error, match=said):
         opened(tmp_path / "v.mp4", stand_in)
 
@@ -330,7 +325,7 @@ def test_a_device_that_is_lost(
 
     encoder = opened(tmp_path / "v.mp4", stand_in)
     monkeypatch.setattr(encoder, "_stream", Lost())
-    with pytest.raises(HardwareError, match=r"failed at frame 0: .*gone.*; --codec h264 needs no"):
+    with pytest.raises(HardwareError, match=r"failed at frame 0: .*gone.*; `codec` h264 needs no"):
         encoder.write((np.zeros((48, 64), np.uint8),), 0)
     encoder.abandon()
 
@@ -344,7 +339,7 @@ def test_packing_and_unpacking(
     stand_in: str, compare: Callable[..., list[str]],
 ) -> None:  # fmt: skip
     inline = InlineEngine()
-    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: inline)
+    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: inline)
     paths = recording(tmp_path)
     options = PackOptions(quality="crf=12", codec=stand_in, gop=5, window=window)
     mp4ds.pack(paths, tmp_path / "dataset", options)
@@ -363,10 +358,10 @@ def test_evaluating(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stand_in: s
     code = (
         f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         "import stand_in; stand_in.stand_in_here()\n"
-        "from mp4ds.evaluating import work; work._main()"
+        "from mp4ds.plugins.evaluating import trials; trials._main()"
     )
     monkeypatch.setattr(
-        "mp4ds.evaluating.engines.command", lambda task: [sys.executable, "-c", code, *task]
+        "mp4ds.plugins.evaluating.trials.command", lambda task: [sys.executable, "-c", code, *task]
     )
     options = EvaluateOptions(codecs=[stand_in], crf=["30"], frames=6, target="psnr_y=20")
     (camera,) = evaluate(recording(tmp_path)[0], options, output=tmp_path / "out").cameras

@@ -29,7 +29,7 @@ from each import each, fresh
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from jail import Jail, Outcome
 from mp4ds import Mp4dsError, VersionError, yamlio
-from mp4ds.sidecar.fields import FORMAT_VERSION, MAX_CAMERA_INFOS, MAX_FRAMES
+from mp4ds.format.fields import FORMAT_VERSION, MAX_CAMERA_INFOS, MAX_FRAMES
 from scenes import Scene
 from sources import SOURCES, scene
 

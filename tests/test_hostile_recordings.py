@@ -25,7 +25,7 @@ from mcap.writer import CompressionType, Writer
 import mp4ds
 from jail import Jail, Outcome
 from mp4ds import yamlio
-from mp4ds.bags import inflate
+from mp4ds.bags import protocols
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.mcap import McapReader
 from mp4ds.bags.mcap_records import DamageError, unzstd
@@ -215,7 +215,7 @@ def test_rows_that_share_their_pages(tmp_path: Path, jail: Jail) -> None:
 INTERRUPTED = """
 import signal, sys
 from pathlib import Path
-from mp4ds.bags import sqlite_open
+from mp4ds.bags import rosbag2_sqlite as sqlite_open
 
 class Stop(BaseException):
     pass
@@ -494,7 +494,7 @@ def test_a_message_that_unpacks_to_much() -> None:
 
 def test_what_is_written_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also a large black picture, whose chunk would look like a bomb."""
-    monkeypatch.setattr(inflate, "_ALWAYS", 2**20)
+    monkeypatch.setattr(protocols, "_ALWAYS", 2**20)
     channel = Channel(1, "/a", "cdr", None)
     payloads = [b"small", bytes(2**21), b"x" * 2**18, bytes(2**19 + 1), b"last"]
     path = tmp_path / "a.mcap"

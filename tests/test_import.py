@@ -32,13 +32,14 @@ import mp4ds
 from conftest import real
 from each import each
 from in_parts import InlineEngine, facts, leftovers
-from mp4ds.cli import app
+from mp4ds.cli import app_for
 from mp4ds.errors import SourceError
-from mp4ds.importing import ImageFolder, open_images, times
-from mp4ds.importing.calibration import ros_calibration
-from mp4ds.importing.geometry import quaternion
-from mp4ds.sidecar import load_manifest
-from mp4ds.video.image_files import read_image
+from mp4ds.format.sidecars import load_manifest
+from mp4ds.packing.options import ImageFolder
+from mp4ds.plugins.importing import scene
+from mp4ds.plugins.importing.layouts import open_images
+from mp4ds.plugins.importing.scene import quaternion, ros_calibration
+from mp4ds.video.images import read_image
 from test_version0 import FIXTURE, STAMPS, TOPICS, document, nanoseconds, write_text
 
 WIDTH, HEIGHT = 32, 24
@@ -222,20 +223,20 @@ def test_what_cannot_be_had_as_it_is_is_refused(tmp_path: Path) -> None:
 )
 def test_decimal_seconds_are_exact(text: str) -> None:
     rounded: Counter[str] = Counter()
-    assert times.of_unit("s", rounded)(text) == int(Decimal(text) * 10**9)
+    assert scene.of_unit("s", rounded)(text) == int(Decimal(text) * 10**9)
     assert not rounded
 
 
 def test_finer_times_are_rounded_and_counted() -> None:
     rounded: Counter[str] = Counter()
-    assert times.of_unit("s", rounded)("0.0000000015") == 2
-    assert times.of_unit("us", rounded)("1.2345") == 1234
-    assert times.of_unit("us", rounded)("1.234") == 1234
-    assert rounded == {times.ROUNDED: 2}
+    assert scene.of_unit("s", rounded)("0.0000000015") == 2
+    assert scene.of_unit("us", rounded)("1.2345") == 1234
+    assert scene.of_unit("us", rounded)("1.234") == 1234
+    assert rounded == {scene.ROUNDED: 2}
 
 
 def test_dates_are_exact() -> None:
-    read = times.of_date(Counter())
+    read = scene.of_date(Counter())
     # date --utc -d '2011-09-26 13:02:25' +%s
     assert read("2011-09-26 13:02:25.964389445") == 1317042145_964389445
     assert read("1970-01-01 00:00:00") == 0
@@ -243,16 +244,16 @@ def test_dates_are_exact() -> None:
 
 @each("text", ["", "x", "-1", "nan", "inf", "1e99", "0x10", "1_000", "2147483648"])
 def test_what_is_no_time_is_refused(text: str) -> None:
-    with pytest.raises(times.NoTimeError):
-        times.of_unit("s", Counter())(text)
+    with pytest.raises(scene.NoTimeError):
+        scene.of_unit("s", Counter())(text)
 
 
 def test_rates_are_exact() -> None:
-    found = times.at_rate(1000, "30000/1001").tolist()
+    found = scene.at_rate(1000, "30000/1001").tolist()
     assert found == [round(Fraction(number * 1001 * 10**9, 30000)) for number in range(1000)]
     for rate in ("0", "-1", "x", "1/0", ""):
-        with pytest.raises(times.NoTimeError):
-            times.at_rate(3, rate)
+        with pytest.raises(scene.NoTimeError):
+            scene.at_rate(3, rate)
 
 
 # ---------------------------------------------------------------- plain folders
@@ -318,8 +319,8 @@ def test_a_rate_is_that_of_each_camera(
         for name in names:
             save(tmp_path / name.format(number), image(number, 3 if name.endswith("jpg") else 1))
     with open_images(tmp_path, ImageFolder(rate="30")) as reader:
-        times = reader.times()
-        found = {channel.topic: times[channel.id].tolist() for channel in reader.channels}
+        found_times = reader.times()
+        found = {channel.topic: found_times[channel.id].tolist() for channel in reader.channels}
     assert found == {topic: [0, 33333333, 66666667] for topic in cameras}
 
 
@@ -440,7 +441,7 @@ def test_in_parts_is_as_in_one_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     place = euroc(tmp_path)
     options = mp4ds.PackOptions(images=mp4ds.ImageFolder(), codec="ffv1", gop=2)
     mp4ds.pack(place, tmp_path / "whole", options)
-    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: InlineEngine())
+    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: InlineEngine())
     tasks: list[int] = []
     mp4ds.pack(
         place,
@@ -461,14 +462,14 @@ def test_an_import_goes_on_unless_the_images_have_changed(
     options = mp4ds.PackOptions(images=mp4ds.ImageFolder(), codec="ffv1", gop=2, window=2)
 
     def use(engine: InlineEngine) -> InlineEngine:
-        monkeypatch.setattr("mp4ds.packing._engine", lambda *_: engine)
+        monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: engine)
         return engine
 
     use(InlineEngine(lambda name: name == "00001-0"))
     with pytest.raises(mp4ds.PartsFailedError):
         mp4ds.pack(place, tmp_path / "ds", options)
     other = replace(options, images=mp4ds.ImageFolder(layout="euroc"))
-    with pytest.raises(mp4ds.OptionError, match="another --images"):
+    with pytest.raises(mp4ds.OptionError, match="another `images`"):
         mp4ds.pack(place, tmp_path / "ds", other)
     shown = sorted((place / CAM0 / "data").iterdir())[3]
     before, times_of = shown.read_bytes(), shown.stat()
@@ -801,7 +802,7 @@ def test_tum(tmp_path: Path) -> None:
 
 
 def run(*arguments: object) -> Any:
-    return CliRunner().invoke(app, list(map(str, arguments)), catch_exceptions=False)
+    return CliRunner().invoke(app_for(), list(map(str, arguments)), catch_exceptions=False)
 
 
 def spoil(path: Path, text: str) -> Callable[[Path], None]:

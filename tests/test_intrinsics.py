@@ -22,16 +22,17 @@ from rosbags.highlevel import AnyReader
 from typer.testing import CliRunner
 
 import mp4ds
-import mp4ds.intrinsics
 from conftest import real
 from each import each
 from foxglove_scenes import FOXGLOVE_SOURCES, foxglove_scene
-from mp4ds.cli import app
-from mp4ds.intrinsics import Camera, Intrinsics, ListedCalibration, effective, intrinsics
-from mp4ds.sidecar import dump_document, load_manifest
-from mp4ds.sidecar.manifest import StaticTransform
-from mp4ds.wire import CalibrationFields
-from mp4ds.wire.transforms import Transform
+from mp4ds.cli import app_for
+from mp4ds.dataset.views import effective
+from mp4ds.format.manifest import StaticTransform
+from mp4ds.format.sidecars import dump_document, load_manifest
+from mp4ds.messages.transforms import Transform
+from mp4ds.messages.wire import CalibrationFields
+from mp4ds.plugins import info
+from mp4ds.plugins.info import CameraCalibrations, Intrinsics, ListedCalibration, intrinsics
 from scenes import INFO, PERIOD, START, TF, Record, Scene, calibration, scene
 from sources import SOURCES, write_bag, write_mcap
 
@@ -77,7 +78,7 @@ def static(*, topic: str = "/tf_static") -> Record:
     return Record(topic, TF, START, {"transforms": links})
 
 
-def camera_of(result: Intrinsics) -> Camera:
+def camera_of(result: Intrinsics) -> CameraCalibrations:
     (camera,) = result.cameras
     return camera
 
@@ -85,7 +86,7 @@ def camera_of(result: Intrinsics) -> Camera:
 # ---------------------------------------------------------------- recordings and datasets
 
 
-def check_focused(camera: Camera, made: Scene) -> None:
+def check_focused(camera: CameraCalibrations, made: Scene) -> None:
     assert camera.frame_id == "cam"
     assert camera.sizes == [(64, 48)]
     assert camera.more == 0
@@ -184,7 +185,7 @@ def test_what_belongs_to_no_other_is_listed_too(packed: bool, tmp_path: Path) ->
 def test_calibrations_without_end_are_counted(
     packed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mp4ds.intrinsics, "MAX_LISTED", 3)
+    monkeypatch.setattr(info, "MAX_LISTED", 3)
     path = SOURCES["bag-none"](tmp_path, focused(scene("mono8"), range(100, 108)))[0]
     if packed:
         mp4ds.pack(path, tmp_path / "dataset")
@@ -348,7 +349,7 @@ def test_effective_matrices_are_told_where_they_differ(
 
 def command(path: Path, *options: str) -> tuple[str, dict[str, Any]]:
     """What the command prints, and the names that this sets when it is run as Python."""
-    result = CliRunner().invoke(app, ["info", str(path), "--intrinsics", *options])
+    result = CliRunner().invoke(app_for(), ["info", str(path), "--intrinsics", *options])
     assert result.exit_code == 0, result.output
     names: dict[str, Any] = {}
     if "--json" not in options:
@@ -449,7 +450,7 @@ def test_errors_are_those_of_info(options: list[str], tmp_path: Path) -> None:
     (tmp_path / "words.txt").write_text("no recording")
     for name in ("words.txt", "nothing.bag"):
         arguments = ["info", str(tmp_path / name), "--intrinsics", *options]
-        result = CliRunner().invoke(app, arguments)
+        result = CliRunner().invoke(app_for(), arguments)
         assert result.exit_code == 2
         assert name in result.output
 

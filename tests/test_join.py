@@ -22,19 +22,13 @@ from coded_tools import ENCODINGS, IN_ORDER, hide, jpeg, superframe
 from coded_tools import encode as encode_packets
 from coded_tools import scene as packet_scene
 from each import each
-from mp4ds.errors import Mp4dsError, VideoError
-from mp4ds.stamps import MAX_GAP_NS, NS_PER_TICK
-from mp4ds.video import (
-    PacketReader,
-    PacketWriter,
-    Recipe,
-    SegmentsDifferError,
-    VideoDecoder,
-    VideoEncoder,
-    join_segments,
-    recipe_for,
-)
-from mp4ds.video.sample_entry import read_sample_entry
+from mp4ds.errors import Mp4dsError, SegmentsDifferError, VideoError
+from mp4ds.times import MAX_GAP_NS, NS_PER_TICK
+from mp4ds.video.codecs import Recipe, recipe_for
+from mp4ds.video.decoder import VideoDecoder
+from mp4ds.video.encoder import VideoEncoder
+from mp4ds.video.mp4 import read_sample_entry
+from mp4ds.video.packets import PacketReader, PacketWriter, join_segments
 from test_packets import write as write_packets
 from test_players import blocks as means_of_blocks
 from test_players import browse, ffprobe
@@ -667,7 +661,7 @@ def run_apart(code: str, *arguments: str) -> str:
 MEASURE = """
 import resource, sys
 from pathlib import Path
-from mp4ds.video import join_segments
+from mp4ds.video.packets import join_segments
 def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 small, segment, target, count, copies = map(str, sys.argv[1:])
 join_segments([Path(small)], range(3), Path(target))
@@ -697,7 +691,7 @@ def test_memory_is_bounded(
 FULL = """
 import resource, signal, sys
 from pathlib import Path
-from mp4ds.video import join_segments
+from mp4ds.video.packets import join_segments
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)
 try:

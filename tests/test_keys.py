@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from each import each, fresh
-from mp4ds.cli.keys import Keyboard, Keys
+from mp4ds.cli.play import Keyboard, Keys
 from waiting import until
 
 ESC = b"\x1b"
@@ -260,7 +260,7 @@ def test_no_standard_input(
 
 PLAYER = """
 import sys, time
-from mp4ds.cli.keys import Keyboard
+from mp4ds.cli.play import Keyboard
 class Player:
     rate = 1.0
     def toggle_paused(self): print("toggled", flush=True)

@@ -14,25 +14,20 @@ from hypothesis.extra import numpy as hnp
 
 from each import each
 from mp4ds.errors import OptionError
-from mp4ds.layouts import (
-    CHROMA_SHIFTS,
+from mp4ds.messages.arrangements import CHROMA_SHIFTS
+from mp4ds.messages.encodings import (
     ENCODINGS,
-    LAYOUTS,
     MAX_ROW_PADDING,
     MAX_SIDE,
     MAX_TABLE,
     NO_PARAMETERS,
     SCALES,
-    Layout,
     Parameters,
-    bind,
-    fit,
-    layout_for,
     pixel_view,
     put_padding,
     row_padding,
-    why_not,
 )
+from mp4ds.messages.layouts import LAYOUTS, Layout, bind, fit, layout_for, why_not
 from pixel_kinds import KINDS, PAIRS, as_message, bits_of, bound, rounded, suited, values
 
 steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])

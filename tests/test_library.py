@@ -22,8 +22,8 @@ import mp4ds
 from coded_scenes import CODED
 from definitions import PICTURES
 from each import each
-from mp4ds.packing import PackOptions
-from mp4ds.unpacking import UnpackOptions
+from mp4ds.packing.options import PackOptions
+from mp4ds.unpacking.unpack import UnpackOptions
 from pictures import CAREFUL, pixels
 from sources import (
     COMMON,

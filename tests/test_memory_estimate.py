@@ -14,9 +14,9 @@ import pytest
 
 from each import each
 from mp4ds.errors import OptionError
-from mp4ds.layouts import CHROMA_SHIFTS
-from mp4ds.video import Recipe, encoder_bytes, recipe_for
-from mp4ds.video.memory import svt_level
+from mp4ds.messages.arrangements import CHROMA_SHIFTS
+from mp4ds.video.codecs import Recipe, recipe_for
+from mp4ds.video.trial import encoder_bytes, svt_level
 
 BENCHMARK = Path(__file__).parents[1] / "benchmarks" / "encoder_memory.py"
 MEASURED = [  # case, threads, frames that fill what the encoder looks ahead

@@ -14,8 +14,14 @@ import pytest
 
 from each import each, fresh
 from mp4ds.errors import Mp4dsError, TargetError, TargetExistsError, WriteError
-from mp4ds.outputs import as_write_error, check_target, digest_file, staged
-from mp4ds.owned import PAGE_SIGN, write_listing
+from mp4ds.files.outputs import (
+    PAGE_SIGN,
+    as_write_error,
+    check_target,
+    digest_file,
+    staged,
+    write_listing,
+)
 
 
 def anything(path: Path) -> set[str]:
@@ -91,7 +97,7 @@ def test_force_replaces_what_may_be_replaced(kind: str, old: str, target: Path) 
 
 def test_nothing_is_replaced_unasked(target: Path) -> None:
     make(target, "file", "old")
-    with pytest.raises(TargetExistsError, match="--force") as caught:
+    with pytest.raises(TargetExistsError, match="`force`") as caught:
         check_target(target, force=False, owned=anything)
     assert isinstance(caught.value, FileExistsError)
     assert caught.value.path == target
@@ -270,7 +276,7 @@ def test_a_move_that_fails_brings_the_old_back(
 
     monkeypatch.setattr(Path, "rename", failing)
     for name in ("exchange", "rename_to_new"):
-        monkeypatch.setattr(f"mp4ds.outputs.{name}", lambda *_: False)
+        monkeypatch.setattr(f"mp4ds.files.outputs.{name}", lambda *_: False)
     with (
         pytest.raises(Mp4dsError, match="Input/output error"),
         staged(target, force=True, owned=anything) as path,
@@ -295,7 +301,7 @@ def test_names_are_exchanged_at_once_where_that_can_be_done(
 
     monkeypatch.setattr(Path, "rename", watched)
     if not can:
-        monkeypatch.setattr("mp4ds.outputs.exchange", lambda *_: False)
+        monkeypatch.setattr("mp4ds.files.outputs.exchange", lambda *_: False)
     elif sys.platform not in ("linux", "darwin"):
         pytest.skip("this system exchanges no names")
     with staged(target, force=True, owned=anything) as path:
@@ -308,12 +314,12 @@ def test_names_are_exchanged_at_once_where_that_can_be_done(
 KILLED = """
 import os, sys
 from pathlib import Path
-import mp4ds.outputs
-from mp4ds.outputs import staged
+from mp4ds.files import outputs
+from mp4ds.files.outputs import staged
 
 target, moment = Path(sys.argv[1]), sys.argv[2]
 if moment == "between":
-    mp4ds.outputs.exchange = lambda *_: False
+    outputs.exchange = lambda *_: False
     rename = Path.rename
     def kill(self, to):
         rename(self, to)

@@ -30,11 +30,14 @@ from coded_tools import (
 )
 from conftest import real
 from each import each, fresh
-from mp4ds.coded import CodedPicture, PictureParser, Refused, annexb, av1, body_of, h264, h265
 from mp4ds.errors import VideoError
-from mp4ds.stamps import MAX_GAP_NS, NS_PER_TICK
-from mp4ds.video import PacketReader, PacketWriter, VideoEncoder, recipe_for
-from mp4ds.video.stand_alone import StandAlonePackets
+from mp4ds.messages.coded import Refused
+from mp4ds.times import MAX_GAP_NS, NS_PER_TICK
+from mp4ds.video import av1, h264, h265, nal
+from mp4ds.video.codecs import recipe_for
+from mp4ds.video.coded_messages import CodedPicture, PictureParser, body_of
+from mp4ds.video.encoder import VideoEncoder
+from mp4ds.video.packets import PacketReader, PacketWriter, StandAlonePackets
 from test_coded_pictures import packets_of
 
 STEP = 33_333
@@ -152,12 +155,12 @@ def test_one_packet(codec: str, tmp_path: Path) -> None:
 def reframed(codec: str, body: bytes, framing: str) -> bytes:
     """A body with SEI and filler among its NAL units, behind other start codes."""
     module = {"h264": h264, "h265": h265}[codec]
-    units = annexb.split(body)[0]
+    units = nal.split(body)[0]
     is_slice = [module.unit_type(u) < (6 if codec == "h264" else 32) for u in units]
     units.insert(is_slice.index(True), SEI[codec])
     units.append(FILLER[codec])
     lengths = (framing.split() * len(units))[: len(units)]
-    return annexb.join(units, " ".join([*lengths, "+2"] if framing == "6 3" else lengths))
+    return nal.join(units, " ".join([*lengths, "+2"] if framing == "6 3" else lengths))
 
 
 @each("framing", ["3", "4", "4 3", "6 3"])
@@ -225,10 +228,10 @@ def test_parameters_that_were_sent_before(codec: str, tmp_path: Path) -> None:
     """The track's header holds them, so that the file plays."""
     module, kinds = {"h264": (h264, (7, 8)), "h265": (h265, (32, 33, 34))}[codec]
     whole = [packet.data for packet in encode(ENCODINGS[codec], frames=8)]
-    units = [annexb.split(body)[0] for body in whole]
-    alone = annexb.join_plain([u for u in units[0] if module.unit_type(u) in kinds])
+    units = [nal.split(body)[0] for body in whole]
+    alone = nal.join_plain([u for u in units[0] if module.unit_type(u) in kinds])
     bodies = [
-        annexb.join_plain([u for u in body if module.unit_type(u) not in kinds]) for body in units
+        nal.join_plain([u for u in body if module.unit_type(u) not in kinds]) for body in units
     ]
     parser = PictureParser(codec)
     assert refusal(parser.parse, bodies[0])

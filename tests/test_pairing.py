@@ -13,9 +13,11 @@ from rosbags.highlevel import AnyReader
 
 from conftest import real
 from each import each
-from mp4ds.bags import open_reader
+from mp4ds.bags.formats import open_reader
 from mp4ds.errors import OptionError
-from mp4ds.pairing import (
+from mp4ds.messages.serializations import form_of, is_calibration, wire_of
+from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, ImageFields, Parts
+from mp4ds.packing.calibrations import (
     IMAGE_WINDOW,
     INFO_WINDOW,
     MAX_CHANNELS,
@@ -24,16 +26,6 @@ from mp4ds.pairing import (
     pair_camera_infos,
 )
 from mp4ds.records import Channel, Message, Schema
-from mp4ds.wire import (
-    CalibrationFields,
-    CodedFields,
-    Fields,
-    ImageFields,
-    Parts,
-    form_of,
-    is_calibration,
-    wire_of,
-)
 
 RAW = ("sensor_msgs/Image", "sensor_msgs/msg/Image", "foxglove.RawImage", "foxglove_msgs/RawImage")
 CODED = (

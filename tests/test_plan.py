@@ -13,16 +13,16 @@ from pydantic import TypeAdapter
 
 from each import each
 from mp4ds.errors import OptionError
+from mp4ds.format.fields import FileName
 from mp4ds.plan import (
     VISUAL_TABLE,
     FileNames,
-    Quality,
+    QualitySetting,
+    QualityTarget,
     Selection,
-    Target,
     parse_quality,
     visual_setting,
 )
-from mp4ds.sidecar.fields import FileName
 
 steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
@@ -32,16 +32,16 @@ steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @each(
     ("text", "quality", "lossless"),
     [
-        ("lossless", Quality("lossless"), True),
-        ("visual", Quality("visual"), False),
-        *((f"crf={n}", Quality("crf", n), False) for n in (0, 7, 22, 63)),
+        ("lossless", QualitySetting("lossless"), True),
+        ("visual", QualitySetting("visual"), False),
+        *((f"crf={n}", QualitySetting("crf", n), False) for n in (0, 7, 22, 63)),
         *(
-            (f"{name}={score}", Quality("target", target=Target(name, score)), False)
+            (f"{name}={score}", QualitySetting("target", target=QualityTarget(name, score)), False)
             for name, score in (("vmaf", 99.5), ("psnr", 42), ("ssim", 0.9801))
         ),
     ],
 )
-def test_qualities(text: str, quality: Quality, lossless: bool) -> None:
+def test_qualities(text: str, quality: QualitySetting, lossless: bool) -> None:
     assert parse_quality(text) == quality
     assert quality.lossless is lossless
     assert str(quality) == text
@@ -102,9 +102,9 @@ def test_a_pattern_that_matches_nothing_is_an_error() -> None:
     topics = ["/b", "/a"]
     Selection(["/a"], ["/b"]).check(topics)
     Selection().check([])
-    with pytest.raises(OptionError, match=r"--topics '/x' matches no topic. There are: /a, /b\."):
+    with pytest.raises(OptionError, match=r"`topics` '/x' matches no topic. There are: /a, /b\."):
         Selection(["/a", "/x"]).check(topics)
-    with pytest.raises(OptionError, match="--exclude '/x' matches no topic"):
+    with pytest.raises(OptionError, match="`exclude` '/x' matches no topic"):
         Selection([], ["/x"]).check(topics)
     with pytest.raises(OptionError, match="There are: none"):
         Selection(["*"]).check([])

@@ -18,11 +18,11 @@ import pytest
 import mp4ds
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.errors import PartsFailedError, TargetError
-from mp4ds.packing import PackOptions, pack_share
-from mp4ds.packing.kept import dump_kept, load_kept
+from mp4ds.packing.manifest import dump_kept, load_kept
+from mp4ds.packing.options import PackOptions
+from mp4ds.packing.pack import pack_share
 from mp4ds.packing.workplace import Workplace
-from mp4ds.video import recipe_for, remade
-from mp4ds.video.codecs import HARDWARE, lossless_codecs
+from mp4ds.video.codecs import HARDWARE, lossless_codecs, recipe_for, remade
 from sources import SOURCES, scene
 from test_bad_input import call, refused, tree
 
@@ -51,7 +51,9 @@ def victim(tmp_path: Path) -> Path:
 def work(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """What an interrupted pack has left."""
     with monkeypatch.context() as patch:
-        patch.setattr("mp4ds.packing._engine", lambda *_: InlineEngine(lambda n: n == "00002-0"))
+        patch.setattr(
+            "mp4ds.packing.pack._engine", lambda *_: InlineEngine(lambda n: n == "00002-0")
+        )
         with pytest.raises(PartsFailedError):
             mp4ds.pack(bag, tmp_path / "out", IN_PARTS)
     return tmp_path / WORK
@@ -59,7 +61,7 @@ def work(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(autouse=True)
 def inline(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: InlineEngine())
+    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: InlineEngine())
 
 
 def pack(bag: Path, tmp_path: Path, *more: str) -> Any:

@@ -18,8 +18,8 @@ import pytest
 
 import mp4ds
 from each import each
-from mp4ds.cli.arguments import spelled
-from mp4ds.playing import PlayOptions, open_player
+from mp4ds.cli.options import spelled
+from mp4ds.plugins.playing.play import PlayOptions, open_player
 from player_scenes import RecordingPublisher, make_drive, recorded
 from test_bad_input import call
 from waiting import WATCHDOG_S
@@ -175,7 +175,7 @@ def test_errors_are_sentences(drive: Path, arguments: list[str], code: int, word
 
 def test_nothing_sourced(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("ROS_VERSION", raising=False)
-    monkeypatch.setattr("mp4ds.publishers.find_spec", lambda _: None)
+    monkeypatch.setattr("mp4ds.plugins.publishing.publisher.find_spec", lambda _: None)
     with (
         pytest.raises(mp4ds.PublishError, match="no ROS is sourced"),
         open_player(drive, PlayOptions()),
@@ -196,11 +196,12 @@ def test_nothing_sourced(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_is_sourced(
     version: str, modules: list[str], kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from mp4ds.publishers import sourced
+    from mp4ds.plugins.publishing.publisher import sourced
 
     monkeypatch.setenv("ROS_VERSION", version)
     monkeypatch.setattr(
-        "mp4ds.publishers.find_spec", lambda name: object() if name in modules else None
+        "mp4ds.plugins.publishing.publisher.find_spec",
+        lambda name: object() if name in modules else None,
     )
     assert sourced() == kind
 

@@ -15,8 +15,8 @@ import pytest
 import mp4ds
 from each import each
 from mp4ds.errors import FormatError, OptionError
-from mp4ds.playing import Player, PlayOptions, PlaySummary, open_player
-from mp4ds.playing.pace import FollowedClock
+from mp4ds.plugins.playing.play import PlayOptions, open_player
+from mp4ds.plugins.playing.player import FollowedClock, Player, PlaySummary
 from player_scenes import MS, START, Recorded, RecordingPublisher, make_drive, recorded
 from waiting import WATCHDOG_S, until
 
@@ -141,22 +141,22 @@ def test_topics(
 @each(
     ("options", "words"),
     [
-        ({"topics": ["/none"]}, "--topics '/none' matches no topic"),
-        ({"regex": "none"}, "--regex 'none' matches no topic"),
+        ({"topics": ["/none"]}, "`topics` '/none' matches no topic"),
+        ({"regex": "none"}, "`regex` 'none' matches no topic"),
         ({"regex": "("}, "no regular expression"),
         ({"remap": ["/tf"]}, "is no rule"),
         ({"remap": ["/none:=/other"]}, "there is no such topic"),
-        ({"rate": 0.0}, "--rate 0"),
-        ({"rate": float("nan")}, "--rate nan"),
-        ({"start_offset": -1.0}, "--start-offset -1"),
+        ({"rate": 0.0}, "`rate` 0"),
+        ({"rate": float("nan")}, "`rate` nan"),
+        ({"start_offset": -1.0}, "`start_offset` -1"),
         ({"start_offset": 100.0}, "after the end"),
-        ({"duration": float("inf")}, "--duration inf"),
-        ({"clock": 0.0}, "--clock 0"),
-        ({"publish_as": "jpg"}, "--publish-as 'jpg'"),
-        ({"restamp": "then"}, "--restamp 'then'"),
-        ({"read_ahead": 0}, "--read-ahead 0"),
-        ({"follow_clock": True, "clock": 10.0}, "--clock contradicts --follow-clock"),
-        ({"follow_clock": True, "rate": 2.0}, "--rate contradicts --follow-clock"),
+        ({"duration": float("inf")}, "`duration` inf"),
+        ({"clock": 0.0}, "`clock` 0"),
+        ({"publish_as": "jpg"}, "`publish_as` 'jpg'"),
+        ({"restamp": "then"}, "`restamp` 'then'"),
+        ({"read_ahead": 0}, "`read_ahead` 0"),
+        ({"follow_clock": True, "clock": 10.0}, "`clock` contradicts `follow_clock`"),
+        ({"follow_clock": True, "rate": 2.0}, "`rate` contradicts `follow_clock`"),
     ],
 )
 def test_wrong_options(
@@ -241,8 +241,8 @@ def test_clock_never_runs_back_or_ahead(drive: tuple[Path, list[Recorded]]) -> N
 
 
 def test_a_recorded_clock_is_not_published_beside_ours(tmp_path: Path) -> None:
-    from mp4ds.bags import open_writer
-    from mp4ds.bags.definitions import ros1_channel
+    from mp4ds.bags.convert import ros1_channel
+    from mp4ds.bags.formats import open_writer
     from mp4ds.records import Message
 
     source = recorded(make_drive(tmp_path / "plain.bag", frames=8))

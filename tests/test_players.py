@@ -27,8 +27,8 @@ import mp4ds
 from coded_scenes import CODED
 from definitions import PICTURES
 from each import each
-from mp4ds.packing import PackOptions
-from mp4ds.video import VideoDecoder
+from mp4ds.packing.options import PackOptions
+from mp4ds.video.decoder import VideoDecoder
 from pictures import CAREFUL
 from scenes import Record, Scene
 from sources import SOURCES, scene

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from mp4ds.engine import ProcessEngine
+from mp4ds.packing.engine import ProcessEngine
 from waiting import until
 
 DONE = "print(json.dumps({'done': True, 'pid': os.getpid()}), flush=True)"
@@ -137,7 +137,7 @@ def test_a_worker_ends_when_its_coordinator_is_killed(tmp_path: Path) -> None:
         "_Orders(['x']); print(json.dumps({'pid': os.getpid()}), flush=True); time.sleep(60)"
     )
     coordinator = (
-        "import sys\nfrom mp4ds.engine import ProcessEngine\n"
+        "import sys\nfrom mp4ds.packing.engine import ProcessEngine\n"
         f"engine = ProcessEngine(lambda _: [sys.executable, '-c', {worker!r}], 1)\n"
         "list(engine.run([('x',)], lambda _, told: print(told['pid'], flush=True)))"
     )

@@ -25,11 +25,21 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from each import each
-from mp4ds.cli.progress import on_terminal, pack_progress, told_by
-from mp4ds.cli.progress_lines import Events, Lines, Log
-from mp4ds.cli.standing import Job, duration_text, left_text, percent_text, plain
-from mp4ds.demo import demo
-from mp4ds.packing import PackProgress
+from mp4ds.cli.progress import (
+    Events,
+    Lines,
+    Log,
+    PackStanding,
+    duration_text,
+    left_text,
+    on_terminal,
+    pack_progress,
+    percent_text,
+    plain,
+    told_by,
+)
+from mp4ds.packing.options import PackProgress
+from mp4ds.plugins.demo import demo
 from waiting import WATCHDOG_S, until
 
 HOUR = 3600.0
@@ -81,10 +91,10 @@ class Clock:
 # ---------------------------------------------------------------- where it stands
 
 
-def paced(share: Callable[[float], float | None], seconds: int, **values: Any) -> Job:
+def paced(share: Callable[[float], float | None], seconds: int, **values: Any) -> PackStanding:
     """A job that was told of each second."""
     clock = Clock()
-    job = Job(clock=clock)
+    job = PackStanding(clock=clock)
     for n in range(seconds + 1):
         clock.seconds = 1000.0 + n
         job.take(told(share(n), **values))
@@ -110,7 +120,7 @@ def test_a_pace_that_changes_is_followed() -> None:
 )
 def test_nothing_is_told_that_is_not_known(state: PackProgress) -> None:
     clock = Clock()
-    job = Job(clock=clock)
+    job = PackStanding(clock=clock)
     for n in range(100):
         clock.seconds = 1000.0 + n
         job.take(state)
@@ -120,7 +130,7 @@ def test_nothing_is_told_that_is_not_known(state: PackProgress) -> None:
 
 def test_no_time_left_is_told_of_a_share_of_a_job() -> None:
     clock = Clock()
-    job = Job(whole=False, clock=clock)
+    job = PackStanding(whole=False, clock=clock)
     for n in range(100):
         clock.seconds = 1000.0 + n
         job.take(told(n / 200))
@@ -129,13 +139,13 @@ def test_no_time_left_is_told_of_a_share_of_a_job() -> None:
 
 
 def test_parts_tell_where_the_work_does_not() -> None:
-    job = Job()
+    job = PackStanding()
     job.take(told(None, tasks_done=119))
     assert job.share == 119 / 240
 
 
 def test_datasets_count_by_their_size() -> None:
-    job = Job()
+    job = PackStanding()
     job.take(told(1.0, dataset="a", gigabytes=10, phase="joining"))
     job.take(told(0.5, dataset="b", gigabytes=30))
     assert job.share == pytest.approx(25 / 40)
@@ -179,8 +189,8 @@ def test_whatever_is_told_nothing_silly_is_shown(
         file=screen, force_terminal=True, width=width, height=height, color_system=None
     )
     tellers = (
-        Log(Job(clock=clock), Lines(log), now=clock.now),
-        Events(Job(clock=clock), Lines(events), now=clock.now),
+        Log(PackStanding(clock=clock), Lines(log), now=clock.now),
+        Events(PackStanding(clock=clock), Lines(events), now=clock.now),
     )
     with on_terminal(console) as show:
         for now, state in reports:
@@ -202,7 +212,7 @@ def test_whatever_is_told_nothing_silly_is_shown(
 def logged(work: Work, seconds: float, *, outcome: str = "done", step: float = 0.5) -> list[str]:
     """The lines of a pack."""
     clock, stream = Clock(), io.StringIO()
-    log = Log(Job(clock=clock), Lines(stream), now=clock.now)
+    log = Log(PackStanding(clock=clock), Lines(stream), now=clock.now)
     for n in range(int(seconds / step) + 1):
         clock.seconds = 1000.0 + n * step
         log.take(told(work(n * step)))
@@ -258,7 +268,7 @@ def test_the_lines_of_a_long_pack_become_rare() -> None:
 
 def test_a_resumed_pack_tells_what_was_done_before() -> None:
     clock, stream = Clock(), io.StringIO()
-    log = Log(Job(clock=clock), Lines(stream), now=clock.now)
+    log = Log(PackStanding(clock=clock), Lines(stream), now=clock.now)
     for n in range(100):
         clock.seconds = 1000.0 + n
         log.take(told(0.8 + n / 10_000, before=192))
@@ -267,7 +277,7 @@ def test_a_resumed_pack_tells_what_was_done_before() -> None:
 
 def test_silence_is_logged_too() -> None:
     clock, stream = Clock(), io.StringIO()
-    log = Log(Job(clock=clock), Lines(stream), now=clock.now)
+    log = Log(PackStanding(clock=clock), Lines(stream), now=clock.now)
     for n in range(100):
         clock.seconds = 1000.0 + n
         log.take(told(n / 1000))
@@ -282,7 +292,7 @@ def test_silence_is_logged_too() -> None:
 
 def test_the_log_of_several_datasets() -> None:
     clock, stream = Clock(), io.StringIO()
-    log = Log(Job(clock=clock), Lines(stream), now=clock.now)
+    log = Log(PackStanding(clock=clock), Lines(stream), now=clock.now)
     for name in ("a", "b", "c"):
         log.take(told(0.0, dataset=name))
     for n in range(1, 100):
@@ -303,7 +313,7 @@ def test_the_log_of_several_datasets() -> None:
 
 def test_hostile_names_reach_no_log() -> None:
     clock, stream = Clock(), io.StringIO()
-    log = Log(Job(clock=clock), Lines(stream), now=clock.now)
+    log = Log(PackStanding(clock=clock), Lines(stream), now=clock.now)
     topics = {HOSTILE + "\udcff" + str(n) + "x" * n: (n, None) for n in range(1000)}
     for n in range(20):
         clock.seconds = 1000.0 + n
@@ -417,7 +427,7 @@ def parsed(text: str) -> list[dict[str, Any]]:
 
 def test_the_events_of_a_pack() -> None:
     clock, stream = Clock(), io.StringIO()
-    events = Events(Job(clock=clock), Lines(stream), now=clock.now)
+    events = Events(PackStanding(clock=clock), Lines(stream), now=clock.now)
     for n in range(1001):
         clock.seconds = 1000.0 + n / 10
         events.take(told(n / 1000, note=HOSTILE))
@@ -448,7 +458,7 @@ def test_the_events_of_a_pack() -> None:
 
 def test_the_last_event_is_not_lost_and_none_is_told_twice() -> None:
     clock, stream = Clock(), io.StringIO()
-    events = Events(Job(clock=clock), Lines(stream), now=clock.now)
+    events = Events(PackStanding(clock=clock), Lines(stream), now=clock.now)
     for n in range(5):
         clock.seconds = 1000.0 + n / 10
         events.take(told(n / 4))
@@ -458,7 +468,7 @@ def test_the_last_event_is_not_lost_and_none_is_told_twice() -> None:
 
 def test_each_dataset_is_told_of_once_a_second() -> None:
     clock, stream = Clock(), io.StringIO()
-    events = Events(Job(clock=clock), Lines(stream), now=clock.now)
+    events = Events(PackStanding(clock=clock), Lines(stream), now=clock.now)
     for n in range(81):
         clock.seconds = 1000.0 + n / 8
         for name in ("a", "b"):
@@ -476,7 +486,7 @@ def test_each_dataset_is_told_of_once_a_second() -> None:
 
 def test_silence_is_told_of() -> None:
     clock, stream = Clock(), io.StringIO()
-    events = Events(Job(clock=clock), Lines(stream), now=clock.now)
+    events = Events(PackStanding(clock=clock), Lines(stream), now=clock.now)
     for n in range(100):
         clock.seconds = 1000.0 + n
         events.take(told(n / 1000))
@@ -491,7 +501,7 @@ def test_silence_is_told_of() -> None:
 
 def test_a_pack_that_does_not_begin_has_no_events() -> None:
     stream = io.StringIO()
-    events = Events(Job(), Lines(stream))
+    events = Events(PackStanding(), Lines(stream))
     events.tick()
     events.end("failed")
     assert stream.getvalue() == ""

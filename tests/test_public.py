@@ -16,13 +16,14 @@ import pytest
 import mp4ds
 from each import each
 from mp4ds import errors
-from mp4ds.demo import demo
+from mp4ds.plugins.demo import demo
 
 ROOT = Path(__file__).parents[1]
 NAMES = [
     "ClusterError",
     "ConversionError",
     "Dataset",
+    "EncoderRefusedError",
     "EvaluateOptions",
     "Evaluation",
     "ExportOptions",
@@ -31,9 +32,11 @@ NAMES = [
     "Frame",
     "FrameNotFoundError",
     "Frames",
+    "HardwareError",
     "ImageFolder",
     "Mp4dsError",
     "OptionError",
+    "OutOfReachError",
     "PackOptions",
     "PackSummary",
     "PartsFailedError",
@@ -43,6 +46,11 @@ NAMES = [
     "PublishError",
     "RecordedMessage",
     "RemoteError",
+    "ReportOptions",
+    "ReportSummary",
+    "SampleError",
+    "ScoringError",
+    "SegmentsDifferError",
     "SourceError",
     "SourceNotFoundError",
     "Stream",
@@ -65,6 +73,7 @@ NAMES = [
     "pack_each",
     "pack_share",
     "play",
+    "report",
     "unpack",
     "validate",
 ]
@@ -128,6 +137,12 @@ def test_every_error_is_public() -> None:
         ("ConversionError", ValueError, 1),
         ("WriteError", OSError, 1),
         ("ClusterError", ConnectionError, 1),
+        ("EncoderRefusedError", mp4ds.Mp4dsError, 1),
+        ("HardwareError", mp4ds.Mp4dsError, 1),
+        ("OutOfReachError", mp4ds.Mp4dsError, 1),
+        ("SampleError", RuntimeError, 1),
+        ("ScoringError", mp4ds.Mp4dsError, 1),
+        ("SegmentsDifferError", mp4ds.Mp4dsError, 1),
         ("RemoteError", Exception, 1),
         ("PartsFailedError", Exception, 1),
         ("PublishError", OSError, 1),
@@ -250,14 +265,13 @@ def test_a_short_pack_imports_what_its_recording_needs(tmp_path: Path) -> None:
     code = f"mp4ds.pack({str(source)!r}, {str(dataset)!r})"
     loaded = python(f"import mp4ds, sys; {code}; print(*sys.modules)").split()
     assert (dataset / "dataset.yaml").is_file()
-    assert {"mp4ds.bags.ros1", "mp4ds.streams.writer"} <= set(loaded)
+    assert {"mp4ds.bags.ros1", "mp4ds.packing.writer"} <= set(loaded)
     others = [
         *("typer", "rich", "jsonschema", "google.protobuf", "sqlite3", "fsspec", "PIL"),
-        *("rosbags.rosbag2", "mp4ds.bags.mcap", "mp4ds.bags.rosbag2", "mp4ds.bags.definitions"),
-        *("mp4ds.importing.layouts", "mp4ds.scoring.ffmpeg", "mp4ds.streams.target"),
-        *("mp4ds.streams.frames", "mp4ds.packing.coordinator", "mp4ds.packing.ros_mp4"),
-        *("mp4ds.coded.av1_references", "mp4ds.coded.vp9", "mp4ds.wire.protobuf"),
-        *("mp4ds.video.access", "mp4ds.video.join", "mp4ds.engine.processes"),
+        *("rosbags.rosbag2", "mp4ds.bags.mcap", "mp4ds.bags.rosbag2", "mp4ds.bags.convert"),
+        *("mp4ds.plugins.importing.layouts", "mp4ds.video.libvmaf", "mp4ds.packing.target"),
+        *("mp4ds.dataset.frames", "mp4ds.packing.coordinator", "mp4ds.plugins.importing.ros_mp4"),
+        *("mp4ds.video.vp9", "mp4ds.messages.protobuf"),
     ]
     assert [name for name in others if name in loaded] == []
 

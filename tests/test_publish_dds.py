@@ -18,11 +18,11 @@ import pytest
 pytest.importorskip("cyclonedds")
 
 from mp4ds.bags.convert import LATCHED_QOS, Converter
-from mp4ds.bags.typedefs import ros2_world
+from mp4ds.bags.types import ros2_world
 from mp4ds.errors import ConversionError, OptionError, PublishError
-from mp4ds.publishers.dds import DdsPublisher
-from mp4ds.publishers.dds_types import dds_name, dds_topic, message_type
-from mp4ds.publishers.qos import Qos
+from mp4ds.plugins.publishing.dds import DdsPublisher
+from mp4ds.plugins.publishing.dds_domain import dds_name, dds_topic, message_type
+from mp4ds.plugins.publishing.ros2_writers import Qos
 from mp4ds.records import Channel, Schema
 from ros2_sides import KINDS, STORE, Side, channel, connect, dds_side, message, padded, until
 from waiting import WATCHDOG_S
@@ -366,7 +366,7 @@ def test_names_in_dds() -> None:
 
 def test_nothing_is_imported_before_it_is_needed() -> None:
     code = (
-        "import sys, mp4ds.publishers.dds, mp4ds.publishers.ros2; "
+        "import sys, mp4ds.plugins.publishing.dds, mp4ds.plugins.publishing.ros2; "
         "sys.exit(any(name.startswith(('cyclonedds', 'rclpy')) for name in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -24,12 +24,12 @@ from chromium import chromium
 from each import each
 from foxglove_client import PAUSE, PLAY, Client
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
-from mp4ds.bags import open_sources
+from mp4ds.bags.formats import open_sources
 from mp4ds.errors import ConversionError, OptionError, PublishError
-from mp4ds.publishers.foxglove import FoxglovePublisher
-from mp4ds.publishers.protocol import Publisher
+from mp4ds.plugins.publishing.foxglove import FoxglovePublisher
+from mp4ds.plugins.publishing.publisher import Publisher
+from mp4ds.plugins.reporting.server import ReportServer
 from mp4ds.records import Channel, Message, Schema
-from mp4ds.report.server import ReportServer
 from sources import SOURCES, scene
 from waiting import WATCHDOG_S
 
@@ -582,7 +582,7 @@ def test_odd_clients_leave_the_gate_open(
 
 def test_a_port_that_is_taken(publisher: FoxglovePublisher) -> None:
     port = int(publisher.address.rpartition(":")[2])
-    with pytest.raises(PublishError, match=rf"ws://127\.0\.0\.1:{port}: .*in use.*--port") as error:
+    with pytest.raises(PublishError, match=rf"ws://127\.0\.0\.1:{port}: .*in use.*`port`") as error:
         FoxglovePublisher(port=port)
     assert "os error" not in str(error.value)
 
@@ -609,9 +609,9 @@ def test_options_that_cannot_be(wrong: dict[str, Any]) -> None:
 
 
 def test_what_foxglove_has_not(publisher: FoxglovePublisher) -> None:
-    with pytest.raises(OptionError, match="--foxglove"):
+    with pytest.raises(OptionError, match="`foxglove`"):
         publisher.follow_clock(lambda time_ns: None)
-    with pytest.raises(OptionError, match=r"/next.*--foxglove"):
+    with pytest.raises(OptionError, match=r"/next.*`foxglove`"):
         publisher.listen("/next", lambda: None)
     assert publisher.world is None
     assert not publisher.wants_clock

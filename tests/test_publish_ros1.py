@@ -458,7 +458,7 @@ def test_wrong_options(roscore: Core, recording: Path) -> None:
 def test_no_rospy() -> None:
     program = (
         "import sys; sys.modules['rospy'] = None\n"
-        "from mp4ds.publishers.ros1 import RospyPublisher\n"
+        "from mp4ds.plugins.publishing.ros1 import RospyPublisher\n"
         "from mp4ds.errors import PublishError\n"
         "try: RospyPublisher()\n"
         "except PublishError as error: print(error)\n"
@@ -482,7 +482,7 @@ def test_leaves_the_process_alone(roscore: Core) -> None:
         "            {k: v for k, v in os.environ.items() if k != 'ROS_LOG_FILENAME'},\n"
         "            signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM))\n"
         "before = state()\n"
-        "from mp4ds.publishers.ros1 import RospyPublisher\n"
+        "from mp4ds.plugins.publishing.ros1 import RospyPublisher\n"
         "with RospyPublisher() as publisher:\n"
         "    during = state()\n"
         "    try: RospyPublisher()\n"

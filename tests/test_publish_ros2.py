@@ -16,8 +16,8 @@ import pytest
 import fake_rclpy
 from mp4ds.bags.convert import LATCHED_QOS
 from mp4ds.errors import ConversionError, OptionError, PublishError
-from mp4ds.publishers.qos import Qos, load_overrides, offered_qos, recorded_qos
-from mp4ds.publishers.ros2 import RclpyPublisher
+from mp4ds.plugins.publishing.ros2 import RclpyPublisher
+from mp4ds.plugins.publishing.ros2_writers import Qos, load_overrides, offered_qos, recorded_qos
 from mp4ds.records import Channel, Schema
 from ros2_sides import KINDS, SIDES, Side, channel, connect, message, padded, until
 from waiting import WATCHDOG_S

@@ -20,15 +20,15 @@ from definitions import IMAGE
 from each import each
 from in_parts import InlineEngine, leftovers
 from mp4ds import yamlio
-from mp4ds.demo import demo
-from mp4ds.errors import OptionError
-from mp4ds.info import info
-from mp4ds.packing import PackOptions
-from mp4ds.plan import Target, parse_quality
-from mp4ds.scoring import ScoringError, find_ffmpeg, largest_crf, vmaf_bytes, vmaf_scores
-from mp4ds.sidecar import Quality
-from mp4ds.streams.crf_control import CrfControl
-from mp4ds.streams.windows import window_frames
+from mp4ds.errors import OptionError, ScoringError
+from mp4ds.format.models import Quality
+from mp4ds.packing.options import PackOptions
+from mp4ds.packing.target import CrfControl, window_frames
+from mp4ds.plan import QualityTarget, parse_quality
+from mp4ds.plugins.demo import demo
+from mp4ds.plugins.info import info
+from mp4ds.video.libvmaf import find_ffmpeg, vmaf_bytes
+from mp4ds.video.scores import largest_crf, vmaf_scores
 from round_trips import unpacked
 from scenes import Record, Scene, instant, scene, together
 from sources import SOURCES
@@ -46,8 +46,8 @@ needs_vmaf = pytest.mark.skipif(
 @pytest.fixture(autouse=True)
 def engine(monkeypatch: pytest.MonkeyPatch) -> InlineEngine:
     inline = InlineEngine()
-    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: inline)
-    monkeypatch.setattr("mp4ds.streams.windows._FRAMES", WINDOW)
+    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: inline)
+    monkeypatch.setattr("mp4ds.packing.target._FRAMES", WINDOW)
     return inline
 
 
@@ -128,7 +128,7 @@ def check_psnr(dataset: Path, noises: list[float], target: float) -> Quality:
 
 
 def test_scores_that_may_be_asked_for() -> None:
-    assert parse_quality("vmaf=99.5").target == Target("vmaf", 99.5)
+    assert parse_quality("vmaf=99.5").target == QualityTarget("vmaf", 99.5)
     assert str(parse_quality("psnr=42.00")) == "psnr=42"
     assert not parse_quality("ssim=0.98").lossless
     for text in ("vmaf", "vmaf=", "vmaf=0", "vmaf=100", "psnr=60", "ssim=1", "ssim=nan", "x=3"):
@@ -229,7 +229,7 @@ def test_in_parts_too_and_each_time_alike(tmp_path: Path, engine: InlineEngine) 
 
     broken = InlineEngine(fails)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mp4ds.packing._engine", lambda *_: broken)
+        patch.setattr("mp4ds.packing.pack._engine", lambda *_: broken)
         with pytest.raises(mp4ds.PartsFailedError):
             mp4ds.pack(paths, tmp_path / "again", options)
     mp4ds.pack(paths, tmp_path / "again", options)
@@ -403,7 +403,8 @@ def test_the_memory_of_vmaf_is_not_underestimated(threads: int) -> None:
     code = f"""if True:
         import resource
         import numpy as np
-        from mp4ds.scoring import find_ffmpeg, vmaf_scores
+        from mp4ds.video.libvmaf import find_ffmpeg
+        from mp4ds.video.scores import vmaf_scores
         luma = np.random.default_rng(0).integers(0, 255, (480, 640), np.uint8)
         grey = np.full((240, 320), 128, np.uint8)
         frames = [(np.roll(luma, n), grey, grey) for n in range(6)]
@@ -418,7 +419,7 @@ def test_without_libvmaf_it_is_said_how_to_get_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     paths = recording(tmp_path, [0.0])
-    monkeypatch.setattr("mp4ds.scoring.ffmpeg._can_score", lambda path: False)
+    monkeypatch.setattr("mp4ds.video.libvmaf._can_score", lambda path: False)
     with pytest.raises(ScoringError, match=r"pip install 'mp4ds\[vmaf\]'"):
         mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="vmaf=95"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]

@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 import mp4ds
 from coded_scenes import CODED
 from each import each
-from mp4ds.demo import demo
-from mp4ds.layouts import ENCODINGS as KNOWN
-from mp4ds.packing import PackOptions
-from mp4ds.sidecar import Calibration, Roi
-from mp4ds.streams.calibrations import Placement
-from mp4ds.streams.lookup import StampIndex
-from mp4ds.unpacking import UnpackOptions
-from mp4ds.video import Renderer
+from mp4ds.dataset.frames import StampIndex
+from mp4ds.dataset.views import Placement
+from mp4ds.format.models import Calibration, Roi
+from mp4ds.messages.encodings import ENCODINGS as KNOWN
+from mp4ds.packing.options import PackOptions
+from mp4ds.plugins.demo import demo
+from mp4ds.unpacking.unpack import UnpackOptions
+from mp4ds.video.images import Renderer
 from pictures import YUV, picture, pixels
 from sources import ENCODINGS, PERIOD, SOURCES, START, Scene, odd_scene, scene
 

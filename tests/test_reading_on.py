@@ -15,14 +15,13 @@ import pytest
 import mp4ds
 from coded_scenes import CODED
 from each import each
-from mp4ds.channels import when_asked
-from mp4ds.dataset import Dataset
+from mp4ds.dataset.channels import when_asked
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.rebuild import DecodedColumns, everything, marked, since, unbroken
 from mp4ds.errors import FormatError, VideoError
-from mp4ds.packing import PackOptions
+from mp4ds.packing.options import PackOptions
 from mp4ds.records import Message, Record
-from mp4ds.streams.choices import everything, marked, since, unbroken
-from mp4ds.streams.rebuild import DecodedColumns
-from mp4ds.video import VideoDecoder
+from mp4ds.video.decoder import VideoDecoder
 from scenes import TRAITS, Scene, odd_scene, scene
 from sources import SOURCES
 
@@ -223,7 +222,7 @@ def test_chosen_packets(name: str, tmp_path: Path) -> None:
         payloads = list(stream.payloads())
         found = [index for index, _ in stream.numbered_makers(every(7))]
         refers = not name.startswith("jpeg")
-        assert set(every(7)(stream.rebuilder.columns)) <= set(found)
+        assert set(every(7)(stream.columns)) <= set(found)
         assert (len(found) > 5) == refers
         assert [bytes(p) for p in stream.payloads(every(7))] == [bytes(payloads[i]) for i in found]
 
@@ -314,7 +313,7 @@ def test_the_whole_video_is_hashed_for_everything_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize("choose", [everything, every(2)])
 def test_messages_that_are_in_no_file(choose: Any, long: Path) -> None:
     with Dataset(long) as dataset:
-        ordinal = dataset[TOPIC].rebuilder.columns.ordinal
+        ordinal = dataset[TOPIC].columns.ordinal
         ordinal[100:] += 1
         with pytest.raises(FormatError, match=rf"message 100 of topic {TOPIC}") as caught:
             rows(dataset.records(choose=choose))

@@ -19,8 +19,8 @@ from conftest import real
 from each import each
 from foxglove_scenes import FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.bags.decoding import decoder_of
+from mp4ds.messages.wire import WireError
 from mp4ds.records import Channel, Schema
-from mp4ds.wire import WireError
 from scenes import image_ros1, raw_scene
 from sources import SOURCES, START, Scene, odd_scene, scene, write_bag, write_mcap
 

@@ -16,25 +16,23 @@ import mp4ds
 from each import each
 from in_parts import InlineEngine
 from mp4ds import yamlio
-from mp4ds.coded import structure
-from mp4ds.coded.coded_frame import CodedFrame
-from mp4ds.coded.references import UnknownStructure
-from mp4ds.coded.structure import (
-    RECORDED_CODECS,
+from mp4ds.dataset.stream import Stream
+from mp4ds.errors import FormatError, VideoError
+from mp4ds.format.models import References
+from mp4ds.format.sidecars import load_stream
+from mp4ds.messages.coded import CodedFrame, UnknownStructure
+from mp4ds.packing.writer import video_facts
+from mp4ds.video import references as structure
+from mp4ds.video.access import Chains, digest_video, packets_of_groups
+from mp4ds.video.codecs import CODECS
+from mp4ds.video.mp4 import SampleTable, read_sample_table
+from mp4ds.video.references import (
     StructureRecorder,
     Structures,
     frame_bytes,
     read_structure,
     write_packet,
 )
-from mp4ds.errors import FormatError, VideoError
-from mp4ds.sidecar import References, load_stream
-from mp4ds.streams import Stream
-from mp4ds.streams.facts import video_facts
-from mp4ds.video import digest_video
-from mp4ds.video.chains import Chains
-from mp4ds.video.digest import packets_of_groups
-from mp4ds.video.samples import SampleTable, read_sample_table
 from remote_servers import web_server
 from sources import SOURCES, scene
 from test_access import Counting, Samples, written
@@ -74,7 +72,7 @@ def test_recorded_and_parsed_chains_are_the_same(name: str, tmp_path: Path) -> N
     data = path.read_bytes()
     found = digest_video(path, recipe.codec)
     assert (found.size, found.sha256) == (len(data), hashlib.sha256(data).hexdigest())
-    assert (found.structures is not None) == (recipe.codec in RECORDED_CODECS)
+    assert (found.structures is not None) == CODECS[recipe.codec].is_free
     if found.structures is not None:
         packets = packets_of_groups(index(path))
         assert packets.sum() == FRAMES
@@ -247,7 +245,7 @@ def test_joined_parts_tell_what_the_joined_packets_tell(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     engine = InlineEngine()
-    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: engine)
+    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: engine)
     recorded = scene("rgb8", frames=40, width=96, height=64)
     (path,) = SOURCES["mcap-ros2-none"](tmp_path, recorded)
     options = mp4ds.PackOptions(quality="visual", codec="av1", gop=8, window=4)

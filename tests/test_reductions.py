@@ -22,15 +22,15 @@ from coded_scenes import CODED, MakeScene
 from definitions import COMPRESSED, IMAGE, INFO
 from each import each
 from foxglove_scenes import FOXGLOVE
-from mp4ds.dataset import Dataset
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.rebuild import DecodedColumns
 from mp4ds.errors import FormatError, OptionError
-from mp4ds.packing import PackOptions
+from mp4ds.format.sidecars import MANIFEST_NAME
+from mp4ds.packing.options import PackOptions
 from mp4ds.records import Message
-from mp4ds.republish import Reduction, Republisher
-from mp4ds.republish.reduction import at_most, times_of
-from mp4ds.sidecar import MANIFEST_NAME
-from mp4ds.streams.rebuild import DecodedColumns
-from mp4ds.unpacking import UnpackOptions
+from mp4ds.unpacking.pictures import Reduction, at_most, times_of
+from mp4ds.unpacking.republish import Republisher
+from mp4ds.unpacking.unpack import UnpackOptions
 from pictures import picture, pixels
 from republished import CAMERAS, Read, file_picture, psnr, read
 from scenes import Record, Scene, odd_scene, scene
@@ -529,7 +529,7 @@ def test_times_are_stamps_or_log_times(stamps: str) -> None:
     ids=repr,
 )
 def test_what_is_no_reduction(options: dict[str, Any]) -> None:
-    with pytest.raises(OptionError, match=r"--(resize|every|max-rate) .* use "):
+    with pytest.raises(OptionError, match=r"`(resize|every|max_rate)` .* use "):
         Reduction(**options)
 
 

@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 from coded_tools import mutations, refusal, scene
 from conftest import real
 from each import each
-from mp4ds.coded import av1
-from mp4ds.coded.configuration import parameter_units
-from mp4ds.coded.references import CodedFrame, ReferenceParser
+from mp4ds.messages.coded import CodedFrame
+from mp4ds.video import av1
+from mp4ds.video.nal import parameter_units
+from mp4ds.video.references import ReferenceParser
 
 WIDTH, HEIGHT, FRAMES, GOP = 128, 96, 45, 20
 DECODERS = {"h265": "hevc", "av1": "libdav1d"}

@@ -12,18 +12,17 @@ from typing import Any, get_args
 
 import pytest
 
-from mp4ds.coded import PACKET_CODECS, packet_codec, zlib_fingerprint
-from mp4ds.coded.png_filters import RULES
-from mp4ds.layouts import ENCODINGS, LAYOUTS, SCALES, Layout, Parameters, bind
+from mp4ds.format.fields import Body
+from mp4ds.format.models import PIXEL_FORMATS, VIDEO_CODECS
+from mp4ds.messages.encodings import ENCODINGS, SCALES, Parameters
+from mp4ds.messages.layouts import LAYOUTS, Layout, bind
+from mp4ds.messages.png import RULES, zlib_fingerprint
+from mp4ds.messages.protobuf import TYPES as FOXGLOVE_TYPES
+from mp4ds.messages.ros import LAYOUTS as ROS_TYPES
+from mp4ds.messages.serializations import WIRES
 from mp4ds.plan import VISUAL_TABLE
-from mp4ds.sidecar.fields import Body
-from mp4ds.sidecar.models import CODECS, PIXEL_FORMATS
-from mp4ds.video import recipe_for
-from mp4ds.video.codecs import codecs_to_try, lossless_codecs
-from mp4ds.video.hardware import HARDWARE
-from mp4ds.wire import WIRES
-from mp4ds.wire.foxglove import TYPES as FOXGLOVE_TYPES
-from mp4ds.wire.ros import LAYOUTS as ROS_TYPES
+from mp4ds.video.codecs import HARDWARE, codecs_to_try, lossless_codecs, recipe_for
+from mp4ds.video.coded_messages import PACKET_CODECS, packet_codec
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "mp4ds"
@@ -259,7 +258,7 @@ def test_the_registry_has_the_table_of_the_paper() -> None:
 
 def test_the_registry_lists_exactly_the_codecs() -> None:
     rows = tables(registry("Codecs"))[0]
-    assert [quoted(row[0]) for row in rows] == [[codec] for codec in CODECS]
+    assert [quoted(row[0]) for row in rows] == [[codec] for codec in VIDEO_CODECS]
     for row in rows:
         (codec,) = quoted(row[0])
         made = {item.mode for item in codec_rows() if item.codec == codec}
@@ -351,8 +350,8 @@ def test_the_registry_lists_exactly_the_hardware() -> None:
 # ---------------------------------------------------------------- reasons for verbatim storage
 
 REFUSALS = {"Unsuited", "Refused", "NoPicture", "WireError", "EncoderRefusedError"}
-ROOMS = ("coded", "layouts", "streams", "video", "wire", "packing")
-NO_CAMERA_MESSAGES = ("transforms.py", "protobuf_objects.py")
+ROOMS = ("messages", "dataset", "video", "packing")
+NO_CAMERA_MESSAGES = ("transforms.py",)
 OF_READING = {
     *("* is no framing of NAL units", "* is no framing of AV1", "* is no framing of *"),
     "it has * NAL units where its framing has *",

@@ -32,18 +32,21 @@ import mp4ds
 from coded_scenes import CODED
 from each import each, fresh
 from mp4ds.errors import OptionError, SourceError, TargetError, TargetExistsError
-from mp4ds.info import info
-from mp4ds.intervals import lost_frames
-from mp4ds.report import ReportOptions, report
-from mp4ds.report.cameras import Camera
-from mp4ds.report.grid import overlay_of
-from mp4ds.report.looks import Look, pictures_in_order
-from mp4ds.report.packed import pack_column
-from mp4ds.report.page import as_script, utc_text
-from mp4ds.report.proxies import proxy_size
-from mp4ds.report.server import ReportServer, byte_range
-from mp4ds.report.timing import axis_of, nearest_offsets, timing_of
-from mp4ds.sidecar import Calibration, Roi
+from mp4ds.format.models import Calibration, Roi
+from mp4ds.plugins.info import info
+from mp4ds.plugins.reporting.cameras import (
+    ReportedCamera,
+    axis_of,
+    nearest_offsets,
+    overlay_of,
+    pack_column,
+    timing_of,
+)
+from mp4ds.plugins.reporting.page import as_script, utc_text
+from mp4ds.plugins.reporting.proxies import Look, pictures_in_order, proxy_size
+from mp4ds.plugins.reporting.report import ReportOptions, report
+from mp4ds.plugins.reporting.server import ReportServer, byte_range
+from mp4ds.times import lost_frames
 from report_scenes import (
     COLOUR,
     DEPTH,
@@ -390,7 +393,7 @@ def test_a_report_elsewhere_plays_the_videos_where_they_are(copy: Path, tmp_path
 
 
 def test_a_pair_alone_needs_a_place(copy: Path, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="--output"):
+    with pytest.raises(OptionError, match="`output`"):
         report(copy / "front_image_raw.mp4")
     summary = report(copy / "front_image_raw.mp4", ReportOptions(output=tmp_path / "pair"))
     assert [camera.topic for camera in summary.cameras] == [COLOUR]
@@ -407,7 +410,7 @@ def test_tiles_are_played_where_no_proxies_are_wanted(packed_bag: Path, tmp_path
 
 
 def test_a_remote_dataset_is_refused(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mp4ds.report.remote", lambda path: path)
+    monkeypatch.setattr("mp4ds.plugins.reporting.report.remote", lambda path: path)
     with pytest.raises(SourceError, match="not on this machine"):
         report(copy, ReportOptions(output=copy.parent / "page"))
     assert not (copy.parent / "page").exists()
@@ -435,7 +438,7 @@ def test_a_failure_leaves_what_was_there(copy: Path, monkeypatch: pytest.MonkeyP
     def fail(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mp4ds.report.write_folder", fail)
+    monkeypatch.setattr("mp4ds.plugins.reporting.report.write_folder", fail)
     with pytest.raises(KeyboardInterrupt):
         report(copy)
     assert sorted(p.relative_to(copy) for p in copy.rglob("*")) == before
@@ -483,7 +486,7 @@ def test_scripts_hold_any_value() -> None:
 
 
 def test_no_code_of_the_page_makes_elements_of_text() -> None:
-    folder = Path(sys.modules["mp4ds.report"].__file__ or "").parent / "page"
+    folder = Path(sys.modules["mp4ds.plugins.reporting.report"].__file__ or "").parent / "page"
     code = "".join(path.read_text() for path in folder.glob("*.js"))
     forbidden = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b|new Function"
     assert len(code) > 10_000
@@ -617,7 +620,7 @@ def test_wrong_scores_are_refused(value: Any, problem: str, copy: Path, tmp_path
 
 @pytest.mark.parametrize("options", [{"proxies": "some"}, {"proxy_width": 10}])
 def test_wrong_options_are_refused(options: dict[str, Any]) -> None:
-    with pytest.raises(OptionError, match="--prox"):
+    with pytest.raises(OptionError, match="`prox"):
         ReportOptions(**options)
 
 
@@ -763,7 +766,7 @@ def test_odd_requests_print_nothing(
 
 
 def test_a_port_that_is_taken(server: ReportServer) -> None:
-    with pytest.raises(OptionError, match=f"--port {server.port}"):
+    with pytest.raises(OptionError, match=f"`port` {server.port}"):
         ReportServer({}, "/", port=server.port)
 
 
@@ -820,7 +823,7 @@ def test_serving_until_interrupted(copy: Path) -> None:
 
 def test_what_a_camera_tells_of_its_calibrations(drive: Path) -> None:
     with mp4ds.open(drive) as dataset:
-        facts = Camera(dataset[COLOUR], COLOUR).facts(0, None, "")
+        facts = ReportedCamera(dataset[COLOUR], COLOUR).facts(0, None, "")
     (listed,) = facts["calibrations"]
     assert listed["from_frame"] == 0
     assert listed["distortion_model"] == "plumb_bob"

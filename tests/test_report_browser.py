@@ -18,13 +18,12 @@ import mp4ds
 from chromium import Tab, chromium
 from conftest import real
 from each import each
-from mp4ds.intervals import intervals, lost_frames
-from mp4ds.report import ReportOptions, report
-from mp4ds.report.looks import Look
-from mp4ds.report.packed import pack_column
-from mp4ds.report.page import as_script
-from mp4ds.report.server import ReportServer
-from mp4ds.report.timing import nearest_offsets
+from mp4ds.plugins.reporting.cameras import nearest_offsets, pack_column
+from mp4ds.plugins.reporting.page import as_script
+from mp4ds.plugins.reporting.proxies import Look
+from mp4ds.plugins.reporting.report import ReportOptions, report
+from mp4ds.plugins.reporting.server import ReportServer
+from mp4ds.times import intervals, lost_frames
 from report_scenes import (
     COLOUR,
     DEPTH,

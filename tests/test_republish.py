@@ -28,10 +28,9 @@ from each import each
 from encoders import cv, nal_units
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.errors import ConversionError, FormatError, OptionError
-from mp4ds.packing import PackOptions
-from mp4ds.republish import KINDS, Republished
-from mp4ds.republish.topics import FreeTopics, republished_topic
-from mp4ds.unpacking import UnpackOptions, UnpackSummary
+from mp4ds.packing.options import PackOptions
+from mp4ds.unpacking.republish import KINDS, FreeTopics, Republished, republished_topic
+from mp4ds.unpacking.unpack import UnpackOptions, UnpackSummary
 from pictures import YUV, picture, sample_format
 from republished import (
     CAMERAS,
@@ -683,7 +682,7 @@ def test_nothing_is_decoded_for_video(packed: Pack, monkeypatch: pytest.MonkeyPa
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("a video was decoded")
 
-    monkeypatch.setattr("mp4ds.streams.Stream.open_video", refuse)
+    monkeypatch.setattr("mp4ds.dataset.stream.Stream.open_video", refuse)
     summary, _ = made.unpack("mcap", "compressed-video")
     assert summary.messages["/cam/image_raw/compressed_video"] == len(made.cameras)
 
@@ -1018,10 +1017,10 @@ def test_no_topic_is_taken_twice() -> None:
 @each(
     ("to", "options", "problem"),
     [
-        ("mcap", {"images": "bmp"}, "--images 'bmp' is not known. Use raw, jpeg, png, compressed"),
-        ("images", {"images": "raw"}, "--images goes with a recording"),
-        ("mcap", {"jpeg_quality": 0}, "--jpeg-quality 0 is not from 1 to 100"),
-        ("mcap", {"jpeg_quality": 101}, "--jpeg-quality 101 is not from 1 to 100"),
+        ("mcap", {"images": "bmp"}, "`images` 'bmp' is not known. Use raw, jpeg, png, compressed"),
+        ("images", {"images": "raw"}, "`images` goes with a recording"),
+        ("mcap", {"jpeg_quality": 0}, "`jpeg_quality` 0 is not from 1 to 100"),
+        ("mcap", {"jpeg_quality": 101}, "`jpeg_quality` 101 is not from 1 to 100"),
     ],
 )
 def test_options_that_contradict(

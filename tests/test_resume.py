@@ -19,7 +19,6 @@ import pytest
 import mp4ds
 from each import each, fresh
 from in_parts import InlineEngine, facts, leftovers
-from mp4ds.demo import demo
 from mp4ds.errors import (
     FormatError,
     OptionError,
@@ -28,7 +27,9 @@ from mp4ds.errors import (
     TargetError,
     TargetExistsError,
 )
-from mp4ds.packing import PackOptions, pack_each, pack_share
+from mp4ds.packing.options import PackOptions
+from mp4ds.packing.pack import pack_each, pack_share
+from mp4ds.plugins.demo import demo
 from round_trips import Compare, unpacked
 from sources import SOURCES, scene
 
@@ -50,7 +51,7 @@ def expected(source: Path, tmp_path: Path) -> dict[str, Any]:
 
 
 def use(monkeypatch: pytest.MonkeyPatch, engine: InlineEngine) -> InlineEngine:
-    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: engine)
+    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: engine)
     return engine
 
 
@@ -125,12 +126,12 @@ def test_where_nothing_was_finished_nothing_is_left(
 @each(
     ("options", "sentence"),
     [
-        ({"codec": "ffv1"}, r"another --codec: 'h264', and now it is 'ffv1'.*--restart"),
-        ({"codec": None}, r"another --codec: 'h264', and now it is None.*--restart"),
-        ({"window": 4}, r"another --window: 3, and now it is 4"),
-        ({"quality": "crf=20"}, r"another --quality: 'lossless', and now it is 'crf=20'"),
-        ({"exclude": ["/imu"]}, r"another --exclude: \[\], and now it is \['/imu'\]"),
-        ({"camera_info": ["a=b"]}, r"another --camera-info"),
+        ({"codec": "ffv1"}, r"another `codec`: 'h264', and now it is 'ffv1'.*`restart`"),
+        ({"codec": None}, r"another `codec`: 'h264', and now it is None.*`restart`"),
+        ({"window": 4}, r"another `window`: 3, and now it is 4"),
+        ({"quality": "crf=20"}, r"another `quality`: 'lossless', and now it is 'crf=20'"),
+        ({"exclude": ["/imu"]}, r"another `exclude`: \[\], and now it is \['/imu'\]"),
+        ({"camera_info": ["a=b"]}, r"another `camera_info`"),
     ],
 )
 def test_other_options_are_refused(
@@ -170,7 +171,7 @@ def test_another_recording_under_the_same_name_is_refused(
 ) -> None:
     fail_at(tmp_path, source, monkeypatch, PARTS[1])
     other = shutil.copy(source, tmp_path / "other.bag")
-    with pytest.raises(OptionError, match=r"holds an unfinished pack of .*--restart"):
+    with pytest.raises(OptionError, match=r"holds an unfinished pack of .*`restart`"):
         mp4ds.pack(other, tmp_path / "dataset", IN_PARTS)
 
 
@@ -257,7 +258,7 @@ def test_a_damaged_job_is_refused(
 ) -> None:
     fail_at(tmp_path, source, monkeypatch, PARTS[1])
     (tmp_path / ".dataset.mp4ds-part" / "job.json").write_text(broken)
-    with pytest.raises(TargetError, match=r"--restart"):
+    with pytest.raises(TargetError, match=r"`restart`"):
         mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
 
 

@@ -146,11 +146,11 @@ def test_what_no_ros_can_hold_is_refused(
     with pytest.raises(mp4ds.ConversionError) as caught:
         unpacked(tmp_path, target)
     assert caught.value.topic in FOXGLOVE_TOPICS
-    for word in (f"topic {caught.value.topic}:", "protobuf", "--exclude", "mcap"):
+    for word in (f"topic {caught.value.topic}:", "protobuf", "`exclude`", "mcap"):
         assert word in str(caught.value)
     assert sorted(tmp_path.rglob("*")) == before
     # what it names all at once is all there is to leave out
-    excluded = re.findall(r"--exclude (\S+?)(?=[ ,])", str(caught.value))
+    excluded = re.findall(r"`exclude` (\S+?)(?=[ ,])", str(caught.value))
     to, storage = TARGETS[target]
     output = output_of(tmp_path, target)
     options = mp4ds.UnpackOptions(storage=storage, exclude=excluded)

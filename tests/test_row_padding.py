@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 import mp4ds
 from in_parts import InlineEngine
 from mp4ds import yamlio
-from mp4ds.bags import open_reader
-from mp4ds.packing import PackOptions
+from mp4ds.bags.formats import open_reader
+from mp4ds.packing.options import PackOptions
 from mp4ds.records import Message
 from round_trips import Compare, unpacked
 from sources import SOURCES, odd_scene
@@ -29,7 +29,7 @@ WIDTH, STEP = 32, 36
 
 @pytest.fixture(autouse=True)
 def engine(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: InlineEngine())
+    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: InlineEngine())
 
 
 def recording(folder: Path, trait: str, source: str = "mcap-ros2-none", **options: Any) -> Any:
@@ -89,7 +89,7 @@ def test_padding_beyond_a_bound_is_verbatim(
     window: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compare: Compare
 ) -> None:
     """Of parts, those with too much of it together become two streams."""
-    monkeypatch.setattr("mp4ds.sidecar.fields.MAX_PADDING", 150)
+    monkeypatch.setattr("mp4ds.format.fields.MAX_PADDING", 150)
     paths = recording(tmp_path, "row-padding-varied")
     summary = mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=window))
     (topic,) = (topic for topic in summary.topics if topic.topic == TOPIC)

@@ -25,8 +25,9 @@ from conftest import DATA, real
 from damage import INJURIES, Key, Piece, all_messages, pieces_of, sound_messages
 from each import each, fresh
 from mp4ds import SourceError
-from mp4ds.bags import open_sources
+from mp4ds.bags.formats import open_sources
 from mp4ds.bags.salvage.losses import LossLog, bounded
+from mp4ds.format.manifest import LossEntry
 from mp4ds.records import (
     EVERYTHING,
     MAX_LOSSES,
@@ -37,7 +38,6 @@ from mp4ds.records import (
     Message,
     Record,
 )
-from mp4ds.sidecar import LossEntry
 from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2, write_split_bags
 
 PLACES = 8
@@ -539,7 +539,7 @@ READ = """
 import resource, sys
 from pathlib import Path
 limit = int(sys.argv[2])
-from mp4ds.bags import open_sources
+from mp4ds.bags.formats import open_sources
 from mp4ds.bags.salvage import mcap, ros1, rosbag2
 from mp4ds.errors import SourceError
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))

@@ -22,9 +22,10 @@ from coded_tools import encode as encode_packets
 from conftest import DATA, real
 from each import each
 from mp4ds.errors import VideoError
-from mp4ds.stamps import MAX_GAP_NS, NS_PER_TICK
-from mp4ds.video import join_segments, recipe_for
-from mp4ds.video.samples import SampleTable, Unindexed, read_sample_table
+from mp4ds.times import MAX_GAP_NS, NS_PER_TICK
+from mp4ds.video.codecs import recipe_for
+from mp4ds.video.mp4 import SampleTable, Unindexed, read_sample_table
+from mp4ds.video.packets import join_segments
 from test_packets import write as write_packets
 from test_video import LOSSLESS, LOSSY, encode, noise
 

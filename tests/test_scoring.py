@@ -22,19 +22,9 @@ import pytest
 from numpy.typing import NDArray
 
 from each import each
-from mp4ds.scoring import (
-    MAX_PSNR,
-    METRICS,
-    VMAF_MODEL,
-    Ffmpeg,
-    Scorer,
-    ScoringError,
-    YuvFrame,
-    find_ffmpeg,
-    psnr,
-    ssim,
-    summary_of,
-)
+from mp4ds.errors import ScoringError
+from mp4ds.video.libvmaf import VMAF_MODEL, Ffmpeg, find_ffmpeg
+from mp4ds.video.scores import MAX_PSNR, METRICS, Scorer, YuvFrame, psnr, ssim, summary_of
 from waiting import WATCHDOG_S, until
 
 FRAMES = 8
@@ -423,7 +413,8 @@ import itertools, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # where the tests are run in background
 sys.path.insert(0, {tests!r})
 from test_scoring import clip
-from mp4ds.scoring import Scorer, find_ffmpeg
+from mp4ds.video.libvmaf import find_ffmpeg
+from mp4ds.video.scores import Scorer
 ffmpeg = find_ffmpeg()
 print("ready", flush=True)
 frames = itertools.cycle(clip((64, 48)))

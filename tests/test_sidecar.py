@@ -17,28 +17,26 @@ from jsonschema import Draft202012Validator
 from each import each
 from mp4ds import yamlio
 from mp4ds.errors import FormatError, VersionError
-from mp4ds.layouts import ENCODINGS, LAYOUTS
-from mp4ds.records import Channel, Schema
-from mp4ds.sidecar import (
+from mp4ds.format.fields import (
     FORMAT_VERSION,
-    ChannelModel,
-    Manifest,
-    SchemaModel,
-    StreamSidecar,
-    dump_document,
-    load_document,
-    load_manifest,
-    load_stream,
-    schema_text,
-)
-from mp4ds.sidecar.fields import (
     MAX_CAMERA_INFOS,
     MAX_FRAMES,
     decode_base64,
     document_of,
     parse_version,
 )
-from mp4ds.sidecar.models import LayoutParameters
+from mp4ds.format.manifest import Manifest
+from mp4ds.format.models import ChannelModel, LayoutParameters, SchemaModel, StreamSidecar
+from mp4ds.format.sidecars import (
+    dump_document,
+    load_document,
+    load_manifest,
+    load_stream,
+    schema_text,
+)
+from mp4ds.messages.encodings import ENCODINGS
+from mp4ds.messages.layouts import LAYOUTS
+from mp4ds.records import Channel, Schema
 from pixel_kinds import PAIRS, bound, rounded
 
 steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mp4ds.packing.spans import cut_times, group_topics, share, spans_of
+from mp4ds.packing.planning import cut_times, group_topics, share, spans_of
 
 TIMES = st.lists(
     st.lists(st.integers(-(2**62), 2**62) | st.integers(0, 50), min_size=1, max_size=80),

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from each import each
-from mp4ds.stamps import (
+from mp4ds.times import (
     INT64_MAX,
     INT64_MIN,
     MAX_GAP_NS,

@@ -15,8 +15,15 @@ import pytest
 import mp4ds
 from each import each
 from mp4ds.errors import FrameNotFoundError, OptionError, TargetExistsError
-from mp4ds.report.looks import Look
-from mp4ds.report.stills import StillOptions, frames, number_at, parse_sheet, spread, time_of
+from mp4ds.plugins.reporting.proxies import Look
+from mp4ds.plugins.reporting.stills import (
+    StillOptions,
+    frames,
+    number_at,
+    parse_sheet,
+    spread,
+    time_of,
+)
 from report_scenes import COLOUR, DEPTH, FRAMES, HEIGHT, WIDTH, blocks, pack_cameras, two_cameras
 from sources import COMMON, ENCODINGS, odd_scene, scene
 
@@ -60,7 +67,7 @@ def test_times_as_they_are_written(text: str, time: int) -> None:
     "text", ["", "now", "1e9", "+", "+1.0000000001", "2023-13-14T22:13:20", "1.5 s", "12:30", "٣"]
 )
 def test_what_is_no_time(text: str) -> None:
-    with pytest.raises(OptionError, match="--at"):
+    with pytest.raises(OptionError, match="`at`"):
         time_of(text, START)
 
 
@@ -207,7 +214,7 @@ def test_a_sheet_that_is_too_large(drive: Path, tmp_path: Path) -> None:
 
 @each("text", ["5", "0x4", "5x", "x4", "5x4x3", "-1x3", "1000x1"])
 def test_what_is_no_sheet(text: str) -> None:
-    with pytest.raises(OptionError, match="--sheet"):
+    with pytest.raises(OptionError, match="`sheet`"):
         parse_sheet(text)
 
 
@@ -225,14 +232,14 @@ def test_what_is_no_sheet(text: str) -> None:
     ],
 )
 def test_options_that_do_not_go_together(options: dict[str, Any]) -> None:
-    with pytest.raises(OptionError, match="--"):
+    with pytest.raises(OptionError, match="`"):
         StillOptions(**options)
 
 
 def test_what_cannot_be_saved(drive: Path, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=r"neither a \.png"):
         frames(drive, tmp_path / "out.gif", StillOptions(topic=COLOUR, at="#0"))
-    with pytest.raises(OptionError, match=f"--topic of {COLOUR}, {DEPTH}|{DEPTH}, {COLOUR}"):
+    with pytest.raises(OptionError, match=f"`topic` of {COLOUR}, {DEPTH}|{DEPTH}, {COLOUR}"):
         frames(drive, tmp_path / "out.png", StillOptions(at="#0"))
     with pytest.raises(OptionError, match="no stream '/nowhere'"):
         frames(drive, tmp_path / "out.png", StillOptions(topic="/nowhere", at="#0"))

@@ -16,8 +16,9 @@ import stranger
 from coded_scenes import CODED
 from each import each
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
-from mp4ds.layouts import ENCODINGS, LAYOUTS, Encoding, fit
-from mp4ds.packing import pack
+from mp4ds.messages.encodings import ENCODINGS, Encoding
+from mp4ds.messages.layouts import LAYOUTS, fit
+from mp4ds.packing.pack import pack
 from scenes import Scene, odd_scene, scene
 from sources import SOURCES
 from stranger_messages import Stream

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import mp4ds
 from each import each, fresh
-from mp4ds.sync import match, synchronize
+from mp4ds.times import match, synchronize
 from sources import (
     IMAGE,
     START,

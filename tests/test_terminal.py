@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 import mp4ds
-from mp4ds.cli import app
+from mp4ds.cli import app_for
 from mp4ds.cli.output import status_line
 from scenes import Scene
 from sources import scene, write_mcap
@@ -45,7 +45,7 @@ def call(*arguments: object) -> Result:
     out, err = Screen(), Screen()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            app([str(argument) for argument in arguments])
+            app_for()([str(argument) for argument in arguments])
             code: Any = 0
         except SystemExit as ended:
             code = ended.code or 0
@@ -184,7 +184,7 @@ def test_an_error_that_nobody_thought_of(
     def broken(_: object) -> None:
         raise TypeError("open() got an unexpected keyword argument 'x'\n\x1b[31m.")
 
-    monkeypatch.setattr("mp4ds.info.info", broken)
+    monkeypatch.setattr("mp4ds.plugins.info.info", broken)
     monkeypatch.setenv("MP4DS_DEBUG", "1" if debug else "")
     done = call("info", recording, *(["--json"] if as_json else []))
     assert done.code == 1
@@ -208,7 +208,7 @@ def test_an_error_that_nobody_thought_of(
 WITHIN = """
 import resource, sys
 from pathlib import Path
-import mp4ds.checks, mp4ds.packing, mp4ds.unpacking
+import mp4ds.dataset.checks, mp4ds.packing.pack, mp4ds.unpacking.unpack
 from mp4ds.cli import main
 used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 limit = used + int(sys.argv.pop(1)) * 2**20

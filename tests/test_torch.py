@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 import mp4ds
-from mp4ds.demo import demo
-from mp4ds.packing import PackOptions
-from mp4ds.streams import Stream
+from mp4ds.dataset.stream import Stream
+from mp4ds.packing.options import PackOptions
+from mp4ds.plugins.demo import demo
 from scenes import PERIOD, Scene, odd_scene, scene
 from sources import SOURCES
 from test_examples import ROOT, run
@@ -31,7 +31,7 @@ from torch.utils.data import DataLoader, Subset  # noqa: E402
 
 from each import each  # noqa: E402
 from mp4ds.torch import FrameDataset, FrameStream, SampleError  # noqa: E402
-from mp4ds.torch.windows import rows_of, windows  # noqa: E402
+from mp4ds.torch.datasets import rows_of, windows  # noqa: E402
 from waiting import WATCHDOG_S  # noqa: E402
 
 LEFT, RIGHT = BOTH = ["/left/image_raw", "/right/image_raw"]
@@ -534,7 +534,7 @@ def damaged(drives: list[Path], tmp_path: Path) -> Path:
     shutil.copytree(drives[0], drive)
     (video,) = drive.glob("right*.mp4")
     data = bytearray(video.read_bytes())
-    from mp4ds.video.samples import read_sample_table
+    from mp4ds.video.mp4 import read_sample_table
 
     with video.open("rb") as file:
         table = read_sample_table(file, len(data), "")

@@ -11,11 +11,9 @@ import numpy as np
 
 from conftest import real
 from each import each
-from mp4ds.streams.video_file import Video
-from mp4ds.video import read_sample_entry
+from mp4ds.dataset.frames import Video
 from mp4ds.video.access import FrameAccess
-from mp4ds.video.sample_entry import SampleEntry
-from mp4ds.video.track_colour import TrackColour, track_colour
+from mp4ds.video.mp4 import SampleEntry, TrackColour, read_sample_entry, track_colour
 from test_access import opened
 from test_references import FRAMES, HEIGHT, RECIPES, WIDTH, encoded_file
 

@@ -23,16 +23,16 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from conftest import real
 from each import each
 from mp4ds import yamlio
-from mp4ds.bags import open_reader
-from mp4ds.records import Channel, Message, Schema
-from mp4ds.sidecar.manifest import StaticTransform
-from mp4ds.wire import WireError
-from mp4ds.wire.transforms import (
+from mp4ds.bags.formats import open_reader
+from mp4ds.format.manifest import StaticTransform
+from mp4ds.messages.transforms import (
     MAX_TRANSFORMS,
     Transform,
     TransformCollector,
     transform_parser,
 )
+from mp4ds.messages.wire import WireError
+from mp4ds.records import Channel, Message, Schema
 
 Vector = tuple[float, float, float]
 Rotation = tuple[float, float, float, float]
@@ -391,7 +391,7 @@ def test_without_protobuf_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> Any:
         raise ImportError(name)
 
-    monkeypatch.setattr("mp4ds.wire.transforms.import_module", missing)
+    monkeypatch.setattr("mp4ds.messages.transforms.import_module", missing)
     with pytest.raises(WireError, match="protobuf is not installed"):
         transform_parser(PROTOBUF)
     collector = TransformCollector()

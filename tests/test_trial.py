@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 import mp4ds
 from each import each
-from mp4ds.errors import OptionError
-from mp4ds.layouts import ENCODINGS, MAX_SIDE, bind, fit
-from mp4ds.packing import PackOptions
-from mp4ds.video import Recipe, VideoEncoder, choose, recipe_for
-from mp4ds.video.codecs import lossless_codecs
-from mp4ds.video.encoder import EncoderRefusedError, open_encoder
-from mp4ds.video.trial import NEAR, Choice, estimate
+from mp4ds.errors import EncoderRefusedError, OptionError
+from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE
+from mp4ds.messages.layouts import bind, fit
+from mp4ds.packing.options import PackOptions
+from mp4ds.video.codecs import Recipe, lossless_codecs, recipe_for
+from mp4ds.video.encoder import VideoEncoder, open_encoder
+from mp4ds.video.trial import NEAR, Choice, choose, estimate
 from pictures import picture
 from pixel_kinds import as_message, rounded
 from round_trips import unpacked

@@ -26,8 +26,8 @@ import pytest
 import typer
 
 from each import each
-from mp4ds.cli import app
-from mp4ds.cli.arguments import spelled
+from mp4ds.cli import app_for
+from mp4ds.cli.options import spelled
 from test_examples import ROOT
 from waiting import WATCHDOG_S
 
@@ -96,7 +96,7 @@ def call(arguments: list[str]) -> Done:
     code = 0
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
         try:
-            app(args=arguments)
+            app_for()(args=arguments)
         except SystemExit as ended:
             code = int(ended.code or 0)
     return Done(code, printed.getvalue())
@@ -165,7 +165,7 @@ def test_there_are_tutorials_and_they_run_something() -> None:
 
 @cache
 def options_of(command: str) -> set[str]:
-    group = typer.main.get_command(app)
+    group = typer.main.get_command(app_for())
     assert hasattr(group, "commands")
     known = group.commands[command]
     below = getattr(known, "commands", {}).values()
@@ -201,7 +201,7 @@ def test_every_option_that_a_page_names_is_there(page: Path) -> None:
 def test_every_option_is_told_on_some_page() -> None:
     pages = [ROOT / "README.md", *DOCS.rglob("*.md")]
     text = "\n".join(page.read_text() for page in pages)
-    group = typer.main.get_command(app)
+    group = typer.main.get_command(app_for())
     assert hasattr(group, "commands")
     for name, command in group.commands.items():
         for option in command.params:

@@ -16,7 +16,7 @@ from PIL import Image
 
 import mp4ds
 from in_parts import InlineEngine, facts
-from mp4ds.cli import app
+from mp4ds.cli import app_for
 from mp4ds.errors import (
     OptionError,
     PartsFailedError,
@@ -25,10 +25,11 @@ from mp4ds.errors import (
     TargetError,
     TargetExistsError,
 )
-from mp4ds.packing import PackOptions, PackProgress, pack_each, pack_share
-from mp4ds.remote import RemotePath
-from mp4ds.unpacking import UnpackOptions
-from mp4ds.uploads import local_path
+from mp4ds.files.uploads import local_path
+from mp4ds.files.urls import RemotePath
+from mp4ds.packing.options import PackOptions, PackProgress
+from mp4ds.packing.pack import pack_each, pack_share
+from mp4ds.unpacking.unpack import UnpackOptions
 from remote_servers import Request, Server
 from remote_stores import Put, folder_url, put, s3, s3_running, stores
 from round_trips import TARGETS, Compare
@@ -98,7 +99,7 @@ def test_a_pack_is_uploaded_the_manifest_last(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     engine = InlineEngine()
-    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: engine)
+    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: engine)
     url = f"{folder_url}/drive"
     told: list[PackProgress] = []
     summary = mp4ds.pack(source, url, replace(FAST, window=window), progress=told.append)
@@ -217,7 +218,7 @@ def test_what_is_uploaded_is_counted(
     def short(self: Any, local: Path, path: Any) -> None:
         self._fs.pipe_file(path.url, local.read_bytes()[:-1])
 
-    monkeypatch.setattr("mp4ds.remote.store.Store.put", short)
+    monkeypatch.setattr("mp4ds.files.store.Store.put", short)
     with pytest.raises(RemoteError, match=r"could not be uploaded: \d+ of \d+ bytes are there"):
         mp4ds.pack(source, f"{folder_url}/drive", FAST)
 
@@ -229,7 +230,7 @@ def test_a_store_that_refuses_is_told_before_the_work(
     staging: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("mp4ds.packing._plan", None)
+    monkeypatch.setattr("mp4ds.packing.pack._plan", None)
     s3.fails = lambda heard: 403 if heard.method == "PUT" else None
     with pytest.raises(TargetError, match=r"cannot be uploaded: access is refused"):
         mp4ds.pack(source, f"{folder_url}/drive", FAST)
@@ -266,13 +267,13 @@ def test_a_divided_pack_goes_on(
 ) -> None:
     url, options = f"{folder_url}/drive", replace(FAST, window=3)
     failing = InlineEngine(lambda task: task == "00001-0")
-    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: failing)
+    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: failing)
     with pytest.raises(PartsFailedError):
         mp4ds.pack(source, url, options)
     assert there(stores, url) == set()
     assert any("00000-0" in name for name in left(staging))
     going_on = InlineEngine()
-    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: going_on)
+    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: going_on)
     mp4ds.pack(source, url, options)
     assert "00000-0" not in going_on.ran
     assert left(staging) == []
@@ -289,7 +290,7 @@ def test_shares_meet_in_the_temporary_folder(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     url, options = f"{folder_url}/drive", replace(FAST, window=3)
-    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: InlineEngine())
+    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: InlineEngine())
     for number in (1, 2):
         pack_share(source, url, (number, 2), options)
     mp4ds.pack(source, url, replace(options, join=True))
@@ -416,7 +417,7 @@ def test_the_command_line(source: Path, folder_url: str, put: Put, s3: Server) -
     from typer.testing import CliRunner
 
     def run(*arguments: str) -> Any:
-        result = CliRunner().invoke(app, [*arguments, "--json"])
+        result = CliRunner().invoke(app_for(), [*arguments, "--json"])
         assert result.exit_code == 0, result.output
         return json.loads(result.stdout)
 

@@ -25,9 +25,9 @@ from rosbags.typesys import Stores, get_typestore
 
 import mp4ds
 from each import each
-from mp4ds.info import info
-from mp4ds.sidecar.migrate import migrate
-from mp4ds.stamps import decode_column
+from mp4ds.format.sidecars import migrate
+from mp4ds.plugins.info import info
+from mp4ds.times import decode_column
 
 steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 

@@ -22,21 +22,15 @@ from PIL import Image
 
 from coded_tools import jpeg
 from each import each
-from mp4ds.coded import Refused
-from mp4ds.errors import OptionError, VideoError
-from mp4ds.layouts import CHROMA_SHIFTS, ENCODINGS, bind, fit, layout_for
-from mp4ds.video import (
-    ImageFile,
-    Recipe,
-    VideoDecoder,
-    VideoEncoder,
-    check_codec,
-    recipe_for,
-    tool_versions,
-)
-from mp4ds.video.codecs import lossless_codecs
-from mp4ds.video.encoder import EncoderRefusedError
-from mp4ds.video.jpeg import jpeg_pixels
+from mp4ds.errors import EncoderRefusedError, OptionError, VideoError
+from mp4ds.messages.arrangements import CHROMA_SHIFTS
+from mp4ds.messages.coded import Refused
+from mp4ds.messages.encodings import ENCODINGS
+from mp4ds.messages.layouts import bind, fit, layout_for
+from mp4ds.video.codecs import Recipe, check_codec, lossless_codecs, recipe_for
+from mp4ds.video.decoder import VideoDecoder, jpeg_pixels
+from mp4ds.video.encoder import VideoEncoder, tool_versions
+from mp4ds.video.images import ImageFile
 from mp4ds.video.planes import PlaneMaker
 from pictures import BAYER, picture
 from pixel_kinds import KINDS, PAIRS, as_message, bits_of, rounded, suited, values

@@ -15,10 +15,10 @@ from coded_scenes import CODED
 from each import each, fresh
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from in_parts import InlineEngine, facts, leftovers
-from mp4ds.demo import demo
 from mp4ds.errors import OptionError
-from mp4ds.packing import PackOptions
+from mp4ds.packing.options import PackOptions
 from mp4ds.packing.planning import TASK_BYTES
+from mp4ds.plugins.demo import demo
 from pictures import ENCODINGS, picture
 from round_trips import Compare, own_target, unpacked
 from scenes import Scene
@@ -36,7 +36,7 @@ ONE_ENCODER = TASK_BYTES + 40 * 2**20
 @fresh
 def engine(monkeypatch: pytest.MonkeyPatch) -> InlineEngine:
     inline = InlineEngine()
-    monkeypatch.setattr("mp4ds.packing._engine", lambda *_: inline)
+    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: inline)
     return inline
 
 
@@ -163,7 +163,7 @@ def test_memory_for_less_than_one_encoder_is_refused(
 ) -> None:
     monkeypatch.undo()  # the engine is to be the usual one
     demo(tmp_path / "drive.bag", seconds=3)
-    with pytest.raises(OptionError, match=r"--memory of 50 MiB is too little: one encoder"):
+    with pytest.raises(OptionError, match=r"`memory` of 50 MiB is too little: one encoder"):
         mp4ds.pack(
             tmp_path / "drive.bag", tmp_path / "d", PackOptions(window=15, memory=50 * 2**20)
         )

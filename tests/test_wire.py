@@ -13,18 +13,18 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from each import each
-from mp4ds.wire import (
+from mp4ds.messages.serializations import form_of, wire_of
+from mp4ds.messages.wire import (
+    MAX_BLANK,
     CalibrationFields,
     Form,
     ImageFields,
     Parts,
     Slots,
     WireError,
-    form_of,
+    join_stamp,
     prove,
-    wire_of,
 )
-from mp4ds.wire.forms import MAX_BLANK, join_stamp
 from sources import IMAGE, INFO, build, image_cdr, image_ros1, typestore
 
 steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])

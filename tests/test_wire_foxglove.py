@@ -22,7 +22,8 @@ import mp4ds
 from conftest import real
 from each import each
 from foxglove_wire import SERIALIZATIONS, message_class
-from mp4ds.wire.forms import (
+from mp4ds.messages.protobuf import TYPES, ProtobufForm
+from mp4ds.messages.wire import (
     MAX_BLANK,
     CalibrationFields,
     CodedFields,
@@ -34,8 +35,6 @@ from mp4ds.wire.forms import (
     WireError,
     prove,
 )
-from mp4ds.wire.foxglove import TYPES
-from mp4ds.wire.protobuf import ProtobufForm
 from round_trips import Compare
 from scenes import Record
 

@@ -98,6 +98,12 @@ def problems(dataset: Path) -> list[str]:
     return [problem.code for problem in found if problem.place and problem.message]
 
 
+def page(dataset: Path) -> Path:
+    """A page of a dataset."""
+    found: mp4ds.ReportSummary = mp4ds.report(dataset, mp4ds.ReportOptions(proxies="none"))
+    return found.index
+
+
 def brightness(path: str) -> list[tuple[int, float]]:
     """Stamp and mean of every frame of the first stream."""
     with mp4ds.open(path) as dataset:

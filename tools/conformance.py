@@ -26,10 +26,12 @@ from conformance_files import REFUSED_BY_READERS, VALID, Document, part_of
 from conformance_invalid import INVALID
 from conformance_recordings import RECORDINGS, ROOT, chosen_layouts, recording_of
 from mp4ds import yamlio
-from mp4ds.conformance import as_json, conformance_dump
-from mp4ds.packing import PackOptions, pack
-from mp4ds.sidecar import FORMAT_VERSION, MANIFEST_NAME
-from mp4ds.streams import Stream
+from mp4ds.dataset.stream import Stream
+from mp4ds.format.fields import FORMAT_VERSION
+from mp4ds.format.sidecars import MANIFEST_NAME
+from mp4ds.packing.options import PackOptions
+from mp4ds.packing.pack import pack
+from mp4ds.plugins.conformance import as_json, conformance_dump
 
 CASES = ROOT / "conformance" / "cases"
 LIST = "cases.json"

@@ -20,9 +20,11 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from coded_scenes import CODED  # noqa: E402
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES  # noqa: E402
-from mp4ds.layouts import Encoding, Parameters, Pixels, bind, fit  # noqa: E402
-from mp4ds.streams import planning  # noqa: E402
-from mp4ds.video import Choice, recipe_for  # noqa: E402
+from mp4ds.messages.encodings import Encoding, Parameters, Pixels  # noqa: E402
+from mp4ds.messages.layouts import bind, fit  # noqa: E402
+from mp4ds.packing import tracks  # noqa: E402
+from mp4ds.video.codecs import recipe_for  # noqa: E402
+from mp4ds.video.trial import Choice  # noqa: E402
 from pictures import picture  # noqa: E402
 from scenes import IMAGE, PERIOD, START, Record, Scene, image_cdr, odd_scene, scene  # noqa: E402
 from sources import SOURCES  # noqa: E402
@@ -73,12 +75,12 @@ def chosen_layouts(wanted: Mapping[tuple[str, int], Wanted]) -> Iterator[None]:
         recipe = recipe_for(layout.pixel_format, lossless=True, codec=codec)
         return Choice(name, layout.parameters, recipe, bytes_per_frame=0)
 
-    before = planning.choose
-    planning.choose = choose  # type: ignore[assignment]
+    before = tracks.choose
+    tracks.choose = choose  # type: ignore[assignment]
     try:
         yield
     finally:
-        planning.choose = before
+        tracks.choose = before
 
 
 # ---------------------------------------------------------------- every layout

@@ -16,8 +16,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mp4ds.sidecar.fields import FORMAT_VERSION
-from mp4ds.sidecar.io import generate_schema
+from mp4ds.format.fields import FORMAT_VERSION
+from mp4ds.format.sidecars import generate_schema
 
 ROOT = Path(__file__).resolve().parents[1]
 KINDS = ("stream", "dataset")

@@ -7,6 +7,7 @@ The public surface, and nothing else::
     mp4ds.import_ros_mp4("a.mp4", "a.yaml", "a")   a dataset of the paper's tool as it is
     mp4ds.export("drive", "euroc", "for_slam")  EuRoC, TUM, KITTI, COLMAP, Rerun, LeRobot
     mp4ds.evaluate("drive.bag").recommended     encoder settings, tried on clips of its cameras
+    mp4ds.report("drive")                       a page of its cameras, times and calibrations
     mp4ds.play("drive")                         as if it were the recording: ROS 1, ROS 2, Foxglove
     mp4ds.validate("drive", deep=True)          every problem, or an empty list
     mp4ds.open("drive")["/camera/image_raw"][7].data
@@ -25,19 +26,29 @@ TYPE_CHECKING = False  # without typing, whose import costs more than all of thi
 if TYPE_CHECKING:
     from typing import Any
 
-    from mp4ds.checks import Problem, validate
-    from mp4ds.dataset import Dataset
-    from mp4ds.dataset import open_dataset as open
+    from mp4ds.dataset.checks import Problem, validate
+    from mp4ds.dataset.dataset import Dataset
+    from mp4ds.dataset.dataset import open_dataset as open
+    from mp4ds.dataset.frames import Frame, Frames, Video
+    from mp4ds.dataset.messages import RecordedMessage
+    from mp4ds.dataset.stream import Stream
+    from mp4ds.dataset.topic_frames import TopicFrames
     from mp4ds.errors import (
         ClusterError,
         ConversionError,
+        EncoderRefusedError,
         FormatError,
         FrameNotFoundError,
+        HardwareError,
         Mp4dsError,
         OptionError,
+        OutOfReachError,
         PartsFailedError,
         PublishError,
         RemoteError,
+        SampleError,
+        ScoringError,
+        SegmentsDifferError,
         SourceError,
         SourceNotFoundError,
         TargetError,
@@ -46,54 +57,72 @@ if TYPE_CHECKING:
         VideoError,
         WriteError,
     )
-    from mp4ds.evaluating import EvaluateOptions, Evaluation, evaluate
-    from mp4ds.exporting import ExportOptions, ExportSummary, export
-    from mp4ds.importing import ImageFolder
-    from mp4ds.packing import PackOptions, PackSummary, pack, pack_each, pack_share
-    from mp4ds.packing.ros_mp4 import import_ros_mp4
-    from mp4ds.playing import PlayOptions, PlaySummary, play
-    from mp4ds.recorded import RecordedMessage
-    from mp4ds.streams import Frame, Frames, Stream, TopicFrames, Video
-    from mp4ds.sync import Sync
-    from mp4ds.unpacking import UnpackOptions, UnpackSummary, unpack
+    from mp4ds.packing.options import ImageFolder, PackOptions, PackSummary
+    from mp4ds.packing.pack import pack, pack_each, pack_share
+    from mp4ds.plugins.evaluating.evaluate import evaluate
+    from mp4ds.plugins.evaluating.options import EvaluateOptions
+    from mp4ds.plugins.evaluating.results import Evaluation
+    from mp4ds.plugins.exporting.export import export
+    from mp4ds.plugins.exporting.job import ExportOptions, ExportSummary
+    from mp4ds.plugins.importing.ros_mp4 import import_ros_mp4
+    from mp4ds.plugins.playing.play import PlayOptions, play
+    from mp4ds.plugins.playing.player import PlaySummary
+    from mp4ds.plugins.reporting.report import ReportOptions, ReportSummary, report
+    from mp4ds.times import Sync
+    from mp4ds.unpacking.unpack import UnpackOptions, UnpackSummary, unpack
 
 _HOMES = {
-    "checks": ("Problem", "validate"),
-    "dataset": ("Dataset",),
-    "errors": (
-        "ClusterError",
-        "ConversionError",
-        "FormatError",
-        "FrameNotFoundError",
-        "Mp4dsError",
-        "OptionError",
-        "PartsFailedError",
-        "PublishError",
-        "RemoteError",
-        "SourceError",
-        "SourceNotFoundError",
-        "TargetError",
-        "TargetExistsError",
-        "VersionError",
-        "VideoError",
-        "WriteError",
+    "dataset.checks": (
+        "Problem",
+        "validate",
     ),
-    "importing": ("ImageFolder",),
-    "packing": ("PackOptions", "PackSummary", "pack", "pack_each", "pack_share"),
-    "packing.ros_mp4": ("import_ros_mp4",),
-    "evaluating": ("EvaluateOptions", "Evaluation", "evaluate"),
-    "exporting": ("ExportOptions", "ExportSummary", "export"),
-    "playing": ("PlayOptions", "PlaySummary", "play"),
-    "recorded": ("RecordedMessage",),
-    "streams": ("Frame", "Frames", "Stream", "TopicFrames", "Video"),
-    "sync": ("Sync",),
-    "unpacking": ("UnpackOptions", "UnpackSummary", "unpack"),
+    "dataset.dataset": ("Dataset",),
+    "dataset.frames": (
+        "Frame",
+        "Frames",
+        "Video",
+    ),
+    "dataset.messages": ("RecordedMessage",),
+    "dataset.stream": ("Stream",),
+    "dataset.topic_frames": ("TopicFrames",),
+    "packing.options": (
+        "ImageFolder",
+        "PackOptions",
+        "PackSummary",
+    ),
+    "packing.pack": (
+        "pack",
+        "pack_each",
+        "pack_share",
+    ),
+    "plugins.evaluating.evaluate": ("evaluate",),
+    "plugins.evaluating.options": ("EvaluateOptions",),
+    "plugins.evaluating.results": ("Evaluation",),
+    "plugins.exporting.export": ("export",),
+    "plugins.exporting.job": (
+        "ExportOptions",
+        "ExportSummary",
+    ),
+    "plugins.importing.ros_mp4": ("import_ros_mp4",),
+    "plugins.playing.play": (
+        "PlayOptions",
+        "play",
+    ),
+    "plugins.playing.player": ("PlaySummary",),
+    "plugins.reporting.report": ("ReportOptions", "ReportSummary", "report"),
+    "times": ("Sync",),
+    "unpacking.unpack": (
+        "UnpackOptions",
+        "UnpackSummary",
+        "unpack",
+    ),
 }
 
 __all__ = [
     "ClusterError",
     "ConversionError",
     "Dataset",
+    "EncoderRefusedError",
     "EvaluateOptions",
     "Evaluation",
     "ExportOptions",
@@ -102,9 +131,11 @@ __all__ = [
     "Frame",
     "FrameNotFoundError",
     "Frames",
+    "HardwareError",
     "ImageFolder",
     "Mp4dsError",
     "OptionError",
+    "OutOfReachError",
     "PackOptions",
     "PackSummary",
     "PartsFailedError",
@@ -114,6 +145,11 @@ __all__ = [
     "PublishError",
     "RecordedMessage",
     "RemoteError",
+    "ReportOptions",
+    "ReportSummary",
+    "SampleError",
+    "ScoringError",
+    "SegmentsDifferError",
     "SourceError",
     "SourceNotFoundError",
     "Stream",
@@ -136,6 +172,7 @@ __all__ = [
     "pack_each",
     "pack_share",
     "play",
+    "report",
     "unpack",
     "validate",
 ]
@@ -143,7 +180,9 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "open":
-        return import_module("mp4ds.dataset").open_dataset
+        return import_module("mp4ds.dataset.dataset").open_dataset
+    if name.endswith("Error") and name in __all__:
+        return getattr(import_module("mp4ds.errors"), name)
     for module, names in _HOMES.items():
         if name in names:
             return getattr(import_module(f"mp4ds.{module}"), name)

@@ -15,6 +15,12 @@
     ├── ConversionError (ValueError)   1  a message that the target cannot hold
     ├── WriteError (OSError)           1  the disk refused while writing
     ├── PartsFailedError               1  parts of a pack failed, the others are kept
+    ├── EncoderRefusedError            1  pictures that an encoder does not take
+    ├── HardwareError                  1  an encoder of the hardware that is not there, or failed
+    ├── OutOfReachError                1  a score that a stream cannot have
+    ├── SegmentsDifferError            1  videos that cannot be joined
+    ├── ScoringError                   1  an ffmpeg with libvmaf that is not there, or failed
+    ├── SampleError (RuntimeError)     1  a sample of a data loader that cannot be read
     ├── ClusterError (ConnectionError) 1  a cluster that does not answer, or was lost
     ├── RemoteError                    1  a store or web server that fails
     └── PublishError (OSError)         1  ROS or another receiver that is not there, or was lost
@@ -102,7 +108,7 @@ class TargetExistsError(TargetError, FileExistsError):
     """The output exists and ``force`` was not given."""
 
     def __init__(self, path: Path | str) -> None:
-        super().__init__(path, "exists already", "Choose another name, or replace it with --force.")
+        super().__init__(path, "exists already", "Choose another name, or replace it with `force`.")
 
 
 class OptionError(Mp4dsError, ValueError):
@@ -253,3 +259,65 @@ class PublishError(Mp4dsError, OSError):
     def __init__(self, where: str, problem: str) -> None:
         self.where = where
         super().__init__(f"{where}: {problem}.")
+
+
+class ScoringError(Mp4dsError):
+    """Frames cannot be scored: libvmaf is missing or failed, or the frames do not match."""
+
+
+class SampleError(Mp4dsError, RuntimeError):
+    """Frames of a sample cannot be read; says of which dataset and topic, and which frame.
+
+    A DataLoader makes an error of a worker again in the main process, from its text alone. So
+    this one has nothing but its text, and is the same with and without workers.
+    """
+
+
+class OutOfReachError(Mp4dsError):
+    """A stream that was begun cannot have the score that was asked for.
+
+    Args:
+        topic: Of its messages.
+        stream: What tells it from the others of a pack.
+        reason: What was tried.
+    """
+
+    def __init__(self, topic: str, stream: Any, reason: str) -> None:
+        self.stream, self.reason = stream, reason
+        super().__init__(f"{topic}: {reason}. Ask for less, or pack it with `quality` lossless.")
+
+
+class SegmentsDifferError(Mp4dsError):
+    """Videos that cannot be one: their track could not describe the packets of both.
+
+    Args:
+        first: The segment that the others are compared with.
+        other: The segment that differs from it.
+        differences: What differs, and how.
+    """
+
+    def __init__(self, first: Path, other: Path, differences: str) -> None:
+        self.first, self.other = first, other
+        super().__init__(
+            f"{other}: cannot be joined to {first}, since they differ in {differences}. "
+            "Encode both with the same options, or keep them as two streams."
+        )
+
+
+class HardwareError(Mp4dsError):
+    """An encoder of the hardware cannot be used here.
+
+    Args:
+        name: As ``--codec`` has it.
+        problem: What was tried, and why it failed, without a full stop.
+        remedy: What the user can do, without a full stop.
+        instead: The codec that needs no hardware.
+    """
+
+    def __init__(self, name: str, problem: str, remedy: str, instead: str) -> None:
+        self.name = name
+        super().__init__(f"`codec` {name}: {problem}. {remedy}; `codec` {instead} needs no device.")
+
+
+class EncoderRefusedError(Mp4dsError):
+    """The encoder does not take pictures of this kind or size; the message says why."""

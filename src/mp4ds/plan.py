@@ -39,7 +39,7 @@ _BOUNDS = {"vmaf": 100.0, "psnr": 60.0, "ssim": 1.0}  # of PSNR, dB: identical p
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class QualityTarget:
     """The score that packed frames are to have.
 
     Attributes:
@@ -60,7 +60,7 @@ class Target:
 
 
 @dataclass(frozen=True, slots=True)
-class Quality:
+class QualitySetting:
     """What ``--quality`` asked for.
 
     Attributes:
@@ -71,7 +71,7 @@ class Quality:
 
     name: str
     crf: int | None = None
-    target: Target | None = None
+    target: QualityTarget | None = None
 
     @property
     def lossless(self) -> bool:
@@ -84,24 +84,24 @@ class Quality:
         return self.name if self.crf is None else f"crf={self.crf}"
 
 
-def parse_quality(text: str) -> Quality:
+def parse_quality(text: str) -> QualitySetting:
     """Parse ``lossless``, ``visual``, ``crf=N``, ``vmaf=SCORE``, ``psnr=DB`` or ``ssim=SCORE``.
 
     Raises:
         OptionError: Anything else.
     """
     if text in ("lossless", "visual"):
-        return Quality(text)
+        return QualitySetting(text)
     match = re.fullmatch(r"crf=([0-9]{1,2})", text)
     if match and int(match.group(1)) <= 63:
-        return Quality("crf", int(match.group(1)))
+        return QualitySetting("crf", int(match.group(1)))
     match = re.fullmatch(r"(vmaf|psnr|ssim)=([0-9]{1,3}(?:\.[0-9]{1,4})?)", text)
     if match:
-        target = Target(match.group(1), float(match.group(2)))
+        target = QualityTarget(match.group(1), float(match.group(2)))
         if 0 < target.score < _BOUNDS[target.metric]:
-            return Quality("target", target=target)
+            return QualitySetting("target", target=target)
     raise OptionError(
-        f"--quality {text!r} is not known. Use lossless, visual, crf=N with N from 0 to 63, or a "
+        f"`quality` {text!r} is not known. Use lossless, visual, crf=N with N from 0 to 63, or a "
         "score to reach: vmaf=99.5 (below 100), psnr=42 (dB, below 60) or ssim=0.98 (below 1)."
     )
 
@@ -142,12 +142,12 @@ class Selection:
             OptionError: Names the pattern and the topics there are.
         """
         known = sorted(set(topics))
-        for option, patterns in (("--topics", self._topics), ("--exclude", self._exclude)):
+        for option, patterns in (("topics", self._topics), ("exclude", self._exclude)):
             for pattern in patterns:
                 if not any(_matches(topic, (pattern,)) for topic in known):
                     listed = ", ".join(known[:20]) + (", ..." if len(known) > 20 else "")
                     raise OptionError(
-                        f"{option} {pattern!r} matches no topic. There are: {listed or 'none'}."
+                        f"`{option}` {pattern!r} matches no topic. There are: {listed or 'none'}."
                     )
 
 

@@ -1,29 +1,29 @@
-"""Converts channels and messages between ROS 1 and ROS 2.
-
-Payloads are converted byte by byte (rosbags' ros1_to_cdr and cdr_to_ros1): both worlds
-serialise the same values in the same order, but for the header's sequence number, which only
-ROS 1 has. Definitions become the standard ones of the target where these serialise alike.
-"""
+"""Converts channels and messages between ROS 1 and ROS 2; standard definitions of either."""
 
 from __future__ import annotations
 
 import base64
 import re
+import struct
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, is_dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.msg import denormalize_msgtype, normalize_msgtype
 from rosbags.typesys.store import Typestore
 
-from mp4ds.bags.convert_times import Where, time_beyond, where_times_are
-from mp4ds.bags.typedefs import (
+from mp4ds.bags.types import (
     BAD_DEFINITION,
     BAD_PAYLOAD,
+    BUILTIN,
     HEADER,
     MAX_TAIL,
+    field_shape,
     fields_of,
     make_store,
     ros1_world,
@@ -37,6 +37,65 @@ from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import Typesdict
+
+TIME = BUILTIN[0]
+Where = Literal["nowhere", "header", "anywhere"]
+
+
+def where_times_are(types: Typesdict, name: str) -> Where:
+    """Whether messages of a type have times: none, one in the header they begin with, or others."""
+
+    def has_time(part: str) -> bool:
+        return part == TIME or any(has_time(inner) for _, inner, _ in _parts(types, part))
+
+    parts = _parts(types, name)
+    is_headed = bool(parts) and parts[0] == (0, HEADER, False)
+    others = name == TIME or any(has_time(part) for _, part, _ in parts[is_headed:])
+    return "anywhere" if others else "header" if is_headed else "nowhere"
+
+
+def _parts(types: Typesdict, name: str) -> list[tuple[int, str, bool]]:
+    """Of the fields that are messages: place, type, and whether they are several."""
+    shapes = [field_shape(desc) for _, desc in fields_of(types, name)]
+    return [
+        (place, shape.message, shape.length is not None or shape.bound is not None)
+        for place, shape in enumerate(shapes)
+        if shape.message
+    ]
+
+
+def time_beyond(where: Where, data: bytes | memoryview, name: str, store: Typestore) -> int | None:
+    """Seconds of a time in a message that only ROS 2 takes for negative; None where there is none.
+
+    Args:
+        where: From `where_times_are`.
+        data: The message in little-endian CDR.
+        name: Its type.
+        store: What parses it.
+    """
+    if where == "nowhere":
+        return None
+    if where == "header":
+        seconds = struct.unpack_from("<i", data, 4)[0]
+        return int(seconds) if seconds < 0 else None
+    words = np.frombuffer(data, "<i4", count=len(data) // 4)
+    if not (words < 0).any():  # as CDR has them: at multiples of four
+        return None
+    return next((sec for sec in _seconds(store.deserialize_cdr(data, name)) if sec < 0), None)
+
+
+def _seconds(value: Any) -> Iterator[int]:
+    if is_dataclass(value):
+        if getattr(value, "__msgtype__", "") == TIME:
+            yield int(getattr(value, "sec"))  # noqa: B009 - of rosbags' making
+        for name in value.__dataclass_fields__:
+            yield from _seconds(getattr(value, name))
+    elif isinstance(value, list):
+        for item in value:
+            yield from _seconds(item)
+
+
+# ---------------------------------------------------------------- convert
 
 LATCHED_QOS = """\
 - history: 1
@@ -58,9 +117,9 @@ LATCHED_QOS = """\
 
 _ROS1 = "ros1:"  # begins the keys that keep a ROS 1 connection header in ROS 2 metadata
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
-_REMEDY = "Exclude the topic with --exclude, or unpack to mcap, which keeps it as it is."
+_REMEDY = "Exclude the topic with `exclude`, or unpack to mcap, which keeps it as it is."
 
-_KEPT_AS_IT_IS = "Unpack to mcap, which keeps it as it is, or exclude the topic with --exclude."
+_KEPT_AS_IT_IS = "Unpack to mcap, which keeps it as it is, or exclude the topic with `exclude`."
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,3 +349,64 @@ def _end(plan: _Plan, raw: memoryview, *, to_ros1: bool) -> int:
     if to_ros1:
         return 4 + definition.getsize_cdr_to_ros1(raw[4:], 0, None, 0, plan.store)[0]
     return definition.getsize_ros1_to_cdr(raw, 0, None, 0, plan.store)[0]
+
+
+# ---------------------------------------------------------------- standard definitions
+
+
+def ros1_channel(channel_id: int, topic: str, type_name: str, callerid: str) -> Channel:
+    """A channel of a standard ROS 1 type, with its definition and md5sum.
+
+    Args:
+        channel_id: Unique in the recording.
+        topic: Topic name.
+        type_name: Such as ``sensor_msgs/Image``.
+        callerid: Name of the publishing node.
+    """
+    package, name = type_name.split("/")
+    definition, md5sum = _store().generate_msgdef(f"{package}/msg/{name}", ros_version=1)
+    return Channel(
+        channel_id,
+        topic,
+        "ros1",
+        Schema(type_name, "ros1msg", definition.encode()),
+        {"md5sum": md5sum, "callerid": callerid},
+    )
+
+
+def ros2_channel(channel_id: int, topic: str, type_name: str) -> Channel:
+    """A channel of a standard ROS 2 type, with its definition and type hash.
+
+    Args:
+        channel_id: Unique in the recording.
+        topic: Topic name.
+        type_name: Such as ``sensor_msgs/msg/Image``.
+    """
+    store = _ros2_store()
+    definition, _ = store.generate_msgdef(type_name, ros_version=2)
+    return Channel(
+        channel_id,
+        topic,
+        "cdr",
+        Schema(type_name, "ros2msg", definition.encode()),
+        {QOS_KEY: "", HASH_KEY: store.hash_rihs01(type_name)},
+    )
+
+
+def latched(channel: Channel) -> Channel:
+    """The same ROS 2 channel, which gives those that subscribe late its last message."""
+    return replace(channel, metadata={**channel.metadata, QOS_KEY: LATCHED_QOS})
+
+
+@lru_cache(maxsize=1)
+def _ros2_store() -> Typestore:
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+@lru_cache(maxsize=1)
+def _store() -> Typestore:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(
+        get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
+    )
+    return store

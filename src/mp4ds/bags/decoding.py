@@ -8,20 +8,20 @@ from typing import Any
 
 from rosbags.typesys.msg import normalize_msgtype
 
-from mp4ds.bags.type_sizes import has_empty_items, sizes_of
-from mp4ds.bags.typedefs import (
+from mp4ds.bags.types import (
     BAD_DEFINITION,
     BAD_PAYLOAD,
     MAX_TAIL,
+    has_empty_items,
     make_store,
     ros1_world,
     ros2_world,
+    sizes_of,
     types_of,
 )
 from mp4ds.errors import OptionError
+from mp4ds.messages.wire import WireError
 from mp4ds.records import Channel
-from mp4ds.wire import WireError
-from mp4ds.wire.protobuf_objects import protobuf_decoder
 
 Decoder = Callable[[memoryview], Any]
 """Makes an object of a payload.
@@ -122,3 +122,51 @@ _DECODERS: Mapping[str, Callable[[Channel], Decoder]] = {
     "json": _json,
     "protobuf": _protobuf,
 }
+
+
+def protobuf_decoder(type_name: str, schema: bytes) -> Callable[[bytes], Any]:
+    """What makes an object of a serialized message; it raises WireError for what is none.
+
+    Args:
+        type_name: Full name of the message's type.
+        schema: A serialized FileDescriptorSet that declares it and all that it refers to.
+
+    Raises:
+        WireError: It does not.
+    """
+    # only recordings with protobuf need it
+    from google.protobuf.message import DecodeError
+
+    try:
+        message_class = _message_class(type_name, schema)
+    except (DecodeError, LookupError, ValueError, TypeError, RecursionError):
+        raise WireError(f"its schema does not declare {type_name}") from None
+
+    def decode(data: bytes) -> Any:
+        try:
+            return message_class.FromString(data)
+        except (DecodeError, ValueError):  # the latter by protobuf's pure Python
+            raise WireError(f"it is no {type_name}") from None
+
+    return decode
+
+
+def _message_class(type_name: str, schema: bytes) -> Any:
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.descriptor_pool import DescriptorPool
+    from google.protobuf.message_factory import GetMessageClass
+
+    waiting = {file.name: file for file in FileDescriptorSet.FromString(schema).file}
+    pool = DescriptorPool()
+
+    def add(name: str) -> None:
+        """A file after those that it imports."""
+        file = waiting.pop(name, None)
+        if file is not None:
+            for dependency in file.dependency:
+                add(dependency)
+            pool.Add(file)
+
+    while waiting:
+        add(next(iter(waiting)))
+    return GetMessageClass(pool.FindMessageTypeByName(type_name))

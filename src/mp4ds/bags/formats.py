@@ -1,21 +1,268 @@
-"""The table of recording formats, and how a path tells which one it is."""
+"""The table of recording formats, several recordings read as one, and their digests."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, overload
+from typing import TYPE_CHECKING, BinaryIO, Literal, overload
 
-from mp4ds.bags.protocols import BagReader, BagWriter
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.bags.protocols import BagReader, BagWriter, SourcePart, merged
 from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
-from mp4ds.owned import begins_with
-from mp4ds.records import Channel, Message
-from mp4ds.remote import remote
-from mp4ds.source_files import HOW_TO_OPEN, video_at
+from mp4ds.files.outputs import begins_with
+from mp4ds.files.sources import (
+    HOW_TO_OPEN,
+    is_folder,
+    source_digest,
+    source_name,
+    source_size,
+    video_at,
+)
+from mp4ds.files.urls import remote
+from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Record, Schema
 
 if TYPE_CHECKING:
-    from mp4ds.bags.salvage.reader import Salvage, SalvageReader
+    from mp4ds.bags.salvage.losses import Salvage, SalvageReader
+
+_BLOCK = 2**20
+
+
+class SourceHasher:
+    """SHA-256 of the source files, taken while they are read, behind the reader.
+
+    The bytes are then still in the system's cache: the disk is read once. A folder is hashed when
+    the reader is past its bytes. A context manager.
+
+    Args:
+        path: The recording; a folder's name is put before those of its files.
+        files: All files, in reading order.
+    """
+
+    def __init__(self, path: Path, files: Sequence[Path]) -> None:
+        self._folder = path if path.is_dir() else None
+        self._files = list(files)
+        self._sizes = {path: source_size(path) for path in files if is_folder(path)}
+        self._position = 0
+        self._number = 0
+        self._offset = 0
+        self._hash = hashlib.sha256()
+        self._stream: BinaryIO | None = None  # held, as another file may take the name
+        self.digests: list[tuple[str, int, str]] = []
+
+    def advance(self, position: int | None) -> None:
+        """Hash up to a position in all files, None for the end.
+
+        Raises:
+            SourceError: A file cannot be read.
+        """
+        while self._number < len(self._files) and (position is None or self._position < position):
+            path = self._files[self._number]
+            end = self._position + self._sizes.get(path, 0)
+            if position is not None and position < end:
+                return
+            try:
+                if path in self._sizes:
+                    self._finish(path, *source_digest(path))
+                    self._position = end
+                    continue
+                if self._stream is None:
+                    self._stream = path.open("rb")
+                at_end = self._hash_file(self._stream, position)
+            except OSError as error:
+                raise SourceError(path, f"cannot be read: {error.strerror}") from None
+            if at_end:
+                self._finish(path, self._offset, self._hash.hexdigest())
+
+    def _hash_file(self, stream: BinaryIO, position: int | None) -> bool:
+        while position is None or self._position < position:
+            block = stream.read(_BLOCK)
+            if not block:
+                return True
+            self._hash.update(block)
+            self._offset += len(block)
+            self._position += len(block)
+        return False
+
+    def _finish(self, path: Path, size: int, sha256: str) -> None:
+        self.digests.append((source_name(path, self._folder), size, sha256))
+        self._hash = hashlib.sha256()
+        self._offset = 0
+        self._number += 1
+        self._close()
+
+    def _close(self) -> None:
+        if self._stream:
+            self._stream.close()
+        self._stream = None
+
+    def __enter__(self) -> SourceHasher:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()
+
+
+# ---------------------------------------------------------------- several recordings
+
+_NO_STATS = ChannelStats(0, 0, 0)
+
+
+class MultiReader:
+    """A split recording, or recordings made side by side.
+
+    Parts that follow each other in time are read one after the other, parts that overlap are
+    merged by log time. Channels equal in all fields are one channel.
+
+    Args:
+        openers: Each opens one part; a part is open only while it is read.
+
+    Attributes:
+        is_indexed: Whether all parts are.
+    """
+
+    def __init__(self, openers: Sequence[Callable[[], BagReader]]) -> None:
+        self._openers = openers
+        self._channels: dict[tuple[object, ...], Channel] = {}
+        self._schemas: dict[Schema, None] = {}
+        self._skipped: Counter[str] = Counter()
+        self._done = 0
+        self._active: list[BagReader] = []
+        self._stats: dict[int, ChannelStats] = {}
+        self.is_indexed = True
+        spans: list[tuple[int, int, int]] = []
+        files: list[list[Path]] = []
+        for number, opener in enumerate(openers):
+            with opener() as part:
+                if number == 0:
+                    self.path, self.format = part.path, part.format
+                    self.profile, self.library = part.profile, part.library
+                elif part.profile != self.profile:
+                    self.profile = ""
+                self.is_indexed &= part.is_indexed
+                files.append(list(part.files))
+                for channel in part.channels:
+                    self._shared(channel)
+                self._schemas.update(dict.fromkeys(part.unused_schemas))
+                stats = part.stats()
+                self._add_stats(part, stats)
+                known = [item for item in stats.values() if item.count]
+                start = min((item.start for item in known), default=0)
+                end = max((item.end for item in known), default=2**63)
+                spans.append((start, end, number))
+        self._spans = sorted(spans)
+        self.files: Sequence[Path] = [file for *_, number in self._spans for file in files[number]]
+
+    def _shared(self, channel: Channel) -> Channel:
+        key = channel.identity
+        if key not in self._channels:
+            self._channels[key] = replace(channel, id=len(self._channels))
+        return self._channels[key]
+
+    def _add_stats(self, part: BagReader, stats: Mapping[int, ChannelStats]) -> None:
+        for channel in part.channels:
+            if channel.id in stats and stats[channel.id].count:
+                shared = self._shared(channel).id
+                self._stats[shared] = self._stats.get(shared, _NO_STATS).plus(stats[channel.id])
+
+    @property
+    def channels(self) -> Sequence[Channel]:
+        """See `BagReader.channels`."""
+        return list(self._channels.values())
+
+    @property
+    def unused_schemas(self) -> Sequence[Schema]:
+        """See `BagReader.unused_schemas`."""
+        return list(self._schemas)
+
+    @property
+    def skipped(self) -> Mapping[str, int]:
+        """See `BagReader.skipped`."""
+        return self._skipped
+
+    @property
+    def position(self) -> int:
+        """See `BagReader.position`."""
+        return self._done + sum(part.position for part in self._active)
+
+    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+        """See `BagReader.records`."""
+        self._done = 0
+        self._skipped.clear()
+        if self.is_indexed:
+            return self._merged(excerpt)
+        # What is out of order would be merged otherwise without what is not wanted.
+        return filter(excerpt.has, self._merged(EVERYTHING if excerpt.has_messages else excerpt))
+
+    def _merged(self, excerpt: Excerpt) -> Iterator[Record]:
+        return merged(
+            [
+                SourcePart(start, partial(self._part_records, number, excerpt))
+                for start, end, number in self._spans
+                if excerpt.others or excerpt.touches(start, end)
+            ]
+        )
+
+    def _part_records(self, number: int, excerpt: Excerpt) -> Iterator[Record]:
+        part = self._openers[number]()
+        self._active.append(part)
+        try:
+            for record in part.records(excerpt):
+                if isinstance(record, Message):
+                    yield record.of_channel(self._shared(record.channel))
+                else:
+                    yield record
+            for channel in part.channels:
+                self._shared(channel)
+            self._skipped.update(part.skipped)
+            self._schemas.update(dict.fromkeys(part.unused_schemas))
+            self._done += sum(file.stat().st_size for file in part.files)
+        finally:
+            self._active.remove(part)
+            part.__exit__()
+
+    def stats(self) -> Mapping[int, ChannelStats]:
+        """See `BagReader.stats`."""
+        return self._stats
+
+    def times(self) -> Mapping[int, NDArray[np.int64]]:
+        """See `BagReader.times`."""
+        found: dict[int, list[NDArray[np.int64]]] = {}
+        for opener in self._openers:
+            with opener() as part:
+                times = part.times()
+                for channel in part.channels:
+                    if channel.id in times:
+                        found.setdefault(self._shared(channel).id, []).append(times[channel.id])
+        return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items()}
+
+    def first(self, channel: Channel) -> Message | None:
+        """See `BagReader.first`."""
+        best: Message | None = None
+        for opener in self._openers:
+            with opener() as part:
+                for own in part.channels:
+                    if self._shared(own).id != channel.id:
+                        continue
+                    message = part.first(own)
+                    if message and (best is None or message.log_time < best.log_time):
+                        best = message.of_channel(channel)
+        return best
+
+    def __enter__(self) -> MultiReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for part in self._active:
+            part.__exit__()
+
+
+# ---------------------------------------------------------------- formats
 
 # each imports its library when it is needed: a recording is of one format
 
@@ -106,7 +353,7 @@ def format_of(path: Path) -> str:
 
 
 def recording_names(path: Path) -> set[str] | None:
-    """Names of a recording's files; see `mp4ds.owned.Owned`."""
+    """Names of a recording's files; see `mp4ds.files.outputs.Owned`."""
     from mp4ds.bags.rosbag2_metadata import METADATA_FILE, read_bag_info
 
     if path.is_file():
@@ -157,8 +404,6 @@ def open_sources(paths: Sequence[Path], *, salvage: bool = False) -> BagReader:
         return _open_salvaged(paths)
     if len(paths) == 1:
         return open_reader(paths[0])
-    from mp4ds.bags.multi import MultiReader
-
     return MultiReader([partial(open_reader, path) for path in paths])
 
 
@@ -168,7 +413,7 @@ def _open_salvaged(paths: Sequence[Path]) -> SalvageReader:
     openers = [partial(_SALVAGERS[format_of(path)], path) for path in paths]
     if len(paths) == 1:
         return openers[0]()
-    from mp4ds.bags.salvage.multi import MultiSalvage
+    from mp4ds.bags.salvage.losses import MultiSalvage
 
     return MultiSalvage(openers)
 
@@ -187,9 +432,9 @@ def limits_of(
 
         return ros1_write.check_channel, ros1_write.check_message
     if target == "rosbag2" and storage == "sqlite3":
-        from mp4ds.bags import rosbag2_sqlite_write
+        from mp4ds.bags import rosbag2_write
 
-        return rosbag2_sqlite_write.check_channel, rosbag2_sqlite_write.check_message
+        return rosbag2_write.check_channel, rosbag2_write.check_message
     from mp4ds.bags.mcap_write import check_message
 
     return lambda _: None, check_message
@@ -224,4 +469,4 @@ def open_writer(
         from mp4ds.bags.mcap_write import McapWriter
 
         return McapWriter(path, profile=profile, library=library)
-    raise OptionError(f"--to {target!r} is not known. Use bag, rosbag2, mcap or images.")
+    raise OptionError(f"`to` {target!r} is not known. Use bag, rosbag2, mcap or images.")

@@ -1,11 +1,12 @@
-"""Reads MCAP files (https://mcap.dev/spec)."""
+"""Reads MCAP files (https://mcap.dev/spec), whole or in part."""
 
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -13,17 +14,22 @@ from mcap import records as mcap_records
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from mp4ds.bags import ordering
-from mp4ds.bags.by_reading import first_of, sorted_times, times_of, with_own_payload
-from mp4ds.bags.mcap_between import Between, look_between
-from mp4ds.bags.mcap_declared import Declared
-from mp4ds.bags.mcap_excerpt import read_chunks, read_others
-from mp4ds.bags.mcap_index import Summary, read_summary
+from mp4ds.bags import protocols
+from mp4ds.bags.mcap_index import (
+    Between,
+    ChunkEntry,
+    McapSummary,
+    look_between,
+    read_frames,
+    read_summary,
+)
 from mp4ds.bags.mcap_records import (
     MAGIC,
+    PRIVATE_OPCODE,
     SALVAGE_REMEDY,
     ByteStream,
     DamageError,
+    Declared,
     MessageHead,
     RecordStream,
     chunk_record,
@@ -33,21 +39,135 @@ from mp4ds.bags.mcap_records import (
     parse_message,
     unpack_chunk,
 )
-from mp4ds.bags.mcap_write import McapWriter
-from mp4ds.bags.ordering import HoldBack
-from mp4ds.bags.protocols import Format
+from mp4ds.bags.protocols import (
+    Format,
+    HoldBack,
+    first_of,
+    sorted_times,
+    times_of,
+    with_own_payload,
+)
 from mp4ds.errors import SourceError
 from mp4ds.records import (
     EVERYTHING,
+    Attachment,
     Channel,
     ChannelStats,
     Excerpt,
     Message,
+    MetadataRecord,
     Record,
     Schema,
 )
 
-__all__ = ["McapReader", "McapWriter"]
+_OTHERS = (Opcode.ATTACHMENT, Opcode.METADATA)
+
+
+def read_others(stream: RecordStream, declared: Declared) -> Iterator[Record]:
+    """The attachments and metadata records of a file, seeking over all else.
+
+    Raises:
+        SourceError: The file is damaged or cut short.
+    """
+    for opcode, place in read_frames(stream):
+        if opcode in _OTHERS:
+            yield _other_at(stream, place, declared)
+        elif opcode >= PRIVATE_OPCODE:
+            declared.skip(opcode)
+
+
+def _other_at(stream: RecordStream, place: int, declared: Declared) -> Attachment | MetadataRecord:
+    stream.seek(place)
+    try:
+        record = declared.other(*stream.next())
+    except DamageError as error:
+        raise stream.damaged(error) from None
+    if record is None:
+        raise stream.damaged("it was another one before")
+    return record
+
+
+def read_chunks(
+    stream: RecordStream,
+    excerpt: Excerpt,
+    summary: McapSummary,
+    between: Between,
+    declared: Declared,
+) -> Iterator[Record]:
+    """Read an excerpt from the chunks that it needs, by their starts, whatever their order.
+
+    Args:
+        stream: A stream of known size.
+        excerpt: What to read.
+        summary: The file's summary.
+        between: What stands between its chunks.
+        declared: What the file declares, from its summary on.
+
+    Yields:
+        Messages by log time, ties in file order, payloads as the file holds them; attachments
+        and metadata records as they stand among the chunks.
+
+    Raises:
+        SourceError: The file is damaged, or holds other messages than its index tells.
+    """
+    others = deque(between.others if excerpt.others else ())
+    if excerpt.others:
+        for opcode, count in between.private.items():
+            declared.skip(opcode, count)
+    known = summary.channels.keys()
+    unwanted = {key for key in known if not excerpt.has_topic(declared.channels[key].topic)}
+    held = HoldBack()
+    select = partial(summary.chunks.select, excerpt, unwanted)
+    chunks = select() if excerpt.has_messages else ()
+    stream.expect((chunk.offset, chunk.offset + chunk.length) for chunk, _ in select())
+    for chunk, following in chunks:
+        while others and others[0] < chunk.offset:
+            yield _other_at(stream, others.popleft(), declared)
+        counts_private = excerpt.has_time(chunk.start)  # by one of several spans
+        try:
+            for kind, part in _records(stream, chunk):
+                if kind == Opcode.MESSAGE:
+                    head = parse_message(part)
+                    _check(head, chunk, summary)
+                    if head.channel_id not in unwanted and excerpt.has_time(head.log_time):
+                        held.add(declared.message(head, "it"), chunk.offset)
+                elif kind < PRIVATE_OPCODE or counts_private:
+                    declared.take(kind, part)
+        except DamageError as error:
+            raise stream.damaged(error) from None
+        # Of messages at the very start of the next chunk, some may stand before this one.
+        yield from held.release(None if following is None else following - 1)
+    for place in others:
+        yield _other_at(stream, place, declared)
+
+
+def _records(stream: RecordStream, chunk: ChunkEntry) -> Iterator[tuple[int, memoryview]]:
+    """Opcode and body of each record in a chunk."""
+    stream.seek(chunk.offset)
+    opcode, body = stream.next()
+    if opcode != Opcode.CHUNK or stream.tell() != chunk.offset + chunk.length:
+        raise DamageError("it is not the chunk that the index lists there")
+    content = unpack_chunk(body)
+    if len(content) > chunk.size:
+        raise DamageError(f"it unpacks to {len(content)} bytes, and its index tells of less")
+    for _, kind, part in chunk_records(content):
+        yield kind, part
+
+
+def _check(head: MessageHead, chunk: ChunkEntry, summary: McapSummary) -> None:
+    """Refuse a message that an excerpt without this chunk would have lost."""
+    if not chunk.start <= head.log_time <= chunk.end:
+        problem = f"of log time {head.log_time}"
+    elif head.channel_id not in summary.channels or (
+        chunk.channels and head.channel_id not in chunk.channels
+    ):
+        problem = f"of channel {head.channel_id}"
+    else:
+        return
+    raise DamageError(f"it holds a message {problem}, of which its index does not tell")
+
+
+# ---------------------------------------------------------------- the reader
 
 
 class McapReader:
@@ -62,7 +182,6 @@ class McapReader:
             not seekable, whose ``tell()`` counts bytes of the file.
         message_decompress: Makes the payload of a message from what the file holds; raises
             `DamageError` for what it cannot read.
-        in_file_order: Give messages as they stand in the file, whatever their log times.
 
     Raises:
         SourceError: The file is missing, no MCAP file, or cut short.
@@ -76,18 +195,16 @@ class McapReader:
         *,
         open_stream: Callable[[], ByteStream] | None = None,
         message_decompress: Callable[[memoryview], bytes] | None = None,
-        in_file_order: bool = False,
     ) -> None:
         self.path = path
         self.files: Sequence[Path] = [path]
         self._open_stream = open_stream
         self._decompress = message_decompress
-        self._in_file_order = in_file_order
         self._declared = Declared()
         self._first: dict[int, Message] | None = None
         self._pass: RecordStream | None = None
         self._position = 0
-        self._summary: Summary | None = None
+        self._summary: McapSummary | None = None
         with closing(self._start_pass()) as stream:
             try:
                 self._read_ends(stream)
@@ -164,9 +281,9 @@ class McapReader:
     def _between(self) -> Between | None:
         """What stands between the chunks, where excerpts can be read from these alone."""
         summary = self._summary
-        if summary is None or self._in_file_order:
+        if summary is None:
             return None
-        if summary.chunks.held_in_time_order() > ordering.HOLD_BYTES:
+        if summary.chunks.held_in_time_order() > protocols.HOLD_BYTES:
             return None
         return self._found_between
 
@@ -187,11 +304,18 @@ class McapReader:
 
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """Read everything once, or a part of it. See `BagReader.records`."""
+        return self._one_pass(lambda stream: self._read(stream, excerpt))
+
+    def as_it_stands(self) -> Iterator[Record]:
+        """Read everything once, messages in the order of the file, whatever their log times."""
+        return self._one_pass(lambda stream: self._read_through(stream, None))
+
+    def _one_pass(self, read: Callable[[RecordStream], Iterator[Record]]) -> Iterator[Record]:
         stream = self._start_pass()
         self._pass = stream
         self._declared.skipped.clear()
         try:
-            yield from self._read(stream, excerpt)
+            yield from read(stream)
             self._position = self.path.stat().st_size
         finally:
             self._pass = None
@@ -201,17 +325,17 @@ class McapReader:
         if self._between and self._summary and self._needs_chunks_alone(self._summary, excerpt):
             yield from self._read_chunks(stream, excerpt, self._summary, self._between)
         elif excerpt.has_messages or stream.size is None:
-            yield from filter(excerpt.has, self._read_through(stream))
+            yield from filter(excerpt.has, self._read_through(stream, self._hold_back()))
         elif excerpt.others:
             yield from read_others(stream, self._declared)
 
     @staticmethod
-    def _needs_chunks_alone(summary: Summary, excerpt: Excerpt) -> bool:
+    def _needs_chunks_alone(summary: McapSummary, excerpt: Excerpt) -> bool:
         # The whole is read as it lies, unless it is too much out of order.
-        return excerpt != EVERYTHING or summary.chunks.held_in_file_order() > ordering.HOLD_BYTES
+        return excerpt != EVERYTHING or summary.chunks.held_in_file_order() > protocols.HOLD_BYTES
 
     def _read_chunks(
-        self, stream: RecordStream, excerpt: Excerpt, summary: Summary, between: Between
+        self, stream: RecordStream, excerpt: Excerpt, summary: McapSummary, between: Between
     ) -> Iterator[Record]:
         count = 0
         for record in read_chunks(stream, excerpt, summary, between, self._declared):
@@ -227,9 +351,11 @@ class McapReader:
                 SALVAGE_REMEDY,
             )
 
-    def _read_through(self, stream: RecordStream) -> Iterator[Record]:
-        in_time_order = self._summary and self._summary.chunks.has_messages
-        held = HoldBack() if in_time_order and not self._in_file_order else None
+    def _hold_back(self) -> HoldBack | None:
+        """What puts messages in order, where the file tells its chunks' times."""
+        return HoldBack() if self._summary and self._summary.chunks.has_messages else None
+
+    def _read_through(self, stream: RecordStream, held: HoldBack | None) -> Iterator[Record]:
         declared = self._declared
         if stream.size is not None:
             stream.expect([(stream.tell(), stream.size)])
@@ -306,7 +432,7 @@ class McapReader:
 
     def _times_by_reading(self) -> dict[int, NDArray[np.int64]]:
         with closing(self._start_pass()) as stream:
-            return times_of(self._read_through(stream))
+            return times_of(self._read_through(stream, None))
 
     def first(self, channel: Channel) -> Message | None:
         """The channel's first message by log time, or None.
@@ -353,7 +479,7 @@ class McapReader:
 
     def _first_by_reading(self) -> dict[int, Message]:
         with closing(self._start_pass()) as stream:
-            return first_of(self._read_through(stream))
+            return first_of(self._read_through(stream, self._hold_back()))
 
     def __enter__(self) -> McapReader:
         return self

@@ -1,10 +1,12 @@
-"""What the summary section of an MCAP file tells without reading its messages."""
+"""What the summary of an MCAP file tells, and its chunks, without reading its messages."""
 
 from __future__ import annotations
 
+import bisect
 import struct
+from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -13,17 +15,224 @@ from mcap import records as mcap_records
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from mp4ds.bags.mcap_chunks import ChunkTable
 from mp4ds.bags.mcap_records import (
     FOOTER_BYTES,
     MAGIC,
+    MAX_RECORD_BYTES,
     OF_SUMMARY,
     PRIVATE_OPCODE,
     DamageError,
     RecordStream,
     parse,
 )
-from mp4ds.records import ChannelStats
+from mp4ds.errors import SourceError
+from mp4ds.records import ChannelStats, Excerpt
+
+_HEAD = struct.Struct("<QQQQI")
+_CHANNEL = np.dtype([("id", "<u2"), ("offset", "<u8")])
+_LATEST = 2**64 - 1
+_MAX_OFFSET = 2**62  # sums of three do not wrap
+
+
+class ChunkEntry(NamedTuple):
+    """A chunk that the summary lists.
+
+    Attributes:
+        offset: Byte offset of its record in the file.
+        length: Bytes of its record.
+        start: Earliest log time of its messages, nanoseconds; 0 without messages.
+        end: Latest log time of its messages, nanoseconds; 0 without messages.
+        size: Bytes of its content, decompressed.
+        channels: Ids of the channels that it holds messages of; empty where the file does
+            not tell, or without messages.
+    """
+
+    offset: int
+    length: int
+    start: int
+    end: int
+    size: int
+    channels: frozenset[int]
+
+
+class ChunkTable:
+    """All chunks that a summary lists, in arrays: a long recording has many of them.
+
+    It is filled by `add`, and may be asked after `finish`.
+    """
+
+    def __init__(self) -> None:
+        self._added = array("Q")
+        self._ids = array("H")
+        self._counts = array("I")
+
+    def __len__(self) -> int:
+        return len(self._counts)
+
+    def add(self, body: bytes) -> None:
+        """Take in a chunk index record.
+
+        Raises:
+            DamageError: It does not hold what it must.
+        """
+        try:
+            start, end, offset, length, map_bytes = _HEAD.unpack_from(body)
+            after = _HEAD.size + map_bytes
+            channels = np.frombuffer(body[_HEAD.size : after], _CHANNEL)
+            index_length, text_bytes = struct.unpack_from("<QI", body, after)
+            _, size = struct.unpack_from("<QQ", body, after + 12 + text_bytes)
+        except (struct.error, ValueError):
+            raise DamageError("a chunk index is shorter than its fields") from None
+        self._added.extend((offset, length, index_length, start, end, size))
+        self._ids.frombytes(channels["id"].astype(np.uint16).tobytes())
+        self._counts.append(len(channels))
+
+    def finish(self) -> None:
+        """Order the chunks as they lie in the file."""
+        columns = np.array(self._added, np.uint64).reshape(-1, 6)
+        del self._added
+        order = np.argsort(columns[:, 0], kind="stable")
+        self._offsets, self._lengths, self._index_lengths, self._starts, self._ends, self._sizes = (
+            np.ascontiguousarray(columns[order].T)
+        )
+        counts = np.array(self._counts, np.int64)
+        self._held = counts[order]
+        self._first = (np.cumsum(counts) - counts)[order]
+        self._channels = np.array(self._ids, np.uint16)
+        self._owners = np.repeat(np.argsort(order).astype(np.int32), counts)
+        # A chunk without messages has the start 0, which would hold back everything before it.
+        self._empty = (self._held == 0) & (self._starts == 0) & (self._ends == 0)
+        self._later_starts = _later_starts(self._known_starts())
+        self._places = array("Q", self._offsets.tobytes())
+
+    def _known_starts(self) -> NDArray[np.uint64]:
+        starts: NDArray[np.uint64] = self._starts.copy()
+        starts[self._empty] = _LATEST
+        return starts
+
+    @property
+    def has_messages(self) -> bool:
+        """Whether it lists a chunk with messages."""
+        return not self._empty.all()
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the chunks can lie and follow each other as it tells."""
+        places = self._offsets, self._lengths, self._index_lengths
+        if any(column.max(initial=0) > _MAX_OFFSET for column in places):
+            return False
+        ends = self._offsets + self._lengths + self._index_lengths
+        return bool(
+            (ends[:-1] <= self._offsets[1:]).all()
+            and (self._starts <= self._ends).all()
+            and (self._sizes <= MAX_RECORD_BYTES).all()
+        )
+
+    def later_start(self, offset: int) -> int | None:
+        """The earliest log time in the chunks after a byte offset; None after the last."""
+        place = bisect.bisect_right(self._places, offset)
+        return self._later_starts[place] if place < len(self._later_starts) else None
+
+    def span(self) -> tuple[int, int] | None:
+        """Least and greatest log time of all chunks; None without messages."""
+        return (self._later_starts[0], int(self._ends.max())) if self.has_messages else None
+
+    def spans(self) -> dict[int, tuple[int, int]]:
+        """Least and greatest log time of the chunks that hold a channel, by its id.
+
+        It is empty where a chunk does not tell which channels it holds.
+        """
+        if ((self._held == 0) & ~self._empty).any():
+            return {}
+        first, last = np.full(2**16, _LATEST, np.uint64), np.zeros(2**16, np.uint64)
+        np.minimum.at(first, self._channels, self._starts[self._owners])
+        np.maximum.at(last, self._channels, self._ends[self._owners])
+        keys = np.unique(self._channels).tolist()
+        return {key: (int(first[key]), int(last[key])) for key in keys}
+
+    def places(self) -> Iterator[tuple[int, int, int]]:
+        """Byte offsets of each chunk, of its end, and of that of its message indexes."""
+        columns = self._offsets, self._lengths, self._index_lengths
+        for offset, length, index_length in zip(*(c.tolist() for c in columns), strict=True):
+            yield offset, offset + length, offset + length + index_length
+
+    def held_in_file_order(self) -> int:
+        """Bytes that wait at most for earlier messages, if chunks are read as they lie."""
+        return self._most_held(np.arange(len(self)))
+
+    def held_in_time_order(self) -> int:
+        """Bytes that wait at most for earlier messages, if chunks are read by their starts."""
+        return self._most_held(self._by_start(np.arange(len(self))))
+
+    def _by_start(self, numbers: NDArray[np.intp]) -> NDArray[np.intp]:
+        return numbers[np.argsort(self._starts[numbers], kind="stable")]
+
+    def _most_held(self, order: NDArray[np.intp]) -> int:
+        if not len(order):
+            return 0
+        following = np.array(_later_starts(self._known_starts()[order]), np.uint64)[1:]
+        sizes = np.where(self._empty, 0, self._sizes).astype(np.int64)
+        by_end = np.argsort(self._ends)
+        gone = np.concatenate(([0], np.cumsum(sizes[by_end])))
+        past = gone[np.searchsorted(self._ends[by_end], following)]
+        return int((np.cumsum(sizes[order])[:-1] - past).max(initial=0))
+
+    def select(
+        self, excerpt: Excerpt, unwanted: Collection[int]
+    ) -> Iterator[tuple[ChunkEntry, int | None]]:
+        """The chunks that may hold messages of an excerpt, by their starts.
+
+        Chunks that tell of no messages are among them: whether that is true shows when they
+        are read.
+
+        Args:
+            excerpt: Its span counts.
+            unwanted: Ids of the channels that are not part of it.
+
+        Yields:
+            Each chunk, and the start of the next one, None after the last.
+        """
+        mask = self._within(excerpt)
+        if unwanted:
+            wanted = ~np.isin(self._channels, np.array(sorted(unwanted), np.uint16))
+            holds = self._held == 0
+            holds[self._owners[wanted]] = True
+            mask &= holds
+        order = self._by_start(np.flatnonzero(mask | self._empty))
+        for place, number in enumerate(order, 1):
+            following = int(self._starts[order[place]]) if place < len(order) else None
+            yield self._entry(int(number)), following
+
+    def _within(self, excerpt: Excerpt) -> NDArray[np.bool_]:
+        mask = np.ones(len(self), np.bool_)
+        start, end = excerpt.start or 0, excerpt.end
+        if start > _LATEST:
+            mask[:] = False
+        elif start > 0:
+            mask &= self._ends >= np.uint64(start)
+        if end is not None and end <= _LATEST:
+            mask &= self._starts < np.uint64(max(end, 0))
+        return mask
+
+    def _entry(self, number: int) -> ChunkEntry:
+        first = self._first[number]
+        channels = self._channels[first : first + self._held[number]]
+        return ChunkEntry(
+            int(self._offsets[number]),
+            int(self._lengths[number]),
+            int(self._starts[number]),
+            int(self._ends[number]),
+            int(self._sizes[number]),
+            frozenset(channels.tolist()),
+        )
+
+
+def _later_starts(starts: NDArray[np.uint64]) -> array[int]:
+    """The least of each start and those after it."""
+    return array("Q", np.minimum.accumulate(starts[::-1])[::-1].tobytes())
+
+
+# ---------------------------------------------------------------- the index
 
 
 class IndexEntries(NamedTuple):
@@ -43,7 +252,7 @@ class IndexEntries(NamedTuple):
 
 
 @dataclass
-class Summary:
+class McapSummary:
     """A summary section.
 
     Attributes:
@@ -159,7 +368,7 @@ def _parse_entries(chunk: int, body: bytes) -> IndexEntries:
     return IndexEntries(channel_id, chunk, pairs[:, 0], pairs[:, 1])
 
 
-def read_summary(stream: RecordStream) -> Summary | None:
+def read_summary(stream: RecordStream) -> McapSummary | None:
     """Read the summary section of a file, leaving the stream anywhere.
 
     Returns:
@@ -183,7 +392,7 @@ def read_summary(stream: RecordStream) -> Summary | None:
     if not summary_start:
         return None
     stream.seek(summary_start)
-    summary = Summary(summary_start)
+    summary = McapSummary(summary_start)
     while True:
         opcode, body = stream.next()
         if opcode == Opcode.FOOTER:
@@ -195,7 +404,7 @@ def read_summary(stream: RecordStream) -> Summary | None:
     return summary
 
 
-def _add(summary: Summary, opcode: int, body: bytes) -> None:
+def _add(summary: McapSummary, opcode: int, body: bytes) -> None:
     if opcode == Opcode.CHUNK_INDEX:
         summary.chunks.add(body)
     elif opcode == Opcode.SCHEMA:
@@ -208,3 +417,102 @@ def _add(summary: Summary, opcode: int, body: bytes) -> None:
         summary.statistics = parse(mcap_records.Statistics, body)
     elif opcode >= PRIVATE_OPCODE:
         summary.private[opcode] += 1
+
+
+# ---------------------------------------------------------------- between the chunks
+
+_FRAME = struct.Struct("<BQ")
+_OTHERS = (Opcode.ATTACHMENT, Opcode.METADATA)
+
+
+@dataclass
+class Between:
+    """What stands between the chunks that a summary lists.
+
+    Attributes:
+        is_sound: Whether the chunks are where the summary says, and no messages beside them.
+        others: Byte offsets of the attachments and metadata records.
+        private: How many records of each private opcode there are.
+    """
+
+    is_sound: bool = True
+    others: array[int] = field(default_factory=lambda: array("Q"))
+    private: Counter[int] = field(default_factory=Counter)
+
+
+def look_between(stream: RecordStream, summary: McapSummary) -> Between:
+    """Look at the records between the chunks, leaving the stream anywhere.
+
+    Args:
+        stream: A stream of known size.
+        summary: Its summary; its chunks must be sound.
+    """
+    found = Between(private=Counter(summary.private))
+    place = len(MAGIC)
+    for start, _, end in summary.chunks.places():
+        if start != place:
+            _look(stream, place, start, found)
+        if not found.is_sound:
+            return found
+        place = end
+    _look(stream, place, summary.offset, found)
+    return found
+
+
+def _look(stream: RecordStream, place: int, end: int, found: Between) -> None:
+    try:
+        while place < end and found.is_sound:
+            opcode, following = read_frame(stream, place)
+            if opcode in _OTHERS:
+                found.others.append(place)
+            elif opcode >= PRIVATE_OPCODE:
+                found.private[opcode] += 1
+            elif opcode in (Opcode.MESSAGE, Opcode.CHUNK, Opcode.FOOTER):
+                found.is_sound = False
+            place = following
+    except (DamageError, SourceError):
+        found.is_sound = False  # reading it all tells what is wrong
+    found.is_sound &= place == end
+
+
+def read_frame(stream: RecordStream, place: int) -> tuple[int, int]:
+    """The opcode of the record at a byte offset, and the offset of the next one.
+
+    Raises:
+        DamageError: There is no record.
+        SourceError: The file cannot be read.
+    """
+    stream.seek(place)
+    stream.start = place
+    opcode, length = _FRAME.unpack(stream.read(_FRAME.size))
+    if length > MAX_RECORD_BYTES:
+        raise DamageError(f"it tells of {length} bytes")
+    return opcode, place + _FRAME.size + length
+
+
+def read_frames(stream: RecordStream) -> Iterator[tuple[int, int]]:
+    """Seek over all records of a file up to its footer.
+
+    Args:
+        stream: A stream of known size; it may be moved between the frames.
+
+    Yields:
+        Opcode and byte offset of each.
+
+    Raises:
+        SourceError: The file is damaged or cut short.
+    """
+    place = len(MAGIC)
+    while True:
+        try:
+            opcode, following = read_frame(stream, place)
+        except DamageError as error:
+            raise stream.damaged(error) from None
+        if stream.size is not None and following > stream.size:
+            raise stream.cut_short()
+        if opcode == Opcode.FOOTER:
+            break
+        yield opcode, place
+        place = following
+    stream.seek(following)
+    stream.read_magic()

@@ -11,7 +11,7 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 
 from mp4ds._version import __version__
-from mp4ds.bags.inflate import most_unpacked
+from mp4ds.bags.protocols import most_unpacked
 from mp4ds.errors import ConversionError, OptionError
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
 

@@ -1,10 +1,12 @@
-"""What a reader and a writer of recordings can do."""
+"""What a reader and a writer of recordings can do, and what readers share."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import heapq
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,3 +162,148 @@ class BagWriter(Protocol):
     def __enter__(self) -> BagWriter: ...
 
     def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None: ...
+
+
+# ---------------------------------------------------------------- ordering
+
+HOLD_BYTES = 256 * 2**20
+"""Payload bytes held back at most; what is out of order by more comes as early as it can."""
+
+
+class HoldBack:
+    """Sorts messages by log time, ties in source order, holding back only what it must."""
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[int, int, int, Message]] = []
+        self._added = 0
+        self._bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._heap)
+
+    def add(self, message: Message, place: int = 0) -> None:
+        """Take a message in.
+
+        Args:
+            message: The message.
+            place: Where it stands in the source, if messages are not added in source order;
+                ties of one place come in the order in which they were added.
+        """
+        self._added += 1
+        self._bytes += len(message.data)
+        heapq.heappush(self._heap, (message.log_time, place, self._added, message))
+
+    def release(self, until: int | None) -> Iterator[Message]:
+        """Give out, in order, what no later message can precede.
+
+        Args:
+            until: No message added later precedes one of this log time, in nanoseconds; None
+                when no message follows at all.
+        """
+        while self._heap and (
+            until is None or self._heap[0][0] <= until or self._bytes > HOLD_BYTES
+        ):
+            message = heapq.heappop(self._heap)[-1]
+            self._bytes -= len(message.data)
+            yield message
+
+
+class SourcePart(NamedTuple):
+    """One of several sources that are read as one.
+
+    Attributes:
+        start: None of its messages has an earlier log time, nanoseconds.
+        records: Begins to read it.
+    """
+
+    start: int
+    records: Callable[[], Iterator[Record]]
+
+
+def merged(parts: Sequence[SourcePart]) -> Iterator[Record]:
+    """Several sources in log-time order, each being read from when its time has come.
+
+    Ties come in the order of `parts`. Attachments and metadata records do not wait.
+
+    Args:
+        parts: Each in log-time order; one that is not comes as it is.
+    """
+    waiting = sorted(
+        range(len(parts)), key=lambda number: (parts[number].start, number), reverse=True
+    )
+    heads: list[tuple[int, int, Message, Iterator[Record]]] = []
+
+    def is_next(time: int, number: int) -> bool:
+        if waiting and parts[waiting[-1]].start <= time:
+            return False
+        return not heads or (time, number) < heads[0][:2]
+
+    while waiting or heads:
+        if waiting and (not heads or parts[waiting[-1]].start <= heads[0][0]):
+            number = waiting.pop()
+            records = parts[number].records()
+        else:
+            _, number, message, records = heapq.heappop(heads)
+            yield message
+        for record in records:
+            if isinstance(record, Message) and not is_next(record.log_time, number):
+                heapq.heappush(heads, (record.log_time, number, record, records))
+                break
+            yield record
+
+
+# ---------------------------------------------------------------- bounds
+
+CHUNK_RATIO = 256  # of lz4 it is 255
+"""Times smaller than its content the data of a large chunk or message is at most."""
+
+FILE_RATIO = 1024
+"""The same of a whole file, which is not held in memory."""
+
+ZSTD_PIECE = 2**11
+"""Bytes of zstd that are unpacked at a time: they give 64 MiB at most."""
+
+_ALWAYS = 128 * 2**20
+
+
+def most_unpacked(packed: int, ratio: int = CHUNK_RATIO) -> int:
+    """Bytes that so many compressed ones may unpack to.
+
+    Small ones may hold anything, such as a black picture.
+    """
+    return max(_ALWAYS, ratio * packed)
+
+
+# ---------------------------------------------------------------- without an index
+
+_INT64_MAX = np.uint64(2**63 - 1)
+
+
+def times_of(records: Iterable[Record]) -> dict[int, NDArray[np.int64]]:
+    """Log times by channel id, sorted; see `sorted_times`."""
+    found: dict[int, list[int]] = {}
+    for record in records:
+        if isinstance(record, Message):
+            found.setdefault(record.channel.id, []).append(record.log_time)
+    return {key: sorted_times(np.array(times, np.uint64)) for key, times in found.items()}
+
+
+def sorted_times(times: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """Log times, sorted; those past the year 2262 as the last one that fits."""
+    return np.sort(np.minimum(times, _INT64_MAX)).astype(np.int64)
+
+
+def first_of(records: Iterable[Record]) -> dict[int, Message]:
+    """The first message of each channel by log time, by channel id."""
+    first: dict[int, Message] = {}
+    for record in records:
+        if isinstance(record, Message):
+            known = first.get(record.channel.id)
+            if known is None or record.log_time < known.log_time:
+                first[record.channel.id] = with_own_payload(record)
+    return first
+
+
+def with_own_payload(message: Message) -> Message:
+    """A message to be kept: a view would keep the whole chunk in memory."""
+    return replace(message, data=bytes(message.data))

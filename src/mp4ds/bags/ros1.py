@@ -1,46 +1,33 @@
 """Reads ROS 1 bags of format 2.0 (wiki.ros.org/Bags/Format/2.0).
 
-rosbags frames the records. What it normalises or bounds too late is done here: connection
-headers stay as recorded, the index is kept in arrays, chunks unpack to their declared size.
+Connection headers stay as recorded, the index is kept in arrays, chunks unpack to their declared
+size and no further.
 """
 
 from __future__ import annotations
 
-import os
+import struct
 from array import array
 from collections import OrderedDict, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag1,
-    MessageDefinition,
-    MessageDefinitionFormat,
-)
-from rosbags.rosbag1 import Reader, ReaderError
-from rosbags.rosbag1.reader import (
-    Chunk,
-    ChunkInfo,
-    Header,
-    IndexData,
-    RecordType,
-    read_bytes,
-    read_uint32,
-)
 
+from mp4ds.bags.mcap_records import DamageError
 from mp4ds.bags.protocols import Format
 from mp4ds.bags.ros1_records import (
     COPY_AGAIN,
     DAMAGE,
     MAGIC,
     MAX_TIME,
-    UINT32,
+    BagFile,
+    Fields,
+    Op,
     check_bag,
     check_between,
     count_messages,
@@ -51,8 +38,8 @@ from mp4ds.bags.ros1_records import (
     unpack_chunk,
 )
 from mp4ds.errors import SourceError
+from mp4ds.files.urls import expect
 from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Record, Schema
-from mp4ds.remote import expect
 
 CACHED_CHUNKS = 8
 CACHED_BYTES = 64 * 2**20
@@ -60,6 +47,7 @@ CACHED_BYTES = 64 * 2**20
 
 _LATEST = 2**63 - 1  # more than any time of a bag
 _CHUNK_HEAD, _INDEX_HEAD = 96, 64  # bytes at most, of the records as everybody writes them
+_COUNT = struct.Struct("<II")  # of a chunk: connection, messages
 _INDEX_ENTRY = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
 
 
@@ -104,12 +92,14 @@ class Ros1Reader:
         self._position = 0
         self._size = check_bag(path)
         self._chunks: OrderedDict[int, memoryview] = OrderedDict()
-        self._bag = _Bag(path)
         try:
-            self._bag.open()
+            self._bag = _Bag(path)
+        except DAMAGE as error:
+            raise SourceError(path, f"is damaged: {reason(error)}", COPY_AGAIN) from None
+        try:
             self._index = self._bag.take_index()
-            for number, info in enumerate(self._bag.chunk_infos):
-                if not any(info.connection_counts.values()):
+            for number, chunk in enumerate(self._bag.chunks):
+                if not any(chunk.counts.values()):
                     self._chunk(number)  # nobody else will see whether it holds messages
         except DAMAGE as error:
             self._close()
@@ -137,7 +127,7 @@ class Ros1Reader:
         for channel, time, chunk, offset, is_last in self._entries(excerpt):
             if chunk not in visited:
                 visited.add(chunk)
-                self._position += self._bag.chunk_at(chunk).datasize
+                self._position += self._bag.chunks[chunk].packed
             yield self._message(channel, time, chunk, offset)
             if is_last:
                 self._chunks.pop(chunk, None)
@@ -153,7 +143,7 @@ class Ros1Reader:
         owners = np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.times) for p in parts])
         order = np.lexsort((offsets, chunks, times))
         self._bag.expect(_first_seen(chunks[order]))
-        last = np.full(len(self._bag.chunk_infos), -1)
+        last = np.full(len(self._bag.chunks), -1)
         last[chunks[order]] = np.arange(len(order))
         for start in range(0, len(order), 4096):
             rows = order[start : start + 4096]
@@ -166,7 +156,7 @@ class Ros1Reader:
         try:
             data = payload(self._chunk(chunk), offset, channel.id, time)
         except DAMAGE as error:
-            place = f"topic {channel.topic}, chunk at byte {self._bag.chunk_infos[chunk].pos}"
+            place = f"topic {channel.topic}, chunk at byte {self._bag.chunks[chunk].start}"
             raise SourceError(
                 self.path, f"is damaged: {place}: {reason(error)}", COPY_AGAIN
             ) from None
@@ -177,13 +167,7 @@ class Ros1Reader:
         if number in self._chunks:
             self._chunks.move_to_end(number)
             return self._chunks[number]
-        chunk = self._bag.chunk_at(number)
-        self._bag.file.seek(chunk.datapos)
-        packed = read_bytes(self._bag.file, chunk.datasize)
-        unpacked = memoryview(chunk.decompressor(packed))
-        listed = sum(self._bag.chunk_infos[number].connection_counts.values())
-        if (found := count_messages(unpacked)) != listed:
-            raise ReaderError(f"its index lists {listed} messages of {found}")
+        unpacked = self._bag.content(number)
         size = len(unpacked) + sum(map(len, self._chunks.values()))
         while len(self._chunks) > 1 and (len(self._chunks) >= CACHED_CHUNKS or size > CACHED_BYTES):
             size -= len(self._chunks.popitem(last=False)[1])
@@ -217,8 +201,7 @@ class Ros1Reader:
 
     def _close(self) -> None:
         self._chunks.clear()
-        if self._bag.bio:
-            self._bag.bio.close()
+        self._bag.file.close()
 
 
 def _first_seen(numbers: NDArray[np.int32]) -> list[int]:
@@ -228,147 +211,158 @@ def _first_seen(numbers: NDArray[np.int32]) -> list[int]:
     return ordered
 
 
-class _Bag(Reader):
-    """rosbags' reader, with connections as `Channel` and the index in arrays.
+class _Chunk(NamedTuple):
+    """A chunk as the index of the bag and its own header tell it.
+
+    Attributes:
+        start: Byte where its record begins.
+        counts: Its messages by connection.
+        compression: Its name.
+        size: Bytes of its content.
+        place: Byte where its data begin.
+        packed: Bytes of these.
+    """
+
+    start: int
+    counts: Mapping[int, int]
+    compression: str = ""
+    size: int = 0
+    place: int = 0
+    packed: int = 0
+
+
+class _Bag:
+    """A bag and its index.
 
     Attributes:
         channels: By connection number, in the order of the bag's index.
+        chunks: In that order, too.
+
+    Raises:
+        DamageError: The index is damaged, or does not list all that there is.
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path)
+        self.file = BagFile(path)
         self.channels: dict[int, Channel] = {}
-        self._index_start = self._index_end = 0
-        self._chunk_ends: dict[int, int] = {}  # by where they begin, with their index records
+        self.chunks: list[_Chunk] = []
         # By connection: raw index entries; number of a chunk and of its entries, alternating.
         self._index_entries: defaultdict[int, bytearray] = defaultdict(bytearray)
         self._index_runs: defaultdict[int, array[int]] = defaultdict(partial(array, "I"))
+        try:
+            self._read()
+        except BaseException:
+            self.file.close()
+            raise
 
-    @property
-    def file(self) -> BinaryIO:
-        """The open file."""
-        if self.bio is None:
-            raise ReaderError("the recording is closed")
-        return self.bio
-
-    def chunk_at(self, number: int) -> Chunk:
-        """Where a chunk is."""
-        return self.chunks[self.chunk_infos[number].pos]
-
-    def open(self) -> None:
-        """Read the bag's index, also where there are connections without any chunk."""
-        super().open()
-        if not self.chunk_infos:
-            self.file.seek(len(MAGIC))
-            header = Header.read(self.file, RecordType.BAGHEADER)
-            self.file.seek(header.get_uint64("index_pos"))
-            for _ in range(header.get_uint32("conn_count")):
-                self.read_connection()
-            self._index_end = self.file.tell()
+    def _read(self) -> None:
+        file = self.file
+        file.seek(len(MAGIC))
+        header = file.header(Op.BAG)
+        first = file.length() + file.tell()
+        index = header.number(b"index_pos", 8)
+        file.seek(index)
+        for _ in range(header.number(b"conn_count")):
+            self._read_connection()
+        start = file.tell()
+        listed = [self._read_chunk_info() for _ in range(header.number(b"chunk_count"))]
         if self._goes_on():
-            raise ReaderError("its header counts fewer chunks than its index lists")
-        self._check_unlisted()
-
-    def _check_unlisted(self) -> None:
-        """Refuse messages that the index does not list: they would be lost without a word."""
-        if len(self.chunks) < len(self.chunk_infos):
-            raise ReaderError("its index lists a chunk twice")
-        self.file.seek(len(MAGIC))
-        header = Header.read(self.file, RecordType.BAGHEADER)
-        place = read_uint32(self.file) + self.file.tell()
-        for start in sorted(self._chunk_ends):
-            check_between(self.file, place, start)
-            place = self._chunk_ends[start]
+            raise DamageError("its header counts fewer chunks than its index lists")
+        expect(file.stream, self._index_ranges(listed, start))
+        ends = {}
+        for chunk in listed:
+            self.chunks.append(self._read_chunk(chunk))
+            for _ in chunk.counts:
+                self._read_index()
+            ends[chunk.start] = file.tell()
+        if len(ends) < len(listed):
+            raise DamageError("its index lists a chunk twice")
+        # messages that the index does not list would be lost without a word
+        for chunk_start in sorted(ends):
+            check_between(file, first, chunk_start)
+            first = ends[chunk_start]
         # a bag without chunks is read to its end: nothing else tells where its index is
-        end = header.get_uint64("index_pos") if self.chunks else self.file.seek(0, os.SEEK_END)
-        check_between(self.file, place, end)
+        check_between(file, first, index if listed else file.size)
 
     def _goes_on(self) -> bool:
         """Whether a record follows the last one of the index that was read."""
-        self.file.seek(self._index_end)
         try:
-            return "op" in Header.read(self.file)
+            return b"op" in self.file.header()
         except DAMAGE:
             return False
 
-    def read_chunk_info(self) -> ChunkInfo:
-        """Read the summary of a chunk."""
-        info = super().read_chunk_info()
-        self._index_end = self.file.tell()
-        return info
-
-    def read_connection(self) -> Connection:
-        """Read a connection record, keeping its header verbatim."""
-        if not self.channels:
-            self._index_start = self.file.tell()
-        record = dict(split_header(read_bytes(self.file, read_uint32(self.file))))
-        if record.get(b"op") != bytes([RecordType.CONNECTION]):
-            raise ReaderError("a connection record is missing")
-        (number,) = UINT32.unpack(record[b"conn"])
-        header = dict(split_header(read_bytes(self.file, read_uint32(self.file))))
+    def _read_connection(self) -> None:
+        record = self.file.header()
+        if record.get(b"op") != bytes([Op.CONNECTION]):
+            raise DamageError("a connection record is missing")
+        number = record.number(b"conn")
+        header = Fields(split_header(self.file.take(self.file.length())))
         channel = make_channel(number, record.get(b"topic", header.get(b"topic", b"")), header)
         self.channels.setdefault(number, channel)  # the first of a number counts, as in ROS
-        return Connection(
-            number,
-            channel.topic,
-            channel.type_name,
-            MessageDefinition(MessageDefinitionFormat.NONE, ""),
-            "",
-            0,
-            ConnectionExtRosbag1(None, None),
-            self,
-        )
 
-    def expect(self, chunks: Iterable[int]) -> None:
-        """Tell which chunks will be read, by their numbers, in that order."""
-        places = map(self.chunk_at, chunks)
-        expect(self.file, ((chunk.datapos, chunk.datapos + chunk.datasize) for chunk in places))
+    def _read_chunk_info(self) -> _Chunk:
+        header = self.file.header(Op.CHUNK_INFO)
+        _check_version(header)
+        self.file.length()
+        counts = self.file.take(8 * header.number(b"count"))
+        return _Chunk(header.number(b"chunk_pos", 8), dict(_COUNT.iter_unpack(counts)))
 
-    def _index_ranges(self) -> Iterator[tuple[int, int]]:
-        """Where the index lies: between the data of the chunks."""
-        infos = self.chunk_infos
-        ends = [info.pos for info in infos[1:]] + [self._index_start]
-        for info, end in zip(infos, ends, strict=True):
-            head = info.pos + _CHUNK_HEAD
-            yield info.pos, head
-            size = sum(
-                _INDEX_HEAD + _INDEX_ENTRY.itemsize * count
-                for count in info.connection_counts.values()
-            )
-            if head < end:
-                yield max(head, end - size), end
+    def _read_chunk(self, chunk: _Chunk) -> _Chunk:
+        """A chunk with what its header tells; it will unpack to that size."""
+        self.file.seek(chunk.start)
+        header = self.file.header(Op.CHUNK)
+        compression = header.get(b"compression", b"").decode(errors="replace")
+        packed, place = self.file.length(), self.file.tell()
+        self.file.seek(place + packed)
+        return _Chunk(chunk.start, chunk.counts, compression, header.number(b"size"), place, packed)
 
-    def read_chunk(self) -> Chunk:
-        """Read a chunk's header; it will unpack to the size that this tells."""
-        if not self.chunks:
-            expect(self.file, self._index_ranges())
-        header = Header.read(self.file, RecordType.CHUNK)
-        unpack = partial(unpack_chunk, header.get_string("compression"), header.get_uint32("size"))
-        size = read_uint32(self.file)
-        start = self.file.tell()
-        self._chunk_ends[self.chunk_infos[len(self.chunks)].pos] = start + size
-        self.file.seek(start + size)
-        return Chunk(size, start, unpack)
-
-    def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
-        """Read what the chunk at `pos` holds of one connection."""
-        header = Header.read(self.file, RecordType.IDXDATA)
-        if (version := header.get_uint32("ver")) != 1:
-            raise ReaderError(f"its index has the unknown version {version}")
-        number, count = header.get_uint32("conn"), header.get_uint32("count")
-        entries = read_bytes(self.file, read_uint32(self.file))
-        chunk = len(self.chunks) - 1
-        info = self.chunk_infos[chunk]
+    def _read_index(self) -> None:
+        """Read what the last chunk holds of one connection."""
+        header = self.file.header(Op.INDEX)
+        _check_version(header)
+        number, count = header.number(b"conn"), header.number(b"count")
+        entries = self.file.take(self.file.length())
+        chunk = self.chunks[-1]
         if (
-            info.pos != pos
-            or info.connection_counts.get(number) != count
+            chunk.counts.get(number) != count
             or len(entries) != count * _INDEX_ENTRY.itemsize
             or number not in self.channels
         ):
-            raise ReaderError(f"the index of the chunk at byte {pos} contradicts that of the bag")
-        self._chunk_ends[pos] = self.file.tell()
+            problem = f"the index of the chunk at byte {chunk.start} contradicts that of the bag"
+            raise DamageError(problem)
         self._index_entries[number] += entries
-        self._index_runs[number].extend((chunk, count))
+        self._index_runs[number].extend((len(self.chunks) - 1, count))
+
+    @staticmethod
+    def _index_ranges(chunks: Sequence[_Chunk], end: int) -> Iterator[tuple[int, int]]:
+        """Where the index lies: between the data of the chunks."""
+        ends = [chunk.start for chunk in chunks[1:]] + [end]
+        for chunk, next_start in zip(chunks, ends, strict=True):
+            head = chunk.start + _CHUNK_HEAD
+            yield chunk.start, head
+            entries = (_INDEX_HEAD + _INDEX_ENTRY.itemsize * n for n in chunk.counts.values())
+            if head < next_start:
+                yield max(head, next_start - sum(entries)), next_start
+
+    def expect(self, chunks: Iterable[int]) -> None:
+        """Tell which chunks will be read, by their numbers, in that order."""
+        found = map(self.chunks.__getitem__, chunks)
+        expect(self.file.stream, ((one.place, one.place + one.packed) for one in found))
+
+    def content(self, number: int) -> memoryview:
+        """An unpacked chunk.
+
+        Raises:
+            DamageError: It is damaged, or holds another number of messages than the index lists.
+        """
+        chunk = self.chunks[number]
+        self.file.seek(chunk.place)
+        packed = self.file.take(chunk.packed)
+        unpacked = memoryview(unpack_chunk(chunk.compression, chunk.size, packed))
+        listed = sum(chunk.counts.values())
+        if (found := count_messages(unpacked)) != listed:
+            raise DamageError(f"its index lists {listed} messages of {found}")
+        return unpacked
 
     def take_index(self) -> dict[int, _Index]:
         """The index by connection number; drops what it was made from."""
@@ -380,12 +374,17 @@ class _Bag(Reader):
         chunks = np.repeat(runs[:, 0].astype(np.int32), runs[:, 1])
         times = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
         if times.max(initial=0) >= MAX_TIME:
-            raise ReaderError("it has a message of a time past 2^32 seconds, which is none of ROS")
+            raise DamageError("it has a message of a time past 2^32 seconds, which is none of ROS")
         places = chunks.astype(np.int64) << 32 | entries["offset"]
         if len(np.unique(places)) < len(places):
-            raise ReaderError("its index lists a message twice")
+            raise DamageError("its index lists a message twice")
         order = np.lexsort((entries["offset"], chunks, times))
         index = _Index(times[order], chunks[order], entries["offset"][order])
         if np.logical_and.reduce([column[1:] == column[:-1] for column in index]).any():
-            raise ReaderError("its index lists a message twice")
+            raise DamageError("its index lists a message twice")
         return index
+
+
+def _check_version(header: Fields) -> None:
+    if (version := header.number(b"ver")) != 1:
+        raise DamageError(f"its index has the unknown version {version}")

@@ -8,15 +8,15 @@ import re
 import struct
 from bz2 import BZ2Decompressor
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
+from enum import IntEnum
 from pathlib import Path
 from typing import BinaryIO
 
 import lz4.frame
-from rosbags.rosbag1 import ReaderError
-from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 
-from mp4ds.bags.inflate import most_unpacked
-from mp4ds.bags.mcap_records import SALVAGE_REMEDY, open_source, other_begin
+from mp4ds.bags.mcap_records import SALVAGE_REMEDY, DamageError, open_source, other_begin
+from mp4ds.bags.protocols import most_unpacked
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, Schema
 
@@ -25,22 +25,111 @@ MAX_TIME = 2**32 * 10**9
 """A ROS 1 time is two uint32, seconds and nanoseconds: from here on there are no times."""
 UINT32 = struct.Struct("<I")
 COPY_AGAIN = f"Copy it again, or repair it with `rosbag reindex`; {SALVAGE_REMEDY}"
-DAMAGE = (
-    ReaderError,
-    AssertionError,
-    struct.error,
-    ValueError,
-    LookupError,
-    EOFError,
-    OSError,
-    RuntimeError,
-    MemoryError,
-)
-"""What reading a damaged bag raises: rosbags checks some of its input by assertions."""
+DAMAGE = (DamageError, OSError)
+"""What reading a damaged bag raises, or one on a damaged disk."""
 
 _TIME = struct.Struct("<II")
-_MESSAGE_OP = UINT32.pack(4) + b"op=" + bytes([RecordType.MSGDATA])
 _BASE64 = ";base64"  # marks a connection header field that is not UTF-8, as metadata must be
+
+
+class Op(IntEnum):
+    """Kinds of records."""
+
+    MESSAGE = 2
+    BAG = 3
+    INDEX = 4
+    CHUNK = 5
+    CHUNK_INFO = 6
+    CONNECTION = 7
+
+
+_MESSAGE_OP = UINT32.pack(4) + b"op=" + bytes([Op.MESSAGE])
+
+
+class Fields(dict[bytes, bytes]):
+    """The fields of a record's header."""
+
+    def number(self, name: bytes, size: int = 4) -> int:
+        """A field that is an unsigned number.
+
+        Raises:
+            DamageError: It is not there, or not of that size.
+        """
+        value = self.get(name, b"")
+        if len(value) != size:
+            raise DamageError(f"a record has no field {name.decode()!r} of {size} bytes")
+        return int.from_bytes(value, "little")
+
+    @property
+    def op(self) -> int:
+        """The kind of the record."""
+        return self.number(b"op", 1)
+
+
+class BagFile:
+    """A bag that is read record by record.
+
+    Args:
+        path: The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.stream: BinaryIO = open_source(path)
+        self.size = path.stat().st_size
+
+    def seek(self, place: int) -> None:
+        """Go to a byte.
+
+        Raises:
+            DamageError: The file ends before.
+        """
+        if place > self.size:
+            raise DamageError(f"it has no byte {place}")
+        self.stream.seek(place)
+
+    def tell(self) -> int:
+        """The byte that is read next."""
+        return self.stream.tell()
+
+    def take(self, size: int) -> bytes:
+        """The next bytes.
+
+        Raises:
+            DamageError: There are fewer.
+        """
+        data = self.stream.read(size) if size <= self.size else b""
+        if len(data) != size:
+            raise DamageError("a record is cut short")
+        return data
+
+    def length(self) -> int:
+        """The length of what follows."""
+        return int.from_bytes(self.take(4), "little")
+
+    def header(self, op: Op | None = None) -> Fields:
+        """The header of the next record.
+
+        Args:
+            op: What it should be; None for any.
+
+        Raises:
+            DamageError: It is not, or is cut short.
+        """
+        fields = Fields(split_header(self.take(self.length())))
+        if op is not None and fields.op != op:
+            raise DamageError(f"a record of kind {fields.op} stands where {op.name} should")
+        return fields
+
+    def close(self) -> None:
+        """Close the file."""
+        self.stream.close()
+
+
+def _number(data: bytes | memoryview, offset: int) -> int:
+    try:
+        return int(UINT32.unpack_from(data, offset)[0])
+    except struct.error:
+        raise DamageError("a record is cut short") from None
 
 
 def check_bag(path: Path) -> int:
@@ -52,15 +141,15 @@ def check_bag(path: Path) -> int:
     Raises:
         SourceError: It is missing, empty, no bag, an old or encrypted one, or not indexed.
     """
-    with open_source(path) as stream:
-        size = path.stat().st_size
-        start = stream.read(32)
+    with closing(BagFile(path)) as file:
+        size = file.size
+        start = file.stream.read(32)
         if not start.startswith(MAGIC):
             raise other_format(path, start)
         try:
-            stream.seek(len(MAGIC))
-            header = Header.read(stream, RecordType.BAGHEADER)
-            index, encryptor = header.get_uint64("index_pos"), header.get("encryptor", b"")
+            file.seek(len(MAGIC))
+            header = file.header(Op.BAG)
+            index, encryptor = header.number(b"index_pos", 8), header.get(b"encryptor", b"")
         except DAMAGE as error:
             raise SourceError(path, f"is damaged: {reason(error)}", COPY_AGAIN) from None
     if encryptor:
@@ -94,35 +183,27 @@ def other_format(path: Path, start: bytes) -> SourceError:
     return other_begin(path, "a ROS 1 bag", MAGIC, start)
 
 
-def reason(error: BaseException) -> str:
+def reason(error: DamageError | OSError) -> str:
     """What an error of `DAMAGE` means, as the end of a sentence."""
-    if isinstance(error, struct.error):
-        return "a record is cut short"
-    if isinstance(error, MemoryError):
-        return "a record has an impossible length"
     if isinstance(error, OSError) and error.strerror:
         return f"it cannot be read: {error.strerror}"
-    if not isinstance(error, ReaderError):
-        return "a record does not follow the format"
-    text = re.sub(r"^Bag index looks damaged: \(.(.*).,\)$", r"\1", str(error)).rstrip(".")
-    return text[:1].lower() + text[1:]
+    return str(error)
 
 
 def split_header(raw: bytes) -> Iterator[tuple[bytes, bytes]]:
     """The fields of a record's header, in order.
 
     Raises:
-        ReaderError: They do not fill the header.
-        struct.error: As above.
+        DamageError: They do not fill the header.
     """
     offset = 0
     while offset < len(raw):
-        (size,) = UINT32.unpack_from(raw, offset)
+        size = _number(raw, offset)
         offset += 4
         name, equals, value = raw[offset : offset + size].partition(b"=")
         offset += size
         if not equals or offset > len(raw):
-            raise ReaderError("a record's header is damaged")
+            raise DamageError("a record's header is damaged")
         yield name, value
 
 
@@ -143,24 +224,24 @@ def payload(chunk: memoryview, offset: int, number: int, time: int) -> memoryvie
         time: Log time that it should have, nanoseconds.
 
     Raises:
-        ReaderError: Another message is there, or none.
-        struct.error: The chunk ends before.
+        DamageError: Another message is there, or none.
     """
     while True:
-        (size,) = UINT32.unpack_from(chunk, offset)
-        fields = dict(split_header(bytes(chunk[offset + 4 : offset + 4 + size])))
-        (length,) = UINT32.unpack_from(chunk, offset + 4 + size)
+        size = _number(chunk, offset)
+        fields = Fields(split_header(bytes(chunk[offset + 4 : offset + 4 + size])))
+        length = _number(chunk, offset + 4 + size)
         start = offset + 8 + size
-        if fields.get(b"op") != bytes([RecordType.CONNECTION]):
+        if fields.op != Op.CONNECTION:
             break
         offset = start + length  # some writers let the index point to the connection before it
-    if fields.get(b"op") != bytes([RecordType.MSGDATA]):
-        raise ReaderError("the index does not point to a message")
-    found = (UINT32.unpack(fields[b"conn"])[0], *_TIME.unpack(fields[b"time"]))
-    if found[0] != number or found[1] * 10**9 + found[2] != time:
-        raise ReaderError("the index points to another message")
+    if fields.op != Op.MESSAGE:
+        raise DamageError("the index does not point to a message")
+    stamp = fields.get(b"time", b"")
+    found = _TIME.unpack(stamp) if len(stamp) == _TIME.size else (0, -1)
+    if fields.number(b"conn") != number or found[0] * 10**9 + found[1] != time:
+        raise DamageError("the index points to another message")
     if start + length > len(chunk):
-        raise ReaderError("a message is longer than its chunk")
+        raise DamageError("a message is longer than its chunk")
     return chunk[start : start + length]
 
 
@@ -168,29 +249,28 @@ def count_messages(chunk: memoryview) -> int:
     """How many messages an unpacked chunk holds, whatever the index says.
 
     Raises:
-        struct.error: It ends within a record.
+        DamageError: It ends within a record.
     """
     count = offset = 0
     while offset < len(chunk):
-        (size,) = UINT32.unpack_from(chunk, offset)
+        size = _number(chunk, offset)
         offset += 4 + size
         count += _MESSAGE_OP in bytes(chunk[offset - size : offset])
-        (length,) = UINT32.unpack_from(chunk, offset)
-        offset += 4 + length
+        offset += 4 + _number(chunk, offset)
     return count
 
 
-def check_between(file: BinaryIO, place: int, end: int) -> None:
+def check_between(file: BagFile, place: int, end: int) -> None:
     """Refuse messages between two bytes of a bag, where the index lists none.
 
     Raises:
-        ReaderError: There are some, or something that is no record.
+        DamageError: There are some, or something that is no record.
     """
     while place < end:
         file.seek(place)
-        if Header.read(file).get_uint8("op") in (RecordType.CHUNK, RecordType.MSGDATA):
-            raise ReaderError(f"its index does not list what it holds at byte {place}")
-        place = read_uint32(file) + file.tell()
+        if file.header().op in (Op.CHUNK, Op.MESSAGE):
+            raise DamageError(f"its index does not list what it holds at byte {place}")
+        place = file.length() + file.tell()
 
 
 def unpack_chunk(compression: str, size: int, data: bytes) -> bytes:
@@ -202,24 +282,24 @@ def unpack_chunk(compression: str, size: int, data: bytes) -> bytes:
         data: As it is in the file.
 
     Raises:
-        ReaderError: The data is damaged, or the compression is not known.
+        DamageError: The data is damaged, or the compression is not known.
     """
     if compression == "none":
         unpacked = data
     elif compression in ("bz2", "lz4"):
         if size > most_unpacked(len(data)):
-            raise ReaderError(f"it promises {size} bytes and has {len(data)}")
+            raise DamageError(f"it promises {size} bytes and has {len(data)}")
         machine = BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
         try:
             unpacked = machine.decompress(data, max_length=size + 1)
         except (OSError, RuntimeError):
-            raise ReaderError(f"its {compression} data is damaged") from None
+            raise DamageError(f"its {compression} data is damaged") from None
         if not machine.eof:
-            raise ReaderError(f"its {compression} data does not unpack to {size} bytes")
+            raise DamageError(f"its {compression} data does not unpack to {size} bytes")
     else:
-        raise ReaderError(f"it is compressed by {compression!r}, which is not known")
+        raise DamageError(f"it is compressed by {compression!r}, which is not known")
     if len(unpacked) != size:
-        raise ReaderError(f"it unpacks to {len(unpacked)} bytes instead of {size}")
+        raise DamageError(f"it unpacks to {len(unpacked)} bytes instead of {size}")
     return unpacked
 
 

@@ -17,10 +17,9 @@ from rosbags.interfaces import (
     MessageDefinitionFormat,
 )
 from rosbags.rosbag1 import Writer
-from rosbags.rosbag1.reader import RecordType
 from rosbags.rosbag1.writer import WriteChunk
 
-from mp4ds.bags.ros1_records import MAX_TIME, UINT32, join_header, make_header
+from mp4ds.bags.ros1_records import MAX_TIME, UINT32, Op, join_header, make_header
 from mp4ds.errors import ConversionError, OptionError, TargetExistsError
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
 
@@ -40,7 +39,7 @@ def check_channel(channel: Channel) -> None:
             channel.topic,
             f"its messages are {channel.message_encoding or 'of no known encoding'}, "
             "and a ROS 1 bag holds only those of ROS 1",
-            "Exclude the topic with --exclude, or unpack to mcap, which keeps it as it is.",
+            "Exclude the topic with `exclude`, or unpack to mcap, which keeps it as it is.",
         )
 
 
@@ -157,7 +156,7 @@ class _BagWriter(Writer):
             self,
         )
         number = UINT32.pack(connection.id)
-        record = ((b"op", bytes([RecordType.CONNECTION])), (b"conn", number), (b"topic", topic))
+        record = ((b"op", bytes([Op.CONNECTION])), (b"conn", number), (b"topic", topic))
         connection.record = join_header(record) + join_header(header)
         self.write_connection(connection, self.chunks[-1].data)
         self.connections.append(connection)
@@ -174,7 +173,7 @@ class _BagWriter(Writer):
         chunk = self.chunks[-1]
         chunk.connections[number].append((time, chunk.data.tell()))
         chunk.start, chunk.end = min(chunk.start, time), max(chunk.end, time)
-        op, conn = (4, b"op=", RecordType.MSGDATA), (9, b"conn=", number)
+        op, conn = (4, b"op=", Op.MESSAGE), (9, b"conn=", number)
         stamp = (13, b"time=", *divmod(time, 10**9))
         chunk.data.write(_MESSAGE_HEAD.pack(38, *op, *conn, *stamp, len(data)))
         chunk.data.write(data)

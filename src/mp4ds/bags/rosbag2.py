@@ -14,8 +14,16 @@ from numpy.typing import NDArray
 
 from mp4ds.bags.mcap import McapReader, is_mcap
 from mp4ds.bags.mcap_records import SALVAGE_REMEDY, unzstd
-from mp4ds.bags.ordering import Part, merged
-from mp4ds.bags.protocols import Format
+from mp4ds.bags.protocols import Format, SourcePart, merged
+from mp4ds.bags.rosbag2_files import (
+    SharedChannels,
+    ZstdFile,
+    consecutive,
+    copy_file,
+    decompress_file,
+    is_zstd,
+    unlisted_storage,
+)
 from mp4ds.bags.rosbag2_metadata import (
     METADATA_FILE,
     RECORD,
@@ -24,11 +32,9 @@ from mp4ds.bags.rosbag2_metadata import (
     parse_bag_info,
     read_bag_info,
 )
-from mp4ds.bags.rosbag2_parts import SharedChannels, consecutive, unlisted_storage
 from mp4ds.bags.rosbag2_sqlite import SqliteReader
-from mp4ds.bags.rosbag2_write import Rosbag2Writer
-from mp4ds.bags.zstd_files import ZstdFile, copy_file, decompress_file, is_zstd
 from mp4ds.errors import SourceError, SourceNotFoundError
+from mp4ds.files.urls import remote
 from mp4ds.records import (
     EVERYTHING,
     Channel,
@@ -39,9 +45,6 @@ from mp4ds.records import (
     Record,
     Schema,
 )
-from mp4ds.remote import remote
-
-__all__ = ["Rosbag2Reader", "Rosbag2Writer"]
 
 StorageReader = McapReader | SqliteReader
 _NO_STATS = ChannelStats(0, 0, 0)
@@ -201,7 +204,7 @@ class Rosbag2Reader:
             starts = [reader.start or 0 for reader in self._readers if reader]
             yield from merged(
                 [
-                    Part(start, partial(self._file_records, number, excerpt))
+                    SourcePart(start, partial(self._file_records, number, excerpt))
                     for number, start in enumerate(starts)
                 ]
             )

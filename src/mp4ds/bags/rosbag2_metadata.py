@@ -48,7 +48,7 @@ _Dumper.add_representer(str, _represent_str)
 
 
 @dataclass(frozen=True)
-class Topic:
+class TopicMetadata:
     """A topic as metadata.yaml lists it.
 
     Attributes:
@@ -102,7 +102,7 @@ class BagInfo:
     compression: str
     ros_distro: str
     custom_data: Mapping[str, str]
-    topics: tuple[Topic, ...]
+    topics: tuple[TopicMetadata, ...]
     counts: Mapping[str, int]
 
 
@@ -208,7 +208,7 @@ def _base_name(name: Any, path: Path) -> str:
 
 
 def _counts(
-    info: Mapping[str, Any], names: Sequence[str], topics: Sequence[Topic]
+    info: Mapping[str, Any], names: Sequence[str], topics: Sequence[TopicMetadata]
 ) -> Mapping[str, int]:
     if len(names) == 1:
         return {names[0]: sum(topic.count for topic in topics)}
@@ -243,11 +243,11 @@ def _compression(info: Mapping[str, Any], path: Path) -> str:
     return mode
 
 
-def _topic(item: Mapping[str, Any]) -> Topic:
+def _topic(item: Mapping[str, Any]) -> TopicMetadata:
     topic = item["topic_metadata"]
     qos = topic.get("offered_qos_profiles")
     has_qos, has_hash = "offered_qos_profiles" in topic, "type_description_hash" in topic
-    return Topic(
+    return TopicMetadata(
         name=_text(topic["name"]),
         type_name=_text(topic["type"]),
         serialization_format=_text(topic["serialization_format"]),

@@ -1,25 +1,158 @@
-"""``mp4ds evaluate``."""
+"""``mp4ds evaluate``, and what it prints."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from mp4ds.cli.failures import told_errors
-from mp4ds.cli.options import ClusterOption
-from mp4ds.cli.output import print_json
-from mp4ds.errors import OptionError
+from mp4ds.cli.options import JsonFlag, takes
+from mp4ds.cli.output import print_json, print_table, say, size_text
+from mp4ds.cli.process import told_errors
+from mp4ds.plugins.evaluating.evaluate import evaluate as run
+from mp4ds.plugins.evaluating.options import EvaluateOptions
 
 if TYPE_CHECKING:
-    from mp4ds.evaluating import EvaluateProgress
+    from mp4ds.plugins.evaluating.results import (
+        CameraEvaluation,
+        Cell,
+        EvaluateProgress,
+        Evaluation,
+    )
+
+_CELLS = [
+    (name, "right")
+    for name in (
+        *("codec", "preset", "crf", "kbit/s", "B/frame", "fps", "CPU s", "decoded/CPU s"),
+        *("VMAF", "harmonic", "5 %", "least", "PSNR Y", "SSIM", "whole", "time"),
+    )
+]
+_RATES = [
+    (name, "right")
+    for name in (
+        *("Hz", "frames", "codec", "preset", "crf", "score", "ceiling"),
+        *("B/frame", "ms/frame", "kbit/s"),
+    )
+]
+_STORAGE = [("stored as", "fold"), ("B/frame", "right"), ("size", "right"), ("days", "right"),
+            ("CPU days", "right")]  # fmt: skip
+
+
+def print_evaluation(result: Evaluation) -> None:
+    """Print what was found."""
+    for camera in result.cameras:
+        _print_camera(camera)
+    for topic, reason in result.left_out.items():
+        say(f"{topic}: left out: {reason}")
+    if len(result.cameras) > 1:
+        for item in result.recommended:
+            say(f"{item.why} for all cameras: {item.options} (at least {item.score:.2f})")
+        if not result.recommended:
+            say("no setting reaches the targets of all cameras")
+    known = f", {result.known} known from before" if result.known else ""
+    say(f"{result.output}/index.html: {result.tried} settings tried{known}")
+
+
+def _print_camera(camera: CameraEvaluation) -> None:
+    rate = f" at {camera.rate:.2f} Hz" if camera.rate else ""
+    say(
+        f"{camera.topic}: {camera.encoding} {camera.size[0]}x{camera.size[1]}{rate}; clip of "
+        f"{camera.frames} frames from {camera.start:.2f} s on, of {camera.source_frames}"
+    )
+    print_table(_CELLS, [_cell_row(cell) for cell in camera.cells])
+    ceiling = ", ".join(f"{name} {value.mean:.2f}" for name, value in camera.ceiling.items())
+    say(f"ceiling, the clip beside itself: {ceiling}")
+    if camera.rates:
+        print_table(_RATES, _rate_rows(camera))
+    if camera.storage and camera.data_set:
+        data_set = camera.data_set
+        say(
+            f"{data_set.streams} cameras for {data_set.hours:g} hours at {data_set.rate:.2f} Hz, "
+            f"{data_set.frames:.0f} frames:"
+        )
+        print_table(_STORAGE, _storage_rows(camera))
+    for note in camera.notes:
+        say(f"note: {note}")
+    for item in camera.recommended:
+        say(f"{item.why}: {item.options} ({camera.target.metric} {item.score:.2f})")
+
+
+def _score(cell: Cell, metric: str, statistic: str, digits: int) -> str:
+    summary = cell.scores.get(metric)
+    return "" if summary is None else f"{getattr(summary, statistic):.{digits}f}"
+
+
+def _cell_row(cell: Cell) -> list[str]:
+    setting = cell.setting
+    return [
+        setting.codec,
+        setting.preset,
+        str(setting.crf),
+        f"{cell.kbps:.0f}",
+        f"{cell.frame_bytes:.0f}",
+        f"{cell.encode_fps:.1f}",
+        f"{cell.encode_cpu_seconds:.2f}",
+        f"{cell.decode_fps:.0f}",
+        *(
+            _score(cell, "vmaf", statistic, 2)
+            for statistic in ("mean", "harmonic_mean", "percentile_5", "minimum")
+        ),
+        _score(cell, "psnr_y", "mean", 2),
+        _score(cell, "ssim", "mean", 4),
+        size_text(cell.whole_bytes),
+        time_text(cell.whole_seconds),
+    ]
+
+
+def _rate_rows(camera: CameraEvaluation) -> list[list[str]]:
+    return [
+        [
+            f"{row.rate:g}",
+            str(row.frames),
+            row.setting.codec,
+            row.setting.preset,
+            str(row.setting.crf),
+            f"{row.score:.2f}" + ("" if row.reached else " (not reached)"),
+            f"{row.ceiling:.2f}",
+            f"{row.frame_bytes:.0f}",
+            f"{row.frame_seconds * 1000:.1f}",
+            f"{row.kbps:.0f}",
+        ]
+        for row in camera.rates
+    ]
+
+
+def _storage_rows(camera: CameraEvaluation) -> list[list[str]]:
+    return [
+        [
+            row.form,
+            f"{row.frame_bytes:.0f}",
+            f"{row.gigabytes:.1f} GB",
+            "" if row.days is None else f"{row.days:.2f}",
+            "" if row.cpu_days is None else f"{row.cpu_days:.2f}",
+        ]
+        for row in camera.storage
+    ]
+
+
+def time_text(seconds: float) -> str:
+    """A time in the unit that suits it."""
+    for limit, unit, size in ((120, "s", 1), (7200, "min", 60), (172_800, "h", 3600)):
+        if seconds < limit:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds / 86_400:.1f} days"
+
+
+# ---------------------------------------------------------------- evaluate
 
 _AGAIN = "what was measured is kept: run the same command again to go on"
 
 
+@takes(EvaluateOptions)
 def evaluate(
+    options: Callable[[], EvaluateOptions],
     source: Annotated[
         str,
         typer.Argument(help="A .bag, rosbag2 folder, .mcap, dataset, video or folder of images."),
@@ -30,129 +163,19 @@ def evaluate(
             "--output", "-o", metavar="DIR", help="For the results; NAME_evaluation by default."
         ),
     ] = None,
-    codecs: Annotated[
-        str,
-        typer.Option(
-            "--codecs",
-            help="Of svtav1, x264 and x265, with commas between; or as --codec of mp4ds pack.",
-        ),
-    ] = "svtav1,x264,x265",
-    crf: Annotated[
-        str, typer.Option("--crf", help="Such as 16:25, 16:25:3 or 16,20,24.")
-    ] = "16:25:3",
-    presets: Annotated[
-        str,
-        typer.Option(
-            "--presets", help="Such as 6,8,medium; each is tried with the codecs that have it."
-        ),
-    ] = "",
-    topics: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option("--topics", "-t", metavar="GLOB", help="Only cameras that match."),
-    ] = None,
-    exclude: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option("--exclude", "-x", metavar="GLOB", help="Leave out cameras that match."),
-    ] = None,
-    start: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option(
-            "--start", metavar="SECONDS", help="Where the clips begin; from the middle by default."
-        ),
-    ] = None,
-    duration: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option("--duration", metavar="SECONDS", help="Of the clips, instead of --frames."),
-    ] = None,
-    frames: Annotated[int, typer.Option("--frames", min=1, help="Of a clip.")] = 150,
-    fps: Annotated[float, typer.Option("--fps", help="Of a folder of images.")] = 30.0,
-    target: Annotated[
-        str, typer.Option("--target", help="The score to reach: vmaf, psnr_y ... or ssim.")
-    ] = "vmaf=99.5",
-    rates: Annotated[
-        str,
-        typer.Option(
-            "--rates",
-            metavar="HZ",
-            help="Such as 2,5,10,20,30,60: the crf that reaches the target at these rates.",
-        ),
-    ] = "",
-    streams: Annotated[
-        Optional[int],  # noqa: UP045
-        typer.Option("--streams", min=1, help="Cameras of a data set, whose size is told."),
-    ] = None,
-    hours: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option("--hours", help="How long they record."),
-    ] = None,
-    gop: Annotated[
-        Optional[int],  # noqa: UP045
-        typer.Option(
-            "--gop", min=1, max=100_000, help="Most frames from a key frame to the next; 60."
-        ),
-    ] = None,
-    threads: Annotated[
-        Optional[int],  # noqa: UP045
-        typer.Option(
-            "--threads",
-            min=1,
-            max=1024,
-            help="Of an encoder; all cores by default, one on a cluster.",
-        ),
-    ] = None,
-    jobs: Annotated[
-        int,
-        typer.Option("--jobs", "-j", min=1, max=1024, help="Settings at a time; 1 for true times."),
-    ] = 1,
-    cluster: ClusterOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    as_json: JsonFlag = False,
 ) -> None:
     """Try encoder settings on clips of a recording: quality, size and time.
 
     Makes a folder with tables, plots and a page, and recommends what to pack with. An evaluation
     that was interrupted goes on when the same command is run again.
     """
-    from mp4ds.cli.evaluate_output import print_evaluation
-    from mp4ds.evaluating import EvaluateOptions
-    from mp4ds.evaluating import evaluate as run
-    from mp4ds.video.codecs import LOSSY_GOP
-
     with told_errors(as_json), _interruptible(), _progress(as_json) as report:
-        options = EvaluateOptions(
-            codecs=_words(codecs),
-            crf=_words(crf),
-            presets=_words(presets),
-            topics=topics or (),
-            exclude=exclude or (),
-            start=start,
-            duration=duration,
-            frames=frames,
-            fps=fps,
-            gop=gop or LOSSY_GOP,
-            threads=threads,
-            jobs=jobs,
-            cluster=cluster,
-            target=target,
-            rates=_numbers("--rates", rates),
-            streams=streams,
-            hours=hours,
-        )
-        result = run(source, options, output=output, progress=report)
+        result = run(source, options(), output=output, progress=report)
     if as_json:
         print_json(result)
     else:
         print_evaluation(result)
-
-
-def _words(text: str) -> Sequence[str]:
-    return [word.strip() for word in text.split(",") if word.strip()]
-
-
-def _numbers(name: str, text: str) -> Sequence[float]:
-    try:
-        return [float(word) for word in _words(text)]
-    except ValueError:
-        raise OptionError(f"{name} {text!r} is no list of numbers, such as 2,5,10.") from None
 
 
 @contextmanager

@@ -1,88 +1,163 @@
-"""Options that several commands have."""
+"""Options of dataclasses as those of commands, and values as users write them."""
 
 from __future__ import annotations
 
-from typing import Annotated, Optional
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import update_wrapper
+from typing import Annotated, Any, Optional, Union, get_args, get_origin, get_type_hints
 
 import typer
+from typer.models import OptionInfo
+
+from mp4ds.errors import OptionError
+from mp4ds.options import Options, Shown, shown_of
 
 DatasetArgument = Annotated[str, typer.Argument(help="A dataset, or a sidecar beside its video.")]
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-TopicsOption = Annotated[
-    Optional[list[str]],  # noqa: UP045 - read at run time by typer
-    typer.Option("--topics", "-t", metavar="GLOB", help="Only topics that match; may be repeated."),
-]
-ExcludeOption = Annotated[
-    Optional[list[str]],  # noqa: UP045
-    typer.Option("--exclude", "-x", metavar="GLOB", help="Leave out topics that match."),
-]
 ForceFlag = Annotated[bool, typer.Option("--force", "-f", help="Replace an existing output.")]
-ResizeOption = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option("--resize", metavar="0.5|WxH", help="Smaller images, calibrations to match."),
-]
-EveryOption = Annotated[
-    int, typer.Option("--every", min=1, metavar="N", help="Every Nth frame only.")
-]
-MaxRateOption = Annotated[
-    Optional[float],  # noqa: UP045
-    typer.Option("--max-rate", metavar="HZ", help="So many frames a second at most."),
-]
-JpegQualityOption = Annotated[
-    int, typer.Option("--jpeg-quality", min=1, max=100, help="Of JPEG files that are made.")
-]
 
-ClusterOption = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option("--cluster", metavar="ADDRESS", help="Dask scheduler, tcp://HOST:PORT, or slurm."),
-]
+_FLAGS: dict[str, str] = {}  # what the options of the commands that were made are called
 
-# of what makes videos
-CodecOption = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option(
-        "--codec",
-        help="h264, h265, ffv1 (lossless), av1, av1-10bit (lossy); of a graphics card av1-nvenc, "
-        "h264-nvenc, h265-nvenc, ...-vaapi or ...-videotoolbox.",
-    ),
-]
-PresetOption = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option("--preset", help="The encoder's preset, such as 6, veryfast or p4."),
-]
-TranscodeFlag = Annotated[
-    bool,
-    typer.Option(
-        "--transcode", help="Encode JPEG images anew by --quality, instead of copying them."
-    ),
-]
-PurposeOption = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option(
-        "--for",
-        metavar="PURPOSE",
-        help="archive: smallest files. training: fastest random access.",
-    ),
-]
-GopOption = Annotated[
-    Optional[int],  # noqa: UP045
-    typer.Option(
-        "--gop",
-        min=1,
-        max=100_000,
-        help="Most frames from a key frame to the next; 30 by default, 60 where lossy.",
-    ),
-]
-JobsOption = Annotated[
-    Optional[int],  # noqa: UP045
-    typer.Option(
-        "--jobs", "-j", min=1, max=1024, help="Processes at a time; all cores by default."
-    ),
-]
-MemoryOption = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option("--memory", metavar="SIZE", help="Such as 8G; half of the machine's by default."),
-]
-RestartFlag = Annotated[
-    bool, typer.Option("--restart", help="Start over where an unfinished run was left.")
-]
+
+def in_flags(text: str) -> str:
+    """A sentence of the library, with the flags of the command line for the names of options."""
+    return re.sub("`([a-z_0-9]+)`", lambda match: _FLAGS.get(match[1], match[0]), text)
+
+
+def takes(
+    *kinds: type[Options], without: Sequence[str] = ()
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of dataclasses, behind its own that are required.
+
+    The command gets, for each dataclass, a function that makes it of what the user gave, and
+    raises `OptionError` for values that are none.
+
+    Args:
+        kinds: The dataclasses; no two have an option of the same name.
+        without: Options that the command does not have.
+    """
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        hints = get_type_hints(command, include_extras=True)
+        written = list(inspect.signature(command).parameters.values())[len(kinds) :]
+        own = [parameter.replace(annotation=hints[parameter.name]) for parameter in written]
+        for parameter in own:
+            for info in get_args(parameter.annotation)[1:]:
+                if isinstance(info, OptionInfo):
+                    _FLAGS[parameter.name] = _long(info.param_decls or (), parameter.name)
+        for kind in kinds:
+            _FLAGS.update({name: _long(item.flags, name) for name, item in shown_of(kind).items()})
+        made = [_parameters(kind, without) for kind in kinds]
+        required = [parameter for parameter in own if parameter.default is parameter.empty]
+        others = [parameter for parameter in own if parameter.default is not parameter.empty]
+        parameters = [*required, *(one for found in made for one in found.values()), *others]
+
+        def call(**given: Any) -> None:
+            values = [{name: given.pop(name) for name in found} for found in made]
+            command(
+                *(
+                    lambda kind=kind, value=value: _made(kind, value)
+                    for kind, value in zip(kinds, values, strict=True)
+                ),
+                **given,
+            )
+
+        update_wrapper(call, command)
+        del call.__dict__["__wrapped__"]  # typer would look there
+        call.__dict__["__signature__"] = inspect.Signature(
+            [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in parameters]
+        )
+        call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        return call
+
+    return decorate
+
+
+def _parameters(kind: type[Options], without: Sequence[str]) -> Mapping[str, inspect.Parameter]:
+    hints = get_type_hints(kind)
+    return {
+        name: _parameter(name, hints[name], getattr(kind, name), item)
+        for name, item in shown_of(kind).items()
+        if name not in without
+    }
+
+
+def _parameter(name: str, hint: Any, default: Any, shown: Shown) -> inspect.Parameter:
+    decls = shown.flags
+    if not any(flag.startswith("--") for flag in decls):
+        decls = (_long(decls, name), *decls)
+    if shown.parse or default == ():
+        default = shown.default
+    info = typer.Option(
+        *decls,
+        help=in_flags(shown.help),
+        metavar=shown.metavar,
+        min=shown.least,
+        max=shown.most,
+    )
+    return inspect.Parameter(
+        name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=default,
+        annotation=Annotated[_plain(hint, shown), info],
+    )
+
+
+def _long(decls: Sequence[str], name: str) -> str:
+    found = [flag for flag in decls if flag.startswith("--")]
+    return found[0].partition("/")[0] if found else "--" + name.replace("_", "-")
+
+
+def _plain(hint: Any, shown: Shown) -> Any:
+    """A type that typer makes of text."""
+    if shown.parse:
+        return Optional[str]  # noqa: UP045
+    if get_origin(hint) not in (None, Union) and type(None) not in get_args(hint):
+        return Optional[list[str]]  # noqa: UP045 - of a sequence
+    if type(None) in get_args(hint):  # written with a bar, which older typers do not read
+        return Optional[get_args(hint)[0]]  # noqa: UP045
+    return hint
+
+
+def _made(kind: type[Options], given: Mapping[str, Any]) -> Options:
+    shown = shown_of(kind)
+    values = {}
+    for name, value in given.items():
+        parse = shown[name].parse
+        if value is not None:
+            values[name] = parse(value) if parse else value
+    return kind(**values)
+
+
+def parse_share(text: str) -> tuple[int, int]:
+    """Number and count of ``I/N``.
+
+    Raises:
+        OptionError: It is none.
+    """
+    match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+    if not match or not 1 <= int(match[1]) <= int(match[2]):
+        raise OptionError(f"`shard` {text!r} is not I/N, such as 3/16, with I from 1 to N.")
+    return int(match[1]), int(match[2])
+
+
+def spelled(arguments: Sequence[str]) -> list[str]:
+    """Arguments of the command line, ``play --clock 50`` with its rate as an option of its own.
+
+    ``--clock`` is a flag of `rosbag play` and takes a number, if there is one, from users of
+    ``ros2 bag play``.
+    """
+    if arguments[:1] != ["play"]:
+        return [*arguments]
+    made: list[str] = []
+    for argument in arguments:
+        name, has_value, value = argument.partition("=")
+        if name == "--clock" and has_value:
+            made += ["--clock", "--hz", value]
+        elif made[-1:] == ["--clock"] and re.fullmatch(r"[0-9]+(\.[0-9]+)?", argument):
+            made += ["--hz", argument]
+        else:
+            made.append(argument)
+    return made

@@ -18,11 +18,11 @@ from mp4ds.errors import Mp4dsError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from mp4ds.checks import Problem
-    from mp4ds.info import Info, TopicInfo
-    from mp4ds.packing import PackSummary, TopicSummary
+    from mp4ds.dataset.checks import Problem
+    from mp4ds.packing.options import PackSummary, TopicSummary
+    from mp4ds.plugins.info import Info, TopicInfo
     from mp4ds.records import Loss
-    from mp4ds.unpacking import UnpackProgress, UnpackSummary
+    from mp4ds.unpacking.unpack import UnpackProgress, UnpackSummary
 
 _LOSSES_SHOWN = 20
 

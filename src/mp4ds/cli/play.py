@@ -1,34 +1,352 @@
-"""``mp4ds play``."""
+"""``mp4ds play``: the keyboard of a player, where it stands, and what it did."""
 
 from __future__ import annotations
 
+import os
+import select
 import signal
+import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
-from typing import Annotated, Any, Optional
+from dataclasses import replace
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mp4ds.cli.arguments import parse_resize
-from mp4ds.cli.failures import told_errors
-from mp4ds.cli.options import (
-    EveryOption,
-    JpegQualityOption,
-    JsonFlag,
-    MaxRateOption,
-    ResizeOption,
-    TopicsOption,
-)
-from mp4ds.cli.output import print_json
-from mp4ds.cli.play_output import play_progress, print_play, tell
-from mp4ds.cli.process import ending_signals
+from mp4ds.cli.options import JsonFlag, takes
+from mp4ds.cli.output import complain, print_json, say, shown
+from mp4ds.cli.process import ending_signals, told_errors
 from mp4ds.errors import OptionError
+from mp4ds.plugins.playing.play import PlayOptions, open_player
+from mp4ds.plugins.publishing.publisher import Controls
+
+if TYPE_CHECKING:
+    from mp4ds.plugins.playing.player import PlayProgress, PlaySummary
+
+_FASTER = 1.1
+_POLL_S = 0.2
+"""How often it is looked whether the command is in the foreground again."""
+
+_ENDING = ("SIGTERM", "SIGHUP", "SIGQUIT")
+"""Signals that end a program without a word, where nobody handles them."""
+
+_ESCAPE = 0x1B
+_ARROWS = {ord("A"): "up", ord("B"): "down", ord("C"): "right", ord("D"): "left"}
+_MAX_SEQUENCE = 32
+
+
+class Keyboard:
+    """Controls a player by keys, while it is entered; a context manager.
+
+    Space: stand still or go on; right or ``s``: one message; left or ``b``: one back; up and
+    down: 10 % faster and slower. Others are ignored. Where standard input is no terminal it
+    does nothing.
+
+    The terminal is set to give keys at once and not to show them. It is as it was after the end,
+    whatever ends the body or, by a signal, the program; and while the program is stopped
+    (Ctrl-Z) or in the background, where it reads nothing.
+
+    Args:
+        controls: The player.
+        fd: File descriptor of the terminal; None for standard input.
+    """
+
+    def __init__(self, controls: Controls, *, fd: int | None = None) -> None:
+        self._actions: dict[str, Callable[[], object]] = {
+            " ": controls.toggle_paused,
+            "right": controls.play_next,
+            "s": controls.play_next,
+            "left": controls.step_back,
+            "b": controls.step_back,
+            "up": lambda: controls.set_rate(_rounded(controls.rate * _FASTER)),
+            "down": lambda: controls.set_rate(_rounded(controls.rate / _FASTER)),
+        }
+        self._terminal = _terminal(fd)
+        self._handlers: dict[int, Any] = {}
+        self._wake: tuple[int, int] | None = None
+        self._thread: threading.Thread | None = None
+
+    def __enter__(self) -> Keyboard:
+        if self._terminal is not None:
+            self._handle_signals()
+            try:
+                self._wake = os.pipe()
+                self._thread = threading.Thread(
+                    target=self._read,
+                    args=(self._terminal, self._wake[0]),
+                    name="keys",
+                    daemon=True,
+                )
+                self._terminal.take()
+                self._thread.start()
+            except BaseException:
+                self._leave()
+                raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._leave()
+
+    def _leave(self) -> None:
+        """Give the terminal back."""
+        if self._terminal is not None:
+            self._terminal.leave()
+        if self._wake is not None:
+            os.close(self._wake[1])
+            # a key's action that does not end, with all of the program, is not waited for
+            if self._thread is not None and self._thread.ident is not None:
+                self._thread.join(_POLL_S * 5)
+            if self._thread is None or not self._thread.is_alive():
+                os.close(self._wake[0])
+            self._wake = None
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        self._handlers.clear()
+
+    # ------------------------------------------------------------ keys
+
+    def _read(self, terminal: _Terminal, wake: int) -> None:
+        keys = Keys()
+        while True:
+            is_ours = terminal.take()
+            watched = [wake, terminal.fd] if is_ours else [wake]
+            ready, _, _ = select.select(watched, [], [], _POLL_S)
+            if wake in ready:
+                return
+            if terminal.fd not in ready:
+                continue
+            try:
+                data = os.read(terminal.fd, 256)
+            except OSError:  # it was closed
+                return
+            if not data:
+                return
+            for key in keys.feed(data):
+                if action := self._actions.get(key):
+                    action()
+
+    # ------------------------------------------------------------ signals
+
+    def _handle_signals(self) -> None:
+        """Only the main thread can; elsewhere the terminal is given back at the end alone."""
+        if threading.current_thread() is not threading.main_thread():
+            return
+        for name in _ENDING:
+            number = getattr(signal, name)
+            if signal.getsignal(number) is signal.SIG_DFL:
+                self._handlers[number] = signal.signal(number, self._on_end)
+        if signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL:
+            self._handlers[signal.SIGTSTP] = signal.signal(signal.SIGTSTP, self._on_stop)
+
+    def _on_end(self, number: int, frame: FrameType | None) -> None:
+        if self._terminal is not None:
+            self._terminal.leave()
+        signal.signal(number, signal.SIG_DFL)
+        signal.raise_signal(number)
+
+    def _on_stop(self, number: int, frame: FrameType | None) -> None:
+        """Stop, as is usual; the thread takes the terminal again after it went on."""
+        if self._terminal is None:
+            return
+        self._terminal.leave()
+        signal.signal(number, signal.SIG_DFL)
+        signal.raise_signal(number)
+        signal.signal(number, self._on_stop)
+        self._terminal.come_back()
+
+
+class Keys:
+    """Takes keys out of what a terminal sends, wherever that is cut."""
+
+    def __init__(self) -> None:
+        self._sequence = b""
+
+    def feed(self, data: bytes) -> Iterator[str]:
+        """The keys that are complete: a character, ``up``, ``down``, ``left`` or ``right``.
+
+        Other sequences, such as those of function keys, are left out. An escape that no sequence
+        follows is left out, too.
+        """
+        for byte in data:
+            if byte == _ESCAPE:
+                self._sequence = b"\x1b"
+            elif not self._sequence or (self._sequence == b"\x1b" and byte not in b"[O"):
+                self._sequence = b""
+                if byte < 0x80:
+                    yield chr(byte)
+            elif len(self._sequence) > 1 and 0x40 <= byte <= 0x7E:
+                is_bare = len(self._sequence) == 2
+                self._sequence = b""
+                if is_bare and byte in _ARROWS:
+                    yield _ARROWS[byte]
+            else:
+                self._sequence = (self._sequence + bytes([byte]))[:_MAX_SEQUENCE]
+
+
+class _Terminal:
+    """A terminal that gives keys at once while it is taken."""
+
+    def __init__(self, fd: int, termios: Any) -> None:
+        self.fd = fd
+        self._termios = termios
+        self._before: list[Any] | None = None
+        self._is_left = False
+        # a signal may come while the main thread has it
+        self._lock = threading.RLock()
+
+    def take(self) -> bool:
+        """Set it if it is the program's at present; returns whether it is."""
+        with self._lock:
+            if self._is_left or not self._is_in_foreground():
+                return False
+            if self._before is None:
+                try:
+                    before = self._termios.tcgetattr(self.fd)
+                    self._termios.tcsetattr(self.fd, self._termios.TCSANOW, self._keyed(before))
+                except self._termios.error:  # it was closed
+                    return False
+                self._before = before
+            return True
+
+    def leave(self) -> None:
+        """Have it as it was, and not take it again."""
+        with self._lock:
+            self._is_left = True
+            before, self._before = self._before, None
+            if before is None or not self._is_in_foreground():
+                return
+            try:
+                self._termios.tcsetattr(self.fd, self._termios.TCSANOW, before)
+            except self._termios.error:  # it was closed
+                return
+
+    def come_back(self) -> None:
+        """Let it be taken again."""
+        with self._lock:
+            self._is_left = False
+
+    def _keyed(self, before: list[Any]) -> list[Any]:
+        attributes = [*before[:6], [*before[6]]]
+        attributes[3] &= ~(self._termios.ICANON | self._termios.ECHO)
+        attributes[6][self._termios.VMIN] = 1
+        attributes[6][self._termios.VTIME] = 0
+        return attributes
+
+    def _is_in_foreground(self) -> bool:
+        """Whether it may be read and set: a program in the background would be stopped."""
+        try:
+            return os.tcgetpgrp(self.fd) == os.getpgrp()
+        except OSError:  # not the terminal that controls the program: nobody stops it
+            return True
+
+
+def _terminal(fd: int | None) -> _Terminal | None:
+    """The terminal, where there is one."""
+    try:
+        import termios
+
+        number = sys.stdin.fileno() if fd is None else fd
+        return _Terminal(number, termios) if os.isatty(number) else None
+    except (ImportError, AttributeError, OSError, ValueError):
+        # another system; standard input that is None, closed, or a file of Python's
+        return None
+
+
+def _rounded(rate: float) -> float:
+    """Without the last digits, so that faster and slower cancel."""
+    return float(f"{rate:.9g}")
+
+
+# ---------------------------------------------------------------- what is shown
+
+_NS = 1_000_000_000
+_SLOW_S = 0.5  # that is told at once; less is no more than told at the end
+
+
+@contextmanager
+def play_progress(*, is_quiet: bool) -> Iterator[Callable[[PlayProgress], None]]:
+    """On a terminal, a line that tells where it stands; anywhere, that it cannot keep up.
+
+    Args:
+        is_quiet: No line.
+    """
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(stderr=True)
+    told: set[str] = set()
+
+    def warn(state: PlayProgress) -> None:
+        if state.slowed_s >= _SLOW_S and "slow" not in told:
+            told.add("slow")
+            tell("frames are not made in time: the clock waits for them (--drop leaves them out)")
+        if state.dropped and "dropped" not in told:
+            told.add("dropped")
+            tell("frames are not made in time: late ones are left out")
+
+    if is_quiet or not console.is_terminal:
+        yield warn
+        return
+    with console.status("") as status:
+
+        def report(state: PlayProgress) -> None:
+            warn(state)
+            status.update(Text(_standing(state)))
+
+        yield report
+
+
+def tell(text: str) -> None:
+    """Say something beside the result."""
+    complain(text)
+
+
+def _standing(state: PlayProgress) -> str:
+    now, length = ((time - state.start_ns) / _NS for time in (state.time_ns, state.end_ns))
+    parts = [
+        f"{now:.1f} of {length:.1f} s",
+        f"{state.rate:g}x {shown(state.state)}".strip(),
+        f"{state.messages} messages",
+    ]
+    if state.slowed_s >= _SLOW_S:
+        parts.append(f"slowed by {state.slowed_s:.1f} s")
+    if state.dropped:
+        parts.append(f"{state.dropped} late frames left out")
+    return " · ".join(parts)
+
+
+def print_play(summary: PlaySummary) -> None:
+    """Tell what was played."""
+    for topic, count in summary.messages.items():
+        say(f"{topic}: {count}")
+    for topic, reasons in summary.as_recorded.items():
+        for reason, count in reasons.items():
+            say(f"{topic}: {count} as recorded: {reason}")
+    for topic, count in summary.thinned.items():
+        say(f"{topic}: {count} frames left out on request")
+    total = sum(summary.messages.values())
+    text = f"{total} messages in {summary.seconds:.1f} s"
+    if summary.loops:
+        text += f", begun again {summary.loops} times"
+    if summary.stopped:
+        text += ", stopped before the end"
+    say(text)
+    if summary.slowed_s >= 0.1:
+        say(f"{summary.slowed_s:.1f} s longer than recorded, since frames were not made in time")
+    if summary.dropped:
+        say(f"{summary.dropped} frames left out, since they were late")
+
+
+# ---------------------------------------------------------------- play
 
 _DEFAULT_CLOCK_HZ = 100.0
 
 
+@takes(PlayOptions, without=("to", "clock"))
 def play(
+    options: Callable[[], PlayOptions],
     datasets: Annotated[
         list[str], typer.Argument(metavar="DATASET...", help="Datasets; several are merged.")
     ],
@@ -39,37 +357,6 @@ def play(
     foxglove: Annotated[
         bool, typer.Option("--foxglove", help="To Foxglove, as a WebSocket server.")
     ] = False,
-    rate: Annotated[float, typer.Option("--rate", "-r", help="Times the recorded speed.")] = 1.0,
-    start_offset: Annotated[
-        float,
-        typer.Option("--start-offset", "--start", "-s", help="Seconds to leave out at first."),
-    ] = 0.0,
-    duration: Annotated[
-        Optional[float],  # noqa: UP045 - read at run time by typer
-        typer.Option("--duration", "--playback-duration", "-u", help="Seconds to play."),
-    ] = None,
-    loop: Annotated[bool, typer.Option("--loop", "-l", help="Begin again at the end.")] = False,
-    delay: Annotated[
-        float, typer.Option("--delay", "-d", help="Seconds to wait before the first message.")
-    ] = 0.0,
-    pause: Annotated[
-        bool, typer.Option("--pause", "--start-paused", "-p", help="Stand still at first.")
-    ] = False,
-    topics: TopicsOption = None,
-    exclude: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option(
-            "--exclude", "--exclude-topics", "-x", metavar="GLOB", help="Leave out topics."
-        ),
-    ] = None,
-    regex: Annotated[
-        str, typer.Option("--regex", "-e", help="Topics of which a part matches.")
-    ] = "",
-    remap: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option("--remap", "-m", metavar="OLD:=NEW", help="Give a topic another name."),
-    ] = None,
-    prefix: Annotated[str, typer.Option("--prefix", help="Put before the topics.")] = "",
     clock: Annotated[
         bool,
         typer.Option(
@@ -80,72 +367,6 @@ def play(
     clock_hz: Annotated[
         float, typer.Option("--hz", help="The rate of --clock, besides with each message.")
     ] = _DEFAULT_CLOCK_HZ,
-    follow_clock: Annotated[
-        Optional[bool],  # noqa: UP045
-        typer.Option(
-            "--follow-clock/--no-follow-clock",
-            help="Play by the /clock of another player; by default where /use_sim_time is set "
-            "(ROS 1) and there is no --clock.",
-        ),
-    ] = None,
-    immediate: Annotated[
-        bool, typer.Option("--immediate", "-i", help="As fast as can be.")
-    ] = False,
-    wait_for_subscribers: Annotated[
-        bool, typer.Option("--wait-for-subscribers", help="Begin when all topics have one.")
-    ] = False,
-    qos_overrides: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(
-            "--qos-profile-overrides-path", metavar="YAML", help="QoS by topic, for ROS 2."
-        ),
-    ] = None,
-    publish_as: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(
-            "--publish-as", help="Cameras as raw, compressed (JPEG) or ffmpeg (video packets)."
-        ),
-    ] = None,
-    jpeg_quality: JpegQualityOption = 95,
-    resize: ResizeOption = None,
-    every: EveryOption = 1,
-    max_rate: MaxRateOption = None,
-    read_ahead: Annotated[
-        int,
-        typer.Option(
-            "--read-ahead",
-            "--read-ahead-queue-size",
-            help="Frames of each camera that are made ahead.",
-        ),
-    ] = 8,
-    drop: Annotated[
-        bool, typer.Option("--drop", help="Leave out frames that come late, keep the speed.")
-    ] = False,
-    restamp: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option("--restamp", metavar="now", help="Give headers the time of publishing."),
-    ] = None,
-    lock_step: Annotated[
-        str,
-        typer.Option(
-            "--lock-step",
-            metavar="TOPIC",
-            help="The next frame goes when a message came on this topic.",
-        ),
-    ] = "",
-    host: Annotated[str, typer.Option("--host", help="To listen on, for Foxglove.")] = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option("--port", min=0, max=65535, help="To listen on, for Foxglove.")
-    ] = 8765,
-    allow_origin: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option(
-            "--allow-origin",
-            metavar="URL",
-            help="A web site that may connect, such as http://robot:8080, besides Foxglove's and "
-            "those of this machine.",
-        ),
-    ] = None,
     no_keyboard: Annotated[
         bool, typer.Option("--disable-keyboard-controls", help="Leave the keyboard alone.")
     ] = False,
@@ -158,53 +379,21 @@ def play(
 
     Keys: space pauses; right: one message; left: one back; up and down: faster and slower.
     """
-    from mp4ds.playing import PlayOptions, open_player
-
     with told_errors(as_json), ExitStack() as stack:
         kinds = {"ros1": ros1, "ros2": ros2, "foxglove": foxglove}
         chosen = [name for name, on in kinds.items() if on]
         if len(chosen) > 1:
             raise OptionError(f"--{chosen[0]} contradicts --{chosen[1]}.")
-        options = PlayOptions(
-            to=chosen[0] if chosen else None,
-            rate=rate,
-            start_offset=start_offset,
-            duration=duration,
-            loop=loop,
-            delay=delay,
-            paused=pause,
-            topics=topics or (),
-            exclude=exclude or (),
-            regex=regex,
-            remap=remap or (),
-            prefix=prefix,
-            clock=clock_hz if clock else None,
-            follow_clock=follow_clock,
-            immediate=immediate,
-            wait_for_subscribers=wait_for_subscribers,
-            qos_overrides=qos_overrides,
-            publish_as=publish_as,
-            jpeg_quality=jpeg_quality,
-            resize=parse_resize(resize),
-            every=every,
-            max_rate=max_rate,
-            read_ahead=read_ahead,
-            drop=drop,
-            restamp=restamp,
-            lock_step=lock_step,
-            host=host,
-            port=port,
-            origins=allow_origin or (),
+        told = replace(
+            options(), to=chosen[0] if chosen else None, clock=clock_hz if clock else None
         )
         report = stack.enter_context(play_progress(is_quiet=as_json or not progress))
-        player = stack.enter_context(open_player(datasets, options, progress=report))
+        player = stack.enter_context(open_player(datasets, told, progress=report))
         tell(f"publishing to {player.address}")
         if player.follows_clock:
             tell("the /clock of another player leads (--clock: this one, --no-follow-clock: none)")
         caught = stack.enter_context(_signals(player.stop))
         if not no_keyboard:
-            from mp4ds.cli.keys import Keyboard
-
             stack.enter_context(Keyboard(player))
         summary = player.run()
     if as_json:

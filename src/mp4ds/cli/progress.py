@@ -1,64 +1,354 @@
-"""What `mp4ds pack` tells of its progress, always on stderr.
-
-On a terminal bars; in a log file a line now and then, once a pack has taken 10 s; with ``--json``
-one event per line, each a JSON object in ASCII:
-
-``{"event": "start", "time": ..., "dataset": ...}``
-    Before the first ``progress``. Nothing is told of a pack that fails before it begins.
-
-``{"event": "progress", "time": ..., "dataset": ..., ...}``
-    At most one a second of each dataset, every 10 s of the last one where nothing happens, and
-    at the end whatever is newer than the last one told.
-
-    ======================  ===============================================================
-    ``time``                string, UTC, ISO 8601 with milliseconds
-    ``dataset``             string, the folder being made
-    ``phase``               ``"planning"``, ``"packing"``, ``"joining"`` or ``"uploading"``
-    ``note``                string, what is being done now, or empty
-    ``done``                number 0 to 1, share of this phase; null where nothing tells
-    ``job_done``            number 0 to 1, share of the packing of all datasets; or null
-    ``tasks_done``          integer, parts that are done
-    ``tasks_total``         integer, parts that there are; 0 for a pack in one go
-    ``tasks_before``        integer, parts of ``tasks_done`` that an earlier run did
-    ``failed``              integer, parts that failed
-    ``bytes_read``          integer, payload bytes packed so far
-    ``bytes_total``         integer, bytes of the source files
-    ``bytes_written``       integer, bytes of the dataset so far
-    ``topics``              object: topic of a camera -> ``{"done": integer, "total": integer
-                            or null}``, messages
-    ``seconds_left``        integer, until all is packed; null where too little is known
-    ======================  ===============================================================
-
-``{"event": "end", "time": ..., "outcome": ..., "seconds": ...}``
-    The last one: ``"done"``, ``"failed"`` or ``"interrupted"``, and how long it took.
-
-Lines that do not begin with ``{`` are warnings and errors for people. Readers ignore events and
-keys that they do not know.
-"""
+"""What `mp4ds pack` tells of its progress, always on stderr: live, in lines, and as events."""
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Protocol
+from datetime import datetime, timedelta, timezone
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
-from mp4ds.cli.progress_lines import Events, Lines, Log
-from mp4ds.cli.standing import (
-    PACE_SECONDS,
-    Job,
-    amounts,
-    count_text,
-    packed_share,
-    phase_text,
-    plain,
-)
+from mp4ds.cli.output import shown, size_text
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.progress import Progress
 
-    from mp4ds.packing import PackProgress
+    from mp4ds.packing.options import PackProgress
+
+PACE_SECONDS = 60.0
+"""Over which a pace is taken."""
+
+_LEFT_SECONDS = 3.0
+_NAME_WIDTH = 60
+_ROUNDING = 1e-6
+
+
+class PackStanding:
+    """Where one or several packs stand.
+
+    Args:
+        whole: As for `pack_progress`.
+        clock: Seconds; does not go back.
+
+    Attributes:
+        states: What was told last of each dataset, in the order in which they began.
+    """
+
+    def __init__(self, *, whole: bool = True, clock: Callable[[], float] = time.monotonic) -> None:
+        self.states: dict[Path, PackProgress] = {}
+        self.clock = clock
+        self._whole = whole
+        self._began: float | None = None
+        self._pace: Progress | None = None
+
+    @property
+    def seconds(self) -> float | None:
+        """Since it began; None before."""
+        return None if self._began is None else self.clock() - self._began
+
+    @property
+    def share(self) -> float | None:
+        """Share of it that is packed, by bytes of the sources; None where nothing tells."""
+        total = packed = 0.0
+        for state in self.states.values():
+            share, weight = packed_share(state), max(1.0, state.bytes_total)
+            if share is None:
+                return None
+            total, packed = total + weight, packed + weight * share
+        return packed / total if total else None
+
+    def take(self, state: PackProgress) -> None:
+        """Take what is told."""
+        if self._began is None:
+            self._began = self.clock()
+        self.states[state.dataset] = state
+        share = self.share
+        # a short pack ends before this needs rich
+        if share is None or not self._whole or self.clock() - self._began < _LEFT_SECONDS:
+            return
+        if self._pace is None:
+            from rich.progress import Progress
+
+            # never shown: it is here for what it knows of time
+            self._pace = Progress(get_time=self.clock, speed_estimate_period=PACE_SECONDS)
+            self._pace.add_task("", total=1.0, completed=share)  # type: ignore[arg-type]
+        self._pace.update(self._pace.task_ids[0], completed=share)
+
+    @property
+    def seconds_left(self) -> int | None:
+        """Until all is packed, by the pace of the last minute; None while too little is known."""
+        left = self._pace.tasks[0].time_remaining if self._pace else None
+        return None if left is None else int(left)
+
+
+def packed_share(state: PackProgress) -> float | None:
+    """Share of a dataset that is packed, 0 to 1; None where nothing tells."""
+    if state.phase == "planning":
+        return 0.0
+    if state.phase != "packing":
+        return 1.0
+    if state.done is not None:
+        return min(1.0, max(0.0, state.done))
+    return min(1.0, state.tasks_done / state.tasks_total) if state.tasks_total else None
+
+
+def plain(value: object) -> str:
+    """A name in ASCII that fits into a line and steers no terminal."""
+    text = shown(value).encode("ascii", "backslashreplace").decode()
+    return text if len(text) <= _NAME_WIDTH else "..." + text[3 - _NAME_WIDTH :]
+
+
+def percent_text(share: float | None) -> str:
+    """A share in percent, never 100 before all is done; empty where it is not known."""
+    return "" if share is None else f"{int(100 * share + _ROUNDING)} %"
+
+
+def duration_text(seconds: float) -> str:
+    """A duration in the largest two units that say something."""
+    if seconds < 99.5:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    if minutes < 60:
+        return f"{minutes} min"
+    if minutes < 48 * 60:
+        return f"{minutes // 60} h {minutes % 60} min"
+    hours = round(seconds / 3600)
+    return f"{hours // 24} d {hours % 24} h"
+
+
+def left_text(seconds: float | None) -> str:
+    """The time left; empty where it is not known, or no time."""
+    return f"{duration_text(seconds)} left" if seconds else ""
+
+
+def count_text(done: int, total: int | None) -> str:
+    """So many of so many, if that is known."""
+    return str(done) if total is None else f"{done}/{total}"
+
+
+def amounts(states: list[PackProgress]) -> list[str]:
+    """Parts done and in all, if there are any, and bytes read and written."""
+    total, failed = sum(s.tasks_total for s in states), sum(s.failed for s in states)
+    parts = f"parts {sum(s.tasks_done for s in states)}/{total}" if total else ""
+    read, written = sum(s.bytes_read for s in states), sum(s.bytes_written for s in states)
+    texts = [
+        parts,
+        f"{failed} failed" if failed else "",
+        f"{size_text(read)} -> {size_text(written)}",
+    ]
+    return list(filter(None, texts))
+
+
+def phase_text(state: PackProgress) -> str:
+    """What is being done with a dataset, where it is not just packed."""
+    return "" if state.phase == "packing" else f"{state.phase} {plain(state.note)}".strip()
+
+
+# ---------------------------------------------------------------- lines
+
+_EVENT_SECONDS, _SILENCE_SECONDS = 1.0, 10.0
+_LONG_SECONDS = 10.0
+_LINE_SECONDS, _LINE_SECONDS_MOST, _LINE_GROWTH = 60.0, 600.0, 0.05
+_LISTED = 20
+
+
+class Lines:
+    """Writes lines, as long as anybody takes them: a pack does not fail for want of a log.
+
+    Args:
+        stream: Where to.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._is_broken = False
+
+    def write(self, line: str) -> None:
+        """Write a line and flush it."""
+        if self._is_broken:
+            return
+        try:
+            self._stream.write(line + "\n")
+            self._stream.flush()
+        except (OSError, ValueError):  # ValueError: it was closed
+            self._is_broken = True
+
+
+class Events:
+    """Tells of a job by events in JSON.
+
+    Args:
+        job: Where it stands.
+        lines: Take the events.
+        now: The time of day, with its zone.
+    """
+
+    def __init__(
+        self,
+        job: PackStanding,
+        lines: Lines,
+        *,
+        now: Callable[[], datetime] = lambda: datetime.now(timezone.utc),
+    ) -> None:
+        self._job = job
+        self._lines = lines
+        self._now = now
+        self._told: dict[Path, float] = {}
+        self._waiting: dict[Path, PackProgress] = {}
+        self._last: PackProgress | None = None
+
+    def take(self, state: PackProgress) -> None:
+        """See `ProgressWriter.take`."""
+        self._job.take(state)
+        if self._last is None:
+            self._write("start", dataset=str(state.dataset))
+        self._last = self._waiting[state.dataset] = state
+        self._tell_waiting(_EVENT_SECONDS)
+
+    def tick(self) -> None:
+        """See `ProgressWriter.tick`."""
+        self._tell_waiting(_EVENT_SECONDS)
+        if self._last and self._job.clock() - max(self._told.values()) >= _SILENCE_SECONDS:
+            self._tell(self._last)
+
+    def end(self, outcome: str) -> None:
+        """See `ProgressWriter.end`."""
+        self._tell_waiting(0)
+        if self._job.seconds is not None:
+            self._write("end", outcome=outcome, seconds=round(self._job.seconds, 3))
+
+    def _tell_waiting(self, pause: float) -> None:
+        for dataset, state in list(self._waiting.items()):
+            told = self._told.get(dataset)
+            if told is None or self._job.clock() - told >= pause:
+                self._tell(state)
+
+    def _tell(self, state: PackProgress) -> None:
+        self._told[state.dataset] = self._job.clock()
+        self._waiting.pop(state.dataset, None)
+        done = packed_share(state) if state.phase == "packing" else state.done
+        self._write(
+            "progress",
+            dataset=str(state.dataset),
+            phase=state.phase,
+            note=state.note,
+            # joining that does not tell how far it is keeps the whole share of packing
+            done=None if done == 1 and state.phase != "packing" else _rounded(done),
+            job_done=_rounded(self._job.share),
+            tasks_done=state.tasks_done,
+            tasks_total=state.tasks_total,
+            tasks_before=state.tasks_before,
+            failed=state.failed,
+            bytes_read=state.bytes_read,
+            bytes_total=state.bytes_total,
+            bytes_written=state.bytes_written,
+            topics={
+                topic: {"done": done, "total": total}
+                for topic, (done, total) in state.topics.items()
+            },
+            seconds_left=self._job.seconds_left,
+        )
+
+    def _write(self, event: str, **values: Any) -> None:
+        now = self._now().isoformat(timespec="milliseconds")
+        self._lines.write(json.dumps({"event": event, "time": now, **values}))
+
+
+def _rounded(share: float | None) -> float | None:
+    return None if share is None else round(share, 6)
+
+
+class Log:
+    """Tells of a long job by plain lines: of its beginning, its end, and now and then.
+
+    The first comes after 10 s. Others follow when a minute went by, later a twentieth of the
+    time since the beginning, at most ten minutes.
+
+    Args:
+        job: Where it stands.
+        lines: Take the lines.
+        now: The local time of day.
+    """
+
+    def __init__(
+        self, job: PackStanding, lines: Lines, *, now: Callable[[], datetime] = datetime.now
+    ) -> None:
+        self._job = job
+        self._lines = lines
+        self._now = now
+        self._told: float | None = None
+
+    def take(self, state: PackProgress) -> None:
+        """See `ProgressWriter.take`."""
+        self._job.take(state)
+        self.tick()
+
+    def tick(self) -> None:
+        """See `ProgressWriter.tick`."""
+        seconds = self._job.seconds
+        if seconds is None or seconds < _LONG_SECONDS:
+            return
+        states = list(self._job.states.values())
+        if self._told is None:
+            began = self._now() - timedelta(seconds=seconds)
+            before = sum(state.tasks_before for state in states)
+            self._line(
+                f"started {began:%Y-%m-%d}",
+                f"{size_text(sum(state.bytes_total for state in states))} to pack",
+                f"{before} parts were done before" if before else "",
+                at=began,
+            )
+        elif seconds - self._told < min(
+            _LINE_SECONDS_MOST, max(_LINE_SECONDS, _LINE_GROWTH * self._told)
+        ):
+            return
+        self._told = seconds
+        if len(states) == 1:
+            texts = [phase_text(states[0]) or percent_text(self._job.share), _topics(states[0])]
+        else:
+            texts = [percent_text(self._job.share), _datasets(states)]
+        self._line(*texts, *amounts(states), left_text(self._job.seconds_left))
+
+    def end(self, outcome: str) -> None:
+        """See `ProgressWriter.end`."""
+        if self._told is not None and self._job.seconds is not None:
+            told = f"{outcome} after {duration_text(self._job.seconds)}"
+            self._line(told, *amounts(list(self._job.states.values())))
+
+    def _line(self, *texts: str, at: datetime | None = None) -> None:
+        names = [dataset.name for dataset in self._job.states]
+        what = plain(names[0]) if len(names) == 1 else f"{len(names)} datasets"
+        told = " | ".join(filter(None, texts))
+        self._lines.write(f"{at or self._now():%H:%M:%S} packing {what}: {told}")
+
+
+def _topics(state: PackProgress) -> str:
+    first = islice(state.topics.items(), _LISTED)
+    texts = [f"{plain(topic)} {count_text(*counts)}" for topic, counts in first]
+    return _listed(texts, len(state.topics))
+
+
+def _datasets(states: list[PackProgress]) -> str:
+    in_work = [state for state in states if packed_share(state) not in (0, 1) or phase_text(state)]
+    texts = [
+        f"{plain(one.dataset.name)} {phase_text(one) or percent_text(packed_share(one))}".rstrip()
+        for one in in_work[:_LISTED]
+    ]
+    return _listed(texts, len(in_work))
+
+
+def _listed(texts: list[str], count: int) -> str:
+    more = count - len(texts)
+    return ", ".join(texts) + (f" and {more} more" if more else "")
+
+
+# ---------------------------------------------------------------- progress
 
 _TICK_SECONDS = 1.0
 
@@ -85,7 +375,7 @@ def pack_progress(as_json: bool, *, whole: bool = True) -> Iterator[Take]:
             with on_terminal(console, whole=whole) as take:
                 yield take
             return
-    job = Job(whole=whole)
+    job = PackStanding(whole=whole)
     teller = (Events if as_json else Log)(job, Lines(stream))
     with told_by(teller, tick_seconds=_TICK_SECONDS) as take:
         yield take
@@ -108,7 +398,7 @@ def on_terminal(console: Console, *, whole: bool = True) -> Iterator[Take]:
         TaskProgressColumn(),
         TextColumn("{task.fields[told]}", markup=False),
     ]
-    job = Job(whole=False)
+    job = PackStanding(whole=False)
     with Progress(
         *columns,
         *([TimeRemainingColumn()] if whole else []),
@@ -144,7 +434,7 @@ def on_terminal(console: Console, *, whole: bool = True) -> Iterator[Take]:
         yield take
 
 
-class Teller(Protocol):
+class ProgressWriter(Protocol):
     """Tells of a job in lines."""
 
     def take(self, state: PackProgress) -> None:
@@ -158,7 +448,7 @@ class Teller(Protocol):
 
 
 @contextmanager
-def told_by(teller: Teller, *, tick_seconds: float) -> Iterator[Take]:
+def told_by(teller: ProgressWriter, *, tick_seconds: float) -> Iterator[Take]:
     """Let a job be told of while the context lasts, on from silence to its end."""
     lock, stop = threading.Lock(), threading.Event()
 

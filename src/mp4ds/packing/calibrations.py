@@ -1,16 +1,353 @@
-"""Calibrations on their way into the sidecars of the streams that they belong to."""
+"""Which calibrations belong to which images, and their way into the streams of these."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from mp4ds.packing.report import TopicSummary
-from mp4ds.pairing import INFO_WINDOW, StampPairing, choose_pairs, pair_camera_infos
+from mp4ds.dataset.rebuild import CameraInfoWriter, MessageSplitter, Unsuited
+from mp4ds.errors import OptionError
+from mp4ds.messages.serializations import is_calibration, is_camera, kind_of
+from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, Parts
+from mp4ds.packing.look import CameraMessage
+from mp4ds.packing.options import TopicSummary
+from mp4ds.packing.writer import StreamWriter
 from mp4ds.records import Channel, Message
-from mp4ds.streams import CameraInfoWriter, Forms, Seen, StreamWriter, Unsuited
-from mp4ds.wire import is_calibration, is_camera
+
+INFO_WINDOW = 50
+"""Stamps of a calibration channel that are compared, the latest."""
+IMAGE_WINDOW = 1000
+"""Stamps of an image channel that they are compared with: images may be much more frequent."""
+
+MAX_CHANNELS = 256
+"""Calibration channels, and image channels, whose stamps are compared."""
+
+_MIN_COMMON = 3
+_MIN_SHARE = 0.8
+_LISTED = 20
+
+_INFO_NAMES = ("camera_info", "calibration")  # those of ROS and of Foxglove
+_TRANSPORTS = frozenset({"compressed", "compressedDepth", "ffmpeg", "foxglove"})
+# the topics of one camera, as sensor_msgs/CameraInfo.msg and image_proc name them
+_VIEWS = frozenset(
+    {
+        *("image", "image_raw", "image_mono", "image_color"),
+        *("image_rect", "image_rect_raw", "image_rect_mono", "image_rect_color"),
+    }
+)
+
+# ---------------------------------------------------------------- by the user's choice
+
+
+def choose_pairs(choices: Sequence[str], channels: Sequence[Channel]) -> dict[int, int]:
+    """Pair what the user names.
+
+    Of several publishers on the topics, the first of the one is paired with the first of the
+    other, and so on.
+
+    Args:
+        choices: ``IMAGE=INFO`` each, two topics as the recording spells them.
+        channels: The recording's, as far as they are packed.
+
+    Returns:
+        Id of the calibration channel -> id of the image channel.
+
+    Raises:
+        OptionError: A topic is unknown or not of its kind, or is given to two others.
+    """
+    images = _by_topic(filter(is_camera, channels))
+    infos = _by_topic(filter(is_calibration, channels))
+    known = {channel.topic: channel.type_name for channel in channels}
+    pairs: dict[int, int] = {}
+    image_of: dict[str, str] = {}
+    for choice in dict.fromkeys(choices):
+        image, info = _split_choice(choice, known)
+        _check_kind(choice, image, known, images, "images")
+        _check_kind(choice, info, known, infos, "calibrations")
+        if info in image_of:
+            raise OptionError(
+                f"`camera_info` gives {info} to {image_of[info]} and to {image}: a calibration "
+                "topic belongs to one stream only. The other can do without: its messages are kept."
+            )
+        if image in image_of.values():
+            other = next(key for key, value in image_of.items() if value == image)
+            raise OptionError(
+                f"`camera_info` gives {other} and {info} to {image}: a stream has one "
+                "calibration topic only."
+            )
+        image_of[info] = image
+        for own, target in zip(infos[info], images[image], strict=False):
+            pairs[own.id] = target.id
+    return pairs
+
+
+def _by_topic(channels: Iterable[Channel]) -> dict[str, list[Channel]]:
+    found: dict[str, list[Channel]] = {}
+    for channel in sorted(channels, key=lambda channel: channel.id):
+        found.setdefault(channel.topic, []).append(channel)
+    return found
+
+
+def _split_choice(choice: str, known: Mapping[str, str]) -> tuple[str, str]:
+    places = [place for place, letter in enumerate(choice) if letter == "="]
+    splits = [(choice[:place], choice[place + 1 :]) for place in places]
+    # a topic may have a = in it
+    for image, info in splits:
+        if image in known and info in known:
+            return image, info
+    if not splits or not all(splits[0]):
+        raise OptionError(
+            f"`camera_info` {choice!r} is not of the form IMAGE=INFO, "
+            "such as /left/image_raw=/left/info."
+        )
+    return splits[0]
+
+
+def _check_kind(
+    choice: str,
+    topic: str,
+    known: Mapping[str, str],
+    wanted: Mapping[str, list[Channel]],
+    noun: str,
+) -> None:
+    if topic in wanted:
+        return
+    listed = ", ".join(sorted(wanted)[:_LISTED]) + (", ..." if len(wanted) > _LISTED else "")
+    problem = (
+        f"{topic!r} holds {known[topic] or 'messages without a type'}, no {noun}"
+        if topic in known
+        else f"there is no topic {topic!r} among those that are packed"
+    )
+    raise OptionError(f"`camera_info` {choice!r}: {problem}. Topics of {noun}: {listed or 'none'}.")
+
+
+# ---------------------------------------------------------------- by name
+
+
+def pair_camera_infos(
+    channels: Sequence[Channel],
+    *,
+    chosen: Mapping[int, int] | None = None,
+    sizes: Mapping[int, tuple[int, int]] | None = None,
+) -> dict[int, int]:
+    """Pair calibrations with images by the names of their topics.
+
+    A topic named ``camera_info``, or ``calibration`` as Foxglove's examples have it, belongs to
+    the image topic beside it in the same namespace. For coded images the namespace is that of
+    the image that they are a transport of: ``/cam/image_raw/compressed`` has its calibration on
+    ``/cam/camera_info``. Of several, raw images come first, of these ``image_raw``, else the
+    first by name; of coded ones the largest. Of several publishers on a calibration topic none
+    is paired.
+
+    Args:
+        channels: The recording's, as far as they are packed.
+        chosen: Pairs that hold already, such as those of `choose_pairs`.
+        sizes: Width and height of the images of channels, as far as they are known.
+
+    Returns:
+        Id of the calibration channel -> id of the image channel; the chosen ones too.
+    """
+    pairs = dict(chosen or {})
+    beside: dict[str, list[tuple[int, Channel]]] = {}
+    for image in filter(is_camera, channels):
+        for rank, namespace in enumerate(_namespaces(image)):
+            beside.setdefault(namespace, []).append((rank, image))
+    infos = _by_topic(filter(is_calibration, channels))
+    found = [
+        ((_INFO_NAMES.index(_leaf(topic)), rank, *_preference(image, sizes or {})), own[0], image)
+        for topic, own in infos.items()
+        if len(own) == 1 and _leaf(topic) in _INFO_NAMES
+        for rank, image in beside.get(_parent(topic), [])
+    ]
+    taken = set(pairs.values())
+    for _, info, image in sorted(found, key=lambda item: (item[0], item[1].topic)):
+        if info.id not in pairs and image.id not in taken:
+            pairs[info.id] = image.id
+            taken.add(image.id)
+    return pairs
+
+
+def _preference(
+    image: Channel, sizes: Mapping[int, tuple[int, int]]
+) -> tuple[bool, int, bool, str, int]:
+    """Orders the images of a camera: the raw image is what the calibration was made for."""
+    coded = _is_coded(image)
+    width, height = sizes.get(image.id, (0, 0))
+    return (
+        coded,
+        -width * height if coded else 0,
+        _leaf(_base(image)) != "image_raw",
+        image.topic,
+        image.id,
+    )
+
+
+def _is_coded(image: Channel) -> bool:
+    return kind_of(image) is CodedFields
+
+
+def _leaf(topic: str) -> str:
+    return topic.strip("/").rpartition("/")[2]
+
+
+def _parent(topic: str) -> str:
+    return topic.strip("/").rpartition("/")[0]
+
+
+def _base(image: Channel) -> str:
+    """The topic that a transport was given, which is the topic itself for a plain one."""
+    if _is_coded(image) and _leaf(image.topic) in _TRANSPORTS and _parent(image.topic):
+        return _parent(image.topic)
+    return image.topic.strip("/")
+
+
+def _namespaces(image: Channel) -> list[str]:
+    """Where its calibration may be: beside its base topic, else beside itself."""
+    return list(dict.fromkeys((_parent(_base(image)), _parent(image.topic))))
+
+
+def _camera(image: Channel) -> str:
+    """Equal for image topics that are views of one camera, as far as names tell."""
+    base = _base(image)
+    return f"{_parent(base)}/" if _leaf(base) in _VIEWS else base
+
+
+# ---------------------------------------------------------------- by stamp
+
+
+@dataclass(slots=True)
+class _Track:
+    """What is known of one channel: its latest stamps, zero for none, and its latest message."""
+
+    channel: Channel
+    stamps: deque[int]
+    messages: int = 0
+    frame_id: str = ""
+    fields: Fields | None = None
+    size: tuple[int, int] = (0, 0)
+
+
+class StampPairing:
+    """Pairs calibrations with images that have the same stamps, for what names leave unpaired.
+
+    `add` takes messages of calibration and image channels in the order of the recording. What is
+    kept are the latest `INFO_WINDOW` and `IMAGE_WINDOW` stamps of each channel, so that memory is
+    bounded and a channel that starts late is compared with what was recorded beside it. A
+    calibration channel is paired if
+
+    - at least 3 of its stamps are an image channel's, and at least 80 % of those between that
+      channel's first and last stamp (stamps of zero count as not found),
+    - its frame_id, where both have one, and its size, by ROI and binning, are the images',
+    - and this is so for the images of one camera only, or for those of one camera with the same
+      frame_id, and for no other calibration channel of this camera, which has none yet.
+    """
+
+    def __init__(self) -> None:
+        self._infos: dict[int, _Track] = {}
+        self._images: dict[int, _Track] = {}
+        self._overflow = False
+
+    def add(self, channel: Channel, parts: Parts, *, size: tuple[int, int] = (0, 0)) -> None:
+        """Take a message.
+
+        Args:
+            channel: Its channel, of calibrations or images.
+            parts: The message.
+            size: Width and height of a coded image, where its message does not tell.
+        """
+        is_info = isinstance(parts.fields, CalibrationFields)
+        tracks = self._infos if is_info else self._images
+        if channel.id not in tracks:
+            if len(tracks) == MAX_CHANNELS:
+                self._overflow = True
+                return
+            window = INFO_WINDOW if is_info else IMAGE_WINDOW
+            tracks[channel.id] = _Track(channel, deque(maxlen=window))
+        track = tracks[channel.id]
+        track.stamps.append(parts.stamp)
+        track.messages += 1
+        track.frame_id = parts.frame_id.lstrip("/")
+        track.fields = parts.fields
+        told = parts.fields.width, parts.fields.height
+        track.size = size if 0 in told else told
+
+    def decide(self, paired: Mapping[int, int], *, final: bool = True) -> dict[int, int]:
+        """Pair by what was added so far.
+
+        Args:
+            paired: Pairs that hold already. These calibrations are not paired again, and these
+                images take no other calibration, but are still rivals of the others.
+            final: Whether the recording is at its end. Then, of channels that had fewer than 3
+                messages, all stamps must agree; before, they are not paired.
+
+        Returns:
+            Id of the calibration channel -> id of the image channel; the new ones only. Nothing
+            if there are more than `MAX_CHANNELS` of a kind.
+        """
+        if self._overflow:
+            return {}
+        images = [(image, set(image.stamps) - {0}) for image in self._images.values()]
+        taken = set(paired.values())
+        claims: dict[int, Channel] = {}
+        for info_id, info in sorted(self._infos.items()):
+            if info_id not in paired:
+                fitting = [image for image, found in images if _fits(info, image, found, final)]
+                claim = _only_camera(info, fitting, taken)
+                if claim is not None:
+                    claims[info_id] = claim
+        cameras = Counter(map(_camera, claims.values()))
+        return {
+            info_id: image.id for info_id, image in claims.items() if cameras[_camera(image)] == 1
+        }
+
+
+def _only_camera(info: _Track, fitting: list[_Track], taken: set[int]) -> Channel | None:
+    """The best image channel, if all that fit are of one camera without a calibration."""
+    same_frame = [image for image in fitting if info.frame_id and info.frame_id == image.frame_id]
+    fitting = same_frame or fitting
+    if len({_camera(image.channel) for image in fitting}) != 1:
+        return None
+    if any(image.channel.id in taken for image in fitting):
+        return None
+    sizes = {image.channel.id: image.size for image in fitting}
+    return min((i.channel for i in fitting), key=lambda channel: _preference(channel, sizes))
+
+
+def _fits(info: _Track, image: _Track, found: set[int], final: bool) -> bool:
+    if info.frame_id and image.frame_id and info.frame_id != image.frame_id:
+        return False
+    if not isinstance(info.fields, CalibrationFields) or not _size_fits(info.fields, image.size):
+        return False
+    if not found:
+        return False
+    first, last = min(found), max(found)
+    due = [stamp for stamp in info.stamps if stamp == 0 or first <= stamp <= last]
+    common = [stamp for stamp in due if stamp in found]
+    needed = min(_MIN_COMMON, info.messages, image.messages) if final else _MIN_COMMON
+    return len(set(common)) >= needed and len(common) >= _MIN_SHARE * len(due)
+
+
+def _size_fits(calibration: CalibrationFields, size: tuple[int, int]) -> bool:
+    """Whether images of a size, where both are known, may be what was calibrated (REP 104)."""
+    if 0 in size or 0 in (calibration.width, calibration.height):
+        return True
+    return any(
+        abs(width - size[0]) < 1 and abs(height - size[1]) < 1
+        for width, height in _image_sizes(calibration)
+    )
+
+
+def _image_sizes(calibration: CalibrationFields) -> Iterator[tuple[float, float]]:
+    """Sizes that images of a calibration may have: whole or cut, binned or not."""
+    _, _, roi_height, roi_width = calibration.roi
+    for width, height in ((calibration.width, calibration.height), (roi_width, roi_height)):
+        if width and height:
+            yield width, height
+            yield width / max(1, calibration.binning_x), height / max(1, calibration.binning_y)
+
+
+# ---------------------------------------------------------------- calibrations
 
 _MAX_PENDING = 1000
 """Calibrations that wait for their stream; of a topic with more, all are kept verbatim."""
@@ -64,7 +401,7 @@ class Calibrations:
             self._pairs.update(surveyed)
         elif unpaired_infos(channels, self._pairs):
             self._by_stamp = StampPairing()
-        self._forms: dict[int, Forms] = {}
+        self._forms: dict[int, MessageSplitter] = {}
         self._infos: dict[int, _InfoChannel | None] = {}
         self._counts: Counter[tuple[object, ...]] = Counter()
         self._streams: dict[tuple[object, ...], StreamWriter] = {}
@@ -90,7 +427,7 @@ class Calibrations:
             self._give_up(channel.id, state)
             self._keep(message)
 
-    def saw(self, channel: Channel, seen: Seen) -> None:
+    def saw(self, channel: Channel, seen: CameraMessage) -> None:
         """Take notice of an image's stamp, for calibrations that names leave unpaired."""
         if self._by_stamp is not None:
             size = seen.key.width, seen.key.height
@@ -132,7 +469,7 @@ class Calibrations:
         channel = message.channel
         if self._by_stamp is None or channel.id in self._pairs:
             return
-        forms = self._forms.setdefault(channel.id, Forms(channel))
+        forms = self._forms.setdefault(channel.id, MessageSplitter(channel))
         try:
             self._by_stamp.add(channel, forms.split(message)[1])
         except Unsuited:

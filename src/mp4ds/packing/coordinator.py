@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from mp4ds.engine import Engine, Outcome
 from mp4ds.errors import (
     FormatError,
     OptionError,
@@ -18,18 +18,114 @@ from mp4ds.errors import (
     TargetError,
     WriteError,
 )
-from mp4ds.outputs import is_seen, move_into_place, sync
-from mp4ds.packing.assemble import Assembler
-from mp4ds.packing.job import Task
-from mp4ds.packing.manifest import dataset_files, folder_size, summarize, write_manifest
-from mp4ds.packing.part import Part, read_record
-from mp4ds.packing.progress import JobProgress, Report
-from mp4ds.packing.report import PackSummary
-from mp4ds.packing.run import Run
-from mp4ds.packing.spans import share
+from mp4ds.files.outputs import is_seen, move_into_place, sync
+from mp4ds.files.sources import source_name
+from mp4ds.packing.engine import Engine, Outcome
+from mp4ds.packing.job import Job, Task
+from mp4ds.packing.join import Assembler
+from mp4ds.packing.manifest import (
+    PartRecord,
+    dataset_files,
+    folder_size,
+    read_record,
+    summarize,
+    write_manifest,
+)
+from mp4ds.packing.options import PackProgress, PackSummary
+from mp4ds.packing.pack import PackRun
+from mp4ds.packing.planning import share
 from mp4ds.packing.workplace import Workplace
 from mp4ds.plan import Selection
-from mp4ds.source_files import source_name
+
+_REPORT_SECONDS = 0.1
+
+Report = Callable[[PackProgress], None]
+
+
+class JobProgress:
+    """Adds up what tasks tell.
+
+    Args:
+        job: The job.
+        target: The dataset.
+        report: Told several times a second; None for nobody.
+    """
+
+    def __init__(self, job: Job, target: Path, report: Report | None) -> None:
+        self._job = job
+        self._target = target
+        self._report = report
+        self._told: dict[str, Mapping[str, tuple[int, int]]] = {}
+        self._next = 0.0
+        self._bytes_total = sum(source.size for source in job.sources)
+        self._parts = sum(task.source is None for task in job.tasks)
+        self._done: set[str] = set()
+        self._before = 0
+        self.failed = 0
+        self.bytes_written = 0
+
+    def heard(self, name: str, told: Mapping[str, Any]) -> None:
+        """Take what a task tells of itself."""
+        if "topics" in told:
+            self._told[name] = told["topics"]
+            self.report()
+
+    def finished(self, name: str, topics: Mapping[str, tuple[int, int]], *, before: bool) -> None:
+        """Take notice of a task that is done.
+
+        Args:
+            name: Of the task.
+            topics: Messages and bytes of each of its topics.
+            before: Whether an earlier run did it.
+        """
+        self._told[name] = topics
+        self._done.add(name)
+        self._before += before
+        self.report()
+
+    def report(self, phase: str = "packing", note: str = "", *, now: bool = False) -> None:
+        """Tell where the pack stands, unless it was told just now."""
+        clock = time.monotonic()
+        if self._report is None or (clock < self._next and not now):
+            return
+        self._next = clock + _REPORT_SECONDS
+        messages: dict[str, int] = {}
+        size = 0
+        for topics in self._told.values():
+            for topic, (count, length) in topics.items():
+                messages[topic] = messages.get(topic, 0) + count
+                size += length
+        self._report(
+            PackProgress(
+                dataset=self._target,
+                phase=phase,
+                done=self._share(messages),
+                bytes_read=size,
+                bytes_total=self._bytes_total,
+                bytes_written=self.bytes_written,
+                topics={
+                    topic: (messages.get(topic, 0), self._job.work[topic][0])
+                    for topic in self._job.cameras
+                },
+                tasks_done=len(self._done),
+                tasks_total=self._parts,
+                tasks_before=self._before,
+                failed=self.failed,
+                note=note,
+            )
+        )
+
+    def _share(self, messages: Mapping[str, int]) -> float | None:
+        work = self._job.work
+        total = sum(count * cost for count, cost in work.values())
+        if not total:
+            return None
+        return (
+            sum(min(messages.get(t, 0), count) * cost for t, (count, cost) in work.items()) / total
+        )
+
+
+# ---------------------------------------------------------------- coordinator
 
 _LISTED = 10
 _JOINED_AT_ONCE = 4  # more would only wait for the disk
@@ -50,7 +146,7 @@ class Coordinator:
 
     def __init__(
         self,
-        runs: Sequence[Run],
+        runs: Sequence[PackRun],
         engine: Engine,
         *,
         keep_going: bool = False,
@@ -77,10 +173,10 @@ class Coordinator:
                 listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
                 raise OptionError(
                     f"{run.target}: {len(names)} of {len(run.job.tasks)} parts are missing: "
-                    f"{listed}. Run their shards, or pack without --join to make them here."
+                    f"{listed}. Run their shards, or pack without `join` to make them here."
                 )
 
-    def run(self) -> Iterator[Run]:
+    def run(self) -> Iterator[PackRun]:
         """Run all tasks.
 
         Yields:
@@ -108,7 +204,7 @@ class Coordinator:
         for run in self._runs.values():
             run.raise_failures()
 
-    def _run(self, tasks: list[tuple[str, ...]], waiting: dict[str, int]) -> Iterator[Run]:
+    def _run(self, tasks: list[tuple[str, ...]], waiting: dict[str, int]) -> Iterator[PackRun]:
         with closing(self._engine.run(tasks, self._heard)) as outcomes:
             for outcome in outcomes:
                 folder = outcome.task[0]
@@ -136,7 +232,7 @@ class Coordinator:
             progress.report(now=True)
         return error is None
 
-    def _tell_done(self, run: Run, tasks: Sequence[Task], *, before: bool = True) -> None:
+    def _tell_done(self, run: PackRun, tasks: Sequence[Task], *, before: bool = True) -> None:
         progress = self._progress[str(run.place.folder)]
         for task in tasks:
             if task.source is not None:
@@ -147,7 +243,7 @@ class Coordinator:
             topics = {t["topic"]: (t["messages"], t["raw_bytes"]) for t in record["topics"]}
             progress.finished(task.name, topics, before=before)
 
-    def finish(self, run: Run) -> PackSummary:
+    def finish(self, run: PackRun) -> PackSummary:
         """Make the dataset of a pack whose tasks are done, and remove what it was made of.
 
         Raises:
@@ -187,11 +283,11 @@ class Coordinator:
         return summary
 
     @staticmethod
-    def _join(run: Run, folder: Path, progress: JobProgress) -> Part:
+    def _join(run: PackRun, folder: Path, progress: JobProgress) -> PartRecord:
         job, parts = run.job, run.place.parts
         tasks = [task for task in job.tasks if task.source is None]
         if tasks[0].whole:
-            part = Part.load(parts / tasks[0].name)
+            part = PartRecord.load(parts / tasks[0].name)
             with job.open() as reader:
                 part.check_counts(reader.channels)
             for name in part.files:
@@ -203,7 +299,7 @@ class Coordinator:
             assembler = Assembler(reader, selected, folder, threads=_JOINED_AT_ONCE)
             for task in tasks:
                 chain = task.name if task.solo else task.name.partition("-")[2]
-                assembler.add(Part.load(parts / task.name), chain)
+                assembler.add(PartRecord.load(parts / task.name), chain)
             return assembler.finish(lambda name: progress.report("joining", name, now=True))
 
 
@@ -224,7 +320,7 @@ def _digest(place: Workplace, number: int) -> tuple[int, str]:
 
 
 @contextmanager
-def claimed(runs: Sequence[Run], *, shared: bool) -> Iterator[None]:
+def claimed(runs: Sequence[PackRun], *, shared: bool) -> Iterator[None]:
     """Hold the places of packs; what is left of none that has any result is removed at the end."""
     with ExitStack() as stack:
         for run in runs:

@@ -9,20 +9,20 @@ from pathlib import Path
 from typing import Any
 
 from mp4ds._version import __version__
-from mp4ds.bags import BagReader, open_sources
+from mp4ds.bags.formats import open_sources
+from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import OptionError, SourceError
-from mp4ds.importing import ImageFolder
-from mp4ds.packing.cameras import Exact
-from mp4ds.packing.kept import dump_kept, load_kept
-from mp4ds.packing.packer import PartSettings
-from mp4ds.packing.report import PackOptions
+from mp4ds.files.sources import SourceState, source_digest
+from mp4ds.files.urls import location, spelled
+from mp4ds.packing.manifest import dump_kept, load_kept
+from mp4ds.packing.options import ImageFolder, PackOptions
+from mp4ds.packing.packer import Exact, PartSettings
 from mp4ds.packing.survey import Survey
+from mp4ds.packing.tracks import StreamSettings
 from mp4ds.plan import Selection, parse_quality
 from mp4ds.records import Excerpt
-from mp4ds.remote import location, spelled
-from mp4ds.source_files import SourceState, source_digest
-from mp4ds.streams import StreamSettings
-from mp4ds.video import tool_versions
+from mp4ds.registry import plugin
+from mp4ds.video.encoder import tool_versions
 
 TASK_NAME = r"source-[0-9]{1,9}|whole-[0-9]{1,9}|[0-9]{5,9}-[0-9]{1,9}|all"
 """Pattern of the names of tasks, which are those of folders."""
@@ -211,7 +211,7 @@ class Job:
             raise SourceError(
                 location(self.paths[0]),
                 "consists of other files than when its packing began",
-                "Start over with --restart.",
+                "Start over with `restart`.",
             )
         for source in self.sources:
             source.check()
@@ -266,12 +266,11 @@ def open_recording(
     if images is None:
         return open_sources(paths, salvage=salvage)
     if salvage:
-        raise OptionError("--salvage goes with recordings, not with a folder of images.")
+        raise OptionError("`salvage` goes with recordings, not with a folder of images.")
     if len(paths) != 1:
         raise OptionError(f"One folder of images is read at a time, and {len(paths)} were given.")
-    from mp4ds.importing import open_images
-
-    return open_images(paths[0], images)
+    reader: BagReader = plugin("images")(paths[0], images)
+    return reader
 
 
 def _task(item: Mapping[str, Any]) -> Task:

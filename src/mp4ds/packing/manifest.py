@@ -1,24 +1,23 @@
-"""What completes a dataset: the channels that had no messages, and the manifest."""
+"""What a part of a pack records of itself, and the manifest made of these records."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+import stat
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
+
+import xxhash
 
 from mp4ds._version import __version__
-from mp4ds.bags import BagReader, BagWriter
-from mp4ds.bags.protocols import Format
-from mp4ds.coded import zlib_build
+from mp4ds.bags.protocols import BagReader, BagWriter, Format
 from mp4ds.errors import FormatError, SourceError
-from mp4ds.outputs import digest_file
-from mp4ds.packing.part import Part
-from mp4ds.packing.report import PackSummary
-from mp4ds.sidecar import (
-    FORMAT_VERSION,
-    MANIFEST_NAME,
-    MESSAGES_NAME,
-    ChannelModel,
+from mp4ds.files.outputs import digest_file, write_synced
+from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME, of_types
+from mp4ds.format.manifest import (
     FileEntry,
     LossEntry,
     Manifest,
@@ -27,11 +26,237 @@ from mp4ds.sidecar import (
     StreamEntry,
     TimeRange,
     Verbatim,
-    dump_document,
-    load_manifest,
 )
-from mp4ds.video import tool_versions
-from mp4ds.wire.transforms import TransformCollector
+from mp4ds.format.models import ChannelModel, StreamSidecar
+from mp4ds.format.sidecars import MANIFEST_NAME, dump_document, load_manifest, load_stream
+from mp4ds.messages.png import zlib_build
+from mp4ds.messages.transforms import Transform, TransformCollector
+from mp4ds.packing.options import PackSummary, TopicSummary
+from mp4ds.records import Channel, Loss
+from mp4ds.video.encoder import tool_versions
+
+_MARK = b',\n"xxh64": "'
+_END = b'"}\n'
+
+
+def dump_kept(values: Mapping[str, Any]) -> bytes:
+    """The file of values.
+
+    Args:
+        values: At least one; such as JSON has.
+    """
+    text = json.dumps(values, indent=1).encode().removesuffix(b"}").rstrip()
+    return text + _MARK + xxhash.xxh64_hexdigest(text).encode() + _END
+
+
+def load_kept(data: bytes) -> dict[str, Any]:
+    """The values of a file that `dump_kept` made.
+
+    Raises:
+        ValueError: It is damaged, or another version's.
+    """
+    text, mark, rest = data.rpartition(_MARK)
+    if not mark or rest != xxhash.xxh64_hexdigest(text).encode() + _END:
+        raise ValueError("which is damaged, or another version's")
+    try:
+        values: dict[str, Any] = json.loads(text + b"}")
+    except RecursionError:
+        raise ValueError("which is damaged") from None
+    return values
+
+
+# ---------------------------------------------------------------- part
+
+RECORD_NAME = "part.json"
+
+
+@dataclass(frozen=True, slots=True)
+class PartStream:
+    """A stream of a part, or of a whole recording.
+
+    Attributes:
+        stem: File name of its video and sidecar, without ending.
+        sidecar: Its sidecar.
+        is_renamed: Whether another stream had taken its plain name.
+    """
+
+    stem: str
+    sidecar: StreamSidecar
+    is_renamed: bool = False
+
+
+@dataclass
+class PartRecord:
+    """What was packed of a recording into a folder, but for the manifest.
+
+    Attributes:
+        folder: Where the files are.
+        files: Names of those that were saved.
+        topics: What became of each topic, in the order of the recording.
+        counts: Messages read by channel id.
+        streams: In the order in which they began.
+        span: Log times of the first and last message, ns; None without messages.
+        left_out: Topics left out on request.
+        skipped: What the source holds and no dataset can: a phrase -> how many.
+        transforms: Static transforms, the latest of each child frame.
+        losses: What could not be read of a damaged recording.
+    """
+
+    folder: Path
+    topics: dict[str, TopicSummary] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    streams: list[PartStream] = field(default_factory=list)
+    span: tuple[int, int] | None = None
+    left_out: dict[str, None] = field(default_factory=dict)
+    skipped: dict[str, int] = field(default_factory=dict)
+    transforms: list[Transform] = field(default_factory=list)
+    losses: list[Loss] = field(default_factory=list)
+    files: list[str] = field(default_factory=list)
+
+    @property
+    def messages_path(self) -> Path:
+        """Its messages.mcap."""
+        return self.folder / MESSAGES_NAME
+
+    def topic(self, channel: Channel) -> TopicSummary:
+        """The summary of a channel's topic."""
+        if channel.topic not in self.topics:
+            self.topics[channel.topic] = TopicSummary(channel.topic, channel.type_name)
+        return self.topics[channel.topic]
+
+    def saw(self, times: Iterable[int]) -> None:
+        """Widen the span to hold log times."""
+        for time in times:
+            start, end = self.span or (time, time)
+            self.span = (min(start, time), max(end, time))
+
+    def save(self) -> None:
+        """Write the record; the part is whole then."""
+        record = {
+            "topics": [asdict(topic) for topic in self.topics.values()],
+            "counts": {str(key): count for key, count in self.counts.items()},
+            "streams": [stream.stem for stream in self.streams],
+            "span": self.span,
+            "left_out": list(self.left_out),
+            "skipped": self.skipped,
+            "transforms": [asdict(transform) for transform in self.transforms],
+            "losses": [asdict(loss) for loss in self.losses],
+            "files": {
+                path.name: path.stat().st_size
+                for path in sorted(self.folder.iterdir())
+                if path.name != RECORD_NAME
+            },
+        }
+        write_synced(self.folder / RECORD_NAME, dump_kept(record))
+
+    def forget(self) -> None:
+        """Let it no longer count as whole, so that it is made again."""
+        (self.folder / RECORD_NAME).unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, folder: Path) -> PartRecord:
+        """Read what `save` wrote.
+
+        Raises:
+            FormatError: It is gone or damaged.
+        """
+        record = read_record(folder)
+        if record is None:
+            raise _damaged(folder)
+        try:
+            return cls._of(folder, of_types(_Record, record))
+        except ValueError as error:
+            (folder / RECORD_NAME).unlink(missing_ok=True)  # to be made again
+            if isinstance(error, FormatError):
+                raise
+            raise _damaged(folder) from None
+
+    @classmethod
+    def _of(cls, folder: Path, record: _Record) -> PartRecord:
+        if not record.files.keys() >= {f"{stem}.yaml" for stem in record.streams}:
+            raise ValueError("a stream without a file")
+        sidecars = [load_stream(folder / f"{stem}.yaml") for stem in record.streams]
+        names = {MESSAGES_NAME, *(f"{stem}.yaml" for stem in record.streams)}
+        if record.files.keys() != names | {sidecar.video.file for sidecar in sidecars}:
+            raise ValueError("a file of no stream")
+        part = cls(
+            folder=folder,
+            topics={topic.topic: topic for topic in record.topics},
+            counts=record.counts,
+            streams=[PartStream(*pair) for pair in zip(record.streams, sidecars, strict=True)],
+            span=record.span,
+            left_out=dict.fromkeys(record.left_out),
+            skipped=record.skipped,
+            transforms=record.transforms,
+            losses=record.losses,
+            files=list(record.files),
+        )
+        if part.span:  # what no manifest takes is damage, too, and the part is made again
+            TimeRange(start=part.span[0], end=part.span[1])
+        for loss in part.losses:
+            LossEntry.from_record(loss)
+        for transform in part.transforms:
+            StaticTransform.from_record(transform)
+        return part
+
+    def check_counts(self, channels: Iterable[Channel]) -> None:
+        """Refuse a record that counts messages otherwise by topic than by channel.
+
+        Args:
+            channels: All of the recording.
+
+        Raises:
+            FormatError: It does; the part is made again.
+        """
+        found: Counter[str] = Counter()
+        for channel in channels:
+            found[channel.topic] += self.counts.get(channel.id, 0)
+        told = {name: topic.messages for name, topic in self.topics.items() if topic.messages}
+        if told != {name: count for name, count in found.items() if count}:
+            self.forget()
+            raise _damaged(self.folder)
+
+
+@dataclass(frozen=True, slots=True)
+class _Record:
+    """What the record of a part holds."""
+
+    topics: list[TopicSummary]
+    counts: dict[int, int]
+    streams: list[str]
+    span: tuple[int, int] | None
+    left_out: list[str]
+    skipped: dict[str, int]
+    transforms: list[Transform]
+    losses: list[Loss]
+    files: dict[str, int]
+
+
+def _damaged(folder: Path) -> FormatError:
+    return FormatError("file-missing", folder, "is gone, or damaged since it was made")
+
+
+def read_record(folder: Path) -> dict[str, Any] | None:
+    """The record of a part; None where the part is not whole: a file is missing or cut short."""
+    try:
+        record: dict[str, Any] = load_kept((folder / RECORD_NAME).read_bytes())
+        topics = record.setdefault("topics", [])
+        is_counted = all(
+            isinstance(t["messages"], int) and isinstance(t["raw_bytes"], int) for t in topics
+        )
+        if is_counted and all(_is_whole(folder, *item) for item in record["files"].items()):
+            return record
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        pass
+    return None
+
+
+def _is_whole(folder: Path, name: str, size: int) -> bool:
+    found = (folder / name).lstat()
+    return "/" not in name and stat.S_ISREG(found.st_mode) and found.st_size == size
+
+
+# ---------------------------------------------------------------- manifest
 
 _LARGER = 1.05  # than its source: more is to be explained
 
@@ -56,7 +281,7 @@ class Recorded(Protocol):
 
 
 def declare_rest(
-    part: Part, reader: BagReader, selected: Callable[[str], bool], writer: BagWriter
+    part: PartRecord, reader: BagReader, selected: Callable[[str], bool], writer: BagWriter
 ) -> None:
     """Keep what the recording declares beside its messages.
 
@@ -77,7 +302,7 @@ def declare_rest(
         writer.add_schema(schema)
 
 
-def _channels_of(part: Part) -> set[tuple[object, ...]]:
+def _channels_of(part: PartRecord) -> set[tuple[object, ...]]:
     """Identities of the channels that sidecars describe."""
     models: list[ChannelModel] = []
     for stream in part.streams:
@@ -88,7 +313,7 @@ def _channels_of(part: Part) -> set[tuple[object, ...]]:
 
 
 def write_manifest(
-    part: Part, recording: Recorded, sources: Sequence[tuple[str, int, str]], profile: str
+    part: PartRecord, recording: Recorded, sources: Sequence[tuple[str, int, str]], profile: str
 ) -> None:
     """Write the manifest of a whole recording: the dataset is complete then.
 
@@ -143,7 +368,7 @@ def write_manifest(
     (part.folder / MANIFEST_NAME).write_bytes(dump_document(manifest))
 
 
-def _static_transforms(part: Part) -> list[StaticTransform]:
+def _static_transforms(part: PartRecord) -> list[StaticTransform]:
     """The transforms between the coordinate frames of all images and calibrations."""
     frame_ids: set[str] = set()
     for stream in part.streams:
@@ -154,7 +379,7 @@ def _static_transforms(part: Part) -> list[StaticTransform]:
     return [StaticTransform.from_record(item) for item in collector.between(frame_ids)]
 
 
-def summarize(part: Part, target: Path, source_bytes: int) -> PackSummary:
+def summarize(part: PartRecord, target: Path, source_bytes: int) -> PackSummary:
     """What a pack did.
 
     Args:
@@ -187,7 +412,9 @@ def summarize(part: Part, target: Path, source_bytes: int) -> PackSummary:
     )
 
 
-def _why_larger(part: Part, source_bytes: int, dataset_bytes: int, messages_bytes: int) -> str:
+def _why_larger(
+    part: PartRecord, source_bytes: int, dataset_bytes: int, messages_bytes: int
+) -> str:
     """A sentence where a dataset takes more than its source by more than 5 %; else empty."""
     if dataset_bytes <= _LARGER * source_bytes:
         return ""

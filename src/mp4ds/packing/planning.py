@@ -6,37 +6,106 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
-from mp4ds.bags import BagReader
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.bags.protocols import BagReader
+from mp4ds.dataset.rebuild import Unsuited
 from mp4ds.errors import OptionError
-from mp4ds.packing.calibrations import unpaired_infos
+from mp4ds.files.sources import SourceState
+from mp4ds.messages.serializations import is_calibration, is_camera
+from mp4ds.packing.calibrations import choose_pairs, pair_camera_infos, unpaired_infos
 from mp4ds.packing.job import Job, Task, absolute, outcome_options, tools
-from mp4ds.packing.report import PackOptions
-from mp4ds.packing.spans import GOPS_PER_WINDOW, cut_times, group_topics, spans_of
-from mp4ds.packing.survey import (
-    Decision,
-    Survey,
-    decide,
-    rate_of,
-    survey_channel,
-    survey_pairs,
-)
-from mp4ds.pairing import choose_pairs, pair_camera_infos
-from mp4ds.plan import Quality, Selection, parse_quality
+from mp4ds.packing.look import Looker, depends_on_others
+from mp4ds.packing.options import PackOptions
+from mp4ds.packing.survey import Decision, Survey, decide, rate_of, survey_channel, survey_pairs
+from mp4ds.packing.tracks import PicturePlan, StreamSettings, TargetPlan, needs_trial
+from mp4ds.plan import QualitySetting, Selection, parse_quality
 from mp4ds.records import Channel
-from mp4ds.source_files import SourceState
-from mp4ds.streams import (
-    Looker,
-    PicturePlan,
-    StreamSettings,
-    TargetPlan,
-    Unsuited,
-    depends_on_others,
-    needs_trial,
-)
-from mp4ds.video import encoder_bytes
-from mp4ds.wire import is_calibration, is_camera
+from mp4ds.video.trial import encoder_bytes
+
+GOPS_PER_WINDOW = 10
+"""Groups of pictures of the busiest camera in a window: a cut costs at most one key frame."""
+
+
+def cut_times(times: Sequence[NDArray[np.int64]], frames: int) -> list[int]:
+    """Log times at which a recording is cut, each a message of a camera.
+
+    The busiest camera is cut after so many of its frames each; so is any other within the
+    windows in which it has more than twice as many.
+
+    Args:
+        times: Sorted log times of each camera's messages, ns.
+        frames: Frames of a window.
+
+    Returns:
+        Increasing; each begins a window, and the first window begins before all.
+    """
+    cuts: list[int] = []
+    for column in sorted(times, key=len, reverse=True):
+        edges = [0, *np.searchsorted(column, np.array(cuts, np.int64)).tolist(), len(column)]
+        new: list[int] = []
+        for start, end in pairwise(edges):
+            if end - start > (2 * frames if cuts else frames):
+                new.extend(column[start + frames : end : frames].tolist())
+        cuts = sorted({*cuts, *(time for time in new if time > int(column[0]))})
+    return _without_short_end(cuts, times, frames)
+
+
+def _without_short_end(
+    cuts: list[int], times: Sequence[NDArray[np.int64]], frames: int
+) -> list[int]:
+    """Leave out a last cut after which little is left."""
+    if not cuts:
+        return cuts
+    rest = max((len(column) - np.searchsorted(column, cuts[-1]) for column in times), default=0)
+    return cuts[:-1] if rest < frames // 2 else cuts
+
+
+def spans_of(cuts: Sequence[int]) -> list[tuple[int | None, int | None]]:
+    """Half-open spans of log time, ns, between the cuts; None is open."""
+    edges = [None, *cuts, None]
+    return list(pairwise(edges))
+
+
+def group_topics(costs: Mapping[str, int], budget: int) -> list[list[str]]:
+    """Topics in groups of which each costs no more than a budget, where that can be.
+
+    Args:
+        costs: Bytes of memory that each topic takes while it is packed.
+        budget: Bytes.
+
+    Returns:
+        At least one group; a topic beyond the budget has its own.
+    """
+    groups: list[list[str]] = []
+    left: list[int] = []
+    for topic in sorted(costs, key=lambda topic: (-costs[topic], topic)):
+        place = next((n for n, room in enumerate(left) if costs[topic] <= room), None)
+        if place is None:
+            place = len(groups)
+            groups.append([])
+            left.append(budget)
+        groups[place].append(topic)
+        left[place] -= costs[topic]
+    return groups or [[]]
+
+
+def share(number: int, tasks: Sequence[tuple[str, ...]], shares: int) -> list[tuple[str, ...]]:
+    """One share of tasks of several machines: every so many-th.
+
+    Args:
+        number: Of the share, from 1.
+        tasks: All, in an order on which all machines agree.
+        shares: How many there are.
+    """
+    return list(tasks[number - 1 :: shares])
+
+
+# ---------------------------------------------------------------- planning
 
 TASK_BYTES = 160 * 2**20
 """A task's memory beside its encoders: the interpreter, libraries, and chunks of the source."""
@@ -48,7 +117,7 @@ _COPIED, _OTHER_COST = 0.02, 1_000.0  # of a message that is not encoded; only f
 
 
 @dataclass(frozen=True, slots=True)
-class Means:
+class Resources:
     """What a machine gives to a pack.
 
     Attributes:
@@ -62,11 +131,11 @@ class Means:
     jobs: int | None = None
 
     @classmethod
-    def of(cls, options: PackOptions) -> Means:
+    def of(cls, options: PackOptions) -> Resources:
         """Of this machine, as far as the options allow."""
         return cls(available_cores(), options.memory or available_memory() // 2, options.jobs)
 
-    def for_one_of(self, recordings: int) -> Means:
+    def for_one_of(self, recordings: int) -> Resources:
         """What each of several recordings gets that are packed at the same time."""
         if recordings < 2:
             return self
@@ -83,7 +152,7 @@ class Means:
         if fitting < 1 and self.memory < job.task_bytes:
             needed = -(-job.task_bytes // 2**20)
             raise OptionError(
-                f"--memory of {self.memory // 2**20} MiB is too little: one encoder of the "
+                f"`memory` of {self.memory // 2**20} MiB is too little: one encoder of the "
                 f"largest images takes about {needed} MiB with what is around it."
             )
         return min(self.jobs or busy, max(1, fitting))
@@ -122,7 +191,9 @@ class _Topics:
     infos: dict[str, str]
 
 
-def plan_job(reader: BagReader, paths: Sequence[Path], options: PackOptions, means: Means) -> Job:
+def plan_job(
+    reader: BagReader, paths: Sequence[Path], options: PackOptions, means: Resources
+) -> Job:
     """Plan a pack.
 
     Args:
@@ -187,7 +258,7 @@ def plan_job(reader: BagReader, paths: Sequence[Path], options: PackOptions, mea
 
 
 def _single(
-    reader: BagReader, paths: Sequence[Path], options: PackOptions, means: Means, needed: int
+    reader: BagReader, paths: Sequence[Path], options: PackOptions, means: Resources, needed: int
 ) -> Job:
     """The job of one task that takes everything."""
     workers, threads = _side_by_side(reader, means)
@@ -206,7 +277,7 @@ def _single(
     )
 
 
-def _side_by_side(reader: BagReader, means: Means) -> tuple[int, int]:
+def _side_by_side(reader: BagReader, means: Resources) -> tuple[int, int]:
     """Streams that one process encodes at a time, and the threads of each encoder."""
     cores = means.jobs or means.cores
     workers = min(cores, sum(map(is_camera, reader.channels)) or 1)
@@ -299,7 +370,7 @@ def _encoder_bytes(decision: Decision, threads: int) -> int:
             size = plan.layout.picture_size(decision.key.width, decision.key.height)
             needed = encoder_bytes(plan.recipe, *size, threads)
             if isinstance(plan, TargetPlan) and plan.target.metric == "vmaf":
-                from mp4ds.scoring import vmaf_bytes
+                from mp4ds.video.libvmaf import vmaf_bytes
 
                 # a window is scored when its encoder is gone
                 needed = max(needed, vmaf_bytes(*size, threads))
@@ -311,7 +382,7 @@ def _assumed_bytes(reader: BagReader, topics: _Topics, settings: StreamSettings)
     """Memory of packing everything at once, before the images were looked at closely."""
     needed = TASK_BYTES
     if settings.quality.target is not None:  # no crf is looked for yet
-        settings = replace(settings, quality=Quality("visual"))
+        settings = replace(settings, quality=QualitySetting("visual"))
     for channel in topics.free:
         first = reader.first(channel)
         if first is None:

@@ -7,23 +7,20 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from mp4ds.bags import BagReader
-from mp4ds.pairing import StampPairing
-from mp4ds.records import Channel, Excerpt, Message
-from mp4ds.streams import (
-    Forms,
-    Looker,
-    Seen,
-    StreamKey,
+from mp4ds.bags.protocols import BagReader
+from mp4ds.dataset.rebuild import MessageSplitter, Unsuited
+from mp4ds.messages.serializations import is_calibration
+from mp4ds.packing.calibrations import StampPairing
+from mp4ds.packing.look import CameraMessage, Looker, StreamKey
+from mp4ds.packing.tracks import (
     StreamSettings,
     TrackPlan,
-    Unsuited,
     needs_trial,
     plan_from_values,
     plan_to_values,
     plan_tracks,
 )
-from mp4ds.wire import is_calibration
+from mp4ds.records import Channel, Excerpt, Message
 
 SAMPLES = 6
 """Images of a stream that show how it is best encoded."""
@@ -108,10 +105,10 @@ def rate_of(reader: BagReader, channel: Channel) -> float | None:
 
 
 def decide(
-    samples: Sequence[Seen],
+    samples: Sequence[CameraMessage],
     settings: StreamSettings,
     rate: float | None,
-    runs: Iterable[Iterable[Seen]] | None = None,
+    runs: Iterable[Iterable[CameraMessage]] | None = None,
 ) -> Decision:
     """How images are stored, by looking at the first of them.
 
@@ -165,7 +162,7 @@ def _places_between(starts: Sequence[int | None]) -> list[int | None]:
 
 def _run(
     reader: BagReader, channel: Channel, start: int | None, looker: Looker, key: StreamKey
-) -> Iterator[Seen]:
+) -> Iterator[CameraMessage]:
     """Images of a key from a log time on; of another one's stretch there are none."""
     left = _RUN
     excerpt = Excerpt(start=start, topics=frozenset([channel.topic]), others=False)
@@ -186,9 +183,9 @@ def _samples(
     start: int | None,
     looker: Looker,
     settings: StreamSettings,
-) -> list[Seen]:
+) -> list[CameraMessage]:
     """The first images of one key from a log time on, as many as decide."""
-    samples: list[Seen] = []
+    samples: list[CameraMessage] = []
     excerpt = Excerpt(start=start, topics=frozenset([channel.topic]), others=False)
     for number, record in enumerate(reader.records(excerpt)):
         if isinstance(record, Message) and record.channel.id == channel.id:
@@ -217,7 +214,7 @@ def survey_pairs(
         pairs: Pairs that hold already.
     """
     topics = frozenset(channel.topic for channel in (*cameras, *infos))
-    forms = {channel.id: Forms(channel) for channel in infos}
+    forms = {channel.id: MessageSplitter(channel) for channel in infos}
     lookers = {channel.id: Looker(channel) for channel in cameras}
     pairing = StampPairing()
     found = dict(pairs)

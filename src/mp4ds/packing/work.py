@@ -18,17 +18,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from mp4ds.bags import BagReader
-from mp4ds.engine import give_back
+from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import Mp4dsError, sentence_of
-from mp4ds.outputs import write_synced
-from mp4ds.packing.cameras import Exact
+from mp4ds.files.outputs import write_synced
+from mp4ds.files.sources import unchanged
+from mp4ds.packing.engine import give_back
 from mp4ds.packing.job import Job, Task, digest_source
-from mp4ds.packing.kept import dump_kept
-from mp4ds.packing.packer import Packer, until_in_reach
-from mp4ds.packing.part import RECORD_NAME, Part
+from mp4ds.packing.manifest import RECORD_NAME, PartRecord, dump_kept
+from mp4ds.packing.packer import Exact, Packer, until_in_reach
 from mp4ds.packing.workplace import Workplace
-from mp4ds.source_files import unchanged
 
 _REPORT_SECONDS = 0.5
 _KEPT_BYTES = 400 * 2**20
@@ -79,14 +77,14 @@ class Tasks:
     def _pack(self, job: Job, task: Task, into: Path, progress: Progress | None) -> None:
         next_report = 0.0
 
-        def report(part: Part) -> None:
+        def report(part: PartRecord) -> None:
             nonlocal next_report
             now = time.monotonic()
             if progress is not None and now >= next_report:
                 next_report = now + _REPORT_SECONDS
                 progress(told(part))
 
-        def make(exact: Exact) -> Part:
+        def make(exact: Exact) -> PartRecord:
             for path in into.iterdir():
                 path.unlink()
             return Packer(self._open(job), into, job.settings(task, exact), report).run()
@@ -123,7 +121,7 @@ def _digest(job: Job, number: int, into: Path) -> None:
     write_synced(into / RECORD_NAME, dump_kept(record))
 
 
-def told(part: Part) -> dict[str, Any]:
+def told(part: PartRecord) -> dict[str, Any]:
     """What a task tells of its progress: messages and bytes of each topic."""
     return {
         "topics": {topic.topic: (topic.messages, topic.raw_bytes) for topic in part.topics.values()}
@@ -176,7 +174,7 @@ def _outcome(tasks: Tasks, folder: str, name: str) -> dict[str, Any]:
     try:
         tasks.run(folder, name, _tell)
     except MemoryError:
-        return {"error": ("MemoryError", "out of memory; try fewer --jobs")}
+        return {"error": ("MemoryError", "out of memory; try fewer `jobs`")}
     except (Mp4dsError, OSError) as error:
         tasks.close()  # it may be damaged where it was read ahead
         said = str(error) if isinstance(error, Mp4dsError) else sentence_of(error)

@@ -7,7 +7,7 @@ Somebody else may have put a folder there: in a folder that users share, or by a
 unpacked. So nothing is read from it, written to it or removed from it unless all of it belongs to
 this user and has names that are made here, without any link; a job tells the inode of its folder,
 so that a copy is not taken for what was begun here; and how to encode is worked out again
-(`mp4ds.video.remade`). Trusted are other processes of the same user, and, where machines share the
+(`video.codecs.remade`). Trusted are other processes of the same user, and, where machines share the
 folder and see other inodes (--shard, --join, --cluster), whatever that user has put there.
 """
 
@@ -25,15 +25,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from mp4ds.errors import OptionError, TargetError, WriteError
-from mp4ds.outputs import as_write_error, sync, sync_folder, write_synced
+from mp4ds.files.outputs import as_write_error, is_mine, lock, sync, sync_folder, write_synced
+from mp4ds.files.urls import location
 from mp4ds.packing.job import TASK_NAME, Job, Task, tools
-from mp4ds.packing.part import read_record
-from mp4ds.remote import location
-from mp4ds.system import is_mine, lock
+from mp4ds.packing.manifest import read_record
 
 _SUFFIX = ".mp4ds-part"
 _JOB_NAME = "job.json"
-_ANEW = "Start over with --restart."
+_ANEW = "Start over with `restart`."
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _NAMED = 3
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
@@ -212,7 +211,7 @@ class Workplace:
         for name, value in options.items():
             if job.options.get(name) != value:
                 raise OptionError(
-                    f"The pack was begun with another --{name.replace('_', '-')}: "
+                    f"The pack was begun with another `{name}`: "
                     f"{job.options.get(name)!r}, and now it is {value!r}. Give the same to go on. "
                     + _ANEW
                 )

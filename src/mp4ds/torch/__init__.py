@@ -12,8 +12,7 @@ from importlib.util import find_spec
 if find_spec("torch") is None:
     raise ImportError("mp4ds.torch needs PyTorch. Install it with: pip install 'mp4ds[torch]'")
 
-from mp4ds.torch.dataset import FrameDataset
-from mp4ds.torch.errors import SampleError
-from mp4ds.torch.stream import FrameStream
+from mp4ds.errors import SampleError
+from mp4ds.torch.datasets import FrameDataset, FrameStream
 
 __all__ = ["FrameDataset", "FrameStream", "SampleError"]

@@ -1,28 +1,455 @@
-"""The open streams of a worker: few at a time, and none of another process."""
+"""The recordings and open streams of a worker, and how frames become tensors."""
 
 from __future__ import annotations
 
 import os
 from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mp4ds.dataset import Stream, Video
-from mp4ds.errors import FormatError, Mp4dsError, OptionError, VideoError
-from mp4ds.intervals import nearest
-from mp4ds.torch.codec import TorchcodecReader
-from mp4ds.torch.errors import SampleError
-from mp4ds.torch.pictures import Pictures, View
-from mp4ds.torch.recordings import Recording, Source, open_source
-from mp4ds.video.samples import Unindexed, read_sample_table
+from mp4ds.dataset.dataset import open_dataset
+from mp4ds.dataset.frames import Video
+from mp4ds.dataset.stream import Stream
+from mp4ds.errors import FormatError, Mp4dsError, OptionError, SampleError, VideoError
+from mp4ds.files.urls import location, remote, spelled
+from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.messages.layouts import LAYOUTS
+from mp4ds.times import nearest, synchronize
+from mp4ds.video.codecs import TEN_BITS
+from mp4ds.video.mp4 import Unindexed, read_sample_table
+
+Resize = float | tuple[int, int]
+Crop = tuple[int, int, int, int]
+Dtype = Literal["native", "uint8", "float32"]
+Backend = Literal["mp4ds", "torchcodec"]
+
+_T = TypeVar("_T")
+_FORMATS = ("native", "rgb", "bgr", "gray")
+_DTYPES = ("native", "uint8", "float32")
+_BACKENDS = ("mp4ds", "torchcodec")
 
 
-class Reader(Protocol):
+@dataclass(frozen=True, slots=True)
+class TensorView:
+    """What of a camera's frames is wanted.
+
+    Attributes:
+        format: ``native``, ``rgb``, ``bgr`` or ``gray``.
+        resize: Factor, or width and height, pixels.
+        crop: x, y, width, height before that, pixels.
+    """
+
+    format: str = "rgb"
+    resize: Resize | None = None
+    crop: Crop | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """How the frames of all cameras become tensors.
+
+    Attributes:
+        views: What of each camera, in the order of the topics.
+        dtype: ``native``, ``uint8`` or ``float32``.
+        channels_first: (C, H, W) instead of (H, W, C).
+        fast_colour: See `mp4ds.Dataset`.
+        backend: Who decodes.
+        device: Where the tensors are.
+    """
+
+    views: tuple[TensorView, ...]
+    dtype: str
+    channels_first: bool
+    fast_colour: bool
+    backend: str
+    device: str
+
+    def tensor(self, pixels: Tensor, topic: str, format_name: str) -> Tensor:
+        """The tensor of frames: a view where nothing is to be computed.
+
+        Args:
+            pixels: Shape (N, H, W) or (N, H, W, C).
+            topic: For errors.
+            format_name: What the pixels are.
+
+        Returns:
+            Shape (N, C, H, W), or (N, H, W, C).
+
+        Raises:
+            OptionError: They are no bytes, where ``uint8`` was asked for.
+        """
+        if pixels.ndim == 3:
+            pixels = pixels.unsqueeze(-1)
+        if self.dtype == "uint8" and pixels.dtype != torch.uint8:
+            kind = str(pixels.dtype).removeprefix("torch.")
+            raise OptionError(
+                f"topic {topic}: has frames of {kind}, not uint8. Give dtype='native' to have "
+                "them as they are, or dtype='float32'."
+            )
+        if self.dtype == "float32":
+            pixels = _floats(pixels, scaled=format_name != "native")
+        return pixels.permute(0, 3, 1, 2) if self.channels_first else pixels
+
+
+def _floats(pixels: Tensor, *, scaled: bool) -> Tensor:
+    if not scaled or pixels.dtype.is_floating_point:
+        return pixels.to(torch.float32)
+    return pixels.to(torch.float32).div_(torch.iinfo(pixels.dtype).max)
+
+
+def pictures_from(
+    topics: Sequence[str],
+    *,
+    format_: str | Mapping[str, str],
+    resize: Resize | Mapping[str, Resize] | None,
+    crop: Crop | Mapping[str, Crop] | None,
+    dtype: str,
+    channels_first: bool,
+    fast_colour: bool,
+    backend: str,
+    device: str,
+) -> Pictures:
+    """The choices of a user.
+
+    Raises:
+        OptionError: One is unknown, or for a topic that is not there.
+    """
+    dtype = str(dtype).removeprefix("torch.")
+    _one_of("dtype", dtype, _DTYPES)
+    _one_of("backend", backend, _BACKENDS)
+    formats = _each("format", format_, topics, "rgb")
+    sizes = _each("resize", resize, topics, None)
+    crops = _each("crop", crop, topics, None)
+    for name in formats:
+        _one_of("format", name, _FORMATS)
+    views = tuple(map(TensorView, formats, sizes, crops))
+    if backend == "mp4ds" and device != "cpu":
+        raise OptionError(f"device={device!r} needs backend='torchcodec'.")
+    if backend == "torchcodec":
+        for view in views:
+            if view.format != "rgb" or view.resize is not None:
+                raise OptionError(
+                    "backend='torchcodec' gives format='rgb' without resize; use a transform."
+                )
+    return Pictures(views, dtype, channels_first, fast_colour, backend, device)
+
+
+def _one_of(name: str, value: str, known: Sequence[str]) -> None:
+    if value not in known:
+        raise OptionError(f"{name} is {value!r}, and not one of {', '.join(known)}.")
+
+
+def _each(name: str, given: _T | Mapping[str, _T], topics: Sequence[str], default: _T) -> list[_T]:
+    """A value for each topic, of one for all or a mapping."""
+    if not isinstance(given, Mapping):
+        return [given] * len(topics)
+    unknown = [topic for topic in given if topic not in topics]
+    if unknown:
+        raise OptionError(
+            f"{name} is given for {unknown[0]!r}, which is not among the topics: "
+            f"{', '.join(topics)}."
+        )
+    return [given.get(topic, default) for topic in topics]
+
+
+# ---------------------------------------------------------------- codec
+
+
+class TorchcodecReader:
+    """Decodes a stream's video by ``torchcodec.decoders.VideoDecoder``.
+
+    Args:
+        stream: The stream.
+        crop: x, y, width, height, pixels; None: all.
+        device: Such as ``cpu`` or ``cuda``.
+
+    Raises:
+        OptionError: torchcodec is missing, mistakes the video's range, or the video's pictures
+            are not the images.
+        VideoError: It cannot open the video.
+    """
+
+    def __init__(self, stream: Stream | Video, crop: Crop | None, device: str) -> None:
+        self._path = stream.video_path
+        if isinstance(stream, Stream):
+            _check_layout(stream)
+        if remote(self._path):
+            raise OptionError(f"{self._path}: backend='torchcodec' reads local files alone.")
+        columns, rows = stream.image_size
+        x, y, width, height = crop or (0, 0, columns, rows)
+        if not (0 <= x < x + width <= columns and 0 <= y < y + height <= rows):
+            raise OptionError(f"topic {stream.topic}: crop {crop} is not within {columns}x{rows}.")
+        self._rows, self._columns = slice(y, y + height), slice(x, x + width)
+        self._decoder = self._opened(device)
+        self._check_range(stream)
+
+    def _opened(self, device: str) -> Any:
+        if find_spec("torchcodec") is None:
+            raise OptionError(
+                "backend='torchcodec' needs torchcodec. Install it with: pip install torchcodec"
+            )
+        try:
+            module = import_module("torchcodec.decoders")
+        except (ImportError, OSError, RuntimeError) as error:
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            raise OptionError(f"torchcodec is installed but cannot be used: {reason}") from None
+        try:
+            # with exact seeking, frame n is the n-th shown, whatever its presentation time
+            return module.VideoDecoder(
+                str(self._path), dimension_order="NHWC", device=device, seek_mode="exact"
+            )
+        except (RuntimeError, ValueError) as error:
+            raise self._refused(error) from None
+
+    def _check_range(self, stream: Stream | Video) -> None:
+        """Refuse a video whose range torchcodec mistakes.
+
+        Of AV1, torchcodec 0.13 on a CPU was seen to take the full range for the limited one: the
+        contrast is then 255 / 219 of what it is, and what is dark or bright is lost.
+        """
+        if not len(stream):
+            return
+        with closing(stream):  # it opens its video again where that is asked of it
+            first = stream.read([0], format="rgb")[0]
+        ours = first[self._rows, self._columns].astype(np.int16)
+        mistaken = ((ours - 16) * (255 / 219)).clip(0, 255)
+        theirs = self.read([0])[0].cpu().numpy()
+        if np.abs(theirs - mistaken).mean() < np.abs(theirs - ours).mean():
+            raise OptionError(
+                f"topic {stream.topic}: torchcodec takes its video of the full range for one of "
+                "the limited, so that the contrast would be wrong. Use backend='mp4ds', or a "
+                "dataset that was packed with `codec` h264."
+            )
+
+    def _refused(self, error: Exception) -> VideoError:
+        reason = " ".join(str(error).split()[:40])
+        return VideoError("decode-failed", self._path, f"torchcodec cannot decode it: {reason}")
+
+    def read(self, frames: list[int]) -> Tensor:
+        """Frames in the order asked for, repeated as asked; shape (N, H, W, 3), uint8.
+
+        Raises:
+            VideoError: One does not decode.
+        """
+        try:
+            pixels: Tensor = self._decoder.get_frames_at(frames).data
+        except (RuntimeError, IndexError, ValueError) as error:
+            raise self._refused(error) from None
+        return pixels[:, self._rows, self._columns]
+
+    def close(self) -> None:
+        """Let the decoder go."""
+        self._decoder = None
+
+
+def _check_layout(stream: Stream) -> None:
+    """Refuse pictures that are not the images, or that have more than 8 bits.
+
+    Of lossy videos, 10 bits hold images of 8.
+    """
+    image, video = stream.sidecar.image, stream.sidecar.video
+    is_8_bits = video.pixel_format in (None, TEN_BITS) or not video.pixel_format.endswith("le")
+    if not LAYOUTS[video.layout].is_shown or not is_8_bits:
+        raise OptionError(
+            f"topic {stream.topic}: {image.encoding} images are stored in the layout "
+            f"{video.layout}, which torchcodec does not turn into colours. Use backend='mp4ds'."
+        )
+
+
+# ---------------------------------------------------------------- recordings
+
+Paths = Path | str | Sequence[Path | str]
+"""Datasets: folders, videos beside their sidecars, or URLs of such."""
+
+RESERVED = ("stamp_ns", "index", "dataset")
+"""Keys of a sample that no topic may have."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSource:
+    """A camera of a recording.
+
+    Attributes:
+        topic: Of its images.
+        name: Of its file, without ending.
+        place: Path or URL of the sidecar, or of a video that has none.
+        frames: Number of its frames.
+    """
+
+    topic: str
+    name: str
+    place: str
+    frames: int
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """The samples of one dataset, in order: its rows.
+
+    Attributes:
+        path: As the user named it.
+        sources: Its cameras, in the order of the topics.
+        matches: Frame numbers, int64 of shape (rows, cameras); None: row n is frame n of the only
+            camera.
+        unmatched: Frame numbers that are in no row, by topic.
+    """
+
+    path: str
+    sources: tuple[CameraSource, ...]
+    matches: NDArray[np.int64] | None
+    unmatched: dict[str, NDArray[np.int64]]
+
+    @property
+    def rows(self) -> int:
+        """Number of its samples."""
+        return self.sources[0].frames if self.matches is None else len(self.matches)
+
+    def frames(self, rows: NDArray[np.int64], camera: int) -> NDArray[np.int64]:
+        """Frame numbers of rows in a camera; the same shape."""
+        return rows if self.matches is None else self.matches[rows, camera]
+
+
+class Collection:
+    """The samples of several datasets, one after the other.
+
+    Of a dataset with one camera only the manifest is read; to match several, their stamps.
+
+    Args:
+        paths: The datasets.
+        topics: Topics or names of streams; None: those of the first dataset. All must have them.
+        sync_tolerance_ns: How far header stamps of a match may be apart, nanoseconds.
+
+    Raises:
+        OptionError: A topic is not there, or there is no sample.
+        FormatError: A manifest or sidecar breaks a rule of the format.
+        SourceError: A path is no dataset.
+    """
+
+    def __init__(
+        self, paths: Paths, *, topics: Sequence[str] | None, sync_tolerance_ns: int
+    ) -> None:
+        given = [paths] if isinstance(paths, (str, Path)) else list(paths)
+        if not given:
+            raise OptionError("There are no datasets: the list of paths is empty.")
+        if isinstance(topics, str):
+            raise OptionError(f"topics is a list of topics, such as [{topics!r}].")
+        if sync_tolerance_ns < 0:
+            raise OptionError(
+                f"sync_tolerance_ns is {sync_tolerance_ns}, and must not be negative."
+            )
+        known = _sources(given[0])
+        self.topics = tuple(topics) if topics is not None else tuple(s.topic for s in known)
+        _check_topics(self.topics, given[0])
+        self.recordings = [
+            self._recording(path, known if number == 0 else _sources(path), sync_tolerance_ns)
+            for number, path in enumerate(given)
+        ]
+        if not self.starts[-1]:
+            raise OptionError(
+                f"{given[0]}: no frames of {', '.join(self.topics)} have header stamps within "
+                f"{sync_tolerance_ns} ns of each other. Give a larger sync_tolerance_ns."
+            )
+
+    @cached_property
+    def starts(self) -> NDArray[np.int64]:
+        """Number of the first sample of each recording, and of the end; int64."""
+        return np.cumsum([0, *(recording.rows for recording in self.recordings)], dtype=np.int64)
+
+    def locate(self, samples: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Recording and row of each sample number, of 0 <= number < ``starts[-1]``."""
+        recordings = np.searchsorted(self.starts, samples, side="right") - 1
+        return recordings.astype(np.int64), samples - self.starts[recordings]
+
+    def _recording(
+        self, path: Path | str, sources: list[CameraSource], tolerance_ns: int
+    ) -> Recording:
+        chosen = tuple(_choose(sources, topic, path) for topic in self.topics)
+        if len(chosen) == 1:
+            return Recording(str(path), chosen, None, {chosen[0].topic: np.empty(0, np.int64)})
+        stamps = {}
+        for topic, source in zip(self.topics, chosen, strict=True):
+            stream = open_source(source)
+            stamps[topic] = stream.stamps
+            stream.close()
+        sync = synchronize(stamps, tolerance_ns=tolerance_ns)
+        return Recording(str(path), chosen, sync.indices, sync.unmatched)
+
+
+def open_source(source: CameraSource, *, fast_colour: bool = False) -> Stream | Video:
+    """The stream or video of a camera; others of its dataset are not touched.
+
+    Args:
+        source: Which.
+        fast_colour: See `mp4ds.Dataset`.
+
+    Raises:
+        FormatError: It breaks a rule of the format.
+    """
+    path = location(source.place)
+    if path.suffix == ".yaml":
+        return Stream(path, fast_colour=fast_colour)
+    return open_dataset(path, fast_colour=fast_colour).videos[0]
+
+
+def _sources(path: Path | str) -> list[CameraSource]:
+    """The cameras of a dataset; the manifest tells them without the sidecars."""
+    folder = location(path)
+    if folder.name == MANIFEST_NAME:
+        folder = folder.parent
+    if (folder / MANIFEST_NAME).exists():
+        entries = load_manifest(folder / MANIFEST_NAME).streams
+        places = [folder / entry.sidecar for entry in entries]
+        return [
+            CameraSource(entry.topic, place.stem, spelled(place), entry.frames)
+            for entry, place in zip(entries, places, strict=True)
+        ]
+    with open_dataset(path) as dataset:
+        return [CameraSource(s.topic, s.path.stem, spelled(s.path), len(s)) for s in dataset]
+
+
+def _check_topics(topics: Sequence[str], path: Path | str) -> None:
+    if not topics:
+        raise OptionError(f"{path}: has no camera, or no topics were chosen.")
+    twice = [topic for topic in topics if topics.count(topic) > 1]
+    if twice:
+        raise OptionError(
+            f"{path}: {twice[0]} stands twice among the topics. If it has several streams, choose "
+            "one by the name of its file."
+        )
+    taken = [topic for topic in topics if topic in RESERVED]
+    if taken:
+        raise OptionError(f"{path}: a topic named {taken[0]!r} cannot be a key of a sample.")
+
+
+def _choose(sources: list[CameraSource], topic: str, path: Path | str) -> CameraSource:
+    found = [s for s in sources if topic in (s.topic, s.name)]
+    if not found:
+        known = ", ".join(dict.fromkeys(s.topic for s in sources)) or "none"
+        raise OptionError(f"{path}: has no stream {topic!r}; there are: {known}.")
+    if len(found) > 1:
+        names = ", ".join(s.name for s in found)
+        raise OptionError(
+            f"{path}: {topic} changes its size or encoding and has {len(found)} streams; choose "
+            f"one of {names}."
+        )
+    return found[0]
+
+
+# ---------------------------------------------------------------- cameras
+
+
+class TensorReader(Protocol):
     """What decodes frames of a stream."""
 
     def read(self, frames: list[int]) -> Tensor:
@@ -42,22 +469,22 @@ class StreamReader:
         view: What of its frames is wanted.
     """
 
-    def __init__(self, stream: Stream | Video, view: View) -> None:
+    def __init__(self, stream: Stream | Video, view: TensorView) -> None:
         self._stream = stream
         self._view = view
 
     def read(self, frames: list[int]) -> Tensor:
-        """As `Reader.read`."""
+        """As `TensorReader.read`."""
         view = self._view
         pixels = self._stream.read(frames, format=view.format, resize=view.resize, crop=view.crop)
         return torch.from_numpy(pixels)  # shares the memory
 
     def close(self) -> None:
-        """As `Reader.close`."""
+        """As `TensorReader.close`."""
         self._stream.close()
 
 
-class Camera:
+class OpenCamera:
     """An open stream: its frames as tensors, and its stamps.
 
     Args:
@@ -69,7 +496,7 @@ class Camera:
         FormatError: The stream breaks a rule of the format.
     """
 
-    def __init__(self, source: Source, view: View, pictures: Pictures) -> None:
+    def __init__(self, source: CameraSource, view: TensorView, pictures: Pictures) -> None:
         self.source = source
         self._view = view
         self._pictures = pictures
@@ -80,7 +507,7 @@ class Camera:
                 source.place,
                 f"has {len(self.stream)} frames where {source.frames} are due",
             )
-        self._reader: Reader = (
+        self._reader: TensorReader = (
             TorchcodecReader(self.stream, view.crop, pictures.device)
             if pictures.backend == "torchcodec"
             else StreamReader(self.stream, view)
@@ -160,7 +587,7 @@ class Camera:
         self.stream.close()
 
 
-class Cameras:
+class OpenCameras:
     """The cameras of one process that are open; those not used for long are closed.
 
     A copy of it, by pickling or by a fork, has none open: a decoder's threads do not exist in
@@ -183,13 +610,13 @@ class Cameras:
 
     def _start(self) -> None:
         self._process = os.getpid()
-        self._open: OrderedDict[str, Camera] = OrderedDict()
-        self._inherited: list[OrderedDict[str, Camera]] = []
+        self._open: OrderedDict[str, OpenCamera] = OrderedDict()
+        self._inherited: list[OrderedDict[str, OpenCamera]] = []
 
     def __len__(self) -> int:
         return len(self._open)
 
-    def get(self, recording: Recording, camera: int) -> Camera:
+    def get(self, recording: Recording, camera: int) -> OpenCamera:
         """A camera of a recording, opened if need be.
 
         Raises:
@@ -204,7 +631,7 @@ class Cameras:
         if found is None:
             while len(self._open) >= self._most:
                 self._open.popitem(last=False)[1].close()
-            found = Camera(source, self._pictures.views[camera], self._pictures)
+            found = OpenCamera(source, self._pictures.views[camera], self._pictures)
         self._open[source.place] = found
         return found
 

@@ -1,50 +1,300 @@
-"""Frames of a video by number: a decoder is given only what they need.
-
-To show a frame, a decoder needs the key frame before it and the frames that it refers to, over as
-many steps as it takes. All others in between are left out (`mp4ds.video.chains`); what comes out
-is the same. Where nothing is known of the references, `mp4ds.video.reader` decodes them all.
-"""
+"""Frames of a video by number: a decoder is given only what they need."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import hashlib
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import av
 import numpy as np
 from av.error import FFmpegError
+from numpy.typing import NDArray
 
-from mp4ds.coded import Refused
-from mp4ds.coded.references import UnknownStructure
-from mp4ds.coded.structure import StructureError, Structures
 from mp4ds.errors import FormatError, VideoError
-from mp4ds.layouts import Picture
-from mp4ds.remote import expect
-from mp4ds.sidecar import References
-from mp4ds.video.chains import Chains, Group, Piece
-from mp4ds.video.digest import packets_of_groups
-from mp4ds.video.jpeg import JpegDecoder
-from mp4ds.video.pictures import PictureMaker
-from mp4ds.video.samples import SampleTable, Unindexed, read_sample_table
-from mp4ds.video.scarcity import raise_if_scarce
+from mp4ds.files.outputs import digest_file
+from mp4ds.files.urls import expect
+from mp4ds.messages.arrangements import Picture
+from mp4ds.messages.coded import Refused, UnknownStructure
+from mp4ds.video.codecs import CODECS
+from mp4ds.video.decoder import JpegDecoder
+from mp4ds.video.media import raise_if_scarce
+from mp4ds.video.mp4 import SampleTable, Unindexed, read_sample_table
+from mp4ds.video.pixels import PictureMaker
+from mp4ds.video.references import (
+    RecordedReferences,
+    ReferenceParser,
+    StructureError,
+    StructureRecorder,
+    Structures,
+    frame_bytes,
+    read_structure,
+)
 
-_DECODERS = {
-    "h264": "h264",
-    "h265": "hevc",
-    "av1": "libdav1d",
-    "vp9": "vp9",
-    "ffv1": "ffv1",
-}
-CODECS_OF_ENTRIES = {  # codecs by the four letters of their sample entry
-    **dict.fromkeys(("avc1", "avc3"), "h264"),
-    **dict.fromkeys(("hvc1", "hev1"), "h265"),
-    "av01": "av1",
-    "vp09": "vp9",
-    "FFV1": "ffv1",
-    **dict.fromkeys(("mp4v", "jpeg"), "mjpeg"),
-}
+_BLOCK = 2**20
+
+
+@dataclass(frozen=True, eq=False)
+class VideoDigest:
+    """Of a whole file.
+
+    Attributes:
+        size: Bytes.
+        sha256: Hexadecimal.
+        structures: What its frames refer to, where that is known.
+    """
+
+    size: int
+    sha256: str
+    structures: Structures | None
+
+
+def digest_video(path: Path, codec: str) -> VideoDigest:
+    """Hash a video, and find what its frames refer to in the same bytes.
+
+    Memory is one packet, and the video's index.
+
+    Args:
+        path: An mp4.
+        codec: Name in the registry.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    table = _table(path) if codec in CODECS and CODECS[codec].is_free else None
+    if table is None:
+        return VideoDigest(*digest_file(path), None)
+    recorder = StructureRecorder(codec, table.configuration)
+    digest = hashlib.sha256()
+    size = 0
+    with path.open("rb") as file:
+        number = 0
+        for is_packet, data in _parts(file, table):
+            digest.update(data)
+            size += len(data)
+            if is_packet:
+                recorder.add(data, key=bool(table.sync[number]))
+                number += 1
+    return VideoDigest(size, digest.hexdigest(), recorder.finish())
+
+
+def packets_in_groups(path: Path) -> NDArray[np.int64]:
+    """How many packets each group of pictures of a video has, shape (groups,).
+
+    Raises:
+        VideoError: Its index is damaged.
+        Unindexed: Its index is not read.
+        OSError: It cannot be read.
+    """
+    with path.open("rb") as file:
+        return packets_of_groups(read_sample_table(file, path.stat().st_size, str(path)))
+
+
+def packets_of_groups(table: SampleTable) -> NDArray[np.int64]:
+    """How many packets each group of pictures has, shape (groups,)."""
+    return np.diff(np.append(np.flatnonzero(table.sync), len(table.sync)))
+
+
+def _table(path: Path) -> SampleTable | None:
+    """The index of a video whose packets follow each other; None if that is not known."""
+    try:
+        with path.open("rb") as file:
+            table = read_sample_table(file, path.stat().st_size, str(path))
+    except (VideoError, Unindexed):
+        return None
+    ends = table.places + table.sizes
+    return table if np.all(table.places[1:] >= ends[:-1]) else None
+
+
+def _parts(file: BinaryIO, table: SampleTable) -> Iterator[tuple[bool, bytes]]:
+    """All bytes of a file: its packets, and blocks of what is between them."""
+    place = 0
+    for start, size in zip(table.places.tolist(), table.sizes.tolist(), strict=True):
+        while place < start:
+            data = file.read(min(_BLOCK, start - place))
+            if not data:
+                return  # it became shorter meanwhile
+            place += len(data)
+            yield False, data
+        yield True, file.read(size)
+        place += size
+    while data := file.read(_BLOCK):
+        yield False, data
+
+
+# ---------------------------------------------------------------- chains
+
+_KEPT_FRAMES = 50_000  # coded frames whose references are kept in memory
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A coded frame: a part of a packet that a decoder is to be given.
+
+    Attributes:
+        sample: Number of the packet.
+        part: Number of the coded frame in it.
+        needs: Numbers in its group of the pieces that it refers to.
+        span: Its first byte in the packet and the one after its last; None until it is read.
+    """
+
+    sample: int
+    part: int
+    needs: tuple[int, ...]
+    span: tuple[int, int] | None
+
+
+@dataclass(slots=True)
+class Group:
+    """The coded frames from a key frame to the next, as far as they are known.
+
+    Attributes:
+        first: Number of the key frame's packet.
+        end: Number of the next group's.
+        parser: Of its packets; None where all is known without.
+        pieces: In the order coded.
+        shows: For each packet known the number of the piece that makes its picture come out.
+    """
+
+    first: int
+    end: int
+    parser: ReferenceParser | None
+    pieces: list[Piece] = field(default_factory=list)
+    shows: list[int] = field(default_factory=list)
+
+    def chain(self, samples: Iterable[int]) -> list[int]:
+        """Numbers of the pieces that show the pictures of packets, and of all that these need."""
+        pending = [self.shows[sample - self.first] for sample in samples]
+        found = set(pending)
+        while pending:
+            for number in self.pieces[pending.pop()].needs:
+                if number not in found:
+                    found.add(number)
+                    pending.append(number)
+        return sorted(found)
+
+
+class Chains:
+    """The groups of a video; what is in one is found out when it is first needed.
+
+    Args:
+        table: The video's index.
+        codec: Name in the registry.
+        read: Gives a packet by its number.
+        recorded: What the frames refer to, where that was written down; it fits the index.
+
+    Raises:
+        UnknownStructure: Nothing is known of the references of the codec.
+    """
+
+    def __init__(
+        self,
+        table: SampleTable,
+        codec: str,
+        read: Callable[[int], bytes],
+        recorded: Structures | None = None,
+    ) -> None:
+        self._table = table
+        self._codec = codec
+        self._read = read
+        self._recorded = recorded
+        self._keys = np.flatnonzero(table.sync)
+        self._groups: OrderedDict[int, Group] = OrderedDict()
+        ReferenceParser(codec, table.configuration)
+
+    def group(self, sample: int, last: int) -> Group:
+        """The group that a packet is in, known up to another one of it.
+
+        Raises:
+            UnknownStructure: What its frames refer to is not known.
+            StructureError: What was written down of it contradicts itself.
+        """
+        place = self._place(sample)
+        group = self._groups.get(place)
+        if group is None:
+            group = self._begin(place)
+            self._groups[place] = group
+        self._groups.move_to_end(place)
+        if group.parser is not None:
+            self._parse(group, group.parser, last)
+        self._forget()
+        return group
+
+    def cut(self, group: Group, piece: Piece, packet: bytes) -> bytes:
+        """The bytes of a piece out of its packet.
+
+        Raises:
+            Refused: It does not hold the coded frames that were written down of it.
+        """
+        if piece.span is not None:
+            start, end = piece.span
+            return packet if (start, end) == (0, len(packet)) else packet[start:end]
+        last = group.pieces[group.shows[piece.sample - group.first]]
+        return frame_bytes(
+            self._codec, packet, part=piece.part, parts=last.part + 1, key=not piece.needs
+        )
+
+    def unknown(self, sample: int, last: int) -> range:
+        """Numbers of the packets that `group` would have to read."""
+        if self._recorded is not None:
+            return range(0)
+        place = self._place(sample)
+        group = self._groups.get(place)
+        first = self._first(place) if group is None else group.first + len(group.shows)
+        return range(first, last + 1)
+
+    def _place(self, sample: int) -> int:
+        return int(np.searchsorted(self._keys, sample, side="right")) - 1
+
+    def _first(self, place: int) -> int:
+        return int(self._keys[place]) if place >= 0 else 0
+
+    def split(self, samples: list[int]) -> Iterator[list[int]]:
+        """Packets by the groups that they are in; those of a group must follow each other."""
+        places = np.searchsorted(self._keys, np.array(samples, np.int64), side="right")
+        bounds = [0, *(np.flatnonzero(np.diff(places)) + 1).tolist(), len(samples)]
+        for start, end in pairwise(bounds):
+            yield samples[start:end]
+
+    def _begin(self, place: int) -> Group:
+        count = len(self._table.sizes)
+        following = self._keys[place + 1] if place + 1 < len(self._keys) else count
+        group = Group(self._first(place), int(following), None)
+        if self._recorded is None:
+            group.parser = ReferenceParser(self._codec, self._table.configuration)
+            return group
+        text = self._recorded.texts[int(self._recorded.groups[place])]
+        for sample, frames in enumerate(read_structure(text), group.first):
+            for part, needs in enumerate(frames):
+                group.pieces.append(Piece(sample, part, needs, None))
+            group.shows.append(len(group.pieces) - 1)
+        return group
+
+    def _parse(self, group: Group, parser: ReferenceParser, last: int) -> None:
+        for sample in range(group.first + len(group.shows), last + 1):
+            frames = parser.packet(self._read(sample), key=sample == group.first)
+            shown = -1
+            for part, frame in enumerate(frames):
+                number = len(group.pieces)
+                needs = tuple(number - distance for distance in frame.references)
+                group.pieces.append(Piece(sample, part, needs, (frame.start, frame.end)))
+                if frame.shown:
+                    shown = number
+            group.shows.append(shown)
+
+    def _forget(self) -> None:
+        while (
+            len(self._groups) > 1
+            and sum(len(group.pieces) for group in self._groups.values()) > _KEPT_FRAMES
+        ):
+            self._groups.popitem(last=False)
+
+
+# ---------------------------------------------------------------- access
 
 
 class FrameAccess:
@@ -74,7 +324,7 @@ class FrameAccess:
         frames: int | None,
         maker: PictureMaker,
         threads: int = 1,
-        references: References | None = None,
+        references: RecordedReferences | None = None,
     ) -> None:
         self._path = path
         self._codec = codec
@@ -98,7 +348,8 @@ class FrameAccess:
             table = read_sample_table(self._file, self._path.stat().st_size, str(self._path))
         except Unindexed as error:
             raise UnknownStructure(f"its index is not read: {error}") from None
-        if CODECS_OF_ENTRIES.get(table.codec) != self._codec:
+        known = CODECS.get(self._codec)
+        if known is None or table.codec not in known.entries:
             raise UnknownStructure(f"its track is {table.codec!r}")
         if frames is not None and len(table.order) != frames:
             raise VideoError(
@@ -112,7 +363,7 @@ class FrameAccess:
             )
         return table
 
-    def _recorded(self, references: References) -> Structures:
+    def _recorded(self, references: RecordedReferences) -> Structures:
         try:
             return references.decode(packets_of_groups(self.table))
         except ValueError as error:
@@ -215,7 +466,7 @@ class FrameAccess:
     def _new_context(self) -> Any:
         if self._codec == "mjpeg":
             return JpegDecoder(self._maker.coded_size)
-        context: Any = av.CodecContext.create(_DECODERS[self._codec], "r")
+        context: Any = av.CodecContext.create(CODECS[self._codec].decoder, "r")
         if self.table.configuration:
             context.extradata = self.table.configuration
         context.width, context.height = self.table.width, self.table.height

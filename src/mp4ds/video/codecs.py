@@ -1,20 +1,178 @@
-"""The table of codecs: which encoder, pixel format and options make which stream.
+"""The table of codecs, and which encoder, pixel format and options make which stream.
 
-Chosen by measurement; spec/registry.md, "Codecs", has the reasons, benchmarks/lossless.py
-the figures.
+A codec is added by an entry of `CODECS`, and of the tables of encodings below for what encodes it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from importlib import import_module
 from itertools import product
 from types import MappingProxyType
 from typing import Any
 
 from mp4ds.errors import OptionError
-from mp4ds.video.depths import TEN_BITS
-from mp4ds.video.hardware import CHROMA_PLACE, HARDWARE
+
+TEN_BITS = "yuv420p10le"
+"""The pixel format of 4:2:0 with 10 bits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Codec:
+    """What is known of a codec of the registry, whatever encodes it.
+
+    Attributes:
+        ffmpeg: ffmpeg's name of it.
+        decoder: ffmpeg's name of the decoder for single frames; empty: it has no references.
+        names: In messages: of the codec, or of an encoder that makes it.
+        entries: Four letters of the sample entries of an mp4.
+        pictures: What parses packets of messages, as ``module:name``; empty: none are taken.
+        framing: How packets are framed: ``units`` (NAL), ``obus`` (AV1), or not at all.
+        references: What tells the references of frames, as ``module:name``.
+        is_free: Whether a frame may do without the one before it, which is worth recording.
+        is_split: Whether packets may hold several coded frames.
+    """
+
+    ffmpeg: str
+    references: str
+    decoder: str = ""
+    names: tuple[str, ...] = ()
+    entries: tuple[str, ...] = ()
+    pictures: str = ""
+    framing: str = ""
+    is_free: bool = False
+    is_split: bool = False
+
+
+CODECS: Mapping[str, Codec] = {
+    "h264": Codec(
+        "h264", "references:H264References", "h264",
+        ("h264", "avc", "libx264", "libopenh264"), ("avc1", "avc3"),
+        "h264:H264Pictures", "units", is_free=True,
+    ),
+    "h265": Codec(
+        "hevc", "references:H265References", "hevc",
+        ("h265", "hevc", "libx265"), ("hvc1", "hev1"),
+        "h265:H265Pictures", "units", is_free=True,
+    ),
+    "av1": Codec(
+        "av1", "av1:Av1References", "libdav1d",
+        ("av1", "libsvtav1", "libaom-av1", "librav1e"), ("av01",),
+        "av1:Av1Pictures", "obus", is_free=True, is_split=True,
+    ),
+    "vp9": Codec(
+        "vp9", "references:Vp9References", "vp9", ("vp9", "libvpx-vp9"), ("vp09",),
+        "vp9:Vp9Pictures",
+    ),
+    "ffv1": Codec("ffv1", "references:Ffv1References", "ffv1", entries=("FFV1",)),
+    "mjpeg": Codec(
+        "mjpeg", "references:Intra", names=("mjpeg", "jpeg", "jpg"), entries=("mp4v", "jpeg"),
+        pictures="coded_messages:Jpegs",
+    ),
+    "png": Codec("png", "references:Intra", pictures="coded_messages:Pngs"),
+}  # fmt: skip
+"""By the name in the registry; PNG only as packets that are looked at, no mp4 has them."""
+
+
+def part_of(place: str) -> Any:
+    """What a `Codec` names as ``module:name``; imported when needed: a video is of one codec."""
+    module, _, name = place.partition(":")
+    return getattr(import_module(f"mp4ds.video.{module}"), name)
+
+
+# ---------------------------------------------------------------- encoders
+
+CHROMA_PLACE = "chroma_sample_location"
+"""Option that tags where the chroma is; of these encoders, those of VAAPI go by it."""
+
+_LAMBDA = 118  # FF_QP2LAMBDA, the unit of ffmpeg's -q:v
+
+
+@dataclass(frozen=True, slots=True)
+class HardwareEncoder:
+    """An encoder of the hardware.
+
+    Attributes:
+        codec: What a reader needs.
+        encoder: ffmpeg's name.
+        needs: What it needs on the machine; a phrase.
+        given: Options for every stream.
+        scale: Its option for the quality.
+        first: What a crf of 0 would be in that option.
+        step: What a crf of one more adds to it.
+        most: The largest crf; the smallest is 1, since 0 leaves the choice to most of them.
+        presets: That it has.
+        default_preset: One of them, or empty.
+        device: Kind of device whose memory has to hold the pictures; empty: it takes them as
+            they are.
+    """
+
+    codec: str
+    encoder: str
+    needs: str
+    given: Mapping[str, str]
+    scale: str
+    most: int
+    first: int = 0
+    step: int = 1
+    presets: tuple[str, ...] = ()
+    default_preset: str = ""
+    device: str = ""
+
+    def options(self, crf: int) -> dict[str, str]:
+        """The options for a quality."""
+        return {**self.given, self.scale: str(self.first + crf * self.step)}
+
+
+# all without B-frames, so that frames are coded in the order shown, and without a bit rate
+_NVIDIA = "an NVIDIA graphics card that encodes {}, with its driver"
+_NVENC = MappingProxyType({"rc": "vbr", "b": "0", "bf": "0", "no-scenecut": "1"})
+_NVENC_PRESETS = tuple(f"p{number}" for number in range(1, 8))
+_RENDERS = "a graphics processor that encodes {} by VAAPI, its driver, and access to /dev/dri"
+_VAAPI = MappingProxyType({"rc_mode": "CQP", "bf": "0"})
+_VAAPI_CENTRED = MappingProxyType({**_VAAPI, CHROMA_PLACE: "center"})
+_APPLE = "a Mac with Apple silicon"
+_TOOLBOX = MappingProxyType({"bf": "0", "flags": "+qscale+cgop"})
+# its scale is from 1 to 100, and more is better: -q:v 100 - 2 * crf
+_TOOLBOX_SCALE: Any = MappingProxyType(
+    {"scale": "global_quality", "first": 100 * _LAMBDA, "step": -2 * _LAMBDA, "most": 49}
+)
+
+
+def _nvenc(codec: str, encoder: str, most: int, **given: str) -> HardwareEncoder:
+    return HardwareEncoder(
+        codec, encoder, _NVIDIA.format(codec), {**_NVENC, **given}, "cq", most,
+        presets=_NVENC_PRESETS, default_preset="p4",
+    )  # fmt: skip
+
+
+HARDWARE: Mapping[str, HardwareEncoder] = MappingProxyType(
+    {
+        "h264-nvenc": _nvenc("h264", "h264_nvenc", 51, profile="high"),
+        "h265-nvenc": _nvenc("h265", "hevc_nvenc", 51),
+        "av1-nvenc": _nvenc("av1", "av1_nvenc", 63),
+        "h264-vaapi": HardwareEncoder(
+            "h264", "h264_vaapi", _RENDERS.format("h264"), _VAAPI_CENTRED, "qp", 51, device="vaapi"
+        ),
+        "h265-vaapi": HardwareEncoder(
+            "h265", "hevc_vaapi", _RENDERS.format("h265"), _VAAPI_CENTRED, "qp", 51, device="vaapi"
+        ),
+        # 0 to 255, of which other AV1 encoders make 63 steps
+        "av1-vaapi": HardwareEncoder(
+            "av1", "av1_vaapi", _RENDERS.format("av1"), _VAAPI, "global_quality", 63,
+            step=4, device="vaapi",
+        ),
+        "h264-videotoolbox": HardwareEncoder(
+            "h264", "h264_videotoolbox", _APPLE, {**_TOOLBOX, "profile": "high"}, **_TOOLBOX_SCALE
+        ),
+        "h265-videotoolbox": HardwareEncoder(
+            "h265", "hevc_videotoolbox", _APPLE, _TOOLBOX, **_TOOLBOX_SCALE
+        ),
+    }
+)  # fmt: skip
+"""Name of ``--codec`` -> encoder."""
+
 
 # most frames between key frames, chosen by what they cost (spec/notes.md)
 LOSSLESS_GOP, LOSSY_GOP = 30, 60
@@ -121,49 +279,68 @@ _LOSSLESS: dict[str, dict[str, _Coding]] = {
         for planar in _YUV
     },
 }
+_X26X_PRESETS = (
+    *("ultrafast", "superfast", "veryfast", "faster", "fast"),
+    *("medium", "slow", "slower", "veryslow"),
+)
+_AV1_PRESETS = tuple(str(number) for number in range(14))
+
+
+@dataclass(frozen=True, slots=True)
+class _Lossy:
+    """An encoder that loses, as ``--codec`` names it.
+
+    Attributes:
+        coding: What it is given.
+        presets: That it has.
+        most: The largest crf.
+        least: The smallest crf that is chosen without being asked for.
+    """
+
+    coding: _Coding
+    presets: tuple[str, ...]
+    most: int
+    least: int = 1
+
+
+# with a crf of 1, SVT-AV1's presets from 11 on were seen to make frames that do not look like the
+# pictures, and videos that do not decode
+_AV1_FAST = 11
 _SMALL = "hierarchical-levels=3:enable-qm=1:qm-min=8:ac-bias=1.0"
-_LOSSY: dict[str, _Coding] = {
-    "av1": _Coding("libsvtav1", "yuv420p", {}, "6"),
+_LOSSY: Mapping[str, _Lossy] = {
+    "av1": _Lossy(_Coding("libsvtav1", "yuv420p", {}, "6"), _AV1_PRESETS, 63, 2),
     # a sixth fewer bits for 1.3 times the time (benchmarks/RESULTS.md)
-    "av1-10bit": _Coding("libsvtav1", TEN_BITS, {"svtav1-params": _SMALL}, "6", codec="av1"),
-    "h264": _Coding("libx264", "yuv420p", {**_X264, "x264-params": _CENTRED}, "medium"),
-    "h265": _Coding(
-        "libx265", "yuv420p", {"x265-params": f"{_X265}:{_CENTRED}:{_QUIET}"}, "medium"
+    "av1-10bit": _Lossy(
+        _Coding("libsvtav1", TEN_BITS, {"svtav1-params": _SMALL}, "6", codec="av1"),
+        _AV1_PRESETS, 63, 2,
     ),
-}
+    "h264": _Lossy(
+        _Coding("libx264", "yuv420p", {**_X264, "x264-params": _CENTRED}, "medium"),
+        _X26X_PRESETS, 51,
+    ),
+    "h265": _Lossy(
+        _Coding("libx265", "yuv420p", {"x265-params": f"{_X265}:{_CENTRED}:{_QUIET}"}, "medium"),
+        _X26X_PRESETS, 51,
+    ),
+}  # fmt: skip
 _DEFAULT_LOSSY = "av1"
+_PRESETS: Mapping[str, Sequence[str]] = {
+    "ffv1": (),
+    **{name: found.presets for name, found in _LOSSY.items()},
+    **{name: found.presets for name, found in HARDWARE.items()},
+}
 
 AV1 = ("av1", "av1-10bit")
 """The names of SVT-AV1's two forms."""
 
 MAX_CRF = {
-    "av1": 63,
-    "av1-10bit": 63,
-    "h264": 51,
-    "h265": 51,
+    **{name: found.most for name, found in _LOSSY.items()},
     **{name: found.most for name, found in HARDWARE.items()},
 }
 """The largest crf of each lossy codec, and of each encoder of the hardware."""
 
-# with 1, SVT-AV1's presets from 11 on were seen to make frames that do not look like the pictures,
-# and videos that do not decode
-_AV1_FAST = 11
-LEAST_CRF = {"av1": 2, "h264": 1, "h265": 1}
-"""The smallest crf that is chosen for each lossy codec without being asked for."""
-
-_X26X_PRESETS = (
-    *("ultrafast", "superfast", "veryfast", "faster", "fast"),
-    *("medium", "slow", "slower", "veryslow"),
-)
-_AV1_PRESETS = [str(number) for number in range(14)]
-_PRESETS: dict[str, Sequence[str]] = {
-    "h264": _X26X_PRESETS,
-    "h265": _X26X_PRESETS,
-    "av1": _AV1_PRESETS,
-    "av1-10bit": _AV1_PRESETS,
-    "ffv1": (),
-    **{name: found.presets for name, found in HARDWARE.items()},
-}
+LEAST_CRF = {found.coding.codec or name: found.least for name, found in _LOSSY.items()}
+"""The smallest crf that is chosen for each codec without being asked for."""
 
 
 def lossless_codecs(pixel_format: str) -> Sequence[str]:
@@ -200,21 +377,21 @@ def check_codec(
     able = software if lossless else {*software, *HARDWARE}
     if varied and codec is not None and codec in HARDWARE:
         raise OptionError(
-            f"--codec {codec} goes with --quality visual or crf=N. A score is kept by joining "
+            f"`codec` {codec} goes with `quality` visual or crf=N. A score is kept by joining "
             "pieces of several crf to one video, which the headers that hardware encoders write "
-            f"are not known to allow: use --codec {HARDWARE[codec].codec}, or find the crf by "
+            f"are not known to allow: use `codec` {HARDWARE[codec].codec}, or find the crf by "
             "mp4ds evaluate."
         )
     if codec is not None and codec not in able:
         kind = "lossless" if lossless else "lossy"
         raise OptionError(
-            f"--codec {codec!r} is not one for {kind} packing. Use {', '.join(sorted(able))}."
+            f"`codec` {codec!r} is not one for {kind} packing. Use {', '.join(sorted(able))}."
         )
     name = codec or (lossless_codecs("gray")[0] if lossless else _DEFAULT_LOSSY)
     if preset is not None and preset not in _PRESETS[name]:
         known = ", ".join(_PRESETS[name])
         raise OptionError(
-            f"--preset {preset!r} is not one of {name}. "
+            f"`preset` {preset!r} is not one of {name}. "
             + (f"Use one of {known}." if known else "It has no presets.")
         )
     if crf is not None:
@@ -229,7 +406,7 @@ def _check_crf(codec: str, preset: str | None, crf: int) -> None:
     if not least <= crf <= MAX_CRF[codec]:
         of = f"{codec} with preset {preset}" if preset else codec
         raise OptionError(
-            f"--quality crf={crf} is not one of {of}. Use {least} to {MAX_CRF[codec]}."
+            f"`quality` crf={crf} is not one of {of}. Use {least} to {MAX_CRF[codec]}."
         )
 
 
@@ -335,7 +512,8 @@ def _lossy(name: str, crf: int | None) -> tuple[_Coding, dict[str, str]]:
     if name not in _LOSSY:
         known = ", ".join((*_LOSSY, *HARDWARE))
         raise OptionError(f"codec {name} is lossless only; use one of {known}")
-    return _LOSSY[name], {**_LOSSY[name].options, "crf": str(crf)}
+    coding = _LOSSY[name].coding
+    return coding, {**coding.options, "crf": str(crf)}
 
 
 def _sited_left(options: Mapping[str, str]) -> dict[str, str]:

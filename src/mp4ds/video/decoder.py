@@ -2,21 +2,96 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import os
+import struct
 from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
-from av.error import FFmpegError
+from av.error import FFmpegError, InvalidDataError
+from numpy.typing import NDArray
 
 from mp4ds.errors import VideoError
-from mp4ds.layouts import Picture
-from mp4ds.video.jpeg import JpegDecoder
-from mp4ds.video.media import Media
-from mp4ds.video.pictures import PictureMaker
-from mp4ds.video.scarcity import raise_if_scarce
+from mp4ds.messages.arrangements import Picture
+from mp4ds.messages.coded import Refused
+from mp4ds.video.media import Media, raise_if_scarce
+from mp4ds.video.pixels import PictureMaker
+
+_ENCODINGS = {"L": "mono8", "RGB": "rgb8"}
+_FORMATS = {"mono8": "gray", "rgb8": "rgb24"}
+
+
+def jpeg_pixels(data: bytes | memoryview, size: tuple[int, int]) -> tuple[str, NDArray[np.uint8]]:
+    """The pixels of a file, turned by no tag and converted by no profile.
+
+    Args:
+        data: The file.
+        size: Its width and height; nothing larger is unpacked.
+
+    Returns:
+        The ROS encoding, ``mono8`` or ``rgb8``, and pixels of shape (H, W) or (H, W, 3).
+
+    Raises:
+        Refused: It does not decode, or is of another size or kind.
+    """
+    from PIL.JpegImagePlugin import JpegImageFile
+
+    try:
+        with JpegImageFile(io.BytesIO(data)) as image:
+            if image.mode not in _ENCODINGS:
+                raise ValueError(f"it has colours of another kind ({image.mode})")
+            if image.size != size:
+                raise ValueError(f"it has {image.width}x{image.height} pixels")
+            return _ENCODINGS[image.mode], np.asarray(image)
+    except MemoryError:
+        raise
+    except (OSError, SyntaxError, ValueError, EOFError, LookupError, struct.error) as error:
+        raise Refused(f"its JPEG does not decode: {error}") from None
+
+
+class JpegDecoder:
+    """Takes the place of ffmpeg's decoder of JPEG files, as much of it as is used.
+
+    Args:
+        size: Width and height of the frames.
+    """
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self._size = size
+
+    def decode(self, packet: Any) -> list[av.VideoFrame]:
+        """The frame of a packet; none of the empty one that ends a video.
+
+        Raises:
+            InvalidDataError: It does not decode.
+        """
+        if packet is None or not packet.size:
+            return []
+        try:
+            encoding, pixels = jpeg_pixels(bytes(packet), self._size)
+        except Refused as error:
+            raise InvalidDataError(errno.EINVAL, str(error)) from None
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), _FORMATS[encoding])
+        frame.pts = packet.pts
+        if packet.time_base:
+            frame.time_base = packet.time_base
+        return [frame]
+
+    def frames(self, packets: Iterable[Any]) -> Iterator[av.VideoFrame]:
+        """The frames of packets, in order."""
+        for packet in packets:
+            yield from self.decode(packet)
+
+    def flush_buffers(self) -> None:
+        """There is nothing to forget."""
+
+
+# ---------------------------------------------------------------- decoder
 
 _MOST_THREADS = 16  # that ffmpeg chooses of itself
 

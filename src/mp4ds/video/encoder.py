@@ -3,22 +3,61 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import av
+import av.logging
+from av.codec.hwaccel import HWAccel
 from av.error import FFmpegError
 
-from mp4ds.errors import Mp4dsError
-from mp4ds.layouts import Picture
-from mp4ds.stamps import TIMESCALE
-from mp4ds.video.codecs import Recipe
-from mp4ds.video.convert import Converter, picture_to_frame
-from mp4ds.video.hardware import HardwareError, device_for, refuse_if_unusable, surface_format
-from mp4ds.video.scarcity import raise_if_scarce
-from mp4ds.video.scheduling import ordinary_scheduling
+from mp4ds.errors import EncoderRefusedError, HardwareError
+from mp4ds.messages.arrangements import Picture
+from mp4ds.times import TIMESCALE
+from mp4ds.video.codecs import HARDWARE, Recipe
+from mp4ds.video.media import raise_if_scarce
+from mp4ds.video.pixels import PictureConverter, picture_to_frame
+
+_THREADS = Path("/proc/self/task")
+
+
+@contextmanager
+def ordinary_scheduling() -> Iterator[None]:
+    """Give threads that are made or changed in here the scheduling that the caller has.
+
+    SVT-AV1, where it may, puts its threads and the one that opens it above everything else on the
+    machine (SCHED_FIFO). On a robot, or with other work beside it, that stops the others; and what
+    is started from such a thread inherits it. Nothing is done where the system has no such classes.
+    """
+    if not _THREADS.is_dir():
+        yield
+        return
+    own = os.sched_getscheduler(0), os.sched_getparam(0)
+    before = _classes()
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            os.sched_setscheduler(0, *own)
+        for thread, scheduler in _classes().items():
+            if scheduler != before.get(thread, own[0]):
+                with suppress(OSError):  # it has ended, or may not be changed
+                    os.sched_setscheduler(thread, *own)
+
+
+def _classes() -> dict[int, int]:
+    """Number of the scheduling class of each thread of this process."""
+    found = {}
+    for thread in _THREADS.iterdir():
+        with suppress(OSError):  # it has ended
+            found[int(thread.name)] = os.sched_getscheduler(int(thread.name))
+    return found
+
+
+# ---------------------------------------------------------------- encoder
 
 _TIME_BASE = Fraction(1, TIMESCALE)
 _MATRICES = {"gbr": 0, "bt709": 1, "smpte170m": 6}  # as H.273 numbers them
@@ -27,10 +66,6 @@ _LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.1, 30.0, 240.0  # Hz, what every en
 _NARROW = 64  # columns
 _SLICE_BYTES = 10_000_000  # of samples, chroma counted whole; FFV1 takes some 14 million
 _SLICE_COUNTS = sorted({rows * n for rows in range(1, 17) for n in range(rows, 2 * rows + 1)})
-
-
-class EncoderRefusedError(Mp4dsError):
-    """The encoder does not take pictures of this kind or size; the message says why."""
 
 
 class VideoEncoder:
@@ -67,7 +102,7 @@ class VideoEncoder:
         self.frames = 0
         self._picture_format = picture_format
         # a camera's own YUV keeps its range
-        self._converter = Converter(
+        self._converter = PictureConverter(
             source_full_range=recipe.full_range, full_range=recipe.full_range
         )
         self.width, self.height = coded_size(recipe, width, height)
@@ -143,7 +178,7 @@ class VideoEncoder:
             raise_if_scarce(error)
             if not self.recipe.hardware:
                 raise
-            raise HardwareError(
+            raise hardware_error(
                 self.recipe.hardware,
                 f"{self.recipe.encoder} failed at frame {self.frames}: {error}",
             ) from None
@@ -238,3 +273,118 @@ def tool_versions() -> Mapping[str, str]:
         "av": av.__version__,
         "libavcodec": ".".join(map(str, av.library_versions["libavcodec"])),
     }
+
+
+# ---------------------------------------------------------------- hardware
+
+_USUAL_SIZE = (640, 480)  # which every device takes
+_UPLOADS_SINCE = 18  # PyAV that brings pictures to a device on its own
+
+
+def hardware_error(codec: str, problem: str, remedy: str = "") -> HardwareError:
+    """What to raise where the hardware of a codec cannot be used; see `HardwareError`."""
+    found = HARDWARE[codec]
+    return HardwareError(codec, problem, remedy or f"It needs {found.needs}", found.codec)
+
+
+def check_hardware(codec: str | None) -> None:
+    """Open an encoder for a moment, if it is one of the hardware.
+
+    Args:
+        codec: As ``--codec`` has it.
+
+    Raises:
+        HardwareError: It cannot be used here; says why, and what to do.
+    """
+    if codec is not None and codec in HARDWARE:
+        _open_once(codec, *_USUAL_SIZE)
+
+
+def refuse_if_unusable(codec: str, width: int, height: int) -> None:
+    """Tell a device that fails from one that does not take pictures of a size.
+
+    To be called after an encoder of the hardware could not be opened.
+
+    Args:
+        codec: As ``--codec`` has it.
+        width: Columns of the pictures.
+        height: Rows of the pictures.
+
+    Raises:
+        HardwareError: It is the device.
+    """
+    check_hardware(codec)
+    try:
+        _open_once(codec, width, height)
+    except HardwareError:
+        return
+    raise hardware_error(
+        codec,
+        "the device refused an encoder, and took one a moment later: there were too many at a time",
+        "Give fewer `jobs`",
+    )
+
+
+def device_for(codec: str) -> HWAccel | None:
+    """The device that an encoder's pictures have to be on, for PyAV to bring them there.
+
+    Args:
+        codec: As ``--codec`` has it.
+    """
+    kind = HARDWARE[codec].device if codec in HARDWARE else ""
+    return HWAccel(kind) if kind else None
+
+
+def surface_format(codec: str) -> str:
+    """The pixel format of pictures on an encoder's device; empty: it takes them as they are.
+
+    Args:
+        codec: As ``--codec`` has it.
+    """
+    return "nv12" if codec in HARDWARE and HARDWARE[codec].device else ""
+
+
+def _open_once(codec: str, width: int, height: int) -> None:
+    found = HARDWARE[codec]
+    if found.encoder not in av.codecs_available:
+        raise hardware_error(
+            codec,
+            f"PyAV {av.__version__} was built without {found.encoder}",
+            f"It needs {found.needs}, and a PyAV whose ffmpeg has {found.encoder}",
+        )
+    if found.device and int(av.__version__.split(".")[0]) < _UPLOADS_SINCE:
+        raise hardware_error(
+            codec,
+            f"PyAV {av.__version__} cannot bring pictures to {found.encoder}",
+            f"Install PyAV {_UPLOADS_SINCE}, whose ffmpeg has to have it",
+        )
+    with _told() as lines:
+        try:
+            context: Any = av.CodecContext.create(found.encoder, "w", device_for(codec))
+            context.width, context.height = width, height
+            context.pix_fmt = surface_format(codec) or "yuv420p"
+            context.time_base = Fraction(1, 30)
+            context.options = found.options(min(20, found.most))
+            context.open()
+        except (FFmpegError, ValueError, NotImplementedError) as error:
+            reason = error
+        else:
+            return
+    why = "; ".join(dict.fromkeys(lines)) or getattr(reason, "strerror", None) or str(reason)
+    raise hardware_error(codec, f"{found.encoder} could not be opened: {why}")
+
+
+@contextmanager
+def _told() -> Iterator[list[str]]:
+    """What ffmpeg says of its errors in here, without full stops."""
+    lines: list[str] = []
+    level, skips = av.logging.get_level(), av.logging.get_skip_repeated()
+    av.logging.set_level(av.logging.ERROR)
+    av.logging.set_skip_repeated(False)
+    try:
+        with av.logging.Capture() as logs:
+            yield lines
+            lines += (message.strip().rstrip(".") for _, _, message in logs if message.strip())
+    finally:
+        av.logging.set_skip_repeated(skips)
+        av.logging.set_level(level)

@@ -1,17 +1,254 @@
-"""Single images as files: PNG through the library of the videos, JPEG through libjpeg."""
+"""Single images: files read to the bit and written, and pixels as RGB, BGR or grey in any size."""
 
 from __future__ import annotations
 
 import io
+import re
+import warnings
+from collections.abc import Callable
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
+from av.error import FFmpegError
+from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
+from numpy.typing import NDArray
 
-from mp4ds.errors import OptionError
-from mp4ds.layouts import CHROMA_SHIFTS, ENCODINGS, Encoding, Layout, Pixels, bind
-from mp4ds.video.convert import Converter, plain_frame
+from mp4ds.errors import OptionError, SourceError
+from mp4ds.messages.arrangements import CHROMA_SHIFTS
+from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Encoding, Pixels
+from mp4ds.messages.layouts import Layout, bind
+from mp4ds.video.pixels import PictureConverter, plain_frame
+
+STILL_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".webp")
+"""Endings of the image files that are read."""
+
+STILL_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM", "WEBP")
+"""What may be in them, as Pillow calls it: it knows others, of which some run programs."""
+
+_GREY = ("1", "L", "LA")
+_COLOURS = ("RGB", "RGBA", "P", "CMYK", "YCbCr")
+
+
+def read_still(path: Path) -> tuple[str, NDArray[np.uint8]]:
+    """The pixels of an image file; alpha is left out.
+
+    Returns:
+        The ROS encoding, ``mono8`` or ``rgb8``, and pixels of shape (H, W) or (H, W, 3).
+
+    Raises:
+        SourceError: It is no image, is too large, or has other than 8 bits.
+    """
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(path, formats=STILL_FORMATS) as image:
+                if max(image.size) > MAX_SIDE:
+                    raise SourceError(path, f"has sides of more than {MAX_SIDE} pixels")
+                if image.mode not in (*_GREY, *_COLOURS):
+                    raise SourceError(
+                        path, f"has samples of another kind than 8 bits ({image.mode})"
+                    )
+                is_grey = image.mode in _GREY
+                pixels = np.asarray(image.convert("L" if is_grey else "RGB"), np.uint8)
+    except SourceError:
+        raise
+    except (
+        OSError, ValueError, SyntaxError, EOFError,
+        Image.DecompressionBombError, Image.DecompressionBombWarning,
+    ) as error:  # fmt: skip
+        raise SourceError(path, f"cannot be read as an image: {error}") from None
+    return ("mono8" if is_grey else "rgb8"), pixels
+
+
+def png_file(rgb: NDArray[np.uint8]) -> bytes:
+    """A PNG file.
+
+    Args:
+        rgb: Shape (H, W, 3).
+    """
+    return _file(rgb, "PNG", optimize=True)
+
+
+def jpeg_bytes(rgb: NDArray[np.uint8], quality: int, *, is_grey: bool = False) -> int:
+    """Bytes of the JPEG file that ROS's image transport and OpenCV make: of halved chroma.
+
+    Args:
+        rgb: Shape (H, W, 3).
+        quality: 1 to 100.
+        is_grey: Whether it shows a grey image, whose file has no chroma.
+    """
+    pixels = rgb[:, :, 1] if is_grey else rgb
+    return len(_file(pixels, "JPEG", quality=quality))
+
+
+def _file(pixels: NDArray[np.uint8], kind: str, **options: int) -> bytes:
+    from PIL import Image
+
+    save: Callable[..., None] = Image.fromarray(pixels).save
+    file = io.BytesIO()
+    save(file, kind, **options)
+    return file.getvalue()
+
+
+# ---------------------------------------------------------------- image files
+
+_HEAD = 64
+_NETPBM = re.compile(rb"P([56])" + 3 * rb"(?:\s|#[^\n]*\n)+([0-9]{1,9})" + rb"\s")
+_PNG = b"\x89PNG\r\n\x1a\n"
+_TIFF_BITS = 258
+_CONVERT = "Convert it first, so that what becomes of its values is your choice."
+
+# mode of Pillow -> the encoding of ROS
+_ENCODINGS = {
+    "L": "mono8",
+    "LA": "8UC2",
+    "RGB": "rgb8",
+    "RGBA": "rgba8",
+    **dict.fromkeys(("I;16", "I;16L", "I;16B", "I;16N"), "mono16"),
+    "F": "32FC1",
+}
+# pixel format of ffmpeg -> the encoding of ROS, of what Pillow reads with 8 bits only
+_DEEP = {
+    **dict.fromkeys(("rgb48le", "rgb48be"), "rgb16"),
+    **dict.fromkeys(("rgba64le", "rgba64be"), "rgba16"),
+}
+
+
+def read_image(path: Path) -> tuple[str, Pixels]:
+    """The pixels of an image file, as they are in it.
+
+    PNG, TIFF, BMP and PGM or PPM with 8 and 16 bits, TIFF with floats, too. One bit becomes 0 and
+    255; a picture is not turned by what its metadata say.
+
+    Returns:
+        The ROS encoding, and pixels of shape (H, W) or (H, W, C), little-endian.
+
+    Raises:
+        SourceError: It is no image, or its values cannot be had as they are.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+        found = _netpbm(path) if head[:2] in (b"P5", b"P6") else _still(path, head)
+    except SourceError:
+        raise
+    except (OSError, ValueError, SyntaxError, EOFError, FFmpegError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise SourceError(path, f"cannot be read as an image: {reason}") from None
+    encoding, pixels = found
+    return encoding, np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file, by its header.
+
+    Raises:
+        SourceError: It is no image.
+    """
+    return _header(path)[:2]
+
+
+def image_kind(path: Path) -> str:
+    """Size and kind of pixels of an image file, in words, by its header.
+
+    Raises:
+        SourceError: It is no image.
+    """
+    return "{}x{} {}".format(*_header(path))
+
+
+def _header(path: Path) -> tuple[int, int, str]:
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=STILL_FORMATS) as image:
+                width, height = image.size
+                return int(width), int(height), _ENCODINGS.get(image.mode, image.mode)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise SourceError(path, f"cannot be read as an image: {reason}") from None
+
+
+def _still(path: Path, head: bytes) -> tuple[str, Pixels]:
+    from PIL import Image
+
+    with warnings.catch_warnings():
+        # the sides are bounded here
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        try:
+            with Image.open(path, formats=STILL_FORMATS) as image:
+                _check_size(path, *image.size)
+                if getattr(image, "n_frames", 1) > 1:
+                    raise SourceError(path, "holds several images", "Give each a file of its own.")
+                if _is_deep_colour(image, head):
+                    return _deep_colour(path, "png" if image.format == "PNG" else "tiff")
+                if image.mode == "1":
+                    return "mono8", np.asarray(image.convert("L"))
+                if image.mode == "I" and image.format == "PNG":  # 16 bits, in older Pillow
+                    return "mono16", np.asarray(image).astype(np.uint16)
+                if image.mode not in _ENCODINGS:
+                    raise SourceError(path, f"has pixels of the kind {image.mode}", _CONVERT)
+                return _ENCODINGS[image.mode], np.asarray(image)
+        except Image.DecompressionBombError as error:
+            raise SourceError(path, f"is too large: {error}") from None
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    if not 1 <= min(width, height) <= max(width, height) <= MAX_SIDE:
+        raise SourceError(path, f"has {width}x{height} pixels, which is beyond {MAX_SIDE} a side")
+
+
+def _is_deep_colour(image: Any, head: bytes) -> bool:
+    """Whether Pillow would cut the samples of several channels to 8 bits."""
+    if image.format == "PNG":
+        return head[:8] == _PNG and head[24] == 16 and head[25] != 0
+    if image.format == "TIFF":
+        bits = image.tag_v2.get(_TIFF_BITS, (8,))
+        return len(bits) > 1 and max(bits) > 8
+    return False
+
+
+def _deep_colour(path: Path, codec: str) -> tuple[str, Pixels]:
+    context: Any = av.CodecContext.create(codec, "r")
+    packet = av.Packet(path.read_bytes())
+    frames = [*context.decode(packet), *context.decode(None)]
+    if len(frames) != 1 or frames[0].format.name not in _DEEP:
+        raise SourceError(path, "has more than 8 bits in a form that is not known", _CONVERT)
+    name = frames[0].format.name
+    return _DEEP[name], frames[0].to_ndarray().astype(np.uint16, copy=False)
+
+
+def _netpbm(path: Path) -> tuple[str, Pixels]:
+    """A binary PGM or PPM, with its values as they are: Pillow scales them to 8 or 16 bits."""
+    data = path.read_bytes()
+    match = _NETPBM.match(data)
+    if not match:
+        raise SourceError(path, "cannot be read as an image: its header is damaged")
+    width, height, highest = map(int, match.groups()[1:])
+    _check_size(path, width, height)
+    if not 1 <= highest < 2**16:
+        raise SourceError(path, f"has values up to {highest}, which is beyond 16 bits")
+    channels = 3 if match[1] == b"6" else 1
+    dtype = np.dtype(">u2" if highest > 255 else "u1")
+    start, count = match.end(), width * height * channels
+    if len(data) - start != count * dtype.itemsize:
+        raise SourceError(
+            path, f"holds {len(data) - start} bytes of pixels, not {count * dtype.itemsize}"
+        )
+    shape = (height, width) if channels == 1 else (height, width, channels)
+    pixels = np.frombuffer(data, dtype, count, start).reshape(shape)
+    encoding = "mono" if channels == 1 else "rgb"
+    return f"{encoding}{8 * dtype.itemsize}", pixels
+
+
+# ---------------------------------------------------------------- images
 
 _PNG_FORMATS = {
     "gray": "gray",
@@ -57,14 +294,14 @@ class ImageFile:
         self._quality = quality
         self._layout = _layout(known, demosaic=self._jpeg)
         self._is_yuv = self._layout.pixel_format in CHROMA_SHIFTS
-        self._from_yuv = Converter("smpte170m", source_full_range=False)
-        self._converter = Converter("smpte170m")
+        self._from_yuv = PictureConverter("smpte170m", source_full_range=False)
+        self._converter = PictureConverter("smpte170m")
         self._pixel_format = _PNG_FORMATS.get(self._layout.pixel_format, "rgb24")
         if self._jpeg and self._pixel_format != "gray":
             self._pixel_format = "rgb24"  # libjpeg knows no alpha
 
     def encode(self, pixels: Pixels) -> bytes:
-        """The file's bytes for an image as `mp4ds.layouts.pixel_view` gives it."""
+        """The file's bytes for an image as `mp4ds.messages.encodings.pixel_view` gives it."""
         frame = plain_frame(self._layout.to_picture(pixels), self._layout.pixel_format)
         if self._is_yuv:
             frame = self._from_yuv.convert(frame, "rgb24")
@@ -107,3 +344,175 @@ def _layout(encoding: Encoding, *, demosaic: bool) -> Layout:
         return bind(encoding.lossy, encoding)
     plain = ENCODINGS["mono8" if encoding.bytes_per_sample == 1 else "mono16"]
     return bind(plain.general, plain)
+
+
+# ---------------------------------------------------------------- rendering
+
+# libswscale's flags, as in `mp4ds.video.pixels`: full chroma, accurate rounding, bit-exact
+_CARE = 0x2000 | 0x4000 | 0x40000 | 0x80000
+_AREA, _BICUBIC = 0x20 | _CARE, 0x4 | _CARE
+
+# channels and samples of packed formats
+_PACKED = {
+    "gray": (1, "u1"),
+    "rgb24": (3, "u1"),
+    "bgr24": (3, "u1"),
+    "rgba": (4, "u1"),
+    "bgra": (4, "u1"),
+    "gray16le": (1, "<u2"),
+    "rgb48le": (3, "<u2"),
+    "bgr48le": (3, "<u2"),
+    "rgba64le": (4, "<u2"),
+    "bgra64le": (4, "<u2"),
+}
+# numbers of channels that are colours by the registry: blue, green, red and alpha
+_NAMED = {"mono8": "gray", "mono16": "gray16le", "8UC1": "gray", "8UC3": "bgr24", "8UC4": "bgra",
+          "16UC3": "bgr48le", "16UC4": "bgra64le"}  # fmt: skip
+_BY_BITS = {
+    8: {"rgb": "rgb24", "bgr": "bgr24", "gray": "gray"},
+    16: {"rgb": "rgb48le", "bgr": "bgr48le", "gray": "gray16le"},
+}
+_ENCODING_OF = {
+    "rgb24": "rgb8",
+    "bgr24": "bgr8",
+    "gray": "mono8",
+    "rgb48le": "rgb16",
+    "bgr48le": "bgr16",
+    "gray16le": "mono16",
+}
+
+
+def shown_format(encoding: Encoding) -> str | None:
+    """Name in ffmpeg of what the pixels look like, or None where they are no light.
+
+    Depths, signed numbers, floats, and pairs of channels are data. A Bayer mosaic is its own
+    format, and YUV its planes.
+    """
+    if encoding.mosaic:
+        return f"bayer_{encoding.name[6:10]}" + ("8" if encoding.bytes_per_sample == 1 else "16le")
+    if encoding.even != (1, 1) or encoding.rows != 1:
+        return bind(encoding.general, encoding).pixel_format
+    if encoding.name in _NAMED:
+        return _NAMED[encoding.name]
+    found = re.fullmatch("(rgba?|bgra?)(8|16)", encoding.name)
+    if found is None:
+        return None
+    order, bits = found.groups()
+    if bits == "8":
+        return order if len(order) == 4 else f"{order}24"
+    return f"{order}{16 * len(order)}le"
+
+
+def encoding_as(encoding: Encoding, colours: str) -> str | None:
+    """The ROS encoding of pixels made into ``rgb``, ``bgr`` or ``gray``; 16 bits stay 16 bits.
+
+    Returns:
+        None where the pixels are no light.
+    """
+    if shown_format(encoding) is None:
+        return None
+    return _ENCODING_OF[_BY_BITS[8 * encoding.bytes_per_sample][colours]]
+
+
+class Renderer:
+    """Makes pixels of one encoding into another, of another size; not for several threads.
+
+    Mosaics are interpolated, camera YUV is BT.601 of limited range, alpha is left out, and grey is
+    the luma of BT.601. Sizes are reduced by area and enlarged by bicubic interpolation.
+
+    Args:
+        encoding: Of the pixels; one that `shown_format` knows.
+        target: ROS encoding to make: one of `encoding_as`, or the same encoding where it is
+            neither a mosaic nor YUV.
+        crop: x, y, width and height of the part to take first, or None for all of it.
+        size: Width and height of what is made.
+    """
+
+    def __init__(
+        self,
+        encoding: Encoding,
+        target: str,
+        *,
+        crop: tuple[int, int, int, int] | None,
+        size: tuple[int, int],
+    ) -> None:
+        shown = shown_format(encoding)
+        if shown is None:
+            raise ValueError(f"{encoding.name} images show nothing")
+        self._encoding = encoding
+        self._source = shown
+        self._target = shown_format(ENCODINGS[target])
+        self._crop = crop
+        self._size = size
+        self._layout = bind(encoding.general, encoding) if shown in CHROMA_SHIFTS else None
+        self._camera = PictureConverter("smpte170m", source_full_range=False)
+        self._colours = PictureConverter("smpte170m")
+        self._reformatter = VideoReformatter()
+
+    def render(self, pixels: Pixels, out: Pixels) -> None:
+        """Write what the pixels become.
+
+        Args:
+            pixels: Of the encoding, native byte order.
+            out: Of the target's shape and type.
+        """
+        array, pixel_format = self._packed(pixels)
+        if self._crop is not None:
+            x, y, width, height = self._crop
+            array = array[y : y + height, x : x + width]
+        height, width = array.shape[:2]
+        if pixel_format == self._target and (width, height) == self._size:
+            np.copyto(out, array)
+            return
+        is_smaller = self._size[0] * self._size[1] < width * height
+        frame = self._reformatter.reformat(
+            _frame(array, pixel_format),
+            width=self._size[0],
+            height=self._size[1],
+            format=self._target,
+            src_colorspace=Colorspace.ITU601,
+            dst_colorspace=Colorspace.ITU601,
+            src_color_range=ColorRange.JPEG,
+            dst_color_range=ColorRange.JPEG,
+            interpolation=_AREA if is_smaller else _BICUBIC,
+            threads=1,  # a pool inherited over fork would never end
+        )
+        np.copyto(out, _array(frame))
+
+    def _packed(self, pixels: Pixels) -> tuple[NDArray[Any], str]:
+        """The image in one array, and ffmpeg's name of its format; YUV and mosaics as RGB."""
+        if self._layout is not None:
+            frame = plain_frame(self._layout.to_picture(pixels), self._source)
+            return _array(self._camera.convert(frame, "rgb24")), "rgb24"
+        if self._encoding.mosaic:
+            height, width = pixels.shape
+            frame = plain_frame((_even_mosaic(pixels),), self._source)
+            made = "rgb24" if self._encoding.bytes_per_sample == 1 else "rgb48le"
+            return _array(self._colours.convert(frame, made))[:height, :width], made
+        return pixels, self._source
+
+
+def _even_mosaic(pixels: Pixels) -> Pixels:
+    """Whole blocks of the pattern: what is missing repeats the same colour's last row or column."""
+    pad = [(0, side % 2) for side in pixels.shape]
+    if not any(after for _, after in pad):
+        return pixels
+    return np.pad(pixels, pad, mode="reflect" if min(pixels.shape) > 1 else "edge")
+
+
+def _frame(array: NDArray[Any], pixel_format: str) -> av.VideoFrame:
+    if pixel_format in ("gray", "gray16le") or _PACKED[pixel_format][1] == "u1":
+        return plain_frame((array,), pixel_format)
+    frame = av.VideoFrame(array.shape[1], array.shape[0], pixel_format)
+    _array(frame)[...] = array
+    return frame
+
+
+def _array(frame: av.VideoFrame) -> NDArray[Any]:
+    """The pixels of a packed frame as a view of shape (H, W) or (H, W, C)."""
+    channels, samples = _PACKED[frame.format.name]
+    plane: Any = frame.planes[0]  # a buffer, which its type does not tell
+    rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+    row_bytes = frame.width * channels * np.dtype(samples).itemsize
+    pixels = rows[: frame.height, :row_bytes].view(samples)
+    return pixels if channels == 1 else pixels.reshape(frame.height, frame.width, channels)

@@ -1,7 +1,9 @@
-"""An mp4 opened by PyAV, on this machine or at a URL."""
+"""An mp4 opened by PyAV, and what the system refuses to ffmpeg."""
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -9,18 +11,36 @@ import av
 from av.error import FFmpegError
 
 from mp4ds.errors import RemoteError, VideoError
-from mp4ds.remote import remote
-from mp4ds.video.scarcity import raise_if_scarce
+from mp4ds.files.urls import remote
+from mp4ds.video.codecs import CODECS
 
-FFMPEG_NAMES = {
-    "h264": "h264",
-    "h265": "hevc",
-    "av1": "av1",
-    "vp9": "vp9",
-    "ffv1": "ffv1",
-    "mjpeg": "mjpeg",
-}
-"""Codecs of the registry, as ffmpeg calls them."""
+_FILES = (errno.EMFILE, errno.ENFILE)
+_ENOUGH_BYTES = 32 * 2**20
+
+
+def raise_if_scarce(error: BaseException | None = None) -> None:
+    """Raise for what the system lacks, where that may be why ffmpeg failed, or damaged a frame.
+
+    Ffmpeg says that it has no memory of forged sizes, too, and of memory that is short it says all
+    kinds of things. So it is tried.
+
+    Raises:
+        MemoryError: There is no memory left, or no thread may be started.
+        OSError: Too many files are open.
+    """
+    number = getattr(error, "errno", None)
+    if number in _FILES:
+        raise OSError(number, os.strerror(number), getattr(error, "filename", None)) from None
+    if number == errno.EAGAIN and "avcodec_open2" in str(error):  # of a thread
+        raise MemoryError from None
+    try:
+        bytearray(_ENOUGH_BYTES)
+    except MemoryError:
+        raise MemoryError from None
+
+
+# ---------------------------------------------------------------- media
+
 # names and comments need not be UTF-8; PyAV 19 takes them as they are
 _ANY_METADATA: dict[str, Any] = (
     {"metadata_errors": "ignore"} if int(av.__version__.split(".")[0]) < 19 else {}
@@ -87,7 +107,7 @@ class Media:
         """
         context = self.track.codec_context
         found = context.codec.canonical_name
-        if found != FFMPEG_NAMES.get(codec, codec):
+        if found != (CODECS[codec].ffmpeg if codec in CODECS else codec):
             raise VideoError(
                 "codec-mismatch", self._path, f"is coded as {found} where its sidecar says {codec}"
             )

@@ -1,15 +1,12 @@
-"""Packets of video codecs into an mp4 and out of it, as they are: nothing is encoded or decoded.
-
-What an mp4 holds of a message's body is told by `mp4ds.coded.packets`.
-"""
+"""Packets of video codecs into an mp4, out of it, and joined: nothing is encoded or decoded."""
 
 from __future__ import annotations
 
 import io
 import struct
 from array import array
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,12 +14,15 @@ from typing import Any
 import av
 from av.error import FFmpegError
 
-from mp4ds.coded import PACKET_CODECS, Refused, annexb, av1, h264, h265
-from mp4ds.coded.packets import plain_body
-from mp4ds.errors import VideoError
-from mp4ds.stamps import TIMESCALE
-from mp4ds.video.media import FFMPEG_NAMES, Media, open_input, pixel_format_of
-from mp4ds.video.scarcity import raise_if_scarce
+from mp4ds.errors import SegmentsDifferError, VideoError
+from mp4ds.messages.coded import Refused
+from mp4ds.times import TIMESCALE
+from mp4ds.video import av1, h264, h265, nal
+from mp4ds.video.codecs import CODECS
+from mp4ds.video.coded_messages import PACKET_CODECS, plain_body
+from mp4ds.video.media import Media, open_input, pixel_format_of, raise_if_scarce
+from mp4ds.video.mp4 import SampleEntry, read_sample_entry
+from mp4ds.video.nal import parameter_units
 
 _TIME_BASE = Fraction(1, TIMESCALE)
 _LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.1, 30.0, 240.0  # Hz
@@ -33,11 +33,11 @@ _IVF = {"av1": b"AV01", "vp9": b"VP90"}
 class PacketWriter:
     """One mp4 of coded packets being written. A context manager; leaving it completes the file.
 
-    The first body must be a key frame that `mp4ds.coded.PictureParser` takes.
+    The first body must be a key frame that `mp4ds.video.coded_messages.PictureParser` takes.
 
     Args:
         path: The file to make, by the first body.
-        codec: One of `mp4ds.coded.PACKET_CODECS`.
+        codec: One of `mp4ds.video.coded_messages.PACKET_CODECS`.
         width: Columns of the pictures.
         height: Rows of the pictures.
         parameters: Parameter sets or sequence header, as `PictureParser.parameters` has them;
@@ -147,7 +147,7 @@ class PacketWriter:
             for index, plain in ((0, self._first), (self.frames - 1, self._last)):
                 packet = reader.packet(index) if same else b""
                 if self.codec in _UNITS and same:
-                    packet = annexb.join_plain(annexb.split_length_prefixed(packet))
+                    packet = nal.join_plain(nal.split_length_prefixed(packet))
                 if packet != plain:
                     raise VideoError(
                         "decode-failed", self._path, "does not hold the packets as written"
@@ -185,11 +185,11 @@ def new_mp4(path: Path) -> Any:
 def _probe(codec: str, parameters: bytes, plain: bytes) -> Any:
     """The first body opened as a video of its own, for what an mp4 says about its track."""
     if codec in _UNITS:
-        has_parameters = _UNITS[codec].has_parameters(annexb.split(plain)[0])
+        has_parameters = _UNITS[codec].has_parameters(nal.split(plain)[0])
     else:
         has_parameters = codec != "av1" or bool(av1.sequence_header(plain))
     data = plain if has_parameters else parameters + plain
-    container = FFMPEG_NAMES[codec]
+    container = CODECS[codec].ffmpeg
     if codec in _IVF:
         container = "ivf"
         # header of the file with rate and count, then size and time of the frame
@@ -315,3 +315,231 @@ class PacketReader:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+# ---------------------------------------------------------------- join
+
+
+def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) -> int:
+    """Write the packets of videos one after the other into one file.
+
+    The file is as one `VideoEncoder` or `PacketWriter` would have made it of the same packets:
+    its track describes them in the same words, and its last frame lasts as long as that of the
+    last segment. Of the segments' own times nothing else is used. Memory is one packet, and the
+    indexes of a segment and of the result.
+
+    Args:
+        segments: Files of `VideoEncoder` or `PacketWriter`, at least one, in order. Those of an
+            encoder need the same recipe, gop and rate, while threads and machine may differ.
+        ticks: Presentation times of all frames, in ticks of 1 / `TIMESCALE` s, strictly
+            increasing.
+        target: The file to make, none of the segments. It is removed if it cannot be finished.
+
+    Returns:
+        The number of packets written.
+
+    Raises:
+        SegmentsDifferError: A segment has another codec, size, colour or parameter sets than the
+            first.
+        VideoError: A segment cannot be read, there are not as many ticks as frames, or the
+            result does not hold every packet as it was.
+        ValueError: There are no segments, or the ticks do not increase.
+        OSError: The disk refused.
+    """
+    if not segments:
+        raise ValueError("there are no segments to join")
+    entry = _common_entry(segments)
+    try:
+        written = _copy(segments, iter(ticks), target, entry)
+        written.check(target, entry)
+    except BaseException:
+        target.unlink(missing_ok=True)
+        raise
+    return len(written.ticks)
+
+
+class _Written:
+    """What the index of the file that is made has to say."""
+
+    def __init__(self, codec: str) -> None:
+        self.codec = codec
+        self.ticks, self.sizes = array("q"), array("q")
+        self.keyframes = bytearray()
+
+    def check(self, path: Path, entry: SampleEntry) -> None:
+        """Compare it with what it says.
+
+        Raises:
+            VideoError: It says something else.
+        """
+        if not self._is_in(path):
+            raise VideoError(
+                "decode-failed", path, "would not hold the packets as they are: one is damaged"
+            )
+        if difference := entry.differences(read_sample_entry(path)):
+            raise VideoError(
+                "decode-failed", path, f"differs from the segments it was made of in {difference}"
+            )
+
+    def _is_in(self, path: Path) -> bool:
+        try:
+            with PacketReader(path, codec=self.codec, frames=len(self.ticks)) as reader:
+                found = (reader.ticks, reader.sizes, reader.keyframes)
+                return found == (self.ticks, self.sizes, self.keyframes)
+        except VideoError:
+            return False  # the muxer goes on after some damages, and the index is wrong then
+
+
+def _copy(
+    segments: Sequence[Path], ticks: Iterator[int], target: Path, entry: SampleEntry
+) -> _Written:
+    duration = _last_duration(segments[-1])
+    with closing(Media(segments[0])) as source, closing(new_mp4(target)) as container:
+        written = _Written(source.track.codec_context.codec.canonical_name)
+        stream = _new_stream(container, source.track, entry)
+        try:
+            for segment in segments:
+                _copy_segment(segment, ticks, container, stream, duration, written)
+            if next(ticks, None) is not None:
+                raise VideoError(
+                    "frame-count", target, f"would have {len(written.ticks)} frames, more are due"
+                )
+        except BaseException:
+            # closing completes the file, which may fail, too; the first error tells more
+            with suppress(FFmpegError, OSError):
+                container.close()
+            raise
+        _finish(container, target)
+    return written
+
+
+def _new_stream(container: Any, template: Any, entry: SampleEntry) -> Any:
+    """A track described as the segments' tracks are.
+
+    The template has bit rates of its segment, and from its first packets ffmpeg may have found
+    an aspect ratio of which the segment's track says nothing.
+    """
+    stream = container.add_stream_from_template(template, opaque=True)
+    stream.time_base = _TIME_BASE
+    stream.codec_context.bit_rate = 0
+    stream.codec_context.sample_aspect_ratio = entry.aspect_ratio
+    return stream
+
+
+def _last_duration(path: Path) -> int:
+    """How long the last frame lasts, in ticks; all others last until the next one."""
+    with closing(Media(path)) as source:
+        entries = source.track.index_entries
+        if not len(entries):
+            raise VideoError("frame-count", path, "has no frames")
+        elapsed = entries[len(entries) - 1].timestamp - entries[0].timestamp
+        return max(int(source.track.duration or 0) - int(elapsed), 1)
+
+
+def _copy_segment(
+    path: Path,
+    ticks: Iterator[int],
+    container: Any,
+    stream: Any,
+    duration: int,
+    written: _Written,
+) -> None:
+    with PacketReader(path, codec=written.codec) as reader:
+        for index, data in enumerate(reader.packets()):
+            tick = next(ticks, None)
+            if tick is None:
+                raise VideoError(
+                    "frame-count", path, f"has {len(reader)} frames, {index} of them are due"
+                )
+            if written.ticks and tick <= written.ticks[-1]:
+                raise ValueError(f"tick {tick} does not follow {written.ticks[-1]}")
+            packet = av.Packet(data)
+            packet.stream = stream
+            packet.time_base = _TIME_BASE
+            packet.pts = packet.dts = tick
+            packet.duration = duration
+            packet.is_keyframe = bool(reader.keyframes[index])
+            with _damage_told(path, f"packet {index} is damaged"):
+                container.mux(packet)
+            written.ticks.append(tick)
+            written.sizes.append(len(data))
+            written.keyframes.append(reader.keyframes[index])
+
+
+def _finish(container: Any, target: Path) -> None:
+    with _damage_told(target, "cannot be completed"):
+        container.close()
+
+
+@contextmanager
+def _damage_told(path: Path, problem: str) -> Iterator[None]:
+    """Turns what the muxer refuses into a `VideoError`, but not what the disk refuses."""
+    try:
+        yield
+    except FFmpegError as error:
+        if isinstance(error, OSError):
+            raise
+        raise VideoError("decode-failed", path, f"{problem}: {error}") from None
+
+
+def _common_entry(segments: Sequence[Path]) -> SampleEntry:
+    first = read_sample_entry(segments[0])
+    for segment in segments[1:]:
+        if difference := first.differences(read_sample_entry(segment)):
+            raise SegmentsDifferError(segments[0], segment, difference)
+    return first
+
+
+# ---------------------------------------------------------------- without the mp4
+
+
+class StandAlonePackets(PacketReader):
+    """The packets of a video as they stand alone, for whoever decodes without the mp4.
+
+    H.264 and H.265 come as Annex B with start codes of four bytes, AV1 as temporal units that
+    begin with a delimiter; all with the parameters of the stream before each key frame. VP9
+    packets and images come as they are.
+
+    Args:
+        path: A video without B-frames, such as all that mp4ds writes.
+        codec: Name in the registry.
+        frames: Number of packets that are due, if known.
+
+    Raises:
+        VideoError: As `PacketReader`, or the codec's parameters are damaged.
+    """
+
+    def __init__(self, path: Path, *, codec: str, frames: int | None = None) -> None:
+        super().__init__(path, codec=codec, frames=frames)
+        self._codec = codec
+        try:
+            self._parameters = parameter_units(codec, self.extradata)
+        except Refused as error:
+            self.close()
+            raise self._damage(error) from None
+
+    def _damage(self, error: Refused) -> VideoError:
+        return VideoError("decode-failed", self._path, f"has a packet of which {error}")
+
+    def packet(self, index: int) -> bytes:
+        """One packet; see `PacketReader.packet`."""
+        packet = super().packet(index)
+        parameters = self._parameters if self.keyframes[index] else []
+        try:
+            if self._codec in _UNITS:
+                return _stand_alone(self._codec, packet, parameters)
+            if self._codec == "av1":
+                needed = [] if parameters and av1.sequence_header(packet) else parameters
+                return b"".join((av1.DELIMITER, *needed, packet))
+        except Refused as error:
+            raise self._damage(error) from None
+        return packet
+
+
+def _stand_alone(codec: str, packet: bytes, parameters: list[bytes]) -> bytes:
+    module = _UNITS[codec]
+    units = nal.split_length_prefixed(packet)
+    if parameters and not module.has_parameters(units):
+        at = 1 if units and module.unit_type(units[0]) == module.AUD else 0
+        units[at:at] = parameters
+    return nal.join_plain(units)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -13,12 +14,10 @@ from av.error import FFmpegError
 from numpy.typing import NDArray
 
 from mp4ds.errors import VideoError
-from mp4ds.layouts import Picture
-from mp4ds.video.codecs import Recipe
-from mp4ds.video.convert import Converter, picture_to_frame
-from mp4ds.video.depths import TEN_BITS, narrowed, samples
-from mp4ds.video.media import Media
-from mp4ds.video.scarcity import raise_if_scarce
+from mp4ds.messages.arrangements import Picture
+from mp4ds.video.codecs import TEN_BITS, Recipe
+from mp4ds.video.media import Media, raise_if_scarce
+from mp4ds.video.pixels import PictureConverter, narrowed, picture_to_frame, samples
 
 PLANES_FORMAT = "yuv420p"
 """Pixel format of the planes."""
@@ -36,7 +35,7 @@ class PlaneMaker:
 
     def __init__(self, picture_format: str) -> None:
         self._picture_format = picture_format
-        self._converter = Converter()
+        self._converter = PictureConverter()
 
     def make(self, picture: Picture) -> Planes:
         """The planes of a picture, of their own memory; sides that are odd are padded."""
@@ -111,7 +110,7 @@ def rgb_of(planes: Planes, recipe: Recipe) -> NDArray[np.uint8]:
     frame = av.VideoFrame(columns, rows, PLANES_FORMAT)
     for target, plane in zip(planes_of(frame), planes, strict=True):
         np.copyto(target, plane)
-    converter = Converter(recipe.matrix, source_full_range=recipe.full_range)
+    converter = PictureConverter(recipe.matrix, source_full_range=recipe.full_range)
     return np.asarray(converter.convert(frame, "rgb24").to_ndarray(), np.uint8)
 
 
@@ -161,3 +160,155 @@ def packet_sizes(path: Path) -> PacketSizes:
         raise_if_scarce(error)
         raise VideoError("video-unreadable", path, f"cannot be read: {error}") from None
     return PacketSizes(tuple(keys), tuple(others))
+
+
+# ---------------------------------------------------------------- spool
+
+
+class PlaneSpool:
+    """The planes of a few frames, in a file; one of them is in memory at a time.
+
+    Args:
+        path: The file to make; the caller removes it.
+        width: Columns of a frame, even.
+        height: Rows of a frame, even.
+    """
+
+    def __init__(self, path: Path, width: int, height: int) -> None:
+        self.width, self.height = width, height
+        self._size = width * height * 3 // 2
+        self._file = path.open("w+b", buffering=0)
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def append(self, planes: Planes) -> None:
+        """Keep one more frame.
+
+        Raises:
+            OSError: The disk refused.
+        """
+        self._file.seek(self._count * self._size)
+        for plane in planes:
+            data = np.ascontiguousarray(plane).data.cast("B")
+            while data:
+                data = data[self._file.write(data) :]
+        self._count += 1
+
+    def __iter__(self) -> Iterator[Planes]:
+        return map(self.frame, range(self._count))
+
+    def frame(self, number: int) -> Planes:
+        """The planes of one frame, of their own memory.
+
+        Raises:
+            OSError: The file cannot be read.
+        """
+        data = np.empty(self._size, np.uint8)
+        rest = data.data
+        self._file.seek(number * self._size)
+        while rest:
+            count = self._file.readinto(rest)
+            if not count:
+                raise OSError("frames that were kept on disk have been cut short")
+            rest = rest[count:]
+        return planes_in(data, self.width, self.height)
+
+    def clear(self) -> None:
+        """Forget all frames."""
+        self._count = 0
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+# ---------------------------------------------------------------- samples as decoded
+
+# where green, blue, red and alpha stand in a pixel of packed formats
+_PACKED = {
+    "rgb24": (1, 2, 0),
+    "bgr24": (1, 0, 2),
+    "rgb0": (1, 2, 0),
+    "bgr0": (1, 0, 2),
+    "rgba": (1, 2, 0, 3),
+    "bgra": (1, 0, 2, 3),
+}
+_DEEP = ("le", "be")
+
+
+@dataclass(frozen=True, slots=True)
+class RawPicture:
+    """A decoded picture, one array for each of its planes.
+
+    Attributes:
+        pixel_format: ffmpeg's name of the planar format: a grey, YUV or GBR one.
+        planes: Arrays of shape (rows, columns), uint8 or little-endian uint16.
+    """
+
+    pixel_format: str
+    planes: tuple[NDArray[Any], ...]
+
+    def tobytes(self) -> bytes:
+        """The planes one after the other, by rows without padding."""
+        return b"".join(plane.tobytes() for plane in self.planes)
+
+
+def raw_pictures(path: Path, *, is_gray: bool) -> Iterator[RawPicture]:
+    """Every picture of a video, in order; memory is that of one.
+
+    Args:
+        path: An mp4 with one video track.
+        is_gray: Whether chroma is no part of it: decoders make it up for a grey video, or do not.
+
+    Yields:
+        Views that hold until the next one is asked for.
+
+    Raises:
+        VideoError: ``file-missing``, ``video-unreadable`` or ``decode-failed``.
+    """
+    media = Media(path)
+    number = 0
+    try:
+        for frame in media.container.decode(media.track):
+            if frame.is_corrupt:
+                raise VideoError("decode-failed", path, f"frame {number} is marked as corrupt")
+            yield _raw(frame, is_gray=is_gray)
+            number += 1
+    except (FFmpegError, OSError) as error:
+        raise_if_scarce(error)
+        raise VideoError(
+            "decode-failed", path, f"frame {number} cannot be decoded: {error}"
+        ) from None
+    finally:
+        media.close()
+
+
+def _raw(frame: av.VideoFrame, *, is_gray: bool) -> RawPicture:
+    name = frame.format.name
+    if name in _PACKED:
+        places = _PACKED[name]
+        rows = _samples(frame, 0)
+        pixels = rows[:, : len(rows[0]) // _stride(name) * _stride(name)]
+        pixels = pixels.reshape(len(rows), -1, _stride(name))[:, : frame.width]
+        planes = tuple(pixels[..., place] for place in places)
+        return RawPicture("gbrap" if len(places) == 4 else "gbrp", planes)
+    name = name.replace("yuvj", "yuv")  # full range, told by name
+    if is_gray and name.startswith("yuv"):
+        bits = name.partition("p")[2]
+        name = f"gray{bits}" if bits else "gray"
+    count = 1 if name.startswith("gray") else len(frame.planes)
+    planes = tuple(_samples(frame, index)[:, : frame.planes[index].width] for index in range(count))
+    return RawPicture(name, planes)
+
+
+def _stride(name: str) -> int:
+    return 3 if name.endswith("24") else 4
+
+
+def _samples(frame: av.VideoFrame, index: int) -> NDArray[Any]:
+    """The rows of a plane as samples, padding included."""
+    plane: Any = frame.planes[index]  # a buffer, which its type does not tell
+    rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height]
+    return rows.view("<u2") if frame.format.name.endswith(_DEEP) else rows

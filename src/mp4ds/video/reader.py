@@ -1,18 +1,27 @@
-"""Frames of a video by number, at the least cost that its codec allows."""
+"""Frames of a video by number, at the least cost that its codec allows; videos of others."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
-from mp4ds.coded.references import UnknownStructure
+import av
+import numpy as np
+from av.error import FFmpegError
+from numpy.typing import NDArray
+
 from mp4ds.errors import VideoError
-from mp4ds.layouts import Picture
-from mp4ds.sidecar import References
+from mp4ds.messages.arrangements import Picture
+from mp4ds.messages.coded import UnknownStructure
+from mp4ds.messages.encodings import MAX_SIDE
 from mp4ds.video.access import FrameAccess
-from mp4ds.video.decoder import VideoDecoder
-from mp4ds.video.pictures import PictureMaker
+from mp4ds.video.codecs import CODECS
+from mp4ds.video.decoder import JpegDecoder, VideoDecoder
+from mp4ds.video.media import Media, raise_if_scarce
+from mp4ds.video.mp4 import Unindexed, read_sample_table
+from mp4ds.video.pixels import PictureMaker
+from mp4ds.video.references import RecordedReferences
 
 
 class Seeking(Protocol):
@@ -100,7 +109,7 @@ def open_frames(
     matrix: str | None,
     full_range: bool,
     fast_colour: bool = False,
-    references: References | None = None,
+    references: RecordedReferences | None = None,
 ) -> FrameReader:
     """The frames of a video of which all is known that `VideoDecoder` asks for.
 
@@ -138,3 +147,203 @@ def open_frames(
         )
 
     return FrameReader(open_access, open_decoder)
+
+
+# ---------------------------------------------------------------- videos of others
+
+_SECOND = 1_000_000_000
+_LATEST = 2**63 // _SECOND - 1  # seconds
+_TRIES = 3
+
+
+class VideoFile:
+    """One mp4 with one video track, of any codec that is known here. A context manager.
+
+    Args:
+        path: The video.
+        fast_colour: See `Converter`.
+
+    Attributes:
+        codec: Name in the registry, or ffmpeg's.
+        size: Width and height of its frames, as coded.
+        times: Presentation times, nanoseconds, rounded down, int64, shape (frames,), in order.
+
+    Raises:
+        VideoError: It cannot be read, or is no such video.
+    """
+
+    def __init__(self, path: Path, *, fast_colour: bool = False) -> None:
+        self._path = path
+        self._frames: Iterator[av.VideoFrame] = iter(())
+        self._last: int | None = None
+        self._media = Media(path)
+        try:
+            self._stream = self._media.track
+            context: Any = self._stream.codec_context
+            self.size: tuple[int, int] = context.width, context.height
+            name = context.codec.canonical_name
+            self.codec = next((key for key, value in CODECS.items() if value.ffmpeg == name), name)
+            if not 1 <= min(self.size) <= max(self.size) <= MAX_SIDE:
+                width, height = self.size
+                raise VideoError("video-unreadable", path, f"has frames of {width}x{height} pixels")
+            self._stream.thread_count = 1  # threads inherited over a fork would never end
+            self._maker = _maker_of(path, self.size, fast_colour)
+            self._ticks, self._keys = self._read_ticks()
+            if not len(self._ticks):
+                raise VideoError("video-unreadable", path, "has no frames")
+            self.times = self._nanoseconds()
+        except BaseException:
+            self.close()
+            raise
+
+    def _read_ticks(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Ticks at which frames are shown, and those of frames at which decoding can begin."""
+        try:
+            with self._path.open("rb") as file:
+                table = read_sample_table(file, self._path.stat().st_size, str(self._path))
+        except Unindexed:
+            return self._read_packets()
+        except OSError as error:
+            raise VideoError("video-unreadable", self._path, f"cannot be read: {error}") from None
+        ticks = table.presentation[table.order]
+        return ticks, np.sort(table.presentation[table.sync])
+
+    def _read_packets(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """As `_read_ticks`, from the packets, all of which are read."""
+        ticks, keys = [], []
+        try:
+            for packet in self._media.container.demux(self._stream):
+                if packet.pts is None:
+                    continue
+                if packet.is_keyframe:
+                    keys.append(packet.pts)
+                if not packet.is_discard:
+                    ticks.append(packet.pts)
+        except (FFmpegError, OSError) as error:
+            raise_if_scarce(error)
+            raise VideoError("video-unreadable", self._path, f"cannot be read: {error}") from None
+        return np.sort(np.array(ticks, np.int64)), np.sort(np.array(keys, np.int64))
+
+    def _nanoseconds(self) -> NDArray[np.int64]:
+        base = self._stream.time_base
+        latest = np.abs(self._ticks[[0, -1]]).max()
+        if latest * base >= _LATEST or base.numerator != 1:
+            raise VideoError("video-unreadable", self._path, "has times beyond 64 bits")
+        whole, part = np.divmod(self._ticks, base.denominator)
+        times: NDArray[np.int64] = whole * _SECOND + part * _SECOND // base.denominator
+        return times
+
+    def picture(self, index: int) -> Picture:
+        """One frame as RGB, 8 bits; the next ones are decoded on, others from their key frame.
+
+        Args:
+            index: 0 <= index < frames.
+
+        Returns:
+            One array of shape (H, W, 3), which holds until the next one is asked for.
+
+        Raises:
+            VideoError: It cannot be decoded.
+        """
+        tick = int(self._ticks[index])
+        group = self._group(tick)
+        if (
+            self._last is None
+            or index <= self._last
+            or group != self._group(self._tick(self._last))
+        ):
+            self._seek(group, index)
+        self._last = None
+        frame = self._next_at(tick, index)
+        for _ in range(_TRIES):
+            if frame is not None or group < 0:
+                break
+            # sought by decoding time, which may have led to a later key frame
+            group -= 1
+            self._seek(group, index)
+            frame = self._next_at(tick, index)
+        if frame is None:
+            raise VideoError("decode-failed", self._path, f"frame {index} was not found")
+        picture = self._maker.make(frame, index)
+        self._last = index
+        return picture
+
+    def _tick(self, index: int) -> int:
+        return int(self._ticks[index])
+
+    def _group(self, tick: int) -> int:
+        """Number of the last key frame that is shown by then; -1 if none is."""
+        return int(np.searchsorted(self._keys, tick, side="right")) - 1
+
+    def _seek(self, group: int, index: int) -> None:
+        container = self._media.container
+        try:
+            container.seek(
+                int(self._keys[group] if group >= 0 else self._ticks[0]), stream=self._stream
+            )
+            if self.codec == "mjpeg":
+                self._frames = JpegDecoder(self.size).frames(container.demux(self._stream))
+            else:
+                self._frames = container.decode(self._stream)
+        except (FFmpegError, OSError) as error:
+            raise_if_scarce(error)
+            raise VideoError(
+                "decode-failed", self._path, f"frame {index} cannot be sought: {error}"
+            ) from None
+
+    def _next_at(self, tick: int, index: int) -> av.VideoFrame | None:
+        try:
+            for frame in self._frames:
+                if frame.pts is not None and frame.pts >= tick:
+                    return frame if frame.pts == tick else None
+        except (FFmpegError, OSError) as error:
+            raise_if_scarce(error)
+            raise VideoError(
+                "decode-failed", self._path, f"frame {index} cannot be decoded: {error}"
+            ) from None
+        return None
+
+    def close(self) -> None:
+        """Close the file."""
+        self._media.close()
+
+    def __enter__(self) -> VideoFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def open_file_frames(
+    path: Path, *, codec: str, size: tuple[int, int], frames: int, fast_colour: bool
+) -> FrameReader:
+    """The frames of a video of others by number, as RGB of 8 bits.
+
+    Args:
+        path: The video.
+        codec: As `VideoFile` tells it.
+        size: As `VideoFile` tells it.
+        frames: How many there are.
+        fast_colour: See `Converter`.
+
+    Raises:
+        VideoError: It cannot be read.
+    """
+    return FrameReader(
+        lambda: FrameAccess(
+            path, codec=codec, frames=frames, maker=_maker_of(path, size, fast_colour)
+        ),
+        lambda: VideoFile(path, fast_colour=fast_colour),
+    )
+
+
+def _maker_of(path: Path, size: tuple[int, int], fast_colour: bool) -> PictureMaker:
+    return PictureMaker(
+        path,
+        coded_size=size,
+        picture_format="rgb24",
+        picture_size=size,
+        matrix=None,
+        full_range=False,
+        fast_colour=fast_colour,
+    )

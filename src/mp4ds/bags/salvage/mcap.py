@@ -3,26 +3,390 @@
 from __future__ import annotations
 
 import contextlib
+import struct
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 from mcap import records as mcap_records
 from mcap.opcode import Opcode
 
 from mp4ds.bags.mcap import McapReader
-from mp4ds.bags.mcap_declared import Declared
-from mp4ds.bags.mcap_records import MAGIC, DamageError, open_source, parse
-from mp4ds.bags.ordering import HOLD_BYTES, HoldBack
-from mp4ds.bags.protocols import BagReader, Format
-from mp4ds.bags.salvage.losses import LossLog
-from mp4ds.bags.salvage.mcap_pass import McapPass
-from mp4ds.bags.salvage.mcap_summary import SalvagedSummary, read_summary
-from mp4ds.bags.salvage.reader import FileSalvage
-from mp4ds.bags.salvage.window import Window
-from mp4ds.bags.zstd_files import ZstdStream
+from mp4ds.bags.mcap_records import (
+    MAGIC,
+    MAX_RECORD_BYTES,
+    DamageError,
+    Declared,
+    open_source,
+    parse,
+    parse_message,
+)
+from mp4ds.bags.protocols import HOLD_BYTES, BagReader, Format, HoldBack
+from mp4ds.bags.rosbag2_files import ZstdStream
+from mp4ds.bags.salvage.losses import Draft, FileSalvage, LossLog, Tally
+from mp4ds.bags.salvage.mcap_summary import McapFraming, SalvagedSummary, read_summary
+from mp4ds.bags.salvage.scan import MAX_UNPROVEN, RecordFrame, Scan, Window, unpack
 from mp4ds.errors import SourceError
-from mp4ds.records import Channel, ChannelStats, Message, Record, Schema
+from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record, Schema
+
+_CHUNK_HEAD = struct.Struct("<QQQII")
+_TIME_END = 14  # of the log time in a message
+_MARGIN = 600 * 10**9  # ns; the end of a damaged chunk may be that of the next one
+Found = Message | Attachment | MetadataRecord | None
+
+
+class McapPass:
+    """One reading of an MCAP file.
+
+    Args:
+        path: Its name.
+        window: At its start.
+        log: Where losses are put down.
+        declared: Schemas and channels, those of the summary at first.
+        summary: What could be read of it.
+        decompress: Makes the payload of a message from what the file holds, if anything does.
+
+    Attributes:
+        offset: Byte where the record being read begins.
+        found: Records of an MCAP file that were met.
+        count: Messages that the file has by its statistics; None where it does not tell.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        window: Window,
+        log: LossLog,
+        declared: Declared,
+        summary: SalvagedSummary,
+        decompress: Callable[[memoryview], bytes] | None,
+    ) -> None:
+        self._path = path
+        self._window = window
+        self._log = log
+        self._declared = declared
+        self._summary = summary
+        self._decompress = decompress
+        self._tally = Tally(log, self._topic_of)
+        self._framing = McapFraming(declared.channels)
+        self._scan = Scan(window, self._framing, self._lose)
+        self._schemas = set[int]()
+        if summary.is_verified:
+            self._schemas.update(schema.id for schema in summary.schemas)
+        self._undefined: dict[int, int] = {}
+        self._plain: _Plain | None = None
+        self.offset = 0
+        self.found = 0
+        self.count = _message_count(summary.statistics)
+
+    def _topic_of(self, channel_id: int) -> str | None:
+        channel = self._declared.channels.get(channel_id)
+        return channel.topic if channel else None
+
+    def records(self) -> Iterator[Found]:
+        """All records in the order of the file; None after each of the file's own records."""
+        yield from self._begin()
+        ended = False
+        while frame := self._scan.next():
+            self.found += 1
+            self.offset = self._window.offset
+            if frame.kind == Opcode.FOOTER:
+                ended = True
+                self._end(frame)
+            else:
+                ended = False
+                yield from self._record(frame)
+            if not self._tally.is_doubtful:
+                yield None
+        self._leave_plain(Opcode.FOOTER)
+        yield from self._tally.settle()
+        if not ended:
+            self._tally.lost(self._window.offset, None, "the file ends before its footer")
+        if problem := self._window.problem:
+            self._log.lost(None, None, problem, join=False)
+        self._tally.close()
+        for channel_id, schema_id in self._undefined.items():
+            topic = self._topic_of(channel_id)
+            if schema_id not in self._schemas and topic is not None:
+                problem = f"the definition of its messages, schema {schema_id}, is not there"
+                self._log.lost(None, None, problem).add(0, [topic])
+
+    def _begin(self) -> Iterator[Found]:
+        window = self._window
+        if bytes(window.peek(len(MAGIC))) == MAGIC:
+            window.skip(len(MAGIC))
+        else:
+            self._scan.resync(0, "the first bytes are not those of an MCAP file", passed=0)
+            return
+        frame = self._framing.frame(window.peek(self._framing.lookahead))
+        if frame is None or frame.kind != Opcode.HEADER or not self._scan.is_followed(frame.size):
+            self._scan.resync(window.offset, "the header is damaged", passed=0)
+            return
+        self.found += 1
+        body = self._scan.body(frame)
+        try:
+            parse(mcap_records.Header, body or b"")
+        except DamageError:
+            self._lose(len(MAGIC), frame.size, "the header is damaged")
+        yield None
+
+    def _end(self, frame: RecordFrame[int]) -> None:
+        self._scan.body(frame)
+        window = self._window
+        if bytes(window.peek(len(MAGIC))) == MAGIC:
+            window.skip(len(MAGIC))
+        else:
+            start = window.offset
+            window.skip(len(MAGIC))
+            self._lose(start, window.offset - start, "the last bytes are not those of an MCAP file")
+
+    def _record(self, frame: RecordFrame[int]) -> Iterator[Found]:
+        self._leave_plain(frame.kind)
+        if frame.kind != Opcode.MESSAGE_INDEX and self._plain is None:
+            yield from self._tally.settle()
+        if frame.kind == Opcode.CHUNK:
+            yield from self._chunk(frame)
+            return
+        offset = self._window.offset
+        body = self._scan.body(frame)
+        if body is None:
+            return
+        try:
+            if frame.kind == Opcode.MESSAGE:
+                yield from self._take(body, offset, is_doubtful=self._plain is not None)
+            elif frame.kind == Opcode.MESSAGE_INDEX:
+                self._listed(body, offset)
+            else:
+                yield self._other(frame.kind, body)
+        except DamageError as error:
+            self._lose(offset, frame.size, str(error))
+
+    def _other(self, opcode: int, body: bytes) -> Found:
+        """Take a record that is neither message nor chunk.
+
+        Raises:
+            DamageError: It is damaged, or contradicts another one.
+        """
+        if opcode == Opcode.STATISTICS:
+            self.count = _message_count(parse(mcap_records.Statistics, body))
+        elif opcode == Opcode.SCHEMA:
+            self._schemas.add(parse(mcap_records.Schema, body).id)
+        elif opcode == Opcode.CHANNEL:
+            channel = parse(mcap_records.Channel, body)
+            if channel.schema_id and channel.schema_id not in self._schemas:
+                self._undefined[channel.id] = channel.schema_id
+        return self._declared.other(opcode, body)
+
+    def _take(self, body: bytes, offset: int, *, is_doubtful: bool) -> Iterator[Message]:
+        """Give out a message, or keep it until an index tells whether it is one.
+
+        Raises:
+            DamageError: It is shorter than its fields.
+        """
+        channel_id, time = _key(body)
+        if is_doubtful and channel_id not in self._declared.channels:
+            return
+        message = self._message(memoryview(body), offset)
+        if message and is_doubtful:
+            self._tally.hold(channel_id, message)
+        elif message:
+            self._tally.gave(channel_id, time)
+            yield message
+
+    def _message(self, body: memoryview, offset: int) -> Message | None:
+        """A message; None where it is lost.
+
+        Raises:
+            DamageError: It is shorter than its fields.
+        """
+        head = parse_message(body)
+        channel = self._channel(head.channel_id)
+        data: bytes | memoryview = head.data
+        if channel is None:
+            problem = f"messages of channel {head.channel_id}, of which no record tells"
+            self._lose_message(head.channel_id, head.log_time, offset, problem)
+            return None
+        if self._decompress:
+            try:
+                data = self._decompress(head.data)
+            except DamageError:
+                problem = f"messages of {channel.topic} of which the compression is damaged"
+                loss = self._lose_message(head.channel_id, head.log_time, offset, problem)
+                loss.topics[channel.topic] = None
+                return None
+        return Message(channel, head.log_time, head.publish_time, head.sequence, data)
+
+    def _channel(self, channel_id: int) -> Channel | None:
+        """The channel of an id, by a summary that is in doubt where nothing else tells it."""
+        channels = self._declared.channels
+        if channel_id not in channels and channel_id in self._summary.doubtful:
+            record = self._summary.doubtful[channel_id]
+            for schema in self._summary.schemas:
+                if schema.id == record.schema_id and schema.id not in self._schemas:
+                    self._schemas.add(schema.id)
+                    self._declared.add_schema(schema)
+            self._declared.add_channel(record)
+        return channels.get(channel_id)
+
+    def _lose_message(self, channel_id: int, time: int, offset: int, problem: str) -> Draft:
+        self._tally.stray(channel_id, time)
+        loss = self._log.lost_of_kind(problem, offset, problem)
+        loss.add(1, ())
+        return loss
+
+    def _chunk(self, frame: RecordFrame[int]) -> Iterator[Found]:
+        """The messages of a chunk, as far as it can be unpacked."""
+        window, scan = self._window, self._scan
+        offset = window.offset
+        proven = scan.is_proven(frame)
+        have = window.peek(frame.size if proven else min(frame.size, MAX_UNPROVEN))
+        chunk = _Chunk.unpacked(have[frame.head :])
+        self._tally.open(None, offset + frame.size, chunk.span)
+        if chunk.is_plain and chunk.problem:
+            # Its records stand in the file like any other: what is wrong hides no others.
+            if chunk.is_doubtful:
+                self._plain = _Plain(offset, offset + frame.size, chunk.problem)
+            window.skip(frame.head + chunk.head)
+            return
+        problems = [chunk.problem] if chunk.problem else []
+        yield from self._content(chunk, offset, problems)
+        end = frame.head + chunk.used
+        if proven and (not problems or scan.is_followed(frame.size)):
+            window.skip(frame.size)
+        elif not problems and scan.is_followed(end):
+            window.skip(end)  # the content is whole: the length of the record is what is wrong
+        else:
+            problem = problems[0] if problems else scan.cut_or_damaged(frame)
+            scan.resync(offset, problem, passed=frame.head, kinds=self._framing.outer)
+            return
+        if problems:
+            self._lose(offset, window.offset - offset, problems[0])
+        else:
+            self._tally.verified()
+
+    def _leave_plain(self, kind: int) -> None:
+        """Where an uncompressed chunk that is damaged ends, tell so if nothing else did."""
+        if self._plain is None:
+            return
+        start, end, problem = self._plain
+        offset = self._window.offset
+        if offset < end and kind not in self._framing.outer:
+            return
+        self._plain = None
+        if not self._tally.has_losses:
+            self._lose(start, min(offset, end) - start, problem)
+
+    def _content(self, chunk: _Chunk, offset: int, problems: list[str]) -> Iterator[Found]:
+        """The records of a chunk."""
+        inner = Scan(
+            Window.of_content(chunk.content, self._path),
+            self._framing,
+            lambda _offset, _size, problem: problems.append(f"in a chunk, {problem}"),
+        )
+        while frame := inner.next():
+            body = inner.body(frame)
+            if body is None:
+                continue
+            try:
+                if frame.kind != Opcode.MESSAGE:
+                    self._other(frame.kind, body)
+                else:
+                    yield from self._take(body, offset, is_doubtful=chunk.is_doubtful)
+            except DamageError as error:
+                problems.append(f"in a chunk, {error}")
+
+    def _listed(self, body: bytes, offset: int) -> None:
+        """A message index: what it lists must have been read, or is lost."""
+        channel_id, length = struct.unpack_from("<HI", body)
+        pairs = np.frombuffer(body, "<u8", count=min(length, len(body) - 6) // 8, offset=6)
+        if not self._tally.count_matches(channel_id, len(pairs) // 2, offset):
+            times, counts = np.unique(pairs[::2], return_counts=True)
+            listed = dict(zip(times.tolist(), counts.tolist(), strict=True))
+            self._tally.listed(channel_id, listed)
+
+    def _lose(self, offset: int, size: int, problem: str) -> None:
+        if self._summary.offset is not None and offset >= self._summary.offset:
+            self._log.lost(offset, size, problem).add(0, ())
+        else:
+            self._tally.lost(offset, size, problem)
+
+
+class _Plain(NamedTuple):
+    """A damaged chunk that is not compressed: where it begins and ends, and what is wrong."""
+
+    start: int
+    end: int
+    problem: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Chunk:
+    """What came out of a chunk.
+
+    Attributes:
+        content: Records.
+        is_plain: Whether it is not compressed.
+        head: Bytes of the chunk's body before its records.
+        used: Bytes of the chunk's body that it was made of, as far as that shows.
+        problem: What is wrong with it, a phrase; empty where nothing is.
+        is_doubtful: Whether the content may be something else than what was recorded.
+        span: Least and greatest log time that its messages can have, ns.
+    """
+
+    content: bytes
+    is_plain: bool
+    head: int
+    used: int
+    problem: str
+    is_doubtful: bool
+    span: tuple[int, int]
+
+    @classmethod
+    def unpacked(cls, body: memoryview) -> _Chunk:
+        """Unpack the body of a chunk, perhaps cut short."""
+        if len(body) < _CHUNK_HEAD.size + 8:
+            return cls(b"", False, 0, 0, "a chunk is cut short", False, (0, 0))
+        start, end, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
+        compression = bytes(body[_CHUNK_HEAD.size :][:name_length]).decode(errors="replace")
+        records = _CHUNK_HEAD.size + name_length
+        length = int.from_bytes(body[records : records + 8], "little")
+        unpacked = unpack(compression, body[records + 8 :][:length], min(size, MAX_RECORD_BYTES))
+        problem = unpacked.problem
+        if crc and zlib.crc32(unpacked.content) == crc:
+            problem = ""
+        elif crc and not problem:
+            problem = (
+                "a chunk does not match its checksum: its messages were kept, "
+                "though something of them is not as it was"
+            )
+        used = records + 8 + unpacked.used if unpacked.used else 0
+        is_plain = not compression
+        is_doubtful = bool(problem) and (not unpacked.is_sound or not unpacked.problem)
+        if is_plain:
+            start, end = start - _MARGIN, end + _MARGIN
+        return cls(
+            unpacked.content, is_plain, records + 8, used, problem, is_doubtful, (start, end)
+        )
+
+
+def _message_count(statistics: mcap_records.Statistics | None) -> int | None:
+    """How many messages a file has; None where its statistics contradict themselves."""
+    if statistics is None:
+        return None
+    counts, total = statistics.channel_message_counts, int(statistics.message_count)
+    return total if total == sum(counts.values()) else None
+
+
+def _key(message: bytes) -> tuple[int, int]:
+    """Channel id and log time of a message, ns."""
+    return int.from_bytes(message[:2], "little"), int.from_bytes(message[6:_TIME_END], "little")
+
+
+# ---------------------------------------------------------------- the reader
 
 
 class McapSalvage(FileSalvage):
@@ -34,7 +398,6 @@ class McapSalvage(FileSalvage):
             are then those in its content.
         message_decompress: Makes the payload of a message from what the file holds; raises
             `DamageError` for what it cannot read.
-        in_file_order: Give messages as they stand in the file, whatever their log times.
 
     Raises:
         SourceError: The file is missing, empty, or unreadable.
@@ -48,13 +411,11 @@ class McapSalvage(FileSalvage):
         *,
         is_compressed: bool = False,
         message_decompress: Callable[[memoryview], bytes] | None = None,
-        in_file_order: bool = False,
     ) -> None:
         super().__init__(path)
         open_source(path).close()
         self._is_compressed = is_compressed
         self._decompress = message_decompress
-        self._in_file_order = in_file_order
         self._declared = Declared()
         self._given = 0
         self._count: int | None = None
@@ -115,7 +476,7 @@ class McapSalvage(FileSalvage):
     @property
     def is_ordered(self) -> bool:
         """Whether messages come in log-time order."""
-        return self._summary.chunks.has_messages and not self._in_file_order
+        return self._summary.chunks.has_messages
 
     @property
     def start(self) -> int | None:
@@ -132,7 +493,7 @@ class McapSalvage(FileSalvage):
 
     @property
     def _orderly(self) -> Callable[[], BagReader] | None:
-        if self._in_file_order or self._summary.chunks.held_in_file_order() <= HOLD_BYTES:
+        if self._summary.chunks.held_in_file_order() <= HOLD_BYTES:
             return None
         return partial(McapReader, self.path, message_decompress=self._decompress)
 

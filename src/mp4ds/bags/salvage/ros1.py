@@ -2,38 +2,291 @@
 
 from __future__ import annotations
 
+import bisect
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import struct
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from rosbags.rosbag1.reader import RecordType
 
-from mp4ds.bags.mcap_records import open_source
-from mp4ds.bags.ordering import HOLD_BYTES, HoldBack
-from mp4ds.bags.protocols import BagReader, Format
+from mp4ds.bags.mcap_records import DamageError, open_source
+from mp4ds.bags.protocols import HOLD_BYTES, BagReader, Format, HoldBack
 from mp4ds.bags.ros1 import Ros1Reader
 from mp4ds.bags.ros1_records import (
-    DAMAGE,
     MAGIC,
     MAX_TIME,
     UINT32,
+    Op,
     make_channel,
     other_format,
     split_header,
 )
-from mp4ds.bags.salvage.losses import LossLog
-from mp4ds.bags.salvage.reader import FileSalvage
-from mp4ds.bags.salvage.ros1_framing import Ros1Framing, number, time
-from mp4ds.bags.salvage.ros1_index import BagIndex, read_index
-from mp4ds.bags.salvage.scan import MAX_UNPROVEN, Frame, Scan
-from mp4ds.bags.salvage.tally import Tally
-from mp4ds.bags.salvage.unpack import unpack
-from mp4ds.bags.salvage.window import Window
+from mp4ds.bags.salvage.losses import FileSalvage, LossLog, Tally
+from mp4ds.bags.salvage.scan import MAX_UNPROVEN, RecordFrame, Scan, Window, unpack
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, ChannelStats, Message, Record
+
+MAX_HEADER = 2**16
+"""Bytes of a record's header: a few fields, and the topic of a connection."""
+
+_OP = re.compile(rb"\x04\x00\x00\x00op=[\x02\x04-\x07]")
+_MAX_BEFORE_OP = 512
+_MAX_FOUND_HEADER = 4096
+_TIME = struct.Struct("<II")
+
+# Sizes of the fields that a record of a kind must have.
+_FIELDS: Mapping[int, Mapping[bytes, int]] = {
+    Op.MESSAGE: {b"conn": 4, b"time": 8},
+    Op.BAG: {b"index_pos": 8},
+    Op.INDEX: {b"ver": 4, b"conn": 4, b"count": 4},
+    Op.CHUNK: {b"size": 4},
+    Op.CHUNK_INFO: {b"chunk_pos": 8, b"count": 4, b"start_time": 8, b"end_time": 8},
+    Op.CONNECTION: {b"conn": 4},
+}
+
+
+class Ros1Framing:
+    """Records by the fields of their headers. See `Framing`.
+
+    A chunk that is not compressed is framed by its header alone, so that its records stand
+    in the file like any other: damage to one does not hide the others.
+    """
+
+    lookahead = MAX_HEADER + 8
+    outer: Collection[int] = frozenset({Op.CHUNK, Op.INDEX, Op.CHUNK_INFO})
+
+    def frame(self, view: memoryview) -> RecordFrame[int] | None:
+        """See `Framing.frame`."""
+        if len(view) < 8:
+            return None
+        (length,) = UINT32.unpack_from(view)
+        if length > MAX_HEADER or length + 8 > len(view):
+            return None
+        try:
+            fields = dict(split_header(bytes(view[4 : 4 + length])))
+        except DamageError:
+            return None
+        op = fields.get(b"op", b"")
+        needed = _FIELDS.get(op[0]) if len(op) == 1 else None
+        if needed is None:
+            return None
+        if any(len(fields.get(name, b"")) != size for name, size in needed.items()):
+            return None
+        head = length + 8
+        (body,) = UINT32.unpack_from(view, length + 4)
+        if op[0] == Op.CHUNK:
+            if b"compression" not in fields:
+                return None
+            if fields[b"compression"] == b"none":
+                body = 0
+        return RecordFrame(op[0], head, head + body, fields)
+
+    def find(
+        self,
+        view: memoryview,
+        end: int,
+        is_followed: Callable[[int], bool],
+        kinds: Collection[int] | None = None,
+    ) -> int | None:
+        """See `Framing.find`; a header with all its fields is beyond doubt by itself."""
+        for match in _OP.finditer(view):
+            if kinds is None or view[match.end() - 1] in kinds:
+                start = self._start(view, match.start())
+                if start is not None and start < end:
+                    return start
+            if match.start() > end + _MAX_BEFORE_OP:
+                break
+        return None
+
+    def _start(self, view: memoryview, op: int) -> int | None:
+        """Where the record begins whose field ``op`` is there."""
+        first = max(0, op - _MAX_BEFORE_OP)
+        before = bytes(view[first:op])
+        for start in range(len(before) - 4, -1, -1):
+            if before[start + 2] or before[start + 3]:
+                continue
+            (length,) = UINT32.unpack_from(before, start)
+            if not op - first - start + 4 <= length <= _MAX_FOUND_HEADER:
+                continue
+            if self.frame(view[first + start :]):
+                return first + start
+        return None
+
+
+def number(field: bytes) -> int:
+    """A field that is an unsigned number."""
+    return int.from_bytes(field, "little")
+
+
+def time(field: bytes) -> int:
+    """A field that is a time, nanoseconds."""
+    seconds, nanoseconds = _TIME.unpack(field)
+    return int(seconds) * 10**9 + int(nanoseconds)
+
+
+# ---------------------------------------------------------------- the index
+
+_COUNT = struct.Struct("<II")
+_SEARCHED = 16 * 2**20
+_OF_INDEX = (Op.CONNECTION, Op.CHUNK_INFO)
+
+
+class BagIndex:
+    """Connections and chunks that the index of a bag lists.
+
+    Attributes:
+        channels: By connection number, in the order of the index.
+        chunks: Byte offsets of the chunks, sorted.
+        due: Byte where the index should begin by the header of the bag, None where not known.
+        offset: The same, where there is an index.
+    """
+
+    def __init__(self) -> None:
+        self.channels: dict[int, Channel] = {}
+        self.chunks: list[int] = []
+        self.due: int | None = None
+        self.offset: int | None = None
+        self._infos: dict[int, tuple[int, int, bytes]] = {}
+        self._places: list[int] = []
+        self._later: list[int] = []
+
+    def add(self, frame: RecordFrame[int], body: bytes) -> None:
+        """Take a record of the index in."""
+        if frame.kind == Op.CHUNK_INFO:
+            fields = frame.fields
+            span = time(fields[b"start_time"]), time(fields[b"end_time"])
+            self._infos[number(fields[b"chunk_pos"])] = (*span, body[: len(body) // 8 * 8])
+            return
+        connection = number(frame.fields[b"conn"])
+        try:
+            header = dict(split_header(body))
+        except DamageError:
+            return
+        topic = frame.fields.get(b"topic", header.get(b"topic", b""))
+        self.channels.setdefault(connection, make_channel(connection, topic, header))
+
+    def finish(self, *, chunks: int | None) -> bool:
+        """All that there is was added: where that is not all chunks, it tells of none.
+
+        Args:
+            chunks: How many there are by the header of the bag, None where it does not tell.
+
+        Returns:
+            Whether all chunks are there.
+        """
+        is_whole = chunks == len(self._infos) and self.offset is not None
+        if not is_whole:
+            self._infos.clear()
+        self.chunks = sorted(self._infos)
+        self._places = [chunk for chunk in self.chunks if self._infos[chunk][2]]
+        starts = [self._infos[chunk][0] for chunk in self._places]
+        self._later = np.minimum.accumulate(starts[::-1])[::-1].tolist() if starts else []
+        return is_whole
+
+    def counts(self, chunk: int) -> dict[int, int] | None:
+        """Messages by connection of the chunk at a byte; None where it is not listed."""
+        if chunk not in self._infos:
+            return None
+        found: dict[int, int] = {}
+        for connection, count in _COUNT.iter_unpack(self._infos[chunk][2]):
+            found[connection] = found.get(connection, 0) + count
+        return found
+
+    def span(self, chunk: int) -> tuple[int, int] | None:
+        """First and last log time of the chunk at a byte, ns; None where it is not listed."""
+        info = self._infos.get(chunk)
+        return (info[0], info[1]) if info else None
+
+    def held_in_file_order(self) -> int:
+        """Bytes of chunks, as they are in the file, that wait at most for earlier messages."""
+        if not self._places:
+            return 0
+        ends = np.array([self._infos[chunk][1] for chunk in self._places])
+        sizes = np.diff([*self._places, self.offset or self._places[-1]])
+        by_end = np.argsort(ends)
+        gone = np.concatenate(([0], np.cumsum(sizes[by_end])))
+        past = gone[np.searchsorted(ends[by_end], np.array(self._later[1:], np.int64))]
+        return int((np.cumsum(sizes)[:-1] - past).max(initial=0))
+
+    def start_from(self, offset: int) -> int | None:
+        """The earliest log time of the chunks from a byte on, ns; None after the last."""
+        position = bisect.bisect_left(self._places, offset)
+        return self._later[position] if position < len(self._later) else None
+
+    def stats(self, connections: Iterable[int]) -> dict[int, ChannelStats]:
+        """Counts and spans of the chunks by connection; empty where no chunk is listed."""
+        total = {connection: ChannelStats(0, 0, 0) for connection in connections}
+        for chunk in self.chunks:
+            start, end, _ = self._infos[chunk]
+            for connection, count in (self.counts(chunk) or {}).items():
+                old = total.get(connection)
+                if old is None or not count:
+                    continue
+                first, last = (old.start, old.end) if old.count else (start, end)
+                total[connection] = ChannelStats(
+                    old.count + count, min(first, start), max(last, end)
+                )
+        return total if self.chunks else {}
+
+
+def read_index(path: Path) -> BagIndex:
+    """The index of a bag: all of it, or else what connections the end of the file tells.
+
+    Raises:
+        SourceError: The bag is encrypted, or the disk does not give it.
+    """
+    index = BagIndex()
+    framing = Ros1Framing()
+    with Window.of_file(path) as window:
+        window.skip(len(MAGIC))
+        header = framing.frame(window.peek(framing.lookahead))
+        size = window.size or 0
+    chunks = None
+    if header and header.kind == Op.BAG:
+        if header.fields.get(b"encryptor"):
+            raise SourceError(path, "is encrypted", "Decrypt it with `rosbag decrypt` first.")
+        index.due = number(header.fields[b"index_pos"])
+        chunks = number(header.fields.get(b"chunk_count", b""))
+        if len(MAGIC) + header.size <= index.due < size:
+            _read_records(path, index.due, index)
+    if not index.finish(chunks=chunks) and index.due != 0:
+        _search_connections(path, max(len(MAGIC), size - _SEARCHED), index)
+    return index
+
+
+def _read_records(path: Path, offset: int, index: BagIndex) -> None:
+    """Read an index that stands where it should."""
+    framing = Ros1Framing()
+    with Window.of_file(path, offset) as window:
+        if framing.frame(window.peek(framing.lookahead)) is None:
+            return
+        index.offset = offset
+        scan = Scan(window, framing, lambda *_: None)
+        while frame := scan.next():
+            if frame.kind not in _OF_INDEX:
+                return
+            body = scan.body(frame)
+            if body is not None:
+                index.add(frame, body)
+
+
+def _search_connections(path: Path, offset: int, index: BagIndex) -> None:
+    """Look for connections from a byte on, where the index may stand elsewhere."""
+    framing = Ros1Framing()
+    with Window.of_file(path, offset) as window:
+        scan = Scan(window, framing, lambda *_: None)
+        if offset > len(MAGIC):
+            scan.resync(offset, "", passed=0)
+        while frame := scan.next():
+            body = scan.body(frame)
+            if body is not None and frame.kind == Op.CONNECTION:
+                index.add(frame, body)
+
+
+# ---------------------------------------------------------------- the reader
 
 _MOST_PACKED = 16  # times smaller than its content a chunk is taken to be at most
 _INDEX_ENTRY = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
@@ -141,7 +394,7 @@ class _Pass:
             self._scan.resync(0, "the first bytes are not those of a ROS 1 bag", passed=0)
         while frame := self._scan.next():
             self.found += 1
-            if frame.kind != RecordType.IDXDATA:
+            if frame.kind != Op.INDEX:
                 yield from self._tally.settle()
             yield from self._record(frame)
         yield from self._tally.settle()
@@ -152,36 +405,36 @@ class _Pass:
             self._tally.lost(self._window.offset, None, problem)
         self._tally.close()
 
-    def _record(self, frame: Frame[int]) -> Iterator[Message]:
+    def _record(self, frame: RecordFrame[int]) -> Iterator[Message]:
         offset = self._window.offset
-        if frame.kind == RecordType.CHUNK:
+        if frame.kind == Op.CHUNK:
             (length,) = UINT32.unpack(self._window.peek(frame.head)[-4:])
             self._enter(offset, offset + frame.head + length)
             if frame.fields[b"compression"] == b"none":
                 self._window.skip(frame.size)
             else:
                 yield from self._compressed(frame)
-        elif frame.kind == RecordType.MSGDATA:
+        elif frame.kind == Op.MESSAGE:
             body = self._scan.body(frame)
             if body is not None:
                 message = self._message(frame, body, offset)
                 if message:
                     self._tally.gave(number(frame.fields[b"conn"]), message.log_time)
                     yield message
-        elif frame.kind == RecordType.CONNECTION:
+        elif frame.kind == Op.CONNECTION:
             body = self._scan.body(frame)
             if body is not None and not self._connect(frame, body):
                 self._lose(offset, frame.size, "a connection record is damaged")
-        elif frame.kind == RecordType.IDXDATA:
+        elif frame.kind == Op.INDEX:
             body = self._scan.body(frame)
             if body is not None:
                 self._listed(frame, body, offset)
-        elif frame.kind == RecordType.BAGHEADER and not self._scan.is_followed(frame.size):
+        elif frame.kind == Op.BAG and not self._scan.is_followed(frame.size):
             self._scan.resync(offset, "the header of the bag is damaged", passed=frame.head)
         else:
             self._scan.body(frame)
 
-    def _message(self, frame: Frame[int], body: bytes, offset: int) -> Message | None:
+    def _message(self, frame: RecordFrame[int], body: bytes, offset: int) -> Message | None:
         """A message; None where it is lost."""
         connection, log_time = number(frame.fields[b"conn"]), time(frame.fields[b"time"])
         channel = self._channels.get(connection)
@@ -196,11 +449,11 @@ class _Pass:
             return None
         return Message(channel, log_time, log_time, 0, body)
 
-    def _connect(self, frame: Frame[int], body: bytes, *, is_sure: bool = False) -> bool:
+    def _connect(self, frame: RecordFrame[int], body: bytes, *, is_sure: bool = False) -> bool:
         connection = number(frame.fields[b"conn"])
         try:
             header = dict(split_header(body))
-        except DAMAGE:
+        except DamageError:
             return connection in self._channels
         topic = frame.fields.get(b"topic", header.get(b"topic", b""))
         channel = make_channel(connection, topic, header)
@@ -215,7 +468,7 @@ class _Pass:
                 self._log.lost(None, None, problem).add(0, ())
         return True
 
-    def _compressed(self, frame: Frame[int]) -> Iterator[Message]:
+    def _compressed(self, frame: RecordFrame[int]) -> Iterator[Message]:
         """The messages of a compressed chunk, as far as it can be unpacked."""
         window, scan = self._window, self._scan
         offset = window.offset
@@ -233,7 +486,7 @@ class _Pass:
             body = inner.body(part)
             if body is None:
                 continue
-            if part.kind == RecordType.MSGDATA:
+            if part.kind == Op.MESSAGE:
                 message = self._message(part, body, offset)
                 connection = number(part.fields[b"conn"])
                 if message and unpacked.is_sound:
@@ -241,9 +494,7 @@ class _Pass:
                     yield message
                 elif message:
                     self._tally.hold(connection, message)
-            elif part.kind == RecordType.CONNECTION and not self._connect(
-                part, body, is_sure=not problems
-            ):
+            elif part.kind == Op.CONNECTION and not self._connect(part, body, is_sure=not problems):
                 problems.append("a connection record is damaged")
         end = frame.head + unpacked.used
         if not unpacked.problem and end != frame.size and scan.is_followed(end):
@@ -264,7 +515,7 @@ class _Pass:
         else:
             self._tally.verified()
 
-    def _listed(self, frame: Frame[int], body: bytes, offset: int) -> None:
+    def _listed(self, frame: RecordFrame[int], body: bytes, offset: int) -> None:
         connection, count = number(frame.fields[b"conn"]), number(frame.fields[b"count"])
         if self._tally.count_matches(connection, count, offset):
             return

@@ -1,12 +1,166 @@
-"""Records one after the other, and after damage the next one that can be told to be one."""
+"""A damaged file, read once: records, the next one after damage, and what chunks still hold."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+import io
+from bz2 import BZ2Decompressor
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar
+from pathlib import Path
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
-from mp4ds.bags.salvage.window import BLOCK, Window
+import lz4.frame
+import zstandard
+
+from mp4ds.bags.mcap_records import open_source
+from mp4ds.bags.protocols import ZSTD_PIECE, most_unpacked
+from mp4ds.errors import SourceError
+
+BLOCK = 2**20
+_PIECE = 16 * 2**20
+_MAX_AHEAD = 64 * 2**20
+
+
+class ByteStream(Protocol):
+    """What a window is over: a file, or the content of a compressed one."""
+
+    def read(self, length: int, /) -> bytes:
+        """Read so many bytes; fewer at the end only."""
+        ...
+
+    def close(self) -> None:
+        """Close it."""
+        ...
+
+
+class Window:
+    """What of a file lies before the reader. A context manager.
+
+    Args:
+        source: A stream at byte `offset`.
+        path: Its name, for errors.
+        size: Bytes of the whole file where that is known.
+        offset: Where the stream stands.
+
+    Attributes:
+        offset: Byte at which the window begins.
+        size: Bytes of the whole file, None where it is not known.
+    """
+
+    def __init__(
+        self, source: ByteStream, path: Path, *, size: int | None = None, offset: int = 0
+    ) -> None:
+        self._source = source
+        self._path = path
+        self._data = b""
+        self._at = 0
+        self._ended = False
+        self._probe: io.FileIO | None = None
+        self.offset = offset
+        self.size = size
+
+    @classmethod
+    def of_file(cls, path: Path, offset: int = 0) -> Window:
+        """A window over a file.
+
+        Raises:
+            SourceError: It cannot be opened, is empty, or a git-lfs pointer.
+        """
+        stream = open_source(path)
+        stream.seek(offset)
+        return cls(stream, path, size=path.stat().st_size, offset=offset)
+
+    @classmethod
+    def of_content(cls, content: bytes, path: Path) -> Window:
+        """A window over what a chunk unpacked to."""
+        window = cls(io.BytesIO(), path, size=len(content))
+        window._data, window._ended = content, True
+        return window
+
+    @property
+    def position(self) -> int:
+        """Bytes of the file that the reader has come to."""
+        consumed = getattr(self._source, "consumed", None)
+        return self.offset if consumed is None else int(consumed)
+
+    @property
+    def problem(self) -> str:
+        """Why the content ended before the file did, a phrase; empty where it did not."""
+        return str(getattr(self._source, "problem", ""))
+
+    @property
+    def left(self) -> int | None:
+        """Bytes before the reader, None where that is not known."""
+        if self.size is not None:
+            return max(0, self.size - self.offset)
+        return len(self._data) - self._at if self._ended else None
+
+    def peek(self, length: int) -> memoryview:
+        """The next bytes, fewer at the end only. Reads what is there, whatever is asked for.
+
+        Raises:
+            SourceError: The disk does not give them.
+        """
+        if len(self._data) - self._at < length and not self._ended:
+            self._fill(length)
+        return memoryview(self._data)[self._at : self._at + length]
+
+    def _fill(self, length: int) -> None:
+        pieces = [self._data[self._at :]]
+        have = len(pieces[0])
+        while have < length and not self._ended:
+            wanted = min(max(length - have, BLOCK), _PIECE)
+            try:
+                piece = self._source.read(wanted)
+            except OSError as error:
+                raise SourceError(
+                    self._path, f"cannot be read: {error.strerror or error}"
+                ) from None
+            self._ended = len(piece) < wanted
+            pieces.append(piece)
+            have += len(piece)
+        self._data, self._at = b"".join(pieces), 0
+
+    def skip(self, length: int) -> None:
+        """Go on by so many bytes, which may be more than were looked at."""
+        while length > 0:
+            step = min(length, len(self._data) - self._at) or len(self.peek(min(length, BLOCK)))
+            if not step:
+                return
+            self._at += step
+            self.offset += step
+            length -= step
+
+    def look(self, distance: int, length: int) -> bytes | None:
+        """Bytes far ahead, without reading up to them; None where that cannot be done."""
+        if self._ended or distance + length <= len(self._data) - self._at:
+            return bytes(self.peek(distance + length)[distance:])
+        if self.size is None:
+            if distance > _MAX_AHEAD:
+                return None
+            return bytes(self.peek(distance + length)[distance:])
+        try:
+            if self._probe is None:
+                self._probe = io.FileIO(self._path)
+            self._probe.seek(self.offset + distance)
+            return self._probe.read(length) or b""
+        except OSError as error:
+            raise SourceError(self._path, f"cannot be read: {error.strerror}") from None
+
+    def close(self) -> None:
+        """Close the file."""
+        self._source.close()
+        if self._probe:
+            self._probe.close()
+
+    def __enter__(self) -> Window:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+# ---------------------------------------------------------------- scan
 
 MAX_UNPROVEN = 64 * 2**20
 """Bytes of a record that is taken for one though no other record follows it."""
@@ -15,7 +169,7 @@ _KindT = TypeVar("_KindT")
 
 
 @dataclass(frozen=True, slots=True)
-class Frame(Generic[_KindT]):
+class RecordFrame(Generic[_KindT]):
     """Where a record begins and ends, by its first bytes.
 
     Attributes:
@@ -42,7 +196,7 @@ class Framing(Protocol):
     lookahead: int
     outer: Collection[int]
 
-    def frame(self, view: memoryview) -> Frame[int] | None:
+    def frame(self, view: memoryview) -> RecordFrame[int] | None:
         """The record that these bytes begin with, if they look like one."""
         ...
 
@@ -80,7 +234,7 @@ class Scan:
         self._framing = framing
         self._lose = lose
 
-    def next(self) -> Frame[int] | None:
+    def next(self) -> RecordFrame[int] | None:
         """The next record, not yet taken; None at the end."""
         while True:
             view = self._window.peek(self._framing.lookahead)
@@ -91,7 +245,7 @@ class Scan:
                 return frame
             self.resync(self._window.offset, "what stands there is no record")
 
-    def body(self, frame: Frame[int]) -> bytes | None:
+    def body(self, frame: RecordFrame[int]) -> bytes | None:
         """Take a record. None where it is damaged; the scan then has gone on."""
         if not self.is_proven(frame):
             self.resync(self._window.offset, self.cut_or_damaged(frame))
@@ -107,7 +261,7 @@ class Scan:
         self._window.skip(frame.size)
         return bytes(whole[frame.head : frame.size])
 
-    def is_cut(self, frame: Frame[int]) -> bool:
+    def is_cut(self, frame: RecordFrame[int]) -> bool:
         """Whether the file ends before the record does."""
         left = self._window.left
         if left is None:
@@ -115,7 +269,7 @@ class Scan:
             return left < min(frame.size, MAX_UNPROVEN)
         return left < frame.size
 
-    def is_proven(self, frame: Frame[int]) -> bool:
+    def is_proven(self, frame: RecordFrame[int]) -> bool:
         """Whether a record is all there and, if it is large, another one follows it."""
         if self.is_cut(frame):
             return False
@@ -131,7 +285,7 @@ class Scan:
     def _follows(self, start: int) -> Callable[[int], bool]:
         return lambda distance: self.is_followed(start + distance)
 
-    def cut_or_damaged(self, frame: Frame[int]) -> str:
+    def cut_or_damaged(self, frame: RecordFrame[int]) -> str:
         """What is wrong with a record that is not proven."""
         if self.is_cut(frame):
             return "the file ends within a record"
@@ -168,3 +322,182 @@ class Scan:
                 break
         if window.offset > start:
             self._lose(start, window.offset - start, problem)
+
+
+# ---------------------------------------------------------------- damaged chunks
+
+_UNPACKED_PIECE = 2**12
+_SMALL_PIECE = 64
+"""Bytes unpacked at a time from damaged data: the piece that shows the damage gives nothing."""
+
+_CLOSE = 16
+"""Bytes at the end, of a mark and a checksum, that are unpacked one by one."""
+
+_LZ4_RATIO = 255
+_LZ4_BLOCK = 2**23  # the largest is 4 MiB, and one may be waiting
+
+_MAX_AT_ONCE = 64 * 2**20
+
+_MAGIC = {b"BZh": "bz2", b"\x04\x22\x4d\x18": "lz4", b"\x28\xb5\x2f\xfd": "zstd"}
+
+
+class Unpacked(NamedTuple):
+    """Content of a chunk.
+
+    Attributes:
+        content: What came out, from its beginning.
+        used: Bytes of the data that belong to it, 0 where that does not show.
+        problem: What is wrong, a phrase; empty where nothing is.
+        is_sound: Whether what came out is what went in, though some of it may be missing.
+    """
+
+    content: bytes
+    used: int
+    problem: str
+    is_sound: bool = True
+
+
+def unpack(compression: str, data: memoryview, size: int) -> Unpacked:
+    """Unpack as much as there is.
+
+    Args:
+        compression: Its name: ``none`` or empty, ``bz2``, ``lz4`` or ``zstd``; where that is
+            damaged, the data tells.
+        data: As it is in the file, perhaps cut short.
+        size: Bytes that it should give; no more are unpacked, and no more than data of its
+            length may hold.
+    """
+    if compression in ("", "none"):
+        content = bytes(data[:size])
+        problem = "" if len(content) == size else "a chunk is cut short"
+        return Unpacked(content, len(content), problem)
+    size = min(size, most_unpacked(len(data)))
+    start = bytes(data[:4])
+    found = next((name for magic, name in _MAGIC.items() if start.startswith(magic)), compression)
+    if found not in _MACHINES:
+        return Unpacked(b"", 0, f"a chunk is compressed by {compression!r}, which is not known")
+    pieces: list[bytes] = []
+    left = size + 1
+    machine = _MACHINES[found]()
+    step = len(data) if size <= _MAX_AT_ONCE else _UNPACKED_PIECE
+    at = 0
+    try:
+        while at < len(data) and left > 0 and not machine.eof:
+            pieces.append(machine.decompress(data[at : at + step], left))
+            left -= len(pieces[-1])
+            at += step
+    except _DAMAGE:
+        if step > _UNPACKED_PIECE:
+            pieces, left = _by_pieces(found, data, size)
+        problem = f"the {found} data of a chunk is damaged"
+        return Unpacked(b"".join(pieces)[:size], 0, problem, found == "bz2")
+    content = b"".join(pieces)
+    if not machine.eof:
+        if left <= 0:
+            problem = f"the {found} data of a chunk unpacks to more than {size} bytes"
+            # bz2 verifies a block at its end, which was not reached
+            return Unpacked(b"" if found == "bz2" else content[:size], 0, problem, False)
+        return Unpacked(content, 0, f"the {found} data of a chunk is cut short")
+    used = min(at, len(data)) - machine.unused
+    if len(content) != size:
+        problem = f"a chunk holds {len(content)} bytes instead of {size}"
+        return Unpacked(content, used, problem, found == "bz2")
+    return Unpacked(content, used, "")
+
+
+def _by_pieces(compression: str, data: memoryview, size: int) -> tuple[list[bytes], int]:
+    """What comes out before the damage."""
+    machine = _MACHINES[compression]()
+    pieces: list[bytes] = []
+    left = size
+    try:
+        for start, end in _small_pieces(len(data)):
+            piece = machine.decompress(data[start:end], left)
+            left -= len(piece)
+            if compression == "bz2" and left <= 0 and not machine.eof:
+                break  # its last block was not verified
+            pieces.append(piece)
+            if left <= 0 or machine.eof:
+                break
+    except _DAMAGE:
+        pass
+    return pieces, left
+
+
+def _small_pieces(length: int) -> Iterator[tuple[int, int]]:
+    body = max(0, length - _CLOSE)
+    for start in range(0, body, _SMALL_PIECE):
+        yield start, min(start + _SMALL_PIECE, body)
+    for start in range(body, length):
+        yield start, start + 1
+
+
+_DAMAGE = (OSError, RuntimeError, EOFError, ValueError, zstandard.ZstdError)
+
+
+class _Bz2:
+    def __init__(self) -> None:
+        self._machine = BZ2Decompressor()
+
+    @property
+    def eof(self) -> bool:
+        return self._machine.eof
+
+    @property
+    def unused(self) -> int:
+        return len(self._machine.unused_data)
+
+    def decompress(self, data: memoryview, size: int) -> bytes:
+        return self._machine.decompress(data, max_length=size)
+
+
+class _Lz4:
+    def __init__(self) -> None:
+        self._machine = lz4.frame.LZ4FrameDecompressor()
+
+    @property
+    def eof(self) -> bool:
+        return bool(self._machine.eof)
+
+    @property
+    def unused(self) -> int:
+        return len(self._machine.unused_data or b"")
+
+    def decompress(self, data: memoryview, size: int) -> bytes:
+        # It allocates what it is allowed: more than this cannot come of the data at once.
+        room = min(size, _LZ4_RATIO * len(data) + _LZ4_BLOCK)
+        pieces: list[bytes] = [self._machine.decompress(data, max_length=room)]
+        size -= len(pieces[-1])
+        while size > 0 and pieces[-1] and not self._machine.eof and not self._machine.needs_input:
+            pieces.append(self._machine.decompress(b"", max_length=min(size, _LZ4_BLOCK)))
+            size -= len(pieces[-1])
+        return b"".join(pieces)
+
+
+class _Zstd:
+    def __init__(self) -> None:
+        self._machine = zstandard.ZstdDecompressor().decompressobj()
+        self._not_fed = 0
+
+    @property
+    def eof(self) -> bool:
+        return self._machine.eof
+
+    @property
+    def unused(self) -> int:
+        return len(self._machine.unused_data) + self._not_fed
+
+    def decompress(self, data: memoryview, size: int) -> bytes:
+        # It knows no limit: small pieces bound what comes of one.
+        pieces: list[bytes] = []
+        for at in range(0, len(data), ZSTD_PIECE):
+            if size < 0 or self._machine.eof:
+                self._not_fed = len(data) - at
+                break
+            pieces.append(self._machine.decompress(data[at : at + ZSTD_PIECE]))
+            size -= len(pieces[-1])
+        return b"".join(pieces)
+
+
+_Machine = _Bz2 | _Lz4 | _Zstd
+_MACHINES: dict[str, Callable[[], _Machine]] = {"bz2": _Bz2, "lz4": _Lz4, "zstd": _Zstd}

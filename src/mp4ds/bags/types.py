@@ -1,0 +1,534 @@
+"""Message definitions of ROS 1 and ROS 2: parsed, compared, chosen, bounded; where stamps are."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from rosbags.interfaces import Msgdef, Nodetype
+from rosbags.serde import SerdeError
+from rosbags.serde.utils import SIZEMAP
+from rosbags.typesys import (
+    Stores,
+    TypesysError,
+    get_types_from_idl,
+    get_types_from_msg,
+    get_typestore,
+)
+from rosbags.typesys.msg import normalize_msgtype
+from rosbags.typesys.store import Typestore
+from rosbags.typesys.stores import empty
+
+from mp4ds.errors import OptionError
+from mp4ds.records import Channel, Schema
+
+if TYPE_CHECKING:
+    from rosbags.interfaces.typing import Fielddefs, FieldDesc, Typesdict
+
+FILLER = "structure_needs_at_least_one_member"
+"""Name of the field that empty messages have in ROS 2."""
+
+_MAX_PARTS = 5000  # fields of all types, with the items that rosbags' code spells out
+_MAX_STEPS = 2**16  # fields of a message whose sequences have one item
+_MAX_EMPTY = 2**16  # messages without any byte in one, besides two for each of its bytes
+_MAX_DEPTH = 100
+_READING = (
+    "deserialize_cdr_le",
+    "deserialize_cdr_be",
+    "deserialize_ros1",
+    "getsize_ros1_to_cdr",
+    "ros1_to_cdr",
+    "getsize_cdr_to_ros1",
+    "cdr_to_ros1",
+)
+
+
+class Size(NamedTuple):
+    """What a message of a type has at least, its sequences being empty.
+
+    Attributes:
+        least: Bytes, in any serialization.
+        steps: Fields, with those of its parts, and of one item of each sequence.
+        depth: Levels of messages within messages, those in sequences too.
+    """
+
+    least: int
+    steps: int
+    depth: int
+
+
+def sizes_of(types: Typesdict) -> dict[str, Size]:
+    """The size of each type.
+
+    Args:
+        types: Definitions, complete.
+
+    Raises:
+        ValueError: A type holds itself, or more than any message has.
+        KeyError: A type is not defined.
+    """
+    sizes: dict[str, Size] = {}
+    parts = 0
+    for name in types:
+        todo = [name]
+        while todo:
+            missing = [part for part in _messages(types, todo[-1]) if part not in sizes]
+            if not missing:
+                sizes[todo[-1]] = _size(types, todo[-1], sizes)
+                todo.pop()
+            elif len(todo) > _MAX_DEPTH:
+                raise ValueError(f"{name} holds itself, or too many levels of messages")
+            else:
+                todo.append(missing[0])
+        parts += sum(_spelled_out(desc) for _, desc in types[name][1])
+    if parts > _MAX_PARTS:
+        raise ValueError(f"has more than {_MAX_PARTS} fields")
+    return sizes
+
+
+def has_empty_items(types: Typesdict, sizes: dict[str, Size]) -> bool:
+    """Whether there are arrays of messages without any byte."""
+    return any(
+        desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+        and desc[1][0][0] == Nodetype.NAME
+        and not sizes[str(desc[1][0][1])].least
+        for _, fields in types.values()
+        for _, desc in fields
+    )
+
+
+class BoundedStore(Typestore):
+    """A store whose types read no message of which the least bytes are not there.
+
+    So the items of a sequence are bounded by the bytes that are left, before they are read;
+    those that have no bytes are counted.
+
+    Args:
+        types: Definitions, complete but for time and duration.
+    """
+
+    def __init__(self, types: Typesdict) -> None:
+        super().__init__(empty)
+        self._sizes = sizes_of({**self.fielddefs, **types})
+        self.register(types)
+        self._data: object = None
+        self._empty_left = 0
+
+    def get_msgdef(self, typename: str) -> Msgdef[object]:
+        """See rosbags."""
+        found = self.cache.get(typename)
+        if found is None:
+            found = super().get_msgdef(typename)
+            least = self._sizes[typename].least
+            check = partial(_checked, least=least) if least else self._counted
+            checked: dict[str, Any] = {name: check(getattr(found, name)) for name in _READING}
+            found = self.cache[typename] = replace(found, **checked)
+        return found
+
+    def _counted(self, read: Callable[..., Any]) -> Callable[..., Any]:
+        def counted(data: memoryview, *rest: Any) -> Any:
+            if data is not self._data:
+                self._data, self._empty_left = data, _MAX_EMPTY + 2 * len(data)
+            self._empty_left -= 1
+            if self._empty_left < 0:
+                raise SerdeError("a message in it claims too many without any byte")
+            return read(data, *rest)
+
+        return counted
+
+
+def _checked(read: Callable[..., Any], least: int) -> Callable[..., Any]:
+    def checked(data: memoryview, position: int, *rest: Any) -> Any:
+        if position + least > len(data):
+            raise SerdeError("a message in it is cut short")
+        return read(data, position, *rest)
+
+    return checked
+
+
+def _item(desc: FieldDesc) -> Any:
+    """A field, or what an array or sequence holds."""
+    return desc[1][0] if desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) else desc
+
+
+def _messages(types: Typesdict, name: str) -> list[str]:
+    items = (_item(desc) for _, desc in types[name][1])
+    return [str(item[1]) for item in items if item[0] == Nodetype.NAME]
+
+
+def _length(desc: FieldDesc) -> int:
+    return int(desc[1][1]) if desc[0] == Nodetype.ARRAY else 1
+
+
+def _spelled_out(desc: FieldDesc) -> int:
+    item = _item(desc)
+    is_plain = item[0] == Nodetype.BASE and item[1][0] != "string"
+    return 1 if is_plain else 1 + _length(desc)
+
+
+def _size(types: Typesdict, name: str, sizes: dict[str, Size]) -> Size:
+    least, steps, depth = 0, 1, 0
+    for field, desc in types[name][1]:
+        item, length = _item(desc), _length(desc)
+        if field == FILLER:
+            continue
+        part = Size(SIZEMAP.get(item[1][0], 1), 0, 0)
+        if item[0] == Nodetype.NAME:
+            part = sizes[str(item[1])]
+        elif item[1][0] == "string":
+            part = Size(4, 1, 0)
+        depth = max(depth, part.depth + 1)
+        if desc[0] == Nodetype.SEQUENCE:
+            part = Size(4, part.steps, 0)
+        least += length * part.least
+        steps += 1 + length * part.steps
+    if steps > _MAX_STEPS or depth > _MAX_DEPTH:
+        raise ValueError(f"{name} holds more than any message has")
+    return Size(least, steps, depth)
+
+
+# ---------------------------------------------------------------- definitions
+
+HEADER = "std_msgs/msg/Header"
+
+BAD_DEFINITION = (
+    TypesysError,
+    SerdeError,
+    SyntaxError,
+    RecursionError,
+    LookupError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    AssertionError,
+)
+"""What rosbags raises for a definition that it cannot use."""
+
+BAD_PAYLOAD = (
+    SerdeError,
+    AssertionError,
+    struct.error,
+    ValueError,
+    LookupError,
+    TypeError,
+    MemoryError,
+)
+"""What rosbags raises for a payload that is not of its type."""
+
+MAX_TAIL = 8
+"""Bytes after a message that ROS overlooks; after more, the definition is that of another type."""
+BUILTIN = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+
+_MAX_TEXT, _MAX_IDL, _MAX_LINES = 2**19, 2**17, 2**14
+_NO_CODE = re.compile(r'"(?:\\.|[^"\\])*"?|//.*|/[*](?:(?s:.*?)[*]/|(?s:.*))|\'\\?.\'')
+# rosbags' parser reads what stands in brackets a hundred times, and multiplies without a bound
+_SLOW_IDL = re.compile(r"[(][^()]*[(]|<[^<>;]*<[^<>;]*<|[*]|<<(?!\s*\d{1,2}\b)")
+_BRACKET = re.compile(r"[^\w\s]\s*[(]")
+_MAX_BRACKETS = 8
+_BYTES = {"byte": "uint8", "char": "uint8", "octet": "uint8"}
+_RULER = "=" * 80
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """ROS 1 or ROS 2.
+
+    Attributes:
+        name: ``ROS 1`` or ``ROS 2``.
+        encoding: Message encoding of its channels.
+        schema_encoding: Encoding of the definitions that are made for it.
+        standard: The types that it ships.
+    """
+
+    name: str
+    encoding: str
+    schema_encoding: str
+    standard: Typesdict
+
+
+def ros1_world() -> World:
+    """ROS 1 with the types of Noetic, of which rosbags has all but those of tf2."""
+    tf2 = "tf2_msgs/msg/TFMessage"
+    standard = {tf2: get_typestore(Stores.ROS2_HUMBLE).fielddefs[tf2]}
+    standard.update(get_typestore(Stores.ROS1_NOETIC).fielddefs)
+    return World("ROS 1", "ros1", "ros1msg", standard)
+
+
+def ros2_world(distribution: str) -> World:
+    """ROS 2 with the types of a distribution, such as ``humble``.
+
+    Raises:
+        OptionError: The distribution is not known.
+    """
+    known = {store.value[5:]: store for store in Stores if store.value.startswith("ros2_")}
+    if distribution not in known:
+        names = ", ".join(known)
+        raise OptionError(f"ROS 2 distribution {distribution!r} is not known. Use {names}.")
+    # types that came later, too: a recording without definitions may have them
+    latest = get_typestore(Stores.LATEST).fielddefs
+    standard = {**latest, **get_typestore(known[distribution]).fielddefs}
+    return World("ROS 2", "cdr", "ros2msg", standard)
+
+
+def types_of(schema: Schema, world: World) -> Typesdict:
+    """The type of a schema, and all that it refers to; standard ones where it lacks them.
+
+    Raises:
+        KeyError: A type is defined nowhere.
+        TypesysError: The definition does not parse.
+        ValueError: It is larger than those of messages.
+    """
+    name = normalize_msgtype(schema.name)
+    found = _parse(schema, name)
+    if not fields_of(found, name) and name in world.standard:
+        found.pop(name, None)  # the definition is empty, but perhaps not the type
+    # Time, duration and header are the world's own, whatever their definition is called.
+    for builtin in (*BUILTIN, HEADER):
+        found.pop(builtin, None)
+    types = closure(found, name, world.standard)
+    sizes_of(types)  # refuses what no message can follow
+    return types
+
+
+def _parse(schema: Schema, name: str) -> Typesdict:
+    if len(schema.data) > _MAX_TEXT or schema.data.count(b"\n") > _MAX_LINES:
+        raise ValueError("a definition longer than those of messages")
+    text = schema.data.decode(errors="replace").replace("\r\n", "\n")
+    if not schema.encoding:
+        return {}
+    if schema.encoding in ("ros2idl", "omgidl") or re.match(r"=+\nIDL: ", text):
+        text = re.sub(r"(?m)^[ \t]*#.*$", "", text)  # what it includes stands beside it
+        code = _NO_CODE.sub("", text)
+        brackets = len(_BRACKET.findall(code))
+        if len(text) > _MAX_IDL or brackets > _MAX_BRACKETS or _SLOW_IDL.search(code):
+            raise ValueError("IDL that takes too long to parse")
+        parts = re.split(r"(?m)^=+\n(?:IDL: .*\n)?", text)
+        parsed = (get_types_from_idl(part) for part in parts if part.strip())
+        return {key: value for types in parsed for key, value in types.items()}
+    text = re.sub(r"(?m)^={20,}[ \t]*$", _RULER, text)
+    if schema.encoding == "ros1msg":
+        text = re.sub(r"\broslib/Header\b", "std_msgs/Header", text)  # its name before 2010
+    return get_types_from_msg(text, name)
+
+
+def closure(types: Typesdict, root: str, standard: Typesdict) -> Typesdict:
+    """A type and all that it refers to, each from the first that has it.
+
+    Raises:
+        KeyError: One is in neither.
+    """
+    found: Typesdict = {}
+    todo = [root]
+    while todo:
+        name = todo.pop()
+        if name not in found:
+            found[name] = types[name] if name in types else standard[name]
+            todo += [part for _, desc in found[name][1] if (part := _shape(desc)[3])]
+    return found
+
+
+def fields_of(types: Typesdict, name: str) -> Fielddefs:
+    """A type's fields, none for a type that is not known."""
+    fields = types[name][1] if name in types else []
+    return [field for field in fields if field[0] != FILLER]
+
+
+def same_wire(left: Typesdict, left_name: str, right: Typesdict, right_name: str) -> bool:
+    """Whether two types serialise alike, whatever their fields are called.
+
+    Headers count as alike: only that of ROS 1 has a sequence number, which conversion knows.
+    """
+    if left_name == right_name == HEADER:
+        return True
+    left_fields, right_fields = fields_of(left, left_name), fields_of(right, right_name)
+    if len(left_fields) != len(right_fields):
+        return False
+    for (_, left_desc), (_, right_desc) in zip(left_fields, right_fields, strict=True):
+        *left_shape, left_part = _shape(left_desc)
+        *right_shape, right_part = _shape(right_desc)
+        if left_shape != right_shape or bool(left_part) != bool(right_part):
+            return False
+        if left_part and not same_wire(left, left_part, right, right_part):
+            return False
+    return True
+
+
+@dataclass(frozen=True, slots=True)
+class FieldShape:
+    """What a field holds.
+
+    Attributes:
+        base: A basic type such as ``uint8`` or ``string``; empty for a message.
+        message: Name of the message type; empty for a basic type.
+        text_bound: Most characters of a string; 0 for any number.
+        length: Elements of an array of fixed length; None for anything else.
+        bound: Most elements of a sequence, 0 for any number; None for anything else.
+    """
+
+    base: str
+    message: str
+    text_bound: int
+    length: int | None
+    bound: int | None
+
+
+def field_shape(desc: FieldDesc) -> FieldShape:
+    """What a field of `fields_of` holds."""
+    length, bound = None, None
+    if desc[0] == Nodetype.ARRAY:
+        desc, length = desc[1]
+    elif desc[0] == Nodetype.SEQUENCE:
+        desc, bound = desc[1]
+    if desc[0] == Nodetype.NAME:
+        return FieldShape("", str(desc[1]), 0, length, bound)
+    if desc[0] == Nodetype.BASE:
+        return FieldShape(str(desc[1][0]), "", int(desc[1][1] or 0), length, bound)
+    raise ValueError("an array of arrays")
+
+
+def _shape(desc: FieldDesc) -> tuple[int, int, str, str]:
+    """Kind, length of an array, base type, name of a message type; bounds do not matter."""
+    kind, count = Nodetype.BASE, 0
+    if desc[0] == Nodetype.ARRAY or desc[0] == Nodetype.SEQUENCE:
+        kind = desc[0]
+        count = desc[1][1] if kind == Nodetype.ARRAY else 0
+        desc = desc[1][0]
+    if desc[0] == Nodetype.NAME:
+        return kind, count, "", str(desc[1])
+    base = str(desc[1][0])
+    return kind, count, _BYTES.get(base, base), ""
+
+
+def translate(types: Typesdict, root: str, new_root: str, world: World) -> Typesdict:
+    """Definitions for another world: its standard ones where they serialise alike.
+
+    Args:
+        types: The definitions, complete.
+        root: The type to translate.
+        new_root: Its name in the other world.
+        world: The other world.
+    """
+    chosen: Typesdict = {}
+    for name in types:
+        new_name = new_root if name == root else name
+        if new_name in world.standard and same_wire(types, name, world.standard, new_name):
+            chosen.update(closure({}, new_name, world.standard))
+        else:
+            constants, fields = types[name]
+            # ROS 1 cannot write bounds; ROS 1 definitions have none to lose.
+            chosen.setdefault(new_name, (constants, _without_bounds(fields)))
+    return chosen
+
+
+def _without_bounds(fields: Fielddefs) -> Fielddefs:
+    """Fields without bounds of strings and sequences, which do not show on the wire."""
+    return [(name, _unbounded(desc)) for name, desc in fields]
+
+
+def _unbounded(desc: FieldDesc) -> FieldDesc:
+    if desc[0] == Nodetype.BASE:
+        return (desc[0], (desc[1][0], 0))
+    if desc[0] == Nodetype.NAME:
+        return desc
+    part, count = desc[1]
+    if part[0] == Nodetype.BASE:
+        part = (part[0], (part[1][0], 0))
+    return (desc[0], (part, count if desc[0] == Nodetype.ARRAY else 0))
+
+
+def make_store(types: Typesdict, world: World) -> Typestore:
+    """A store of definitions with the header of a world."""
+    own = {name: found for name, found in types.items() if name not in (*BUILTIN, HEADER)}
+    return BoundedStore({HEADER: world.standard[HEADER], **own})
+
+
+# ---------------------------------------------------------------- stamps
+
+NS = 1_000_000_000
+_DISTRIBUTION = "humble"
+_TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_POSE = 7 * 8  # bytes: a translation and a quaternion of doubles
+_ENCAPSULATION = 4
+
+
+class HeaderStamps:
+    """The stamps in messages of one channel: of their header, or of those of transforms.
+
+    Args:
+        channel: Any; one that is not of ROS, or has no header, has no stamps.
+    """
+
+    def __init__(self, channel: Channel) -> None:
+        self._is_ros1 = channel.message_encoding == "ros1"
+        self._places = self._find(channel)
+
+    @property
+    def has_any(self) -> bool:
+        """Whether messages of the channel have stamps."""
+        return self._places is not None
+
+    def moved(self, payload: bytes | memoryview, move: Callable[[int], int]) -> bytes | bytearray:
+        """A copy of a message with other stamps.
+
+        Args:
+            payload: Of the channel.
+            move: Gives the new stamp of one, nanoseconds. Zero stays zero.
+
+        Raises:
+            ValueError: It is not of the channel's type, or a stamp has no place in it.
+        """
+        made = bytearray(payload)
+        if self._places is None:
+            return made
+        order = "<" if self._is_ros1 or made[1:2] != b"\0" else ">"
+        code = struct.Struct(f"{order}{'I' if self._is_ros1 else 'i'}I")
+        try:
+            for place in self._places(made, order):
+                seconds, nanoseconds = code.unpack_from(made, place)
+                if seconds or nanoseconds:
+                    code.pack_into(made, place, *divmod(move(seconds * NS + nanoseconds), NS))
+        except struct.error as error:
+            raise ValueError(str(error)) from None
+        return made
+
+    def _find(self, channel: Channel) -> Callable[[bytearray, str], Iterator[int]] | None:
+        schema = channel.schema
+        if channel.message_encoding not in ("ros1", "cdr") or schema is None or not schema.name:
+            return None
+        name = normalize_msgtype(schema.name)
+        if name in _TRANSFORMS:
+            return self._of_transforms
+        world = ros1_world() if self._is_ros1 else ros2_world(_DISTRIBUTION)
+        try:
+            fields = fields_of(types_of(schema, world), name)
+        except BAD_DEFINITION:
+            return None
+        if fields and fields[0][1] == (Nodetype.NAME, HEADER):
+            return self._of_header
+        return None
+
+    def _of_header(self, _: bytearray, __: str) -> Iterator[int]:
+        yield 4  # after the sequence number of ROS 1, or the encapsulation of CDR
+
+    def _of_transforms(self, data: bytearray, order: str) -> Iterator[int]:
+        number = struct.Struct(f"{order}I")
+        start = 0 if self._is_ros1 else _ENCAPSULATION
+        (count,) = number.unpack_from(data, start)
+        place = start + 4
+        for _ in range(count):
+            place = self._aligned(place, 4) + (4 if self._is_ros1 else 0)
+            yield place
+            place += 8
+            for _name in ("frame_id", "child_frame_id"):
+                place = self._aligned(place, 4)
+                place += 4 + number.unpack_from(data, place)[0]
+            place = self._aligned(place, 8) + _POSE
+
+    def _aligned(self, place: int, size: int) -> int:
+        if self._is_ros1:
+            return place
+        return place + -(place - _ENCAPSULATION) % size

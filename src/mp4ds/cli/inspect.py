@@ -1,0 +1,186 @@
+"""``mp4ds info``, ``validate``, ``demo`` and ``conformance-dump``; calibrations as Python code."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mp4ds.cli.options import ForceFlag, JsonFlag
+from mp4ds.cli.output import print_info, print_json, print_validation, printed, say, status_line
+from mp4ds.cli.process import told_errors
+
+if TYPE_CHECKING:
+    from mp4ds.plugins.info import CameraCalibrations, Intrinsics, ListedCalibration
+
+
+def validate(
+    path: Annotated[str, typer.Argument(help="A sidecar, a dataset, or a folder of datasets.")],
+    deep: Annotated[
+        bool, typer.Option("--deep", help="Also hash and decode all, and compare every message.")
+    ] = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """List every problem of a dataset; exit code 1 if there is one."""
+    from mp4ds.dataset.checks import validate as run
+    from mp4ds.files.urls import location
+
+    with told_errors(as_json), status_line(as_json) as report:
+        where = location(path)
+        problems = run(where, deep=deep, progress=report)
+    if as_json:
+        print_json({"path": where, "deep": deep, "problems": problems})
+    else:
+        print_validation(where, problems, deep=deep)
+    raise typer.Exit(1 if problems else 0)
+
+
+def info(
+    path: Annotated[str, typer.Argument(help="A bag, rosbag2 folder, MCAP, dataset or sidecar.")],
+    intrinsics: Annotated[
+        bool,
+        typer.Option(
+            "--intrinsics", help="Show the cameras' calibrations, to be pasted into Python."
+        ),
+    ] = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Show what is in a recording or a dataset."""
+    if intrinsics:
+        _print_intrinsics(path, as_json)
+        return
+    from mp4ds.plugins.info import info as run
+
+    with told_errors(as_json):
+        result = run(path)
+    if as_json:
+        print_json(result)
+    else:
+        print_info(result)
+
+
+def _print_intrinsics(path: str, as_json: bool) -> None:
+    from mp4ds.plugins.info import intrinsics as run
+
+    with told_errors(as_json), status_line(as_json, "reading"):
+        result = run(path)
+    if as_json:
+        print_json(result)
+    else:
+        print_intrinsics(result)
+
+
+def demo(
+    output: Annotated[Path, typer.Argument(help="The .bag file to make.")] = Path("demo.bag"),
+    seconds: Annotated[float, typer.Option("--seconds", min=0.1, max=3600.0)] = 3.0,
+    force: ForceFlag = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Make a small recording: two cameras (Bayer and rgb), calibrations, imu and tf."""
+    from mp4ds.plugins.demo import demo as run
+
+    with told_errors(as_json):
+        messages = run(output, seconds=seconds, force=force)
+    if as_json:
+        print_json({"output": output, "messages": messages})
+    else:
+        say(f"{output}: {messages} messages")
+
+
+def conformance_dump(
+    path: Annotated[str, typer.Argument(metavar="FILE", help="A sidecar or a dataset.")],
+) -> None:
+    """Print what a file holds as JSON, to compare other readers with (conformance/README.md).
+
+    Exit code 1 if it has problems, which are then all that is printed.
+    """
+    from mp4ds.plugins.conformance import as_json
+    from mp4ds.plugins.conformance import conformance_dump as run
+
+    with told_errors(as_json=True), status_line(as_json=False) as report:
+        found = run(path, progress=report)
+    with printed():
+        print(as_json(found))
+    raise typer.Exit(1 if found["problems"] else 0)
+
+
+# ---------------------------------------------------------------- calibrations
+
+_MODELS = {
+    "plumb_bob": "D in the order of OpenCV",
+    "rational_polynomial": "D in the order of OpenCV",
+    "equidistant": "for cv2.fisheye",
+}
+
+
+def print_intrinsics(result: Intrinsics) -> None:
+    """Print the calibrations of all cameras, one after the other, and the static transforms."""
+    say(f"# {result.path}: {result.kind}, {len(result.cameras)} cameras")
+    say("import numpy as np")
+    for camera in result.cameras:
+        _print_camera(camera)
+    if result.transforms:
+        _print_transforms(result)
+
+
+def _print_camera(camera: CameraCalibrations) -> None:
+    say("")
+    sizes = ", ".join(f"{width}x{height}" for width, height in camera.sizes) or "size not known"
+    if camera.topic:
+        say(f"# {camera.topic}: {sizes}, frame {camera.frame_id!r}")
+    else:
+        say(f"# {camera.info_topic}: calibrations that belong to no images")
+    if not camera.calibrations:
+        say("# no calibration")
+    for calibration in camera.calibrations:
+        _print_calibration(camera, calibration)
+    if camera.more:
+        say(f"# ... and {camera.more} more changes of the calibration")
+
+
+def _print_calibration(camera: CameraCalibrations, calibration: ListedCalibration) -> None:
+    since = (
+        f"from message {calibration.message} at {calibration.log_time} ns"
+        if calibration.message is not None
+        else "not from a message"
+    )
+    model = calibration.distortion_model
+    hint = f" ({_MODELS[model]})" if model in _MODELS else ""
+    say(
+        f"# {camera.info_topic}, {since}: {calibration.width}x{calibration.height}, "
+        f"{model or 'no distortion model'}{hint}, frame {calibration.frame_id!r}"
+    )
+    if calibration.k[0][0] == 0:
+        say("# not calibrated: K is zero")
+    _print_matrix("K", calibration.k)
+    say(f"D = np.array({calibration.d})")
+    _print_matrix("R", calibration.r)
+    _print_matrix("P", calibration.p)
+    if calibration.binning:
+        say("binning = ({}, {})".format(*calibration.binning))
+    if calibration.roi:
+        say(f"roi = {calibration.roi}")
+    if calibration.k_effective or calibration.p_effective:
+        say("# of the images as they are, cut to the ROI and binned (REP 104):")
+        _print_matrix("K_effective", calibration.k_effective or calibration.k)
+        _print_matrix("P_effective", calibration.p_effective or calibration.p)
+
+
+def _print_matrix(name: str, rows: Sequence[Sequence[float]]) -> None:
+    start = f"{name} = np.array(["
+    lines = (",\n" + " " * len(start)).join(str(list(row)) for row in rows)
+    for line in f"{start}{lines}])".split("\n"):
+        say(line)
+
+
+def _print_transforms(result: Intrinsics) -> None:
+    say("")
+    say("# static transforms: a point p of the child is rotation * p + translation in the parent;")
+    say("# (parent, child, translation x y z in metres, rotation x y z w)")
+    say("transforms = [")
+    for item in result.transforms:
+        values = f"{list(item.translation)}, {list(item.rotation)}"
+        say(f"    ({item.parent!r}, {item.child!r}, {values}),")
+    say("]")

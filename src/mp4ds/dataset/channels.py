@@ -1,0 +1,251 @@
+"""The channels of a recording that have messages in videos, put together again."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Protocol, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.dataset.rebuild import Choice, DecodedColumns, everything
+from mp4ds.dataset.stream import Stream
+from mp4ds.errors import FormatError
+from mp4ds.records import Channel, Message, Record
+
+MessageSource = Callable[[Channel, Choice], Iterator[tuple[int, Message]]]
+"""Gives those messages of a channel that are wanted, each with its place among the channel's."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class PartKey:
+    """Which messages of a dataset are meant.
+
+    Attributes:
+        sidecar: Path of the sidecar that has them.
+        is_calibration: Whether they are its calibrations, not its images.
+    """
+
+    sidecar: Path
+    is_calibration: bool = False
+
+
+class Ahead(Protocol):
+    """Has the items of an iterator made before they are asked for, such as by a thread."""
+
+    def __call__(self, items: Iterator[T], /) -> Iterator[T]:
+        """The same items."""
+
+
+def when_asked(items: Iterator[T], /) -> Iterator[T]:
+    """Has nothing made before it is asked for."""
+    return items
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How the messages are read that belong to videos.
+
+    Attributes:
+        sources: What gives the messages of a part instead.
+        choice: Which are wanted.
+        ahead: Wraps the messages of each part of a channel.
+    """
+
+    sources: Mapping[PartKey, MessageSource] = field(default_factory=dict)
+    choice: Choice = everything
+    ahead: Ahead = when_asked
+
+
+@dataclass(frozen=True)
+class ImageChannel:
+    """A channel with images in videos.
+
+    Attributes:
+        channel: As in `Dataset.channels`.
+        streams: Its streams; each holds some of its messages.
+        recorded: Number of its messages that are in messages.mcap.
+    """
+
+    channel: Channel
+    streams: list[Stream]
+    recorded: int
+
+
+@dataclass(frozen=True)
+class ChannelPart:
+    """Messages of a channel that belong to one video.
+
+    Attributes:
+        key: Which they are.
+        source: Makes them.
+        decode_columns: Gives their columns.
+        stream: Whose images they are; None for calibrations.
+    """
+
+    key: PartKey
+    source: MessageSource
+    decode_columns: Callable[[], DecodedColumns]
+    stream: Stream | None = None
+
+    @property
+    def columns(self) -> DecodedColumns:
+        """Their columns."""
+        return self.decode_columns()
+
+
+@dataclass(frozen=True)
+class ChannelGroup:
+    """A channel with messages in videos, and its channels in messages.mcap if any.
+
+    Attributes:
+        channel: The channel as a whole.
+        parts: Its messages that belong to videos.
+        recorded_ids: Channels of messages.mcap that have the others.
+    """
+
+    channel: Channel
+    parts: list[ChannelPart]
+    recorded_ids: set[int]
+
+    @property
+    def streams(self) -> list[Stream]:
+        """The streams with its images; none for calibrations."""
+        return [part.stream for part in self.parts if part.stream is not None]
+
+    def found_in(self, records: Iterable[Record]) -> Iterator[Message]:
+        """Its messages among the records of messages.mcap, which are read only if there are any."""
+        for record in records if self.recorded_ids else ():
+            if isinstance(record, Message) and record.channel.id in self.recorded_ids:
+                yield replace(record, channel=self.channel)
+
+    def messages(self, reading: Reading) -> Iterator[Message]:
+        """Its messages that belong to videos, in the channel's order."""
+        return (message for _, message in self._placed(reading))
+
+    def parts_of(self, reading: Reading) -> list[Iterator[Message]]:
+        """Its messages that belong to videos, those of each part by themselves."""
+        return [(message for _, message in part) for part in self._read(reading)]
+
+    def merged(
+        self, reading: Reading, recorded: Iterator[Message], place: str
+    ) -> Iterator[Message]:
+        """All its messages, in the channel's order.
+
+        Args:
+            reading: How those are read that belong to videos.
+            recorded: Those of messages.mcap, which have the places that are left.
+            place: The dataset, for errors.
+
+        Raises:
+            FormatError: ``messages-missing``.
+        """
+        places = self.places
+        given = 0
+        for ordinal, message in self._placed(reading):
+            before = ordinal - int(np.searchsorted(places, ordinal))
+            while given < before:
+                verbatim = next(recorded, None)
+                if verbatim is None:
+                    raise FormatError(
+                        "messages-missing",
+                        place,
+                        f"message {self._free(given)} of topic {self.channel.topic} is in no file",
+                    )
+                yield verbatim
+                given += 1
+            yield message
+        yield from recorded
+
+    @property
+    def places(self) -> NDArray[np.int64]:
+        """Places of the messages that belong to videos, among the channel's messages; sorted."""
+        return np.sort(np.concatenate([part.columns.ordinal for part in self.parts]))
+
+    def _free(self, number: int) -> int:
+        """The place that a message of messages.mcap has, by its number among these."""
+        for place in self.places.tolist():
+            number += place <= number
+        return number
+
+    def gap(self, recorded: int) -> str:
+        """What the columns say is missing, empty if nothing.
+
+        The places that they leave free are those of the channel's messages in messages.mcap, so
+        these must be as many.
+
+        Args:
+            recorded: Messages in messages.mcap.
+        """
+        places = self.places
+        total = len(places) + recorded
+        if len(np.unique(places)) < len(places):
+            return "two messages have the same place"
+        if places[-1] >= total:
+            return f"has {total} messages and one of number {places[-1]}"
+        return ""
+
+    def _placed(self, reading: Reading) -> Iterator[tuple[int, Message]]:
+        return heapq.merge(*self._read(reading), key=lambda pair: pair[0])
+
+    def _read(self, reading: Reading) -> list[Iterator[tuple[int, Message]]]:
+        sources = [reading.sources.get(part.key, part.source) for part in self.parts]
+        return [reading.ahead(source(self.channel, reading.choice)) for source in sources]
+
+
+def channel_groups(streams: Sequence[Stream], recorded: Sequence[Channel]) -> list[ChannelGroup]:
+    """The channels that have messages in videos.
+
+    Args:
+        streams: All streams.
+        recorded: The channels of messages.mcap.
+    """
+    groups: dict[tuple[object, ...], ChannelGroup] = {}
+    first_id = 1 + max((channel.id for channel in recorded), default=0)
+    for stream in streams:
+        key = PartKey(stream.path)
+        images = ChannelPart(key, stream.messages, partial(_columns_of, stream), stream)
+        sources = [(stream.sidecar.channel, images)]
+        info = stream.sidecar.camera_info
+        if info and info.messages:
+            key = PartKey(stream.path, is_calibration=True)
+            part = ChannelPart(key, stream.camera_info_messages, partial(_info_columns_of, stream))
+            sources.append((info.channel, part))
+        for model, part in sources:
+            identity = model.to_record(0).identity
+            if identity not in groups:
+                channel = model.to_record(first_id + len(groups))
+                ids = {item.id for item in recorded if item.identity == identity}
+                groups[identity] = ChannelGroup(channel, [], ids)
+            groups[identity].parts.append(part)
+    return list(groups.values())
+
+
+def log_times(
+    groups: Sequence[ChannelGroup], recorded: Mapping[int, NDArray[np.int64]]
+) -> dict[int, NDArray[np.int64]]:
+    """Sorted log times of every message, nanoseconds, by channel id.
+
+    Args:
+        groups: The channels that have messages in videos.
+        recorded: Those of messages.mcap, by the channel ids there.
+    """
+    found = {key: [times] for key, times in recorded.items()}
+    for group in groups:
+        others = [found.pop(key)[0] for key in group.recorded_ids if key in found]
+        found[group.channel.id] = [*others, *(part.columns.log_time for part in group.parts)]
+    return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items() if arrays}
+
+
+def _columns_of(stream: Stream) -> DecodedColumns:
+    return stream.columns
+
+
+def _info_columns_of(stream: Stream) -> DecodedColumns:
+    return cast(DecodedColumns, stream.camera_info_columns)  # it has messages

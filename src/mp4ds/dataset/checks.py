@@ -1,0 +1,484 @@
+"""``validate``: every problem of a sidecar, a dataset, or a folder of datasets.
+
+Three tiers: schema (the released JSON Schema), model (types and rules of one file), checks
+(rules over several files). Codes are listed in spec/registry.md, "Problem codes".
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from pydantic import ValidationError
+
+from mp4ds.bags.formats import limits_of
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.messages import recorded_storage
+from mp4ds.dataset.stream import Stream
+from mp4ds.errors import ConversionError, FormatError, SourceError, SourceNotFoundError, VideoError
+from mp4ds.files.outputs import digest_file
+from mp4ds.files.urls import location
+from mp4ds.format.fields import MESSAGES_NAME
+from mp4ds.format.manifest import FileEntry, Manifest, StreamEntry
+from mp4ds.format.models import References, StreamSidecar, VideoModel
+from mp4ds.format.sidecars import MANIFEST_NAME, load_document, model_problems, schema_text
+from mp4ds.records import Message, Record
+from mp4ds.video.access import digest_video, packets_in_groups
+from mp4ds.video.references import Structures
+
+_Report = Callable[[str], None]
+_Checked = TypeVar("_Checked")
+_Model = TypeVar("_Model", StreamSidecar, Manifest)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One problem found.
+
+    Attributes:
+        code: Stable code, see spec/registry.md.
+        place: File, with key, topic or frame where known.
+        message: What is wrong.
+    """
+
+    code: str
+    place: str
+    message: str
+
+    def __str__(self) -> str:
+        return f"{self.place}: {self.message} [{self.code}]"
+
+
+def validate(
+    path: Path | str, *, deep: bool = False, progress: Callable[[str], None] | None = None
+) -> list[Problem]:
+    """Find all problems of a sidecar, a video with its sidecar, a dataset, or a folder of them.
+
+    Args:
+        path: What to validate, or its URL.
+        deep: Also hash every file, decode every frame, rebuild every message, and compare.
+        progress: Called with a phrase before each costly step.
+
+    Returns:
+        All problems; empty if there is none.
+
+    Raises:
+        SourceNotFoundError: There is nothing at the path.
+        SourceError: It is nothing that can be validated.
+    """
+    return list(dict.fromkeys(_problems(location(path), deep, progress or (lambda _: None))))
+
+
+def _problems(path: Path, deep: bool, report: _Report) -> list[Problem]:
+    if not path.exists():
+        raise SourceNotFoundError(path)
+    if path.name == MANIFEST_NAME:
+        path = path.parent
+    if path.is_dir():
+        return [
+            problem
+            for folder in _datasets_in(path)
+            for problem in _validate_dataset(folder, deep, report)
+        ]
+    sidecar = path.with_suffix(".yaml") if path.suffix == ".mp4" else path
+    if sidecar.suffix not in (".yaml", ".yml"):
+        raise SourceError(
+            path,
+            "is neither a dataset, a sidecar nor a video of one",
+            "Give a dataset folder, a .yaml sidecar, or an .mp4 beside its sidecar.",
+        )
+    model, problems = _read(sidecar, "stream", StreamSidecar)
+    if model is None:
+        return problems
+    stream = Stream(sidecar, sidecar=model)
+    problems = _check_stream(stream)
+    return [*problems, *_check_deep(stream, report)] if deep else problems
+
+
+def _datasets_in(folder: Path) -> list[Path]:
+    if (folder / MANIFEST_NAME).is_file():
+        return [folder]
+    found = sorted(manifest.parent for manifest in folder.rglob(MANIFEST_NAME))
+    if not found:
+        raise SourceError(
+            folder,
+            f"holds no dataset: there is no {MANIFEST_NAME} in it or below it",
+            "Give the folder that `mp4ds pack` made.",
+        )
+    return found
+
+
+def _read(path: Path, kind: str, model: type[_Model]) -> tuple[_Model | None, list[Problem]]:
+    """Tiers schema and model of one YAML file; there is no model where there is a problem."""
+    try:
+        document = load_document(path)
+    except FormatError as error:
+        return None, [Problem(error.code, error.place, error.problem)]
+    if document["kind"] != kind:
+        return None, [Problem("kind-unknown", str(path), f"is no {kind}")]
+    problems = [
+        Problem("schema-invalid", f"{path} at {'.'.join(map(str, error.absolute_path))}", reason)
+        for error in _schema_validator(kind).iter_errors(document)
+        for reason in [_shortened(error.message)]
+    ]
+    if problems:
+        return None, problems
+    try:
+        return model.model_validate(document), []
+    except ValidationError as error:
+        return None, [
+            Problem("model-invalid", f"{path} at {place}", reason)
+            for place, reason in model_problems(error)
+        ]
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= 200 else f"{text[:100]} ... {text[-80:]}"
+
+
+@cache
+def _schema_validator(kind: str) -> Any:
+    from jsonschema import Draft202012Validator
+
+    return Draft202012Validator(json.loads(schema_text(kind)))
+
+
+def _validate_dataset(folder: Path, deep: bool, report: _Report) -> list[Problem]:
+    """All that costs little, then, if deep, the rest."""
+    manifest, problems = _read(folder / MANIFEST_NAME, "dataset", Manifest)
+    if manifest is None:
+        return problems
+    problems = list(_check_files(folder, manifest, report))
+    streams: list[Stream] = []
+    for entry in manifest.streams:
+        sidecar, found = _read(folder / entry.sidecar, "stream", StreamSidecar)
+        problems += found
+        if sidecar is not None:
+            problems += _check_entry(folder, entry, sidecar)
+            streams.append(Stream(folder / entry.sidecar, sidecar=sidecar))
+            problems += _check_stream(streams[-1])
+    problems += _check_listed(folder, manifest)
+    dataset = None if problems else Dataset.of(folder, manifest, streams)
+    if dataset:
+        problems += _check_messages(dataset, manifest)
+    if deep:
+        problems += _check_hashes(folder, manifest, report)
+        for stream in streams:
+            problems += _check_deep(stream, report)
+        if dataset and not problems:
+            problems += _check_recorded(dataset, manifest, report)
+    return problems
+
+
+def _check_files(folder: Path, manifest: Manifest, report: _Report) -> Iterator[Problem]:
+    """Each file of the manifest is there and has its size; small ones have their hash."""
+    for entry in manifest.files:
+        path = folder / entry.name
+        if not path.is_file():
+            yield Problem("file-missing", str(path), "is listed in the manifest and not there")
+            continue
+        size = path.stat().st_size
+        if size != entry.size:
+            yield Problem(
+                "size-mismatch", str(path), f"has {size} bytes where the manifest says {entry.size}"
+            )
+        elif path.suffix == ".yaml":
+            yield from _check_hash(path, entry, report)
+
+
+def _check_hashes(folder: Path, manifest: Manifest, report: _Report) -> Iterator[Problem]:
+    """Each file that has the size that the manifest says has its hash."""
+    for entry in manifest.files:
+        path = folder / entry.name
+        if path.suffix != ".yaml" and path.is_file() and path.stat().st_size == entry.size:
+            yield from _check_hash(path, entry, report)
+
+
+def _check_hash(path: Path, entry: FileEntry, report: _Report) -> Iterator[Problem]:
+    report(f"hashing {path.name}")
+    if digest_file(path)[1] != entry.sha256:
+        yield Problem(
+            "hash-mismatch", str(path), "does not have the SHA-256 that the manifest says"
+        )
+
+
+def _check_listed(folder: Path, manifest: Manifest) -> Iterator[Problem]:
+    """Each file of the folder is in the manifest, and each stream's files too."""
+    listed = {entry.name for entry in manifest.files}
+    for entry in manifest.streams:
+        for name in (entry.sidecar, entry.video):
+            if name not in listed:
+                yield Problem(
+                    "manifest-inconsistent", str(folder / MANIFEST_NAME), f"does not list {name}"
+                )
+    if MESSAGES_NAME not in listed:
+        yield Problem(
+            "manifest-inconsistent", str(folder / MANIFEST_NAME), f"does not list {MESSAGES_NAME}"
+        )
+    listed.add(MANIFEST_NAME)
+    for path in sorted(folder.iterdir()):
+        if path.name not in listed and path.suffix in (".mp4", ".yaml", ".mcap"):
+            yield Problem("file-unlisted", str(path), "is not listed in the manifest")
+
+
+def _check_entry(folder: Path, entry: StreamEntry, sidecar: StreamSidecar) -> Iterator[Problem]:
+    """A sidecar says the same as the manifest."""
+    for what, own, listed in (
+        ("topic", sidecar.channel.topic, entry.topic),
+        ("video", sidecar.video.file, entry.video),
+        ("frames", sidecar.frames, entry.frames),
+    ):
+        if own != listed:
+            yield Problem(
+                "manifest-inconsistent",
+                str(folder / MANIFEST_NAME),
+                f"says {what} {listed} for {entry.sidecar}, which says {own}",
+            )
+
+
+def _check_stream(stream: Stream) -> list[Problem]:
+    """A valid sidecar's columns and its video."""
+    problems: list[Problem] = []
+    try:
+        problems += _check_video_file(stream, deep=False)
+        _ = stream.rebuilder  # decodes and checks the columns
+        _ = stream.info_rebuilder
+        _check_quality(stream)
+        with stream.open_video(sequential=True) as decoder:
+            problems += _check_count(stream, decoder.coded_frames)
+    except FormatError as error:
+        problems.append(Problem(error.code, error.place, error.problem))
+    return problems
+
+
+def _check_count(stream: Stream, coded: int) -> Iterator[Problem]:
+    if coded != len(stream):
+        yield Problem(
+            "frame-count",
+            str(stream.video_path),
+            f"has {coded} frames where its sidecar says {len(stream)}",
+        )
+
+
+def _check_deep(stream: Stream, report: _Report) -> list[Problem]:
+    """A video has its hash, and every frame decodes to the message that was recorded."""
+    problems: list[Problem] = []
+    try:
+        report(f"hashing {stream.video_path.name}")
+        problems += _check_video_file(stream, deep=True)
+        with stream.open_video(sequential=True) as decoder:
+            if any(_check_count(stream, decoder.coded_frames)):
+                return problems
+        problems += _check_frames(stream, report)
+    except FormatError as error:
+        problems.append(Problem(error.code, error.place, error.problem))
+    return problems
+
+
+def _check_quality(stream: Stream) -> None:
+    """The scores are one for each frame, and come to what is told of them.
+
+    Raises:
+        FormatError: They are not, or do not.
+    """
+    quality = stream.sidecar.video.quality
+    if quality is not None:
+        try:
+            quality.decode(len(stream))
+        except ValueError as error:
+            place = f"{stream.path} at video.quality.scores"
+            raise FormatError("scores-invalid", place, str(error)) from None
+
+
+def _check_video_file(stream: Stream, *, deep: bool) -> Iterator[Problem]:
+    if not stream.video_path.is_file():
+        return  # reported when it is opened
+    for error in wrong_facts(stream.video_path, stream.sidecar.video, deep=deep):
+        yield Problem(error.code, error.place, error.problem)
+
+
+def _check_frames(stream: Stream, report: _Report) -> Iterator[Problem]:
+    """Every frame decodes and, where there is a digest, its message is the original one."""
+    report(f"decoding {stream.video_path.name}")
+    for make in stream.makers():
+        try:
+            make()
+        except FormatError as error:
+            yield Problem(error.code, error.place, error.problem)
+
+
+def _check_messages(dataset: Dataset, manifest: Manifest) -> list[Problem]:
+    """All messages together are as many as were packed, and can be unpacked again."""
+    place = str(dataset.path / MESSAGES_NAME)
+    try:
+        gaps = [Problem("messages-missing", topic, what) for topic, what in dataset.gaps()]
+        if gaps:
+            return gaps
+        total = sum(map(_modelled, dataset.streams)) + sum(dataset.recorded_counts.values())
+        if total != manifest.messages:
+            problem = f"and the videos hold {total} messages where the manifest says "
+            return [Problem("message-count", place, f"{problem}{manifest.messages}")]
+        return list(_check_limits(dataset, manifest, (), place))
+    except FormatError as error:
+        return [Problem(error.code, error.place, error.problem)]
+    except SourceError as error:
+        return [Problem("messages-unreadable", place, str(error))]
+
+
+def _check_recorded(dataset: Dataset, manifest: Manifest, report: _Report) -> list[Problem]:
+    """All of messages.mcap can be read, and unpacked again."""
+    report(f"reading {MESSAGES_NAME}")
+    place = str(dataset.path / MESSAGES_NAME)
+    try:
+        return list(_check_limits(dataset, manifest, _counted(dataset, place), place))
+    except FormatError as error:
+        return [Problem(error.code, error.place, error.problem)]
+    except SourceError as error:
+        return [Problem("messages-unreadable", place, str(error))]
+
+
+def _counted(dataset: Dataset, place: str) -> Iterator[Record]:
+    """All of messages.mcap, of which the index must have told just that.
+
+    Raises:
+        FormatError: ``messages-unreadable``: another number of messages of a channel.
+    """
+    counts = Counter[int]()
+    for record in dataset.recorded_records():
+        if isinstance(record, Message):
+            counts[record.channel.id] += 1
+        yield record
+    told = dataset.recorded_counts
+    for key in counts.keys() | told.keys():
+        if counts[key] != told.get(key, 0):
+            problem = f"holds {counts[key]} messages of channel {key}, its index tells of "
+            raise FormatError("messages-unreadable", place, f"{problem}{told.get(key, 0)}")
+
+
+def _check_limits(
+    dataset: Dataset, manifest: Manifest, records: Iterable[Record], place: str
+) -> Iterator[Problem]:
+    """The format that the recording had can hold each channel and message, as unpacking wants.
+
+    Args:
+        dataset: The dataset.
+        manifest: Its manifest.
+        records: What is looked at of messages.mcap.
+        place: Its name.
+    """
+    storage = ""
+    if manifest.format == "rosbag2":
+        storage = recorded_storage(dataset.recorded_records())
+    check_channel, check_message = limits_of(manifest.format, storage)
+
+    def refusal(check: Callable[[_Checked], None], item: _Checked, place: str) -> list[Problem]:
+        try:
+            check(item)
+        except ConversionError as error:
+            return [Problem("message-invalid", place, str(error))]
+        return []
+
+    for channel in dataset.channels:
+        yield from refusal(check_channel, channel, channel.topic)
+    for stream in dataset.streams:
+        for message in _extremes(stream):
+            yield from refusal(check_message, message, str(stream.path))
+    refused: list[Problem] = []
+    for record in records:  # to the end: they are counted
+        if isinstance(record, Message) and not refused:
+            refused = refusal(check_message, record, place)
+    yield from refused
+
+
+def _extremes(stream: Stream) -> Iterator[Message]:
+    """Messages of the least and of the greatest times and numbers that a sidecar has."""
+    parts = [(stream.sidecar.channel, stream.columns)]
+    info, columns = stream.sidecar.camera_info, stream.camera_info_columns
+    if info and columns:
+        parts.append((info.channel, columns))
+    for model, part in parts:
+        values = part.log_time, part.publish_time, part.sequence
+        for end in (np.min, np.max):
+            log_time, publish_time, sequence = (int(end(column)) for column in values)
+            yield Message(model.to_record(0), log_time, publish_time, sequence, b"")
+
+
+def _modelled(stream: Stream) -> int:
+    info = stream.sidecar.camera_info
+    return len(stream) + (info.messages if info else 0)
+
+
+# ---------------------------------------------------------------- facts of the video
+
+
+def wrong_facts(path: Path, video: VideoModel, *, deep: bool) -> Iterator[FormatError]:
+    """What a sidecar says of its video's file and is not so.
+
+    Args:
+        path: The video, which is there.
+        video: What its sidecar says.
+        deep: Also read the whole file.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    size = path.stat().st_size
+    if video.size is not None and size != video.size:
+        yield VideoError(
+            "size-mismatch", path, f"has {size} bytes where its sidecar says {video.size}"
+        )
+        return
+    references = video.references
+    due: Structures | None = None
+    try:
+        due = _structures(path, references) if references else None
+    except VideoError:
+        pass  # told when it is opened, if others cannot read it either
+    except FormatError as error:
+        yield error
+        return
+    if not deep or (video.sha256 is None and due is None):
+        return
+    found = digest_video(path, video.codec)
+    if video.sha256 not in (None, found.sha256):
+        yield VideoError("hash-mismatch", path, "does not have the SHA-256 that its sidecar says")
+    elif due is not None and (problem := _difference(due, found.structures)):
+        yield _unfit(path, problem)
+
+
+def _structures(path: Path, references: References) -> Structures:
+    """What references say of a video.
+
+    Raises:
+        VideoError: Its index is damaged.
+        FormatError: They are not of that video.
+    """
+    try:
+        structures = references.decode(packets_in_groups(path))
+        structures.check()
+    except FormatError:
+        raise
+    except ValueError as error:
+        raise _unfit(path, str(error)) from None
+    return structures
+
+
+def _difference(told: Structures, found: Structures | None) -> str:
+    if found is None or len(found.groups) != len(told.groups):
+        return "its packets do not tell any"
+    numbers = {text: number for number, text in enumerate(found.texts)}
+    as_found = np.array([numbers.get(text, -1) for text in told.texts])
+    wrong = np.flatnonzero(as_found[told.groups] != found.groups)
+    return f"the packets of its group of pictures {wrong[0]} tell others" if len(wrong) else ""
+
+
+def _unfit(path: Path, problem: str) -> FormatError:
+    return FormatError(
+        "references-invalid", path, f"does not fit the references in its sidecar: {problem}"
+    )

@@ -1,0 +1,406 @@
+"""A dataset, opened: its streams, and every message of the recording again."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.dataset.channels import (
+    Ahead,
+    ChannelGroup,
+    ImageChannel,
+    MessageSource,
+    PartKey,
+    Reading,
+    channel_groups,
+    log_times,
+    when_asked,
+)
+from mp4ds.dataset.frames import Frames, Video
+from mp4ds.dataset.messages import MessagesFile, RecordedMessage, as_recorded
+from mp4ds.dataset.rebuild import Choice, everything, last_of, since
+from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.topic_frames import TopicFrames
+from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
+from mp4ds.files.sources import HOW_TO_OPEN, video_at
+from mp4ds.files.urls import location
+from mp4ds.format.fields import MESSAGES_NAME
+from mp4ds.format.manifest import Manifest
+from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.records import Channel, Excerpt, Message, Record, Schema
+from mp4ds.times import Sync, synchronize
+
+_VIDEOS = (".mp4", ".m4v", ".mov")
+
+
+class Dataset:
+    """A folder that `mp4ds pack` made, or one video with its sidecar.
+
+    ``dataset["/topic"]`` has a topic's frames, ``"/topic" in dataset`` tells whether it has any,
+    and iteration gives all streams. Where a topic changes its size or encoding and so has several
+    streams, ``dataset["/topic"]`` is a `TopicFrames`: the frames of all of them in the order of
+    recording. Each stream is also found by its file's name without ending.
+
+    Attributes:
+        path: The folder, or the video or sidecar.
+        manifest: Of the folder; None for one video.
+        streams: Its streams.
+        videos: Videos of others, which have no sidecar; see `mp4ds.open`.
+
+    Args:
+        path: The folder, a manifest, a sidecar, or a video beside its sidecar; or its URL.
+        jpeg_quality: Of the JPEG files that messages of transcoded streams get, 1 to 100.
+        fast_colour: Of videos with halved chroma give it to frames as it is, several times as
+            fast as interpolating it as `mp4ds.unpack` does. Messages are not changed by it.
+
+    Raises:
+        SourceNotFoundError: There is nothing.
+        SourceError: What is there is no dataset.
+        FormatError: A file breaks a rule of the format.
+    """
+
+    def __init__(
+        self, path: Path | str, *, jpeg_quality: int = 95, fast_colour: bool = False
+    ) -> None:
+        self.path = location(path)
+        if not self.path.exists():
+            raise SourceNotFoundError(self.path)
+        if self.path.name == MANIFEST_NAME:
+            self.path = self.path.parent
+        self.manifest: Manifest | None = None
+        holds_one = (self.path / MANIFEST_NAME).exists()
+        if not holds_one and self.path.suffix not in (".yaml", ".yml", ".mp4"):
+            problem = "is no dataset"
+            remedy = "Give a folder that `mp4ds pack` made, or a sidecar beside its video."
+            if video := video_at(self.path):
+                problem, remedy = f"is {video}, and no dataset", HOW_TO_OPEN
+            raise SourceError(self.path, problem, remedy)
+        if self.path.is_dir():
+            self.manifest = load_manifest(self.path / MANIFEST_NAME)
+            sidecars = [self.path / entry.sidecar for entry in self.manifest.streams]
+        else:
+            sidecars = [self.path.with_suffix(".yaml") if self.path.suffix == ".mp4" else self.path]
+        self.streams: list[Stream] = [
+            Stream(sidecar, jpeg_quality=jpeg_quality, fast_colour=fast_colour)
+            for sidecar in sidecars
+        ]
+        self.videos: list[Video] = []
+
+    @classmethod
+    def of(cls, folder: Path, manifest: Manifest, streams: Sequence[Stream]) -> Dataset:
+        """A folder of which all sidecars were read already."""
+        dataset = cls.__new__(cls)
+        dataset.path, dataset.manifest = folder, manifest
+        dataset.streams, dataset.videos = list(streams), []
+        return dataset
+
+    @property
+    def _all(self) -> list[Stream | Video]:
+        return [*self.streams, *self.videos]
+
+    @property
+    def topics(self) -> list[str]:
+        """Topics that have frames."""
+        return list(dict.fromkeys(stream.topic for stream in self._all))
+
+    @cached_property
+    def _by_name(self) -> dict[str, Frames]:
+        """The frames of each topic, and the streams by the names of their files."""
+        found: dict[str, Frames] = {one.path.stem: one for one in self._all}
+        found |= {video.topic: video for video in self.videos}
+        for topic in dict.fromkeys(stream.topic for stream in self.streams):
+            streams = [stream for stream in self.streams if stream.topic == topic]
+            found[topic] = TopicFrames(streams) if len(streams) > 1 else streams[0]
+        return found
+
+    def __getitem__(self, topic: str) -> Frames:
+        if topic not in self._by_name:
+            known = ", ".join(self.topics) or "none"
+            raise KeyError(f"{self.path} has no stream {topic!r}; there are: {known}")
+        return self._by_name[topic]
+
+    def __contains__(self, topic: object) -> bool:
+        return topic in self._by_name
+
+    def __iter__(self) -> Iterator[Stream | Video]:
+        return iter(self._all)
+
+    def __len__(self) -> int:
+        return len(self._all)
+
+    @property
+    def profile(self) -> str:
+        """MCAP profile of the recording: ``ros1``, ``ros2`` or another."""
+        if self.manifest:
+            return self.manifest.recording_profile
+        return "ros1" if self.streams[0].sidecar.wire == "ros1" else "ros2"
+
+    @cached_property
+    def channels(self) -> list[Channel]:
+        """All channels of the recording."""
+        return [*self._verbatim_channels, *(group.channel for group in self._groups)]
+
+    @cached_property
+    def _file(self) -> MessagesFile:
+        return MessagesFile(self.path / MESSAGES_NAME if self.manifest else None)
+
+    @property
+    def unused_schemas(self) -> Sequence[Schema]:
+        """Definitions of the recording that no channel refers to."""
+        return self._file.unused_schemas
+
+    @property
+    def recorded_counts(self) -> Mapping[int, int]:
+        """Messages in messages.mcap by channel id, as its index tells."""
+        return self._file.counts
+
+    def verify_messages(self) -> None:
+        """Compare messages.mcap with its SHA-256: not all that it holds has a checksum of its own.
+
+        Raises:
+            FormatError: ``file-missing`` or ``hash-mismatch``.
+        """
+        if self.manifest:
+            self._file.verify(self.manifest)
+
+    def recorded_records(self) -> Iterator[Record]:
+        """Everything in messages.mcap, in file order."""
+        return self._file.in_file_order()
+
+    @cached_property
+    def _groups(self) -> list[ChannelGroup]:
+        return channel_groups(self.streams, self._file.channels)
+
+    @cached_property
+    def _verbatim_channels(self) -> list[Channel]:
+        split = {channel_id for group in self._groups for channel_id in group.recorded_ids}
+        return [channel for channel in self._file.channels if channel.id not in split]
+
+    def image_channels(self) -> list[ImageChannel]:
+        """The channels that have images in videos."""
+        recorded = self._file.counts
+        found = []
+        for group in self._groups:
+            if group.streams:
+                count = sum(recorded.get(key, 0) for key in group.recorded_ids)
+                found.append(ImageChannel(group.channel, group.streams, count))
+        return found
+
+    def messages(self, topics: Sequence[str] | None = None) -> Iterator[RecordedMessage]:
+        """The messages that are no frames, by log time, each decoded when asked for.
+
+        Calibrations are among them. Images that no video could hold are, too, if their topic is
+        asked for.
+
+        Args:
+            topics: Only these topics; None for all.
+
+        Raises:
+            OptionError: There is no such topic.
+            FormatError: The dataset breaks a rule of the format.
+        """
+        if isinstance(topics, str):
+            raise OptionError(f"topics is a list of topics, such as [{topics!r}]")
+        known = list(dict.fromkeys(channel.topic for channel in self.channels))
+        unknown = [topic for topic in topics or () if topic not in known]
+        if unknown:
+            raise OptionError(
+                f"{self.path} has no topic {unknown[0]!r}; there are: {', '.join(known) or 'none'}"
+            )
+        wanted = None if topics is None else frozenset(topics)
+        return as_recorded(self._no_frames(wanted), self._file.path or self.path)
+
+    def _no_frames(self, wanted: frozenset[str] | None) -> Iterator[Message]:
+        ids = {channel.id for channel in self._verbatim_channels}
+        calibrations = []
+        for group in self._groups:
+            if wanted is not None and group.channel.topic not in wanted:
+                continue
+            if not group.streams:
+                calibrations.append(self._group_messages(group, Reading()))
+            elif wanted is not None:
+                ids |= group.recorded_ids
+        found = self._file.in_time(Excerpt(topics=wanted))
+        recorded = (message for message in found if message.channel.id in ids)
+        return heapq.merge(recorded, *calibrations, key=_time_of)
+
+    def sync(
+        self,
+        topics: Sequence[str] | None = None,
+        *,
+        tolerance_ns: int,
+        reference: str | None = None,
+    ) -> Sync:
+        """Frames of several topics that were taken at the same time, by their header stamps.
+
+        Args:
+            topics: Topics, or names of streams; None: all topics. Numbers of frames are those of
+                ``dataset[topic]``.
+            tolerance_ns: Most nanoseconds between a frame and that of the reference.
+            reference: One of the topics, with whose frames those of the others are matched;
+                None: the one with the fewest frames, of several the first.
+
+        Raises:
+            OptionError: There is no such topic, or the tolerance is negative.
+        """
+        if isinstance(topics, str):
+            raise OptionError(f"topics is a list of topics, such as [{topics!r}]")
+        if topics is None:
+            topics = self.topics
+        try:
+            stamps = {topic: self[topic].stamps for topic in topics}
+        except KeyError as error:
+            raise OptionError(str(error.args[0])) from None
+        if len(stamps) < len(topics):
+            raise OptionError(f"a topic stands twice among {', '.join(topics)}")
+        return synchronize(stamps, tolerance_ns=tolerance_ns, reference=reference)
+
+    def records(
+        self,
+        sources: Mapping[PartKey, MessageSource] | None = None,
+        *,
+        start: int | None = None,
+        choose: Choice = everything,
+        topics: Collection[str] | None = None,
+        ahead: Ahead = when_asked,
+    ) -> Iterator[Record]:
+        """Everything that was recorded, merged by log time; each channel in its own order.
+
+        From a time on, a channel's messages that are in messages.mcap are merged with those of
+        its videos by log time. There are only messages then, and what lies before the key frame
+        of the first one of a video is not decoded. Where some messages are left out, videos are
+        not compared with their SHA-256, while messages still are with their digests.
+
+        Args:
+            sources: What gives the messages of a video or its calibrations; all others are as
+                recorded.
+            start: The first log time, nanoseconds; None for everything.
+            choose: Which messages of videos, and of their calibrations, are wanted. Packets
+                that refer to others come with those between two that are wanted.
+            topics: Only these topics; None for all.
+            ahead: Wraps what gives the messages of each video and calibration, and of
+                messages.mcap, so that each may be read by a thread of its own. A dataset is not
+                to be read twice at a time by such threads.
+
+        Raises:
+            FormatError: A frame does not decode, or a message does not match its digest.
+        """
+        choice = choose if start is None else since(start, choose)
+        reading = Reading(sources or {}, choice, ahead)
+        groups = [item for item in self._groups if topics is None or item.channel.topic in topics]
+        if start is not None:
+            excerpt = Excerpt(start=start, topics=None if topics is None else frozenset(topics))
+            recorded = ahead(self._recorded_in(excerpt))
+            parts = [part for group in groups for part in group.parts_of(reading)]
+            return heapq.merge(recorded, *parts, key=_time_of)
+        channels = (self._group_messages(group, reading) for group in groups)
+        return heapq.merge(ahead(self._verbatim_records(topics)), *channels, key=_time_of)
+
+    def last_before(self, time_ns: int, channels: Collection[Channel]) -> list[Message]:
+        """The last message of some channels before a log time, of those that have one.
+
+        Args:
+            time_ns: Nanoseconds.
+            channels: Of `channels`.
+        """
+        found: dict[int, Message] = {}
+        topics = frozenset(channel.topic for channel in channels)
+        for message in self._recorded_in(Excerpt(end=time_ns, topics=topics)):
+            found[message.channel.id] = message
+        reading = Reading(choice=last_of(time_ns))
+        for group in self._groups:
+            for message in group.messages(reading) if group.channel.topic in topics else ():
+                other = found.get(message.channel.id)
+                if other is None or other.log_time <= message.log_time:
+                    found[message.channel.id] = message
+        return [found[channel.id] for channel in channels if channel.id in found]
+
+    def times(self) -> dict[int, NDArray[np.int64]]:
+        """Sorted log times of every message, nanoseconds, by channel id; decodes no frame."""
+        return log_times(self._groups, self._file.times())
+
+    def gaps(self) -> Iterator[tuple[str, str]]:
+        """Topics of which the columns say that messages are missing, and what is missing."""
+        if self.manifest is None:
+            return
+        recorded = self._file.counts
+        for group in self._groups:
+            gap = group.gap(sum(recorded.get(key, 0) for key in group.recorded_ids))
+            if gap:
+                yield group.channel.topic, gap
+
+    def _verbatim_records(self, topics: Collection[str] | None) -> Iterator[Record]:
+        channels = self._verbatim_channels
+        wanted = {item.id for item in channels if topics is None or item.topic in topics}
+        for record in self.recorded_records():
+            if not isinstance(record, Message) or record.channel.id in wanted:
+                yield record
+
+    def _recorded_in(self, excerpt: Excerpt) -> Iterator[Message]:
+        """Messages in messages.mcap, by log time, on the channels that they belong to."""
+        owners = {key: group.channel for group in self._groups for key in group.recorded_ids}
+        for message in self._file.in_time(excerpt):
+            owner = owners.get(message.channel.id)
+            yield replace(message, channel=owner) if owner else message
+
+    def _group_messages(self, group: ChannelGroup, reading: Reading) -> Iterator[Message]:
+        """One channel's messages from all its places, in the channel's order."""
+        recorded = reading.ahead(group.found_in(self.recorded_records()))
+        if self.manifest is None:  # a pair alone has only its own messages
+            return chain(group.messages(reading), recorded)
+        return group.merged(reading, recorded, str(self.path))
+
+    def close(self) -> None:
+        """Close all videos."""
+        for stream in self._all:
+            stream.close()
+
+    def __enter__(self) -> Dataset:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _time_of(record: Record) -> int:
+    return getattr(record, "log_time", 0)
+
+
+class _VideoDataset(Dataset):
+    """One video of others."""
+
+    def __init__(self, path: Path, *, fast_colour: bool) -> None:
+        self.path = path
+        self.manifest = None
+        self.streams = []
+        self.videos = [Video(path, fast_colour=fast_colour)]
+
+    @property
+    def profile(self) -> str:
+        """Empty: there is no recording."""
+        return ""
+
+
+def open_dataset(path: Path | str, *, fast_colour: bool = False) -> Dataset:
+    """Open a dataset, or one video with its sidecar. See `Dataset`.
+
+    A video that has no sidecar and is in no dataset is opened, too: `Dataset.videos` then has
+    it, and its topic is the file's name without ending.
+
+    Args:
+        path: See `Dataset`.
+        fast_colour: See `Dataset`.
+    """
+    place = location(path)
+    if place.suffix.lower() in _VIDEOS and place.is_file():
+        beside = (place.with_suffix(".yaml"), place.parent / MANIFEST_NAME)
+        if not any(path.exists() for path in beside):
+            return _VideoDataset(place, fast_colour=fast_colour)
+    return Dataset(place, fast_colour=fast_colour)

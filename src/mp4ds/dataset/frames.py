@@ -1,0 +1,675 @@
+"""Frames by number and by stamp: what streams, videos of others and whole topics have in common."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from operator import index as as_integer
+from pathlib import Path
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.dataset.views import Crop, Resize, View, view_of
+from mp4ds.errors import FrameNotFoundError, OptionError
+from mp4ds.format.models import Calibration
+from mp4ds.messages.arrangements import Picture
+from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
+from mp4ds.video.reader import FrameReader, VideoFile, open_file_frames
+
+_WANTED = {
+    "nearest": "near",
+    "before": "at or before",
+    "after": "at or after",
+    "exact": "of exactly",
+}
+_INT64 = np.iinfo(np.int64)
+
+
+class StampIndex:
+    """Finds frames by stamp; of several with the same stamp, the first in order.
+
+    Args:
+        topic: For errors.
+        stamps: Nanoseconds, shape (frames,), at least one.
+    """
+
+    def __init__(self, topic: str, stamps: NDArray[np.int64]) -> None:
+        self._topic = topic
+        self._order = np.argsort(stamps, kind="stable")
+        self._sorted = stamps[self._order]
+
+    def find(self, stamp_ns: int, *, mode: str, tolerance_ns: int | None) -> int:
+        """Number of the frame that belongs to a time.
+
+        Args:
+            stamp_ns: Nanoseconds.
+            mode: ``nearest``, and of two that are equally near the earlier one; ``before``: the
+                last at or before the time; ``after``: the first at or after it; ``exact``.
+            tolerance_ns: Most nanoseconds between them, or None for any number.
+
+        Raises:
+            FrameNotFoundError: There is none.
+            OptionError: There is no such mode or tolerance.
+        """
+        if mode not in _WANTED:
+            raise OptionError(f"there is no mode {mode!r}: use {', '.join(_WANTED)}")
+        stamp = as_integer(stamp_ns)
+        tolerance = None if tolerance_ns is None else as_integer(tolerance_ns)
+        if tolerance is not None and tolerance < 0:
+            raise OptionError(f"a tolerance of {tolerance} ns: use 0 or more")
+        earlier, later = self._around(stamp)
+        near = [place for place in (earlier, later) if place is not None]
+        nearest = min(near, key=lambda place: abs(self._stamp(place) - stamp))
+        place = {"before": earlier, "after": later}.get(mode, nearest)
+        if place is not None:
+            distance = abs(self._stamp(place) - stamp)
+            most = 0 if mode == "exact" else tolerance
+            if most is None or distance <= most:
+                return int(self._order[place])
+        within = "" if tolerance is None else f"within {tolerance} ns "
+        wanted = _WANTED[mode] if not within else f"{within}{_WANTED[mode]}"
+        raise FrameNotFoundError(self._topic, stamp, wanted, self._stamp(nearest))
+
+    def between(self, start_ns: int, end_ns: int) -> NDArray[np.int64]:
+        """Numbers of the frames with start_ns <= stamp < end_ns, by stamp."""
+        first, last = (self._place(as_integer(time)) for time in (start_ns, end_ns))
+        return self._order[first : max(first, last)]
+
+    def _place(self, stamp: int) -> int:
+        """How many stamps are smaller."""
+        if stamp > _INT64.max:
+            return len(self._sorted)
+        value = np.int64(max(stamp, _INT64.min))
+        return int(np.searchsorted(self._sorted, value, side="left"))
+
+    def _around(self, stamp: int) -> tuple[int | None, int | None]:
+        """Places of the last one at or before a time, and of the first one at or after it."""
+        place = self._place(stamp)
+        later = place if place < len(self._sorted) else None
+        if later is not None and self._stamp(later) == stamp:
+            return later, later
+        earlier = self._place(self._stamp(place - 1)) if place else None
+        return earlier, later
+
+    def _stamp(self, place: int) -> int:
+        return int(self._sorted[place])
+
+
+def numbers_of(topic: str, count: int, indices: Sequence[int] | NDArray[np.int64]) -> list[int]:
+    """Frame numbers, negative ones counted from the end.
+
+    Args:
+        topic: For errors.
+        count: Frames that there are.
+        indices: Any integers.
+
+    Raises:
+        IndexError: There is no such frame.
+        TypeError: One is no integer.
+    """
+    numbers = []
+    for index in indices.tolist() if isinstance(indices, np.ndarray) else indices:
+        if isinstance(index, bool):
+            raise TypeError("frames are chosen by number: give np.flatnonzero(mask) of a mask")
+        asked = as_integer(index)
+        number = asked + count if asked < 0 else asked
+        if not 0 <= number < count:
+            raise IndexError(
+                f"{topic} has {count} frames, and no frame {asked}: they are 0 to {count - 1}, "
+                f"or {-count} to -1 from the end"
+            )
+        numbers.append(number)
+    return numbers
+
+
+# ---------------------------------------------------------------- frames
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of a stream.
+
+    Attributes:
+        data: Pixels in the encoding, shape as `Encoding.shape`, native byte order.
+        index: Number of the frame in its stream.
+        stamp_ns: Header stamp, nanoseconds.
+        log_time_ns: When it was recorded, nanoseconds.
+        frame_id: Coordinate frame.
+        encoding: ROS image encoding of `data`.
+        intrinsics: The calibration of `data`, or None where the recording has none.
+    """
+
+    data: Pixels
+    index: int
+    stamp_ns: int
+    log_time_ns: int
+    frame_id: str
+    encoding: str
+    intrinsics: Calibration | None
+
+
+Indices = Sequence[int] | NDArray[np.int64]
+
+
+class Frames(ABC):
+    """A sequence of frames, decoded when asked for.
+
+    ``len(frames)``, ``frames[i]``, ``frames[-1]``, ``frames[a:b]`` and iteration work as on a
+    list. Not to be shared between threads or over a fork.
+
+    Where frames can be given otherwise than recorded:
+
+    * ``format``: ``"native"`` in their ROS encoding; ``"rgb"`` and ``"bgr"``, shape (H, W, 3);
+      ``"gray"``, shape (H, W). 16 bits stay 16 bits, a Bayer mosaic is interpolated, alpha is
+      left out. Depths and other numbers are only given as ``"native"``.
+    * ``crop``: x, y, width and height in pixels of the image, cut out first.
+    * ``resize``: a factor, or width and height. Sizes are reduced by area and enlarged by bicubic
+      interpolation; depths and other numbers take the nearest pixel. The frame's `intrinsics`
+      are those of the picture given.
+    """
+
+    # ------------------------------------------------------------ what they are
+
+    @property
+    @abstractmethod
+    def topic(self) -> str:
+        """Topic of the images."""
+
+    @property
+    @abstractmethod
+    def stamps(self) -> NDArray[np.int64]:
+        """Header stamps, nanoseconds, shape (frames,)."""
+
+    @property
+    @abstractmethod
+    def log_times(self) -> NDArray[np.int64]:
+        """Log times, nanoseconds, shape (frames,)."""
+
+    @property
+    @abstractmethod
+    def encoding(self) -> str:
+        """ROS image encoding of the frames as recorded."""
+
+    @property
+    @abstractmethod
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the images, pixels."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of a frame's pixels as recorded: (H, W), or (H, W, channels)."""
+        return self._known_encoding.shape(*self.image_size)
+
+    @property
+    def dtype(self) -> np.dtype[np.generic]:
+        """Type of a frame's samples as recorded, native byte order."""
+        return np.dtype(self._known_encoding.dtype)
+
+    @property
+    def _known_encoding(self) -> Encoding:
+        return ENCODINGS[self.encoding]
+
+    @property
+    def calibrations(self) -> Sequence[Calibration]:
+        """All calibrations, in the order in which they were first seen; none where not known."""
+        return []
+
+    @abstractmethod
+    def intrinsics_at(self, index: int) -> Calibration | None:
+        """The calibration that held when a frame was recorded.
+
+        Args:
+            index: 0 <= index < frames.
+        """
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close what is open of videos."""
+
+    # ------------------------------------------------------------ by number
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Frame]: ...
+
+    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
+        if isinstance(index, slice):
+            return self.get(range(*index.indices(len(self))))
+        return self.get((index,))[0]
+
+    @abstractmethod
+    def __iter__(self) -> Iterator[Frame]: ...
+
+    @abstractmethod
+    def get(
+        self,
+        indices: Indices,
+        *,
+        format: str = "native",  # noqa: A002 - as users write it
+        resize: Resize = None,
+        crop: Crop = None,
+    ) -> list[Frame]:
+        """Frames by number, decoded in the order that costs least.
+
+        Args:
+            indices: In any order, also several times; negative ones count from the end.
+            format: See `Frames`.
+            resize: See `Frames`.
+            crop: See `Frames`.
+
+        Returns:
+            One frame for each index, whose pixels are its own.
+
+        Raises:
+            IndexError: There is no such frame.
+            OptionError: There is no such format, part or size, or not of these frames.
+            VideoError: A frame cannot be decoded.
+        """
+
+    @abstractmethod
+    def read(
+        self,
+        indices: Indices,
+        *,
+        format: str = "rgb",  # noqa: A002
+        resize: Resize = None,
+        crop: Crop = None,
+        out: Pixels | None = None,
+    ) -> Pixels:
+        """Pixels of frames by number, in one array.
+
+        Args:
+            indices: As for `get`.
+            format: See `Frames`.
+            resize: See `Frames`.
+            crop: See `Frames`.
+            out: Where to write them, or None for a new array. Shape and type as returned.
+
+        Returns:
+            Shape (indices, H, W) or (indices, H, W, channels); `out`, if it was given.
+
+        Raises:
+            IndexError: There is no such frame.
+            OptionError: As for `get`; or `out` has another shape or type.
+            VideoError: A frame cannot be decoded.
+        """
+
+    # ------------------------------------------------------------ by stamp
+
+    @cached_property
+    def _by_stamp(self) -> StampIndex:
+        return StampIndex(self.topic, self.stamps)
+
+    def index_at(
+        self, stamp_ns: int, *, mode: str = "nearest", tolerance_ns: int | None = None
+    ) -> int:
+        """Number of the frame that belongs to a time.
+
+        Stamps need not be sorted. Of several frames with the same stamp it is the first in
+        order, and of two that are equally near the earlier one.
+
+        Args:
+            stamp_ns: Nanoseconds.
+            mode: ``nearest``; ``before``: the last at or before the time; ``after``: the first
+                at or after it; ``exact``.
+            tolerance_ns: Most nanoseconds between the frame and the time; None for any number.
+
+        Raises:
+            FrameNotFoundError: There is no such frame.
+            OptionError: There is no such mode or tolerance.
+        """
+        return self._by_stamp.find(stamp_ns, mode=mode, tolerance_ns=tolerance_ns)
+
+    def at(
+        self,
+        stamp_ns: int,
+        *,
+        mode: str = "nearest",
+        tolerance_ns: int | None = None,
+        format: str = "native",  # noqa: A002
+        resize: Resize = None,
+        crop: Crop = None,
+    ) -> Frame:
+        """The frame that belongs to a time.
+
+        Args:
+            stamp_ns: See `index_at`.
+            mode: See `index_at`.
+            tolerance_ns: See `index_at`.
+            format: See `Frames`.
+            resize: See `Frames`.
+            crop: See `Frames`.
+
+        Raises:
+            FrameNotFoundError: There is no such frame.
+            OptionError: An option is wrong; see `get` and `index_at`.
+            VideoError: The frame cannot be decoded.
+        """
+        index = self.index_at(stamp_ns, mode=mode, tolerance_ns=tolerance_ns)
+        return self.get((index,), format=format, resize=resize, crop=crop)[0]
+
+    @abstractmethod
+    def between(
+        self,
+        start_ns: int,
+        end_ns: int,
+        *,
+        format: str = "native",  # noqa: A002
+        resize: Resize = None,
+        crop: Crop = None,
+    ) -> Iterator[Frame]:
+        """The frames with ``start_ns <= stamp < end_ns``, by stamp, decoded one by one.
+
+        Args:
+            start_ns: Nanoseconds.
+            end_ns: Nanoseconds.
+            format: See `Frames`.
+            resize: See `Frames`.
+            crop: See `Frames`.
+
+        Raises:
+            OptionError: An option is wrong; see `get`.
+            VideoError: A frame cannot be decoded.
+        """
+
+
+# ---------------------------------------------------------------- frames of one video
+
+
+class DecodedFrames(Frames):
+    """The frames of one video, all of one size and encoding. See `Frames`."""
+
+    def __init__(self) -> None:
+        self._views: dict[str, View] = {}
+
+    # ------------------------------------------------------------ what makes them
+
+    @abstractmethod
+    def pictures_of(self, indices: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+        """Pictures of some frames, each with its number.
+
+        Args:
+            indices: 0 <= index < frames, increasing.
+
+        Yields:
+            Views that hold until the next one is asked for. Nothing else may be read meanwhile.
+
+        Raises:
+            VideoError: One cannot be decoded.
+        """
+
+    @abstractmethod
+    def _pictures_apart(self, runs: Iterable[Sequence[int]]) -> Iterator[tuple[int, Picture]]:
+        """As `pictures_of` for each run, by a decoder of its own: more may be read meanwhile."""
+
+    @abstractmethod
+    def _pictures(self) -> Iterator[Picture]:
+        """All pictures in order, read by a decoder of their own."""
+
+    @abstractmethod
+    def _write_pixels(self, picture: Picture, out: Pixels) -> None:
+        """Write the pixels of a picture, as recorded."""
+
+    @abstractmethod
+    def _frame_id(self, index: int) -> str: ...
+
+    # ------------------------------------------------------------ by number
+
+    def __iter__(self) -> Iterator[Frame]:
+        view = self._view("native", None, None)
+        for index, picture in enumerate(self._pictures()):
+            yield self._frame(index, picture, view)
+
+    def get(
+        self,
+        indices: Indices,
+        *,
+        format: str = "native",  # noqa: A002 - as users write it
+        resize: Resize = None,
+        crop: Crop = None,
+    ) -> list[Frame]:
+        """See `Frames.get`."""
+        numbers = numbers_of(self.topic, len(self), indices)
+        view = self._view(format, resize, crop)
+        found: dict[int, Frame] = {}
+        for number, picture in self.pictures_of(sorted(set(numbers))):
+            found[number] = self._frame(number, picture, view)
+        given: set[int] = set()
+        frames = []
+        for number in numbers:
+            frame = found[number]
+            frames.append(replace(frame, data=frame.data.copy()) if number in given else frame)
+            given.add(number)
+        return frames
+
+    def read(
+        self,
+        indices: Indices,
+        *,
+        format: str = "rgb",  # noqa: A002
+        resize: Resize = None,
+        crop: Crop = None,
+        out: Pixels | None = None,
+    ) -> Pixels:
+        """See `Frames.read`."""
+        numbers = numbers_of(self.topic, len(self), indices)
+        view = self._view(format, resize, crop)
+        out = output(out, (len(numbers), *view.shape), view.dtype)
+        self._write(numbers, view, list(out))
+        return out
+
+    def _write(self, numbers: Sequence[int], view: View, out: Sequence[Pixels]) -> None:
+        """Write the pixels of frames.
+
+        Args:
+            numbers: 0 <= number < frames, in any order, also several times.
+            view: Of these frames.
+            out: An array for each.
+
+        Raises:
+            VideoError: A frame cannot be decoded.
+        """
+        places: dict[int, list[int]] = {}
+        for place, number in enumerate(numbers):
+            places.setdefault(number, []).append(place)
+        for number, picture in self.pictures_of(sorted(places)):
+            first, *others = places[number]
+            self._give(picture, view, out[first])
+            for place in others:
+                np.copyto(out[place], out[first])
+
+    # ------------------------------------------------------------ by stamp
+
+    def between(
+        self,
+        start_ns: int,
+        end_ns: int,
+        *,
+        format: str = "native",  # noqa: A002
+        resize: Resize = None,
+        crop: Crop = None,
+    ) -> Iterator[Frame]:
+        """See `Frames.between`."""
+        return self._in_order(
+            self._by_stamp.between(start_ns, end_ns), self._view(format, resize, crop)
+        )
+
+    def _in_order(self, indices: NDArray[np.int64], view: View) -> Iterator[Frame]:
+        """Frames in an order, of which what increases is decoded in one go."""
+        falls = np.flatnonzero(np.diff(indices) < 0) + 1
+        runs = (run.tolist() for run in np.split(indices, falls) if len(run))
+        for index, picture in self._pictures_apart(runs):
+            yield self._frame(index, picture, view)
+
+    # ------------------------------------------------------------ how they are given
+
+    def _view(self, format: str, resize: Resize, crop: Crop) -> View:  # noqa: A002
+        """One way of giving the frames.
+
+        Raises:
+            OptionError: There is no such format, part or size, or not of these frames.
+        """
+        key = repr((format, resize, crop))
+        view = self._views.get(key)
+        if view is None:
+            view = view_of(
+                self.topic,
+                self._known_encoding,
+                self.image_size,
+                format=format,
+                resize=resize,
+                crop=crop,
+            )
+            self._views = {key: view}  # the last one alone: it holds tables of its own
+        return view
+
+    def _give(self, picture: Picture, view: View, out: Pixels) -> None:
+        if view.is_plain:
+            self._write_pixels(picture, out)
+            return
+        pixels: Pixels = np.empty(self.shape, self.dtype)
+        self._write_pixels(picture, pixels)
+        view.give(pixels, out)
+
+    def _frame(self, index: int, picture: Picture, view: View) -> Frame:
+        data: Pixels = np.empty(view.shape, view.dtype)
+        self._give(picture, view, data)
+        return Frame(
+            data=data,
+            index=index,
+            stamp_ns=int(self.stamps[index]),
+            log_time_ns=int(self.log_times[index]),
+            frame_id=self._frame_id(index),
+            encoding=view.encoding.name,
+            intrinsics=view.calibration(self.intrinsics_at(index)),
+        )
+
+
+def output(out: Pixels | None, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> Pixels:
+    """The array to write into.
+
+    Raises:
+        OptionError: It cannot take what is to be written.
+    """
+    if out is None:
+        return np.empty(shape, dtype)
+    if not isinstance(out, np.ndarray) or (out.shape, out.dtype) != (shape, dtype):
+        found = f"{out.dtype} {out.shape}" if isinstance(out, np.ndarray) else type(out).__name__
+        raise OptionError(f"out is {found} where an array of {dtype} {shape} is needed")
+    if not out.flags.writeable:
+        raise OptionError("out cannot be written to")
+    return out
+
+
+# ---------------------------------------------------------------- videos of others
+
+
+class Video(DecodedFrames):
+    """The frames of an mp4 that has no sidecar. See `Frames`.
+
+    Its topic is the file's name without ending. Frames are ``rgb8``, as the video's colours are
+    tagged, in the orientation in which they are coded; stamps are the presentation times, the
+    first one's usually 0.
+
+    Args:
+        path: The video.
+        fast_colour: Of videos with halved chroma give it to frames as it is, several times as
+            fast as interpolating it as `mp4ds.unpack` does. Messages are not changed by it.
+
+    Raises:
+        VideoError: It cannot be read, or has not one video track.
+    """
+
+    def __init__(self, path: Path, *, fast_colour: bool = False) -> None:
+        super().__init__()
+        self.path = path
+        self._fast_colour = fast_colour
+        self._reader: FrameReader | None = None
+        with VideoFile(path) as file:
+            self._codec, self._size, self._times = file.codec, file.size, file.times
+
+    @property
+    def topic(self) -> str:
+        """The file's name without ending."""
+        return self.path.stem
+
+    @property
+    def video_path(self) -> Path:
+        """The video."""
+        return self.path
+
+    @property
+    def stamps(self) -> NDArray[np.int64]:
+        """Presentation times, nanoseconds, shape (frames,)."""
+        return self._times
+
+    @property
+    def log_times(self) -> NDArray[np.int64]:
+        """Presentation times, nanoseconds, shape (frames,)."""
+        return self._times
+
+    @property
+    def encoding(self) -> str:
+        """``rgb8``."""
+        return "rgb8"
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the frames, pixels."""
+        return self._size
+
+    def intrinsics_at(self, index: int) -> Calibration | None:
+        """None: a video has no calibration.
+
+        Args:
+            index: 0 <= index < frames.
+        """
+        return None
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def pictures_of(self, indices: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+        """See `DecodedFrames.pictures_of`."""
+        if self._reader is None:
+            self._reader = self._open_reader()
+        return self._reader.pictures_of(indices)
+
+    def _pictures_apart(self, runs: Iterable[Sequence[int]]) -> Iterator[tuple[int, Picture]]:
+        with self._open_reader() as reader:
+            for run in runs:
+                yield from reader.pictures_of(run)
+
+    def _open_reader(self) -> FrameReader:
+        return open_file_frames(
+            self.path,
+            codec=self._codec,
+            size=self._size,
+            frames=len(self),
+            fast_colour=self._fast_colour,
+        )
+
+    def _pictures(self) -> Iterator[Picture]:
+        with VideoFile(self.path, fast_colour=self._fast_colour) as file:
+            yield from map(file.picture, range(len(self)))
+
+    def _write_pixels(self, picture: Picture, out: Pixels) -> None:
+        np.copyto(out, picture[0])
+
+    def _frame_id(self, index: int) -> str:
+        return ""
+
+    def close(self) -> None:
+        """Close the video, if it is open."""
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None

@@ -1,0 +1,192 @@
+"""messages.mcap of a dataset, and messages of a recording to be looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.bags.mcap import McapReader
+from mp4ds.errors import FormatError, SourceError
+from mp4ds.files.outputs import digest_file
+from mp4ds.format.fields import MESSAGES_NAME
+from mp4ds.format.manifest import Manifest
+from mp4ds.messages.wire import WireError
+from mp4ds.records import Channel, Excerpt, Message, MetadataRecord, Record, Schema
+
+
+class MessagesFile:
+    """messages.mcap of a dataset; of one video with its sidecar, which has none, empty.
+
+    Args:
+        path: The file; None where there is none.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self.path = path
+
+    def verify(self, manifest: Manifest) -> None:
+        """Compare it with its SHA-256: not all that it holds has a checksum of its own.
+
+        Raises:
+            FormatError: ``file-missing`` or ``hash-mismatch``.
+        """
+        if self.path is None:
+            return
+        self._check_there(self.path)
+        entry = next((item for item in manifest.files if item.name == MESSAGES_NAME), None)
+        if entry is None or digest_file(self.path)[1] != entry.sha256:
+            raise FormatError(
+                "hash-mismatch", self.path, "does not have the SHA-256 that the manifest says"
+            )
+
+    @staticmethod
+    def _check_there(path: Path) -> None:
+        if not path.is_file():
+            raise FormatError("file-missing", path, "does not exist")
+
+    @cached_property
+    def _reader(self) -> McapReader | None:
+        """Reads it; holds no file open between its passes.
+
+        Raises:
+            FormatError: ``file-missing``; ``messages-unreadable`` where it does not list them all.
+            SourceError: It is damaged, or no MCAP file.
+        """
+        if self.path is None:
+            return None
+        self._check_there(self.path)
+        reader = McapReader(self.path)
+        if not reader.has_whole_index:
+            raise FormatError(
+                "messages-unreadable",
+                self.path,
+                "has no index of all that it holds; copy it again, or see `mcap recover`",
+            )
+        return reader
+
+    @property
+    def channels(self) -> Sequence[Channel]:
+        """Its channels."""
+        return self._reader.channels if self._reader else ()
+
+    @property
+    def unused_schemas(self) -> Sequence[Schema]:
+        """Definitions that no channel refers to."""
+        return self._reader.unused_schemas if self._reader else ()
+
+    @cached_property
+    def counts(self) -> Mapping[int, int]:
+        """Messages by channel id, as its index tells."""
+        stats = self._reader.stats() if self._reader else {}
+        return {key: item.count for key, item in stats.items()}
+
+    def times(self) -> Mapping[int, NDArray[np.int64]]:
+        """Sorted log times, nanoseconds, by channel id."""
+        return self._reader.times() if self._reader else {}
+
+    def in_file_order(self) -> Iterator[Record]:
+        """All that is in it, as it stands there."""
+        return self._reader.as_it_stands() if self._reader else iter(())
+
+    def in_time(self, excerpt: Excerpt) -> Iterator[Message]:
+        """The messages of an excerpt, by log time."""
+        records = self._reader.records(replace(excerpt, others=False)) if self._reader else ()
+        return (record for record in records if isinstance(record, Message))
+
+
+def recorded_storage(records: Iterable[Record]) -> str:
+    """The storage that a rosbag2 source had; mcap, the default of ROS 2, where none is told.
+
+    Args:
+        records: All that is in messages.mcap; the folder's own record stands before its messages.
+    """
+    for record in records:
+        if isinstance(record, Message):
+            break
+        if isinstance(record, MetadataRecord) and record.name == "mp4ds:rosbag2":
+            return "sqlite3" if record.metadata.get("storage") == "sqlite3" else "mcap"
+    return "mcap"
+
+
+@dataclass(frozen=True)
+class RecordedMessage:
+    """One message as recorded.
+
+    Attributes:
+        topic: Its topic.
+        type_name: Its type as the recording spells it; empty where that is not known.
+        log_time_ns: When it was recorded, nanoseconds.
+        publish_time_ns: When it was published, nanoseconds; the log time where not known.
+        raw: Its bytes, which cannot be written to.
+        decode: What `decoded` calls.
+    """
+
+    topic: str
+    type_name: str
+    log_time_ns: int
+    publish_time_ns: int
+    raw: memoryview
+    decode: Callable[[memoryview], Any] = field(repr=False, compare=False)
+
+    @cached_property
+    def decoded(self) -> Any:
+        """The message as an object, decoded when first asked for.
+
+        ROS 1 and ROS 2 give an object whose attributes are the message's fields, arrays of
+        numbers as numpy's; protobuf a message of its own; JSON dicts and lists.
+
+        Raises:
+            OptionError: No message of the topic can be decoded.
+            SourceError: This one is not of the type that its topic tells.
+        """
+        return self.decode(self.raw)
+
+
+def as_recorded(messages: Iterable[Message], path: Path) -> Iterator[RecordedMessage]:
+    """Messages to be looked at.
+
+    Args:
+        messages: Of any channels.
+        path: Where they are from, for errors.
+    """
+    topics: dict[int, _Topic] = {}
+    for message in messages:
+        channel = message.channel
+        topic = topics.setdefault(channel.id, _Topic(channel, path))
+        yield RecordedMessage(
+            topic=channel.topic,
+            type_name=channel.type_name,
+            log_time_ns=message.log_time,
+            publish_time_ns=message.publish_time,
+            raw=memoryview(message.data).toreadonly(),
+            decode=topic.decode,
+        )
+
+
+class _Topic:
+    """Decodes the messages of a channel; the first one makes the decoder."""
+
+    def __init__(self, channel: Channel, path: Path) -> None:
+        self._channel = channel
+        self._path = path
+
+    @cached_property
+    def _decoder(self) -> Callable[[memoryview], Any]:
+        # rosbags takes long to import, and not everybody decodes messages
+        from mp4ds.bags.decoding import decoder_of
+
+        return decoder_of(self._channel)
+
+    def decode(self, raw: memoryview) -> Any:
+        try:
+            return self._decoder(raw)
+        except WireError as error:
+            raise SourceError(
+                self._path, f"a message of {self._channel.topic} cannot be decoded: {error}"
+            ) from None

@@ -1,0 +1,557 @@
+"""One stream of a dataset, opened: its frames by number, and its messages again."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xxhash
+from numpy.typing import NDArray
+
+from mp4ds.dataset.frames import DecodedFrames
+from mp4ds.dataset.rebuild import (
+    CameraInfoRebuilder,
+    Choice,
+    DecodedColumns,
+    camera_info_columns,
+    check_slots,
+    decode_columns,
+    everything,
+    form_for,
+    message_at,
+    template_of,
+    unbroken,
+)
+from mp4ds.errors import FormatError
+from mp4ds.files.outputs import digest_file
+from mp4ds.format.fields import decode_base64
+from mp4ds.format.models import Calibration, StreamSidecar
+from mp4ds.format.sidecars import load_stream
+from mp4ds.messages import depth, png
+from mp4ds.messages.arrangements import Picture
+from mp4ds.messages.coded import Refused
+from mp4ds.messages.encodings import ENCODINGS, Pixels, pixel_view, put_padding
+from mp4ds.messages.png import zlib_build, zlib_fingerprint
+from mp4ds.messages.wire import CodedFields, Fields, ImageFields, Template
+from mp4ds.records import Channel, Message
+from mp4ds.video.coded_messages import body_of
+from mp4ds.video.decoder import VideoDecoder
+from mp4ds.video.images import ImageFile
+from mp4ds.video.packets import PacketReader
+from mp4ds.video.reader import FrameReader, open_frames
+
+
+class MessageRebuilder:
+    """Makes the camera messages of a stream.
+
+    Args:
+        sidecar: The stream's.
+        columns: The stream's.
+        place: Name of the sidecar, for errors.
+        jpeg_quality: Of the JPEG files that transcoded messages get, 1 to 100.
+
+    Raises:
+        FormatError: The sidecar contradicts itself.
+    """
+
+    def __init__(
+        self, sidecar: StreamSidecar, columns: DecodedColumns, place: str, *, jpeg_quality: int = 95
+    ) -> None:
+        self._sidecar = sidecar
+        self._place = place
+        self._encoding = ENCODINGS[sidecar.image.encoding]
+        self._layout = sidecar.layout
+        self.columns = columns
+        self._digests = self._decode_digests()
+        self._templates = self._make_templates()
+        self._recipes = [
+            png.PngRecipe(**header.png.model_dump(exclude={"deflate"})) if header.png else None
+            for header in sidecar.headers
+        ]
+        image = sidecar.image
+        self._row_bytes = image.width * self._encoding.pixel_bytes
+        rows = self._encoding.shape(image.width, image.height)[0]
+        self._padding_size = rows * (image.step - self._row_bytes)
+        self._paddings: dict[int, bytes | None] = {}
+        for variant in range(len(sidecar.headers)):  # so that a wrong one is told at once
+            self._padding(variant)
+        self._jpeg = (
+            ImageFile(self._encoding.name, "jpeg", quality=jpeg_quality)
+            if sidecar.body == "jpeg"
+            else None
+        )
+        check_slots(self.columns, self._templates, place)
+
+    @property
+    def picture_format(self) -> str:
+        """Pixel format of the pictures that `pixels` takes."""
+        return self._layout.pixel_format
+
+    @property
+    def picture_size(self) -> tuple[int, int]:
+        """Width and height of the pictures that `pixels` takes."""
+        return self._layout.picture_size(self._sidecar.image.width, self._sidecar.image.height)
+
+    def pixels(self, picture: Picture) -> Pixels:
+        """A new array of the image's pixels, shape `Encoding.shape`, native byte order."""
+        image = self._sidecar.image
+        shape = self._encoding.shape(image.width, image.height)
+        out: Pixels = np.empty(shape, self._encoding.dtype)
+        self.write_pixels(picture, out)
+        return out
+
+    def write_pixels(self, picture: Picture, out: Pixels) -> None:
+        """Write the image's pixels into an array of the shape and type that `pixels` gives."""
+        self._layout.to_pixels(picture, out)
+
+    def payload(self, index: int, picture: Picture) -> bytes | bytearray:
+        """The message of a frame, verified against its digest where there is one.
+
+        Args:
+            index: Of the frame.
+            picture: Of the frame, decoded.
+
+        Raises:
+            FormatError: ``digest-mismatch``, naming topic and frame.
+        """
+        if self._sidecar.body == "pixels":
+            return self._verified(index, self._with_pixels(index, picture))
+        variant = int(self.columns.variant[index])
+        pixels, recipe = self.pixels(picture), self._recipes[variant]
+        prefix = bytes.fromhex(self._sidecar.headers[variant].prefix)
+        try:
+            if self._jpeg is not None:
+                body = self._jpeg.encode(pixels)
+            elif recipe is not None:
+                body = prefix + png.rebuild(pixels, recipe)
+            else:
+                body = prefix + depth.encode_rvl(pixels)
+        except Refused as error:
+            raise self._failure("header-mismatch", index, f"cannot be made: {error}") from None
+        if self._digests is None:  # its length may be another than the recorded one's
+            body += bytes(self._templates[variant].padding(len(body)))
+        return self._verified(index, self._around(index, body))
+
+    def packet_payload(self, index: int, packet: bytes) -> bytes | bytearray:
+        """The message of a packet, verified against its digest.
+
+        Args:
+            index: Of the frame.
+            packet: As the video has it.
+
+        Raises:
+            FormatError: ``digest-mismatch`` or ``decode-failed``, naming topic and frame.
+        """
+        framing = self._sidecar.headers[int(self.columns.variant[index])].framing
+        try:
+            body = body_of(self._sidecar.video.codec, packet, framing)
+        except Refused as error:
+            raise self._failure("decode-failed", index, f"cannot be made: {error}") from None
+        return self._verified(index, self._around(index, body))
+
+    def _with_pixels(self, index: int, picture: Picture) -> bytes | bytearray:
+        image = self._sidecar.image
+        template = self._templates[int(self.columns.variant[index])]
+        padding = self._padding(int(self.columns.variant[index]))
+        size = self._encoding.size(image.step, image.height)
+        if padding is not None:
+            size += len(padding) - self._padding_size
+        head, tail = template.around(self.columns.slots(index), size)
+        payload = bytearray(len(head) + size + len(tail))
+        payload[: len(head)] = head
+        out = pixel_view(
+            memoryview(payload)[len(head) :],
+            self._encoding,
+            width=image.width,
+            height=image.height,
+            step=image.step,
+            is_bigendian=bool(image.is_bigendian),
+        )
+        self._layout.to_pixels(picture, out)
+        if padding is not None:
+            body = memoryview(payload)[len(head) : len(head) + size]
+            put_padding(body, padding, row_bytes=self._row_bytes, step=image.step)
+        if tail:
+            payload[len(payload) - len(tail) :] = tail
+        return payload
+
+    def _around(self, index: int, body: bytes | bytearray) -> bytes:
+        template = self._templates[int(self.columns.variant[index])]
+        head, tail = template.around(self.columns.slots(index), len(body))
+        return b"".join((head, body, tail))
+
+    def _verified(self, index: int, payload: bytes | bytearray) -> bytes | bytearray:
+        if self._digests is None or xxhash.xxh64_intdigest(payload) == self._digests[index]:
+            return payload
+        header = self._sidecar.headers[int(self.columns.variant[index])]
+        remark = ""
+        if header.png and header.png.deflate != zlib_fingerprint():
+            remark = (
+                f": its PNG file is made again by zlib, and this Python has {zlib_build()}, which "
+                "makes other bytes. Use a Python that is linked with zlib itself, or unpack with "
+                "`images` raw"
+            )
+        raise self._failure(
+            "digest-mismatch", index, f"does not come back as it was recorded{remark}"
+        )
+
+    def _failure(self, code: str, index: int, problem: str) -> FormatError:
+        topic = self._sidecar.channel.topic
+        return FormatError(code, self._place, f"message {index} of topic {topic} {problem}")
+
+    def _decode_digests(self) -> list[int] | None:
+        if self._sidecar.digests is None:
+            return None
+        try:
+            return self._sidecar.digests.decode(self._sidecar.frames).tolist()  # type: ignore[no-any-return]
+        except ValueError as error:
+            raise FormatError("column-invalid", f"{self._place} at digests", str(error)) from None
+
+    def _padding(self, variant: int) -> bytes | None:
+        """What follows the rows of pixels in messages of a header; None: zeros.
+
+        Raises:
+            FormatError: ``header-mismatch``: there are not as many bytes as the rows leave.
+        """
+        if variant not in self._paddings:
+            text = self._sidecar.headers[variant].padding
+            place = f"{self._place} at headers.{variant}.padding"
+            try:
+                padding = None if text is None else _inflated(text, self._padding_size)
+            except ValueError as error:
+                raise FormatError("header-mismatch", place, str(error)) from None
+            per_row = self._sidecar.image.step - self._row_bytes
+            dues = (self._padding_size, self._padding_size - per_row)
+            if padding is not None and (not per_row or len(padding) not in dues):
+                raise FormatError(
+                    "header-mismatch", place, f"has not the {dues[0]} bytes that rows leave"
+                )
+            self._paddings = {variant: padding}  # one of them: they may be large
+        return self._paddings[variant]
+
+    def _make_templates(self) -> list[Template]:
+        sidecar, image = self._sidecar, self._sidecar.image
+        form = form_for(sidecar.channel.to_record(0), sidecar.wire, self._place)
+        raw = ImageFields(
+            encoding=image.encoding,
+            width=image.width,
+            height=image.height,
+            step=image.step,
+            is_bigendian=image.is_bigendian,
+        )
+        templates = []
+        for number, header in enumerate(sidecar.headers):
+            fields: Fields = raw if sidecar.body == "pixels" else CodedFields(header.format or "")
+            place = f"{self._place} at headers.{number}.template"
+            templates.append(template_of(form, header.template, header.frame_id, fields, place))
+        return templates
+
+
+def _inflated(text: str, most: int) -> bytes:
+    """The bytes of base64 of a zlib stream, at most so many and one more.
+
+    Raises:
+        ValueError: It is none.
+    """
+    inflater = zlib.decompressobj()
+    try:
+        data = inflater.decompress(decode_base64(text), most + 1)
+    except zlib.error as error:
+        raise ValueError(f"cannot be inflated: {error}") from None
+    if len(data) <= most and (not inflater.eof or inflater.unused_data):
+        raise ValueError("is not one whole stream of zlib")
+    return data
+
+
+# ---------------------------------------------------------------- the reader
+
+
+class Stream(DecodedFrames):
+    """One camera topic (of one geometry), as a sequence of frames. See `Frames`.
+
+    Args:
+        path: The sidecar; the video is beside it.
+        sidecar: What it holds, if it was read already.
+        jpeg_quality: Of the JPEG files that messages of a transcoded stream get, 1 to 100.
+        fast_colour: Of videos with halved chroma give it to frames as it is, several times as
+            fast as interpolating it as `mp4ds.unpack` does. Messages are not changed by it.
+
+    Raises:
+        FormatError: The sidecar or its video breaks a rule of the format.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        sidecar: StreamSidecar | None = None,
+        jpeg_quality: int = 95,
+        fast_colour: bool = False,
+    ) -> None:
+        super().__init__()
+        self.path = path
+        self._jpeg_quality = jpeg_quality
+        self._fast_colour = fast_colour
+        self.sidecar = sidecar or load_stream(path)
+        self._reader: FrameReader | None = None
+
+    @property
+    def topic(self) -> str:
+        """Topic of the images."""
+        return self.sidecar.channel.topic
+
+    @cached_property
+    def video_path(self) -> Path:
+        """The stream's video."""
+        return self.path.parent / self.sidecar.video.file
+
+    @cached_property
+    def columns(self) -> DecodedColumns:
+        """One value a frame: its times, and what fills its message; checked when first used."""
+        try:
+            size = self.video_path.stat().st_size
+        except OSError as error:
+            raise FormatError(
+                "file-missing", self.video_path, f"cannot be read: {error.strerror}"
+            ) from None
+        if self.sidecar.frames > size:  # a coded frame takes a byte at least
+            raise FormatError(
+                "frame-count", self.path, f"claims {self.sidecar.frames} frames in {size} bytes"
+            )
+        count, variants = self.sidecar.frames, len(self.sidecar.headers)
+        return decode_columns(self.sidecar.columns, count, variants, str(self.path))
+
+    @cached_property
+    def rebuilder(self) -> MessageRebuilder:
+        """Makes the stream's messages."""
+        return MessageRebuilder(
+            self.sidecar, self.columns, str(self.path), jpeg_quality=self._jpeg_quality
+        )
+
+    @property
+    def stamps(self) -> NDArray[np.int64]:
+        """Header stamps, nanoseconds, shape (frames,)."""
+        return self.columns.stamp
+
+    @property
+    def log_times(self) -> NDArray[np.int64]:
+        """Log times, nanoseconds, shape (frames,)."""
+        return self.columns.log_time
+
+    @property
+    def encoding(self) -> str:
+        """ROS image encoding of the frames as recorded."""
+        return self.sidecar.image.encoding
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the images, pixels."""
+        return self.sidecar.image.width, self.sidecar.image.height
+
+    @property
+    def calibrations(self) -> Sequence[Calibration]:
+        """All calibrations, in the order in which they were first seen."""
+        return self.sidecar.camera_info.calibrations if self.sidecar.camera_info else []
+
+    @cached_property
+    def camera_info_columns(self) -> DecodedColumns | None:
+        """The columns of the CameraInfo messages, if there are any."""
+        info = self.sidecar.camera_info
+        return camera_info_columns(info, str(self.path)) if info and info.messages else None
+
+    @cached_property
+    def info_rebuilder(self) -> CameraInfoRebuilder | None:
+        """Makes the CameraInfo messages, if there are any."""
+        info, columns = self.sidecar.camera_info, self.camera_info_columns
+        if info is None or columns is None:
+            return None
+        return CameraInfoRebuilder(info, columns, str(self.path))
+
+    def intrinsics_at(self, index: int) -> Calibration | None:
+        """The calibration that held when a frame was recorded: the last before it, else the first.
+
+        Args:
+            index: 0 <= index < frames.
+        """
+        if not self.calibrations:
+            return None
+        columns = self.camera_info_columns
+        if columns is None:
+            return self.calibrations[0]
+        place = np.searchsorted(columns.log_time, self.log_times[index], side="right")
+        return self.calibrations[int(columns.variant[max(int(place) - 1, 0)])]
+
+    def open_video(self, *, sequential: bool, fast_colour: bool = False) -> VideoDecoder:
+        """A decoder of its own for the stream's pictures.
+
+        Args:
+            sequential: Decode with all cores, for reading in order.
+            fast_colour: As of the stream; never for what messages are made of.
+
+        Raises:
+            VideoError: The video cannot be read, or is not what the sidecar says.
+        """
+        return VideoDecoder(
+            self.video_path, **self._promises, sequential=sequential, fast_colour=fast_colour
+        )
+
+    @property
+    def _promises(self) -> dict[str, Any]:
+        """What the sidecar says of the video, as those that decode it ask for it."""
+        video = self.sidecar.video
+        return {
+            "codec": video.codec,
+            "coded_size": (video.width, video.height),
+            "frames": self.sidecar.frames,
+            "picture_format": self.rebuilder.picture_format,
+            "picture_size": self.rebuilder.picture_size,
+            "matrix": video.matrix,
+            "full_range": video.full_range,
+        }
+
+    def __len__(self) -> int:
+        return self.sidecar.frames
+
+    def pictures_of(self, indices: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+        """See `DecodedFrames.pictures_of`."""
+        if not len(indices):
+            return iter(())
+        if self._reader is None:
+            self._reader = self._open_reader()
+        return self._reader.pictures_of(indices)
+
+    def _pictures_apart(self, runs: Iterable[Sequence[int]]) -> Iterator[tuple[int, Picture]]:
+        with self._open_reader() as reader:
+            for run in runs:
+                yield from reader.pictures_of(run)
+
+    def _open_reader(self) -> FrameReader:
+        return open_frames(
+            self.video_path,
+            **self._promises,
+            fast_colour=self._fast_colour,
+            references=self.sidecar.video.references,
+        )
+
+    def _pictures(self) -> Iterator[Picture]:
+        with self.open_video(sequential=True, fast_colour=self._fast_colour) as decoder:
+            yield from decoder.pictures()
+
+    def _write_pixels(self, picture: Picture, out: Pixels) -> None:
+        self.rebuilder.write_pixels(picture, out)
+
+    def _frame_id(self, index: int) -> str:
+        return self.sidecar.headers[int(self.columns.variant[index])].frame_id
+
+    def messages(
+        self, channel: Channel, choice: Choice = everything
+    ) -> Iterator[tuple[int, Message]]:
+        """The image messages, each with its place among the channel's messages.
+
+        Args:
+            channel: The channel to make them on.
+            choice: Which are wanted; see `numbered_makers`. The video is compared with its
+                SHA-256 only where all are.
+
+        Raises:
+            FormatError: A frame does not decode, or a message does not match its digest.
+        """
+        columns = self.columns
+        if self.sidecar.digests is None and choice is everything:
+            self.verify_video()
+        for index, make in self.numbered_makers(choice):
+            yield int(columns.ordinal[index]), message_at(columns, index, channel, make())
+
+    def payloads(self, choice: Choice = everything) -> Iterator[bytes | bytearray]:
+        """The payloads of messages, in order; see `messages`."""
+        return (make() for make in self.makers(choice))
+
+    def makers(self, choice: Choice = everything) -> Iterator[Callable[[], bytes | bytearray]]:
+        """As `numbered_makers`, without the numbers."""
+        return (make for _, make in self.numbered_makers(choice))
+
+    def numbered_makers(
+        self, choice: Choice = everything
+    ) -> Iterator[tuple[int, Callable[[], bytes | bytearray]]]:
+        """For each message its number, and what makes its payload before the next one is taken.
+
+        Args:
+            choice: Which are wanted. Packets of a video that refer to others are of no use
+                without them: those between two that are wanted come, too.
+
+        Raises:
+            FormatError: A frame cannot be read; the makers raise what else is wrong with one.
+        """
+        rebuilder = self.rebuilder
+        if self.sidecar.body == "packet":
+            video = self.sidecar.video
+            with PacketReader(
+                self.video_path,
+                codec=video.codec,
+                frames=self.sidecar.frames,
+                coded_size=(video.width, video.height),
+            ) as reader:
+                for index in unbroken(choice(self.columns), reader.key_numbers):
+                    yield index, partial(rebuilder.packet_payload, index, reader.packet(index))
+            return
+        with self.open_video(sequential=True) as decoder:
+            for index, picture in self.pictures_in_order(decoder, choice):
+                yield index, partial(rebuilder.payload, index, picture)
+
+    def pictures_in_order(
+        self, decoder: VideoDecoder, choice: Choice = everything
+    ) -> Iterator[tuple[int, Picture]]:
+        """Pictures that are wanted, each with its number.
+
+        Args:
+            decoder: Of `open_video`.
+            choice: Which are wanted. Where all are, the video must not go on after them.
+
+        Yields:
+            Views that hold until the next one is asked for.
+
+        Raises:
+            VideoError: See `VideoDecoder.pictures`.
+        """
+        if choice is everything:
+            yield from enumerate(decoder.pictures())
+        else:
+            yield from decoder.pictures_at(choice(self.columns))
+
+    def verify_video(self) -> None:
+        """Compare the video with its SHA-256, for where no digest of a message tells damage.
+
+        Raises:
+            FormatError: ``file-missing`` or ``hash-mismatch``.
+        """
+        video = self.sidecar.video
+        if not self.video_path.is_file():
+            raise FormatError("file-missing", self.video_path, "does not exist")
+        if video.sha256 is not None and digest_file(self.video_path)[1] != video.sha256:
+            raise FormatError(
+                "hash-mismatch",
+                self.video_path,
+                "does not have the SHA-256 that its sidecar says",
+            )
+
+    def camera_info_messages(
+        self, channel: Channel, choice: Choice = everything
+    ) -> Iterator[tuple[int, Message]]:
+        """The CameraInfo messages, each with its place among the channel's messages.
+
+        Args:
+            channel: The channel to make them on.
+            choice: Which are wanted.
+        """
+        rebuilder = self.info_rebuilder
+        return rebuilder.messages(channel, choice(rebuilder.columns)) if rebuilder else iter(())
+
+    def close(self) -> None:
+        """Close the video, if it is open."""
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None

@@ -1,0 +1,278 @@
+"""How frames are to be given: their format, which part of them, its size, and its calibration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from operator import index as as_integer
+
+import numpy as np
+
+from mp4ds.dataset.rebuild import fields_of
+from mp4ds.errors import OptionError
+from mp4ds.format.models import Calibration, Roi
+from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Encoding, Pixels
+from mp4ds.messages.wire import CalibrationFields
+from mp4ds.video.images import Renderer, encoding_as, shown_format
+
+Matrix = list[list[float]]
+
+
+def effective(calibration: CalibrationFields) -> tuple[Matrix, Matrix]:
+    """K and P for the images as they are, rather than for the full resolution.
+
+    The principal point moves by the offset of the region of interest, then all that is in pixels
+    is divided by the binning, as REP 104 has it and image_geometry's PinholeCameraModel does.
+
+    Args:
+        calibration: K and P of the full resolution, with ROI and binning.
+
+    Returns:
+        K, 3 x 3, and P, 3 x 4.
+    """
+    x_offset, y_offset, _, _ = calibration.roi
+    scales = [1.0 / max(1, binning) for binning in (calibration.binning_x, calibration.binning_y)]
+    matrices = []
+    for values in (calibration.k, calibration.p):
+        matrix = np.array(values).reshape(3, -1)
+        matrix[0, 2] -= x_offset
+        matrix[1, 2] -= y_offset
+        matrix[:2] *= np.array(scales)[:, None]
+        matrices.append(matrix.tolist())
+    return matrices[0], matrices[1]
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Where a picture was cut out of an image, and its size after that.
+
+    Attributes:
+        crop: x, y, width and height in pixels of the image.
+        size: Width and height of the picture.
+    """
+
+    crop: tuple[int, int, int, int]
+    size: tuple[int, int]
+
+    def calibration(self, image: Calibration) -> Calibration:
+        """The calibration of the picture; without binning, and without a region of interest.
+
+        The middle of a pixel has whole coordinates, so that a picture scaled by s has its
+        principal point at ``(cx + 0.5) * s - 0.5``.
+
+        Args:
+            image: The calibration of the image, as recorded.
+        """
+        x, y, width, height = self.crop
+        k, p = (np.array(matrix) for matrix in effective(fields_of(image)))
+        for row, offset, scale in (
+            (0, x, self.size[0] / width),
+            (1, y, self.size[1] / height),
+        ):
+            for matrix in (k, p):
+                # by the third row, which is 0 in the matrices of a camera that is not calibrated
+                matrix[row] = scale * (matrix[row] - offset * matrix[2])
+                matrix[row] += (0.5 * scale - 0.5) * matrix[2]
+        rectify = image.roi.do_rectify if image.roi else 0
+        return image.model_copy(
+            update={
+                "width": self.size[0],
+                "height": self.size[1],
+                "k": k.ravel().tolist(),
+                "p": p.ravel().tolist(),
+                "binning_x": 0,
+                "binning_y": 0,
+                "roi": _whole(rectify) if rectify else None,
+                "template": None,  # the recorded message is another
+            }
+        )
+
+
+def _whole(do_rectify: int) -> Roi:
+    return Roi(x_offset=0, y_offset=0, height=0, width=0, do_rectify=do_rectify)
+
+
+# ---------------------------------------------------------------- views
+
+Resize = float | tuple[int, int] | None
+"""A factor, or width and height in pixels."""
+
+Crop = tuple[int, int, int, int] | None
+"""x, y, width and height in pixels of the image, cut out before anything else."""
+
+FORMATS = ("native", "rgb", "bgr", "gray")
+"""As recorded; (H, W, 3); (H, W, 3); (H, W)."""
+
+_Part = tuple[int, int, int, int]
+_Size = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One way of giving the frames of a stream; not to be shared between threads.
+
+    Attributes:
+        encoding: ROS image encoding of what is given.
+        shape: Of one frame.
+        dtype: Of its pixels.
+        is_plain: Whether the pixels are given as they were recorded.
+    """
+
+    encoding: Encoding
+    shape: tuple[int, ...]
+    dtype: np.dtype[np.generic]
+    is_plain: bool
+    _placement: Placement | None = None
+    _renderer: Renderer | None = None
+
+    def give(self, pixels: Pixels, out: Pixels) -> None:
+        """Write what the pixels of an image become.
+
+        Args:
+            pixels: As recorded, native byte order.
+            out: Of the view's shape and type.
+        """
+        if self._renderer is not None:
+            self._renderer.render(pixels, out)
+        elif self._placement is not None:
+            np.copyto(out, _nearest(pixels, self._placement))
+        else:
+            np.copyto(out, pixels)
+
+    def calibration(self, image: Calibration | None) -> Calibration | None:
+        """The calibration of what is given, from that of the image."""
+        if image is None or self._placement is None:
+            return image
+        return self._placement.calibration(image)
+
+
+def view_of(
+    topic: str,
+    encoding: Encoding,
+    image_size: _Size,
+    *,
+    format: str,  # noqa: A002 - as users write it
+    resize: Resize,
+    crop: Crop,
+) -> View:
+    """The view that was asked for.
+
+    Args:
+        topic: For errors.
+        encoding: Of the images.
+        image_size: Their width and height.
+        format: One of `FORMATS`.
+        resize: A factor, or width and height.
+        crop: x, y, width, height.
+
+    Raises:
+        OptionError: There is no such format, part or size, or not of these images.
+    """
+    if format not in FORMATS:
+        raise OptionError(f"there is no format {format!r} of frames: use {', '.join(FORMATS)}")
+    width, height = image_size
+    part = _part(topic, image_size, crop) if crop is not None else (0, 0, width, height)
+    cut = part[2:]
+    size = size_after(topic, cut, resize) if resize is not None else cut
+    is_whole = cut == size == (width, height)
+    given = encoding
+    if format != "native" or not is_whole:
+        given = _given(topic, encoding, format, part, is_resized=size != cut)
+    shape, dtype = given.shape(*size), np.dtype(given.dtype)
+    if is_whole and given is encoding:
+        return View(given, shape, dtype, is_plain=True)
+    placement = None if is_whole else Placement(part, size)
+    is_rendered = format != "native" or (size != cut and _is_interpolated(encoding))
+    renderer = (
+        Renderer(encoding, given.name, crop=part if crop is not None else None, size=size)
+        if is_rendered
+        else None
+    )
+    return View(given, shape, dtype, False, placement, renderer)
+
+
+def _part(topic: str, image_size: _Size, crop: Sequence[int]) -> _Part:
+    width, height = image_size
+    try:
+        x, y, columns, rows = (as_integer(value) for value in crop)
+    except (TypeError, ValueError):
+        raise OptionError(f"a crop is (x, y, width, height) in pixels, not {crop!r}") from None
+    if min(x, y) < 0 or min(columns, rows) < 1 or x + columns > width or y + rows > height:
+        raise OptionError(f"a crop of {tuple(crop)} is not within the {width}x{height} of {topic}")
+    return x, y, columns, rows
+
+
+def size_after(topic: str, cut: _Size, resize: float | Sequence[int]) -> _Size:
+    """Width and height of frames that are resized.
+
+    Args:
+        topic: For errors.
+        cut: Their width and height before.
+        resize: A factor, or width and height.
+
+    Raises:
+        OptionError: There is no such size.
+    """
+    problem = f"frames of {topic} cannot be resized to {resize!r}"
+    advice = "use a factor such as 0.5, or (width, height) in pixels"
+    if isinstance(resize, bool):
+        raise OptionError(f"{problem}: {advice}")
+    try:
+        if isinstance(resize, Sequence):
+            width, height = (as_integer(side) for side in resize)
+        else:
+            factor = float(resize)
+            if not (math.isfinite(factor) and 0 < factor <= MAX_SIDE):
+                raise OptionError(f"{problem}: {advice}")
+            width, height = (max(1, round(side * factor)) for side in cut)
+    except (TypeError, ValueError):
+        raise OptionError(f"{problem}: {advice}") from None
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise OptionError(f"{problem}: sides are 1 to {MAX_SIDE} pixels")
+    return width, height
+
+
+def _given(
+    topic: str, encoding: Encoding, colours: str, part: _Part, *, is_resized: bool
+) -> Encoding:
+    """The encoding of what is given."""
+    if colours != "native":
+        name = encoding_as(encoding, colours)
+        if name is None:
+            raise OptionError(
+                f"{topic} has {encoding.name} images, which are numbers and no light: they are "
+                f"given as format='native', not {colours!r}"
+            )
+        return ENCODINGS[name]
+    is_yuv = encoding.even != (1, 1) or encoding.rows != 1
+    if is_yuv or (encoding.mosaic and is_resized):
+        raise OptionError(
+            f"{topic} has {encoding.name} images, which can be cut and resized as rgb, bgr or "
+            "gray only: give format="
+        )
+    if not encoding.mosaic:
+        return encoding
+    x, y = part[0] % 2, part[1] % 2  # the pattern begins at another colour
+    rows = encoding.mosaic[:2], encoding.mosaic[2:]
+    mosaic = "".join(rows[(row + y) % 2][(column + x) % 2] for row in (0, 1) for column in (0, 1))
+    return ENCODINGS[f"bayer_{mosaic}{8 * encoding.bytes_per_sample}"]
+
+
+def _is_interpolated(encoding: Encoding) -> bool:
+    """Whether values between two others make sense: not of depths, labels and other numbers."""
+    return shown_format(encoding) is not None and not encoding.name[0].isdigit()
+
+
+def _nearest(pixels: Pixels, placement: Placement) -> Pixels:
+    """The part of an image, each pixel that of its nearest one."""
+    x, y, width, height = placement.crop
+    part = pixels[y : y + height, x : x + width]
+    if placement.size == (width, height):
+        return part
+    columns, rows = (
+        (2 * np.arange(made) + 1) * side // (2 * made)
+        for made, side in zip(placement.size, (width, height), strict=True)
+    )
+    found: Pixels = part[rows[:, None], columns]
+    return found

@@ -1,0 +1,1 @@
+"""Where recordings and datasets are: outputs, sources, and what is at URLs."""

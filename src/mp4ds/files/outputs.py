@@ -1,0 +1,576 @@
+"""Outputs appear under their final name only when whole, and replace only what mp4ds wrote."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import hashlib
+import json
+import os
+import re
+import shutil
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path, PurePosixPath
+from typing import IO, Any
+
+from mp4ds.errors import TargetError, TargetExistsError, WriteError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+_AT_FDCWD = -100
+_UNABLE = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EXDEV)
+
+
+def lock(file: IO[Any], *, shared: bool = False) -> bool:
+    """Lock a file for as long as it is open, or its process lives.
+
+    Args:
+        file: Open for writing, as NFS wants it.
+        shared: Others may hold it, too, if they share it.
+
+    Returns:
+        Whether it is locked; False where the system or the file system has no locks.
+
+    Raises:
+        BlockingIOError: Another holds it.
+    """
+    if fcntl is None:
+        return False
+    try:
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise
+    except OSError:
+        return False
+    return True
+
+
+def is_mine(stat: os.stat_result, folder: Path) -> bool:
+    """Whether something belongs to the user whom this process works for.
+
+    Args:
+        stat: What is told of it.
+        folder: One beside it: a server may have another name for the user.
+    """
+    if not hasattr(os, "geteuid") or stat.st_uid == os.geteuid():
+        return True
+    with suppress(OSError), tempfile.TemporaryFile(dir=folder) as file:
+        return os.fstat(file.fileno()).st_uid == stat.st_uid
+    return False
+
+
+def exchange(one: Path, other: Path) -> bool:
+    """Exchange what stands under two names, in one step.
+
+    Returns:
+        Whether that was done; False where the system or the file system cannot.
+
+    Raises:
+        OSError: It can, and failed.
+    """
+    return _renamed(one, other, linux=2, macos=2)  # RENAME_EXCHANGE, RENAME_SWAP
+
+
+def rename_to_new(old: Path, new: Path) -> bool:
+    """Rename, unless there is something under the new name.
+
+    Returns:
+        Whether that was done; False where the system or the file system cannot.
+
+    Raises:
+        FileExistsError: There is something.
+        OSError: It failed.
+    """
+    return _renamed(old, new, linux=1, macos=4)  # RENAME_NOREPLACE, RENAME_EXCL
+
+
+def _renamed(old: Path, new: Path, *, linux: int, macos: int) -> bool:
+    names = os.fsencode(old), os.fsencode(new)
+    try:
+        libc = ctypes.CDLL(None, use_errno=True)
+        if sys.platform == "darwin":
+            failed = libc.renamex_np(*names, macos)
+        else:
+            failed = libc.renameat2(_AT_FDCWD, names[0], _AT_FDCWD, names[1], linux)
+    except (AttributeError, OSError, TypeError):  # it has no such function, or no such library
+        return False
+    if not failed:
+        return True
+    code = ctypes.get_errno()
+    if code in _UNABLE:
+        return False
+    raise OSError(code, os.strerror(code), str(old), None, str(new))
+
+
+# ---------------------------------------------------------------- owned
+
+Owned = Callable[[Path], Iterable[str] | None]
+"""Tells the names of an output's files, from its folder on; None: it is none that mp4ds writes.
+
+Of an output that is a file, the one name is empty.
+"""
+
+LISTING_NAME = "mp4ds_files.json"
+"""File of a folder that lists the files in it, where nothing else does."""
+
+PAGE_SIGN = b'<meta name="generator" content="mp4ds'
+"""Within the first bytes of each page that mp4ds makes."""
+
+_PAGE_NAME = "index.html"
+_PAGE_BYTES = 1000
+_MOST_BYTES = 2**26
+_NAMED = 3
+
+
+def check_replaceable(target: Path, owned: Owned) -> None:
+    """Refuse to replace what mp4ds did not write.
+
+    Args:
+        target: What is there.
+        owned: Tells its names.
+
+    Raises:
+        TargetError: It is something else, or there is something else in it.
+    """
+    if target.is_symlink():
+        raise TargetError(
+            target,
+            "is a symbolic link, which `force` does not replace",
+            f"Name {os.path.realpath(target)} itself, or remove the link.",
+        )
+    is_folder = target.is_dir()
+    if is_folder and not any(target.iterdir()):
+        return
+    names = refuse_not_ours(target, owned(target))
+    if is_folder:
+        refuse_strangers(target, strangers(target, names))
+
+
+def refuse_not_ours(target: Path, names: Iterable[str] | None) -> set[str]:
+    """The names of an output's files.
+
+    Raises:
+        TargetError: There are none: it is not of the kind.
+    """
+    if names is None:
+        raise TargetError(
+            target,
+            "exists and is not something that mp4ds wrote, so `force` does not replace it",
+            "Choose another name, or remove it yourself.",
+        )
+    return set(names)
+
+
+def refuse_strangers(target: Path, others: Collection[str]) -> None:
+    """Refuse to replace a folder that holds something else, too.
+
+    Raises:
+        TargetError: Names some of it.
+    """
+    if not others:
+        return
+    listed = ", ".join(sorted(others)[:_NAMED]) + (", ..." if len(others) > _NAMED else "")
+    what = "1 thing" if len(others) == 1 else f"{len(others)} things"
+    raise TargetError(
+        target,
+        f"holds {what} that mp4ds did not write ({listed}), so `force` does not replace it",
+        "Move that elsewhere, or choose another name.",
+    )
+
+
+def strangers(folder: Path, names: Collection[str]) -> list[str]:
+    """What is in a folder besides files of some names, those of a report in it, and their folders.
+
+    Args:
+        folder: The folder.
+        names: From it on, with slashes.
+
+    Returns:
+        Names; that of a folder, in which nothing is known, ends with a slash.
+    """
+    known = set(names)
+    folders = {str(above) for name in known for above in PurePosixPath(name).parents}
+    found: list[str] = []
+    waiting = [(folder, "")]
+    while waiting:
+        place, prefix = waiting.pop()
+        with os.scandir(place) as entries:
+            for entry in entries:
+                name, path = prefix + entry.name, Path(entry.path)
+                if entry.is_dir(follow_symlinks=False):
+                    listed = listed_names(path) or ()
+                    known.update(f"{name}/{inner}" for inner in listed)
+                    if name in folders or listed:
+                        folders.update(
+                            f"{name}/{above}"
+                            for inner in listed
+                            for above in PurePosixPath(inner).parents
+                        )
+                        waiting.append((path, f"{name}/"))
+                    else:
+                        found.append(f"{name}/")
+                elif not entry.is_file(follow_symlinks=False) or not (
+                    name in known or (name == _PAGE_NAME and is_page(path))
+                ):
+                    found.append(name)
+    return found
+
+
+def write_listing(folder: Path) -> None:
+    """List all files of a folder in it."""
+    names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+    text = json.dumps({"files": names}, indent=1) + "\n"
+    (folder / LISTING_NAME).write_text(text, encoding="utf-8")
+
+
+def listed_names(folder: Path, listing: str = LISTING_NAME) -> set[str] | None:
+    """The names that a listing in a folder tells, with its own; None where there is none.
+
+    Args:
+        folder: The folder.
+        listing: Name of a file of JSON that has them under ``files``.
+    """
+    path = folder / listing
+    try:
+        if path.is_symlink() or path.stat().st_size > _MOST_BYTES:
+            return None
+        names = json.loads(path.read_bytes())["files"]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        return None
+    return {listing, *names}
+
+
+def begins_with(path: Path, *starts: bytes) -> bool:
+    """Whether a file is of a kind, by its first bytes; or is empty, so that nothing is lost."""
+    try:
+        if not path.is_file():
+            return False
+        with path.open("rb") as stream:
+            head = stream.read(max(map(len, starts)))
+    except OSError:
+        return False
+    return not head or head.startswith(starts)
+
+
+def is_page(path: Path) -> bool:
+    """Whether a file is a page that mp4ds made."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        return PAGE_SIGN in stream.read(_PAGE_BYTES)
+
+
+# ---------------------------------------------------------------- outputs
+
+_LOCK, _NEW, _OLD = "lock", "new", "old"  # all there is in a folder where an output is made
+_SUFFIX = ".part"
+
+
+@contextmanager
+def staged(
+    target: Path, *, force: bool, owned: Owned, sources: Sequence[Path] = ()
+) -> Iterator[Path]:
+    """Make an output under a temporary name and move it into place at the end.
+
+    Args:
+        target: The final name; its parent folder must exist.
+        force: Replace an existing target.
+        owned: Tells which files of an existing target mp4ds wrote.
+        sources: What the output is made from: neither may stand in the other.
+
+    Yields:
+        A path that does not exist yet, for the caller to make a file or folder at.
+
+    Raises:
+        TargetExistsError: The target exists and ``force`` is not set.
+        TargetError: It may not be written or replaced.
+        WriteError: The disk refused.
+    """
+    _clear_leftovers(target)
+    check_target(target, force=force, owned=owned, sources=sources)
+    try:
+        folder, held = _begun(target.parent, _prefix(target), _SUFFIX)
+    except OSError as error:
+        if error.errno in _FULL:
+            raise WriteError(target, error) from None
+        raise TargetError(
+            target, f"cannot be written there: {error.strerror}", "Choose another folder."
+        ) from None
+    try:
+        path = folder / _NEW / target.name
+        path.parent.mkdir()
+        yield path
+        sync(path)
+        old = folder / _OLD / target.name
+        move_into_place(path, target, old, force=force, owned=owned)
+    except OSError as error:
+        raise as_write_error(error, target) from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        held.close()
+
+
+@contextmanager
+def work_folder(parent: Path, prefix: str) -> Iterator[Path]:
+    """A folder of this run alone, which is removed at the end.
+
+    Those of killed runs are removed first.
+
+    Args:
+        parent: Where it is made.
+        prefix: How its name begins.
+
+    Raises:
+        OSError: The disk refused.
+    """
+    for path in _matching(parent, prefix):
+        _remove_abandoned(path)
+    folder, held = _begun(parent, prefix)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        held.close()
+
+
+def _begun(parent: Path, prefix: str, suffix: str = "") -> tuple[Path, IO[bytes]]:
+    """A new folder, and its lock, so that no other run takes it for abandoned."""
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=prefix, suffix=suffix, dir=parent))
+        try:
+            file = (folder / _LOCK).open("xb")
+            with suppress(BlockingIOError):
+                lock(file)
+                if (folder / _LOCK).exists():
+                    return folder, file
+            file.close()
+        except FileNotFoundError:
+            continue  # another run has removed it before it was locked, as it may above
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+
+
+def _matching(parent: Path, prefix: str, suffix: str = "") -> Iterator[Path]:
+    """The folders in which runs work, or did."""
+    name = re.compile(re.escape(prefix) + "[a-z0-9_]{8}" + re.escape(suffix))
+    with suppress(OSError):
+        for path in list(parent.iterdir()):
+            if name.fullmatch(path.name) and not path.is_symlink() and path.is_dir():
+                yield path
+
+
+def _remove_abandoned(folder: Path, before: Callable[[], None] = lambda: None) -> None:
+    """Remove what a killed run has left; not where another is at work, or nobody knows.
+
+    Args:
+        folder: Its folder.
+        before: Called before it is removed, if it is.
+    """
+    with suppress(OSError):
+        folder.rmdir()
+    with suppress(OSError), (folder / _LOCK).open("r+") as file:
+        if is_mine(folder.lstat(), folder.parent) and lock(file):
+            before()
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _prefix(target: Path) -> str:
+    return f".{target.name[:60]}."
+
+
+def _clear_leftovers(target: Path) -> None:
+    """Remove what killed runs for a target have left, as far as it can be told to be that."""
+
+    def give_back() -> None:
+        if os.path.lexists(old) and not os.path.lexists(target):
+            old.rename(target)
+
+    for folder in _matching(target.parent, _prefix(target), _SUFFIX):
+        old = folder / _OLD / target.name
+        with suppress(OSError):
+            parts = list(folder.iterdir())
+            inner = [path.name for part in parts if part.name != _LOCK for path in part.iterdir()]
+            # another target's long name may begin alike
+            if {part.name for part in parts} <= {_LOCK, _NEW, _OLD} and (
+                {*inner} <= {target.name} and not any(part.is_symlink() for part in parts)
+            ):
+                _remove_abandoned(folder, give_back)
+
+
+def check_target(
+    target: Path,
+    *,
+    force: bool,
+    owned: Owned,
+    sources: Sequence[Path] = (),
+) -> None:
+    """Refuse a target early, before any work is done. See `staged`."""
+    check_place(target, sources)
+    if not os.path.lexists(target):
+        return
+    if not force:
+        raise TargetExistsError(target)
+    check_replaceable(target, owned)
+
+
+def check_place(target: Path, sources: Sequence[Path]) -> None:
+    """Keep a source from being written into, or replaced together with what is around it.
+
+    Raises:
+        TargetError: It would be, or there is no folder to write in.
+    """
+    place = target.resolve()
+    for source in (path.resolve() for path in sources):
+        if place == source or source in place.parents or place in source.parents:
+            raise TargetError(
+                target, f"overlaps with the source {source}", "Choose a place beside the source."
+            )
+    if not target.parent.is_dir():
+        raise TargetError(target, f"{target.parent} is no folder", "Make the folder first.")
+
+
+def as_write_error(error: OSError, target: Path) -> OSError:
+    """The error to report for an operating system's error while writing."""
+    if isinstance(error, (WriteError, TargetError)) or error.errno is None:
+        return error
+    if error.errno in _WRITE_ERRNOS:
+        return WriteError(target, error)
+    return error
+
+
+_BLOCK = 2**20
+_SEEN_SECONDS, _LOOK_SECONDS = 90.0, 1.0  # NFS keeps names and sizes for up to a minute
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_WRITE_ERRNOS = {
+    *_FULL,
+    errno.EFBIG,
+    errno.EIO,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.ENAMETOOLONG,
+}
+
+
+def sync(path: Path) -> None:
+    """Bring an output's bytes, and the names in its folders, to the disk before its own name is."""
+    for place in [*sorted(path.rglob("*"), reverse=True), path]:
+        if place.is_dir():
+            sync_folder(place)
+        elif place.is_file():
+            with place.open("rb") as stream:
+                os.fsync(stream.fileno())
+
+
+def write_synced(path: Path, data: bytes, *, replace: bool = True) -> None:
+    """Write a small file whole or not at all, whatever happens meanwhile.
+
+    Args:
+        path: The file.
+        data: Its content.
+        replace: Replace the file if it is there.
+
+    Raises:
+        FileExistsError: It is there, and is not to be replaced.
+        OSError: The disk refused.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.{socket.gethostname()}.part")
+    try:
+        with part.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        if replace:
+            part.replace(path)
+        else:
+            path.hardlink_to(part)
+    finally:
+        part.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Bring the names in a folder to the disk, where the system can."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def is_seen(is_there: Callable[[], bool], *folders: Path) -> bool:
+    """Whether what another machine has made is there; a file system may show it after a while only.
+
+    Args:
+        is_there: Looks for it.
+        folders: In which it is.
+    """
+    end = time.monotonic() + _SEEN_SECONDS
+    while not (seen := is_there()) and time.monotonic() < end:
+        for folder in folders:
+            list(folder.iterdir())  # which asks the server for its names anew
+        time.sleep(_LOOK_SECONDS)
+    return seen
+
+
+def move_into_place(path: Path, target: Path, old: Path, *, force: bool, owned: Owned) -> None:
+    """Give an output its final name, in exchange for what stands there.
+
+    Args:
+        path: The output, whole; afterwards what it replaced, where the system can exchange names.
+        target: Its final name.
+        old: Where what it replaces is put on other systems; on the same file system.
+        force: Replace what stands there.
+        owned: Tells which files of that mp4ds wrote.
+
+    Raises:
+        TargetExistsError: Something stands there and ``force`` is not set.
+        TargetError: Meanwhile something else was put there.
+    """
+    if not os.path.lexists(target):
+        try:
+            if not rename_to_new(path, target):
+                path.rename(target)
+        except FileExistsError:
+            raise TargetExistsError(target) from None
+    elif not force:
+        raise TargetExistsError(target)  # it appeared meanwhile
+    else:
+        check_replaceable(target, owned)
+        if not exchange(path, target):
+            _replace(path, target, old)
+    sync_folder(target.parent)
+
+
+def _replace(path: Path, target: Path, old: Path) -> None:
+    old.parent.mkdir(exist_ok=True)
+    target.rename(old)
+    try:
+        path.rename(target)
+    except OSError:
+        with suppress(OSError):
+            old.rename(target)
+        raise
+
+
+def digest_file(path: Path) -> tuple[int, str]:
+    """Size in bytes and SHA-256 of a file."""
+    digest = hashlib.sha256()
+    size = 0
+    with path.open("rb") as stream:
+        while block := stream.read(_BLOCK):
+            digest.update(block)
+            size += len(block)
+    return size, digest.hexdigest()

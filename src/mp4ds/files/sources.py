@@ -1,0 +1,235 @@
+"""The files that a recording consists of; one of them may be a folder of images.
+
+Such a folder counts as one file, since a manifest cannot list a hundred thousand: what is in it,
+without the folders, in the order of the names. Its digest is that of a listing as sha256sum
+writes it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import xxhash
+
+from mp4ds.errors import SourceError
+from mp4ds.files.outputs import digest_file
+from mp4ds.files.urls import location, remote, spelled
+
+_SAMPLE = 2**16
+_SIDES = ("-wal", "-journal")
+"""What sqlite puts beside a database that is being written to: its latest changes."""
+
+
+_CONTAINERS = [
+    (re.compile(start, re.DOTALL), name)
+    for start, name in (
+        (rb"RIFF.{4}AVI ", "an AVI video"),
+        (rb"\x1a\x45\xdf\xa3", "a Matroska or WebM video"),
+        (rb".{4}ftyp(?!avi|hei|hev|mif|msf)", "an MP4 video"),
+        (rb"FLV\x01", "an FLV video"),
+        (rb"\x30\x26\xb2\x75\x8e\x66\xcf\x11", "a WMV video"),
+        (rb"\x00\x00\x01\xba", "an MPEG video"),
+    )
+]
+HOW_TO_OPEN = (
+    "`mp4ds.open` reads the frames of an .mp4 or .mov, without packing; "
+    "`ffmpeg -i VIDEO -c copy VIDEO.mp4` makes one of others."
+)
+"""What to do with a video that is given instead of a recording or dataset."""
+
+
+def video_at(path: Path) -> str:
+    """What kind of video a file is, with its article; empty if it is none or cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(16)
+    except OSError:
+        return ""
+    return next((name for begin, name in _CONTAINERS if begin.match(start)), "")
+
+
+def is_folder(path: Path) -> bool:
+    """Whether a file of a recording is a folder."""
+    return not remote(path) and path.is_dir()
+
+
+def members(folder: Path) -> list[Path]:
+    """The regular files directly in a folder, by name.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    return sorted((path for path in folder.iterdir() if path.is_file()), key=_name)
+
+
+def _name(path: Path) -> bytes:
+    return path.name.encode(errors="surrogateescape")
+
+
+def source_size(path: Path) -> int:
+    """Bytes of a file of a recording.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    if is_folder(path):
+        return sum(member.stat().st_size for member in members(path))
+    return path.stat().st_size
+
+
+def source_digest(path: Path) -> tuple[int, str]:
+    """Size in bytes and SHA-256 of a file of a recording.
+
+    Of a folder it is the SHA-256 of a line for each member: its own SHA-256, two spaces and its
+    name.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    if not is_folder(path):
+        return digest_file(path)
+    total, listing = 0, hashlib.sha256()
+    for member in members(path):
+        size, digest = digest_file(member)
+        total += size
+        listing.update(b"%b  %b\n" % (digest.encode(), _name(member)))
+    return total, listing.hexdigest()
+
+
+def source_name(path: Path, folder: Path | None) -> str:
+    """Name of a recording's file in a manifest: with its folder's, where that was given."""
+    if folder is None or path == folder:
+        return path.name
+    if path.parent == folder:
+        return f"{folder.name}/{path.name}"
+    if remote(path) or folder not in path.parents:
+        return path.name
+    return f"{folder.name}/{path.relative_to(folder).as_posix()}"
+
+
+@dataclass(frozen=True, slots=True)
+class SourceState:
+    """A file of a recording, as far as a change would show, on whatever machine.
+
+    Attributes:
+        path: Absolute, or a URL.
+        size: Bytes.
+        modified_ns: When it was written, as the file system tells; 0 at a URL.
+        sample: XXH64 of its first and last bytes and of what sqlite keeps beside it, or of the
+            names, sizes and times in a folder; at a URL, what the store says of its content, such
+            as an ETag, where it says anything.
+    """
+
+    path: str
+    size: int
+    modified_ns: int
+    sample: str
+
+    @classmethod
+    def of(cls, path: Path) -> SourceState:
+        """The state of a file now.
+
+        Raises:
+            SourceError: It cannot be read.
+        """
+        try:
+            if is_folder(path):
+                return cls._of_folder(path)
+            stat = path.stat()
+            found = remote(path)
+            if found and found.tag:
+                return cls(found.url, stat.st_size, 0, found.tag)
+            with path.open("rb") as stream:
+                digest = xxhash.xxh64(stream.read(_SAMPLE))
+                if stat.st_size > _SAMPLE:
+                    stream.seek(max(_SAMPLE, stat.st_size - _SAMPLE))
+                    digest.update(stream.read(_SAMPLE))
+            if not found:
+                sides = [path.with_name(path.name + suffix) for suffix in _SIDES]
+                _add_listing(digest, list(filter(os.path.isfile, sides)))  # also of long names
+        except OSError as error:
+            raise SourceError(path, f"cannot be read: {error.strerror}") from None
+        return cls(spelled(path), stat.st_size, stat.st_mtime_ns, digest.hexdigest())
+
+    @classmethod
+    def _of_folder(cls, folder: Path) -> SourceState:
+        digest = xxhash.xxh64()
+        size, latest = _add_listing(digest, members(folder))
+        return cls(spelled(folder), size, latest, digest.hexdigest())
+
+    def check(self) -> None:
+        """Refuse the file if it is not what it was.
+
+        Raises:
+            SourceError: It has changed, or cannot be read.
+        """
+        path = location(self.path)
+        if SourceState.of(path) != self:
+            raise SourceError(
+                path,
+                "has changed since its packing began",
+                "Start over with `restart`, or give the file back as it was.",
+            )
+
+
+def _add_listing(digest: xxhash.xxh64, files: Sequence[Path]) -> tuple[int, int]:
+    """Add names, sizes and times of files to a digest; bytes of all, and the latest time."""
+    size = latest = 0
+    for path in files:
+        stat = path.stat()
+        digest.update(f"{path.name}\0{stat.st_size}\0{stat.st_mtime_ns}\n".encode(errors="replace"))
+        size += stat.st_size
+        latest = max(latest, stat.st_mtime_ns)
+    return size, latest
+
+
+@contextmanager
+def unchanged(states: Sequence[SourceState]) -> Iterator[None]:
+    """Refuse what is read of a recording while the context lasts, if it changes meanwhile.
+
+    Args:
+        states: Of its files, as they are to be from beginning to end.
+
+    Raises:
+        SourceError: Names a file that is not what it was, or that another one took the place of.
+    """
+    for state in states:
+        state.check()
+    before = [_identities(location(state.path)) for state in states]
+
+    def check() -> None:
+        for state, identities in zip(states, before, strict=True):
+            path = location(state.path)
+            if SourceState.of(path) != state or any(map(_differ, identities, _identities(path))):
+                raise SourceError(
+                    path,
+                    "changed while it was read",
+                    "Pack it again when nothing writes to it any more.",
+                )
+
+    try:
+        yield
+    except SourceError:
+        check()  # it may look damaged because it changed
+        raise
+    check()
+
+
+def _identities(path: Path) -> list[tuple[int, int, int]]:
+    """Device, inode and time of the last change of a file, or of all in a folder."""
+    if remote(path):
+        return []
+    stats = (one.stat() for one in (members(path) if is_folder(path) else [path]))
+    return [(stat.st_dev, stat.st_ino, stat.st_ctime_ns) for stat in stats]
+
+
+def _differ(before: tuple[int, int, int], now: tuple[int, int, int]) -> bool:
+    """Whether another file took a name."""
+    # a network file system may number the same one anew, and a new link to it sets its time
+    return before[:2] != now[:2] and before[2] != now[2]

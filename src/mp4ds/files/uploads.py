@@ -1,0 +1,187 @@
+"""Outputs for URLs: made whole on this machine, then copied there.
+
+The file by which an output is recognised comes last, so that what is there without it is visibly
+not whole.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TypeVar
+
+from mp4ds.errors import Mp4dsError, RemoteError, TargetError, TargetExistsError
+from mp4ds.files.outputs import Owned, lock, refuse_not_ours, refuse_strangers
+from mp4ds.files.urls import RemotePath
+
+Made = TypeVar("Made")
+Report = Callable[[str, int, int], None]
+"""Called with the file that is being uploaded, bytes uploaded, and bytes in all."""
+
+_LOCK = "lock"
+_PROBE = ".mp4ds-upload"
+
+
+def uploaded(
+    target: RemotePath,
+    make: Callable[[Path], Made],
+    *,
+    is_folder: bool = True,
+    last: str = "",
+    force: bool,
+    owned: Owned,
+    report: Report | None = None,
+) -> Made:
+    """Make an output on this machine, and copy it to a URL.
+
+    Args:
+        target: Where it goes.
+        make: Makes it at a path of this machine, in the place of what is there.
+        is_folder: Whether it is a folder.
+        last: Of a folder, the file in it that is copied last; without it, it is not whole.
+        force: Replace what is at the URL.
+        owned: Tells which files of that mp4ds wrote.
+        report: Told of the upload.
+
+    Returns:
+        What `make` returns.
+
+    Raises:
+        TargetError: The target may not be written or replaced, or another run is at work on it.
+        RemoteError: It could not be uploaded; what was made is kept here.
+    """
+    local = local_path(target)
+    with _claimed(local.parent, target):
+        old = _replaced(target, is_folder=is_folder, force=force, owned=owned)
+        _probe(target / _PROBE if is_folder else target.with_name(f"{target.name}{_PROBE}"))
+        made = make(local)
+        kept = f"What was made is kept in {local}: copy it there with a tool of your own"
+        kept += f", {last} last, or run the command again." if last else ", or run again."
+        try:
+            _send(local, target, old, last, report)
+        except (TargetError, RemoteError) as error:
+            raise type(error)(target, str(error).rstrip("."), kept) from None
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"interrupted while uploading. {kept}") from None
+        _remove(local)
+    return made
+
+
+def local_path(target: RemotePath) -> Path:
+    """Where the output for a URL is made: the same on all machines that share ``TMPDIR``.
+
+    Raises:
+        TargetError: Nothing can be uploaded there, or no folder be made here.
+    """
+    shown = target
+    if not target.is_writable:
+        problem = "is on a web server, which takes no uploads"
+        raise TargetError(shown, problem, "Name a place in a store, such as s3://.")
+    if target.parent == target:
+        raise TargetError(shown, "is a whole bucket", "Name a folder in it.")
+    digest = hashlib.sha256(str(target).encode()).hexdigest()
+    folder = _own_folder() / f"{target.name[:60]}-{digest[:16]}"
+    folder.mkdir(exist_ok=True)
+    return folder / target.name
+
+
+def _own_folder() -> Path:
+    """The user's own folder in the system's temporary one, where nobody else can meddle."""
+    folder = Path(tempfile.gettempdir()) / f"mp4ds-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        stat = folder.lstat()
+    except OSError as error:
+        raise TargetError(
+            folder, f"cannot be made: {error.strerror}", "Name another folder by TMPDIR."
+        ) from None
+    if not folder.is_dir() or folder.is_symlink() or stat.st_uid != os.getuid():
+        raise TargetError(folder, "belongs to somebody else", "Name another folder by TMPDIR.")
+    return folder
+
+
+@contextmanager
+def _claimed(folder: Path, target: RemotePath) -> Iterator[None]:
+    """Hold the folder while working in it; it goes when it holds nothing any more."""
+    with (folder / _LOCK).open("w") as file:
+        try:
+            lock(file)
+        except BlockingIOError:
+            raise TargetError(
+                target, "another mp4ds is making it here", "Wait for it, or end it."
+            ) from None
+        try:
+            yield
+        finally:
+            if {path.name for path in folder.iterdir()} <= {_LOCK}:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _replaced(target: RemotePath, *, is_folder: bool, force: bool, owned: Owned) -> set[str]:
+    """Names of the files to replace, empty that of a file; see `outputs.check_target`."""
+    shown, now = target, RemotePath(target.url)
+    if not now.exists():
+        return set()
+    if not force:
+        raise TargetExistsError(shown)
+    old = refuse_not_ours(shown, owned(now))
+    if not is_folder:
+        return {""}
+    begin = len(target.url) + 1
+    there = {path.url[begin:] for path in now.files()}
+    refuse_strangers(shown, there - old)
+    return there
+
+
+def _probe(path: RemotePath) -> None:
+    """Learn before the work whether the place can be written to."""
+    with tempfile.NamedTemporaryFile() as file:
+        path.upload(Path(file.name))
+    path.remove()
+
+
+def _send(local: Path, target: RemotePath, old: set[str], last: str, report: Report | None) -> None:
+    for name in sorted(old - {""}, key=lambda name: name != last):
+        (target / name).remove()
+    files, done = _files(local, last), 0
+    try:
+        for name, size in files.items():
+            if report:
+                report(name or target.name, done, sum(files.values()))
+            _place(target, name).upload(local / name)
+            done += size
+    except BaseException:
+        for name in files if "" not in old else ():  # a file that is not replaced stays
+            with suppress(Mp4dsError):
+                _place(target, name).remove()
+        raise
+
+
+def _place(target: RemotePath, name: str) -> RemotePath:
+    return target / name if name else target
+
+
+def _files(local: Path, last: str) -> Mapping[str, int]:
+    """Sizes of files to upload, bytes, by their names in a folder; of a file, the name is empty."""
+    if local.is_file():
+        return {"": local.stat().st_size}
+    files = {
+        path.relative_to(local).as_posix(): path.stat().st_size
+        for path in sorted(local.rglob("*"))
+        if path.is_file()
+    }
+    if last in files:
+        files[last] = files.pop(last)
+    return files
+
+
+def _remove(local: Path) -> None:
+    if local.is_dir():
+        shutil.rmtree(local, ignore_errors=True)
+    else:
+        local.unlink(missing_ok=True)

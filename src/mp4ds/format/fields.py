@@ -1,0 +1,166 @@
+"""The base of all models of the format, the types of their fields, and columns of values."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import re
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+
+from mp4ds.messages.encodings import MAX_SIDE
+from mp4ds.times import INT64_MAX, INT64_MIN, decode_column
+
+T = TypeVar("T")
+
+FORMAT_VERSION = "1.1"
+MESSAGES_NAME = "messages.mcap"
+MAX_FRAMES = 2 * 10**7  # 92 hours at 60 Hz; bounds what a sidecar can make a reader allocate
+MAX_CAMERA_INFOS = 10**7
+MAX_VARIANTS = 256
+"""Headers or calibrations of a stream: a topic with more is not modelled any further."""
+MAX_PADDING = 4 * 2**20
+"""Characters of all paddings of a stream: its headers stand in the part of a YAML file that is
+parsed as a whole."""
+
+Int64 = Annotated[int, Field(ge=INT64_MIN, le=INT64_MAX)]
+Time = Annotated[int, Field(ge=INT64_MIN, le=2**64 - 1)]
+Uint32 = Annotated[int, Field(ge=0, le=2**32 - 1)]
+Uint64 = Annotated[int, Field(ge=0, le=2**64 - 1)]
+Side = Annotated[int, Field(ge=1, le=MAX_SIDE)]
+Count = Annotated[int, Field(ge=0, le=MAX_FRAMES)]
+Size = Annotated[int, Field(ge=0, le=INT64_MAX)]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+FileName = Annotated[
+    str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,127}$", description="A plain file name.")
+]
+Base64 = Annotated[str, Field(pattern=r"^[A-Za-z0-9+/]*={0,2}$")]
+Version = Annotated[str, Field(pattern=r"^(0|[1-9][0-9]*)\.(0|[1-9][0-9]*)$")]
+Body = Literal["pixels", "packet", "png", "rvl", "jpeg"]
+Profile = Annotated[
+    str,
+    Field(
+        pattern=r"^(lossless|visual|crf=[0-9]{1,2}"
+        r"|(vmaf|psnr|ssim)=[0-9]{1,3}(\.[0-9]{1,4})?)$"
+    ),
+]
+
+
+class Model(BaseModel):
+    """Base of all models: nothing is converted, added or changed."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+def decode_base64(text: str) -> bytes:
+    """Decode base64.
+
+    Raises:
+        ValueError: It is not base64.
+    """
+    try:
+        data = base64.b64decode(text, validate=True)
+    except binascii.Error as error:
+        raise ValueError(f"{text[:20]!r} is not base64: {error}") from None
+    if base64.b64encode(data).decode() != text:
+        raise ValueError(f"{text[:20]!r} is not base64: it does not encode what it decodes to")
+    return data
+
+
+def exceeds_padding(paddings: Iterable[str | None]) -> bool:
+    """Whether headers have more of it than one stream may."""
+    return sum(len(padding or "") for padding in paddings) > MAX_PADDING
+
+
+def parse_version(text: str) -> tuple[int, int]:
+    """Major and minor.
+
+    Raises:
+        ValueError: Not of the form MAJOR.MINOR.
+    """
+    match = re.fullmatch(r"(0|[1-9]\d*)\.(0|[1-9]\d*)", text)
+    if not match:
+        raise ValueError(f"version {text!r} is not of the form MAJOR.MINOR")
+    return int(match.group(1)), int(match.group(2))
+
+
+def document_of(model: BaseModel) -> dict[str, Any]:
+    """JSON-like values of a model, without the keys that have their default."""
+    return model.model_dump(mode="json", by_alias=True, exclude_defaults=True)
+
+
+def of_types(kind: type[T], values: Mapping[str, Any]) -> T:
+    """A dataclass from values as JSON has them.
+
+    Raises:
+        ValueError: A value is missing, or not of its field's type.
+    """
+    adapter: TypeAdapter[T] = TypeAdapter(kind)
+    return adapter.validate_python(values)
+
+
+# ---------------------------------------------------------------- columns
+
+
+class Column(Model):
+    """A column of 64-bit integers: ``value[i] = value[i-1] + step + residual[i-1]``."""
+
+    start: Int64 = Field(description="The first value.")
+    step: Int64 = Field(description="The common difference.")
+    values: str = Field(
+        description="Residuals of the differences, separated by white space; r*n is n times r."
+    )
+
+    def decode(self, count: int) -> NDArray[np.int64]:
+        """The values, shape (count,).
+
+        Raises:
+            ValueError: The column does not have that length; says why.
+        """
+        return decode_column(self.start, self.step, self.values, count)
+
+
+class Columns(Model):
+    """One value per message, in the order of the video's frames."""
+
+    log_time: Column = Field(description="When each message was recorded, ns.")
+    publish_time: Column | None = Field(None, description="ns; absent: the log times.")
+    sequence: Column | None = Field(None, description="MCAP sequence; absent: all 0.")
+    stamp: Column = Field(description="Header stamps, ns.")
+    seq: Column | None = Field(None, description="ROS 1 header sequence numbers.")
+    pts: Column | None = Field(None, description="Presentation times that packets tell.")
+    variant: Column | None = Field(
+        None, description="Number of the header or calibration of each; absent: all 0."
+    )
+    ordinal: Column | None = Field(
+        None, description="Place of each among the channel's messages; absent: 0, 1, 2 ..."
+    )
+
+    def names(self) -> list[str]:
+        """Names of the columns that are there."""
+        return [name for name in type(self).model_fields if getattr(self, name) is not None]
+
+
+class Digests(Model):
+    """A digest of each original message payload, in frame order."""
+
+    algorithm: Literal["xxh64"] = Field(description="XXH64 with seed 0.")
+    values: str = Field(description="16 hexadecimal digits each, separated by white space.")
+
+    def decode(self, count: int) -> NDArray[np.uint64]:
+        """The digests, shape (count,).
+
+        Raises:
+            ValueError: There are not that many; says so.
+        """
+        try:
+            raw = bytes.fromhex(self.values)
+        except ValueError:
+            raise ValueError("holds something else than hexadecimal digits") from None
+        if len(raw) != 8 * count:
+            raise ValueError(f"holds {len(raw) / 8:g} digests where {count} are due")
+        return np.frombuffer(raw, dtype=">u8").astype(np.uint64)

@@ -1,0 +1,156 @@
+"""The model of a manifest."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Annotated, Literal
+
+from pydantic import Field, FiniteFloat, model_validator
+
+from mp4ds.format.fields import Count, FileName, Model, Profile, Sha256, Size, Time, Version
+from mp4ds.messages.transforms import MAX_TRANSFORMS, Transform
+from mp4ds.records import MAX_LOSSES, MAX_LOST_TOPICS, Loss
+
+
+class Source(Model):
+    """A recording file that was packed."""
+
+    name: str = Field(description="File name, for a rosbag2 folder with the folder's name.")
+    size: Size = Field(description="Bytes.")
+    sha256: Sha256
+
+
+class StreamEntry(Model):
+    """A stream of the dataset."""
+
+    topic: str
+    sidecar: FileName
+    video: FileName
+    frames: Count
+
+
+class FileEntry(Model):
+    """A file of the dataset."""
+
+    name: FileName
+    size: Size = Field(description="Bytes.")
+    sha256: Sha256
+
+
+class Verbatim(Model):
+    """Camera messages that are in messages.mcap as they were, and why."""
+
+    topic: str
+    messages: Size
+    first: Size = Field(description="Number of the first of them among the topic's messages.")
+    reason: str
+
+
+class StaticTransform(Model):
+    """Pose of a coordinate frame in another, which holds for the whole recording.
+
+    A point p of the child frame is rotation * p + translation in the parent frame.
+    """
+
+    parent: str = Field(description="Frame in which the child is placed, as recorded.")
+    child: str = Field(description="Frame that is placed, as recorded.")
+    translation: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] = Field(
+        description="x, y, z of the child's origin, metres."
+    )
+    rotation: Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)] = Field(
+        description="x, y, z, w of a unit quaternion."
+    )
+
+    @classmethod
+    def from_record(cls, transform: Transform) -> StaticTransform:
+        """The model of a transform."""
+        return cls(
+            parent=transform.parent,
+            child=transform.child,
+            translation=list(transform.translation),
+            rotation=list(transform.rotation),
+        )
+
+
+class LossEntry(Model):
+    """Something of the recording that could not be read when it was packed."""
+
+    file: str = Field(description="Name of the recording's file.")
+    offset: Size | None = Field(None, description="Byte where it begins; absent without a place.")
+    size: Size | None = Field(
+        None, description="Bytes, of which some may have been read; absent where not known."
+    )
+    problem: str = Field(description="What is wrong, in words.")
+    messages: Size | None = Field(
+        None, description="Messages that are lost; absent where nothing tells."
+    )
+    topics: Annotated[list[str], Field(max_length=MAX_LOST_TOPICS)] = Field(
+        default_factory=list, description="Of the messages that are lost, as far as known."
+    )
+    start: Time | None = Field(
+        None, description="Log time of the last message read before it, ns; absent if not known."
+    )
+    end: Time | None = Field(
+        None, description="Log time of the first message read after it, ns; absent if not known."
+    )
+
+    @classmethod
+    def from_record(cls, loss: Loss) -> LossEntry:
+        """The model of a loss."""
+        return cls(
+            file=loss.file,
+            offset=loss.offset,
+            size=loss.size,
+            problem=loss.problem,
+            messages=loss.messages,
+            topics=list(loss.topics),
+            start=loss.start,
+            end=loss.end,
+        )
+
+
+class TimeRange(Model):
+    """Log times of the first and the last message, ns, both included."""
+
+    start: Time
+    end: Time
+
+
+class Manifest(Model):
+    """A dataset: its sources, its files, and what is in them."""
+
+    mp4ds: Version = Field(description="Version of the format.")
+    kind: Literal["dataset"]
+    profile: Profile = Field(description="What was asked for.")
+    format: Literal["bag", "rosbag2", "mcap"] = Field(description="Format of the recording.")
+    recording_profile: str = Field(description="MCAP profile of the recording: ros1, ros2 ...")
+    library: str = Field("", description="The recording's own library string.")
+    sources: list[Source]
+    messages: Size = Field(description="Messages of the recording that were packed.")
+    losses: Annotated[list[LossEntry], Field(max_length=MAX_LOSSES)] = Field(
+        default_factory=list, description="What of the recording could not be read."
+    )
+    topics_left_out: list[str] = Field(
+        default_factory=list, description="Topics that were left out on request."
+    )
+    time_range: TimeRange | None = Field(None, description="Absent without messages.")
+    streams: list[StreamEntry]
+    transforms: Annotated[list[StaticTransform], Field(max_length=MAX_TRANSFORMS)] = Field(
+        default_factory=list,
+        description="Static transforms that connect the cameras: a copy of what /tf_static says.",
+    )
+    verbatim: list[Verbatim] = Field(default_factory=list)
+    files: list[FileEntry]
+    tools: dict[str, str] = Field(default_factory=dict, description="Versions that packed it.")
+
+    @model_validator(mode="after")
+    def _once(self) -> Manifest:
+        for what, names in (
+            ("file", [entry.name for entry in self.files]),
+            ("sidecar", [entry.sidecar for entry in self.streams]),
+            ("video", [entry.video for entry in self.streams]),
+        ):
+            twice = [name for name, count in Counter(names).items() if count > 1]
+            if twice:
+                raise ValueError(f"{what} {twice[0]} is listed twice")
+        return self

@@ -1,0 +1,574 @@
+"""The one source of truth for the format: schemas/ and the tables of spec/ are made from it."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from mp4ds.format.fields import (
+    MAX_CAMERA_INFOS,
+    MAX_FRAMES,
+    MAX_VARIANTS,
+    Base64,
+    Body,
+    Column,
+    Columns,
+    Count,
+    Digests,
+    FileName,
+    Model,
+    Profile,
+    Sha256,
+    Side,
+    Size,
+    Uint32,
+    Uint64,
+    Version,
+    decode_base64,
+    exceeds_padding,
+)
+from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, MAX_TABLE, Parameters
+from mp4ds.messages.layouts import LAYOUTS, Layout, bind, why_not
+from mp4ds.messages.png import PNG_ENCODINGS
+from mp4ds.messages.serializations import WIRES
+from mp4ds.plan import TOLERANCES, QualityTarget
+from mp4ds.records import Channel, Schema
+from mp4ds.times import encode_column
+from mp4ds.video.codecs import CODECS
+from mp4ds.video.coded_messages import PACKET_CODECS
+from mp4ds.video.references import (
+    MAX_CHARS,
+    MAX_STRUCTURE_CHARS,
+    MAX_STRUCTURES,
+    STRUCTURE_PATTERN,
+    Structures,
+)
+
+SCORE_STEPS = {"vmaf": 100, "psnr": 100, "ssim": 10_000}
+"""Metric -> how many steps of the column of scores are 1."""
+
+_DIGITS = 4  # after the point of what is told of all scores
+_ROUNDED = 2 * 10.0**-_DIGITS
+
+Score = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
+
+
+class Quality(Model):
+    """The scores that were asked for, and those that were measured while packing."""
+
+    metric: Literal["vmaf", "psnr", "ssim"] = Field(
+        description="What was measured (registry, Profiles)."
+    )
+    target: Score = Field(description="What was asked for.")
+    mean: Score = Field(description="Of all frames.")
+    p5: Score = Field(description="5th percentile of the frames.")
+    min: Score = Field(description="Of the worst frame.")
+    worst_window: Score = Field(description="Least mean of the frames of a window.")
+    windows: Annotated[Count, Field(ge=1)] = Field(
+        description="Windows that were measured each by itself."
+    )
+    reencoded: Count = Field(0, description="Of these, encoded more than once.")
+    limited: Count = Field(
+        0, description="Of these, with originals that themselves score too little."
+    )
+    scores: Column = Field(description="Of each frame, in steps of 0.01; SSIM: of 0.0001.")
+
+    @model_validator(mode="after")
+    def _counted(self) -> Quality:
+        if max(self.reencoded, self.limited) > self.windows:
+            raise ValueError("more windows are told of than there are")
+        return self
+
+    @classmethod
+    def from_scores(
+        cls,
+        target: QualityTarget,
+        scores: NDArray[np.int64],
+        *,
+        worst_window: float,
+        windows: int,
+        reencoded: int,
+        limited: int,
+    ) -> Quality:
+        """The model of scores.
+
+        Args:
+            target: What was asked for.
+            scores: Of each frame, in steps of the metric (`SCORE_STEPS`), shape (frames,).
+            worst_window: Least mean of a window.
+            windows: How many there are.
+            reencoded: How many of them were encoded again.
+            limited: How many have originals that score too little themselves.
+        """
+        mean, p5, least = _told(scores, target.metric)
+        values = {
+            "metric": target.metric,
+            "target": target.score,
+            "mean": mean,
+            "p5": p5,
+            "min": least,
+            "worst_window": round(worst_window, _DIGITS),
+            "windows": windows,
+            "reencoded": reencoded,
+            "limited": limited,
+            "scores": encode_column(scores),
+        }
+        return cls.model_validate(values)
+
+    @classmethod
+    def joined(cls, parts: Sequence[tuple[Quality, int]]) -> Quality:
+        """What holds of consecutive videos together.
+
+        Args:
+            parts: Of each what holds of it, and its frames; at least one, all of one target.
+
+        Raises:
+            ValueError: A column does not have a score for each frame.
+        """
+        first = parts[0][0]
+        return cls.from_scores(
+            QualityTarget(first.metric, first.target),
+            np.concatenate([part.scores.decode(frames) for part, frames in parts]),
+            worst_window=min(part.worst_window for part, _ in parts),
+            windows=sum(part.windows for part, _ in parts),
+            reencoded=sum(part.reencoded for part, _ in parts),
+            limited=sum(part.limited for part, _ in parts),
+        )
+
+    def decode(self, frames: int) -> NDArray[np.float64]:
+        """The score of each frame, shape (frames,).
+
+        Raises:
+            ValueError: There are not that many, or they do not come to what is told of them.
+        """
+        steps = self.scores.decode(frames)
+        for name, due in zip(("mean", "p5", "min"), _told(steps, self.metric), strict=True):
+            if abs(due - getattr(self, name)) > _ROUNDED:
+                raise ValueError(f"has scores whose {name} is {due:g}, not {getattr(self, name):g}")
+        return steps / SCORE_STEPS[self.metric]
+
+    def __str__(self) -> str:
+        text = (
+            f"{self.metric} {self.mean:g} (asked for: {self.target:g}), 5 % of the frames below "
+            f"{self.p5:g}, least {self.min:g}; worst of {self.windows} windows "
+            f"{self.worst_window:g}"
+        )
+        if self.reencoded:
+            text += f"; {self.reencoded} encoded again"
+        if self.limited:
+            text += (
+                f"; {self.limited} that were to have {TOLERANCES[self.metric]:g} less than the "
+                "originals beside themselves, which is less than was asked for"
+            )
+        return text
+
+
+def _told(steps: NDArray[np.int64], metric: str) -> tuple[float, float, float]:
+    """Mean, 5th percentile and least of scores."""
+    found = (np.mean(steps), np.percentile(steps, 5), np.min(steps))
+    mean, p5, least = (round(float(value) / SCORE_STEPS[metric], _DIGITS) for value in found)
+    return mean, p5, least
+
+
+# ---------------------------------------------------------------- references
+
+Structure = Annotated[str, Field(pattern=STRUCTURE_PATTERN, max_length=MAX_STRUCTURE_CHARS)]
+
+
+class References(Model):
+    """What the coded frames of each group of pictures refer to."""
+
+    structures: Annotated[list[Structure], Field(min_length=1, max_length=MAX_STRUCTURES)] = Field(
+        description="Those that occur, each of the packets from a key frame to the next."
+    )
+    groups: Column = Field(description="Number of the structure of each group of pictures.")
+
+    @model_validator(mode="after")
+    def _bounded(self) -> References:
+        if sum(map(len, self.structures)) > MAX_CHARS:
+            raise ValueError(f"the structures have more than {MAX_CHARS} characters together")
+        return self
+
+    @property
+    def split(self) -> bool:
+        """Whether packets hold several coded frames."""
+        return any("+" in text for text in self.structures)
+
+    @classmethod
+    def from_structures(cls, structures: Structures) -> References:
+        """The model of what was found in a video."""
+        groups = Column.model_validate(encode_column(structures.groups))
+        return cls(structures=list(structures.texts), groups=groups)
+
+    def decode(self, packets: NDArray[np.int64]) -> Structures:
+        """The structures of a video.
+
+        Args:
+            packets: Of each of its groups of pictures, shape (groups,), at least one.
+
+        Raises:
+            ValueError: They are not of such a video; says why.
+        """
+        try:
+            groups = self.groups.decode(len(packets))
+        except ValueError as error:
+            raise ValueError(f"their column of groups {error}") from None
+        structures = Structures(self.structures, groups)
+        if problem := structures.mismatch(packets):
+            raise ValueError(problem)
+        return structures
+
+
+# ---------------------------------------------------------------- models
+
+_GREY_OR_COLOUR = frozenset({"mono8", "rgb8"})
+_BODY_ENCODINGS = {
+    "packet": _GREY_OR_COLOUR,
+    "jpeg": _GREY_OR_COLOUR,
+    "rvl": frozenset({"16UC1"}),
+    "png": frozenset(PNG_ENCODINGS.values()),
+}
+VIDEO_CODECS = tuple(name for name, codec in CODECS.items() if codec.entries)
+PIXEL_FORMATS = (
+    *("gray", "gray10le", "gray12le", "gray14le", "gray16le"),
+    *("rgb24", "bgr24", "bgr0", "bgra"),
+    *("gbrp10le", "gbrp12le", "gbrp14le", "gbrp16le"),
+    *("gbrap10le", "gbrap12le", "gbrap14le", "gbrap16le"),
+    *("yuv420p", "yuv422p", "yuv444p", "yuv420p10le"),
+)
+
+
+class SchemaModel(Model):
+    """A message definition, verbatim."""
+
+    name: str = Field(description="Type name as the source spells it.")
+    encoding: str = Field(description="ros1msg, ros2msg, ros2idl ...; empty: no definition.")
+    text: str | None = Field(None, description="The definition, where it is UTF-8.")
+    base64: Base64 | None = Field(None, description="The definition, where it is not.")
+
+    @model_validator(mode="after")
+    def _one_form(self) -> SchemaModel:
+        if (self.text is None) == (self.base64 is None):
+            raise ValueError("a schema has either text or base64")
+        if self.base64 is not None:
+            decode_base64(self.base64)
+        return self
+
+    @classmethod
+    def from_record(cls, schema: Schema) -> SchemaModel:
+        """The model of a definition."""
+        try:
+            text = schema.data.decode()
+        except UnicodeDecodeError:
+            data = base64.b64encode(schema.data).decode()
+            return cls(name=schema.name, encoding=schema.encoding, base64=data)
+        return cls(name=schema.name, encoding=schema.encoding, text=text)
+
+    def to_record(self) -> Schema:
+        """The definition of the model."""
+        data = self.text.encode() if self.text is not None else decode_base64(self.base64 or "")
+        return Schema(self.name, self.encoding, data)
+
+
+class ChannelModel(Model):
+    """The channel that the messages were recorded on."""
+
+    topic: str = Field(description="Topic name as the source spells it.")
+    message_encoding: str = Field(description="ros1, cdr or protobuf.")
+    schema_: SchemaModel | None = Field(None, alias="schema", description="Message definition.")
+    metadata: dict[str, str] = Field(
+        default_factory=dict, description="Connection header, QoS, type hash; verbatim."
+    )
+
+    @classmethod
+    def from_record(cls, channel: Channel) -> ChannelModel:
+        """The model of a channel."""
+        schema = SchemaModel.from_record(channel.schema) if channel.schema else None
+        return cls(
+            topic=channel.topic,
+            message_encoding=channel.message_encoding,
+            schema=schema,
+            metadata=dict(channel.metadata),
+        )
+
+    def to_record(self, channel_id: int) -> Channel:
+        """The channel of the model, under an id of the caller's choice."""
+        schema = self.schema_.to_record() if self.schema_ else None
+        return Channel(channel_id, self.topic, self.message_encoding, schema, self.metadata)
+
+
+class Image(Model):
+    """What all images of the stream have in common."""
+
+    encoding: str = Field(description="ROS image encoding.")
+    width: Side = Field(description="Columns, pixels.")
+    height: Side = Field(description="Rows, pixels.")
+    step: Uint32 = Field(description="Bytes per row; what exceeds the pixels is padding.")
+    is_bigendian: Annotated[int, Field(ge=0, le=255)] = Field(
+        description="The byte as it stands; for samples of several bytes not 0 means big-endian."
+    )
+
+    @model_validator(mode="after")
+    def _fits(self) -> Image:
+        encoding = ENCODINGS.get(self.encoding)
+        reason = why_not(
+            self.encoding,
+            width=self.width,
+            height=self.height,
+            step=self.step,
+            size=encoding.size(self.step, self.height) if encoding else 0,
+        )
+        if reason:
+            raise ValueError(reason)
+        return self
+
+
+class PngFile(Model):
+    """How a PNG file is made of its pixels."""
+
+    filters: str = Field(description="Rule of the row filters (registry, PNG files).")
+    level: Annotated[int, Field(ge=1, le=9)] = Field(description="Level of deflate.")
+    strategy: Annotated[int, Field(ge=0, le=4)] = Field(description="Strategy of deflate.")
+    memory_level: Annotated[int, Field(ge=1, le=9)] = Field(description="Its memory level.")
+    window_bits: Annotated[int, Field(ge=9, le=15)] = Field(description="Its window.")
+    zlib_header: Annotated[str, Field(pattern=r"^[0-9a-f]{4}$")] = Field(
+        description="The two bytes before the deflated data, hexadecimal."
+    )
+    chunk_bytes: Annotated[int, Field(ge=0, le=2**31)] = Field(
+        description="Image data in each IDAT chunk but the last; 0: one chunk."
+    )
+    deflate: Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")] = Field(
+        description="Fingerprint of the deflate that makes these bytes (registry, PNG files)."
+    )
+    before: Base64 = Field("", description="Chunks between the header and the image data.")
+    after: Base64 = Field("", description="What follows the image data.")
+
+
+class Header(Model):
+    """The part of a message around its body that does not change from frame to frame."""
+
+    frame_id: str = Field(description="Coordinate frame.")
+    format: str | None = Field(None, description="Of a coded image, to the letter.")
+    template: Base64 | None = Field(
+        None,
+        description="The blank message, where it is not that of a plain serialization.",
+    )
+    framing: Annotated[str, Field(pattern=r"^[0-9a-z +]*$", max_length=4096)] = Field(
+        "", description="Of packets: the start codes or delimiter that an mp4 does not keep."
+    )
+    prefix: Annotated[str, Field(pattern=r"^([0-9a-f]{2})*$", max_length=64)] = Field(
+        "", description="Bytes of the body before the coded picture, hexadecimal."
+    )
+    png: PngFile | None = Field(None, description="How the file in the body is made.")
+    padding: Base64 | None = Field(
+        None, description="What follows the pixels of each row, deflated; absent: zeros."
+    )
+
+
+class Color(Model):
+    """How the video's samples are to be understood; the names are ffmpeg's."""
+
+    primaries: str = Field(description="Colour primaries.")
+    transfer: str = Field(description="Transfer characteristics.")
+    matrix: str = Field(description="Matrix coefficients.")
+    range: Literal["full", "limited"] = Field(description="Range of the samples.")
+
+
+class LayoutParameters(Model):
+    """What a layout needs to know of a stream."""
+
+    bits: Annotated[int, Field(ge=1, le=16)] | None = Field(
+        None, description="Bits of a value that are kept."
+    )
+    shift: Annotated[int, Field(ge=0, le=15)] | None = Field(
+        None, description="Zero bits below them in each sample of the image."
+    )
+    low: Annotated[int, Field(ge=1, le=8)] | None = Field(
+        None, description="How many of the bits are low ones, folded and stored apart."
+    )
+    table: Annotated[list[Uint64], Field(max_length=MAX_TABLE)] | None = Field(
+        None, description="The bit patterns that occur, in increasing order."
+    )
+    entries: Annotated[int, Field(ge=1, le=MAX_TABLE)] | None = Field(
+        None, description="Length of the list of values in each picture."
+    )
+    hole: Uint32 | None = Field(
+        None, description="Bit pattern of the float that stands for no measurement."
+    )
+    scale: str | None = Field(None, description="product or quotient: of metres.")
+    alpha: Annotated[int, Field(ge=0, le=255)] | None = Field(
+        None, description="Alpha of every pixel."
+    )
+
+
+class VideoModel(Model):
+    """The video file and how it was made."""
+
+    file: FileName
+    layout: str = Field(description="How pixels became the picture (registry, Layouts).")
+    parameters: LayoutParameters | None = Field(None, description="Of the layout, if it has any.")
+    codec: str = Field(description="Codec (registry, Codecs).")
+    pixel_format: str | None = Field(
+        None, description="Pixel format of the coded video; absent for packets as they came."
+    )
+    width: Annotated[int, Field(ge=1, le=MAX_SIDE + 1)] = Field(description="Picture width.")
+    height: Annotated[int, Field(ge=1, le=MAX_SIDE + 1)] = Field(description="Picture height.")
+    color: Color | None = Field(None, description="Absent where the samples are not colours.")
+    encoder: str = Field("", description="Encoder that made it.")
+    options: dict[str, str] = Field(default_factory=dict, description="The encoder's options.")
+    size: Size | None = Field(None, description="Bytes.")
+    sha256: Sha256 | None = Field(None, description="Of the file.")
+    references: References | None = Field(
+        None, description="What its frames refer to; absent: the packets tell."
+    )
+    quality: Quality | None = Field(None, description="Present where a score was asked for.")
+
+    @property
+    def matrix(self) -> str | None:
+        """Matrix coefficients of the video's colours; None where the video itself tells them."""
+        if self.color is None:
+            return None if self.pixel_format is None else "bt709"
+        return self.color.matrix
+
+    @property
+    def full_range(self) -> bool:
+        """Whether the video's samples use their full range."""
+        return self.color is None or self.color.range == "full"
+
+    @model_validator(mode="after")
+    def _known(self) -> VideoModel:
+        if self.layout not in LAYOUTS:
+            raise ValueError(f"layout {self.layout!r} is not one of {', '.join(LAYOUTS)}")
+        if self.codec not in VIDEO_CODECS:
+            raise ValueError(f"codec {self.codec!r} is not one of {', '.join(VIDEO_CODECS)}")
+        if self.pixel_format not in (*PIXEL_FORMATS, None):
+            known = ", ".join(PIXEL_FORMATS)
+            raise ValueError(f"pixel format {self.pixel_format!r} is not one of {known}")
+        if self.references is not None:
+            self._check_references(self.references)
+        return self
+
+    def _check_references(self, references: References) -> None:
+        if not CODECS[self.codec].is_free:
+            raise ValueError(f"a video of codec {self.codec} has no references")
+        if references.split and not CODECS[self.codec].is_split:
+            raise ValueError(f"a packet of codec {self.codec} holds one frame")
+
+
+class Roi(Model):
+    """Region of interest of a CameraInfo."""
+
+    x_offset: Uint32
+    y_offset: Uint32
+    height: Uint32
+    width: Uint32
+    do_rectify: Annotated[int, Field(ge=0, le=255)]
+
+
+Matrix9 = Annotated[list[float], Field(min_length=9, max_length=9)]
+Matrix12 = Annotated[list[float], Field(min_length=12, max_length=12)]
+
+
+class Calibration(Model):
+    """The intrinsics of a camera: a CameraInfo without its stamp."""
+
+    frame_id: str = Field(description="Coordinate frame.")
+    height: Uint32 = Field(description="Rows of the calibrated image.")
+    width: Uint32 = Field(description="Columns of the calibrated image.")
+    distortion_model: str
+    d: list[float] = Field(description="Distortion parameters.")
+    k: Matrix9 = Field(description="Intrinsic matrix by rows.")
+    r: Matrix9 = Field(description="Rectification matrix by rows.")
+    p: Matrix12 = Field(description="Projection matrix by rows.")
+    binning_x: Uint32 = 0
+    binning_y: Uint32 = 0
+    roi: Roi | None = Field(None, description="Absent: all zero.")
+    template: Base64 | None = Field(
+        None,
+        description="The blank message, where it is not that of a plain serialization.",
+    )
+
+
+class CameraInfo(Model):
+    """The CameraInfo messages that belong to the stream."""
+
+    channel: ChannelModel
+    wire: str = Field(description="Serialization (registry, Wires).")
+    messages: Annotated[int, Field(ge=0, le=MAX_CAMERA_INFOS)]
+    calibrations: Annotated[list[Calibration], Field(max_length=MAX_VARIANTS)]
+    columns: Columns | None = Field(None, description="Absent when there are no messages.")
+
+
+class StreamSidecar(Model):
+    """One stream: a video and everything that turns its frames back into messages."""
+
+    mp4ds: Version = Field(description="Version of the format.")
+    kind: Literal["stream"]
+    profile: Profile = Field(description="What was asked for; only lossless is exact.")
+    stamps: Literal["header", "record-float"] = Field(
+        "header", description="record-float: record times that were kept as float seconds."
+    )
+    frames: Annotated[int, Field(ge=1, le=MAX_FRAMES)] = Field(description="Frames of the video.")
+    channel: ChannelModel
+    wire: str = Field(description="Serialization (registry, Wires).")
+    body: Body = Field(
+        "pixels", description="What a message's body is to the video (registry, Bodies)."
+    )
+    image: Image
+    headers: Annotated[list[Header], Field(min_length=1, max_length=MAX_VARIANTS)]
+    video: VideoModel
+    camera_info: CameraInfo | None = None
+    columns: Columns
+    digests: Digests | None = Field(None, description="Present in the lossless profile.")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> StreamSidecar:
+        for wire in (self.wire, *([self.camera_info.wire] if self.camera_info else [])):
+            if wire not in WIRES:
+                raise ValueError(f"wire {wire!r} is not one of {', '.join(WIRES)}")
+        if self.profile == "lossless" and self.digests is None:
+            raise ValueError("a lossless stream has digests")
+        quality = self.video.quality
+        if quality and self.profile != str(QualityTarget(quality.metric, quality.target)):
+            raise ValueError(f"video.quality is of another profile than {self.profile}")
+        width, height = self.layout.picture_size(self.image.width, self.image.height)
+        if self.video.width < width or self.video.height < height:
+            raise ValueError(f"the video is smaller than its pictures of {width}x{height}")
+        self._check_body()
+        return self
+
+    def _check_body(self) -> None:
+        body, encoding = self.body, self.image.encoding
+        allowed = _BODY_ENCODINGS.get(body)
+        if allowed is not None and encoding not in allowed:
+            raise ValueError(f"a stream with the body {body} has no {encoding} images")
+        if (self.video.pixel_format is None) != (body == "packet"):
+            raise ValueError("video.pixel_format is absent for the body packet, and only there")
+        if body == "packet" and self.video.codec not in PACKET_CODECS:
+            raise ValueError(f"no packets of codec {self.video.codec} are carried")
+        if body == "jpeg" and self.profile == "lossless":
+            raise ValueError("a stream with the body jpeg is not lossless")
+        if exceeds_padding(header.padding for header in self.headers):
+            raise ValueError("the headers have too much padding")
+        for number, header in enumerate(self.headers):
+            if (header.png is not None) != (body == "png"):
+                raise ValueError(f"headers.{number}.png is there for the body png, and only there")
+            if header.padding is not None and body != "pixels":
+                raise ValueError(f"headers.{number}.padding is there for the body pixels only")
+
+    @property
+    def layout(self) -> Layout:
+        """The layout of the video's pictures.
+
+        Raises:
+            ValueError: It does not suit the images, or its parameters.
+        """
+        given = self.video.parameters
+        values = given.model_dump(exclude_none=True) if given else {}
+        encoding = ENCODINGS[self.image.encoding]
+        return bind(self.video.layout, encoding, Parameters.from_values(values))

@@ -1,0 +1,329 @@
+"""Reading and writing the YAML files, through the tiers schema and model; older versions."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable
+from fractions import Fraction
+from functools import cache
+from importlib.resources import files
+from pathlib import Path, PurePath
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from mp4ds import yamlio
+from mp4ds.errors import FormatError, VersionError
+from mp4ds.format.fields import FORMAT_VERSION, document_of, parse_version
+from mp4ds.format.manifest import Manifest
+from mp4ds.format.models import StreamSidecar
+from mp4ds.times import encode_column
+
+Document = dict[str, Any]
+
+_VERSION_0_KEYS = {"bagname", "topic_name", "camera_info", "img_timestamp"}
+
+
+def version_of(document: Document) -> str | None:
+    """The version that a document claims; None where it claims none."""
+    if "mp4ds" in document:
+        version = document["mp4ds"]
+        return version if isinstance(version, str) else None
+    return "0" if set(document) >= {"topic_name", "img_timestamp"} else None
+
+
+def migrate(document: Document, place: str) -> Document:
+    """Bring a document of any older version to the current one.
+
+    Raises:
+        FormatError: ``migration-failed``, with what is missing.
+    """
+    while (version := version_of(document)) in MIGRATIONS:
+        try:
+            document = MIGRATIONS[str(version)](document, place)
+        except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise FormatError(
+                "migration-failed", place, f"is not a whole file of version {version} ({reason})"
+            ) from None
+    return document
+
+
+def _from_0(old: Document, place: str) -> Document:
+    """Version 0: one stream, float seconds of record time, the first camera_info."""
+    unknown = set(old) - _VERSION_0_KEYS
+    if unknown:
+        raise ValueError(f"unknown keys {sorted(unknown)}")
+    if not isinstance(old["topic_name"], list):
+        raise ValueError("topic_name is no list")
+    info_topic, image_topic = map(_text, old["topic_name"])
+    info = old["camera_info"]
+    # round half even of the exact product: the nearest nanosecond to the stored float
+    times = [round(Fraction(_number(seconds)) * 10**9) for seconds in old["img_timestamp"]]
+    column = encode_column(times)
+    width, height = _integer(info["width"]), _integer(info["height"])
+    return {
+        "mp4ds": "1.0",
+        "kind": "stream",
+        "profile": "crf=22",
+        "stamps": "record-float",
+        "frames": len(times),
+        "channel": _channel_0(image_topic, "sensor_msgs/Image"),
+        "wire": "ros1",
+        "image": {
+            "encoding": "bgr8",
+            "width": width,
+            "height": height,
+            "step": 3 * width,
+            "is_bigendian": 0,
+        },
+        "headers": [{"frame_id": str(info["frameid"])}],
+        "video": {
+            "file": PurePath(place).with_suffix(".mp4").name,
+            "layout": "bgr24",
+            "codec": "av1",
+            "pixel_format": "yuv420p",
+            "width": width,
+            "height": height,
+            # that tool left the conversion to ffmpeg, which then takes BT.601, limited
+            "color": {
+                "primaries": "bt709",
+                "transfer": "bt709",
+                "matrix": "smpte170m",
+                "range": "limited",
+            },
+        },
+        "camera_info": {
+            "channel": _channel_0(info_topic, "sensor_msgs/CameraInfo"),
+            "wire": "ros1",
+            "messages": 0,
+            "calibrations": [_calibration_0(info)],
+        },
+        "columns": {
+            "log_time": column,
+            "stamp": column,
+            "seq": {"start": 0, "step": 1, "values": f"0*{len(times) - 1}" if times[1:] else ""},
+        },
+    }
+
+
+def _channel_0(topic: str, type_name: str) -> Document:
+    return {
+        "topic": topic,
+        "message_encoding": "ros1",
+        "schema": {"name": type_name, "encoding": "", "text": ""},
+        "metadata": {},
+    }
+
+
+def _calibration_0(info: Document) -> Document:
+    return {
+        "frame_id": str(info["frameid"]),
+        "height": _integer(info["height"]),
+        "width": _integer(info["width"]),
+        "distortion_model": str(info["distortion_model"]),
+        **{key.lower(): [_number(value) for value in info[key]] for key in "DKRP"},
+    }
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"{value!r} is no number")
+    if value - value != 0:
+        raise ValueError(f"{value} is no finite number")
+    return float(value)
+
+
+def _integer(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f"{value!r} is no whole number")
+    return value
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError(f"{value!r} is no text")
+    return value
+
+
+def _from_1_0(old: Document, place: str) -> Document:
+    """Version 1.0: no header has padding."""
+    headers = old.get("headers")
+    if isinstance(headers, list) and any(isinstance(h, dict) and "padding" in h for h in headers):
+        raise ValueError("headers with padding are of version 1.1")
+    return {**old, "mp4ds": "1.1"}
+
+
+MIGRATIONS: dict[str, Callable[[Document, str], Document]] = {"0": _from_0, "1.0": _from_1_0}
+"""Version that a step starts from -> the step."""
+
+
+# ---------------------------------------------------------------- files
+
+MANIFEST_NAME = "dataset.yaml"
+
+_COMMENTS = {
+    "stream": "One camera stream, packed by mp4ds: frame n of the video is entry n of each column.",
+    "dataset": "A robot recording, packed by mp4ds: `mp4ds unpack` gives it back.",
+}
+_MODELS: dict[str, type[StreamSidecar] | type[Manifest]] = {
+    "stream": StreamSidecar,
+    "dataset": Manifest,
+}
+_NEWS_LISTED = 5
+_ModelT = TypeVar("_ModelT", bound=BaseModel)
+
+
+def names_dataset(path: Path) -> bool:
+    """Whether a path is that of a dataset, a sidecar or a video, not of a recording."""
+    if path.is_dir() and (path / MANIFEST_NAME).is_file():
+        return True
+    return path.suffix in (".yaml", ".yml", ".mp4") and path.exists()
+
+
+def dump_document(model: StreamSidecar | Manifest) -> bytes:
+    """The YAML file of a model."""
+    return yamlio.dump(document_of(model), comment=_COMMENTS[model.kind])
+
+
+def load_document(path: Path) -> dict[str, Any]:
+    """Read a file of any version as a document of the current one.
+
+    Raises:
+        FormatError: ``file-missing``, ``yaml-invalid``, ``checksum-mismatch``,
+            ``version-unsupported``, ``migration-failed`` or ``kind-unknown``.
+    """
+    try:
+        if not path.is_file() and path.exists():
+            raise FormatError("file-missing", path, "is no regular file")
+        if path.stat().st_size > yamlio.MAX_BYTES:
+            raise FormatError("yaml-invalid", path, f"is larger than {yamlio.MAX_BYTES} bytes")
+        data = path.read_bytes()
+    except OSError as error:
+        raise FormatError("file-missing", path, f"cannot be read: {error.strerror}") from None
+    document = migrate(yamlio.load(data, str(path)), str(path))
+    version = version_of(document)
+    if version is None:
+        raise FormatError(
+            "version-unsupported",
+            path,
+            f'has no version such as `mp4ds: "{FORMAT_VERSION}"`, in quotes',
+        )
+    try:
+        found = parse_version(version)
+    except ValueError as error:
+        raise FormatError("version-unsupported", path, str(error)) from None
+    supported = parse_version(FORMAT_VERSION)
+    if found[0] > supported[0]:
+        raise VersionError(path, version, FORMAT_VERSION)
+    if found < supported:
+        raise FormatError(
+            "version-unsupported", path, f"is of version {version!r}, which never was"
+        )
+    if document.get("kind") not in list(_MODELS):
+        raise FormatError("kind-unknown", path, "is neither a stream nor a dataset")
+    return document if found == supported else _without_news(document, path)
+
+
+def _without_news(document: dict[str, Any], path: Path) -> dict[str, Any]:
+    """A document of a newer minor version without the keys that this one does not know."""
+    dropped: list[str] = []
+    while True:
+        try:
+            model_for(document).model_validate(document)
+        except ValidationError as error:
+            unknown = [item["loc"] for item in error.errors() if item["type"] == "extra_forbidden"]
+        else:
+            unknown = []
+        if not unknown:
+            break
+        for place in unknown:
+            _remove(document, place)
+            dropped.append(".".join(map(str, place)))
+    warnings.warn(
+        f"{path} is of format version {document['mp4ds']}, newer than {FORMAT_VERSION}; "
+        f"ignored: {', '.join(dropped[:_NEWS_LISTED]) or 'nothing'}"
+        + (f" and {len(dropped) - _NEWS_LISTED} more" if len(dropped) > _NEWS_LISTED else ""),
+        stacklevel=2,
+    )
+    return document
+
+
+def _remove(document: Any, place: tuple[int | str, ...]) -> None:
+    for key in place[:-1]:
+        document = document[key]
+    document.pop(place[-1], None)
+
+
+def load_stream(path: Path, *, video: str | None = None) -> StreamSidecar:
+    """Read a stream's sidecar.
+
+    Args:
+        path: The file.
+        video: Name of the video that it is for, where that is another one than it tells.
+
+    Raises:
+        FormatError: Any code of `load_document`, or ``model-invalid``.
+    """
+    document = load_document(path)
+    if video is not None and isinstance(document.get("video"), dict):
+        document["video"]["file"] = video
+    return _model(StreamSidecar, document, path)
+
+
+def load_manifest(path: Path) -> Manifest:
+    """Read a dataset's manifest.
+
+    Raises:
+        FormatError: Any code of `load_document`, or ``model-invalid``.
+    """
+    return _model(Manifest, load_document(path), path)
+
+
+def _model(model: type[_ModelT], document: dict[str, Any], path: Path) -> _ModelT:
+    try:
+        return model.model_validate(document)
+    except ValidationError as error:
+        problems = model_problems(error)
+        place, problem = problems[0]
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise FormatError("model-invalid", f"{path} at {place}", problem + more) from None
+
+
+def model_problems(error: ValidationError) -> list[tuple[str, str]]:
+    """Place and sentence of each problem that a model found."""
+    return [
+        (
+            ".".join(map(str, item["loc"])) or "the top",
+            item["msg"].removeprefix("Value error, "),
+        )
+        for item in error.errors(include_url=False, include_input=False)
+    ]
+
+
+def model_for(document: dict[str, Any]) -> type[StreamSidecar] | type[Manifest]:
+    """The model of a document that `load_document` returned."""
+    return _MODELS[document["kind"]]
+
+
+@cache
+def schema_text(kind: str) -> str:
+    """The released JSON Schema of ``stream`` or ``dataset``, as shipped with the package."""
+    name = f"v{FORMAT_VERSION}/{kind}.schema.json"
+    shipped = files("mp4ds") / "schemas" / name
+    if shipped.is_file():
+        return shipped.read_text(encoding="utf-8")
+    # a checkout: the wheel's copy is made from this folder
+    return (Path(__file__).parents[3] / "schemas" / name).read_text(encoding="utf-8")
+
+
+def generate_schema(kind: str) -> str:
+    """The JSON Schema that the models describe now."""
+    schema = _MODELS[kind].model_json_schema(by_alias=True, mode="validation")
+    schema = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$id": f"urn:mp4ds:{FORMAT_VERSION}:{kind}",
+        **schema,
+    }
+    return json.dumps(schema, indent=2) + "\n"

@@ -1,0 +1,1 @@
+"""What camera messages hold: serializations, image encodings and layouts, files of images."""

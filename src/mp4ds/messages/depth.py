@@ -1,0 +1,219 @@
+"""Depth images: ROS' compressedDepth, of PNG or RVL."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.messages import png
+from mp4ds.messages.coded import MAX_IMAGE_BYTES, Refused, check_size
+
+_HEADER = struct.Struct("<II")
+_WORD_BYTES, _WORD_NIBBLES = 4, 8
+_MAX_GROUPS = 11  # 33 bits: what a count or a difference takes at most
+
+Depth = NDArray[np.uint16]
+_Numbers = NDArray[np.int64]
+
+
+def decode_rvl(data: bytes | memoryview) -> Depth:
+    """Decode an RVL image.
+
+    Args:
+        data: Header and words, nothing after them.
+
+    Returns:
+        uint16 array of shape (rows, cols).
+
+    Raises:
+        Refused: It is no RVL, cut short, or promises more pixels than it codes.
+    """
+    if len(data) < _HEADER.size or len(data) % _WORD_BYTES:
+        raise Refused("it is no RVL: it has no whole number of words")
+    columns, rows = _HEADER.unpack_from(data)
+    check_size(columns, rows)
+    if 2 * columns * rows > MAX_IMAGE_BYTES:
+        raise Refused(f"its RVL image has {columns}x{rows} pixels")
+    words = np.frombuffer(data, "<u4", offset=_HEADER.size)
+    numbers = _read_numbers(_nibbles_of(words))
+    starts, lengths, first = _read_runs(numbers, columns * rows)
+    # every number that is no count is a difference
+    is_difference = np.ones(first[-1] if len(first) else 0, bool)
+    is_difference[first[:-1]] = False
+    is_difference[first[:-1] + 1] = False
+    zigzag = numbers[: len(is_difference)][is_difference]
+    values = np.cumsum((zigzag >> 1) ^ -(zigzag & 1))
+    if len(values) and (values.min() < 1 or values.max() > 0xFFFF):
+        raise Refused("its RVL codes a depth beyond 16 bits")
+    image = np.zeros(columns * rows, np.uint16)
+    image[_ranges(starts, lengths)] = values
+    return image.reshape(rows, columns)
+
+
+def encode_rvl(depth: Depth) -> bytes:
+    """Encode an image of shape (rows, cols) as the reference does."""
+    rows, columns = depth.shape
+    flat = np.ascontiguousarray(depth).reshape(-1)
+    filled = flat != 0
+    edges = np.flatnonzero(np.diff(filled)) + 1
+    bounds = np.concatenate(([0], edges, [len(flat)]))
+    if filled[0]:
+        bounds = np.concatenate(([0], bounds))  # the first count is of zeros
+    if len(bounds) % 2 == 0:
+        bounds = np.concatenate((bounds, [len(flat)]))  # and the last of what is not zero
+    zeros, nonzeros = np.diff(bounds)[0::2], np.diff(bounds)[1::2]
+    values = flat[filled].astype(np.int64)
+    differences = np.diff(values, prepend=0)
+    # each run's two counts stand before its differences
+    numbers = np.empty(len(values) + 2 * len(zeros), np.int64)
+    first = np.cumsum(nonzeros) - nonzeros + 2 * np.arange(len(zeros))
+    is_difference = np.ones(len(numbers), bool)
+    is_difference[first] = is_difference[first + 1] = False
+    numbers[first], numbers[first + 1] = zeros, nonzeros
+    numbers[is_difference] = (differences << 1) ^ (differences >> 63)
+    return _HEADER.pack(columns, rows) + _words_of(_write_numbers(numbers)).tobytes()
+
+
+def _nibbles_of(words: NDArray[np.uint32]) -> NDArray[np.uint8]:
+    octets = words.astype(">u4").view(np.uint8)
+    nibbles = np.empty(2 * len(octets), np.uint8)
+    nibbles[0::2] = octets >> 4
+    nibbles[1::2] = octets & 15
+    return nibbles
+
+
+def _words_of(nibbles: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    padded = np.zeros(-(-len(nibbles) // _WORD_NIBBLES) * _WORD_NIBBLES, np.uint8)
+    padded[: len(nibbles)] = nibbles
+    octets = padded[0::2] << 4 | padded[1::2]
+    return octets.view(">u4").astype("<u4").view(np.uint8)
+
+
+def _read_numbers(nibbles: NDArray[np.uint8]) -> _Numbers:
+    """The numbers that nibbles code; ones cut off at the end are left out."""
+    ends = np.flatnonzero(nibbles < 8)
+    if not len(ends):
+        raise Refused("its RVL codes no number")
+    starts = np.concatenate(([0], ends[:-1] + 1))
+    lengths = ends - starts + 1
+    groups = int(lengths.max())
+    if groups > _MAX_GROUPS:
+        raise Refused("its RVL codes a number beyond 32 bits")
+    numbers = (nibbles[starts] & 7).astype(np.int64)
+    longer = np.arange(len(numbers))
+    for group in range(1, groups):
+        longer = longer[lengths[longer] > group]
+        numbers[longer] |= (nibbles[starts[longer] + group] & 7).astype(np.int64) << 3 * group
+    return numbers
+
+
+def _write_numbers(numbers: _Numbers) -> NDArray[np.uint8]:
+    lengths = np.ones(len(numbers), np.int64)
+    bits = 3
+    while (beyond := numbers >> bits > 0).any():
+        lengths += beyond
+        bits += 3
+    ends = np.cumsum(lengths)
+    starts = ends - lengths
+    nibbles = np.empty(int(ends[-1]), np.uint8)
+    longer = np.arange(len(numbers))
+    for group in range(int(lengths.max())):
+        longer = longer[lengths[longer] > group]
+        nibbles[starts[longer] + group] = (numbers[longer] >> 3 * group & 7) | 8
+    nibbles[ends - 1] &= 7
+    return nibbles
+
+
+def _read_runs(numbers: _Numbers, pixels: int) -> tuple[_Numbers, _Numbers, _Numbers]:
+    """Where runs of pixels that are not zero are, and where their counts stand.
+
+    Returns:
+        First pixel and length of each run, and the place of its counts among the numbers, with
+        the number of numbers used after the last.
+    """
+    counts = numbers.tolist()
+    starts: list[int] = []
+    lengths: list[int] = []
+    places: list[int] = []
+    place = pixel = 0
+    while pixel < pixels:
+        if place + 1 >= len(counts):
+            raise Refused("its RVL is cut short")
+        zeros, nonzeros = counts[place], counts[place + 1]
+        places.append(place)
+        starts.append(pixel + zeros)
+        lengths.append(nonzeros)
+        pixel += zeros + nonzeros
+        place += 2 + nonzeros
+    if pixel > pixels or place > len(counts):
+        raise Refused("its RVL codes another number of pixels than it promises")
+    places.append(place)
+    return np.array(starts), np.array(lengths), np.array(places)
+
+
+def _ranges(starts: _Numbers, lengths: _Numbers) -> _Numbers:
+    """All places of the runs, in order."""
+    total = int(lengths.sum())
+    shifts = starts - (np.cumsum(lengths) - lengths)
+    return np.repeat(shifts, lengths) + np.arange(total)
+
+
+# ---------------------------------------------------------------- depth
+
+HEADER_BYTES = 12
+
+
+@dataclass(frozen=True, slots=True)
+class DepthImage:
+    """A compressedDepth image, unpacked.
+
+    Attributes:
+        header: Twelve bytes, or none where an image stands without a header.
+        pixels: uint16 array of shape (H, W), the values as they are coded.
+        recipe: How the PNG is made again; None for RVL.
+    """
+
+    header: bytes
+    pixels: NDArray[np.uint16]
+    recipe: png.PngRecipe | None
+
+
+def decode_depth(data: bytes | memoryview, hint: png.PngRecipe | None = None) -> DepthImage:
+    """Unpack the data of a message whose bytes can be made again, which is tried.
+
+    Whether it is PNG or RVL is told by the content: formats such as ``16UC1; compressedDepth``
+    do not say it.
+
+    Args:
+        data: The message's data.
+        hint: Recipe of another image of the same topic.
+
+    Raises:
+        Refused: It is neither, damaged, not of 16 bits, or does not rebuild.
+    """
+    view = memoryview(data)
+    start = 0 if bytes(view[:8]) == png.SIGNATURE else HEADER_BYTES
+    header, body = bytes(view[:start]), view[start:]
+    if bytes(body[:8]) == png.SIGNATURE:
+        pixels, recipe = png.decode(body, hint)
+        if pixels.dtype != np.uint16 or pixels.ndim != 2:
+            raise Refused("its depth image is not grey with 16 bits")
+        return DepthImage(header, pixels.astype(np.uint16, copy=False), recipe)
+    depth = decode_rvl(body)
+    if encode_rvl(depth) != body:
+        raise Refused("its RVL does not rebuild byte for byte")
+    return DepthImage(header, depth, None)
+
+
+def rebuild_depth(image: DepthImage) -> bytes:
+    """The message's data.
+
+    Raises:
+        Refused: The recipe is none.
+    """
+    if image.recipe is None:
+        return image.header + encode_rvl(image.pixels)
+    return image.header + png.rebuild(image.pixels, image.recipe)

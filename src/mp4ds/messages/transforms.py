@@ -1,0 +1,318 @@
+"""Static transforms between coordinate frames, read out of /tf_static for extrinsics.
+
+What is read here is a convenience copy: the messages themselves are stored verbatim, so that
+what does not parse, or makes no sense, is left out without harm.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+from mp4ds.messages.serializations import wire_of
+from mp4ds.messages.wire import PrimitiveReader, WireError
+from mp4ds.records import Channel, Schema
+
+MAX_TRANSFORMS = 1000
+"""Child frames that a collector keeps."""
+
+_MAX_MESSAGE = 1 << 20
+_MAX_IN_MESSAGE = 10 * MAX_TRANSFORMS
+_MAX_SCHEMA = 1 << 20
+_MAX_SCHEMA_FILES = 100
+_TOLERANCE = 0.01  # of a rotation's squared norm, as tf2 has it
+_TOPIC = "tf_static"
+_ROS_TYPES = {
+    "tf2_msgs/TFMessage": ("list", "stamped"),
+    "tf/tfMessage": ("list", "stamped"),
+    "foxglove_msgs/FrameTransforms": ("list", "foxglove"),
+    "foxglove_msgs/FrameTransform": ("one", "foxglove"),
+}
+_FOXGLOVE_TYPES = frozenset({"foxglove.FrameTransform", "foxglove.FrameTransforms"})
+_CDR_ORDERS = {"cdr-le": "<", "cdr-be": ">"}
+
+
+@dataclass(frozen=True, slots=True)
+class Transform:
+    """Pose of a frame in another: a point p of the child is rotation * p + translation there.
+
+    Attributes:
+        parent: The frame in which the child is placed.
+        child: The frame that is placed.
+        translation: x, y, z in metres.
+        rotation: x, y, z, w of a unit quaternion.
+    """
+
+    parent: str
+    child: str
+    translation: tuple[float, float, float]
+    rotation: tuple[float, float, float, float]
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether tf2 would take it: two frames, finite numbers, a rotation of norm 1."""
+        return (
+            bool(self.parent and self.child)
+            and _name(self.parent) != _name(self.child)
+            and all(map(math.isfinite, (*self.translation, *self.rotation)))
+            and abs(sum(value * value for value in self.rotation) - 1) < _TOLERANCE
+        )
+
+
+Parser = Callable[[memoryview], list[Transform]]
+
+
+def transform_parser(channel: Channel) -> Parser:
+    """What gives the transforms of a channel's messages, whether they are usable or not.
+
+    Takes tf2_msgs/TFMessage, tf/tfMessage and the ROS types of foxglove_msgs in ROS 1 and CDR;
+    foxglove.FrameTransform and foxglove.FrameTransforms in protobuf (by the recorded descriptor)
+    and JSON. Of the latter two, an absent translation is zero and an absent rotation is none.
+
+    It raises `WireError` for a message that does not parse, or is beyond all measure (more than
+    1 MiB).
+
+    Raises:
+        WireError: The type is none of transforms, or its descriptor does not parse.
+    """
+    parse = _parser(channel)
+
+    def bounded(data: memoryview) -> list[Transform]:
+        if len(data) > _MAX_MESSAGE:
+            raise WireError(f"it has {len(data)} bytes")
+        return parse(data)
+
+    return bounded
+
+
+def _parser(channel: Channel) -> Parser:
+    encoding, name = channel.message_encoding, _ros_name(channel)
+    if encoding in ("ros1", "cdr") and name in _ROS_TYPES:
+        return lambda data: _parse_ros(encoding, name, data)
+    if channel.schema and channel.type_name in _FOXGLOVE_TYPES:
+        many = channel.type_name.endswith("s")
+        if encoding == "json":
+            return lambda data: _read_nodes(_parse_json(data), many)
+        if encoding == "protobuf":
+            decode = _protobuf_decoder(channel.schema)
+            return lambda data: _read_nodes(decode(data), many)
+    raise WireError(f"type {channel.type_name!r} in {encoding!r} is no transform")
+
+
+def _ros_name(channel: Channel) -> str:
+    return channel.type_name.replace("/msg/", "/")
+
+
+def _name(frame_id: str) -> str:
+    """A frame's name as tf2 compares it."""
+    return frame_id.removeprefix("/")
+
+
+# ---------------------------------------------------------------- ROS
+
+
+def _parse_ros(encoding: str, name: str, data: memoryview) -> list[Transform]:
+    wire = wire_of(encoding, data)
+    cdr = wire != "ros1"
+    reader = PrimitiveReader(data, 4 if cdr else 0, _CDR_ORDERS.get(wire, "<"), aligned=cdr)
+    amount, layout = _ROS_TYPES[name]
+    count = reader.integer("I") if amount == "list" else 1
+    # a message that claims more than it holds ends in an error
+    return [_read_ros(reader, layout, cdr=cdr) for _ in range(count)]
+
+
+def _read_ros(reader: PrimitiveReader, layout: str, *, cdr: bool) -> Transform:
+    if layout == "stamped" and not cdr:
+        reader.take("I")  # seq
+    reader.take("I", 2)  # stamp
+    parent = reader.string(terminated=cdr)
+    child = reader.string(terminated=cdr)
+    x, y, z = reader.take("d", 3)
+    qx, qy, qz, qw = reader.take("d", 4)
+    return Transform(parent, child, (x, y, z), (qx, qy, qz, qw))
+
+
+# ---------------------------------------------------------------- Foxglove
+
+
+def _parse_json(data: memoryview) -> Any:
+    try:
+        return json.loads(bytes(data))
+    except (ValueError, RecursionError) as error:
+        raise WireError(f"it is no JSON: {error}") from None
+
+
+def _protobuf_decoder(schema: Schema) -> Callable[[memoryview], Any]:
+    """Decodes messages of a recorded descriptor, whatever its field numbers."""
+    if len(schema.data) > _MAX_SCHEMA:
+        raise WireError(f"its descriptor has {len(schema.data)} bytes")
+    try:
+        # a large import, which most recordings do without
+        descriptor_pb2 = import_module("google.protobuf.descriptor_pb2")
+        pools = import_module("google.protobuf.descriptor_pool")
+        factory = import_module("google.protobuf.message_factory")
+        decode_error = import_module("google.protobuf.message").DecodeError
+    except ImportError:
+        raise WireError("protobuf is not installed") from None
+    try:
+        files = descriptor_pb2.FileDescriptorSet.FromString(schema.data).file
+        pool = pools.DescriptorPool()
+        for file in _in_order({file.name: file for file in files}):
+            pool.Add(file)
+        message_class = factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
+    except (decode_error, TypeError, ValueError, KeyError, RecursionError) as error:
+        raise WireError(f"its descriptor does not parse: {error}") from None
+
+    def decode(data: memoryview) -> Any:
+        try:
+            return message_class.FromString(bytes(data))
+        except (decode_error, ValueError) as error:
+            raise WireError(f"it does not parse: {error}") from None
+
+    return decode
+
+
+def _in_order(files: dict[str, Any]) -> list[Any]:
+    """Descriptor files, each after those that it imports.
+
+    Raises:
+        ValueError: One is missing, they import each other, or there are too many.
+    """
+    if len(files) > _MAX_SCHEMA_FILES:
+        raise ValueError(f"it has {len(files)} files")
+    ordered: dict[str, Any] = {}
+    while len(ordered) < len(files):
+        ready = [
+            name
+            for name, file in files.items()
+            if name not in ordered and all(other in ordered for other in file.dependency)
+        ]
+        if not ready:
+            raise ValueError("it imports what it does not hold")
+        ordered.update((name, files[name]) for name in ready)
+    return list(ordered.values())
+
+
+def _read_nodes(message: Any, many: bool) -> list[Transform]:
+    """The transforms of a decoded message: JSON, or an object of protobuf."""
+    try:
+        nodes = _value(message, "transforms", []) if many else [message]
+        if len(nodes) > _MAX_IN_MESSAGE:
+            raise ValueError(f"it has {len(nodes)} transforms")
+        return [_read_node(node) for node in nodes]
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise WireError(f"its fields are not those of a transform: {error}") from None
+
+
+def _read_node(node: Any) -> Transform:
+    names = [_value(node, f"{end}_frame_id", "") for end in ("parent", "child")]
+    if not all(isinstance(name, str) for name in names):
+        raise TypeError("the name of a frame is no string")
+    x, y, z = _numbers(_part(node, "translation"), "xyz", (0.0, 0.0, 0.0))
+    qx, qy, qz, qw = _numbers(_part(node, "rotation"), "xyzw", (0.0, 0.0, 0.0, 1.0))
+    return Transform(names[0], names[1], (x, y, z), (qx, qy, qz, qw))
+
+
+def _value(node: Any, name: str, default: Any) -> Any:
+    return node.get(name, default) if isinstance(node, dict) else getattr(node, name)
+
+
+def _part(node: Any, name: str) -> Any:
+    if isinstance(node, dict):
+        return node.get(name)
+    return getattr(node, name) if node.HasField(name) else None
+
+
+def _numbers(node: Any, names: str, absent: tuple[float, ...]) -> list[float]:
+    values = absent if node is None else [_value(node, name, 0.0) for name in names]
+    if not all(isinstance(value, (int, float)) for value in values):
+        raise TypeError("a coordinate is no number")
+    return [float(value) for value in values]
+
+
+# ---------------------------------------------------------------- collecting
+
+
+class TransformCollector:
+    """The static transforms of a recording: the latest of each child frame.
+
+    A copy for the consumer's convenience, of what is stored verbatim: messages that do not parse
+    and transforms that tf2 would refuse are left out, and so are child frames beyond the limit.
+
+    Args:
+        known: Those of earlier messages, in their order.
+        limit: Most child frames.
+    """
+
+    def __init__(self, known: Iterable[Transform] = (), *, limit: int = MAX_TRANSFORMS) -> None:
+        self._limit = limit
+        self._latest: dict[str, Transform] = {}
+        self._parsers: dict[tuple[str, Schema | None], Parser | None] = {}
+        self._take(known)
+
+    @staticmethod
+    def takes(channel: Channel) -> bool:
+        """Whether a channel has static transforms: the last part of its topic is tf_static."""
+        is_transform = channel.type_name in _FOXGLOVE_TYPES or _ros_name(channel) in _ROS_TYPES
+        return is_transform and channel.topic.strip("/").rpartition("/")[2] == _TOPIC
+
+    def add(self, channel: Channel, data: bytes | memoryview) -> None:
+        """Take a message, if it is one of static transforms."""
+        if not self.takes(channel):
+            return
+        parser = self._parser(channel)
+        try:
+            found = parser(memoryview(data)) if parser else []
+        except WireError:
+            return
+        self._take(found)
+
+    def _take(self, transforms: Iterable[Transform]) -> None:
+        for transform in transforms:
+            child = _name(transform.child)
+            if transform.is_usable and (child in self._latest or len(self._latest) < self._limit):
+                self._latest[child] = transform
+
+    def _parser(self, channel: Channel) -> Parser | None:
+        key = (channel.message_encoding, channel.schema)
+        if key not in self._parsers:
+            try:
+                self._parsers[key] = transform_parser(channel)
+            except WireError:
+                self._parsers[key] = None
+        return self._parsers[key]
+
+    @property
+    def transforms(self) -> list[Transform]:
+        """All of them, in the order in which their children were first seen."""
+        return list(self._latest.values())
+
+    def between(self, frame_ids: Iterable[str]) -> list[Transform]:
+        """The transforms that connect cameras with each other and with the rest of the robot.
+
+        These are the ones between each camera's frame and the root of its tree, so that the path
+        from any camera to any other is there, and to the frames above them.
+
+        Args:
+            frame_ids: The cameras' frames.
+
+        Returns:
+            A part of `transforms`, in the same order.
+        """
+        return between(self._latest, frame_ids)
+
+
+def between(by_child: Mapping[str, Transform], frame_ids: Iterable[str]) -> list[Transform]:
+    """See `TransformCollector.between`; `by_child` has names without a leading slash."""
+    kept: set[str] = set()
+    for frame_id in frame_ids:
+        child = _name(frame_id)
+        # stops where another camera's path went on, and in a circle
+        while child in by_child and child not in kept:
+            kept.add(child)
+            child = _name(by_child[child].parent)
+    return [transform for child, transform in by_child.items() if child in kept]

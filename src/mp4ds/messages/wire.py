@@ -1,0 +1,304 @@
+"""The neutral parts of camera messages, and what every serialization can do with them.
+
+A form knows one message type in one serialization. It splits a message into its body, its times
+and a blank, and fills a blank again; what it rebuilds is compared with the original by the
+caller, so nothing here needs to be trusted (spec/index.md, "Exactness").
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+NS = 10**9
+MAX_BLANK = 1 << 16
+"""Largest blank, bytes: what a message may hold besides its body."""
+
+
+class WireError(ValueError):
+    """A payload that does not parse as its type; the message says where it ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImageFields:
+    """What a raw image says of its pixels.
+
+    Attributes:
+        encoding: ROS image encoding.
+        width: Columns.
+        height: Rows.
+        step: Bytes per row.
+        is_bigendian: The byte as it stands; 0 where the type has none.
+    """
+
+    encoding: str
+    width: int
+    height: int
+    step: int
+    is_bigendian: int
+
+
+@dataclass(frozen=True, slots=True)
+class CodedFields:
+    """What a message says of the coded picture or packet that it holds.
+
+    Attributes:
+        format: The format or encoding, to the letter.
+        width: Columns of the image, 0 where the type does not say.
+        height: Rows of the image, 0 where the type does not say.
+    """
+
+    format: str
+    width: int = 0
+    height: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationFields:
+    """The calibration of a camera: all fields but the header.
+
+    Attributes:
+        height: Rows.
+        width: Columns.
+        distortion_model: As UTF-8.
+        d: Distortion parameters.
+        k: Intrinsic matrix, 3 x 3, by rows.
+        r: Rectification matrix, 3 x 3, by rows.
+        p: Projection matrix, 3 x 4, by rows.
+        binning_x: Columns binned into one.
+        binning_y: Rows binned into one.
+        roi: x_offset, y_offset, height, width.
+        roi_do_rectify: The byte as it stands.
+    """
+
+    height: int
+    width: int
+    distortion_model: str
+    d: tuple[float, ...]
+    k: tuple[float, ...]
+    r: tuple[float, ...]
+    p: tuple[float, ...]
+    binning_x: int = 0
+    binning_y: int = 0
+    roi: tuple[int, int, int, int] = (0, 0, 0, 0)
+    roi_do_rectify: int = 0
+
+
+Fields = ImageFields | CodedFields | CalibrationFields
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """A camera message, taken apart.
+
+    Attributes:
+        stamp: Header stamp, nanoseconds.
+        seq: Header sequence number; None where the type has none, as in ROS 2.
+        pts: Presentation time of a packet; None where the type has none.
+        frame_id: As UTF-8.
+        fields: The rest of what it says.
+        body: Pixels or coded picture, a view into the payload; empty for a calibration.
+        blank: The message with stamp, seq, pts and body blank.
+    """
+
+    stamp: int
+    seq: int | None
+    pts: int | None
+    frame_id: str
+    fields: Fields
+    body: memoryview
+    blank: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Slots:
+    """What differs between the messages that share a blank, besides the body."""
+
+    stamp: int
+    seq: int | None = None
+    pts: int | None = None
+
+
+class Template(Protocol):
+    """A blank whose slots are found."""
+
+    def around(self, slots: Slots, body_size: int) -> tuple[bytes, bytes]:
+        """The bytes before and after the body.
+
+        Args:
+            slots: The values to fill in.
+            body_size: Bytes of the body.
+
+        Raises:
+            WireError: A value has no place in this serialization.
+        """
+        ...
+
+    def padding(self, body_size: int) -> int:
+        """Zero bytes that a body of another length than the recorded one needs after it.
+
+        What follows a body may be aligned by its length.
+        """
+        ...
+
+
+class Form(Protocol):
+    """One message type in one serialization."""
+
+    @property
+    def wire(self) -> str:
+        """Name of the serialization, as sidecars spell it."""
+        ...
+
+    def split(self, data: memoryview) -> Parts:
+        """Take a message apart.
+
+        Raises:
+            WireError: The payload does not parse, or cannot be modelled; says why.
+        """
+        ...
+
+    def template(self, blank: bytes) -> Template:
+        """The template of a blank.
+
+        Raises:
+            WireError: It is no blank message of this form.
+        """
+        ...
+
+    def plain(self, frame_id: str, fields: Fields) -> bytes | None:
+        """The blank as a plain serializer writes it; None where that is not modelled."""
+        ...
+
+
+def prove(template: Template, parts: Parts, data: memoryview) -> bool:
+    """Whether a message's template and parts give the message's bytes again."""
+    head, tail = template.around(Slots(parts.stamp, parts.seq, parts.pts), len(parts.body))
+    end = len(data) - len(tail)  # the body itself is a view of what is there
+    return len(head) + len(parts.body) == end and data[: len(head)] == head and data[end:] == tail
+
+
+def join_stamp(sec: int, nanosec: int) -> int:
+    """Nanoseconds.
+
+    Raises:
+        WireError: A stamp that does not come back from them.
+    """
+    if not 0 <= nanosec < NS:
+        raise WireError("its stamp has a second or more in nanoseconds")
+    return sec * NS + nanosec
+
+
+def text(raw: memoryview) -> str:
+    """Decode a string of a message.
+
+    Raises:
+        WireError: It is not UTF-8.
+    """
+    try:
+        return str(raw, "utf-8")
+    except UnicodeDecodeError:
+        raise WireError("a string is not UTF-8") from None
+
+
+def check_floats(values: Sequence[float]) -> None:
+    """Refuse what YAML cannot hold; such a message is stored verbatim.
+
+    Raises:
+        WireError: A value is infinite or not a number.
+    """
+    if any(value - value != 0 for value in values):
+        raise WireError("a calibration value is not finite")
+
+
+# ---------------------------------------------------------------- primitive types
+
+
+class PrimitiveReader:
+    """Reads primitives in order; `aligned` inserts the padding of CDR.
+
+    Args:
+        data: The payload.
+        start: Where the fields begin; alignment counts from here.
+        order: ``<`` or ``>``.
+        aligned: Whether primitives stand at multiples of their size.
+    """
+
+    def __init__(self, data: memoryview, start: int, order: str, *, aligned: bool) -> None:
+        self._data = data
+        self._start = start
+        self.offset = start
+        self._order = order
+        self._aligned = aligned
+
+    def align(self, size: int) -> int:
+        """Go to where the next primitive of that size stands; returns the offset."""
+        if self._aligned:
+            self.offset += -(self.offset - self._start) % size
+        return self.offset
+
+    def take(self, code: str, count: int = 1) -> tuple[float, ...]:
+        """Read `count` primitives of a struct code."""
+        if count == 0:
+            return ()
+        size = struct.calcsize(code)
+        self.align(size)
+        end = self.offset + size * count
+        if end > len(self._data):
+            raise WireError(f"it ends at byte {len(self._data)}, inside of its fields")
+        values = struct.unpack_from(f"{self._order}{count}{code}", self._data, self.offset)
+        self.offset = end
+        return values
+
+    def integer(self, code: str) -> int:
+        """Read one integer."""
+        return int(self.take(code)[0])
+
+    def raw(self, size: int) -> memoryview:
+        """Read bytes as a view."""
+        end = self.offset + size
+        if end > len(self._data):
+            raise WireError(f"it ends at byte {len(self._data)} where a field needs {end}")
+        view = self._data[self.offset : end]
+        self.offset = end
+        return view
+
+    def string(self, *, terminated: bool) -> str:
+        """Read a length-prefixed string, in CDR with its closing NUL."""
+        size = self.integer("I")
+        raw = self.raw(size)
+        if terminated:
+            if size == 0 or raw[-1] != 0:
+                raise WireError("a string does not end in NUL")
+            raw = raw[:-1]
+        return text(raw)
+
+
+class PrimitiveWriter:
+    """Writes what `PrimitiveReader` reads, with padding of zeros."""
+
+    def __init__(self, prefix: bytes, order: str, *, aligned: bool) -> None:
+        self._data = bytearray(prefix)
+        self._start = len(prefix)
+        self._order = order
+        self._aligned = aligned
+
+    def put(self, code: str, *values: float) -> None:
+        """Write primitives of a struct code."""
+        if not values:
+            return
+        if self._aligned:
+            self._data += bytes(-(len(self._data) - self._start) % struct.calcsize(code))
+        self._data += struct.pack(f"{self._order}{len(values)}{code}", *values)
+
+    def string(self, value: str, *, terminated: bool) -> None:
+        """Write a length-prefixed string."""
+        raw = value.encode() + (b"\0" if terminated else b"")
+        self.put("I", len(raw))
+        self._data += raw
+
+    def getvalue(self) -> bytes:
+        """All bytes written."""
+        return bytes(self._data)

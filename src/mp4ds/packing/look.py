@@ -1,0 +1,241 @@
+"""What a camera message holds, and to which stream it belongs."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from mp4ds.dataset.rebuild import MessageSplitter, Unsuited
+from mp4ds.format.fields import Body
+from mp4ds.messages import depth, jpeg, png
+from mp4ds.messages.coded import Refused
+from mp4ds.messages.encodings import ENCODINGS, Pixels, pixel_view, row_padding
+from mp4ds.messages.layouts import why_not
+from mp4ds.messages.png import PNG_ENCODINGS
+from mp4ds.messages.wire import CodedFields, Form, ImageFields, Parts
+from mp4ds.records import Channel, Message
+from mp4ds.video.coded_messages import PictureParser, packet_codec
+from mp4ds.video.decoder import jpeg_pixels
+
+_MAX_PNG_REFUSALS = 20  # in a row
+
+
+@dataclass(frozen=True, slots=True)
+class StreamKey:
+    """What the messages of one stream have in common.
+
+    Attributes:
+        wire: Serialization.
+        body: What a message's body is to the video (spec/registry.md, "Bodies").
+        codec: Codec of packets; empty where the video is encoded here.
+        encoding: ROS image encoding of the frames.
+        width: Columns.
+        height: Rows.
+        step: Bytes per row.
+        is_bigendian: The byte as it stands.
+    """
+
+    wire: str
+    body: Body
+    codec: str
+    encoding: str
+    width: int
+    height: int
+    step: int
+    is_bigendian: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class BodyFraming:
+    """What makes a body of a packet or of pixels, the same for many messages.
+
+    Attributes:
+        framing: Start codes and delimiters that an mp4 does not keep.
+        prefix: Bytes before the coded picture.
+        png: How its file was written.
+        padding: What stands between rows of pixels, deflated; None: zeros.
+    """
+
+    framing: str = ""
+    prefix: bytes = b""
+    png: png.PngRecipe | None = None
+    padding: bytes | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CameraMessage:
+    """A camera message, as far as its stream needs to know it.
+
+    Attributes:
+        key: Its stream's.
+        form: How it is serialized.
+        parts: What it consists of.
+        wrap: What its body has beside the packet or pixels.
+        pixels: Its pixels, shape as `pixel_view` gives it; None for a packet.
+        keyframe: Whether decoding can begin at its packet.
+        parameters: What a decoder needs to know before the packet.
+    """
+
+    key: StreamKey
+    form: Form
+    parts: Parts
+    wrap: BodyFraming = BodyFraming()
+    pixels: Pixels | None = None
+    keyframe: bool = True
+    parameters: bytes = b""
+
+
+class Looker:
+    """Looks into the messages of one channel.
+
+    Args:
+        channel: The channel.
+        transcode: Decode JPEG files instead of taking them as packets.
+    """
+
+    def __init__(self, channel: Channel, *, transcode: bool = False) -> None:
+        self._is_packets = _holds_packets(channel)
+        self._forms = MessageSplitter(channel)
+        self._parsers: dict[str, PictureParser] = {}
+        self._png: png.PngRecipe | None = None
+        self._png_refusals = 0
+        self._transcode = transcode
+
+    def look(self, message: Message) -> CameraMessage:
+        """What a message holds.
+
+        Raises:
+            Unsuited: No stream can carry it; says why.
+        """
+        form, parts = self._forms.split(message)
+        fields = parts.fields
+        try:
+            if isinstance(fields, ImageFields):
+                return _raw_image(form, parts, fields)
+            if isinstance(fields, CodedFields):
+                return self._kind_of(parts.body, fields)(form, parts)
+        except Refused as reason:
+            raise Unsuited(str(reason)) from None
+        raise Unsuited("it holds no image")
+
+    def leave_out(self, seen: CameraMessage) -> None:
+        """Tell that no stream took what was seen last."""
+        if seen.key.codec in self._parsers:
+            self._parsers[seen.key.codec].leave_out()
+
+    def _kind_of(
+        self, body: memoryview, fields: CodedFields
+    ) -> Callable[[Form, Parts], CameraMessage]:
+        if self._is_packets:
+            codec = packet_codec(fields.format)
+            if codec != "mjpeg":
+                return lambda form, parts: self._packet(form, parts, codec)
+        elif bytes(body[: len(png.SIGNATURE)]) == png.SIGNATURE:
+            return self._png_image
+        elif "compressedDepth" in fields.format:
+            return self._depth_image
+        return self._jpeg_image
+
+    def _packet(self, form: Form, parts: Parts, codec: str) -> CameraMessage:
+        if codec not in self._parsers:
+            self._parsers[codec] = PictureParser(codec)
+        parser = self._parsers[codec]
+        picture = parser.parse(parts.body)
+        return CameraMessage(
+            _coded_key(form, "packet", codec, "rgb8", picture.width, picture.height),
+            form,
+            parts,
+            BodyFraming(framing=picture.framing),
+            keyframe=picture.keyframe,
+            parameters=parser.parameters,
+        )
+
+    def _jpeg_image(self, form: Form, parts: Parts) -> CameraMessage:
+        found = jpeg.parse(parts.body)
+        encoding = "mono8" if found.components == 1 else "rgb8"
+        if not self._transcode:
+            key = _coded_key(form, "packet", "mjpeg", encoding, found.width, found.height)
+            return CameraMessage(key, form, parts)
+        _, pixels = jpeg_pixels(parts.body, (found.width, found.height))
+        key = _coded_key(form, "jpeg", "", encoding, found.width, found.height)
+        return CameraMessage(key, form, parts, pixels=pixels)
+
+    def _png_image(self, form: Form, parts: Parts) -> CameraMessage:
+        with self._png_trial():
+            pixels, self._png = png.decode(parts.body, self._png)
+        height, width = pixels.shape[:2]
+        channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+        encoding = PNG_ENCODINGS[pixels.itemsize, channels]
+        key = _coded_key(form, "png", "", encoding, width, height)
+        return CameraMessage(key, form, parts, BodyFraming(png=self._png), pixels=pixels)
+
+    @contextmanager
+    def _png_trial(self) -> Iterator[None]:
+        """Give up on a topic whose files are none that can be made again: trying is costly."""
+        if self._png_refusals == _MAX_PNG_REFUSALS:
+            raise Refused("PNG files of its topic do not rebuild")
+        try:
+            yield
+        except Refused:
+            self._png_refusals += 1
+            raise
+        self._png_refusals = 0
+
+    def _depth_image(self, form: Form, parts: Parts) -> CameraMessage:
+        with self._png_trial():
+            image = depth.decode_depth(parts.body, self._png)
+        self._png = image.recipe or self._png
+        height, width = image.pixels.shape
+        key = _coded_key(form, "png" if image.recipe else "rvl", "", "16UC1", width, height)
+        wrap = BodyFraming(prefix=image.header, png=image.recipe)
+        return CameraMessage(key, form, parts, wrap, pixels=image.pixels)
+
+
+def depends_on_others(channel: Channel, message: Message) -> bool:
+    """Whether messages of a channel cannot be understood without earlier ones.
+
+    Args:
+        channel: A camera channel.
+        message: One of its messages.
+    """
+    try:
+        _, parts = MessageSplitter(channel).split(message)
+        fields = parts.fields
+        if not isinstance(fields, CodedFields) or not _holds_packets(channel):
+            return False
+        return packet_codec(fields.format) != "mjpeg"
+    except (Unsuited, Refused):
+        return _holds_packets(channel)
+
+
+def _holds_packets(channel: Channel) -> bool:
+    return not channel.type_name.endswith("CompressedImage")
+
+
+def _coded_key(
+    form: Form, body: Body, codec: str, encoding: str, width: int, height: int
+) -> StreamKey:
+    step = width * ENCODINGS[encoding].pixel_bytes
+    return StreamKey(form.wire, body, codec, encoding, width, height, step)
+
+
+def _raw_image(form: Form, parts: Parts, fields: ImageFields) -> CameraMessage:
+    reason = why_not(
+        fields.encoding,
+        width=fields.width,
+        height=fields.height,
+        step=fields.step,
+        size=len(parts.body),
+    )
+    if reason:
+        raise Unsuited(reason)
+    encoding = ENCODINGS[fields.encoding]
+    size = {"width": fields.width, "height": fields.height, "step": fields.step}
+    padding = row_padding(parts.body, encoding, **size)
+    wrap = BodyFraming() if padding is None else BodyFraming(padding=zlib.compress(padding))
+    is_bigendian = fields.is_bigendian
+    pixels = pixel_view(parts.body, encoding, **size, is_bigendian=bool(is_bigendian))
+    key = StreamKey(form.wire, "pixels", "", fields.encoding, **size, is_bigendian=is_bigendian)
+    return CameraMessage(key, form, parts, wrap, pixels=pixels)

@@ -1,0 +1,238 @@
+"""How to pack, what a pack tells while it runs, and what became of each topic."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from mp4ds.errors import OptionError
+from mp4ds.options import Options, cluster, exclude, force, option, parse_size, topics
+from mp4ds.plan import parse_quality
+from mp4ds.records import Loss
+
+
+@dataclass(frozen=True)
+class ImageFolder(Options):
+    """How a folder of images is read as a recording."""
+
+    layout: str | None = option("euroc, kitti, tum or plain; as found by default.")
+    stamps: str | None = option("Times, one a line; or times and file names.", metavar="FILE")
+    rate: str | None = option(
+        "Where there are no times, such as 20 or 30000/1001; of each camera, where the names tell "
+        "several.",
+        metavar="HZ",
+    )
+    unit: str | None = option(
+        "Of times that are whole numbers: s, ms, us or ns; ns by default, if they have the digits."
+    )
+    calibration: str | None = option("As ROS's camera_calibration saves it.", metavar="YAML")
+    topic: str | None = option("Of plain images; /camera/image_raw by default.", None, "-t")
+    frame_id: str | None = option("Of plain images; camera by default.")
+    encoding: str | None = option(
+        "Of plain images, such as bayer_rggb8 or 16UC1; as in the files by default."
+    )
+
+    def absolute(self) -> ImageFolder:
+        """The same with absolute paths, for processes elsewhere."""
+        stamps, calibration = (
+            None if path is None else os.path.abspath(path)  # noqa: PTH100 - keeps links
+            for path in (self.stamps, self.calibration)
+        )
+        return replace(self, stamps=stamps, calibration=calibration)
+
+
+# ---------------------------------------------------------------- pack
+
+_MAX_REASONS = 10
+_OTHER = "other reasons"
+
+
+@dataclass(frozen=True)
+class PackOptions(Options):
+    """How to pack."""
+
+    topics: Sequence[str] = topics()
+    exclude: Sequence[str] = exclude()
+    quality: str = option(
+        "lossless, visual, crf=N, or a score to keep: vmaf=99.5, psnr=42, ssim=0.98.",
+        "lossless",
+        "-q",
+    )
+    codec: str | None = option(
+        "h264, h265, ffv1 (lossless), av1, av1-10bit (lossy); of a graphics card av1-nvenc, "
+        "h264-nvenc, h265-nvenc, ...-vaapi or ...-videotoolbox; chosen by measurement by default."
+    )
+    preset: str | None = option("The encoder's preset, such as 6, veryfast or p4.")
+    transcode: bool = option(
+        "Encode JPEG images anew by `quality`, instead of copying them.", False
+    )
+    camera_info: Sequence[str] = option(
+        "Topics that belong together, where names and stamps do not tell.",
+        (),
+        metavar="IMAGE=INFO",
+    )
+    purpose: str | None = option(
+        "archive: smallest files. training: fastest random access.",
+        None,
+        "--for",
+        metavar="PURPOSE",
+    )
+    gop: int | None = option(
+        "Most frames from a key frame to the next; 30 by default, 60 where lossy.",
+        least=1,
+        most=100_000,
+    )
+    window: int | None = option(
+        "Frames of the busiest camera in a part of a long recording; 10 times `gop`.",
+        least=2,
+        most=10_000_000,
+    )
+    jobs: int | None = option(
+        "Processes at a time; all cores by default.", None, "-j", least=1, most=1024
+    )
+    memory: int | None = option(
+        "Such as 8G; half of the machine's by default.", metavar="SIZE", parse=parse_size
+    )
+    cluster: str | None = cluster()
+    join: bool = option("Make the dataset of what the shards packed.", False)
+    keep_going: bool = option("Where a part fails, go on with the others.", False)
+    salvage: bool = option("Pack what can be read of a damaged recording.", False)
+    restart: bool = option("Start over where an unfinished run was left.", False)
+    force: bool = force()
+    images: ImageFolder | None = option("How a folder of images is read as a recording.")
+
+    @property
+    def group_frames(self) -> int:
+        """Most frames from one key frame to the next.
+
+        Raises:
+            OptionError: `quality` or `purpose` is none.
+        """
+        from mp4ds.video.codecs import GOPS, LOSSLESS_GOP, LOSSY_GOP
+
+        lossless = parse_quality(self.quality).lossless
+        if self.purpose is not None and self.purpose not in GOPS:
+            raise OptionError(f"`purpose` {self.purpose!r} is not one of {', '.join(GOPS)}.")
+        if self.purpose is not None and self.gop is not None:
+            raise OptionError("`purpose` chooses what `gop` says. Give one of them.")
+        if self.purpose is not None:
+            return GOPS[self.purpose]
+        return self.gop or (LOSSLESS_GOP if lossless else LOSSY_GOP)
+
+
+@dataclass(frozen=True)
+class PackProgress:
+    """Where a pack stands.
+
+    Attributes:
+        dataset: What is being made.
+        phase: ``planning``, ``packing``, ``joining`` or, for a URL, ``uploading``.
+        done: Share of the work of this phase that is done, 0 to 1; None where nothing tells.
+        bytes_read: Payload bytes of the messages packed so far.
+        bytes_total: Bytes of the source files.
+        bytes_written: Bytes of the dataset so far.
+        topics: Messages packed so far and in all (None: not known), by topic of a camera.
+        tasks_done: Parts that are done.
+        tasks_total: Parts that there are; 0 for a recording packed in one go.
+        tasks_before: Of those done, the ones that an earlier run did.
+        failed: Parts that failed.
+        note: What is being done now, if it is worth telling.
+    """
+
+    dataset: Path
+    phase: str
+    done: float | None
+    bytes_read: int
+    bytes_total: int
+    bytes_written: int
+    topics: Mapping[str, tuple[int, int | None]]
+    tasks_done: int = 0
+    tasks_total: int = 0
+    tasks_before: int = 0
+    failed: int = 0
+    note: str = ""
+
+    @property
+    def frames(self) -> int:
+        """Camera messages packed so far."""
+        return sum(done for done, _ in self.topics.values())
+
+
+@dataclass
+class TopicSummary:
+    """What became of a topic.
+
+    Attributes:
+        topic: Its name.
+        type_name: Its message type.
+        messages: Messages packed.
+        frames: Messages of these that are frames of a video or entries of its camera_info.
+        raw_bytes: Payload bytes of all messages.
+        packed_bytes: Bytes of its videos and sidecars; 0 for one that is in messages.mcap.
+        files: Its videos.
+        verbatim: Reason -> (messages, number of the first) for camera messages stored verbatim.
+        notes: What else is worth knowing.
+    """
+
+    topic: str
+    type_name: str
+    messages: int = 0
+    frames: int = 0
+    raw_bytes: int = 0
+    packed_bytes: int = 0
+    files: list[str] = field(default_factory=list)
+    verbatim: dict[str, tuple[int, int]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def count_verbatim(self, reason: str, number: int) -> None:
+        """Count one more message stored verbatim, the topic's message of that number."""
+        if reason not in self.verbatim and len(self.verbatim) >= _MAX_REASONS:
+            reason = _OTHER
+        count, first = self.verbatim.get(reason, (0, number))
+        self.verbatim[reason] = (count + 1, first)
+
+    def extend(self, later: TopicSummary, before: int) -> None:
+        """Add what became of later messages.
+
+        Args:
+            later: Of these messages alone.
+            before: Messages of the topic before them.
+        """
+        self.messages += later.messages
+        self.frames += later.frames
+        self.raw_bytes += later.raw_bytes
+        for reason, (count, number) in later.verbatim.items():
+            if reason not in self.verbatim and len(self.verbatim) >= _MAX_REASONS:
+                reason = _OTHER
+            known, first = self.verbatim.get(reason, (0, before + number))
+            self.verbatim[reason] = (known + count, first)
+        self.notes.extend(note for note in later.notes if note not in self.notes)
+
+
+@dataclass(frozen=True)
+class PackSummary:
+    """What a pack did.
+
+    Attributes:
+        dataset: The folder made.
+        topics: One entry per topic, in the recording's order.
+        source_bytes: Bytes of the source files.
+        dataset_bytes: Bytes of the dataset.
+        messages_bytes: Bytes of messages.mcap.
+        left_out: Topics left out on request.
+        skipped: What the source holds and no dataset can: a phrase -> how many.
+        losses: What could not be read of a damaged recording.
+        larger: Why the dataset is larger than its source, where it is by more than 5 %.
+    """
+
+    dataset: Path
+    topics: list[TopicSummary]
+    source_bytes: int
+    dataset_bytes: int
+    messages_bytes: int
+    left_out: list[str]
+    skipped: dict[str, int]
+    losses: list[Loss] = field(default_factory=list)
+    larger: str = ""

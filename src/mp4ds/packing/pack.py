@@ -1,0 +1,476 @@
+"""Source -> dataset: images into videos, all the rest verbatim.
+
+A short recording is packed in one pass. A long one is divided into tasks, which run on every
+core or on other machines, and whose results stay until all are there.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mp4ds import errors
+from mp4ds.bags.formats import SourceHasher
+from mp4ds.bags.protocols import BagReader
+from mp4ds.errors import (
+    FormatError,
+    OptionError,
+    PartsFailedError,
+    SourceError,
+    TargetExistsError,
+    WriteError,
+)
+from mp4ds.files.outputs import check_target, staged
+from mp4ds.files.sources import source_size, unchanged
+from mp4ds.files.urls import RemotePath, location, remote
+from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.messages.serializations import is_camera
+from mp4ds.packing.job import Job, Task, absolute, open_recording, outcome_options
+from mp4ds.packing.manifest import PartRecord, dataset_files, folder_size, summarize, write_manifest
+from mp4ds.packing.options import PackOptions, PackProgress, PackSummary
+from mp4ds.packing.packer import Exact, Packer, until_in_reach
+from mp4ds.packing.planning import Resources, plan_job
+from mp4ds.packing.workplace import Workplace
+from mp4ds.plan import parse_quality
+from mp4ds.registry import plugin
+from mp4ds.video.codecs import check_codec
+from mp4ds.video.encoder import check_hardware
+
+if TYPE_CHECKING:
+    from mp4ds.packing.engine import Engine
+
+
+@dataclass
+class PackRun:
+    """One recording being packed by tasks.
+
+    Attributes:
+        job: What is to be done.
+        place: Where its parts are made.
+        paths: What is to be packed, as it was given.
+        target: The dataset.
+        force: Replace an existing dataset.
+        is_new: Whether the job was planned just now.
+        failures: Name and sentence of each task that failed.
+        exit_code: What the first of them asks for.
+    """
+
+    job: Job
+    place: Workplace
+    paths: Sequence[Path]
+    target: Path
+    force: bool
+    is_new: bool
+    failures: list[tuple[str, str]] = field(default_factory=list)
+    exit_code: int = 1
+
+    def begin(self, options: dict[str, object], *, anew: bool, alone: bool) -> None:
+        """Take the place over; it is held.
+
+        Args:
+            options: Those that decide what comes out.
+            anew: Forget what is there.
+            alone: Nobody else is at work there.
+
+        Raises:
+            OptionError: An unfinished pack with other options is there.
+            SourceError: The recording has changed since.
+        """
+        if anew and alone:
+            self.place.clear()
+        if self.is_new:
+            self.job = self.place.begin(self.job)
+        self.place.check(self.job, options, absolute(self.paths))
+        if alone:
+            self.place.sweep()
+
+    @property
+    def missing(self) -> list[Task]:
+        """The tasks whose results are not there."""
+        return [task for task in self.job.tasks if not self.place.is_done(task)]
+
+    def fail(self, name: str, kind: str, sentence: str) -> None:
+        """Take notice of a task that failed."""
+        if not self.failures:
+            self.exit_code = getattr(getattr(errors, kind, None), "exit_code", 1)
+        self.failures.append((name, sentence))
+
+    def raise_failures(self) -> None:
+        """Report the tasks that failed.
+
+        Raises:
+            PartsFailedError: There are some.
+        """
+        if self.failures:
+            raise PartsFailedError(self.target, self.failures, len(self.job.tasks), self.exit_code)
+
+
+# ---------------------------------------------------------------- in one pass
+
+_REPORT_SECONDS = 0.1
+
+
+def pack_in_one_pass(
+    reader: BagReader,
+    job: Job,
+    folder: Path,
+    target: Path,
+    report: Callable[[PackProgress], None] | None,
+    exact: Exact,
+) -> PackSummary:
+    """Pack a whole recording; its files are hashed while they are read.
+
+    Args:
+        reader: The recording.
+        job: Of one task.
+        folder: The folder to fill, empty.
+        target: Its final name.
+        report: Told of progress several times a second.
+        exact: Streams that are made lossless, since a score is out of their reach.
+
+    Raises:
+        SourceError: The recording is damaged, or changed while it was read.
+        OutOfReachError: A stream cannot have the score that was asked for.
+        OSError: The disk refused.
+    """
+    total = sum(map(source_size, reader.files))
+    stats = reader.stats()
+    counts: dict[str, int | None] = {}
+    for channel in filter(is_camera, reader.channels):
+        count = stats[channel.id].count if channel.id in stats else None
+        known = counts.get(channel.topic, 0)
+        counts[channel.topic] = None if count is None or known is None else known + count
+    next_report = 0.0
+
+    def progress(part: PartRecord, *, done: bool = False) -> None:
+        nonlocal next_report
+        hasher.advance(reader.position)
+        now = time.monotonic()
+        if report is None or (now < next_report and not done):
+            return
+        next_report = now + _REPORT_SECONDS
+        report(
+            PackProgress(
+                dataset=target,
+                phase="packing",
+                done=1.0 if done else min(1.0, reader.position / max(1, total)),
+                bytes_read=sum(topic.raw_bytes for topic in part.topics.values()),
+                bytes_total=total,
+                bytes_written=folder_size(folder),
+                topics={
+                    name: (topic.messages, counts[name])
+                    for name, topic in part.topics.items()
+                    if name in counts
+                },
+            )
+        )
+
+    (task,) = (task for task in job.tasks if task.whole)
+    with unchanged(job.sources), SourceHasher(reader.path, reader.files) as hasher:
+        part = Packer(reader, folder, job.settings(task, exact), progress).run()
+        hasher.advance(None)
+    write_manifest(part, reader, hasher.digests, job.options["quality"])
+    progress(part, done=True)
+    return summarize(part, target, total)
+
+
+# ---------------------------------------------------------------- pack
+
+# a short pack is mostly imports: what only divided packs, URLs and scores need is left to them
+
+
+Report = Callable[[PackProgress], None]
+
+
+def pack(
+    sources: Sequence[Path | str] | Path | str,
+    dataset: Path | str,
+    options: PackOptions | None = None,
+    *,
+    progress: Report | None = None,
+) -> PackSummary:
+    """Pack a recording into a dataset.
+
+    Args:
+        sources: A bag, rosbag2 folder or MCAP file, or several that belong together; or URLs. A
+            folder of images where the options have `images`.
+        dataset: The folder to make, or its URL.
+        options: How; the default loses nothing.
+        progress: Called several times a second.
+
+    Returns:
+        What became of each topic.
+
+    Raises:
+        SourceError: The recording cannot be read.
+        TargetError: The dataset may not be written there.
+        WriteError: The disk refused.
+        RemoteError: A store or web server fails.
+        OptionError: An option is wrong.
+        PartsFailedError: Parts of a long recording failed; those finished are kept beside the
+            dataset, and calling again goes on with the others. Else nothing is left behind.
+    """
+    chosen = _checked(options or PackOptions())
+    return _pack(_paths(sources), _absolute(dataset), chosen, progress)
+
+
+def _pack(
+    paths: Sequence[Path], target: Path, options: PackOptions, progress: Report | None
+) -> PackSummary:
+    store = remote(target)
+    if store:
+        return _pack_to_store(paths, store, options, progress)
+    run = _plan(paths, target, options)
+    if run.is_new and run.job.is_single and not options.cluster:
+        return until_in_reach(partial(_pack_in_one_pass, run, progress))
+    return _pack_runs([run], options, progress)[0]
+
+
+def _pack_to_store(
+    paths: Sequence[Path], store: RemotePath, options: PackOptions, progress: Report | None
+) -> PackSummary:
+    """Pack on this machine, then upload."""
+    from mp4ds.files.uploads import uploaded
+
+    shown = store
+
+    def make(local: Path) -> PackSummary:
+        report = progress and (lambda state: progress(replace(state, dataset=shown)))
+        return _pack(paths, local, replace(options, force=True), report)
+
+    def tell(name: str, done: int, total: int) -> None:
+        if progress:
+            share = done / total if total else None
+            progress(PackProgress(shown, "uploading", share, 0, total, done, {}, note=name))
+
+    owned = dataset_files
+    summary = uploaded(
+        store, make, last=MANIFEST_NAME, force=options.force, owned=owned, report=tell
+    )
+    return replace(summary, dataset=shown)
+
+
+def pack_share(
+    sources: Sequence[Path | str] | Path | str,
+    dataset: Path | str,
+    share: tuple[int, int],
+    options: PackOptions | None = None,
+    *,
+    progress: Report | None = None,
+) -> None:
+    """Pack one machine's share of a recording; `pack` makes the dataset when all shares are there.
+
+    Args:
+        sources: As for `pack`, under the same path on all machines.
+        dataset: The folder to make in the end; beside it the parts are made.
+        share: Number of this share, from 1, and how many there are.
+        options: How; the same for all shares.
+        progress: Called several times a second.
+
+    Raises:
+        Mp4dsError: As `pack`.
+    """
+    chosen = _checked(options or PackOptions())
+    target = _absolute(dataset)
+    store = remote(target)
+    if store:
+        from mp4ds.files.uploads import local_path
+
+        target = local_path(store)
+    run = _plan(_paths(sources), target, chosen, is_share=True)
+    _pack_runs([run], chosen, progress, share=share)
+
+
+def pack_each(
+    sources: Sequence[Path | str],
+    folder: Path | str,
+    options: PackOptions | None = None,
+    *,
+    progress: Report | None = None,
+) -> list[PackSummary]:
+    """Pack recordings into one dataset each, as one job.
+
+    Args:
+        sources: Each a bag, rosbag2 folder or MCAP file, or its URL.
+        folder: Where, or at which URL, to make the datasets; each is named as its recording.
+        options: How.
+        progress: Called several times a second.
+
+    Returns:
+        What became of each that was packed now, in the order of the sources; datasets that are
+        there already, of the same recordings, are left as they are.
+
+    Raises:
+        Mp4dsError: As `pack`.
+    """
+    chosen = _checked(options or PackOptions())
+    parent = _absolute(folder)
+    targets: dict[Path, Path] = {}
+    for source in map(location, sources):
+        target = parent / (source.name if source.is_dir() else source.stem)
+        if target in targets:
+            raise OptionError(
+                f"{targets[target]} and {source} would both become {target}. Pack one elsewhere."
+            )
+        targets[target] = source
+    if remote(parent):  # one after the other, so that only one is on this machine at a time
+        return [
+            _pack([source], target, chosen, progress)
+            for target, source in targets.items()
+            if chosen.force or not _is_packed(source, target, chosen)
+        ]
+    parent.mkdir(exist_ok=True)
+    runs = []
+    for target, source in targets.items():
+        if chosen.force or not _is_packed(source, target, chosen):
+            runs.append(_plan([source], target, chosen, recordings=len(targets)))
+    return _pack_runs(runs, chosen, progress)
+
+
+def _is_packed(source: Path, target: Path, options: PackOptions) -> bool:
+    """Whether a dataset of a recording is there already."""
+    if not (target / MANIFEST_NAME).exists() if remote(target) else not os.path.lexists(target):
+        return False
+    with open_recording([source], images=options.images) as reader:
+        sizes = sorted(map(source_size, reader.files))
+    try:
+        manifest = load_manifest(target / MANIFEST_NAME)
+    except FormatError:
+        raise TargetExistsError(target) from None
+    if sorted(item.size for item in manifest.sources) != sizes:
+        raise TargetExistsError(target)
+    return True
+
+
+def _checked(options: PackOptions) -> PackOptions:
+    """Refuse options that contradict each other.
+
+    Raises:
+        OptionError: They do.
+        HardwareError: An encoder is asked for that this machine has not.
+        ScoringError: VMAF is asked for, and there is nothing that computes it.
+    """
+    quality = parse_quality(options.quality)
+    if options.transcode and quality.lossless:
+        raise OptionError(
+            "`transcode` goes with a lossy `quality`, such as visual: without loss, a JPEG file "
+            "is smaller than any video of its pixels."
+        )
+    check_codec(
+        options.codec,
+        options.preset,
+        lossless=quality.lossless,
+        crf=quality.crf,
+        varied=quality.target is not None,
+    )
+    if not (options.cluster or options.join):  # else others encode, or did
+        check_hardware(options.codec)
+    if quality.target and quality.target.metric == "vmaf" and not options.join:
+        from mp4ds.video.libvmaf import find_ffmpeg
+
+        find_ffmpeg()  # says how to get one before anything is read
+    images = options.images.absolute() if options.images else None
+    return replace(
+        options, quality=str(quality), purpose=None, gop=options.group_frames, images=images
+    )
+
+
+def _plan(
+    paths: Sequence[Path],
+    target: Path,
+    options: PackOptions,
+    *,
+    recordings: int = 1,
+    is_share: bool = False,
+) -> PackRun:
+    """The pack of a recording: one that was begun before, or a new one."""
+    check_target(target, force=options.force, owned=dataset_files, sources=paths)
+    place = Workplace.beside(target)
+    shared = is_share or options.join or options.cluster is not None
+    job = None if options.restart else place.job(shared=shared)
+    if job is not None:
+        return PackRun(job, place, paths, target, options.force, is_new=False)
+    if options.join:
+        raise OptionError(
+            f"There is nothing to join: {place.folder} holds no pack. Run the shards first."
+        )
+    with open_recording(paths, salvage=options.salvage, images=options.images) as reader:
+        job = plan_job(reader, paths, options, Resources.of(options).for_one_of(recordings))
+    return PackRun(job, place, paths, target, options.force, is_new=True)
+
+
+def _pack_in_one_pass(run: PackRun, progress: Report | None, exact: Exact) -> PackSummary:
+    with (
+        run.job.open() as reader,
+        staged(run.target, force=run.force, owned=dataset_files, sources=run.paths) as folder,
+    ):
+        folder.mkdir()
+        try:
+            return pack_in_one_pass(reader, run.job, folder, run.target, progress, exact)
+        except OSError as error:
+            if isinstance(error, SourceError) or error.errno is None:
+                raise
+            raise WriteError(run.target, error) from error
+
+
+def _pack_runs(
+    runs: Sequence[PackRun],
+    options: PackOptions,
+    progress: Report | None,
+    *,
+    share: tuple[int, int] | None = None,
+) -> list[PackSummary]:
+    """Run the tasks of packs, and make their datasets unless only a share of the tasks is run."""
+    from mp4ds.packing.coordinator import Coordinator, claimed
+
+    summaries = {}
+    with claimed(runs, shared=share is not None):
+        for run in runs:
+            run.begin(outcome_options(options), anew=options.restart, alone=share is None)
+        coordinator = Coordinator(
+            runs,
+            _engine(runs, options),
+            keep_going=options.keep_going,
+            share_of=share or (1, 1),
+            report=progress,
+        )
+        if options.join:
+            coordinator.refuse_missing()
+        for run in coordinator.run():
+            if share is None:
+                summaries[run.target] = coordinator.finish(run)
+    return [summaries[run.target] for run in runs if run.target in summaries]
+
+
+def _engine(runs: Sequence[PackRun], options: PackOptions) -> Engine:
+    if options.cluster:
+        from mp4ds.packing.work import run_task
+
+        engine: Engine = plugin("cluster")(run_task, options.cluster, task_bytes=_task_bytes(runs))
+        return engine
+    from mp4ds.packing.engine import ProcessEngine
+    from mp4ds.packing.work import command
+
+    means = Resources.of(options)
+    return ProcessEngine(command, min((means.slots(run.job) for run in runs), default=1))
+
+
+def _task_bytes(runs: Sequence[PackRun]) -> int:
+    return max((run.job.task_bytes for run in runs), default=0)
+
+
+def _paths(sources: Sequence[Path | str] | Path | str) -> list[Path]:
+    several = [sources] if isinstance(sources, (str, Path, RemotePath)) else sources
+    return [location(path) for path in several]
+
+
+def _absolute(path: Path | str) -> Path:
+    found = location(path)
+    if remote(found):
+        return found
+    return Path(os.path.abspath(found))  # noqa: PTH100 - keeps links, unlike resolve()

@@ -1,0 +1,495 @@
+"""Streams that are to have a score: their windows encoded, scored, and encoded again."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from array import array
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.format.models import SCORE_STEPS
+from mp4ds.format.models import Quality as Measured
+from mp4ds.messages.layouts import Layout
+from mp4ds.packing.look import CameraMessage, StreamKey
+from mp4ds.packing.tracks import OutOfReach, PicturePlan, StreamSettings, TargetPlan, picture_facts
+from mp4ds.plan import QualityTarget
+from mp4ds.times import TIMESCALE
+from mp4ds.video.codecs import LEAST_CRF, MAX_CRF, Recipe
+from mp4ds.video.encoder import VideoEncoder, coded_size
+from mp4ds.video.libvmaf import Ffmpeg, find_ffmpeg
+from mp4ds.video.packets import join_segments
+from mp4ds.video.planes import PLANES_FORMAT, PlaneMaker, Planes, PlaneSpool, decoded_planes
+from mp4ds.video.scores import SMALLEST, largest_crf, psnr_scores, ssim_scores, vmaf_scores
+
+FALLS = {"vmaf": 0.3, "psnr": 0.4, "ssim": 0.001}
+"""Metric -> about how much less it is for each crf more, around what is asked for."""
+
+_MOST_UP = 8  # crf from one window to the next
+_RANGE = 4  # of how fast scores fall, beside what is assumed
+_LAVISH = 0.5  # of the tolerance: a window with more too much is encoded again, with fewer bits
+_MOST_TRIMS = 2  # times
+_NOISE = 1e-9  # of sums of floats
+
+
+class CrfControl:
+    """Chooses the crf of one window after the other.
+
+    The mean of all frames does not fall below the target at any time, nor that of a window by
+    more than the tolerance: what earlier windows have too much, later ones may lack. Nor is a
+    window much better than it is to be, where a second try with fewer bits can tell.
+
+    Args:
+        start: The crf of the first window.
+        smallest: That may be chosen.
+        largest: That may be chosen.
+        tolerance: How far below the target the mean of a window may be.
+        fall: About how much less a score is for each crf more.
+    """
+
+    def __init__(
+        self, start: int, smallest: int, largest: int, tolerance: float, fall: float
+    ) -> None:
+        self.crf = start
+        self._smallest, self._largest = smallest, largest
+        self._tolerance = tolerance
+        self._assumed = self._fall = fall
+        self._surplus = 0.0  # of all frames together
+
+    def accepted(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
+        """The largest crf of those tried that is good enough; None where none is.
+
+        Args:
+            tried: Crf -> the mean score of the window's frames.
+            due: What is asked for.
+            frames: How many it has.
+        """
+        least = self._least(due, frames) - _NOISE
+        return max((crf for crf, mean in tried.items() if mean >= least), default=None)
+
+    def next(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
+        """The crf to encode a window with again; None where no more is to be tried.
+
+        Args:
+            tried: Crf -> the mean score of the window, in the order they were tried.
+            due: What is asked for.
+            frames: How many it has.
+        """
+        self._learn(tried)
+        best = self.accepted(tried, due, frames)
+        if best is None:
+            return self._better(tried, due, frames)
+        is_lavish = tried[best] - due > _LAVISH * self._tolerance
+        return self._smaller(tried, best, due) if is_lavish else None
+
+    def keep(self, tried: Mapping[int, float], crf: int, due: float, frames: int) -> None:
+        """Take a window as it was encoded with a crf, and choose that of the next one.
+
+        Args:
+            tried: Crf -> the mean score of the window.
+            crf: The one accepted.
+            due: What was asked for.
+            frames: How many it has.
+        """
+        mean = tried[crf]
+        self._surplus = max(0.0, self._surplus + (mean - due) * frames)
+        room = (due - self._least(due, frames)) / 2  # half of it is for what is not foreseen
+        up = int((mean - due + room) / self._fall)
+        self.crf = min(crf + min(max(up, 0), _MOST_UP), self._largest)
+
+    def _least(self, due: float, frames: int) -> float:
+        return due - min(self._tolerance, self._surplus / frames)
+
+    def _better(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
+        crf, mean = min(tried.items())
+        if crf == self._smallest:
+            return None
+        short = self._least(due, frames) - mean
+        # doubled each time: a scene whose scores do not rise comes to an end soon; but a half
+        # at the most, as small crf differ more
+        step = max(ceil(short / self._fall), 1 << (len(tried) - 1))
+        return max(self._smallest, crf // 2, crf - step)
+
+    def _smaller(self, tried: Mapping[int, float], best: int, due: float) -> int | None:
+        if len(tried) > _MOST_TRIMS:
+            return None
+        refused = min((crf for crf in tried if crf > best), default=self._largest + 1)
+        crf = min(best + int((tried[best] - due) / self._fall), refused - 1)
+        return crf if crf > best else None
+
+    def _learn(self, tried: Mapping[int, float]) -> None:
+        if len(tried) > 1:
+            (crf, mean), (other, its_mean) = list(tried.items())[-2:]
+            found = (its_mean - mean) / (crf - other)
+            self._fall = min(max(found, self._assumed / _RANGE), self._assumed * _RANGE)
+
+
+# ---------------------------------------------------------------- windows
+
+_FRAMES = 60  # of a window, or as many as are of one group of pictures, where that is longer
+_MOST_FRAMES = 240
+
+
+def window_frames(gop: int) -> int:
+    """Frames of a window: whole groups of pictures, so that windows cost no more key frames.
+
+    Args:
+        gop: Most frames from one key frame to the next.
+    """
+    return min(max(1, _FRAMES // gop) * gop, _MOST_FRAMES)
+
+
+@dataclass(frozen=True)
+class WindowCoder:
+    """Encodes and scores windows.
+
+    Attributes:
+        recipe: Codec and options; the crf is another one each time.
+        layout: How images become pictures.
+        size: Columns and rows of an image.
+        target: Its metric is measured.
+        gop: Most frames from one key frame to the next.
+        threads: Of the encoder, and of libvmaf.
+        rate: Frames per second, where known.
+    """
+
+    recipe: Recipe
+    layout: Layout
+    size: tuple[int, int]
+    target: QualityTarget
+    gop: int
+    threads: int
+    rate: float | None
+
+    @cached_property
+    def coded_size(self) -> tuple[int, int]:
+        """Columns and rows of a coded picture."""
+        return coded_size(self.recipe, *self.layout.picture_size(*self.size))
+
+    @cached_property
+    def ffmpeg(self) -> Ffmpeg | None:
+        """What computes VMAF, where that is the metric.
+
+        Raises:
+            ScoringError: There is none; says how to get one.
+        """
+        return find_ffmpeg() if self.target.metric == "vmaf" else None
+
+    def maker(self) -> PlaneMaker:
+        """Makes planes of pictures."""
+        return PlaneMaker(self.layout.pixel_format)
+
+    def spool(self, path: Path) -> PlaneSpool:
+        """Keeps planes in a file."""
+        return PlaneSpool(path, *self.coded_size)
+
+    def encode(
+        self, frames: PlaneSpool, ticks: Sequence[int], crf: int, path: Path
+    ) -> NDArray[np.int64]:
+        """Encode a window.
+
+        Args:
+            frames: Those of the window, at least one.
+            ticks: When each is shown, increasing.
+            crf: Constant rate factor.
+            path: The video to make.
+
+        Returns:
+            The scores of its frames, in steps of the metric (`SCORE_STEPS`).
+
+        Raises:
+            EncoderRefusedError: The codec does not take such pictures.
+            ScoringError: libvmaf failed.
+            OSError: The disk refused.
+        """
+        width, height = self.coded_size
+        encoder = VideoEncoder(
+            path,
+            replace(self.recipe, options={**self.recipe.options, "crf": str(crf)}),
+            picture_format=PLANES_FORMAT,
+            width=width,
+            height=height,
+            gop=self.gop,
+            threads=self.threads,
+            rate=self.rate,
+        )
+        try:
+            for planes, tick in zip(frames, ticks, strict=True):
+                encoder.write(planes, tick - ticks[0])
+        except BaseException:
+            encoder.abandon()
+            raise
+        encoder.close()
+        return self._scores(frames, decoded_planes(path))
+
+    def reachable(self, frames: PlaneSpool) -> float:
+        """The score to ask of a window: the target, or less where that is beyond it.
+
+        VMAF takes what is at rest for less than it is, even beside itself.
+
+        Raises:
+            ScoringError: libvmaf failed.
+        """
+        target = self.target
+        if target.metric != "vmaf":
+            return target.score
+        ceiling = self.mean(self._scores(frames, frames))
+        return min(target.score, ceiling - target.tolerance)
+
+    def mean(self, scores: NDArray[np.int64]) -> float:
+        """The mean of scores that are told in steps."""
+        return float(np.mean(scores)) / SCORE_STEPS[self.target.metric]
+
+    def _scores(self, frames: PlaneSpool, decoded: Iterable[Planes]) -> NDArray[np.int64]:
+        if self.ffmpeg is not None:
+            # what moves in the first frame is told by the second
+            before = frames.frame(1) if len(frames) > 1 else None
+            found = vmaf_scores(
+                frames, decoded, ffmpeg=self.ffmpeg, threads=self.threads, before=before
+            )
+        else:
+            measure = psnr_scores if self.target.metric == "psnr" else ssim_scores
+            found = measure(frames, decoded)
+        return np.rint(found * SCORE_STEPS[self.target.metric]).astype(np.int64)
+
+
+# ---------------------------------------------------------------- target
+
+_MOST_SEARCHED = 5  # encodings of the samples
+_USUAL_RATE = 30.0
+
+
+def target_plan(
+    plan: PicturePlan,
+    target: QualityTarget,
+    key: StreamKey,
+    runs: Iterable[Iterable[CameraMessage]],
+    settings: StreamSettings,
+    rate: float | None,
+) -> TargetPlan:
+    """Look for the crf with which samples of a stream have a score.
+
+    Args:
+        plan: How the stream is made; with the crf to try first.
+        target: The score.
+        key: Of the stream.
+        runs: Consecutive messages of it from one or several places, at least one message.
+        settings: How to encode.
+        rate: Frames per second, where known.
+
+    Raises:
+        OutOfReach: No crf gives it.
+        EncoderRefusedError: The encoder does not take such pictures.
+        ScoringError: VMAF cannot be computed.
+    """
+    coder = _coder(plan, target, key, settings, rate)
+    if min(coder.coded_size) < SMALLEST:
+        raise OutOfReach(f"images with less than {SMALLEST} rows or columns have no {target}")
+    with tempfile.TemporaryDirectory(prefix="mp4ds-") as folder:
+        crf = _start_crf(coder, runs, int(plan.recipe.options["crf"]), Path(folder))
+    recipe = replace(plan.recipe, options={**plan.recipe.options, "crf": str(crf)})
+    return TargetPlan(plan.layout, recipe, str(target), exact=False, target=target)
+
+
+def _coder(
+    plan: PicturePlan,
+    target: QualityTarget,
+    key: StreamKey,
+    settings: StreamSettings,
+    rate: float | None,
+) -> WindowCoder:
+    return WindowCoder(
+        plan.recipe,
+        plan.layout,
+        (key.width, key.height),
+        target,
+        gop=settings.gop,
+        threads=settings.threads,
+        rate=rate,
+    )
+
+
+def _start_crf(
+    coder: WindowCoder, runs: Iterable[Iterable[CameraMessage]], guess: int, folder: Path
+) -> int:
+    maker, target = coder.maker(), coder.target
+    least = LEAST_CRF[coder.recipe.codec]
+    spools = []
+    try:
+        for number, run in enumerate(runs):
+            spools.append(coder.spool(folder / f"{number}.yuv"))
+            for seen in run:
+                if seen.pixels is not None:
+                    spools[-1].append(maker.make(coder.layout.to_picture(seen.pixels)))
+        filled = [spool for spool in spools if len(spool)]
+        due = float(np.mean([coder.reachable(spool) for spool in filled]))
+
+        known: dict[int, float] = {}
+
+        def score(crf: int) -> float:
+            video = folder / "sample.mp4"
+            step = round(TIMESCALE / (coder.rate or _USUAL_RATE)) or 1
+            found = []
+            for spool in filled:
+                ticks = range(0, len(spool) * step, step)
+                found.append(coder.mean(coder.encode(spool, ticks, crf, video)))
+            known[crf] = float(np.mean(found))
+            return known[crf]
+
+        crf, reached, _ = largest_crf(
+            score,
+            due,
+            guess=guess,
+            largest=MAX_CRF[coder.recipe.codec],
+            smallest=least,
+            fall=FALLS[target.metric],
+            most=_MOST_SEARCHED,
+        )
+        # a few frames have less VMAF than many, compared with their originals too: where they fall
+        # a little short, the first window tells
+        if not reached and crf == least and known[crf] < due - target.tolerance:
+            raise OutOfReach(_far_off(target, due, f"crf {crf} gives {known[crf]:.2f}"))
+        return crf
+    finally:
+        for spool in spools:
+            spool.close()
+
+
+def _far_off(target: QualityTarget, due: float, made: str) -> str:
+    """Why a stream is lossless: a score, what is due at least, and what there is."""
+    limit = f" of the {due:.2f} that its originals allow" if due < target.score else ""
+    return f"{target} is out of reach: {made}{limit}"
+
+
+class TargetTrack:
+    """See `Track`.
+
+    The frames of a window are kept on disk as planes. When it is full it is encoded, decoded and
+    scored, and encoded again with a lower crf until it is good enough. The windows' videos are
+    joined at the end.
+    """
+
+    def __init__(
+        self,
+        plan: TargetPlan,
+        path: Path,
+        key: StreamKey,
+        settings: StreamSettings,
+        rate: float | None,
+    ) -> None:
+        self._plan = plan
+        self.note = plan.note
+        self._path = path
+        self._coder = _coder(plan, plan.target, key, settings, rate)
+        self._maker = self._coder.maker()
+        self._most = window_frames(settings.gop)
+        self._control = CrfControl(
+            int(plan.recipe.options["crf"]),
+            LEAST_CRF[plan.recipe.codec],
+            MAX_CRF[plan.recipe.codec],
+            plan.target.tolerance,
+            FALLS[plan.target.metric],
+        )
+        self._folder = path.with_name(f".{path.stem}.windows")
+        self._folder.mkdir()
+        self._spool = self._coder.spool(self._folder / "frames.yuv")
+        self._ticks = array("q")
+        self._segments: list[Path] = []
+        self._scores: list[NDArray[np.int64]] = []
+        self._reencoded = self._limited = 0
+
+    def refuses(self, seen: CameraMessage) -> str | None:
+        """See `Track.refuses`."""
+        if seen.pixels is None:
+            return "it has no pixels"
+        return self._plan.layout.refuses(seen.pixels)
+
+    def write(self, seen: CameraMessage, tick: int) -> None:
+        """See `Track.write`.
+
+        Raises:
+            OutOfReach: A window cannot have the score.
+        """
+        if seen.pixels is not None:
+            self._spool.append(self._maker.make(self._plan.layout.to_picture(seen.pixels)))
+            self._ticks.append(tick)
+        if len(self._spool) == self._most:
+            self._finish_window()
+
+    def _finish_window(self) -> None:
+        """Encode the window until it is good enough.
+
+        Raises:
+            OutOfReach: It is not with any crf.
+        """
+        coder, control, target = self._coder, self._control, self._plan.target
+        spool, due = self._spool, target.score
+        frames = len(spool)
+        ticks = self._ticks[-frames:]
+        number = len(self._segments)
+        found: dict[int, NDArray[np.int64]] = {}
+        tried: dict[int, float] = {}
+        crf: int | None = control.crf
+        while crf is not None:
+            found[crf] = coder.encode(spool, ticks, crf, self._segment(number, crf))
+            tried[crf] = coder.mean(found[crf])
+            if len(tried) == 1 and control.accepted(tried, due, frames) is None:
+                due = coder.reachable(spool)
+            crf = control.next(tried, due, frames)
+        kept = control.accepted(tried, due, frames)
+        if kept is None:
+            first, least = len(self._ticks) - frames, min(tried)
+            made = f"crf {least} gives frames {first} to {first + frames - 1} of a part "
+            raise OutOfReach(_far_off(target, due, f"{made}{tried[least]:.2f}"))
+        control.keep(tried, kept, due, frames)
+        for crf in tried.keys() - {kept}:
+            self._segment(number, crf).unlink()
+        self._segments.append(self._segment(number, kept))
+        self._scores.append(found[kept])
+        self._reencoded += len(tried) > 1
+        self._limited += due < target.score
+        spool.clear()
+
+    def _segment(self, number: int, crf: int) -> Path:
+        return self._folder / f"{number:06}-{crf}.mp4"
+
+    def close(self) -> None:
+        """See `Track.close`.
+
+        Raises:
+            OutOfReach: A window cannot have the score.
+        """
+        try:
+            if len(self._spool):
+                self._finish_window()
+            join_segments(self._segments, self._ticks, self._path)
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """See `Track.abandon`."""
+        self._spool.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def describe(self) -> dict[str, Any]:
+        """See `Track.describe`."""
+        coder = self._coder
+        options = {**self._plan.recipe.options, "g": str(coder.gop)}
+        return {
+            **picture_facts(self._plan, coder.coded_size, options),
+            "quality": Measured.from_scores(
+                self._plan.target,
+                np.concatenate(self._scores),
+                worst_window=min(map(coder.mean, self._scores)),
+                windows=len(self._scores),
+                reencoded=self._reencoded,
+                limited=self._limited,
+            ),
+        }

@@ -1,0 +1,508 @@
+"""What a stream's video is made of: pictures encoded here, or packets as they came."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+from mp4ds.bags.mcap_write import compressed_size
+from mp4ds.dataset.rebuild import Unsuited
+from mp4ds.errors import EncoderRefusedError, OptionError
+from mp4ds.format.models import Color, LayoutParameters
+from mp4ds.messages.coded import Refused
+from mp4ds.messages.encodings import ENCODINGS, Parameters
+from mp4ds.messages.layouts import Layout, bind, layout_for
+from mp4ds.packing.look import CameraMessage, StreamKey
+from mp4ds.plan import QualitySetting, QualityTarget, visual_setting
+from mp4ds.video.codecs import AV1, Recipe, lossless_codecs, recipe_for, remade
+from mp4ds.video.encoder import VideoEncoder
+from mp4ds.video.packets import PacketWriter
+from mp4ds.video.trial import choose
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSettings:
+    """How streams are to be encoded.
+
+    Attributes:
+        quality: What was asked for.
+        codec: Name of the codec, or None for the default.
+        preset: Preset of the encoder, or None for the default.
+        gop: Most frames between key frames.
+        threads: Threads of each encoder.
+        transcode: Whether JPEG topics are encoded anew.
+    """
+
+    quality: QualitySetting
+    codec: str | None
+    preset: str | None
+    gop: int
+    threads: int
+    transcode: bool = False
+
+
+class Track(Protocol):
+    """A video being written.
+
+    Attributes:
+        note: What the user should know of it; empty if nothing.
+    """
+
+    note: str
+
+    def refuses(self, seen: CameraMessage) -> str | None:
+        """Why the track cannot carry a message exactly, or None if it can."""
+        ...
+
+    def write(self, seen: CameraMessage, tick: int) -> None:
+        """Write a message's frame.
+
+        Args:
+            seen: The message.
+            tick: Presentation time in ticks, greater than the last.
+
+        Raises:
+            OSError: The disk refused.
+        """
+        ...
+
+    def close(self) -> None:
+        """Finish the file.
+
+        Raises:
+            OSError: The disk refused.
+        """
+        ...
+
+    def abandon(self) -> None:
+        """Close the file as it is; the caller removes it."""
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """What `mp4ds.format.models.Video` says of it, but for the file."""
+        ...
+
+
+class TrackPlan(Protocol):
+    """How a track may be made."""
+
+    @property
+    def profile(self) -> str:
+        """What the stream's sidecar calls it."""
+        ...
+
+    @property
+    def exact(self) -> bool:
+        """Whether messages come back to the byte."""
+        ...
+
+    @property
+    def note(self) -> str:
+        """What the user should know of it; empty if nothing."""
+        ...
+
+    def open(
+        self, path: Path, seen: CameraMessage, settings: StreamSettings, rate: float | None
+    ) -> Track:
+        """Begin the file.
+
+        Args:
+            path: The video to make.
+            seen: The first message.
+            settings: How to encode.
+            rate: Frames per second, where known.
+
+        Raises:
+            Unsuited: The encoder does not take such pictures.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class PicturePlan:
+    """Pictures, encoded here. See `TrackPlan`."""
+
+    layout: Layout
+    recipe: Recipe
+    profile: str
+    exact: bool
+    note: str = ""
+
+    def open(
+        self, path: Path, seen: CameraMessage, settings: StreamSettings, rate: float | None
+    ) -> Track:
+        """See `TrackPlan.open`."""
+        return _PictureTrack(self, path, seen.key, settings, rate)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TargetPlan(PicturePlan):
+    """Pictures, encoded here until they have a score. See `TrackPlan`."""
+
+    target: QualityTarget
+
+    def open(
+        self, path: Path, seen: CameraMessage, settings: StreamSettings, rate: float | None
+    ) -> Track:
+        """See `TrackPlan.open`."""
+        from mp4ds.packing.target import TargetTrack
+
+        return TargetTrack(self, path, seen.key, settings, rate)
+
+
+class OutOfReach(Exception):  # noqa: N818 - no error: the stream is made lossless
+    """A score that frames do not have with any crf; says how far they are from it."""
+
+
+def _recipes(plan: PicturePlan) -> Iterator[Recipe]:
+    """The recipe of a plan, then those of the other codecs that hold its pictures exactly."""
+    yield plan.recipe
+    pixel_format = plan.layout.pixel_format
+    for codec in lossless_codecs(pixel_format) if plan.recipe.lossless else ():
+        if codec != plan.recipe.codec:
+            yield recipe_for(pixel_format, lossless=True, codec=codec)
+
+
+class _PictureTrack:
+    """See `Track`."""
+
+    def __init__(
+        self,
+        plan: PicturePlan,
+        path: Path,
+        key: StreamKey,
+        settings: StreamSettings,
+        rate: float | None,
+    ) -> None:
+        self._layout = layout = plan.layout
+        self.note = plan.note
+        width, height = layout.picture_size(key.width, key.height)
+        refusals: list[str] = []
+        for recipe in _recipes(plan):
+            try:
+                self._encoder = VideoEncoder(
+                    path,
+                    recipe,
+                    picture_format=layout.pixel_format,
+                    width=width,
+                    height=height,
+                    gop=settings.gop,
+                    threads=settings.threads,
+                    rate=rate,
+                )
+            except EncoderRefusedError as error:
+                path.unlink(missing_ok=True)
+                refusals.append(str(error))
+                continue
+            self._plan = replace(plan, recipe=recipe)
+            if refusals:
+                coded = f"coded as {recipe.codec}: {refusals[0]}"
+                self.note = "; ".join(filter(None, (plan.note, coded)))
+            return
+        raise Unsuited(refusals[0])
+
+    def refuses(self, seen: CameraMessage) -> str | None:
+        """See `Track.refuses`."""
+        if seen.pixels is None:
+            return "it has no pixels"
+        return self._layout.refuses(seen.pixels)
+
+    def write(self, seen: CameraMessage, tick: int) -> None:
+        """See `Track.write`."""
+        if seen.pixels is not None:
+            self._encoder.write(self._layout.to_picture(seen.pixels), tick)
+
+    def close(self) -> None:
+        """See `Track.close`."""
+        self._encoder.close()
+
+    def abandon(self) -> None:
+        """See `Track.abandon`."""
+        self._encoder.abandon()
+
+    def describe(self) -> dict[str, Any]:
+        """See `Track.describe`."""
+        encoder = self._encoder
+        return picture_facts(self._plan, (encoder.width, encoder.height), encoder.options)
+
+
+def picture_facts(
+    plan: PicturePlan, size: tuple[int, int], options: Mapping[str, str]
+) -> dict[str, Any]:
+    """What `Track.describe` says of a video that is encoded here.
+
+    Args:
+        plan: How it was made.
+        size: Columns and rows of its pictures.
+        options: Of the encoder.
+    """
+    layout, recipe = plan.layout, plan.recipe
+    values = layout.parameters.to_values()
+    return {
+        "layout": layout.name,
+        "parameters": LayoutParameters.model_validate(values) if values else None,
+        "codec": recipe.codec,
+        "pixel_format": recipe.pixel_format,
+        "width": size[0],
+        "height": size[1],
+        "color": _color(recipe) if layout.is_shown else None,
+        "encoder": recipe.encoder,
+        "options": dict(options),
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class PacketPlan:
+    """Packets as they came. See `TrackPlan`."""
+
+    profile: str = "lossless"
+    exact: bool = True
+    note: str = ""
+
+    def open(
+        self, path: Path, seen: CameraMessage, settings: StreamSettings, rate: float | None
+    ) -> Track:
+        """See `TrackPlan.open`."""
+        return _PacketTrack(path, seen, rate, self.note)
+
+
+class _PacketTrack:
+    """See `Track`."""
+
+    def __init__(self, path: Path, seen: CameraMessage, rate: float | None, note: str) -> None:
+        self.note = note
+        self._key = seen.key
+        self._begun = False
+        self._writer = PacketWriter(
+            path,
+            seen.key.codec,
+            width=seen.key.width,
+            height=seen.key.height,
+            parameters=seen.parameters,
+            rate=rate,
+        )
+
+    def refuses(self, seen: CameraMessage) -> str | None:
+        """See `Track.refuses`."""
+        if not self._begun:
+            try:
+                self._writer.begin(seen.parts.body)
+            except Refused as reason:
+                return str(reason)
+            self._begun = True
+        return None
+
+    def write(self, seen: CameraMessage, tick: int) -> None:
+        """See `Track.write`."""
+        self._writer.write(seen.parts.body, tick, keyframe=seen.keyframe)
+
+    def close(self) -> None:
+        """See `Track.close`."""
+        self._writer.close()
+
+    def abandon(self) -> None:
+        """See `Track.abandon`."""
+        self._writer.abandon()
+
+    def describe(self) -> dict[str, Any]:
+        """See `Track.describe`."""
+        key = self._key
+        return {
+            "layout": layout_for(ENCODINGS[key.encoding], lossless=False).name,
+            "codec": key.codec,
+            "width": key.width,
+            "height": key.height,
+        }
+
+
+def _color(recipe: Recipe) -> Color:
+    return Color(
+        primaries="bt709",
+        transfer="bt709",
+        matrix=recipe.matrix,
+        range="full" if recipe.full_range else "limited",
+    )
+
+
+# ---------------------------------------------------------------- planning
+
+_KEPT_JPEG = "JPEG files are kept as they are; --transcode encodes them anew"
+_NEGLIGIBLE = 1 / 50
+"""Of the raw size: a video as small as this is kept although zstd would be smaller still."""
+
+
+def needs_trial(seen: CameraMessage, settings: StreamSettings) -> bool:
+    """Whether `plan_tracks` is better for having several messages."""
+    if seen.pixels is None:
+        return False
+    if settings.quality.target is not None:
+        return True
+    return seen.key.body != "jpeg" and _is_lossless(seen.key.encoding, settings)
+
+
+def _is_lossless(encoding: str, settings: StreamSettings) -> bool:
+    return settings.quality.lossless or ENCODINGS[encoding].lossy is None
+
+
+def plan_tracks(
+    samples: Sequence[CameraMessage],
+    settings: StreamSettings,
+    rate: float | None,
+    runs: Iterable[Iterable[CameraMessage]] | None = None,
+) -> list[TrackPlan]:
+    """How the messages of one key are stored in videos.
+
+    Args:
+        samples: The first messages, at least one.
+        settings: What was asked for.
+        rate: Frames per second, where known.
+        runs: Of messages of the same key, from several places of the recording, by which the crf
+            for a score is chosen. None: the samples.
+
+    Returns:
+        The best plan first; the last one takes every message of the key.
+
+    Raises:
+        Unsuited: A video would be larger than the messages are by zstd, or cannot have the
+            score that was asked for.
+        ScoringError: VMAF cannot be computed.
+    """
+    first = samples[0]
+    if first.pixels is None:
+        can_shrink = first.key.codec == "mjpeg" and not settings.quality.lossless
+        return [PacketPlan(note=_KEPT_JPEG if can_shrink else "")]
+    if not _is_lossless(first.key.encoding, settings):
+        plan = _lossy_plan(first.key, settings, rate)
+        target = settings.quality.target
+        if target is None:
+            return [plan]
+        return _target_plans(plan, target, samples, runs, settings, rate)
+    return _lossless_plans(samples, settings)
+
+
+def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) -> PicturePlan:
+    quality = settings.quality
+    layout = layout_for(ENCODINGS[key.encoding], lossless=False)
+    crf, preset = quality.crf, settings.preset
+    if crf is None:  # a score is looked for from there
+        crf, table_preset = visual_setting(rate)
+        if settings.codec in (None, *AV1):
+            preset = preset or str(table_preset)
+    recipe = recipe_for(
+        layout.pixel_format,
+        lossless=False,
+        codec=settings.codec,
+        crf=crf,
+        preset=preset,
+        varied=quality.target is not None,
+    )
+    return PicturePlan(layout, recipe, str(quality), exact=False)
+
+
+def _target_plans(
+    plan: PicturePlan,
+    target: QualityTarget,
+    samples: Sequence[CameraMessage],
+    runs: Iterable[Iterable[CameraMessage]] | None,
+    settings: StreamSettings,
+    rate: float | None,
+) -> list[TrackPlan]:
+    """A plan that keeps a score, and one for images that cannot have it."""
+    from mp4ds.packing.target import target_plan
+
+    key = samples[0].key
+    is_jpeg = key.body == "jpeg"
+    try:
+        found = target_plan(plan, target, key, runs or [samples], settings, rate)
+    except EncoderRefusedError as error:
+        raise Unsuited(str(error)) from None
+    except OutOfReach as reason:
+        if is_jpeg:  # which is smaller than any lossless video of its pixels
+            raise Unsuited(str(reason)) from None
+        return _lossless_plans(samples, settings, f"kept lossless: {reason}")
+    if is_jpeg:
+        return [found]
+    general = layout_for(plan.layout.encoding, lossless=True)
+    recipe = recipe_for(general.pixel_format, lossless=True)
+    return [found, PicturePlan(general, recipe, "lossless", exact=True)]
+
+
+def _lossless_plans(
+    samples: Sequence[CameraMessage], settings: StreamSettings, note: str = ""
+) -> list[TrackPlan]:
+    encoding = ENCODINGS[samples[0].key.encoding]
+    pixels = [seen.pixels for seen in samples if seen.pixels is not None]
+    asked = settings.quality.lossless
+    if not (asked or note):
+        note = f"{encoding.name} is kept lossless"
+    tried = partial(choose, pixels, encoding, gop=settings.gop, threads=settings.threads)
+    codec = settings.codec if asked else None  # else they were meant for lossy videos
+    try:
+        try:
+            best = tried(codec=codec, preset=settings.preset if asked else None)
+        except (OptionError, EncoderRefusedError) as error:
+            if codec is None:
+                raise
+            best = tried(codec=None, preset=None)
+            note = "; ".join(filter(None, (note, f"coded as {best.recipe.codec}: {error}")))
+    except EncoderRefusedError as error:
+        raise Unsuited(str(error)) from None
+    _refuse_noise(samples, best.bytes_per_frame)
+    layout = bind(best.layout, encoding, best.parameters)
+    plan = PicturePlan(layout, best.recipe, "lossless", exact=True, note=note)
+    general = layout_for(encoding, lossless=True)
+    if general.name == layout.name:
+        return [plan]
+    recipe = recipe_for(general.pixel_format, lossless=True)
+    return [plan, PicturePlan(general, recipe, "lossless", exact=True)]
+
+
+def _refuse_noise(samples: Sequence[CameraMessage], video_size: float) -> None:
+    """Refuse what a video would not make smaller.
+
+    Raises:
+        Unsuited: Tells both sizes.
+    """
+    bodies = [seen.parts.body for seen in samples]
+    raw = sum(map(len, bodies)) / len(bodies)
+    if video_size <= raw * _NEGLIGIBLE:
+        return
+    verbatim = compressed_size(bodies) / len(bodies)
+    if video_size > verbatim:
+        raise Unsuited(
+            f"a video would not be smaller: about {video_size / verbatim:.2f} times as large"
+        )
+
+
+def plan_to_values(plan: TrackPlan) -> dict[str, Any]:
+    """A plan as JSON has it."""
+    values = {"profile": plan.profile, "exact": plan.exact, "note": plan.note}
+    if isinstance(plan, PicturePlan):
+        layout = plan.layout
+        values["layout"] = layout.name
+        values["encoding"] = layout.encoding.name
+        values["parameters"] = layout.parameters.to_values()
+        values["recipe"] = asdict(plan.recipe)
+    if isinstance(plan, TargetPlan):
+        values["target"] = asdict(plan.target)
+    return values
+
+
+def plan_from_values(values: Mapping[str, Any]) -> TrackPlan:
+    """The plan that `plan_to_values` was given.
+
+    Raises:
+        ValueError: It is none, or encodes as this version never does.
+    """
+    common = {name: values[name] for name in ("profile", "exact", "note")}
+    if "recipe" not in values:
+        return PacketPlan(**common)
+    parameters = Parameters.from_values(values["parameters"])
+    layout = bind(values["layout"], ENCODINGS[values["encoding"]], parameters)
+    recipe = remade(layout.pixel_format, values["recipe"])
+    if "target" in values:
+        return TargetPlan(layout, recipe, target=QualityTarget(**values["target"]), **common)
+    return PicturePlan(layout, recipe, **common)

@@ -1,0 +1,280 @@
+"""What a file holds, in the form in which readers of the format are compared.
+
+conformance/README.md says what each key means. Integers of 64 bits are strings, since JSON
+parsers keep 53 bits of a number.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.dataset.channels import ImageChannel
+from mp4ds.dataset.checks import Problem, validate
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.rebuild import DecodedColumns
+from mp4ds.dataset.stream import Stream
+from mp4ds.errors import SourceError, VideoError
+from mp4ds.files.urls import location
+from mp4ds.format.fields import MESSAGES_NAME
+from mp4ds.format.manifest import Manifest
+from mp4ds.format.sidecars import MANIFEST_NAME
+from mp4ds.records import Attachment, Message, MetadataRecord
+from mp4ds.video.packets import PacketReader
+from mp4ds.video.planes import raw_pictures
+
+Values = dict[str, Any]
+
+
+def as_json(values: Values) -> str:
+    """The text of what `conformance_dump` returns, the same each time."""
+    return json.dumps(values, indent=1)
+
+
+_EXACT_LOSSY = ("gray8", "planar420", "halved420")
+"""Layouts whose pixels are the decoded samples in lossy streams, too."""
+
+
+def conformance_dump(
+    path: Path | str, *, progress: Callable[[str], None] | None = None
+) -> dict[str, Any]:
+    """What is in a sidecar with its video, or in a dataset, as JSON has it.
+
+    Every frame is decoded and every message rebuilt, a frame at a time; what is returned has a
+    few hashes for each.
+
+    Args:
+        path: A sidecar, its video, a dataset or its manifest; or a URL.
+        progress: Called with a phrase before each costly step.
+
+    Returns:
+        ``problems``, and without any of them all that conformance/README.md lists.
+
+    Raises:
+        SourceNotFoundError: There is nothing at the path.
+        SourceError: It is nothing of the kind.
+    """
+    path = location(path)
+    if path.name == MANIFEST_NAME:
+        path = path.parent
+    if path.is_dir() and not (path / MANIFEST_NAME).exists():
+        raise SourceError(
+            path, f"is no dataset: there is no {MANIFEST_NAME} in it", "Give one dataset."
+        )
+    problems = [_problem(problem) for problem in validate(path, deep=True, progress=progress)]
+    if problems:
+        return {"problems": sorted(problems, key=lambda item: tuple(item.values()))}
+    with Dataset(path) as dataset:
+        found: Values = {"problems": []}
+        if dataset.manifest:
+            found["manifest"] = _manifest(dataset.manifest)
+        found["streams"] = [_stream(stream) for stream in dataset.streams]
+        if dataset.manifest:
+            found["order"] = [_order(channel) for channel in dataset.image_channels()]
+            found["messages"] = _messages(dataset)
+        return found
+
+
+def _problem(problem: Problem) -> Values:
+    """A problem; its place is the name of a file and a key in it, or a topic alone."""
+    file, _, key = problem.place.removesuffix(" at the top").partition(" at ")
+    is_file = Path(file).suffix in (".yaml", ".yml", ".mp4", ".mcap")
+    return {
+        "file": Path(file).name if is_file else "",
+        "at": key if is_file else problem.place,
+        "code": problem.code,
+    }
+
+
+def _texts(values: Iterable[int]) -> list[str]:
+    return [str(value) for value in values]
+
+
+def _sha256(data: bytes | bytearray | memoryview) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _manifest(manifest: Manifest) -> Values:
+    span = manifest.time_range
+    return {
+        "profile": manifest.profile,
+        "format": manifest.format,
+        "recording_profile": manifest.recording_profile,
+        "messages": str(manifest.messages),
+        "time_range": {"start": str(span.start), "end": str(span.end)} if span else None,
+        "streams": [entry.sidecar for entry in manifest.streams],
+        "files": sorted(entry.name for entry in manifest.files),
+    }
+
+
+# ---------------------------------------------------------------- streams
+
+
+def _stream(stream: Stream) -> Values:
+    sidecar = stream.sidecar
+    columns = stream.columns
+    channel = sidecar.channel
+    video = sidecar.video
+    return {
+        "sidecar": stream.path.name,
+        "video": video.file,
+        "topic": channel.topic,
+        "type": channel.schema_.name if channel.schema_ else "",
+        "message_encoding": channel.message_encoding,
+        "wire": sidecar.wire,
+        "profile": sidecar.profile,
+        "stamps": sidecar.stamps,
+        "body": sidecar.body,
+        "image": sidecar.image.model_dump(),
+        "layout": video.layout,
+        "codec": video.codec,
+        "coded_size": [video.width, video.height],
+        "frames": sidecar.frames,
+        "columns": _columns(columns),
+        "frame_id": [sidecar.headers[number].frame_id for number in columns.variant.tolist()],
+        **_decoded(stream),
+        "camera_info": _camera_info(stream),
+    }
+
+
+def _columns(columns: DecodedColumns) -> Values:
+    """Every column, also those that are absent and have a default."""
+    zeros: NDArray[np.int64] = np.zeros(len(columns.stamp), np.int64)
+    found = {
+        "log_time": columns.log_time,
+        "publish_time": columns.publish_time,
+        "sequence": columns.sequence,
+        "stamp": columns.stamp,
+        "seq": zeros if columns.seq is None else columns.seq,
+        "pts": zeros if columns.pts is None else columns.pts,
+        "variant": columns.variant,
+        "ordinal": columns.ordinal,
+    }
+    return {name: _texts(values.tolist()) for name, values in found.items()}
+
+
+def _decoded(stream: Stream) -> Values:
+    """Hashes of what the video has of each frame, and of what is made of it."""
+    sidecar = stream.sidecar
+    is_lossless = sidecar.profile == "lossless"
+    is_packet = sidecar.body == "packet"
+    has_exact_pixels = is_lossless or sidecar.video.layout in _EXACT_LOSSY
+    made = list(_of_packets(stream) if is_packet else _of_pictures(stream))
+    return {
+        "packets": _packets(stream),
+        "planes": _planes(stream),
+        "pixels": [item[0] for item in made] if has_exact_pixels and not is_packet else None,
+        "payloads": [item[1] for item in made] if is_lossless else None,
+    }
+
+
+def _of_pictures(stream: Stream) -> Iterator[tuple[str, str]]:
+    """SHA-256 of the pixels and of the payload of each frame."""
+    rebuilder = stream.rebuilder
+    with stream.open_video(sequential=True) as decoder:
+        for index, picture in enumerate(decoder.pictures()):
+            pixels = rebuilder.pixels(picture)
+            little_endian = pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)
+            payload = rebuilder.payload(index, picture)
+            yield _sha256(little_endian.tobytes()), _sha256(payload)
+
+
+def _of_packets(stream: Stream) -> Iterator[tuple[str, str]]:
+    for payload in stream.payloads():
+        yield "", _sha256(payload)
+
+
+def _packets(stream: Stream) -> list[str]:
+    with PacketReader(stream.video_path, codec=stream.sidecar.video.codec) as reader:
+        return [_sha256(reader.packet(index)) for index in range(len(stream))]
+
+
+def _planes(stream: Stream) -> Values | None:
+    """Of each picture; None where decoders may differ, or not every packet decodes."""
+    video = stream.sidecar.video
+    if video.codec == "mjpeg":
+        return None
+    pictures = raw_pictures(
+        stream.video_path, is_gray=(video.pixel_format or "").startswith("gray")
+    )
+    formats, hashes = set(), []
+    try:
+        for picture in pictures:
+            formats.add(picture.pixel_format)
+            hashes.append(_sha256(picture.tobytes()))
+    except VideoError:
+        return None
+    if len(hashes) != len(stream) or len(formats) != 1:
+        return None
+    return {"pixel_format": formats.pop(), "sha256": hashes}
+
+
+def _camera_info(stream: Stream) -> Values | None:
+    """The calibrations, their messages, and which of them holds for each frame."""
+    info = stream.sidecar.camera_info
+    if info is None:
+        return None
+    channel = info.channel.to_record(0)
+    found: Values = {
+        "topic": channel.topic,
+        "type": channel.type_name,
+        "wire": info.wire,
+        "messages": info.messages,
+        "calibrations": [
+            {"frame_id": item.frame_id, "width": item.width, "height": item.height, "k": item.k}
+            for item in info.calibrations
+        ],
+        "columns": None,
+        "payloads": None,
+        "holds": None,
+    }
+    columns = stream.camera_info_columns
+    if columns is not None:
+        messages = stream.camera_info_messages(channel)
+        found["columns"] = _columns(columns)
+        found["payloads"] = [_sha256(message.data) for _, message in messages]
+        after = np.searchsorted(columns.log_time, stream.log_times, side="right")
+        found["holds"] = columns.variant[np.maximum(after - 1, 0)].tolist()
+    return found
+
+
+# ---------------------------------------------------------------- the dataset
+
+
+def _order(channel: ImageChannel) -> Values:
+    """In which file each message of a channel is, in the channel's order."""
+    places = {
+        ordinal: stream.path.name
+        for stream in channel.streams
+        for ordinal in stream.columns.ordinal.tolist()
+    }
+    count = len(places) + channel.recorded
+    return {
+        "topic": channel.channel.topic,
+        "files": [places.get(ordinal, MESSAGES_NAME) for ordinal in range(count)],
+    }
+
+
+def _messages(dataset: Dataset) -> Values:
+    """What messages.mcap holds."""
+    topics = Counter[tuple[str, str]]()
+    kinds = Counter[type]()
+    for record in dataset.recorded_records():
+        kinds[type(record)] += 1
+        if isinstance(record, Message):
+            topics[record.channel.topic, record.channel.type_name] += 1
+    return {
+        "topics": [
+            {"topic": topic, "type": type_name, "messages": count}
+            for (topic, type_name), count in sorted(topics.items())
+        ],
+        "attachments": kinds[Attachment],
+        "metadata": kinds[MetadataRecord],
+    }

@@ -1,0 +1,1 @@
+"""Settings of encoders, tried on clips of a recording."""

@@ -1,0 +1,432 @@
+"""Settings of encoders, tried on clips of a recording: quality, size and time.
+
+Each camera gives a short clip, which is encoded as `mp4ds pack` would encode it with every
+setting of a grid, decoded, and compared with what the encoder was given. What was measured is
+kept in the folder of the evaluation, so that the same call goes on where it was interrupted.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from mp4ds._version import __version__
+from mp4ds.errors import ScoringError, SourceError
+from mp4ds.files.outputs import check_place, refuse_not_ours, work_folder, write_synced
+from mp4ds.files.urls import remote
+from mp4ds.plan import FileNames, Selection
+from mp4ds.plugins.evaluating.clips import (
+    Clip,
+    EvaluatedCamera,
+    EvaluatedSource,
+    Unfit,
+    chosen,
+    chosen_at_rate,
+    clip_seconds,
+    make_clip,
+    open_source,
+)
+from mp4ds.plugins.evaluating.options import (
+    EvaluateOptions,
+    Grid,
+    ScoreGoal,
+    Setting,
+    check_options,
+    first_guess,
+    grid_of,
+)
+from mp4ds.plugins.evaluating.page import write_files
+from mp4ds.plugins.evaluating.results import (
+    CEILING_MARGIN,
+    CameraEvaluation,
+    Cell,
+    DataSet,
+    EvaluateProgress,
+    Evaluation,
+    RateRow,
+    StorageRow,
+    reachable_score,
+    recommend,
+    score_of,
+    storage,
+)
+from mp4ds.plugins.evaluating.trials import ClipPlace, Engines, Failure, Found, Trials, versions_of
+from mp4ds.video.codecs import MAX_CRF
+from mp4ds.video.encoder import check_hardware
+from mp4ds.video.libvmaf import VMAF_MODEL, Ffmpeg, find_ffmpeg
+from mp4ds.video.scores import largest_crf
+
+_NEAR = 1.05  # rates that differ by less are the same
+_SHORT = 30  # frames
+_MODEL_ROWS = 1080
+
+
+class CameraTrial:
+    """The trial of one camera.
+
+    Args:
+        camera: Which.
+        name: Of its files.
+        options: How.
+        grid: What to try.
+        trials: What runs it.
+        work: Folder for clips.
+        report: Told when something was done.
+    """
+
+    def __init__(
+        self,
+        camera: EvaluatedCamera,
+        name: str,
+        options: EvaluateOptions,
+        grid: Grid,
+        trials: Trials,
+        work: Path,
+        report: Callable[[EvaluateProgress], None] | None,
+    ) -> None:
+        self._camera = camera
+        self._name = name
+        self._options = options
+        self._target = options.wanted
+        self._grid = grid
+        self._trials = trials
+        self._work = work
+        self._report = report
+        self._notes: list[str] = []
+        self._done = 0
+        self._total = len(grid.settings())
+
+    def run(self, origin: int) -> CameraEvaluation:
+        """Try all settings.
+
+        Args:
+            origin: Log time at which the source begins, nanoseconds.
+
+        Raises:
+            Unfit: The camera's images are of no use.
+            ScoringError: Nothing could be tried.
+        """
+        self._tell("reading")
+        place = self._clip(chosen(self._camera.times, origin, self._options), self._camera.rate)
+        try:
+            return self._evaluated(place)
+        finally:
+            place.path.unlink(missing_ok=True)
+
+    def _evaluated(self, place: ClipPlace) -> CameraEvaluation:
+        clip, target = place.clip, self._target
+        settings = self._grid.settings()
+        measured = self._trials.run(place, [None, *settings], self._count)
+        ceiling = _measured(measured, None)["scores"]
+        reachable = reachable_score(target, ceiling[target.metric].mean)
+        cells = self._cells(place, {item: measured[item] for item in settings})
+        self._note(clip, reachable, cells)
+        recommended = recommend([(cells, reachable)], target)
+        rates = self._rates()
+        data_set = self._data_set()
+        rows: Sequence[StorageRow] = ()
+        if data_set is not None:
+            best = max(cells, key=lambda cell: score_of(cell, target))
+            wanted = recommended[0].setting if recommended else best.setting
+            shown = next(cell for cell in cells if cell.setting == wanted)
+            rows = storage(clip, place.path, shown, data_set)
+        return CameraEvaluation(
+            topic=clip.topic,
+            name=self._name,
+            encoding=clip.encoding,
+            size=clip.image_size,
+            rate=self._camera.rate,
+            frames=clip.frames,
+            start=clip.start,
+            seconds=clip_seconds(clip),
+            source_frames=clip.source_frames,
+            raw_bytes=clip.raw_bytes,
+            ceiling=ceiling,
+            target=target,
+            reachable=reachable,
+            cells=cells,
+            recommended=recommended,
+            rates=rates,
+            data_set=data_set,
+            storage=rows,
+            ground_truth=self._trials.picture(place, None),
+            notes=self._notes,
+        )
+
+    def _clip(self, indices: list[int], rate: float | None, suffix: str = "") -> ClipPlace:
+        path = self._work / f"{self._name}{suffix}.yuv"
+        return ClipPlace(make_clip(self._camera, indices, rate, path), path, self._name)
+
+    def _cells(self, place: ClipPlace, measured: dict[Setting | None, Found]) -> list[Cell]:
+        found = list(self._trials.cells(place, measured))
+        cells = [item for item in found if isinstance(item, Cell)]
+        failures = [item for item in found if isinstance(item, Failure)]
+        if not cells:
+            raise ScoringError(
+                f"{self._camera.topic}: no setting could be tried. {failures[0].sentence}"
+            )
+        told: dict[str, list[str]] = {}
+        for item in failures:
+            told.setdefault(item.sentence, []).append(item.setting.name if item.setting else "")
+        for sentence, names in told.items():
+            self._notes.append(f"not tried: {', '.join(names)}: {sentence}")
+        return cells
+
+    def _note(self, clip: Clip, reachable: float, cells: Sequence[Cell]) -> None:
+        target, options = self._target, self._options
+        if reachable < target.score:
+            self._notes.append(
+                f"the clip beside itself has {target.metric} {reachable + CEILING_MARGIN:.2f}: "
+                f"the target is {CEILING_MARGIN} less, {reachable:.2f} instead of {target.score:g}"
+            )
+        if all(score_of(cell, target) < reachable for cell in cells):
+            best = max(cells, key=lambda cell: score_of(cell, target))
+            self._notes.append(
+                f"no setting reaches {target.metric} {reachable:.2f}; the best one is "
+                f"{best.setting.name} with {score_of(best, target):.2f}: try a smaller --crf"
+            )
+        if clip.other_frames:
+            self._notes.append(
+                f"{clip.other_frames} images within the clip are of another size or encoding, or "
+                "cannot be read, and are left out of it"
+            )
+        if self._camera.is_jpeg:
+            self._notes.append("was recorded as JPEG files, which mp4ds pack --transcode encodes")
+        if clip.frames < _SHORT:
+            self._notes.append(f"a clip of {clip.frames} frames tells little: give more --frames")
+        if clip.height > _MODEL_ROWS and "vmaf" in cells[0].scores:
+            self._notes.append(
+                f"{VMAF_MODEL} is a model of {_MODEL_ROWS} rows; it is used for {clip.height}, "
+                "too, and not the one for 4K, so that cameras compare"
+            )
+        if options.jobs > 1 or options.cluster:
+            self._notes.append("times are those of settings that were tried side by side")
+        machines = sorted({cell.machine for cell in cells} - {""})
+        if len(machines) > 1:
+            self._notes.append(
+                f"times are those of {len(machines)} machines, {', '.join(machines)}, and compare "
+                "as far as these are alike"
+            )
+
+    # ------------------------------------------------------------ rates
+
+    def _rates(self) -> list[RateRow]:
+        rows = []
+        for rate in sorted(set(self._options.rates)):
+            own = self._camera.rate
+            if own is None or rate > own * _NEAR:
+                self._notes.append(f"has no {rate:g} images per second: not tried at this rate")
+                continue
+            self._tell(f"looking for the crf at {rate:g} Hz")
+            indices = chosen_at_rate(self._camera.times, rate, self._options.frames)
+            place = self._clip(indices, min(rate, own), f"-{rate:g}hz")
+            try:
+                codec, presets = next(iter(self._grid.presets.items()))
+                rows += [self._rate_row(place, rate, codec, preset) for preset in presets]
+            finally:
+                place.path.unlink(missing_ok=True)
+        return rows
+
+    def _rate_row(self, place: ClipPlace, rate: float, codec: str, preset: str) -> RateRow:
+        target = self._target
+        original = _measured(self._trials.run(place, [None]), None)
+        ceiling = original["scores"][target.metric].mean
+        cells: dict[int, Cell] = {}
+
+        def score(crf: int) -> float:
+            setting = Setting(codec, preset, crf, self._grid.gop)
+            measured = self._trials.run(place, [setting])
+            _measured(measured, setting)
+            (cells[crf],) = (
+                cell for cell in self._trials.cells(place, measured) if isinstance(cell, Cell)
+            )
+            return score_of(cells[crf], target)
+
+        crf, reached, tried = largest_crf(
+            score,
+            reachable_score(target, ceiling),
+            guess=first_guess(codec, rate),
+            largest=MAX_CRF[codec],
+        )
+        cell = cells[crf]
+        return RateRow(
+            rate=rate,
+            frames=place.clip.frames,
+            setting=cell.setting,
+            reached=reached,
+            score=score_of(cell, target),
+            frame_bytes=cell.frame_bytes,
+            frame_seconds=cell.encode_seconds / place.clip.frames,
+            kbps=cell.frame_bytes * rate * 8 / 1000,
+            ceiling=ceiling,
+            tried=tried,
+        )
+
+    # ------------------------------------------------------------ the rest
+
+    def _data_set(self) -> DataSet | None:
+        rate = self._camera.rate
+        if rate is None:
+            self._notes.append("has no rate, so that nothing is said of hours of it")
+            return None
+        return DataSet(self._options.streams or 1, self._options.hours or 1.0, rate)
+
+    def _count(self, done: int) -> None:
+        self._done = done
+        self._tell("trying settings")
+
+    def _tell(self, what: str) -> None:
+        if self._report is not None:
+            self._report(EvaluateProgress(self._camera.topic, what, self._done, self._total))
+
+
+def _measured(found: dict[Setting | None, Found], setting: Setting | None) -> dict[str, Any]:
+    """What was measured with a setting.
+
+    Raises:
+        ScoringError: Nothing was; says why.
+    """
+    values = found[setting]
+    if isinstance(values, Failure):
+        raise ScoringError(values.sentence)
+    return values
+
+
+# ---------------------------------------------------------------- evaluate
+
+_FOLDERS = ("cells", "pictures", "plots")
+_WORK = "work-"
+_NOTE_NAME = "mp4ds_evaluation.json"  # in folders that an evaluation has made
+
+
+def evaluate(
+    source: Path | str,
+    options: EvaluateOptions | None = None,
+    *,
+    output: Path | str | None = None,
+    progress: Callable[[EvaluateProgress], None] | None = None,
+) -> Evaluation:
+    """Try a grid of encoder settings on clips of a recording's cameras.
+
+    Args:
+        source: A bag, rosbag2 folder, MCAP, dataset, video, or folder of images; or a URL.
+        options: How.
+        output: Folder of the results; None: ``NAME_evaluation`` in the current folder. Results
+            that are there already are used.
+        progress: Called when something was done.
+
+    Returns:
+        What was found; the folder has it as tables, plots and a page.
+
+    Raises:
+        SourceError: The source cannot be read, or has no camera that could be tried.
+        OptionError: An option is wrong.
+        HardwareError: An encoder is asked for that this machine has not.
+        TargetError: The folder may not be used.
+        ScoringError: There is no libvmaf, and the target is one of VMAF; or no setting could be
+            tried.
+        ClusterError: The cluster does not answer, or was lost; what was measured is kept.
+        RemoteError: A store or web server fails.
+        OSError: The disk refused.
+    """
+    chosen = options or EvaluateOptions()
+    check_options(chosen)
+    grid = grid_of(chosen)
+    if not chosen.cluster:  # else others encode
+        for codec in grid.presets:
+            check_hardware(codec)
+    engines = Engines(chosen, len(grid.settings()) + 1)
+    versions = versions_of(_ffmpeg(chosen.wanted))
+    with open_source(source, fps=chosen.fps) as found:
+        folder = _folder(found.path, output)
+        with _work_in(folder) as work, engines:
+            trials = Trials(
+                folder, work, engines, versions=versions, threads=chosen.encoder_threads
+            )
+            result = Evaluation(found.path, folder, [], dict(found.left_out), versions)
+            names = FileNames()
+            origin = _origin(found)
+            for camera in _selected(found, chosen):
+                name, _ = names.name_for(camera.topic)
+                trial = CameraTrial(camera, name, chosen, grid, trials, work, progress)
+                try:
+                    result.cameras.append(trial.run(origin))
+                except Unfit as reason:
+                    result.left_out[camera.topic] = str(reason)
+        _refuse_none(result)
+        rated = [(camera.cells, camera.reachable) for camera in result.cameras]
+        result.recommended = recommend(rated, chosen.wanted)
+        result = replace(result, tried=trials.tried, known=trials.known)
+        write_files(result, chosen)
+    return result
+
+
+def _ffmpeg(target: ScoreGoal) -> Ffmpeg | None:
+    try:
+        return find_ffmpeg()
+    except ScoringError as error:
+        if target.metric == "vmaf":
+            raise ScoringError(
+                f"{error} Or give a target of another metric, such as `target` psnr_y=42."
+            ) from None
+        return None
+
+
+def _folder(source: Path, output: Path | str | None) -> Path:
+    name = output or f"{source.name if source.is_dir() else source.stem}_evaluation"
+    target = Path(os.path.abspath(name))  # noqa: PTH100 - keeps links, unlike resolve()
+    sources = [] if remote(source) else [source]
+    check_place(target, sources)
+    if os.path.lexists(target) and not _is_evaluation(target):
+        refuse_not_ours(target, None)
+    return target
+
+
+def _is_evaluation(path: Path) -> bool:
+    if any((path / name).is_symlink() for name in _FOLDERS):
+        return False
+    return path.is_dir() and ((path / _NOTE_NAME).is_file() or not any(path.iterdir()))
+
+
+@contextmanager
+def _work_in(folder: Path) -> Iterator[Path]:
+    """A folder for what is not kept, within that of the evaluation.
+
+    It has a new name each time: workers of a cluster may still be at a trial of a run that was
+    interrupted, and must not take another clip for theirs.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_synced(folder / _NOTE_NAME, json.dumps({"mp4ds": __version__}).encode())
+    for name in _FOLDERS:
+        (folder / name).mkdir(exist_ok=True)
+    with work_folder(folder, _WORK) as work:
+        yield work
+
+
+def _origin(source: EvaluatedSource) -> int:
+    """Log time at which the source begins, as far as its cameras tell, nanoseconds."""
+    return min((int(camera.times[0]) for camera in source.cameras if len(camera.times)), default=0)
+
+
+def _selected(source: EvaluatedSource, options: EvaluateOptions) -> Iterator[EvaluatedCamera]:
+    selection = Selection(options.topics, options.exclude)
+    selection.check([*(camera.topic for camera in source.cameras), *source.left_out])
+    return (
+        camera
+        for camera in sorted(source.cameras, key=lambda item: item.topic)
+        if selection(camera.topic) and len(camera.times)
+    )
+
+
+def _refuse_none(result: Evaluation) -> None:
+    if result.cameras:
+        return
+    reasons = "; ".join(f"{topic} {reason}" for topic, reason in result.left_out.items())
+    raise SourceError(
+        result.source, f"has no camera to try settings on{f': {reasons}' if reasons else ''}"
+    )

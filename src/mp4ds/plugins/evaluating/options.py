@@ -1,0 +1,276 @@
+"""What an evaluation is asked for, and the grid of settings that it comes to."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from mp4ds.errors import OptionError
+from mp4ds.options import Options, cluster, option, parse_words
+from mp4ds.plan import visual_setting
+from mp4ds.video.codecs import AV1, HARDWARE, LOSSY_GOP, MAX_CRF, check_codec
+from mp4ds.video.scores import METRICS
+
+ENCODER_NAMES = {"svtav1": "av1", "x264": "h264", "x265": "h265"}
+"""Names of the encoders -> of the codecs, as `mp4ds pack` takes them."""
+
+_DEFAULT_PRESETS = {
+    **dict.fromkeys(AV1, ("6", "8")),
+    "h264": ("medium",),
+    "h265": ("medium",),
+    **{name: (found.default_preset,) for name, found in HARDWARE.items()},
+}
+_MOST_CELLS = 10_000
+_CRF = re.compile(r"([0-9]{1,2})(?::([0-9]{1,2})(?::([0-9]{1,2}))?)?")
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """How a clip is encoded, in the words of ``mp4ds pack``.
+
+    Attributes:
+        codec: ``av1``, ``av1-10bit``, ``h264``, ``h265``, or an encoder of the hardware, such as
+            ``h264-nvenc``.
+        preset: Of its encoder; empty where it has none.
+        crf: Constant rate factor.
+        gop: Most frames between key frames.
+    """
+
+    codec: str
+    preset: str
+    crf: int
+    gop: int = LOSSY_GOP
+
+    @property
+    def name(self) -> str:
+        """Short, and different for each of a grid."""
+        return " ".join(filter(None, (self.codec, self.preset, f"crf {self.crf}")))
+
+    @property
+    def pack_options(self) -> str:
+        """The options of ``mp4ds pack`` that encode so."""
+        preset = f" --preset {self.preset}" if self.preset else ""
+        gop = f" --gop {self.gop}" if self.gop != LOSSY_GOP else ""
+        return f"--quality crf={self.crf} --codec {self.codec}{preset}{gop}"
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreGoal:
+    """The score that a setting is to reach.
+
+    Attributes:
+        metric: One of `mp4ds.video.scores.METRICS`.
+        score: What its mean over the frames is to be.
+    """
+
+    metric: str = "vmaf"
+    score: float = 99.5
+
+    def __str__(self) -> str:
+        return f"{self.metric}={self.score:g}"
+
+
+def _rates(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(word) for word in parse_words(text))
+    except ValueError:
+        raise OptionError(f"`rates` {text!r} is no list of numbers, such as 2,5,10.") from None
+
+
+@dataclass(frozen=True)
+class EvaluateOptions(Options):
+    """How to evaluate."""
+
+    codecs: Sequence[str] = option(
+        "Of svtav1, x264 and x265, with commas between; or as `mp4ds pack` calls them.",
+        ("svtav1", "x264", "x265"),
+        parse=parse_words,
+        default_text="svtav1,x264,x265",
+    )
+    crf: Sequence[str] = option(
+        "Such as 16:25, 16:25:3 or 16,20,24.",
+        ("16:25:3",),
+        parse=parse_words,
+        default_text="16:25:3",
+    )
+    presets: Sequence[str] = option(
+        "Such as 6,8,medium; each is tried with the codecs that have it.", (), parse=parse_words
+    )
+    topics: Sequence[str] = option("Only cameras that match.", (), "-t", metavar="GLOB")
+    exclude: Sequence[str] = option("Leave out cameras that match.", (), "-x", metavar="GLOB")
+    start: float | None = option(
+        "Where the clips begin; from the middle by default.", metavar="SECONDS"
+    )
+    duration: float | None = option("Of the clips, instead of `frames`.", metavar="SECONDS")
+    frames: int = option("Of a clip.", 150, least=1)
+    fps: float = option("Of a folder of images.", 30.0)
+    target: str = option("The score to reach: vmaf, psnr_y ... or ssim.", "vmaf=99.5")
+    rates: Sequence[float] = option(
+        "Such as 2,5,10,20,30,60: the crf that reaches the target at these rates.",
+        (),
+        metavar="HZ",
+        parse=_rates,
+    )
+    streams: int | None = option("Cameras of a data set, whose size is told.", least=1)
+    hours: float | None = option("How long they record.")
+    gop: int = option("Most frames from a key frame to the next.", LOSSY_GOP, least=1, most=100_000)
+    threads: int | None = option(
+        "Of an encoder; all cores by default, one on a cluster.", least=1, most=1024
+    )
+    jobs: int = option("Settings at a time; 1 for true times.", 1, "-j", least=1, most=1024)
+    cluster: str | None = cluster()
+
+    @property
+    def encoder_threads(self) -> int:
+        """Threads of an encoder."""
+        if self.cluster:
+            return self.threads or 1  # its workers have a core each
+        return self.threads or max(1, (os.cpu_count() or 1) // self.jobs)
+
+    @property
+    def wanted(self) -> ScoreGoal:
+        """The score to reach.
+
+        Raises:
+            OptionError: `target` is none.
+        """
+        return parse_target(self.target)
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """What is tried.
+
+    Attributes:
+        presets: Of each codec, in the order that was asked for.
+        crfs: Increasing.
+        gop: Most frames between key frames.
+    """
+
+    presets: dict[str, tuple[str, ...]]
+    crfs: tuple[int, ...]
+    gop: int
+
+    def settings(self) -> list[Setting]:
+        """All of them; a codec is not tried with a crf that it does not have."""
+        return [
+            Setting(codec, preset, crf, self.gop)
+            for codec, presets in self.presets.items()
+            for preset in presets
+            for crf in self.crfs
+            if crf <= MAX_CRF[codec]
+        ]
+
+
+def grid_of(options: EvaluateOptions) -> Grid:
+    """The grid that was asked for.
+
+    Raises:
+        OptionError: There is no such codec, preset or crf, or too many of them.
+    """
+    codecs = list(dict.fromkeys(map(_codec, options.codecs)))
+    if not codecs:
+        raise OptionError("`codecs` names none.")
+    grid = Grid(_presets(codecs, options.presets), parse_crfs(options.crf), options.gop)
+    if not 0 < len(grid.settings()) <= _MOST_CELLS:
+        raise OptionError(
+            f"{len(grid.settings())} settings are to be tried; give `codecs`, `presets` and `crf` "
+            f"that make 1 to {_MOST_CELLS}."
+        )
+    return grid
+
+
+def _codec(name: str) -> str:
+    codec = ENCODER_NAMES.get(name, name)
+    if codec not in MAX_CRF:
+        names = [f"{encoder} ({codec})" for encoder, codec in ENCODER_NAMES.items()]
+        known = ", ".join([*names, AV1[1], *HARDWARE])
+        raise OptionError(f"`codecs` {name!r} is not one of {known}.")
+    return codec
+
+
+def _presets(codecs: Sequence[str], asked: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    found: dict[str, tuple[str, ...]] = {}
+    for codec in codecs:
+        own = tuple(dict.fromkeys(preset for preset in asked if _has(codec, preset)))
+        found[codec] = own or _DEFAULT_PRESETS[codec]
+    for preset in asked:
+        if not any(preset in own for own in found.values()):
+            raise OptionError(f"`presets` {preset!r} is none of {', '.join(codecs)}.")
+    return found
+
+
+def _has(codec: str, preset: str) -> bool:
+    try:
+        check_codec(codec, preset, lossless=False)
+    except OptionError:
+        return False
+    return True
+
+
+def parse_crfs(texts: Sequence[str]) -> tuple[int, ...]:
+    """The values of ``18``, ``16:25`` and ``16:25:3``.
+
+    Raises:
+        OptionError: One is none of these.
+    """
+    found: set[int] = set()
+    for text in texts:
+        match = _CRF.fullmatch(text.strip())
+        first, last, step = (int(word) if word else None for word in match.groups()) if match else (
+            None, None, None
+        )  # fmt: skip
+        if first is None or step == 0:
+            raise OptionError(f"`crf` {text!r} is none. Give one such as 18, 16:25 or 16:25:3.")
+        found.update(range(first, (first if last is None else last) + 1, step or 1))
+    if not found or min(found) < 1 or max(found) > max(MAX_CRF.values()):
+        raise OptionError(
+            f"`crf` {', '.join(texts)} has values beyond 1 to {max(MAX_CRF.values())}."
+        )
+    return tuple(sorted(found))
+
+
+def parse_target(text: str) -> ScoreGoal:
+    """The target of ``vmaf=99.5``, ``psnr_y=42`` or ``ssim=0.98``; a number alone is of VMAF.
+
+    Raises:
+        OptionError: It is none.
+    """
+    metric, has_metric, score = text.rpartition("=")
+    metric = metric if has_metric else "vmaf"
+    try:
+        value = float(score)
+    except ValueError:
+        value = -1.0
+    if metric not in METRICS or not 0 < value <= 100:
+        raise OptionError(
+            f"`target` {text!r} is none. Give METRIC=SCORE, such as vmaf=99.5; there are "
+            f"{', '.join(METRICS)}."
+        )
+    return ScoreGoal(metric, value)
+
+
+def check_options(options: EvaluateOptions) -> None:
+    """Refuse numbers that make no sense, and options that contradict each other.
+
+    Raises:
+        OptionError: Names one.
+    """
+    positive = [("duration", options.duration), ("fps", options.fps), ("hours", options.hours)]
+    rates = [("rates", rate) for rate in options.rates]
+    for name, value in [*positive, *rates]:
+        if value is not None and not 0 < value < float("inf"):
+            raise OptionError(f"`{name}` {value:g} is not above 0.")
+    if options.start is not None and not 0 <= options.start < float("inf"):
+        raise OptionError(f"`start` {options.start:g} is not a number of seconds.")
+    if options.cluster and options.jobs != 1:
+        raise OptionError("`jobs` is for this machine; how many a `cluster` tries is up to it.")
+    parse_target(options.target)
+
+
+def first_guess(codec: str, rate: float | None) -> int:
+    """A crf to begin the search for a target with."""
+    crf, _ = visual_setting(rate)
+    return crf if codec in AV1 else crf - 2

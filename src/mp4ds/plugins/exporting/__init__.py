@@ -1,0 +1,1 @@
+"""Dataset -> the formats of other tools."""

@@ -1,0 +1,170 @@
+"""Dataset -> the formats of other tools, as far as each can hold it; the rest is counted."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, replace
+from importlib import import_module
+from pathlib import Path
+
+from mp4ds._version import __version__
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.errors import OptionError
+from mp4ds.files.outputs import begins_with, listed_names, staged
+from mp4ds.files.urls import location, remote
+from mp4ds.plugins.exporting.job import ExportedDataset, ExportJob, ExportOptions, ExportSummary
+
+NOTE_NAME = "mp4ds_export.json"
+"""File of an exported folder that tells what it holds and leaves out."""
+
+FORMATS = {
+    "euroc": "EuRoC",
+    "tum": "TUM",
+    "kitti": "KITTI",
+    "colmap": "COLMAP",
+    "rerun": "Rerun",
+    "lerobot": "LeRobot",
+}
+"""Formats, each written by the module of its name -> what it is called."""
+
+_LIBRARIES = {"rerun": "rerun-sdk", "lerobot": "pyarrow"}
+_SEVERAL = ("lerobot",)  # which hold several datasets
+_FILES = {"rerun": ".rrd"}
+_OPTIONS_OF = {
+    "poses": ("euroc", "tum", "colmap"),
+    "fps": ("lerobot",),
+    "state": ("lerobot",),
+    "action": ("lerobot",),
+    "task": ("lerobot",),
+    "codec": ("lerobot",),
+    "crf": ("lerobot",),
+}
+
+
+def export(
+    datasets: Path | str | Sequence[Path | str],
+    to: str,
+    output: Path | str,
+    options: ExportOptions | None = None,
+    *,
+    progress: Callable[[str], None] | None = None,
+) -> ExportSummary:
+    """Write a dataset in the format of another tool, as far as that can hold it.
+
+    Args:
+        datasets: A dataset, or one video with its sidecar, or its URL; for lerobot also several,
+            each of which becomes an episode.
+        to: ``euroc``, ``tum``, ``kitti``, ``colmap``, ``rerun`` or ``lerobot``.
+        output: The folder to make; for rerun the file.
+        options: How.
+        progress: Called with a phrase now and then.
+
+    Returns:
+        What was written, and every message that was not, counted by its reason.
+
+    Raises:
+        OptionError: An option is wrong, or the format can hold nothing of the dataset.
+        FormatError: The dataset is damaged; nothing is left behind.
+        TargetError: The output may not be written there.
+        WriteError: The disk refused; nothing is left behind.
+        RemoteError: A store or web server fails.
+    """
+    chosen = options or ExportOptions()
+    paths = [datasets] if isinstance(datasets, (str, Path)) else [*datasets]
+    _check(to, paths, chosen)
+    if remote(location(output)):
+        raise OptionError(f"{output} is a URL: export to this machine, then upload it.")
+    target = Path(os.path.abspath(output))  # noqa: PTH100
+    try:
+        writer: Callable[[ExportJob], None] = import_module(f"mp4ds.plugins.exporting.{to}").write
+    except ImportError as error:
+        raise OptionError(
+            f"{FORMATS[to]} needs {_LIBRARIES[to]} ({error}). Install it: pip install 'mp4ds[{to}]'"
+        ) from None
+    with ExitStack() as stack:
+        opened = [stack.enter_context(Dataset(path)) for path in paths]
+        path = stack.enter_context(
+            staged(
+                target,
+                force=chosen.force,
+                owned=_rerun_names if to in _FILES else _export_names,
+                sources=[dataset.path for dataset in opened],
+            )
+        )
+        if to == "lerobot":  # whose videos are of colours
+            chosen = replace(chosen, pixels="rgb")
+        sources = [ExportedDataset(dataset, chosen) for dataset in opened]
+        job = ExportJob(path, target, chosen, sources, progress or (lambda _: None))
+        writer(job)
+        summary = _summary(job, to)
+        if not any(summary.messages.values()):
+            raise OptionError(
+                f"{FORMATS[to]} can hold no topic of {opened[0].path}: "
+                f"{_first_reason(summary) or 'it has no messages'}."
+            )
+        if path.is_dir():
+            files = sorted(p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file())
+            told = {**asdict(summary), "output": target.name, "files": files}
+            note = {"mp4ds": __version__, **told}
+            (path / NOTE_NAME).write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
+        return summary
+
+
+def _check(to: str, paths: Sequence[Path | str], options: ExportOptions) -> None:
+    """Refuse options that are unknown or contradict each other.
+
+    Raises:
+        OptionError: Says which, and what there is.
+    """
+    if to not in FORMATS:
+        raise OptionError(f"format {to!r} is not known. Use {', '.join(FORMATS)}.")
+    if not paths:
+        raise OptionError("there is no dataset to export")
+    if len(paths) > 1 and to not in _SEVERAL:
+        raise OptionError(
+            f"{FORMATS[to]} holds one dataset, and {len(paths)} are given: export each by itself."
+        )
+    usual = ExportOptions()
+    for name, formats in _OPTIONS_OF.items():
+        if getattr(options, name) != getattr(usual, name) and to not in formats:
+            raise OptionError(f"`{name}` goes with {', '.join(formats)}, not with {to}.")
+    if to == "lerobot" and options.pixels not in ("seen", "rgb"):
+        raise OptionError(f"LeRobot's videos are of colours: `pixels` {options.pixels} is not.")
+    if options.tolerance_ns is not None and options.tolerance_ns < 0:
+        raise OptionError("`tolerance_ns` is the most time between frames: use 0 or more.")
+    _ = options.reduction  # refuses its own
+
+
+def _summary(job: ExportJob, to: str) -> ExportSummary:
+    summary = ExportSummary(job.target, to, job.places)
+    for source in job.sources:
+        ledger = source.ledger
+        ledger.settle(source.chosen, FORMATS[to])
+        for topic, count in ledger.held.items():
+            summary.messages[topic] = summary.messages.get(topic, 0) + count
+        for topic, reasons in ledger.left_out.items():
+            into = summary.left_out.setdefault(topic, {})
+            for reason, count in reasons.items():
+                into[reason] = into.get(reason, 0) + count
+        several = len(job.sources) > 1
+        where = f"{source.dataset.path.name}: " if several else ""
+        summary.notes.extend(where + note for note in source.notes)
+    return summary
+
+
+def _first_reason(summary: ExportSummary) -> str:
+    for topic, reasons in summary.left_out.items():
+        for reason in reasons:
+            return f"{topic}: {reason}"
+    return ""
+
+
+def _export_names(path: Path) -> set[str] | None:
+    return listed_names(path, NOTE_NAME)
+
+
+def _rerun_names(path: Path) -> set[str] | None:
+    return {""} if begins_with(path, b"RRF") else None

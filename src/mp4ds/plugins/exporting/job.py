@@ -1,0 +1,473 @@
+"""What an export is made of: its cameras, and the account of what is held and left out."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.rebuild import marked
+from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.views import Placement, View, view_of
+from mp4ds.errors import OptionError
+from mp4ds.format.models import Calibration
+from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
+from mp4ds.messages.serializations import is_camera
+from mp4ds.options import Options, every, exclude, force, max_rate, option, resize, topics
+from mp4ds.plan import Selection
+from mp4ds.records import Channel
+from mp4ds.times import intervals, synchronize, usual_interval
+from mp4ds.unpacking.pictures import Reduction, is_inverse_depth, times_of
+from mp4ds.video.codecs import MAX_CRF
+from mp4ds.video.images import ImageFile, encoding_as
+
+PIXELS = ("seen", "native", "rgb", "gray")
+_CODECS = ("av1", "h264", "h265")
+_NS_PER_MS = 1_000_000
+
+
+def _nanoseconds(milliseconds: str) -> int:
+    try:
+        return round(float(milliseconds) * _NS_PER_MS)
+    except (ValueError, OverflowError):
+        raise OptionError(
+            f"`tolerance_ns` {milliseconds!r} is no number of milliseconds."
+        ) from None
+
+
+@dataclass(frozen=True)
+class ExportOptions(Options):
+    """How to export."""
+
+    topics: Sequence[str] = topics()
+    exclude: Sequence[str] = exclude()
+    resize: float | tuple[int, int] | None = resize()
+    every: int = every()
+    max_rate: float | None = max_rate()
+    pixels: str = option(
+        "seen: as recorded, but Bayer and YUV as RGB; native keeps a mosaic; rgb; gray.",
+        "seen",
+        metavar="KIND",
+    )
+    tolerance_ns: int | None = option(
+        "Only frames of which every camera has one within this time.",
+        None,
+        "--sync",
+        metavar="MS",
+        parse=_nanoseconds,
+    )
+    poses: str | None = option("Of poses, for euroc, tum and colmap.", metavar="TOPIC")
+    fps: int | None = option(
+        "Of lerobot; the rate of the first camera by default.", least=1, most=1000
+    )
+    state: str | None = option("observation.state of lerobot.", metavar="TOPIC")
+    action: str | None = option("action of lerobot.", metavar="TOPIC")
+    task: str = option("What the robot does, for lerobot.", "", metavar="TEXT")
+    codec: str = option("av1, h264 or h265: of videos made for lerobot.", "av1")
+    crf: int = option("Their quality; less is better.", 30, least=0, most=63)
+    force: bool = force()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.pixels not in PIXELS:
+            raise OptionError(f"`pixels` {self.pixels!r} is not known. Use {', '.join(PIXELS)}.")
+        if self.codec not in _CODECS:
+            raise OptionError(f"`codec` {self.codec!r} is not known. Use {', '.join(_CODECS)}.")
+        most = MAX_CRF[self.codec]
+        if not 0 <= self.crf <= most:
+            raise OptionError(f"`crf` {self.crf} is not from 0 to {most}, as {self.codec} has it.")
+
+    @property
+    def reduction(self) -> Reduction:
+        """How much smaller or fewer images are given.
+
+        Raises:
+            OptionError: There is no such size, number or rate.
+        """
+        return Reduction(self.resize, self.every, self.max_rate)
+
+
+@dataclass(frozen=True)
+class ExportSummary:
+    """What an export did.
+
+    Every message of the datasets is counted once, as one that the export holds or by the reason
+    why it does not.
+
+    Attributes:
+        output: The folder or file made.
+        format: Its format.
+        places: Part of the output -> the topic that is in it.
+        messages: Messages that it holds, by topic.
+        left_out: Topic -> reason -> messages that it does not hold.
+        notes: What else the format does not say as it was recorded.
+    """
+
+    output: Path
+    format: str
+    places: dict[str, str] = field(default_factory=dict)
+    messages: dict[str, int] = field(default_factory=dict)
+    left_out: dict[str, dict[str, int]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+# ---------------------------------------------------------------- ledger
+
+AS_RECORDED = "stored as recorded in messages.mcap, not as video"
+NOT_CHOSEN = "not chosen"
+
+
+class Ledger:
+    """Counts the messages of a dataset, by topic.
+
+    Attributes:
+        held: Messages that the export holds, by topic.
+        left_out: Topic -> reason -> messages.
+    """
+
+    def __init__(self, dataset: Dataset) -> None:
+        self._totals: Counter[str] = Counter()
+        times = dataset.times()
+        self._channels: dict[str, Channel] = {}
+        for channel in dataset.channels:
+            self._channels[channel.topic] = channel
+            self._totals[channel.topic] += len(times.get(channel.id, ()))
+        self.held: dict[str, int] = {}
+        self.left_out: dict[str, dict[str, int]] = {}
+
+    def total(self, topic: str) -> int:
+        """Messages of a topic that the dataset has."""
+        return self._totals[topic]
+
+    def hold(self, topic: str, count: int = 1) -> None:
+        """The export holds so many messages more."""
+        self.held[topic] = self.held.get(topic, 0) + count
+
+    def leave(self, topic: str, reason: str, count: int) -> None:
+        """So many messages more are left out."""
+        if count:
+            reasons = self.left_out.setdefault(topic, {})
+            reasons[reason] = reasons.get(reason, 0) + count
+
+    def settle(self, chosen: Callable[[str], bool], name: str) -> None:
+        """Give the messages that nobody counted their reason.
+
+        Args:
+            chosen: Whether a topic was asked for.
+            name: Of the format.
+        """
+        for topic, total in self._totals.items():
+            told = self.held.get(topic, 0) + sum(self.left_out.get(topic, {}).values())
+            channel = self._channels[topic]
+            if not chosen(topic):
+                reason = NOT_CHOSEN
+            elif is_camera(channel):
+                reason = AS_RECORDED
+            else:
+                reason = f"{name} has no place for {channel.type_name or 'such messages'}"
+            self.leave(topic, reason, total - told)
+
+
+# ---------------------------------------------------------------- cameras
+
+_THINNED = "left out on request (--every, --max-rate)"
+_INVERSE = "quantised inverse depths; `mp4ds unpack --images raw` makes depths of them"
+
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ExportedCamera:
+    """The frames of a stream that are given, by time.
+
+    Attributes:
+        stream: The stream.
+        numbers: Numbers of the frames, int64, shape (frames,).
+        times: When they were taken, nanoseconds, increasing or equal; shape (frames,).
+        view: How they look.
+    """
+
+    stream: Stream
+    numbers: Integers
+    times: Integers
+    view: View
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    @property
+    def topic(self) -> str:
+        """Topic of the images."""
+        return self.stream.topic
+
+    @property
+    def frame_id(self) -> str:
+        """Coordinate frame of the first image."""
+        return self.stream.sidecar.headers[0].frame_id
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of what is given, pixels."""
+        height, width = self.view.shape[:2]
+        if self.view.is_plain:  # of YUV, rows are more than the image has
+            return self.stream.image_size
+        return width, height
+
+    @property
+    def is_as_recorded(self) -> bool:
+        """Whether all frames are given, as they were recorded and in their order."""
+        is_whole = np.array_equal(self.numbers, np.arange(len(self.stream)))
+        return self.view.is_plain and is_whole
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """The calibration of what is given, when the first frame was taken; None if unknown."""
+        if not len(self):
+            return None
+        found = self.stream.intrinsics_at(int(self.numbers[0]))
+        if found is None or not found.k[0]:  # a camera that is not calibrated says zeros
+            return None
+        return Placement((0, 0, *self.stream.image_size), self.size).calibration(found)
+
+    @property
+    def rate(self) -> float:
+        """Usual frames in a second; 0 where there is one frame."""
+        usual = usual_interval(intervals(self.times))
+        return 1e9 / usual if usual else 0.0
+
+    def at(self, places: Integers) -> ExportedCamera:
+        """The camera with some of its frames only."""
+        return replace(self, numbers=self.numbers[places], times=self.times[places])
+
+    def pictures(self) -> Iterator[tuple[int, Pixels]]:
+        """What is given of each frame, in the order of the video.
+
+        Yields:
+            Place among `numbers`, and pixels of `view.encoding` that are the caller's.
+
+        Raises:
+            FormatError: The stream is damaged.
+        """
+        self.stream.verify_video()
+        place_of = np.full(len(self.stream), -1, np.int64)
+        place_of[self.numbers] = np.arange(len(self))
+        with self.stream.open_video(sequential=True) as decoder:
+            for index, picture in self.stream.pictures_in_order(decoder, marked(place_of >= 0)):
+                pixels: Pixels = np.empty(self.view.shape, self.view.dtype)
+                self.view.give(self.stream.rebuilder.pixels(picture), pixels)
+                yield int(place_of[index]), pixels
+
+    def png_files(self) -> Iterator[tuple[int, bytes]]:
+        """PNG files of the frames; see `pictures`."""
+        file = ImageFile(self.view.encoding.name, "png")
+        for place, pixels in self.pictures():
+            yield place, file.encode(pixels)
+
+
+def chosen_cameras(
+    streams: Sequence[Stream], options: ExportOptions, ledger: Ledger, notes: list[str]
+) -> list[ExportedCamera]:
+    """The cameras of some streams: those that are calibrated first, then by topic.
+
+    Args:
+        streams: The streams.
+        options: Which frames, and how.
+        ledger: Counts those that are left out.
+        notes: Told what frames become.
+
+    Raises:
+        OptionError: Frames of a stream cannot be given so.
+    """
+    reduction = options.reduction
+    cameras = []
+    for stream in streams:
+        sidecar = stream.sidecar
+        if any(is_inverse_depth(sidecar, header) for header in sidecar.headers):
+            ledger.leave(stream.topic, _INVERSE, len(stream))
+            continue
+        columns = stream.columns
+        kept = np.flatnonzero(reduction.kept(columns))
+        ledger.leave(stream.topic, _THINNED, len(stream) - len(kept))
+        times = times_of(columns)
+        if times is not columns.stamp:
+            notes.append(f"{stream.topic}: its stamps do not increase, log times are told instead")
+        kept = kept[np.argsort(times[kept], kind="stable")]
+        view = _view(stream, options, notes)
+        cameras.append(ExportedCamera(stream, kept, times[kept], view))
+    cameras.sort(key=lambda camera: (camera.calibration is None, camera.topic))
+    if options.tolerance_ns is None or len(cameras) < 2:
+        return cameras
+    return _matched(cameras, options.tolerance_ns, ledger)
+
+
+def _view(stream: Stream, options: ExportOptions, notes: list[str]) -> View:
+    known = ENCODINGS[stream.encoding]
+    colours = options.pixels if options.pixels in ("rgb", "gray") else "native"
+    if options.pixels == "seen" and not is_plain(known):
+        colours = "rgb"
+    if colours != "native" and not is_plain(known):
+        kind = "a Bayer mosaic" if known.mosaic else "YUV"
+        keeps = (
+            ", which --pixels native keeps" if known.mosaic and colours != options.pixels else ""
+        )
+        notes.append(f"{stream.topic}: its pixels are made of {kind}{keeps}")
+    if encoding_as(known, "rgb") is None:
+        colours = "native"  # depths and other numbers have no colours
+    return view_of(
+        stream.topic, known, stream.image_size, format=colours, resize=options.resize, crop=None
+    )
+
+
+def is_plain(encoding: Encoding) -> bool:
+    """Whether an image of an encoding looks like what it shows: neither a mosaic nor YUV."""
+    return not encoding.mosaic and encoding.rows == 1 and encoding.even == (1, 1)
+
+
+def _matched(
+    cameras: list[ExportedCamera], tolerance_ns: int, ledger: Ledger
+) -> list[ExportedCamera]:
+    """The frames that every camera has, frame n of each taken at the same time."""
+    times = {str(number): camera.times for number, camera in enumerate(cameras)}
+    matches = synchronize(times, tolerance_ns=tolerance_ns)
+    for number, camera in enumerate(cameras):
+        reason = "not every camera has a frame of this time (--sync)"
+        ledger.leave(camera.topic, reason, len(matches.unmatched[str(number)]))
+    columns = zip(cameras, matches.indices.T, strict=True)
+    return [camera.at(places) for camera, places in columns]
+
+
+def that_png_holds(cameras: Sequence[ExportedCamera], ledger: Ledger) -> list[ExportedCamera]:
+    """Those of which the images can be PNG files; the others are left out."""
+    found = []
+    for camera in cameras:
+        name = camera.view.encoding.name
+        try:
+            ImageFile(name, "png")
+        except OptionError:
+            ledger.leave(camera.topic, f"PNG cannot hold {name} images", len(camera))
+        else:
+            found.append(camera)
+    return found
+
+
+def of_different_times(camera: ExportedCamera, ledger: Ledger) -> ExportedCamera:
+    """The camera with one frame of each time, where files are called by it."""
+    is_new = np.diff(camera.times, prepend=camera.times[:1] - 1) != 0
+    ledger.leave(
+        camera.topic, "another frame has the same time, and so its name", int((~is_new).sum())
+    )
+    return camera.at(np.flatnonzero(is_new))
+
+
+def hold_calibration(camera: ExportedCamera, ledger: Ledger) -> Calibration | None:
+    """The calibration of a camera, counted as held once: formats have no place for its times."""
+    info = camera.stream.sidecar.camera_info
+    if info is None or camera.calibration is None:
+        return None
+    topic = info.channel.topic
+    columns = camera.stream.camera_info_columns
+    if columns is not None:
+        used = camera.stream.intrinsics_at(int(camera.numbers[0]))
+        same = [number for number, item in enumerate(info.calibrations) if item is used]
+        is_same = np.isin(columns.variant, same)
+        ledger.hold(topic)
+        ledger.leave(topic, "repeats the calibration that is held", int(is_same.sum()) - 1)
+        ledger.leave(
+            topic, "another calibration: one of each camera is held", int((~is_same).sum())
+        )
+    return camera.calibration
+
+
+# ---------------------------------------------------------------- job
+
+_TELL_EVERY = 16  # frames
+
+
+class ExportedDataset:
+    """A dataset that is exported.
+
+    Attributes:
+        dataset: The dataset.
+        ledger: Counts its messages.
+        cameras: Its chosen streams.
+        notes: What the format does not say as it was recorded.
+    """
+
+    def __init__(self, dataset: Dataset, options: ExportOptions) -> None:
+        dataset.verify_messages()
+        self.dataset = dataset
+        self.ledger = Ledger(dataset)
+        self.notes: list[str] = []
+        selected = Selection(options.topics, options.exclude)
+        selected.check(channel.topic for channel in dataset.channels)
+        named = {options.poses, options.state, options.action}
+        self._selected = selected
+        self._named = named
+        streams = [stream for stream in dataset.streams if selected(stream.topic)]
+        self.cameras = chosen_cameras(streams, options, self.ledger, self.notes)
+
+    def chosen(self, topic: str) -> bool:
+        """Whether a topic was asked for, by a glob or by its name."""
+        return self._selected(topic) or topic in self._named
+
+
+@dataclass
+class ExportJob:
+    """An export that is being made.
+
+    Attributes:
+        path: Where to make it.
+        target: What it will be called.
+        options: How.
+        sources: The datasets, one but for formats that hold several.
+        tell: Called with a phrase now and then.
+        places: Part of the output -> the topic that is in it.
+    """
+
+    path: Path
+    target: Path
+    options: ExportOptions
+    sources: Sequence[ExportedDataset]
+    tell: Callable[[str], None]
+    places: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def source(self) -> ExportedDataset:
+        """The dataset, for formats that hold one."""
+        return self.sources[0]
+
+    def note(self, sentence: str) -> None:
+        """Tell what the format does not say as it was recorded."""
+        if sentence not in self.source.notes:
+            self.source.notes.append(sentence)
+
+    def write_png_files(self, camera: ExportedCamera, place: str, names: Sequence[str]) -> None:
+        """Write the frames of a camera as PNG files, and count them.
+
+        Args:
+            camera: The camera.
+            place: The part of the output that they are told to be in.
+            names: Path of each frame's file from the output's folder.
+        """
+        folder = self.path / names[0].rpartition("/")[0] if names else self.path
+        folder.mkdir(parents=True, exist_ok=True)
+        files = camera.png_files()
+        for position, data in self.counted(files, f"{camera.topic} as {place}", len(camera)):
+            (self.path / names[position]).write_bytes(data)
+        self.places[place] = camera.topic
+        self.source.ledger.hold(camera.topic, len(camera))
+
+    def counted(
+        self, items: Iterator[tuple[int, bytes]], what: str, total: int
+    ) -> Iterator[tuple[int, bytes]]:
+        """The same items; tells how many there were now and then."""
+        for number, item in enumerate(items):
+            if number % _TELL_EVERY == 0:
+                self.tell(f"{what}: frame {number} of {total}")
+            yield item

@@ -1,0 +1,86 @@
+"""The layout of KITTI's raw data: image_00/data/0000000000.png, timestamps, calibrations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob, hold_calibration, that_png_holds
+from mp4ds.plugins.exporting.motion import StaticTree, static_transforms
+from mp4ds.plugins.exporting.tum import seconds
+
+_MOST_CAMERAS = 100  # two digits
+_FULL_D = 5
+
+
+def write(job: ExportJob) -> None:
+    """Write the format."""
+    source = job.source
+    cameras = that_png_holds(source.cameras, source.ledger)
+    for camera in cameras[_MOST_CAMERAS:]:
+        source.ledger.leave(camera.topic, f"KITTI counts {_MOST_CAMERAS} cameras", len(camera))
+    cameras = cameras[:_MOST_CAMERAS]
+    job.path.mkdir()
+    tree = StaticTree(static_transforms(source.dataset))
+    lines = []
+    for number, camera in enumerate(cameras):
+        _write_camera(job, number, camera)
+        lines += _calibration_lines(job, tree, cameras[0], number, camera)
+    if lines:
+        (job.path / "calib_cam_to_cam.txt").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    if cameras:
+        times = cameras[0].times
+        text = "".join(f"{seconds(time)}\n" for time in (times - times[:1]).tolist())
+        (job.path / "times.txt").write_text(text, encoding="utf-8")
+    if len({len(camera) for camera in cameras}) > 1:
+        job.note(
+            "cameras have different numbers of frames, so that those of one number are not of one "
+            "time; --sync MS gives only those that belong together"
+        )
+
+
+def _write_camera(job: ExportJob, number: int, camera: ExportedCamera) -> None:
+    place = f"image_{number:02d}"
+    names = [f"{place}/data/{index:010d}.png" for index in range(len(camera))]
+    job.write_png_files(camera, place, names)
+    with (job.path / place / "timestamps.txt").open("w", encoding="utf-8") as file:
+        for text in np.datetime_as_string(camera.times.astype("datetime64[ns]")).tolist():
+            file.write(text.replace("T", " ") + "\n")
+
+
+def _calibration_lines(
+    job: ExportJob, tree: StaticTree, first: ExportedCamera, number: int, camera: ExportedCamera
+) -> list[str]:
+    """The lines of a camera, in the names and order of calib_cam_to_cam.txt."""
+    calibration = hold_calibration(camera, job.source.ledger)
+    if calibration is None:
+        job.note(f"{camera.topic}: it is not calibrated")
+        return []
+    if calibration.distortion_model not in ("", "plumb_bob") or len(calibration.d) > _FULL_D:
+        job.note(
+            f"{camera.topic}: distortion {calibration.distortion_model} with {len(calibration.d)} "
+            "parameters is none of KITTI's; D holds them as they are"
+        )
+    key, (width, height) = f"{number:02d}", camera.size
+    lines = [
+        _line(f"S_{key}", (width, height)),
+        _line(f"K_{key}", calibration.k),
+        _line(f"D_{key}", [*calibration.d, *[0.0] * (_FULL_D - len(calibration.d))]),
+    ]
+    pose = tree.pose(first.frame_id, camera.frame_id)
+    if pose is None:
+        job.note(f"{camera.topic}: no static transforms tell R_{key} and T_{key}")
+    else:
+        lines.append(_line(f"R_{key}", pose[:3, :3].ravel().tolist()))
+        lines.append(_line(f"T_{key}", pose[:3, 3].tolist()))
+    return [
+        *lines,
+        _line(f"S_rect_{key}", (width, height)),
+        _line(f"R_rect_{key}", calibration.r),
+        _line(f"P_rect_{key}", calibration.p),
+    ]
+
+
+def _line(name: str, values: Iterable[float]) -> str:
+    return " ".join([f"{name}:", *(repr(float(value)) for value in values)])

@@ -1,0 +1,1 @@
+"""Folders of images, and videos of the paper's tool, read as if they were recordings."""

@@ -1,0 +1,403 @@
+"""The table of layouts of folders, and folders without one."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
+from mp4ds.files.sources import members
+from mp4ds.files.urls import remote
+from mp4ds.messages.encodings import ENCODINGS
+from mp4ds.packing.options import ImageFolder
+from mp4ds.plugins.importing.benchmarks import (
+    find_euroc,
+    find_kitti,
+    find_tum,
+    is_euroc,
+    is_kitti,
+    is_tum,
+)
+from mp4ds.plugins.importing.reader import ImagesReader
+from mp4ds.plugins.importing.scene import (
+    UNITS,
+    NoTimeError,
+    Rows,
+    Scene,
+    SceneCamera,
+    at_rate,
+    is_number,
+    lines_of,
+    listed_images,
+    of_unit,
+    read_times,
+    ros_calibration,
+    split,
+    unit_of,
+)
+from mp4ds.video.images import STILL_SUFFIXES, image_kind, image_size
+
+_MOST = 8  # cameras; more words are no names of cameras
+_LOOKED_AT = 8
+# a number, but for that of a camera such as cam0
+_NUMBER = re.compile(r"(?<!\d)(?<!cam)(?<!camera)\d+|(?<=cam)\d{2,}|(?<=camera)\d{2,}", re.I)
+_HEX = re.compile(r"[0-9a-f]+", re.I)
+_WORD = re.compile(r"[^\W_]+")
+_ADVICE = (
+    "One rate does not tell their times. Give `stamps` FILE with a time and a file name in each "
+    "line, or put those of each camera into a folder of its own."
+)
+
+
+def by_camera(folder: Path, images: Sequence[Path]) -> Mapping[str, list[Path]]:
+    """The images of each camera by its name, which is empty where there is one camera.
+
+    There are several where the names have different words or endings and the same numbers:
+    ``color_0001.jpg`` and ``depth_0001.png``.
+
+    Args:
+        folder: For errors.
+        images: In order.
+
+    Raises:
+        SourceError: Nothing tells whether they are of one camera.
+    """
+    kinds: dict[str, list[Path]] = {}
+    for path in images:
+        kinds.setdefault(_NUMBER.sub("#", path.stem) + path.suffix.lower(), []).append(path)
+    numbers = [[_numbers(path) for path in paths] for paths in kinds.values()]
+    cameras = {"": list(images)}
+    if _may_be_cameras(images, numbers):
+        if any(found != numbers[0] for found in numbers):
+            first, second = (paths[0].name for paths in list(kinds.values())[:2])
+            raise SourceError(
+                folder,
+                f"holds images of several kinds by their names, such as {first} and {second}, and "
+                "not the same numbers of each",
+                _ADVICE,
+            )
+        cameras = dict(zip(_names(list(kinds)), kinds.values(), strict=True))
+    for paths in cameras.values():
+        _check_turns(folder, paths)
+    return cameras
+
+
+def _numbers(path: Path) -> tuple[int, ...]:
+    return tuple(map(int, _NUMBER.findall(path.stem)))
+
+
+def _may_be_cameras(images: Sequence[Path], numbers: Sequence[list[tuple[int, ...]]]) -> bool:
+    """Whether there are a few kinds, and one number is in several of them."""
+    if not 1 < len(numbers) <= _MOST or min(map(len, numbers)) < 2:
+        return False
+    endings = {path.suffix.lower() for path in images}
+    if len(endings) < len(numbers) and all(_HEX.fullmatch(path.stem) for path in images):
+        return False  # letters are digits, too
+    return len(set().union(*numbers)) < len(images)
+
+
+def _names(kinds: Sequence[str]) -> list[str]:
+    """A name for each camera: the words that not all have; else the ending of its files."""
+    words = [_WORD.findall(Path(kind).stem) for kind in kinds]
+    shared = set(words[0]).intersection(*words)
+    names = ["_".join(word for word in own if word not in shared) for own in words]
+    if len(set(names)) < len(names):
+        endings = [Path(kind).suffix[1:] for kind in kinds]
+        names = ["_".join(filter(None, pair)) for pair in zip(names, endings, strict=True)]
+    if len(set(names)) < len(names):
+        return [f"camera{number}" for number in range(len(names))]
+    return [name or "camera" for name in names]
+
+
+def _check_turns(folder: Path, images: Sequence[Path]) -> None:
+    """Refuse images of two cameras in turns; a camera may well change its size."""
+    kinds = [_kind(path) for path in images[:_LOOKED_AT]]
+    changes = [place for place in range(1, len(kinds)) if kinds[place] != kinds[place - 1]]
+    if len(changes) >= len(set(kinds)) > 1:
+        first, second = (
+            f"{images[place].name} ({kinds[place]})" for place in (changes[0] - 1, changes[0])
+        )
+        raise SourceError(
+            folder, f"holds images of several kinds in turns, such as {first} and {second}", _ADVICE
+        )
+
+
+def _kind(path: Path) -> str:
+    try:
+        return image_kind(path)
+    except SourceError:  # JPEG files are kept whatever is in them
+        return path.suffix.lower()
+
+
+# ---------------------------------------------------------------- plain
+
+_TOPIC, _FRAME = "/camera/image_raw", "camera"
+_LISTED = 3
+_IN_NS = re.compile(r"(?<![A-Za-z])ns\b")
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The images directly in a folder, in the order of the numbers in their names."""
+    found = [path for path in members(folder) if path.suffix.lower() in STILL_SUFFIXES]
+    return sorted(found, key=_in_order)
+
+
+def _in_order(path: Path) -> tuple[list[tuple[int, str]], str]:
+    """Orders 9 before 10, with zeros before it or without."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return [(int(part or 0), "") if n % 2 else (0, part) for n, part in enumerate(parts)], path.name
+
+
+def find_plain(folder: Path, options: ImageFolder) -> Scene:
+    """The images of a folder: of one camera, or of several where a rate tells their times.
+
+    Raises:
+        SourceError: There are none, or nothing tells their times.
+        OptionError: An option is wrong.
+    """
+    if options.stamps and options.rate:
+        raise OptionError("`stamps` tells the times that `rate` makes up. Give one of them.")
+    scene = Scene(folder)
+    images = images_in(folder)
+    if not images:
+        raise SourceError(folder, "holds no images" + _elsewhere(folder))
+    if options.rate:
+        scene.cameras += _by_rate(folder, images, options)
+        files = images
+    else:
+        if options.stamps:
+            files, stamps = _by_list(scene, images, Path(options.stamps), options.unit)
+        else:
+            files, stamps = images, _by_name(scene, images, options.unit)
+        scene.cameras.append(_camera("", files, stamps, options))
+    if unused := len(images) - len(set(files)):
+        scene.skipped["images without a time"] = unused
+    read = {Path(path).resolve() for path in (options.stamps, options.calibration) if path}
+    others = [path for path in members(folder) if path.resolve() not in read]
+    others = [path for path in others if path.suffix.lower() not in STILL_SUFFIXES]
+    if others:
+        scene.skipped[f"files in {folder.resolve().name} that are no images"] = len(others)
+    scene.files.append(folder)
+    return scene
+
+
+def _camera(
+    name: str, files: list[Path], stamps: NDArray[np.int64], options: ImageFolder
+) -> SceneCamera:
+    return SceneCamera(
+        options.topic or (f"/{name}/image_raw" if name else _TOPIC),
+        options.frame_id if options.frame_id is not None else name or _FRAME,
+        files,
+        stamps,
+        encoding=options.encoding,
+    )
+
+
+def _by_rate(folder: Path, images: list[Path], options: ImageFolder) -> list[SceneCamera]:
+    """The cameras whose images are in a folder, all from the same time on."""
+    found = by_camera(folder, images)
+    given = [key for key in ("topic", "frame_id", "encoding") if getattr(options, key) is not None]
+    if len(found) > 1 and given:
+        raise OptionError(
+            f"`{given[0]}` is for the images of one camera, and {folder} holds "
+            f"those of {', '.join(found)}. Put each into a folder of its own."
+        )
+    try:
+        return [
+            _camera(name, files, at_rate(len(files), options.rate or ""), options)
+            for name, files in found.items()
+        ]
+    except NoTimeError as error:
+        raise OptionError(f"`rate`: {error}") from None
+
+
+def _elsewhere(folder: Path) -> str:
+    """Where images are, if not in the folder itself."""
+    places = [path for path in sorted(folder.iterdir()) if path.is_dir() and images_in(path)]
+    if not places:
+        return ", and no layout that is known"
+    listed = ", ".join(path.name for path in places[:_LISTED])
+    more = ", ..." if len(places) > _LISTED else ""
+    return f" itself, and no layout that is known; there are some in {listed}{more}"
+
+
+def _by_list(
+    scene: Scene, images: list[Path], path: Path, unit: str | None
+) -> tuple[list[Path], NDArray[np.int64]]:
+    """The images of a list of times, which may name them."""
+    rows: Rows = [(number, split(line)) for number, line in lines_of(path)]
+    header = rows.pop(0)[1] if rows and not any(map(is_number, rows[0][1])) else []
+    if not rows:
+        raise SourceError(path, "holds no times")
+    time, name = _columns(path, *rows[0])
+    if path.parent.resolve() != scene.folder.resolve():
+        scene.files.append(path)
+    chosen: Rows = []
+    for number, values in rows:
+        if len(values) <= max(time, name or 0):
+            raise SourceError(path, f"line {number} has {len(values)} values, fewer than before")
+        chosen.append((number, [values[time], *([] if name is None else [values[name]])]))
+    if unit is None and len(header) > time and _IN_NS.search(header[time]):
+        unit = "ns"
+    unit = unit or unit_of([values[0] for _, values in chosen if is_number(values[0])])
+    if unit is None:
+        raise OptionError(f"{path}: its times are whole numbers of an unknown unit. Give `unit`.")
+    read = of_unit(unit, scene.skipped)
+    if name is not None:
+        return listed_images(path, scene.folder, read, chosen)
+    stamps = read_times(path, chosen, read)
+    if len(stamps) != len(images):
+        raise SourceError(
+            path, f"has {len(stamps)} times, and there are {len(images)} images in {scene.folder}"
+        )
+    return images, stamps
+
+
+def _columns(path: Path, number: int, values: list[str]) -> tuple[int, int | None]:
+    """Where a line has its time, and the name of an image, if it has one."""
+    time = next((place for place, value in enumerate(values) if is_number(value)), None)
+    if time is None:
+        raise SourceError(path, f"line {number} has no time")
+    names = (place for place, value in enumerate(values) if _is_image(value))
+    return time, next(names, None)
+
+
+def _is_image(name: str) -> bool:
+    return name.lower().endswith(STILL_SUFFIXES)
+
+
+def _by_name(scene: Scene, images: list[Path], unit: str | None) -> NDArray[np.int64]:
+    names = [path.stem for path in images]
+    if all(map(is_number, names)):
+        unit = unit or unit_of(names)
+    elif unit is not None:
+        wrong = next(path for path in images if not is_number(path.stem))
+        raise SourceError(wrong, "has a name that is no time", "Give `stamps` FILE or `rate` HZ.")
+    if unit is None or not all(map(is_number, names)):
+        raise SourceError(
+            scene.folder,
+            "holds images whose names are no times in nanoseconds or decimal seconds",
+            "Give `stamps` FILE, `rate` HZ, or the `unit` of the names.",
+        )
+    read = of_unit(unit, scene.skipped)
+    stamps = np.empty(len(images), np.int64)
+    for place, path in enumerate(images):
+        try:
+            stamps[place] = read(path.stem)
+        except NoTimeError as error:
+            raise SourceError(path, f"has a name that is no time: {error}") from None
+    return stamps
+
+
+# ---------------------------------------------------------------- layouts
+
+_PLAIN_ONLY = ("stamps", "rate", "unit", "topic", "frame_id", "encoding")
+
+
+@dataclass(frozen=True, slots=True)
+class FolderLayout:
+    """A layout of folders.
+
+    Attributes:
+        matches: Whether a folder has it.
+        find: Finds what it holds.
+        is_calibrated: Whether it tells calibrations of its own.
+    """
+
+    matches: Callable[[Path], bool]
+    find: Callable[[Path, ImageFolder], Scene]
+    is_calibrated: bool
+
+
+LAYOUTS: Mapping[str, FolderLayout] = {
+    "euroc": FolderLayout(is_euroc, find_euroc, is_calibrated=True),
+    "kitti": FolderLayout(is_kitti, find_kitti, is_calibrated=True),
+    "tum": FolderLayout(is_tum, find_tum, is_calibrated=False),
+    "plain": FolderLayout(lambda folder: True, find_plain, is_calibrated=False),
+}
+"""In the order in which they are tried."""
+
+
+def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
+    """Open a folder of images as a recording.
+
+    Args:
+        folder: The folder, on this machine.
+        options: How it is read.
+
+    Raises:
+        SourceError: It cannot be read as asked; says why and what to do.
+        OptionError: The options do not suit its layout.
+    """
+    if remote(folder):
+        raise SourceError(folder, "is not read where it is", "Download it first.")
+    if not folder.exists():
+        raise SourceNotFoundError(folder)
+    if not folder.is_dir():
+        raise SourceError(folder, "is no folder of images")
+    _check(options)
+    try:
+        name = options.layout or next(key for key in LAYOUTS if LAYOUTS[key].matches(folder))
+        layout = LAYOUTS[name]
+        _check_for(name, layout, options)
+        if not layout.matches(folder):
+            raise SourceError(folder, f"is not laid out as {name} is", "Leave out `layout`.")
+        scene = layout.find(folder, options)
+    except OSError as error:
+        if isinstance(error, SourceError):
+            raise
+        raise SourceError(error.filename or folder, f"cannot be read: {error.strerror}") from None
+    if options.calibration:
+        _calibrate(scene, Path(options.calibration))
+    if not any(len(camera.files) for camera in scene.cameras):
+        raise SourceError(folder, "holds no images")
+    return ImagesReader(scene)
+
+
+def _check(options: ImageFolder) -> None:
+    if options.layout is not None and options.layout not in LAYOUTS:
+        raise OptionError(f"`layout` {options.layout!r} is not one of {', '.join(LAYOUTS)}.")
+    if options.unit is not None and options.unit not in UNITS:
+        raise OptionError(f"`unit` {options.unit!r} is not one of {', '.join(UNITS)}.")
+    if options.encoding is not None and options.encoding not in ENCODINGS:
+        raise OptionError(f"`encoding` {options.encoding!r} is not one of {', '.join(ENCODINGS)}.")
+    if options.topic is not None and not options.topic.strip("/"):
+        raise OptionError(f"`topic` {options.topic!r} is not a topic name.")
+
+
+def _check_for(name: str, layout: FolderLayout, options: ImageFolder) -> None:
+    """Refuse options that go with other layouts only."""
+    given = [key for key in _PLAIN_ONLY if getattr(options, key) is not None]
+    if name != "plain" and given:
+        raise OptionError(
+            f"`{given[0]}` is for plain folders of images, and this one has the "
+            f"layout {name}, which tells it. Give `layout` plain, or leave it out."
+        )
+    if layout.is_calibrated and options.calibration:
+        raise OptionError(f"`calibration` is not for the layout {name}, which has its own.")
+
+
+def _calibrate(scene: Scene, path: Path) -> None:
+    """Give all cameras a calibration that is theirs by its size.
+
+    Raises:
+        SourceError: It is none, or made for images of another size.
+    """
+    calibration = ros_calibration(path)
+    for camera in scene.cameras:
+        size = image_size(camera.files[0]) if camera.files else None
+        if size not in (None, (calibration.width, calibration.height)):
+            raise SourceError(
+                path,
+                f"is for images of {calibration.width}x{calibration.height}, and those of "
+                f"{camera.topic} have {size[0]}x{size[1]}",
+            )
+    scene.cameras = [replace(camera, calibration=calibration) for camera in scene.cameras]
+    if path.resolve() not in {file.resolve() for file in scene.files}:
+        scene.files.append(path)
+    scene.kept.append(path)

@@ -1,0 +1,551 @@
+"""What a layout finds in a folder, and how its lists, times and calibrations are read."""
+
+from __future__ import annotations
+
+import math
+import re
+from calendar import timegm
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from fractions import Fraction
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds import yamlio
+from mp4ds.errors import FormatError, SourceError
+from mp4ds.messages.transforms import Transform
+from mp4ds.messages.wire import CalibrationFields
+
+UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+"""Nanoseconds of each unit."""
+
+MAX_STAMP = 2**31 * 10**9 - 1
+"""The latest time that a message of ROS 2 has bits for, nanoseconds: in 2038."""
+
+ROUNDED = "times finer than a nanosecond, which were rounded to it"
+
+_CERTAIN_DIGITS = 16  # of nanoseconds since 1970; a count of seconds or images has fewer
+_NUMBER = re.compile(r"\+?([0-9]{1,40})(?:(\.[0-9]{0,40})?([eE][-+]?[0-9]{1,2})?)?")
+_DATE = re.compile(r"([0-9]{4}-[0-9]{2}-[0-9]{2}[ T][0-9]{2}:[0-9]{2}:[0-9]{2})(\.[0-9]{1,40})?")
+
+
+class NoTimeError(ValueError):
+    """A text that is no time; the message is a phrase."""
+
+
+def is_number(text: str) -> bool:
+    """Whether a text is a number that may be a time."""
+    return _NUMBER.fullmatch(text) is not None
+
+
+def unit_of(texts: Sequence[str]) -> str | None:
+    """The unit that numbers have: seconds if one has decimals, nanoseconds if they are long.
+
+    Returns:
+        ``s`` or ``ns``; None if nothing tells.
+    """
+    if any(not text.lstrip("+").isdigit() for text in texts):
+        return "s"
+    longest = max((len(text.lstrip("+0")) for text in texts), default=0)
+    return "ns" if longest >= _CERTAIN_DIGITS else None
+
+
+def of_unit(unit: str, found: Counter[str]) -> Callable[[str], int]:
+    """What reads numbers of a unit.
+
+    Args:
+        unit: One of `UNITS`.
+        found: Gets how many were rounded.
+
+    Returns:
+        Text -> nanoseconds; it raises NoTimeError.
+    """
+    scale = UNITS[unit]
+
+    def read(text: str) -> int:
+        if not _NUMBER.fullmatch(text):
+            raise NoTimeError(f"{text!r} is no time in {unit}")
+        return _checked(Fraction(text) * scale, text, found)
+
+    return read
+
+
+def of_date(found: Counter[str]) -> Callable[[str], int]:
+    """What reads ``2011-09-26 13:02:25.964389445``, which is taken for UTC. See `of_unit`."""
+
+    def read(text: str) -> int:
+        match = _DATE.fullmatch(text.strip())
+        try:
+            whole = datetime.fromisoformat(match[1]) if match else None
+        except ValueError:
+            whole = None
+        if match is None or whole is None:
+            raise NoTimeError(f"{text!r} is no date and time")
+        seconds = timegm(whole.timetuple()) + Fraction(f"0{match[2] or ''}")
+        return _checked(seconds * UNITS["s"], text, found)
+
+    return read
+
+
+def _checked(time: Fraction, text: str, found: Counter[str]) -> int:
+    nanoseconds = round(time)
+    if not 0 <= nanoseconds <= MAX_STAMP:
+        raise NoTimeError(f"{text!r} is not a time from 1970 to 2038, which is what ROS 2 has")
+    if nanoseconds != time:
+        found[ROUNDED] += 1
+    return nanoseconds
+
+
+def at_rate(count: int, rate: str) -> NDArray[np.int64]:
+    """Times of images at a rate, from 0 on, rounded to nanoseconds.
+
+    Args:
+        count: How many.
+        rate: Images per second, such as ``20``, ``29.97`` or ``30000/1001``.
+
+    Raises:
+        NoTimeError: It is no rate.
+    """
+    try:
+        found = Fraction(rate)
+    except (ValueError, ZeroDivisionError):
+        found = Fraction(0)
+    if not Fraction(1, 10**6) <= found <= 10**6:
+        raise NoTimeError(f"{rate!r} is no rate in Hz")
+    times = [round(number * 10**9 / found) for number in range(count)]
+    if times and times[-1] > MAX_STAMP:
+        raise NoTimeError(f"{rate!r} Hz is too slow for {count} images")
+    return np.array(times, np.int64)
+
+
+# ---------------------------------------------------------------- geometry
+
+_TOLERANCE = 1e-2  # of a rotation that a file gives with few digits
+
+Matrix = NDArray[np.float64]
+
+
+def quaternion(rotation: Matrix) -> tuple[float, float, float, float]:
+    """The unit quaternion x, y, z, w of a rotation, w not negative.
+
+    It is the eigenvector of the largest eigenvalue of a symmetric matrix (I. Bar-Itzhack, 2000),
+    which is the nearest rotation to a matrix with rounded digits.
+
+    Args:
+        rotation: Shape (3, 3).
+
+    Raises:
+        ValueError: It is none.
+    """
+    m = rotation
+    is_near = np.abs(m @ m.T - np.eye(3)).max(initial=0) < _TOLERANCE
+    if not np.isfinite(m).all() or not is_near or np.linalg.det(m) < 0:
+        raise ValueError("its rotation is none")
+    symmetric = np.empty((4, 4))
+    symmetric[:3, :3] = m + m.T - np.trace(m) * np.eye(3)
+    vector = [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]
+    symmetric[3, :3] = symmetric[:3, 3] = vector
+    symmetric[3, 3] = np.trace(m)
+    found = np.linalg.eigh(symmetric)[1][:, -1]
+    x, y, z, w = (found if found[3] >= 0 else -found).tolist()
+    return x, y, z, w
+
+
+def transform(parent: str, child: str, rotation: Matrix, translation: Matrix) -> Transform:
+    """The pose of a frame in another: a point p of the child is rotation * p + translation there.
+
+    Args:
+        parent: The frame in which the child is.
+        child: The frame that is placed.
+        rotation: Shape (3, 3).
+        translation: Metres, shape (3,).
+
+    Raises:
+        ValueError: The rotation is none.
+    """
+    if not np.isfinite(translation).all():
+        raise ValueError("its translation is not finite")
+    x, y, z = (translation + 0.0).tolist()  # without negative zeros
+    return Transform(parent, child, (x, y, z), quaternion(rotation))
+
+
+# ---------------------------------------------------------------- calibration
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+_MAX_BYTES = 2**20
+_MAX_SIZE = 2**31
+
+# name in a file -> that of ROS, and how many parameters it may have
+_MODELS = {
+    "plumb_bob": ("plumb_bob", (4, 5)),
+    "radial-tangential": ("plumb_bob", (4, 5)),
+    "radtan": ("plumb_bob", (4, 5)),
+    "rational_polynomial": ("rational_polynomial", (8, 12, 14)),
+    "equidistant": ("equidistant", (4,)),
+    "fisheye": ("equidistant", (4,)),
+}
+
+_OPENCV_HEADER = re.compile(rb"(?:\xef\xbb\xbf)?%YAML:1\.\d[ \t]*\r?\n(?:---[ \t]*\r?\n)?")
+_OPENCV_TAG = re.compile(rb"(?m)(?<=:)[ \t]*!!opencv-matrix(?=[ \t]*\r?$)")
+
+
+def _without_opencv(data: bytes) -> bytes:
+    """YAML without what only OpenCV's FileStorage writes: its directive, and a tag of matrices."""
+    if not (header := _OPENCV_HEADER.match(data)):
+        return data
+    lines = b"#\n" * header[0].count(b"\n")  # errors name the line
+    return lines + _OPENCV_TAG.sub(b"", data[header.end() :])
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The values of a small YAML file, which OpenCV may have written.
+
+    Raises:
+        SourceError: It is none, or uses more of YAML than maps, lists and plain values.
+    """
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise SourceError(path, f"is larger than {_MAX_BYTES} bytes, and no calibration")
+        return yamlio.load(_without_opencv(path.read_bytes()), str(path))
+    except FormatError as error:
+        raise SourceError(path, error.problem) from None
+    except OSError as error:
+        raise SourceError(path, f"cannot be read: {error.strerror}") from None
+
+
+def ros_calibration(path: Path) -> CalibrationFields:
+    """The calibration that ROS's camera_calibration saves.
+
+    Raises:
+        SourceError: It is none; says what is missing or wrong.
+    """
+    values = read_yaml(path)
+    try:
+        k = _matrix(values, "camera_matrix", 9)
+        return CalibrationFields(
+            width=_side(values, "image_width"),
+            height=_side(values, "image_height"),
+            **_distortion(
+                str(_known(values, "distortion_model")),
+                _matrix(values, "distortion_coefficients", None),
+            ),
+            k=k,
+            r=_matrix(values, "rectification_matrix", 9, IDENTITY),
+            p=_matrix(values, "projection_matrix", 12, projection(k)),
+        )
+    except ValueError as error:
+        raise SourceError(
+            path,
+            f"is no calibration: {error}",
+            "Give a YAML file as ROS's camera_calibration saves it.",
+        ) from None
+
+
+def euroc_calibration(path: Path, values: dict[str, Any]) -> CalibrationFields:
+    """The calibration of a camera in EuRoC's sensor.yaml.
+
+    Args:
+        path: The file, for errors.
+        values: Of `read_yaml`.
+
+    Raises:
+        SourceError: It is none; says what is missing or wrong.
+    """
+    try:
+        model = str(_known(values, "camera_model"))
+        if model != "pinhole":
+            raise ValueError(f"camera_model is {model!r}, not pinhole")
+        width, height = _numbers(_known(values, "resolution"), "resolution", 2)
+        fx, fy, cx, cy = _numbers(_known(values, "intrinsics"), "intrinsics", 4)
+        k = (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0)
+        coefficients = _known(values, "distortion_coefficients")
+        return CalibrationFields(
+            width=_whole(width, "resolution"),
+            height=_whole(height, "resolution"),
+            **_distortion(
+                str(_known(values, "distortion_model")),
+                _numbers(coefficients, "distortion_coefficients", None),
+            ),
+            k=k,
+            r=IDENTITY,
+            p=projection(k),
+        )
+    except ValueError as error:
+        raise SourceError(path, f"is no calibration: {error}") from None
+
+
+def euroc_pose(path: Path, values: dict[str, Any]) -> Matrix | None:
+    """``T_BS`` of EuRoC's sensor.yaml: the pose of the sensor in the body, shape (4, 4).
+
+    Raises:
+        SourceError: It is none.
+    """
+    if "T_BS" not in values:
+        return None
+    try:
+        return np.array(_matrix(values, "T_BS", 16)).reshape(4, 4)
+    except ValueError as error:
+        raise SourceError(path, f"tells no pose: {error}") from None
+
+
+def projection(k: Sequence[float]) -> tuple[float, ...]:
+    """The projection matrix, 3 x 4 by rows, of a camera that is not rectified."""
+    return (*k[0:3], 0.0, *k[3:6], 0.0, *k[6:9], 0.0)
+
+
+def _distortion(name: str, values: tuple[float, ...]) -> dict[str, Any]:
+    if name not in _MODELS:
+        known = ", ".join(_MODELS)
+        raise ValueError(f"distortion_model {name!r} is not known; there are {known}")
+    model, counts = _MODELS[name]
+    if len(values) not in counts:
+        listed = " or ".join(map(str, counts))
+        raise ValueError(
+            f"{name} has {listed} distortion_coefficients, and there are {len(values)}"
+        )
+    if model == "plumb_bob":  # ROS's has the third radial one, too
+        values = (*values, 0.0)[:5]
+    return {"distortion_model": model, "d": values}
+
+
+def _known(values: dict[str, Any], key: str) -> Any:
+    if key not in values:
+        raise ValueError(f"{key} is missing")
+    return values[key]
+
+
+def _side(values: dict[str, Any], key: str) -> int:
+    return _whole(_numbers([_known(values, key)], key, 1)[0], key)
+
+
+def _whole(value: float, key: str) -> int:
+    if value != int(value) or not 0 < value < _MAX_SIZE:
+        raise ValueError(f"{key} is {value}")
+    return int(value)
+
+
+def _matrix(
+    values: dict[str, Any], key: str, count: int | None, default: tuple[float, ...] | None = None
+) -> tuple[float, ...]:
+    if key not in values and default is not None:
+        return default
+    matrix = _known(values, key)
+    return _numbers(matrix.get("data") if isinstance(matrix, dict) else matrix, key, count)
+
+
+def _numbers(values: Any, key: str, count: int | None) -> tuple[float, ...]:
+    if not isinstance(values, list) or len(values) != (len(values) if count is None else count):
+        listed = "numbers" if count is None else f"{count} numbers"
+        raise ValueError(f"{key} is no list of {listed}")
+    return tuple(_number(value, key) for value in values)
+
+
+def _number(value: Any, key: str) -> float:
+    try:
+        # YAML 1.1 has spellings of floats, such as 1., that are texts in the subset
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"{key} holds {value!r}")
+    return number
+
+
+# ---------------------------------------------------------------- scene
+
+MAX_TEXT = 2**30
+_MAX_LINE = 2**16
+
+
+@dataclass(frozen=True)
+class SceneCamera:
+    """The images of a camera, by time.
+
+    Attributes:
+        topic: Of its raw images.
+        frame_id: Coordinate frame.
+        files: The images.
+        stamps: Their times, nanoseconds, int64, shape (images,).
+        calibration: Its intrinsics, where they are known.
+        encoding: ROS image encoding; None: the one that the files tell.
+    """
+
+    topic: str
+    frame_id: str
+    files: Sequence[Path]
+    stamps: NDArray[np.int64]
+    calibration: CalibrationFields | None = None
+    encoding: str | None = None
+
+    def by_time(self) -> SceneCamera:
+        """The same in the order of the times; those of one time stay in theirs."""
+        order = np.argsort(self.stamps, kind="stable")
+        files = [self.files[number] for number in order.tolist()]
+        return replace(self, files=files, stamps=self.stamps[order])
+
+
+@dataclass(frozen=True)
+class SensorTable:
+    """Measurements of a sensor that is no camera.
+
+    Attributes:
+        topic: Its topic.
+        kind: One of `mp4ds.plugins.importing.reader.TABLES`.
+        frame_id: Coordinate frame.
+        stamps: Nanoseconds, int64, shape (rows,).
+        rows: float64, shape (rows, values).
+    """
+
+    topic: str
+    kind: str
+    frame_id: str
+    stamps: NDArray[np.int64]
+    rows: NDArray[np.float64]
+
+    def by_time(self) -> SensorTable:
+        """The same in the order of the times."""
+        order = np.argsort(self.stamps, kind="stable")
+        return replace(self, stamps=self.stamps[order], rows=self.rows[order])
+
+
+@dataclass
+class Scene:
+    """All that a folder holds.
+
+    Attributes:
+        folder: The folder.
+        files: What it was read from; folders of images among them.
+        cameras: Its cameras.
+        tables: Its other sensors.
+        transforms: Where they are.
+        kept: Files that are stored as they are: what messages do not say all of.
+        skipped: What is left out: a phrase -> how many.
+    """
+
+    folder: Path
+    files: list[Path] = field(default_factory=list)
+    cameras: list[SceneCamera] = field(default_factory=list)
+    tables: list[SensorTable] = field(default_factory=list)
+    transforms: list[Transform] = field(default_factory=list)
+    kept: list[Path] = field(default_factory=list)
+    skipped: Counter[str] = field(default_factory=Counter)
+
+    def leave_out(self, path: Path, what: str) -> None:
+        """Count the files of something that does not become messages."""
+        files = [path] if path.is_file() else [item for item in path.rglob("*") if item.is_file()]
+        if files:
+            self.skipped[f"files of {what}"] += len(files)
+
+
+def lines_of(path: Path) -> Iterator[tuple[int, str]]:
+    """Number, from 1, and text of each line that is neither blank nor a comment.
+
+    Raises:
+        SourceError: It is no text, or cannot be read.
+    """
+    try:
+        if path.stat().st_size > MAX_TEXT:
+            raise SourceError(path, f"is larger than {MAX_TEXT} bytes, and no list")
+        with path.open(encoding="utf-8-sig") as stream:
+            for number, line in enumerate(iter(lambda: stream.readline(_MAX_LINE), ""), start=1):
+                text = line.strip()
+                if text and not text.startswith("#"):
+                    yield number, text
+    except UnicodeDecodeError:
+        raise SourceError(path, "is no text") from None
+    except OSError as error:
+        raise SourceError(path, f"cannot be read: {error.strerror}") from None
+
+
+def split(line: str) -> list[str]:
+    """The values of a line: between commas if there is one, else between spaces."""
+    if "," in line:
+        return [part.strip() for part in line.split(",")]
+    return line.split()
+
+
+Rows = list[tuple[int, list[str]]]
+
+
+def read_times(path: Path, rows: Rows, read: Callable[[str], int]) -> NDArray[np.int64]:
+    """The times with which the rows of a list begin.
+
+    Raises:
+        SourceError: One is none; names its line.
+    """
+    times = np.empty(len(rows), np.int64)
+    for place, (number, values) in enumerate(rows):
+        try:
+            times[place] = read(values[0])
+        except NoTimeError as error:
+            raise SourceError(path, f"line {number}: {error}") from None
+    return times
+
+
+def read_table(
+    path: Path, read: Callable[[str], int], values: int, *, more: bool = False
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Times and numbers of a list.
+
+    Args:
+        path: The file.
+        read: Reads a time.
+        values: Numbers of each row after the time.
+        more: Whether further ones may follow, which are not read.
+
+    Raises:
+        SourceError: A line has other values; names it.
+    """
+    rows = [(number, split(line)) for number, line in lines_of(path)]
+    times = read_times(path, rows, read)
+    table = np.empty((len(rows), values))
+    for place, (number, row) in enumerate(rows):
+        if len(row) < values + 1 or (len(row) > values + 1 and not more):
+            raise SourceError(path, f"line {number} has {len(row)} values, not {values + 1}")
+        try:
+            table[place] = [float(text) for text in row[1 : values + 1]]
+        except ValueError:
+            raise SourceError(path, f"line {number} holds something else than numbers") from None
+    return times, table
+
+
+def listed_images(
+    path: Path, folder: Path, read: Callable[[str], int], rows: Rows | None = None
+) -> tuple[list[Path], NDArray[np.int64]]:
+    """The images of a list of times and file names.
+
+    Args:
+        path: The list.
+        folder: In which the files are.
+        read: Reads a time.
+        rows: The lines of the list, where they were read already.
+
+    Raises:
+        SourceError: A line is no time and name, or its file is not there.
+    """
+    if rows is None:
+        rows = [(number, _time_and_name(line)) for number, line in lines_of(path)]
+    times = read_times(path, rows, read)
+    return [_listed(path, folder, number, values) for number, values in rows], times
+
+
+def _time_and_name(line: str) -> list[str]:
+    """Two values: a name may have spaces in it."""
+    return [part.strip() for part in re.split(r",|\s", line, maxsplit=1)]
+
+
+def _listed(path: Path, folder: Path, number: int, values: list[str]) -> Path:
+    if len(values) != 2 or not values[1]:
+        raise SourceError(path, f"line {number} is not a time and a file name")
+    name = PurePosixPath(values[1])
+    if name.is_absolute() or ".." in name.parts:
+        raise SourceError(path, f"line {number} names a file outside of {folder}: {name}")
+    image = folder / name
+    if not image.is_file():
+        raise SourceError(path, f"line {number} names {image}, which is not there")
+    return image

@@ -1,0 +1,560 @@
+"""``info``: what is in a recording or a dataset, its calibrations and static transforms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.bags.formats import open_reader
+from mp4ds.bags.protocols import BagReader
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.rebuild import MessageSplitter, Unsuited, fields_of
+from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.views import Matrix, effective
+from mp4ds.files.urls import location
+from mp4ds.format.sidecars import names_dataset
+from mp4ds.messages.serializations import is_calibration, is_camera, kind_of
+from mp4ds.messages.transforms import Transform, TransformCollector
+from mp4ds.messages.wire import CalibrationFields, CodedFields, ImageFields
+from mp4ds.packing.calibrations import StampPairing, pair_camera_infos
+from mp4ds.packing.look import Looker
+from mp4ds.records import Channel, Message
+from mp4ds.times import intervals, lost_frames
+
+
+@dataclass
+class TopicInfo:
+    """What is known of a topic.
+
+    Attributes:
+        topic: Its name.
+        type_name: Its message type.
+        messages: Number of messages.
+        rate_hz: Mean rate, from the log times of the first and the last message.
+        jitter_ms: Standard deviation of the times between messages.
+        gaps: Places where messages are missing by the log times: see `intervals.lost_frames`.
+        longest_gap_s: The longest time between two messages.
+        content: For images the encoding and size, for calibrations the focal length.
+        stored: In a dataset, where and how: codec and file.
+        bytes: In a dataset, bytes of the topic's videos.
+    """
+
+    topic: str
+    type_name: str
+    messages: int = 0
+    rate_hz: float | None = None
+    jitter_ms: float | None = None
+    gaps: int = 0
+    longest_gap_s: float | None = None
+    content: str = ""
+    stored: str = ""
+    bytes: int | None = None
+
+
+@dataclass
+class Info:
+    """What is known of a recording or dataset. Times are nanoseconds.
+
+    Attributes:
+        path: What was looked at.
+        kind: ``bag``, ``rosbag2``, ``mcap``, ``dataset`` or ``stream``.
+        profile: ``ros1``, ``ros2`` ...
+        bytes: Size on disk.
+        start: Earliest log time.
+        end: Latest log time.
+        topics: By name.
+        notes: What else is worth knowing.
+    """
+
+    path: Path
+    kind: str
+    profile: str
+    bytes: int
+    start: int | None = None
+    end: int | None = None
+    topics: list[TopicInfo] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def info(path: Path | str) -> Info:
+    """Look into a recording, a dataset, or a video with its sidecar.
+
+    Args:
+        path: Where it is, or its URL.
+
+    Raises:
+        SourceError: It is no recording or cannot be read.
+        FormatError: The dataset breaks a rule of the format.
+    """
+    path = location(path)
+    if names_dataset(path):
+        with Dataset(path) as dataset:
+            return _dataset_info(dataset)
+    with open_reader(path) as reader:
+        return _recording_info(reader)
+
+
+def _recording_info(reader: BagReader) -> Info:
+    size = sum(file.stat().st_size for file in reader.files)
+    result = Info(reader.path, reader.format, reader.profile, size)
+    times = reader.times()
+    _add_topics(result, list(reader.channels), times)
+    by_topic = {item.topic: item for item in result.topics}
+    for channel in reader.channels:
+        item = by_topic[channel.topic]
+        if not item.content and kind_of(channel):
+            item.content = _content(reader, channel)
+    return result
+
+
+def _add_topics(
+    result: Info, channels: list[Channel], times: Mapping[int, NDArray[np.int64]]
+) -> None:
+    by_topic: dict[str, list[Channel]] = {}
+    for channel in channels:
+        by_topic.setdefault(channel.topic, []).append(channel)
+    for topic, own in sorted(by_topic.items()):
+        found = [times[channel.id] for channel in own if channel.id in times]
+        merged = np.sort(np.concatenate(found)) if found else np.empty(0, np.int64)
+        types = list(dict.fromkeys(channel.type_name for channel in own))
+        item = _timing(TopicInfo(topic, " | ".join(types)), merged)
+        if len(own) > 1:
+            item.content = f"{len(own)} publishers"
+        result.topics.append(item)
+        if len(merged):
+            first, last = int(merged[0]), int(merged[-1])
+            result.start = first if result.start is None else min(result.start, first)
+            result.end = last if result.end is None else max(result.end, last)
+
+
+def _timing(item: TopicInfo, times: NDArray[np.int64]) -> TopicInfo:
+    item.messages = len(times)
+    if len(times) < 2 or times[-1] == times[0]:
+        return item
+    steps = intervals(times)
+    item.rate_hz = (len(times) - 1) * 1e9 / float(times[-1] - times[0])
+    item.jitter_ms = float(steps.std()) / 1e6
+    item.gaps = int((lost_frames(steps) > 0).sum())
+    item.longest_gap_s = float(steps.max()) / 1e9
+    return item
+
+
+def _content(reader: BagReader, channel: Channel) -> str:
+    message = reader.first(channel)
+    if message is None:
+        return ""
+    try:
+        fields = MessageSplitter(channel).split(message)[1].fields
+    except Unsuited as reason:
+        return f"unreadable: {reason}"
+    if isinstance(fields, ImageFields):
+        return f"{fields.encoding} {fields.width}x{fields.height}"
+    if isinstance(fields, CodedFields):
+        return fields.format
+    return intrinsics_text(fields.width, fields.height, fields.distortion_model, fields.k)
+
+
+def intrinsics_text(width: int, height: int, model: str, k: Any) -> str:
+    """One line for a calibration."""
+    return (
+        f"{width}x{height} {model or '-'} fx={k[0]:.1f} fy={k[4]:.1f} cx={k[2]:.1f} cy={k[5]:.1f}"
+    )
+
+
+def _dataset_info(dataset: Dataset) -> Info:
+    whole = dataset.manifest is not None
+    files = (
+        [dataset.path / entry.name for entry in dataset.manifest.files]
+        if dataset.manifest
+        else [stream.video_path for stream in dataset.streams]
+    )
+    result = Info(
+        dataset.path,
+        "dataset" if whole else "stream",
+        dataset.profile,
+        sum(file.stat().st_size for file in files if file.is_file()),
+    )
+    _add_topics(result, dataset.channels, dataset.times())
+    by_topic = {item.topic: item for item in result.topics}
+    for stream in dataset.streams:
+        _add_stream(by_topic, stream)
+    if dataset.manifest:
+        result.notes += [
+            f"{item.topic}: {item.messages} messages stored verbatim from number {item.first} on: "
+            f"{item.reason}"
+            for item in dataset.manifest.verbatim
+        ]
+        if dataset.manifest.topics_left_out:
+            left_out = ", ".join(dataset.manifest.topics_left_out)
+            result.notes.append(f"left out when packed: {left_out}")
+    result.notes += [
+        f"{stream.topic}: {stream.sidecar.video.quality}"
+        for stream in dataset.streams
+        if stream.sidecar.video.quality
+    ]
+    if any(stream.sidecar.stamps == "record-float" for stream in dataset.streams):
+        result.notes.append("times are record times that were stored as float seconds: not exact")
+    return result
+
+
+def _add_stream(by_topic: dict[str, TopicInfo], stream: Stream) -> None:
+    sidecar = stream.sidecar
+    item = by_topic[stream.topic]
+    image = f"{sidecar.image.encoding} {sidecar.image.width}x{sidecar.image.height}"
+    item.content = ", ".join(filter(None, (item.content, image)))
+    stored = f"{sidecar.video.codec} {sidecar.profile}: {sidecar.video.file}"
+    item.stored = ", ".join(filter(None, (item.stored, stored)))
+    size = stream.video_path.stat().st_size if stream.video_path.is_file() else 0
+    item.bytes = (item.bytes or 0) + size
+    info_model = sidecar.camera_info
+    if info_model and info_model.calibrations:
+        calibration = info_model.calibrations[0]
+        text = intrinsics_text(
+            calibration.width, calibration.height, calibration.distortion_model, calibration.k
+        )
+        more = len(info_model.calibrations) - 1
+        other = by_topic.get(info_model.channel.topic)
+        if other is not None:
+            other.content = text + (f" (+{more} more)" if more else "")
+            other.stored = f"in {stream.path.name}"
+
+
+# ---------------------------------------------------------------- intrinsics
+
+MAX_LISTED = 1000
+"""Calibrations of a camera that are listed; of a self-calibrating one there may be more."""
+
+
+@dataclass(frozen=True, slots=True)
+class ListedCalibration:
+    """A calibration of a camera, and from where on it holds.
+
+    Attributes:
+        message: Number of the message that it holds from, among its channel's; None where no
+            messages were recorded.
+        log_time: When that was recorded, nanoseconds.
+        frame_id: Coordinate frame.
+        width: Columns of the calibrated image.
+        height: Rows of the calibrated image.
+        distortion_model: Such as ``plumb_bob``, whose `d` is in the order of OpenCV.
+        k: Intrinsic matrix, 3 x 3.
+        d: Distortion parameters.
+        r: Rectification matrix, 3 x 3.
+        p: Projection matrix, 3 x 4.
+        binning: Columns and rows binned into one, or None where both are 0.
+        roi: x_offset, y_offset, height, width, do_rectify, or None where all are 0.
+        k_effective: `k` for the images as they are, cut and binned; None where it is `k`.
+        p_effective: `p` for the images as they are; None where it is `p`.
+    """
+
+    message: int | None
+    log_time: int | None
+    frame_id: str
+    width: int
+    height: int
+    distortion_model: str
+    k: Matrix
+    d: list[float]
+    r: Matrix
+    p: Matrix
+    binning: tuple[int, int] | None
+    roi: dict[str, int] | None
+    k_effective: Matrix | None
+    p_effective: Matrix | None
+
+
+@dataclass
+class CameraCalibrations:
+    """A camera topic and its calibrations.
+
+    Attributes:
+        topic: Of the images; empty for calibrations that belong to no images.
+        info_topic: Of the calibrations; empty where the images have none.
+        frame_id: Coordinate frame of the first image.
+        sizes: Width and height of the images; several if they change, none if unknown.
+        calibrations: Each that differs from the one before, in the order of the recording.
+        more: Changes of the calibration beyond those listed.
+    """
+
+    topic: str
+    info_topic: str = ""
+    frame_id: str = ""
+    sizes: list[tuple[int, int]] = field(default_factory=list)
+    calibrations: list[ListedCalibration] = field(default_factory=list)
+    more: int = 0
+
+
+@dataclass
+class Intrinsics:
+    """The cameras of a recording or dataset.
+
+    Attributes:
+        path: What was looked at.
+        kind: ``bag``, ``rosbag2``, ``mcap``, ``dataset`` or ``stream``.
+        cameras: By topic; calibrations without images last.
+        transforms: Static transforms that connect the cameras.
+    """
+
+    path: Path
+    kind: str
+    cameras: list[CameraCalibrations]
+    transforms: list[Transform] = field(default_factory=list)
+
+
+def intrinsics(path: Path | str) -> Intrinsics:
+    """The intrinsics and extrinsics in a recording, a dataset, or a video with its sidecar.
+
+    Args:
+        path: Where it is, or its URL.
+
+    Raises:
+        SourceError: It is no recording or cannot be read.
+        FormatError: The dataset breaks a rule of the format.
+    """
+    path = location(path)
+    if names_dataset(path):
+        with Dataset(path) as dataset:
+            return _of_dataset(dataset)
+    with open_reader(path) as reader:
+        return _of_recording(reader)
+
+
+def _rows(values: Sequence[float]) -> Matrix:
+    step = len(values) // 3
+    return [list(values[row * step : (row + 1) * step]) for row in range(3)]
+
+
+def _listed(
+    fields: CalibrationFields, frame_id: str, message: int | None, log_time: int | None
+) -> ListedCalibration:
+    k, p = _rows(fields.k), _rows(fields.p)
+    k_effective, p_effective = effective(fields)
+    roi = dict(zip(("x_offset", "y_offset", "height", "width"), fields.roi, strict=True))
+    roi["do_rectify"] = fields.roi_do_rectify
+    return ListedCalibration(
+        message=message,
+        log_time=log_time,
+        frame_id=frame_id,
+        width=fields.width,
+        height=fields.height,
+        distortion_model=fields.distortion_model,
+        k=k,
+        d=list(fields.d),
+        r=_rows(fields.r),
+        p=p,
+        binning=(
+            (fields.binning_x, fields.binning_y) if fields.binning_x or fields.binning_y else None
+        ),
+        roi=roi if any(roi.values()) else None,
+        k_effective=k_effective if k_effective != k else None,
+        p_effective=p_effective if p_effective != p else None,
+    )
+
+
+class _History:
+    """The calibrations of one channel, as its messages come."""
+
+    def __init__(self, channel: Channel) -> None:
+        self.topic = channel.topic
+        self._forms = MessageSplitter(channel)
+        self._messages = 0
+        self._last: tuple[str, CalibrationFields] | None = None
+        self.calibrations: list[ListedCalibration] = []
+        self.more = 0
+
+    def take(self, message: Message, stamps: StampPairing) -> None:
+        number = self._messages
+        self._messages += 1
+        try:
+            _, parts = self._forms.split(message)
+        except Unsuited:
+            return
+        stamps.add(message.channel, parts)
+        fields = parts.fields
+        if not isinstance(fields, CalibrationFields) or (parts.frame_id, fields) == self._last:
+            return
+        self._last = parts.frame_id, fields
+        if len(self.calibrations) < MAX_LISTED:
+            listed = _listed(fields, parts.frame_id, number, message.log_time)
+            self.calibrations.append(listed)
+        else:
+            self.more += 1
+
+    def give(self, camera: CameraCalibrations) -> None:
+        """Hand all over to the camera."""
+        camera.info_topic = self.topic
+        camera.calibrations += self.calibrations
+        camera.more += self.more
+
+
+# ---------------------------------------------------------------- recordings
+
+
+class _Cameras:
+    """What one pass over messages tells of their cameras.
+
+    Args:
+        channels: Gives the channels, as far as they are known by then.
+    """
+
+    def __init__(self, channels: Callable[[], Sequence[Channel]]) -> None:
+        self._channels = channels
+        self._histories: dict[int, _History] = {}
+        self._forms: dict[int, MessageSplitter] = {}
+        self._seen: dict[int, tuple[str, tuple[int, int]]] = {}
+        self._stamps = StampPairing()
+        self._known = -1  # channels when it was last decided whether stamps are needed
+        self._needs_stamps = False
+        self.transforms = TransformCollector()
+
+    def take(self, message: Message) -> None:
+        channel = message.channel
+        if is_calibration(channel):
+            if channel.id not in self._histories:
+                self._histories[channel.id] = _History(channel)
+            self._histories[channel.id].take(message, self._stamps)
+        elif is_camera(channel):
+            if channel.id not in self._seen or self._wants_stamps():
+                self._take_image(message)
+        else:
+            self.transforms.add(channel, message.data)
+
+    def _wants_stamps(self) -> bool:
+        """Whether names leave a calibration channel unpaired; some formats tell channels late."""
+        channels = self._channels()
+        if len(channels) != self._known:
+            self._known = len(channels)
+            infos = {channel.id for channel in channels if is_calibration(channel)}
+            self._needs_stamps = bool(infos - set(pair_camera_infos(channels)))
+        return self._needs_stamps
+
+    def _take_image(self, message: Message) -> None:
+        channel = message.channel
+        try:
+            _, parts = self._forms.setdefault(channel.id, MessageSplitter(channel)).split(message)
+        except Unsuited:
+            return
+        if channel.id not in self._seen:
+            size = parts.fields.width, parts.fields.height
+            if isinstance(parts.fields, CodedFields):
+                size = _coded_size(message, size)
+            self._seen[channel.id] = parts.frame_id, size
+        self._stamps.add(channel, parts, size=self._seen[channel.id][1])
+
+    def cameras(self) -> list[CameraCalibrations]:
+        """All of them, once all channels are known."""
+        channels = self._channels()
+        pairs = pair_camera_infos(channels)
+        pairs.update(self._stamps.decide(pairs))
+        by_topic: dict[str, CameraCalibrations] = {}
+        for channel in filter(is_camera, channels):
+            camera = by_topic.setdefault(channel.topic, CameraCalibrations(channel.topic))
+            frame_id, size = self._seen.get(channel.id, ("", (0, 0)))
+            camera.frame_id = camera.frame_id or frame_id
+            if 0 not in size and size not in camera.sizes:
+                camera.sizes.append(size)
+        topics = {channel.id: channel.topic for channel in channels}
+        alone = []
+        for info_id, history in self._histories.items():
+            if info_id in pairs:
+                history.give(by_topic[topics[pairs[info_id]]])
+            elif history.calibrations:
+                alone.append(CameraCalibrations(""))
+                history.give(alone[-1])
+        return [*by_topic.values(), *alone]
+
+
+def _coded_size(message: Message, told: tuple[int, int]) -> tuple[int, int]:
+    try:
+        key = Looker(message.channel).look(message).key
+    except Unsuited:
+        return told
+    return key.width, key.height
+
+
+def _sorted(cameras: Iterable[CameraCalibrations]) -> list[CameraCalibrations]:
+    return sorted(cameras, key=lambda camera: (not camera.topic, camera.topic, camera.info_topic))
+
+
+def _of_recording(reader: BagReader) -> Intrinsics:
+    found = _Cameras(lambda: reader.channels)
+    for record in reader.records():
+        if isinstance(record, Message):
+            found.take(record)
+    cameras = _sorted(found.cameras())
+    frames = {camera.frame_id for camera in cameras}
+    frames |= {item.frame_id for camera in cameras for item in camera.calibrations}
+    return Intrinsics(reader.path, reader.format, cameras, found.transforms.between(sorted(frames)))
+
+
+# ---------------------------------------------------------------- datasets
+
+
+def _of_dataset(dataset: Dataset) -> Intrinsics:
+    by_topic: dict[str, CameraCalibrations] = {}
+    for stream in dataset.streams:
+        camera = by_topic.setdefault(stream.topic, CameraCalibrations(stream.topic))
+        image = stream.sidecar.image
+        camera.frame_id = camera.frame_id or stream.sidecar.headers[0].frame_id
+        camera.sizes.append((image.width, image.height))
+        _add_intrinsics(camera, stream)
+    manifest = dataset.manifest
+    transforms = [
+        Transform(
+            parent=item.parent,
+            child=item.child,
+            translation=(item.translation[0], item.translation[1], item.translation[2]),
+            rotation=(item.rotation[0], item.rotation[1], item.rotation[2], item.rotation[3]),
+        )
+        for item in (manifest.transforms if manifest else [])
+    ]
+    return Intrinsics(
+        dataset.path,
+        "dataset" if manifest else "stream",
+        _sorted([*by_topic.values(), *_verbatim(dataset)]),
+        transforms,
+    )
+
+
+def _add_intrinsics(camera: CameraCalibrations, stream: Stream) -> None:
+    info = stream.sidecar.camera_info
+    if info is None:
+        return
+    camera.info_topic = info.channel.topic
+    columns = stream.camera_info_columns
+    if columns is None:
+        camera.calibrations += [
+            _listed(fields_of(item), item.frame_id, None, None) for item in info.calibrations
+        ]
+        return
+    changes = np.flatnonzero(np.diff(columns.variant, prepend=-1))
+    for place in changes[:MAX_LISTED].tolist():
+        item = info.calibrations[int(columns.variant[place])]
+        number, log_time = int(columns.ordinal[place]), int(columns.log_time[place])
+        camera.calibrations.append(_listed(fields_of(item), item.frame_id, number, log_time))
+    camera.more += max(0, len(changes) - MAX_LISTED)
+
+
+def _verbatim(dataset: Dataset) -> list[CameraCalibrations]:
+    """Cameras without a stream, all messages of which are in messages.mcap."""
+    models = [stream.sidecar.channel for stream in dataset.streams]
+    models += [item.channel for s in dataset.streams if (item := s.sidecar.camera_info)]
+    owned = {model.to_record(0).identity for model in models}
+    channels = [
+        channel
+        for channel in dataset.channels
+        if (is_camera(channel) or is_calibration(channel)) and channel.identity not in owned
+    ]
+    if not channels:
+        return []
+    found = _Cameras(lambda: channels)
+    ids = {channel.id for channel in channels}
+    for record in dataset.recorded_records():
+        if isinstance(record, Message) and record.channel.id in ids:
+            found.take(record)
+    return found.cameras()

@@ -1,0 +1,547 @@
+"""The messages of several datasets as they are to be published, from any time on."""
+
+from __future__ import annotations
+
+import heapq
+import re
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from mp4ds.bags.convert import Converter, is_latched
+from mp4ds.bags.types import HeaderStamps
+from mp4ds.dataset.channels import Ahead
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.rebuild import DecodedColumns, everything
+from mp4ds.errors import ConversionError, OptionError
+from mp4ds.plan import Selection
+from mp4ds.records import Channel, Message
+from mp4ds.unpacking.pictures import Reduction
+from mp4ds.unpacking.republish import Republisher
+
+
+class Names:
+    """New names of topics.
+
+    Args:
+        remap: ``old:=new``, each of one topic; a missing slash at the beginning does not count.
+        prefix: Put before all names that are not remapped.
+
+    Raises:
+        OptionError: A rule is none.
+    """
+
+    def __init__(self, remap: Sequence[str] = (), prefix: str = "") -> None:
+        self._rules: dict[str, str] = {}
+        for rule in remap:
+            old, found, new = rule.partition(":=")
+            if not (found and old.strip("/ ") and new.strip("/ ")):
+                raise OptionError(
+                    f"`remap` {rule!r} is no rule: write it as /old/topic:=/new/topic"
+                )
+            self._rules[_rooted(old)] = new
+        self._prefix = prefix.rstrip("/")
+
+    def check(self, topics: Iterable[str]) -> None:
+        """Refuse a rule for a topic that is not there.
+
+        Raises:
+            OptionError: Names it.
+        """
+        known = {_rooted(topic) for topic in topics}
+        for old in self._rules:
+            if old not in known:
+                raise OptionError(f"`remap` {old!r}: there is no such topic to be played")
+
+    def __call__(self, topic: str) -> str:
+        """The name of a topic."""
+        new = self._rules.get(_rooted(topic))
+        if new is not None:
+            return new
+        return f"{self._prefix}/{topic.lstrip('/')}" if self._prefix else topic
+
+
+class Wanted:
+    """Which topics are played.
+
+    Args:
+        selection: By globs.
+        regex: Topics of which a part matches are played too, as with ``ros2 bag play``; with
+            neither globs nor this, all are.
+        without: Topics that are not, whatever the others say.
+
+    Raises:
+        OptionError: The regular expression is none.
+    """
+
+    def __init__(
+        self,
+        topics: Sequence[str] = (),
+        exclude: Sequence[str] = (),
+        *,
+        regex: str = "",
+        without: frozenset[str] = frozenset(),
+    ) -> None:
+        self._by_glob = Selection(topics)
+        self._has_globs = bool(topics)
+        self._excluded = Selection((), exclude)
+        self._globs = Selection(topics, exclude)
+        try:
+            self._regex = re.compile(regex) if regex else None
+        except re.error as error:
+            raise OptionError(f"`regex` {regex!r} is no regular expression: {error}") from None
+        self._without = without
+
+    def __call__(self, topic: str) -> bool:
+        """Whether a topic is played."""
+        if topic in self._without or not self._excluded(topic):
+            return False
+        if self._regex is None:
+            return self._by_glob(topic)
+        return (self._has_globs and self._by_glob(topic)) or bool(self._regex.search(topic))
+
+    def check(self, topics: Iterable[str]) -> None:
+        """Refuse what matches no topic.
+
+        Raises:
+            OptionError: Names the pattern, and the topics there are.
+        """
+        known = list(topics)
+        self._globs.check(known)
+        if self._regex is not None and not any(self._regex.search(topic) for topic in known):
+            raise OptionError(f"`regex` {self._regex.pattern!r} matches no topic.")
+
+
+def _rooted(topic: str) -> str:
+    return "/" + topic.strip().lstrip("/")
+
+
+# ---------------------------------------------------------------- restamp
+
+
+class Restamper:
+    """Moves the stamps of messages. What had the same stamp has the same one again."""
+
+    def __init__(self) -> None:
+        self._stamps: dict[int, tuple[Channel, HeaderStamps]] = {}
+
+    def restamped(
+        self, channel: Channel, payload: bytes | memoryview, wall_of: Callable[[int], int]
+    ) -> bytes | memoryview:
+        """A message as if it was made now; itself where it has no stamp.
+
+        Args:
+            channel: Of the message.
+            payload: The serialized message.
+            wall_of: The time of this machine, nanoseconds, at which the recording's time is
+                what it is given.
+
+        Raises:
+            ConversionError: It is not of the channel's type.
+        """
+        if id(channel) not in self._stamps:
+            self._stamps[id(channel)] = (channel, HeaderStamps(channel))
+        stamps = self._stamps[id(channel)][1]
+        if not stamps.has_any:
+            return payload
+        try:
+            return memoryview(stamps.moved(payload, wall_of))
+        except ValueError as error:
+            problem = f"the stamp of a message cannot be changed: {error}"
+            raise ConversionError(channel.topic, problem) from None
+
+
+# ---------------------------------------------------------------- read ahead
+
+T = TypeVar("T")
+
+_SWITCH_S = 0.001
+
+
+class ReadAhead(Generic[T]):
+    """An iterator whose items are made by a thread of its own, a bounded number ahead.
+
+    Args:
+        items: What makes them; used by the thread alone.
+        depth: Most items that wait.
+        on_ready: Called, by the thread, when an item can be had where there was none.
+    """
+
+    def __init__(
+        self, items: Iterator[T], depth: int, *, on_ready: Callable[[], None] | None = None
+    ) -> None:
+        self._items = items
+        self._depth = depth
+        self._on_ready = on_ready
+        self._changed = threading.Condition()
+        self._waiting: deque[T] = deque()
+        self._is_closed = False
+        self._is_done = False
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def __len__(self) -> int:
+        """Items that wait."""
+        return len(self._waiting)
+
+    def __iter__(self) -> Iterator[T]:
+        return self
+
+    def __next__(self) -> T:
+        with self._changed:
+            while not self._waiting and not self._is_done and not self._is_closed:
+                self._changed.wait()
+            return self._take()
+
+    def head(self) -> T | None:
+        """The next item, which stays; None while it is not made yet.
+
+        Raises:
+            StopIteration: There are no more.
+            BaseException: What the source raised.
+        """
+        with self._changed:
+            if self._waiting:
+                return self._waiting[0]
+            if self._is_done or self._is_closed:
+                return self._take()
+            return None
+
+    def _take(self) -> T:
+        if self._waiting:
+            item = self._waiting.popleft()
+            self._changed.notify_all()
+            return item
+        if self._error is not None:
+            raise self._error
+        raise StopIteration
+
+    def _work(self) -> None:
+        try:
+            for item in self._items:
+                if not self._put(item):
+                    break
+        except BaseException as error:
+            self._error = error
+        finally:
+            close = getattr(self._items, "close", None)
+            if close is not None:  # a generator has files open
+                close()
+            with self._changed:
+                self._is_done = True
+                self._changed.notify_all()
+            self._tell()
+
+    def _put(self, item: T) -> bool:
+        with self._changed:
+            while len(self._waiting) >= self._depth and not self._is_closed:
+                self._changed.wait()
+            if self._is_closed:
+                return False
+            is_first = not self._waiting
+            self._waiting.append(item)
+            self._changed.notify_all()
+        if is_first:
+            self._tell()
+        return True
+
+    def _tell(self) -> None:
+        if self._on_ready is not None:
+            self._on_ready()
+
+    def stop(self) -> None:
+        """Tell the thread to end after the item that it makes."""
+        with self._changed:
+            self._is_closed = True
+            self._waiting.clear()
+            self._changed.notify_all()
+
+    def join(self) -> None:
+        """Wait until the thread ended and what it read from is closed."""
+        self._thread.join()
+
+
+@contextmanager
+def quick_switches() -> Iterator[None]:
+    """Lets a thread that waits for the interpreter have it sooner than Python does by default."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
+# ---------------------------------------------------------------- timeline
+
+
+IsLate = Callable[[int], bool]
+"""Asked with the log time of a frame before it is made; if it is late, it is left out."""
+
+_MERGED_AHEAD = 64
+"""Messages, all topics together, that wait to be published; frames wait where they are made."""
+
+
+@dataclass(frozen=True, slots=True)
+class Due:
+    """A message to be published.
+
+    Attributes:
+        time_ns: When, in the recording's time.
+        channel: The channel to publish it on; one of `Timeline.channels`.
+        payload: The serialized message.
+        is_frame: Whether it is an image.
+    """
+
+    time_ns: int
+    channel: Channel
+    payload: bytes | memoryview
+    is_frame: bool
+
+
+class Timeline:
+    """What is played, merged by log time.
+
+    Args:
+        datasets: Opened; not closed here.
+        world: What the messages have to be in: ``ros1``, ``ros2``; None for as recorded.
+        wanted: Which topics.
+        names: What they are called.
+        kind: What images are given as: one of `republish.KINDS`; None for as recorded.
+        reduction: How much smaller or fewer images are given.
+        jpeg_quality: Of JPEG files that are made, 1 to 100.
+        read_ahead: Frames of each stream that are made ahead.
+
+    Attributes:
+        channels: All that is published.
+        start_ns: Log time of the first message, nanoseconds.
+        end_ns: Log time of the last message, nanoseconds.
+
+    Raises:
+        OptionError: Nothing is to be played.
+        ConversionError: A topic cannot be published there; names it.
+    """
+
+    def __init__(
+        self,
+        datasets: Sequence[Dataset],
+        *,
+        world: str | None,
+        wanted: Wanted,
+        names: Names,
+        kind: str | None = None,
+        reduction: Reduction = Reduction(),  # noqa: B008 - frozen
+        jpeg_quality: int = 95,
+        read_ahead: int = 8,
+    ) -> None:
+        topics = [channel.topic for dataset in datasets for channel in dataset.channels]
+        wanted.check(topics)
+        names.check(topic for topic in topics if wanted(topic))
+        self._read_ahead = read_ahead
+        self._parts = [
+            _Part(dataset, world, wanted, names, kind, reduction, jpeg_quality)
+            for dataset in datasets
+        ]
+        self.channels = [channel for part in self._parts for channel in part.published]
+        spans = [part.span for part in self._parts if part.span]
+        if not spans:
+            raise OptionError("there is no message to be played.")
+        self.start_ns = min(first for first, _ in spans)
+        self.end_ns = max(last for _, last in spans)
+
+    @property
+    def as_recorded(self) -> dict[str, dict[str, int]]:
+        """Camera topics of which messages stay as recorded where another form was asked for."""
+        return {
+            topic: dict(reasons)
+            for part in self._parts
+            if part.republisher
+            for topic, reasons in part.republisher.as_recorded.items()
+        }
+
+    @property
+    def thinned(self) -> dict[str, int]:
+        """Frames left out on request so far, by topic."""
+        return {
+            topic: count
+            for part in self._parts
+            if part.republisher
+            for topic, count in part.republisher.thinned.items()
+        }
+
+    def play(
+        self,
+        start_ns: int,
+        *,
+        is_late: IsLate,
+        on_ready: Callable[[], None],
+    ) -> Playback:
+        """Begin to read, by threads, from a time on.
+
+        Args:
+            start_ns: Log time of the first message that may come.
+            is_late: Asked before a frame is made.
+            on_ready: Called, from another thread, when a message can be had.
+        """
+        return Playback(self._parts, start_ns, self._read_ahead, is_late, on_ready)
+
+    def latched(self, time_ns: int) -> list[Due]:
+        """The last message before a time of each latched channel."""
+        return [due for part in self._parts for due in part.latched(time_ns)]
+
+
+class Playback:
+    """Messages from a time on, read ahead by threads. See `Timeline.play`."""
+
+    def __init__(
+        self,
+        parts: Sequence[_Part],
+        start_ns: int,
+        depth: int,
+        is_late: IsLate,
+        on_ready: Callable[[], None],
+    ) -> None:
+        self._sources: list[ReadAhead[object]] = []
+        self._is_closing = False
+
+        def ahead(items: Iterator[T]) -> Iterator[T]:
+            made = ReadAhead(items, depth)
+            self._sources.append(made)  # type: ignore[arg-type]
+            if self._is_closing:
+                made.stop()
+            return made
+
+        merged = heapq.merge(
+            *(part.messages(start_ns, is_late, ahead) for part in parts),
+            key=lambda due: due.time_ns,
+        )
+        self._merged = ReadAhead(merged, _MERGED_AHEAD, on_ready=on_ready)
+
+    def head(self) -> Due | None:
+        """The next message, which stays; None while it is not made yet.
+
+        Raises:
+            StopIteration: There are no more.
+            Mp4dsError: A dataset is damaged.
+        """
+        return self._merged.head()
+
+    def take(self) -> None:
+        """Go on to the message after the `head`."""
+        next(self._merged)
+
+    def close(self) -> None:
+        """End the threads."""
+        self._is_closing = True
+        self._merged.stop()
+        for source in [*self._sources]:
+            source.stop()
+        self._merged.join()
+        for source in self._sources:
+            source.join()
+
+
+class _Part:
+    """One dataset, and what its channels are where they are published."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        world: str | None,
+        wanted: Wanted,
+        names: Names,
+        kind: str | None,
+        reduction: Reduction,
+        jpeg_quality: int,
+    ) -> None:
+        self._dataset = dataset
+        self._converter = Converter(world)
+        self._names = names
+        self.republisher: Republisher | None = None
+        if kind is not None or reduction != Reduction():
+            encoding = "ros1" if (world or dataset.profile) == "ros1" else "cdr"
+            self.republisher = Republisher(
+                dataset,
+                kind,
+                encoding=encoding,
+                selected=wanted,
+                jpeg_quality=jpeg_quality,
+                reduction=reduction,
+            )
+        self._wanted = wanted
+        self._topics = {item.topic for item in dataset.channels if wanted(item.topic)}
+        self.span = self._span()
+        self._channels: dict[int, Channel] = {}
+        self._frames = {item.channel.id for item in dataset.image_channels()}
+        for channel in dataset.channels:
+            is_emptied = self.republisher is not None and self.republisher.empties(channel)
+            if wanted(channel.topic) and not is_emptied:
+                self._add(channel, self._converter.channel(channel))
+        for channel in self.republisher.channels if self.republisher else ():
+            self._frames.add(channel.id)
+            self._add(channel, channel)
+
+    def _span(self) -> tuple[int, int] | None:
+        """Log times of the first and the last message of the topics that are wanted."""
+        ids = {item.id for item in self._dataset.channels if item.topic in self._topics}
+        times = [times for key, times in self._dataset.times().items() if key in ids and len(times)]
+        if not times:
+            return None
+        return min(int(item[0]) for item in times), max(int(item[-1]) for item in times)
+
+    @property
+    def published(self) -> list[Channel]:
+        """All that is published."""
+        return list(self._channels.values())
+
+    def _add(self, source: Channel, channel: Channel) -> Channel:
+        self._channels[source.id] = replace(channel, topic=self._names(channel.topic))
+        return self._channels[source.id]
+
+    def messages(self, start_ns: int, is_late: IsLate, ahead: Ahead) -> Iterator[Due]:
+        """Messages from a time on; see `Timeline.play`."""
+        frames = [stream.columns for stream in self._dataset.streams]
+
+        def in_time(columns: DecodedColumns) -> Iterator[int]:
+            if not any(columns is item for item in frames):
+                return everything(columns)
+            times = columns.log_time
+            due = np.flatnonzero(times >= start_ns).tolist()
+            return (index for index in due if not is_late(int(times[index])))
+
+        records = self._dataset.records(
+            self.republisher.sources if self.republisher else None,
+            start=start_ns,
+            choose=in_time,
+            topics=self._topics,
+            ahead=ahead,
+        )
+        for record in records:
+            if isinstance(record, Message) and (due := self._due(record)):
+                yield due
+
+    def _due(self, message: Message) -> Due | None:
+        source = message.channel
+        channel = self._channels.get(source.id)
+        if channel is None:
+            if not self._wanted(source.topic):
+                return None
+            channel = self._add(source, self._converter.channel(source))
+        payload = message.data
+        if self.republisher is None or not self.republisher.makes(source):
+            payload = self._converter.payload(source, payload)
+        return Due(message.log_time, channel, payload, source.id in self._frames)
+
+    def latched(self, time_ns: int) -> Iterator[Due]:
+        """The last message before a time, of each latched channel."""
+        channels = [item for item in self._dataset.channels if item.topic in self._topics]
+        for message in self._dataset.last_before(time_ns, [*filter(is_latched, channels)]):
+            if due := self._due(message):
+                yield due

@@ -1,0 +1,1 @@
+"""Where messages are published. The only package that imports ROS and Foxglove."""

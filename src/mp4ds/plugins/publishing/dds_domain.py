@@ -1,0 +1,429 @@
+"""A DDS domain as ROS 2 uses it: its types, and what others publish there."""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from mp4ds.bags.types import BAD_DEFINITION, World, field_shape, make_store, types_of
+from mp4ds.errors import ConversionError, OptionError, PublishError
+from mp4ds.records import HASH_KEY, Channel
+
+_LAST = 232
+_LOCAL = (
+    "<CycloneDDS><Domain><General><AllowMulticast>false</AllowMulticast></General><Discovery>"
+    "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+    '<Peers><Peer address="localhost"/></Peers></Discovery></Domain></CycloneDDS>'
+)
+
+
+def domain_id(asked: int | None) -> int:
+    """The domain that was asked for, else that of ROS_DOMAIN_ID, else 0.
+
+    Raises:
+        OptionError: There is no such domain.
+    """
+    told = os.environ.get("ROS_DOMAIN_ID", "").strip()
+    if asked is None and not told:
+        return 0
+    text = told if asked is None else str(asked)
+    where = "ROS_DOMAIN_ID" if asked is None else "The domain"
+    if not text.isascii() or not text.isdigit() or len(text) > 9 or int(text) > _LAST:
+        raise OptionError(f"{where} is {text!r}, and DDS has domains 0 to {_LAST}.")
+    return int(text)
+
+
+def open_participant(domain: int) -> Any:
+    """A participant of a domain, configured by CYCLONEDDS_URI.
+
+    Discovery is kept to this machine where ROS_LOCALHOST_ONLY or ROS_AUTOMATIC_DISCOVERY_RANGE
+    say so, as ROS 2 does it.
+
+    Raises:
+        PublishError: Cyclone DDS is not installed, or refuses.
+    """
+    where = f"DDS domain {domain}"
+    try:
+        from cyclonedds.core import DDSException
+        from cyclonedds.domain import Domain, DomainParticipant
+    except ImportError:
+        problem = (
+            "Cyclone DDS is not installed, and no ROS 2 is sourced; source one, "
+            "or run: pip install 'mp4ds[dds]'"
+        )
+        raise PublishError(where, problem) from None
+    try:
+        if not _is_local():
+            return DomainParticipant(domain)
+        config = ",".join(filter(None, (_LOCAL, os.environ.get("CYCLONEDDS_URI"))))
+        opened = Domain(domain, config)
+        participant = DomainParticipant(domain)
+        participant.mp4ds_domain = opened  # lives as long
+        return participant
+    except DDSException as error:
+        problem = f"cannot be entered: {error.msg}; look at the network and at CYCLONEDDS_URI"
+        raise PublishError(where, problem) from None
+
+
+def _is_local() -> bool:
+    told = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").strip().upper()
+    return told == "LOCALHOST" or os.environ.get("ROS_LOCALHOST_ONLY", "").strip() == "1"
+
+
+# ---------------------------------------------------------------- types
+
+Types = dict[str, Any]
+"""Definitions by name, as `types_of` finds them."""
+
+_FILLER = "structure_needs_at_least_one_member"
+_NAME = re.compile(r"[A-Za-z]\w*(?:/[A-Za-z]\w*)+", re.ASCII)
+_TOPIC = re.compile(r"/?[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*", re.ASCII)
+_HASH = re.compile(r"RIHS01_[0-9a-f]{64}")
+_MAX_NESTING = 50
+_MAX_SIZE = 2**28  # bytes of what has a fixed size: the library counts them in 32 bits
+_BASES = {
+    "bool": "bool",
+    "octet": "byte",
+    "byte": "byte",
+    "char": "uint8",
+    **{f"{sign}int{bits}": f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)},
+    "float32": "float32",
+    "float64": "float64",
+    "string": "string",
+}
+
+
+def as_is(kind: Any) -> Any:
+    """Let messages of a class be made of, and become, ready CDR with its header of 4 bytes.
+
+    Set from outside: the library takes a base class for one of IDL.
+    """
+
+    def make(self: Any, payload: bytes) -> None:
+        self.payload = payload
+
+    def serialize(
+        self: Any, buffer: Any = None, endianness: Any = None, use_version_2: Any = None
+    ) -> bytes:
+        return bytes(self.payload)
+
+    def deserialize(
+        cls: Any, data: bytes, has_header: bool = True, use_version_2: Any = None
+    ) -> Any:
+        return cls(data)
+
+    kind.__init__ = make
+    kind.serialize = serialize
+    kind.deserialize = classmethod(deserialize)
+    kind.deserialize_key = classmethod(deserialize)  # of what tells that a writer has left
+    return kind
+
+
+class UnsuitableTypeError(Exception):
+    """There is no such type in DDS, or not one that the library can take."""
+
+
+@dataclass(frozen=True, slots=True)
+class DdsType:
+    """How messages of a channel are written.
+
+    Attributes:
+        writes: The class of messages: made of bytes.
+        type_hash: ``RIHS01_...``; empty where the definition is not known.
+        is_real: Whether it announces the real type.
+        is_empty: Whether it has no field: messages have one byte, which some recordings lack.
+    """
+
+    writes: Any
+    type_hash: str
+    is_real: bool
+    is_empty: bool
+
+
+def dds_topic(topic: str, *, bare: bool = False) -> str | None:
+    """The DDS name of a topic, such as ``rt/camera/image``; None where ROS 2 has no such topic.
+
+    Args:
+        topic: As ROS spells it.
+        bare: Without the prefix of ROS.
+    """
+    if not _TOPIC.fullmatch(topic) or "__" in topic:
+        return None
+    return topic.strip("/") if bare else f"rt/{topic.strip('/')}"
+
+
+def dds_name(type_name: str) -> str:
+    """The DDS name of a type: ``std_msgs/msg/String`` -> ``std_msgs.msg.dds_.String_``."""
+    *rooms, name = type_name.split("/")
+    return ".".join((*rooms, "dds_", f"{name}_"))
+
+
+def opaque_type(name: str) -> Any:
+    """A class of messages of a type of which only the DDS name is known, with dots."""
+    from cyclonedds.idl import make_idl_struct
+
+    short = name.rpartition(".")[2]
+    return as_is(make_idl_struct(short, name, {}, dataclassify=False))
+
+
+def message_type(channel: Channel, world: World) -> DdsType:
+    """How messages of a channel are written.
+
+    Raises:
+        ConversionError: The type has no name that ROS 2 could have.
+    """
+    name = _full_name(channel.type_name)
+    if not _NAME.fullmatch(name):
+        problem = f"{channel.type_name!r} is no message type of ROS 2"
+        raise ConversionError(channel.topic, problem, "Leave the topic out.")
+    recorded = channel.metadata.get(HASH_KEY, "")
+    type_hash = recorded if _HASH.fullmatch(recorded) else ""
+    try:
+        types = _known_types(channel, world)
+        type_hash = type_hash or make_store(types, world).hash_rihs01(name)
+        real = as_is(make_struct(types, name))
+    except (*BAD_DEFINITION, UnsuitableTypeError):
+        return DdsType(opaque_type(dds_name(name)), type_hash, False, False)
+    is_empty = types[name][1][0][0] == _FILLER
+    return DdsType(real, type_hash, True, is_empty)
+
+
+def _full_name(name: str) -> str:
+    """A name as ROS 2 has it: ``std_msgs/String`` is short for ``std_msgs/msg/String``."""
+    rooms = name.split("/")
+    return f"{rooms[0]}/msg/{rooms[1]}" if len(rooms) == 2 else name
+
+
+def _known_types(channel: Channel, world: World) -> Types:
+    if channel.schema is None:
+        raise UnsuitableTypeError
+    return {
+        name: (constants, fields or [_filler(world)])
+        for name, (constants, fields) in types_of(channel.schema, world).items()
+    }
+
+
+def _filler(world: World) -> Any:
+    return world.standard["std_msgs/msg/Empty"][1][0]
+
+
+def make_struct(types: Types, name: str, *, has_fields: bool = False) -> Any:
+    """The class of a type, made after those of its parts.
+
+    Args:
+        types: The definitions, complete.
+        name: Which one.
+        has_fields: Whether messages are made of and taken apart into fields.
+
+    Raises:
+        UnsuitableTypeError: There is no such type in DDS.
+    """
+    return _StructMaker(types, has_fields).struct(name)[0]
+
+
+class _StructMaker:
+    def __init__(self, types: Types, has_fields: bool) -> None:
+        self._types = types
+        self._has_fields = has_fields
+        self._made: dict[str, tuple[Any, int]] = {}
+        self._open: list[str] = []
+
+    def struct(self, name: str) -> tuple[Any, int]:
+        """The class of a type, and bytes of what has a fixed size."""
+        from cyclonedds.idl import make_idl_struct
+
+        if name in self._made:
+            return self._made[name]
+        if name in self._open or len(self._open) >= _MAX_NESTING or not _NAME.fullmatch(name):
+            raise UnsuitableTypeError
+        self._open.append(name)
+        fields: dict[str, Any] = {}
+        total = 0
+        for field, desc in self._types[name][1]:
+            if field in fields or field.startswith("__"):
+                raise UnsuitableTypeError
+            fields[field], size = self._field(desc)
+            total += size
+        if total > _MAX_SIZE:
+            raise UnsuitableTypeError
+        self._open.pop()
+        short = f"{name.rpartition('/')[2]}_"
+        made = make_idl_struct(short, dds_name(name), fields, dataclassify=self._has_fields)
+        self._made[name] = made, total
+        return made, total
+
+    def _field(self, desc: Any) -> tuple[Any, int]:
+        from cyclonedds.idl import types
+
+        shape = field_shape(desc)
+        if shape.message:
+            kind, size = self.struct(shape.message)
+        else:
+            kind, size = _base(shape.base, shape.text_bound), 8
+        if shape.length is not None:
+            return types.array[kind, shape.length], size * shape.length
+        if shape.bound is not None:
+            bounded = (kind, shape.bound) if shape.bound else kind
+            return types.sequence[bounded], 24
+        return kind, size
+
+
+def _base(name: str, bound: int) -> Any:
+    from cyclonedds.idl import types
+
+    if name not in _BASES:
+        raise UnsuitableTypeError
+    if name == "string":
+        return types.bounded_str[bound] if bound else str
+    return bool if name == "bool" else getattr(types, _BASES[name])
+
+
+# ---------------------------------------------------------------- listening
+
+_PATIENCE = 50_000_000  # ns that the thread sleeps at most: then it looks for new publishers
+_BATCH = 100
+_KEPT = 1000  # messages that may wait to be taken
+_TYPE_PATIENCE = 2_000_000_000  # ns to wait for another participant to tell of a type
+
+
+class DdsListener:
+    """Calls back for each message of others; a thread that runs until `close`.
+
+    Only this thread calls back. Listeners of the library are not used: they would wait for
+    Python's lock while it is held by a write that waits for the very thread they run on.
+
+    Args:
+        participant: The participant of which the readers are.
+    """
+
+    def __init__(self, participant: Any) -> None:
+        self._participant = participant
+        self._lock = threading.Lock()
+        self._readers: list[tuple[Any, Callable[[Any], None]]] = []
+        self._sought: list[_Sought] = []
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def hear(self, reader: Any, on_sample: Callable[[Any], None]) -> None:
+        """Call with each valid sample that a reader gets."""
+        with self._lock:
+            self._readers.append((reader, on_sample))
+        self._start()
+
+    def seek(self, topic: str, on_message: Callable[[], None]) -> None:
+        """Call for each message of a topic, whatever its type, from when it has a publisher.
+
+        Args:
+            topic: Its DDS name.
+            on_message: Called for each message.
+        """
+        with self._lock:
+            self._sought.append(_Sought(self._participant, topic, on_message))
+        self._start()
+
+    def close(self) -> None:
+        """End the thread, and let go of the readers and of the participant."""
+        self._ended.set()
+        if self._thread and self._thread is not threading.current_thread():
+            self._thread.join()
+        self._readers.clear()
+        self._sought.clear()
+        self._participant = None
+
+    def _start(self) -> None:
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="mp4ds-dds", daemon=True)
+            self._thread.start()
+
+    def _run(self) -> None:
+        from cyclonedds.core import WaitSet
+
+        waiting = WaitSet(self._participant)
+        attached: list[Any] = []
+        while not self._ended.is_set():
+            with self._lock:
+                readers, sought = list(self._readers), list(self._sought)
+            for reader, _ in readers[len(attached) :]:
+                attached.append(_has_data(reader))
+                waiting.attach(attached[-1])
+            for one in sought:
+                for reader in one.found():
+                    self.hear(reader, one.on_sample)
+            waiting.wait(_PATIENCE)
+            for reader, on_sample in readers:
+                self._take(reader, on_sample)
+
+    def _take(self, reader: Any, on_sample: Callable[[Any], None]) -> None:
+        for sample in reader.take(_BATCH):
+            if self._ended.is_set():
+                return
+            if sample.sample_info.valid_data:
+                on_sample(sample)
+
+
+def _has_data(reader: Any) -> Any:
+    from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
+
+    return ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any)
+
+
+class _Sought:
+    """A topic whose type will be known when somebody publishes it."""
+
+    def __init__(self, participant: Any, topic: str, on_message: Callable[[], None]) -> None:
+        from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+
+        self._participant = participant
+        self._topic = topic
+        self._on_message = on_message
+        self._known: set[str] = set()
+        self._publications = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
+
+    def on_sample(self, _: Any) -> None:
+        """A message came."""
+        self._on_message()
+
+    def found(self) -> list[Any]:
+        """Readers of the types of publishers that have appeared since the last call."""
+        readers = []
+        own = self._participant.guid
+        for endpoint in self._publications.take(_BATCH):
+            is_new = endpoint.sample_info.valid_data and endpoint.topic_name == self._topic
+            if is_new and endpoint.participant_key != own and endpoint.type_name not in self._known:
+                self._known.add(endpoint.type_name)
+                readers += self._reader(endpoint)
+        return readers
+
+    def _reader(self, endpoint: Any) -> list[Any]:
+        from cyclonedds.core import DDSException, Policy, Qos
+        from cyclonedds.sub import DataReader
+        from cyclonedds.topic import Topic
+
+        best_effort = Policy.Reliability.BestEffort in endpoint.qos
+        qos = Qos(
+            Policy.Reliability.BestEffort if best_effort else Policy.Reliability.Reliable(0),
+            Policy.History.KeepLast(_KEPT),
+            Policy.IgnoreLocal.Participant,
+        )
+        try:
+            topic = Topic(self._participant, self._topic, self._class(endpoint))
+            return [DataReader(self._participant, topic, qos=qos)]
+        except DDSException:
+            return []  # a second type of the topic: a participant knows one
+
+    def _class(self, endpoint: Any) -> Any:
+        """The publisher's own type where it tells it, as readers then have to have it."""
+        from cyclonedds.core import DDSException
+        from cyclonedds.dynamic import get_types_for_typeid
+
+        if endpoint.type_id is not None:
+            try:
+                found = get_types_for_typeid(self._participant, endpoint.type_id, _TYPE_PATIENCE)
+                return as_is(found[0])
+            except DDSException:
+                pass  # ROS goes by the name alone
+        return opaque_type(endpoint.type_name.replace("::", "."))

@@ -1,0 +1,1 @@
+"""A dataset as a page for the browser, and its frames as images."""

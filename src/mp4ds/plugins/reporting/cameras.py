@@ -1,0 +1,590 @@
+"""What the page knows of a camera: its columns, its times, its calibrations."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.dataset.rebuild import fields_of
+from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.views import effective
+from mp4ds.errors import OptionError
+from mp4ds.format.models import Calibration
+from mp4ds.plugins.reporting.proxies import why_not_seen
+from mp4ds.times import (
+    Floats,
+    Integers,
+    differences,
+    intervals,
+    lost_frames,
+    nearest,
+    usual_interval,
+)
+
+Scores = Mapping[str, NDArray[np.float32]]
+"""By the name of the measure; one for each frame, NaN where there is none."""
+
+_MOST_SCORE_BYTES = 2**30
+_MOST_MEASURES = 16
+
+
+def read_scores(path: Path) -> dict[str, dict[str, NDArray[np.float32]]]:
+    """Scores of streams, from a JSON file ``{TOPIC: {MEASURE: [number or null, ...]}}``.
+
+    Args:
+        path: The file.
+
+    Returns:
+        By topic or name of a stream's file.
+
+    Raises:
+        OptionError: It cannot be read, or is no such file.
+    """
+    try:
+        if path.stat().st_size > _MOST_SCORE_BYTES:
+            raise OptionError(f"`scores` {path} has more than {_MOST_SCORE_BYTES} bytes.")
+        found = json.loads(path.read_bytes())
+    except OSError as error:
+        raise OptionError(f"`scores` {path} cannot be read: {error.strerror}.") from None
+    except (ValueError, RecursionError):
+        raise OptionError(f"`scores` {path} is no JSON.") from None
+    if not isinstance(found, dict):
+        raise _unlike(path)
+    return {topic: _measures(path, measures) for topic, measures in found.items()}
+
+
+def _measures(path: Path, measures: object) -> dict[str, NDArray[np.float32]]:
+    if not isinstance(measures, dict) or len(measures) > _MOST_MEASURES:
+        raise _unlike(path)
+    made = {}
+    for name, values in measures.items():
+        is_list = isinstance(values, list) and all(
+            value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+            for value in values
+        )
+        if not is_list:
+            raise _unlike(path)
+        with np.errstate(over="ignore"):
+            numbers = [np.nan if value is None else float(value) for value in values]
+            made[name] = np.array(numbers, np.float32)
+    return made
+
+
+def _unlike(path: Path) -> OptionError:
+    return OptionError(
+        f'`scores` {path} is not of the form {{"/topic": {{"vmaf": [98.7, null, ...]}}}}, with at '
+        f"most {_MOST_MEASURES} measures of a topic."
+    )
+
+
+def scores_of(stream: Stream, scores: Mapping[str, Scores]) -> Scores:
+    """The scores of one stream.
+
+    Raises:
+        OptionError: There are not as many as frames.
+    """
+    found = scores.get(stream.path.stem) or scores.get(stream.topic) or {}
+    for name, values in found.items():
+        if len(values) != len(stream):
+            raise OptionError(
+                f"{stream.topic} has {len(stream)} frames, and {len(values)} scores {name!r}: "
+                "give one for each frame, null where there is none."
+            )
+    return found
+
+
+# ---------------------------------------------------------------- timing
+
+_MS = 1e6  # nanoseconds
+_WIDER = 2  # times the span of the log times, beyond which stamps are of several clocks
+_SLACK_NS = 10 * 10**9
+_DAY_NS = 86_400 * 10**9
+_NO_STAMPS, _OTHER_CLOCK = "no header stamps", "stamps of another clock"
+
+
+@dataclass(frozen=True)
+class Timing:
+    """The times of one camera in figures. Milliseconds, None where there are too few frames.
+
+    Attributes:
+        frames: Number of frames.
+        rate_hz: Mean rate by the median interval.
+        median_ms: Median of the intervals between stamps that advance.
+        jitter_ms: Standard deviation of the intervals.
+        p99_ms: 99th percentile of how far an interval is from the median.
+        longest_ms: Longest interval.
+        lost: Frames missing by the stamps: see `lost_frames`.
+        gaps: Places where they are missing.
+        repeated: Frames with the stamp of the one before.
+        backward: Frames with an earlier stamp than the one before.
+        seq_missing: Numbers that the header's `seq` leaves out; None where there is no `seq`.
+        delay_median_ms: Median of log time minus stamp.
+        delay_least_ms: Least of them.
+        delay_most_ms: Most of them.
+    """
+
+    frames: int
+    rate_hz: float | None
+    median_ms: float | None
+    jitter_ms: float | None
+    p99_ms: float | None
+    longest_ms: float | None
+    lost: int
+    gaps: int
+    repeated: int
+    backward: int
+    seq_missing: int | None
+    delay_median_ms: float
+    delay_least_ms: float
+    delay_most_ms: float
+
+
+def timing_of(stamps: Integers, log_times: Integers, seq: Integers | None) -> Timing:
+    """The figures of one camera.
+
+    Args:
+        stamps: Header stamps, nanoseconds, at least one.
+        log_times: Log times, nanoseconds.
+        seq: Numbers in the headers, or None.
+    """
+    steps = intervals(stamps)
+    usual = usual_interval(steps)
+    lost = lost_frames(steps)
+    delays = differences(log_times, stamps) / _MS
+    return Timing(
+        frames=len(stamps),
+        rate_hz=1e9 / usual if usual else None,
+        median_ms=usual / _MS if usual else None,
+        jitter_ms=float(steps.std()) / _MS if len(steps) else None,
+        p99_ms=float(np.percentile(np.abs(steps - usual), 99)) / _MS if usual else None,
+        longest_ms=float(steps.max()) / _MS if len(steps) else None,
+        lost=sum(lost[lost > 0].tolist()),
+        gaps=int((lost > 0).sum()),
+        repeated=int((steps == 0).sum()),
+        backward=int((steps < 0).sum()),
+        seq_missing=None if seq is None else _missing_numbers(seq),
+        delay_median_ms=float(np.median(delays)),
+        delay_least_ms=float(delays.min()),
+        delay_most_ms=float(delays.max()),
+    )
+
+
+def _missing_numbers(seq: Integers) -> int:
+    steps = np.diff(seq)
+    return sum((steps[steps > 1] - 1).tolist())
+
+
+def nearest_offsets(stamps: Integers, reference: Integers) -> Floats:
+    """How much later each frame is than the reference's frame that is nearest, nanoseconds.
+
+    Args:
+        stamps: Of a camera.
+        reference: Of the camera that it is compared with, at least one; in any order.
+    """
+    ordered = np.sort(reference)
+    return differences(stamps, ordered[nearest(ordered, stamps)])
+
+
+def untimed(cameras: Sequence[Mapping[str, Integers]]) -> list[str]:
+    """Why the stamps of each camera cannot be compared with those of the others; empty: they can.
+
+    Args:
+        cameras: Columns ``stamp`` and ``log_time`` of each.
+    """
+    have_stamps = [bool(columns["stamp"].any()) for columns in cameras]
+    is_far = [
+        abs(float(np.median(differences(columns["log_time"], columns["stamp"])))) > _DAY_NS
+        for columns in cameras
+    ]
+    # where all are far from the record times, as in a simulation, they are near each other
+    pairs = list(zip(have_stamps, is_far, strict=True))
+    has_near = (True, False) in pairs
+    return [
+        _NO_STAMPS if not has else _OTHER_CLOCK if far and has_near else "" for has, far in pairs
+    ]
+
+
+def axis_of(cameras: Sequence[Mapping[str, Integers]]) -> str:
+    """By which times all cameras are shown together: ``stamp`` or ``log_time``.
+
+    Stamps, where those of every camera mostly advance, and they are all of one clock.
+
+    Args:
+        cameras: Columns ``stamp`` and ``log_time`` of each.
+    """
+    for columns in cameras:
+        steps = intervals(columns["stamp"])
+        if 2 * int((steps > 0).sum()) < len(steps):
+            return "log_time"
+    spans = {name: _span([columns[name] for columns in cameras]) for name in ("stamp", "log_time")}
+    is_one_clock = spans["stamp"] <= _WIDER * spans["log_time"] + _SLACK_NS
+    return "stamp" if is_one_clock else "log_time"
+
+
+def _span(columns: Sequence[Integers]) -> int:
+    if not columns:
+        return 0
+    return max(int(c.max()) for c in columns) - min(int(c.min()) for c in columns)
+
+
+# ---------------------------------------------------------------- packed columns
+
+_BITS = 7
+_MOST_BYTES = 10
+
+
+def pack_column(values: NDArray[np.int64]) -> dict[str, str]:
+    """A column of 64-bit integers, exactly.
+
+    ``value[0] = start`` and ``value[i] = value[i-1] + step + residual[i-1]``, modulo 2^64. A
+    residual is stored as an unsigned number, twice its value or, if it is negative, twice its
+    absolute value less one, in groups of seven bits, the lowest first.
+
+    Args:
+        values: At least one.
+
+    Returns:
+        ``start`` and ``step`` in decimal digits, since a number of a page has 53 bits, and
+        ``values`` in base64.
+    """
+    with np.errstate(over="ignore"):
+        steps = np.diff(values)
+        step = np.partition(steps, len(steps) // 2)[len(steps) // 2] if len(steps) else np.int64(0)
+        residuals = steps - step
+        unsigned = (residuals << 1 ^ residuals >> 63).view(np.uint64)
+    return {
+        "start": str(int(values[0])),
+        "step": str(int(step)),
+        "values": base64.b64encode(_varints(unsigned)).decode(),
+    }
+
+
+def _varints(values: NDArray[np.uint64]) -> bytes:
+    lengths = np.ones(len(values), np.int64)
+    for count in range(1, _MOST_BYTES):
+        lengths += values >= np.uint64(1 << _BITS * count)
+    starts = np.cumsum(lengths) - lengths
+    out = np.zeros(int(lengths.sum()), np.uint8)
+    for count in range(int(lengths.max(initial=0))):
+        has = lengths > count
+        groups = (values[has] >> np.uint64(_BITS * count)) & np.uint64(0x7F)
+        more = np.where(lengths[has] > count + 1, 0x80, 0)
+        out[starts[has] + count] = groups.astype(np.uint8) | more.astype(np.uint8)
+    return out.tobytes()
+
+
+def pack_floats(values: NDArray[np.float32]) -> str:
+    """Numbers of 32 bits, little-endian, in base64; NaN where there is none."""
+    return base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()
+
+
+# ---------------------------------------------------------------- grid
+
+_CELLS = 12  # over the width of the image
+_POINTS = 97  # of a line
+_MARGIN = 0.02  # of the image's sides, beyond which a line is cut
+_REACH, _FARTHEST = 2.5, 5  # times the image without distortion, from its principal point
+_POLYNOMIAL = {"plumb_bob", "rational_polynomial", "radtan", "brown_conrady", "brown"}
+_FISHEYE = {"equidistant", "fisheye", "kannala_brandt", "kannala_brandt4"}
+_MOST_D = 12  # beyond are the tilts of a sensor
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """Lines over an image.
+
+    Attributes:
+        lines: Each a list of x, y, x, y ... as parts of the image's width and height.
+        axes: Those of `lines` that pass through the principal point, by number.
+        center: x and y of the principal point, as parts of the width and height.
+        problem: Why there are no lines; empty if there are.
+    """
+
+    lines: list[list[float]]
+    axes: list[int]
+    center: list[float]
+    problem: str = ""
+
+
+def overlay_of(calibration: Calibration, image_size: tuple[int, int], topic: str) -> Overlay:
+    """A grid of straight lines, equally far apart in a plane before the camera.
+
+    Args:
+        calibration: Of the camera.
+        image_size: Width and height of the images, pixels.
+        topic: Of the images: on one of image_proc's rectified topics P holds, without distortion.
+    """
+    k, p = (np.array(matrix) for matrix in effective(fields_of(calibration)))
+    is_rectified = any(part.startswith("image_rect") for part in topic.split("/"))
+    matrix = p[:, :3] if is_rectified else k
+    d = [] if is_rectified else list(calibration.d)
+    problem = _problem(calibration, matrix, d, image_size)
+    if problem:
+        return Overlay([], [], [], problem)
+    width, height = image_size
+    (fx, _, cx), (_, fy, cy) = matrix[0], matrix[1]
+    model = _name(calibration.distortion_model)
+    step = width / fx / _CELLS
+    lines: list[list[float]] = []
+    axes: list[int] = []
+    reach = [
+        min(_REACH * max(center, side - center), _FARTHEST * side)
+        for center, side in ((cx, width), (cy, height))
+    ]
+    ends = reach[0] / fx, reach[1] / fy
+    for axis in (0, 1):
+        along = np.linspace(-ends[1 - axis], ends[1 - axis], _POINTS)
+        for number in range(-int(ends[axis] / step), int(ends[axis] / step) + 1):
+            across = np.full(_POINTS, number * step)
+            x, y = (across, along) if axis == 0 else (along, across)
+            distorted_x, distorted_y, is_sound = _distort(x, y, model, d)
+            u = (fx * distorted_x + matrix[0, 1] * distorted_y + cx + 0.5) / width
+            v = (fy * distorted_y + cy + 0.5) / height
+            for line in _inside(u, v, is_sound):
+                axes += [len(lines)] if number == 0 else []
+                lines.append(line)
+    return Overlay(lines, axes, [round((cx + 0.5) / width, 5), round((cy + 0.5) / height, 5)])
+
+
+def _name(model: str) -> str:
+    return model.strip().lower().replace(" ", "_")
+
+
+def _problem(
+    calibration: Calibration, matrix: Floats, d: Sequence[float], image_size: tuple[int, int]
+) -> str:
+    """Why there can be no grid."""
+    size = calibration.width, calibration.height
+    if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
+        return "the camera is not calibrated"
+    roi = calibration.roi
+    cut = (roi.width or size[0], roi.height or size[1]) if roi else size
+    seen = cut[0] // max(1, calibration.binning_x), cut[1] // max(1, calibration.binning_y)
+    if 0 not in size and seen != image_size:
+        return f"it is for images of {seen[0]}x{seen[1]}, these are {image_size[0]}x{image_size[1]}"
+    if not any(d):
+        return ""
+    name = _name(calibration.distortion_model)
+    if name not in _POLYNOMIAL | _FISHEYE:
+        return f"the distortion model {calibration.distortion_model!r} is not known here"
+    if not np.isfinite(d).all() or any(d[_MOST_D:]):
+        return "its sensor is tilted, which is not drawn"
+    return ""
+
+
+def _distort(
+    x: Floats, y: Floats, model: str, d: Sequence[float]
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Where a lens puts points of the plane at distance 1, and which of them are in its view."""
+    if not any(d):
+        return x, y, np.ones(len(x), np.bool_)
+    with np.errstate(all="ignore"):  # far outside of the view
+        if model in _FISHEYE:
+            return _fisheye(x, y, d)
+        return _polynomial(x, y, d)
+
+
+def _fisheye(x: Floats, y: Floats, d: Sequence[float]) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    coefficients = [*d[:4], *[0.0] * (4 - len(d[:4]))]
+    radius = np.hypot(x, y)
+    angle = np.arctan(radius)
+    square = angle * angle
+    factor, slope = np.ones_like(angle), np.ones_like(angle)
+    for power, value in enumerate(coefficients, 1):
+        factor += value * square**power
+        slope += (2 * power + 1) * value * square**power
+    scale = np.where(radius > 0, angle * factor / np.where(radius > 0, radius, 1.0), 1.0)
+    return x * scale, y * scale, (slope > 0) & (factor > 0)
+
+
+def _polynomial(
+    x: Floats, y: Floats, d: Sequence[float]
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = [*d[:_MOST_D], *[0.0] * (_MOST_D - len(d))][
+        :_MOST_D
+    ]
+    square = x * x + y * y
+    above = 1 + square * (k1 + square * (k2 + square * k3))
+    below = 1 + square * (k4 + square * (k5 + square * k6))
+    factor = above / below
+    # beyond where the picture turns back, the polynomial means nothing
+    above_slope = k1 + square * (2 * k2 + square * 3 * k3)
+    below_slope = k4 + square * (2 * k5 + square * 3 * k6)
+    slope = factor + 2 * square * (above_slope * below - above * below_slope) / (below * below)
+    distorted_x = x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x)
+    distorted_y = y * factor + p1 * (square + 2 * y * y) + 2 * p2 * x * y
+    distorted_x += square * (s1 + square * s2)
+    distorted_y += square * (s3 + square * s4)
+    return distorted_x, distorted_y, (slope > 0) & (below > 0)
+
+
+def _inside(u: Floats, v: Floats, is_sound: NDArray[np.bool_]) -> list[list[float]]:
+    """The parts of a line that are within the image."""
+    with np.errstate(invalid="ignore"):
+        seen = is_sound & (np.abs(u - 0.5) < 0.5 + _MARGIN) & (np.abs(v - 0.5) < 0.5 + _MARGIN)
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], seen.astype(np.int8), [0]))))
+    parts = []
+    for start, end in edges.reshape(-1, 2):
+        if end - start > 1:
+            points = np.stack([u[start:end], v[start:end]], axis=1)
+            parts.append(np.round(points, 5).ravel().tolist())
+    return parts
+
+
+# ---------------------------------------------------------------- cameras
+
+_MOST_CALIBRATIONS = 64
+"""Changes of a calibration that the page lists; of a self-calibrating camera there are more."""
+
+_MOST_OVERLAYS = 8
+_NOT_SEEN = Overlay([], [], [], "what is played is not the image")
+
+
+@dataclass
+class ReportedCamera:
+    """One stream on the page.
+
+    Attributes:
+        stream: The stream.
+        name: Its topic, or that with the name of its file where the topic has several.
+        times: Presentation times of its frames, microseconds; None where the video is damaged.
+        video: URL of what the page plays, from the page; empty: nothing.
+        is_proxy: Whether that is a proxy.
+        note: Why there is a proxy, or nothing to play.
+        caption: What the pictures show besides the image.
+        scores: Of its frames.
+    """
+
+    stream: Stream
+    name: str
+    times: NDArray[np.int64] | None = None
+    video: str = ""
+    is_proxy: bool = False
+    note: str = ""
+    caption: str = ""
+    scores: Scores = field(default_factory=dict)
+
+    @property
+    def stamps(self) -> NDArray[np.int64]:
+        """Header stamps, nanoseconds."""
+        return self.stream.stamps
+
+    @property
+    def log_times(self) -> NDArray[np.int64]:
+        """Log times, nanoseconds."""
+        return self.stream.log_times
+
+    def check(self) -> None:
+        """Read its columns.
+
+        Raises:
+            FormatError: They break a rule of the format, or there is no video.
+        """
+        _ = self.stream.columns
+        _ = self.stream.camera_info_columns
+
+    def timing(self) -> Timing:
+        """Its figures."""
+        return timing_of(self.stamps, self.log_times, self.stream.columns.seq)
+
+    def columns(self) -> dict[str, Any]:
+        """All of its columns, for the page."""
+        columns: dict[str, Any] = {
+            "frames": len(self.stream),
+            "stamp": pack_column(self.stamps),
+            "log_time": pack_column(self.log_times),
+            "scores": {name: pack_floats(values) for name, values in self.scores.items()},
+        }
+        if self.times is not None:
+            columns["ticks"] = pack_column(self.times)
+        return columns
+
+    def facts(self, number: int, reference: ReportedCamera | None, untimed: str) -> dict[str, Any]:
+        """What the page shows of it besides its columns.
+
+        Args:
+            number: Of the camera on the page.
+            reference: The camera whose stamps it is compared with; None: none.
+            untimed: Why its stamps are not compared; empty: they are.
+        """
+        sidecar = self.stream.sidecar
+        return {
+            "name": self.name,
+            "columns": f"report/columns-{number}.js",
+            "frames": len(self.stream),
+            "encoding": sidecar.image.encoding,
+            "width": sidecar.image.width,
+            "height": sidecar.image.height,
+            "codec": sidecar.video.codec,
+            "profile": sidecar.profile,
+            "file": sidecar.video.file,
+            "video": self.video,
+            "proxy": self.is_proxy,
+            "note": self.note,
+            "caption": self.caption,
+            "shown": self._shown(),
+            "timing": asdict(self.timing()),
+            "untimed": untimed,
+            "offset": None if reference is None else _offset(self.stamps, reference.stamps),
+            **self._calibrations(),
+        }
+
+    @property
+    def _is_seen(self) -> bool:
+        """Whether what is played looks like the image."""
+        return self.is_proxy or not why_not_seen(self.stream)
+
+    def _shown(self) -> list[float]:
+        """The image's part of the width and height of what is played: a video may be padded."""
+        image, video = self.stream.sidecar.image, self.stream.sidecar.video
+        if self.is_proxy or not self._is_seen:
+            return [1.0, 1.0]
+        return [image.width / video.width, image.height / video.height]
+
+    def _calibrations(self) -> dict[str, Any]:
+        """Each calibration that differs from the one before, and the frame it holds from."""
+        info = self.stream.sidecar.camera_info
+        if info is None:
+            return {"calibrations": [], "calibration_topic": "", "calibrations_more": 0}
+        columns = self.stream.camera_info_columns
+        if columns is None:
+            changes, frames = np.arange(len(info.calibrations)), np.zeros(1, np.int64)
+            variants = changes
+        else:
+            changes = np.flatnonzero(np.diff(columns.variant, prepend=-1))
+            variants = columns.variant[changes]
+            frames = np.searchsorted(self.log_times, columns.log_time[changes], side="left")
+            frames[0] = 0  # the first one holds before it, too
+        listed: list[dict[str, Any]] = []
+        size = self.stream.image_size
+        pairs = zip(variants.tolist(), frames.tolist(), strict=False)
+        for variant, frame in list(pairs)[:_MOST_CALIBRATIONS]:
+            item = info.calibrations[variant]
+            made = item.model_dump(exclude={"template"})
+            if len(listed) < _MOST_OVERLAYS:
+                made["overlay"] = asdict(
+                    overlay_of(item, size, self.stream.topic) if self._is_seen else _NOT_SEEN
+                )
+            listed.append({**made, "from_frame": frame})
+        return {
+            "calibrations": listed,
+            "calibration_topic": info.channel.topic,
+            "calibrations_more": max(0, len(changes) - _MOST_CALIBRATIONS),
+        }
+
+
+def _offset(stamps: NDArray[np.int64], reference: NDArray[np.int64]) -> dict[str, float]:
+    """Figures of the offsets to another camera, milliseconds."""
+    offsets = nearest_offsets(stamps, reference) / 1e6
+    return {
+        "median_ms": float(np.median(offsets)),
+        "p99_ms": float(np.percentile(np.abs(offsets), 99)),
+        "most_ms": float(np.abs(offsets).max()),
+    }

@@ -1,0 +1,104 @@
+/* Columns of 64-bit integers, and what is computed of them. Times are nanoseconds. */
+"use strict";
+var mp4dsColumns = (() => {
+  const bytesOf = text => {
+    const raw = atob(text), bytes = new Uint8Array(raw.length);
+    for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
+    return bytes;
+  };
+
+  /** A column as mp4ds.plugins.reporting.cameras.pack_column wrote it: BigInt64Array of so many values. */
+  function decode(packed, count) {
+    const bytes = bytesOf(packed.values), out = new BigInt64Array(count);
+    const step = BigInt(packed.step);
+    let value = BigInt(packed.start), place = 0;
+    out[0] = value;
+    for (let i = 1; i < count; i++) {
+      let number = 0, scale = 1, groups = 0, byte = bytes[place++];
+      while (byte >= 128 && groups < 6) {  // up to 49 bits a number is exact
+        number += (byte - 128) * scale;
+        scale *= 128;
+        groups++;
+        byte = bytes[place++];
+      }
+      let residual;
+      if (byte < 128) {
+        number += byte * scale;
+        residual = BigInt(number % 2 ? -(number + 1) / 2 : number / 2);
+      } else {
+        let big = BigInt(number), shift = 42n;
+        for (; byte >= 128; byte = bytes[place++], shift += 7n) big += BigInt(byte - 128) << shift;
+        big += BigInt(byte) << shift;
+        residual = big & 1n ? -((big + 1n) >> 1n) : big >> 1n;
+      }
+      out[i] = value += step + residual;
+      if (value !== out[i]) value = out[i];  // modulo 2^64
+    }
+    if (place !== bytes.length) throw new Error("a column has another length than it should");
+    return out;
+  }
+
+  const decodeFloats = text => {
+    const bytes = bytesOf(text), view = new DataView(bytes.buffer);
+    return Float64Array.from({length: bytes.length / 4}, (_, i) => view.getFloat32(4 * i, true));
+  };
+
+  /** Number of the last entry that is at most `value`, -1 if none is; of increasing values. */
+  function lastAtMost(values, value) {
+    let low = 0, high = values.length;
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (values[middle] <= value) low = middle + 1; else high = middle;
+    }
+    return low - 1;
+  }
+
+  /** Milliseconds from each frame to the next; entry 0, before which there is none, is NaN. */
+  function intervals(stamps) {
+    const out = new Float64Array(stamps.length).fill(NaN);
+    for (let i = 1; i < stamps.length; i++) out[i] = Number(stamps[i] - stamps[i - 1]) / 1e6;
+    return out;
+  }
+
+  /** Frames missing before each frame (above 0), as intervals.py has it; repeated or earlier stamps are -1. */
+  function lost(steps, usual) {
+    const out = new Float64Array(steps.length);
+    const short = i => i > 0 && i < steps.length ? Math.min(Math.max(usual - steps[i], 0), usual) : 0;
+    for (let i = 1; i < steps.length; i++) {
+      const spread = steps[i] - short(i - 1) - short(i + 1);
+      if (steps[i] <= 0) out[i] = -1;
+      else if (usual && spread > 1.5 * usual) out[i] = Math.round(spread / usual) - 1;
+    }
+    return out;
+  }
+
+  const delays = (logTimes, stamps) =>
+    Float64Array.from(stamps, (stamp, i) => Number(logTimes[i] - stamp) / 1e6);
+
+  /** How much later each frame is than the reference's nearest one, milliseconds. */
+  function offsets(stamps, reference) {
+    const ordered = BigInt64Array.from(reference).sort(), out = new Float64Array(stamps.length);
+    for (let i = 0, at = 0; i < stamps.length; i++) {
+      const stamp = stamps[i];
+      if (at && ordered[at - 1] >= stamp) at = lastAtMost(ordered, stamp - 1n) + 1;
+      while (at < ordered.length - 1 && ordered[at] < stamp) at++;
+      const after = Number(stamp - ordered[at]);
+      const before = at ? Number(stamp - ordered[at - 1]) : Infinity;
+      out[i] = (Math.abs(before) <= Math.abs(after) ? before : after) / 1e6;
+    }
+    return out;
+  }
+
+  /** Where frames are on the common axis: nanoseconds from its start, never falling. */
+  function positions(times, base) {
+    const out = new Float64Array(times.length);
+    let latest = -Infinity;
+    for (let i = 0; i < times.length; i++) {
+      latest = Math.max(latest, Number(times[i] - base));
+      out[i] = latest;
+    }
+    return out;
+  }
+
+  return {decode, decodeFloats, lastAtMost, intervals, lost, delays, offsets, positions};
+})();

@@ -1,0 +1,350 @@
+"""``report``: a dataset as a page for the browser, beside its files.
+
+index.html and a folder ``report`` are added to the dataset, or written elsewhere. The page plays
+the dataset's own videos where browsers do, else small proxies; its columns are exact.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.stream import Stream
+from mp4ds.errors import FormatError, OptionError, SourceError, TargetExistsError
+from mp4ds.files.outputs import (
+    as_write_error,
+    check_target,
+    is_page,
+    listed_names,
+    staged,
+    write_listing,
+    write_synced,
+)
+from mp4ds.files.urls import remote
+from mp4ds.options import Options, force, option
+from mp4ds.plugins.reporting.cameras import ReportedCamera, Scores, read_scores, scores_of
+from mp4ds.plugins.reporting.page import (
+    FOLDER_NAME,
+    INDEX_NAME,
+    PROXIES_NAME,
+    TopicRow,
+    index_page,
+    topic_rows,
+    write_folder,
+)
+from mp4ds.plugins.reporting.proxies import (
+    make_proxy,
+    presentation_times,
+    proxy_key,
+    proxy_size,
+    why_not_in_browsers,
+    why_not_seen,
+)
+
+PROXIES = ("auto", "all", "none")
+_KEYS_NAME = "proxies.json"
+
+
+@dataclass(frozen=True)
+class ReportOptions(Options):
+    """How a report is made."""
+
+    output: Path | None = option(
+        "Where to write it; into the dataset if not said.", None, "-o", metavar="FOLDER"
+    )
+    proxies: str = option(
+        "Small videos for what no browser shows (auto), for all, or none.", "auto", metavar="WHICH"
+    )
+    proxy_width: int = option(
+        "Most columns of a proxy.", 640, metavar="PIXELS", least=64, most=3840
+    )
+    scores: Path | None = option("Quality scores of frames, to be plotted.", metavar="JSON")
+    force: bool = force("Replace an index.html that is no report.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.proxies not in PROXIES:
+            raise OptionError(f"`proxies` {self.proxies!r} is not known. Use {', '.join(PROXIES)}.")
+
+
+@dataclass(frozen=True)
+class CameraSummary:
+    """What the page plays of a stream.
+
+    Attributes:
+        topic: Its topic.
+        plays: Its own ``video``, a ``proxy``, or ``nothing``.
+        note: Why, where it is not its own.
+    """
+
+    topic: str
+    plays: str
+    note: str
+
+
+@dataclass(frozen=True)
+class ReportSummary:
+    """A report that was made.
+
+    Attributes:
+        index: The page.
+        files: What it needs, by path from the folder that dataset and page have in common.
+        cameras: In the order of the page.
+        bytes: Size of all that was written.
+        problems: What of the dataset could not be shown.
+    """
+
+    index: Path
+    files: dict[str, Path] = field(repr=False)
+    cameras: list[CameraSummary]
+    bytes: int
+    problems: list[str]
+
+    @property
+    def start(self) -> str:
+        """Path of the page's URL, where `files` are served."""
+        return quote(next(name for name, path in self.files.items() if path == self.index))
+
+
+def report(
+    dataset: Path | str,
+    options: ReportOptions | None = None,
+    *,
+    progress: Callable[[str], None] | None = None,
+) -> ReportSummary:
+    """Make the page of a dataset. A report of before is replaced; its proxies are used again.
+
+    Args:
+        dataset: A dataset, or one video with its sidecar, on this machine.
+        options: How.
+        progress: Called with a phrase now and then.
+
+    Raises:
+        SourceError: There is no dataset.
+        FormatError: The dataset breaks a rule of the format. A damaged video is no error, but
+            one of the summary's problems.
+        OptionError: An option is wrong.
+        TargetError: The report may not be written there.
+        WriteError: The disk refused; what was there before is still there.
+    """
+    chosen = options or ReportOptions()
+    tell = progress or (lambda _: None)
+    with Dataset(dataset) as opened:
+        if remote(opened.path):
+            raise SourceError(opened.path, "is not on this machine", "Copy the dataset first.")
+        if opened.manifest is None and chosen.output is None:
+            raise OptionError("A video alone has no folder for a report: give `output`.")
+        folder = Path(os.path.abspath(chosen.output or opened.path))  # noqa: PTH100 - as named
+        _check_place(folder, force=chosen.force)
+        scores = _scores(opened, chosen.scores)
+        try:
+            is_new = not folder.exists()
+            folder.mkdir(exist_ok=True)
+            try:
+                return _write(opened, folder, chosen, scores, tell)
+            except BaseException:
+                if is_new:
+                    with suppress(OSError):
+                        folder.rmdir()  # nothing unfinished stays, nor an empty folder
+                raise
+        except OSError as error:
+            raise as_write_error(error, folder) from error
+
+
+def _scores(dataset: Dataset, path: Path | None) -> Mapping[str, Scores]:
+    """The scores of a file.
+
+    Raises:
+        OptionError: It has some of a topic that is no stream.
+    """
+    scores = read_scores(path) if path else {}
+    for topic in scores:
+        if topic not in dataset:
+            known = ", ".join(dataset.topics) or "none"
+            raise OptionError(f"`scores` {path} has {topic!r}, which is none of {known}.")
+    return scores
+
+
+def _check_place(folder: Path, *, force: bool) -> None:
+    """Refuse early what may not be replaced.
+
+    Raises:
+        TargetError: Says what.
+    """
+    if folder.exists():
+        index = folder / INDEX_NAME
+        if os.path.lexists(index) and not is_page(index) and not force:
+            raise TargetExistsError(index)
+        check_target(folder / FOLDER_NAME, force=True, owned=listed_names)
+    else:
+        check_target(folder, force=False, owned=listed_names)
+
+
+def _write(
+    dataset: Dataset,
+    folder: Path,
+    options: ReportOptions,
+    scores: Mapping[str, Scores],
+    tell: Callable[[str], None],
+) -> ReportSummary:
+    target = folder / FOLDER_NAME
+    problems: list[str] = []
+    with staged(target, force=True, owned=listed_names) as path:
+        path.mkdir()
+        proxies = _Proxies(old=target, new=path)
+        cameras = []
+        for camera in _cameras(dataset, scores, problems):
+            try:
+                _give_video(camera, folder, options, proxies, tell)
+            except FormatError as error:
+                camera.note = str(error)
+                problems.append(str(error))
+            cameras.append(camera)
+        proxies.write_keys()
+        tell("topics")
+        write_folder(path, dataset, cameras, _topics(dataset, problems), problems)
+        write_listing(path)
+    write_synced(folder / INDEX_NAME, index_page())
+    return _summary(dataset, folder, cameras, problems)
+
+
+def _cameras(
+    dataset: Dataset, scores: Mapping[str, Scores], problems: list[str]
+) -> Iterator[ReportedCamera]:
+    """The streams by topic; those whose columns cannot be read become problems."""
+    streams = sorted(dataset.streams, key=lambda stream: (stream.topic, stream.path.stem))
+    topics = Counter(stream.topic for stream in streams)
+    for stream in streams:
+        alone = topics[stream.topic] == 1
+        name = stream.topic if alone else f"{stream.topic} ({stream.path.stem})"
+        camera = ReportedCamera(stream, name, scores=scores_of(stream, scores))
+        try:
+            camera.check()
+        except FormatError as error:
+            problems.append(str(error))
+            continue
+        yield camera
+
+
+def _topics(dataset: Dataset, problems: list[str]) -> list[TopicRow]:
+    try:
+        return topic_rows(dataset)
+    except (FormatError, SourceError) as error:
+        problems.append(str(error))
+        return []
+
+
+def _give_video(
+    camera: ReportedCamera,
+    folder: Path,
+    options: ReportOptions,
+    proxies: _Proxies,
+    tell: Callable[[str], None],
+) -> None:
+    """Find or make what the page plays of a camera.
+
+    Raises:
+        FormatError: Its video is damaged.
+    """
+    stream = camera.stream
+    camera.times = presentation_times(stream)
+    unplayable = why_not_in_browsers(stream.video_path)
+    camera.note = unplayable or why_not_seen(stream)
+    if options.proxies == "all" or (camera.note and options.proxies == "auto"):
+        camera.note = camera.note or "asked for"
+        camera.video, camera.caption = proxies.give(stream, camera.times, options.proxy_width, tell)
+        camera.is_proxy = True
+    elif not unplayable:
+        camera.video = _url(stream.video_path, folder)
+
+
+def _url(path: Path, folder: Path) -> str:
+    """Of a file, from a page in a folder."""
+    return quote(Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix())
+
+
+class _Proxies:
+    """The proxies of a report that is being made, and those of the one before."""
+
+    def __init__(self, *, old: Path, new: Path) -> None:
+        self._old = old / PROXIES_NAME
+        self._new = new / PROXIES_NAME
+        self._known: dict[str, list[str]] = {}
+        self._made: dict[str, list[str]] = {}
+        with suppress(OSError, ValueError, AttributeError):
+            found = json.loads((self._old / _KEYS_NAME).read_bytes())
+            self._known = {str(name): [str(part) for part in item] for name, item in found.items()}
+
+    def give(
+        self, stream: Stream, times: NDArray[np.int64], width: int, tell: Callable[[str], None]
+    ) -> tuple[str, str]:
+        """Make a proxy, or take the one that was made before.
+
+        Returns:
+            Its URL from the page, and what its pictures show besides the image.
+        """
+        self._new.mkdir(exist_ok=True)
+        name = f"{stream.path.stem}.mp4"
+        size = proxy_size(stream.image_size, width)
+        key = proxy_key(stream, size)
+        known = self._known.get(name, [])
+        if key and len(known) == 2 and known[0] == key and self._take(name):
+            caption = known[1]
+        else:
+            caption = make_proxy(stream, self._new / name, size=size, times=times, progress=tell)
+        self._made[name] = [key, caption]
+        return f"{FOLDER_NAME}/{PROXIES_NAME}/{quote(name)}", caption
+
+    def _take(self, name: str) -> bool:
+        """Have the old proxy in the new report, too."""
+        try:
+            os.link(self._old / name, self._new / name)
+        except OSError:
+            try:
+                shutil.copyfile(self._old / name, self._new / name)
+            except OSError:
+                (self._new / name).unlink(missing_ok=True)
+                return False
+        return True
+
+    def write_keys(self) -> None:
+        """Write what the proxies were made of, for the next report."""
+        if self._made:
+            (self._new / _KEYS_NAME).write_text(json.dumps(self._made))
+
+
+def _summary(
+    dataset: Dataset, folder: Path, cameras: list[ReportedCamera], problems: list[str]
+) -> ReportSummary:
+    own = [folder / INDEX_NAME, *(p for p in (folder / FOLDER_NAME).rglob("*") if p.is_file())]
+    videos = [c.stream.video_path for c in cameras if c.video and not c.is_proxy]
+    everything = [*own, *(video.resolve() for video in videos)]
+    base = Path(os.path.commonpath([folder.resolve(), *(v.resolve().parent for v in videos)]))
+    return ReportSummary(
+        index=folder / INDEX_NAME,
+        files={_place(path, base): path for path in everything},
+        cameras=[
+            CameraSummary(
+                c.name, "proxy" if c.is_proxy else "video" if c.video else "nothing", c.note
+            )
+            for c in cameras
+        ],
+        bytes=sum(path.stat().st_size for path in own),
+        problems=problems,
+    )
+
+
+def _place(path: Path, base: Path) -> str:
+    resolved = path.parent.resolve() / path.name
+    return f"/{resolved.relative_to(base).as_posix()}"

@@ -1,0 +1,295 @@
+"""``frames``: one frame as an image, or many as a contact sheet."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.frames import Frames
+from mp4ds.dataset.topic_frames import TopicFrames
+from mp4ds.dataset.views import Resize, size_after
+from mp4ds.errors import FrameNotFoundError, OptionError
+from mp4ds.files.outputs import begins_with, staged
+from mp4ds.messages.encodings import ENCODINGS, Pixels
+from mp4ds.options import Options, force, option, resize
+from mp4ds.plugins.reporting.proxies import Look
+from mp4ds.video.drawing import Page
+from mp4ds.video.images import ImageFile, encoding_as
+
+_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
+_MOST_FRAMES = 400  # of a sheet
+_MOST_SIDE = 16384  # pixels of a sheet
+_SHEET_WIDTH = 320  # of a frame on it
+_GAP, _LABEL, _TEXT = 6, 18, 12  # pixels of a sheet
+_PAGE, _INK = (24, 28, 32), (222, 226, 230)
+_BEYOND_NS = 10**9  # that a time may be before the first frame, or after the last one
+_QUALITY = 92
+_NS = 10**9
+_ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?Z?")
+
+
+def parse_sheet(text: str) -> tuple[int, int]:
+    """Columns and rows of ``5x4``.
+
+    Raises:
+        OptionError: It is no such text.
+    """
+    match = re.fullmatch(r"([1-9][0-9]{0,2})x([1-9][0-9]{0,2})", text.strip().lower())
+    if not match:
+        raise OptionError(f"`sheet` {text!r} is not COLUMNSxROWS, such as 5x4.")
+    return int(match[1]), int(match[2])
+
+
+@dataclass(frozen=True)
+class StillOptions(Options):
+    """Which frames are saved, and how."""
+
+    topic: str = option("Of the camera, where there are several.", "", "-t")
+    at: str | None = option(
+        "+SECONDS from the first frame, SECONDS.FRACTION or NANOSECONDS since 1970, an ISO date, "
+        "or #NUMBER of the frame.",
+        metavar="TIME",
+    )
+    sheet: tuple[int, int] | None = option(
+        "So many frames beside and below each other.", metavar="5x4", parse=parse_sheet
+    )
+    resize: float | tuple[int, int] | None = resize(
+        "Size of the frame, or of each; 320 columns on a sheet by default."
+    )
+    exact: bool = option("The samples as recorded, as unpack --to images has them.", False)
+    force: bool = force()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.at is None) == (self.sheet is None):
+            raise OptionError("Give either `at` TIME or `sheet` 5x4.")
+        if self.exact and (self.sheet or self.resize is not None):
+            raise OptionError("`exact` goes neither with `sheet` nor with `resize`.")
+        if self.sheet and not 1 <= self.sheet[0] * self.sheet[1] <= _MOST_FRAMES:
+            raise OptionError(f"`sheet` has 1 to {_MOST_FRAMES} frames.")
+
+
+@dataclass(frozen=True)
+class SavedFrame:
+    """A frame of an image that was saved.
+
+    Attributes:
+        index: Its number.
+        stamp_ns: Header stamp, nanoseconds.
+        log_time_ns: Log time, nanoseconds.
+    """
+
+    index: int
+    stamp_ns: int
+    log_time_ns: int
+
+
+@dataclass(frozen=True)
+class StillSummary:
+    """An image that was saved.
+
+    Attributes:
+        output: The file.
+        topic: Of the camera.
+        frames: In the order of a sheet, by rows.
+        size: Width and height, pixels.
+    """
+
+    output: Path
+    topic: str
+    frames: list[SavedFrame]
+    size: tuple[int, int]
+
+
+def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> StillSummary:
+    """Save a frame, or a contact sheet of frames that are equally far apart.
+
+    A frame looks as it does for the eye: mosaics are interpolated, light of 16 bits stays of 16
+    bits in a PNG file, depths and other numbers get colours.
+
+    Args:
+        dataset: A dataset, or one video with its sidecar; or its URL.
+        output: A ``.png`` or ``.jpg``.
+        options: Which frames, and how.
+
+    Raises:
+        OptionError: An option is wrong, or the file cannot hold the image.
+        FrameNotFoundError: The camera has no frame near the time.
+        VideoError: A frame cannot be decoded.
+        TargetError: The output may not be written there.
+        WriteError: The disk refused.
+    """
+    target = Path(output)
+    kind = _SUFFIXES.get(target.suffix.lower())
+    if kind is None:
+        raise OptionError(f"{target} is neither a .png nor a .jpg: give a name that ends so.")
+    with Dataset(dataset) as opened:
+        stream = _chosen(opened, options.topic)
+        if options.sheet:
+            numbers = spread(len(stream), options.sheet[0] * options.sheet[1])
+            pixels, encoding = _sheet(stream, numbers, options.sheet, options.resize), "rgb8"
+        else:
+            numbers = [number_at(stream, options.at or "")]
+            source = (stream, numbers[0])
+            if isinstance(stream, TopicFrames):
+                source = stream.place_of(numbers[0])
+            pixels, encoding = _still(*source, kind, options)
+        data = ImageFile(encoding, kind, quality=_QUALITY).encode(pixels)
+        with staged(
+            target.absolute(),
+            force=options.force,
+            owned=_image_names,
+        ) as path:
+            path.write_bytes(data)
+        return StillSummary(
+            output=target,
+            topic=stream.topic,
+            frames=[
+                SavedFrame(number, int(stream.stamps[number]), int(stream.log_times[number]))
+                for number in numbers
+            ],
+            size=(pixels.shape[1], pixels.shape[0]),
+        )
+
+
+def _image_names(path: Path) -> set[str] | None:
+    return {""} if begins_with(path, b"\x89PNG", b"\xff\xd8\xff") else None
+
+
+def _chosen(dataset: Dataset, topic: str) -> Frames:
+    if topic:
+        try:
+            return dataset[topic]
+        except KeyError as error:
+            raise OptionError(f"{error.args[0]}.") from None
+    if len(dataset.topics) != 1:
+        known = ", ".join(dataset.topics) or "none"
+        raise OptionError(f"{dataset.path} has several cameras or none: give `topic` of {known}.")
+    return dataset[dataset.topics[0]]
+
+
+# ---------------------------------------------------------------- which
+
+
+def spread(count: int, wanted: int) -> list[int]:
+    """Numbers of frames that are equally far apart, in the middle of as many parts.
+
+    All, where there are not more than are wanted.
+    """
+    if count <= wanted:
+        return list(range(count))
+    return [(2 * number + 1) * count // (2 * wanted) for number in range(wanted)]
+
+
+def number_at(stream: Frames, text: str) -> int:
+    """Number of the frame that is nearest to a time, or that was asked for by number.
+
+    Raises:
+        OptionError: The text is no time, or there is no frame of that number.
+        FrameNotFoundError: The time is more than a second before the first frame, or after the
+            last one.
+    """
+    if text.startswith("#"):
+        count = len(stream)
+        if not re.fullmatch(r"#[0-9]{1,9}", text) or int(text[1:]) >= count:
+            raise OptionError(f"`at` {text!r}: frames of {stream.topic} are #0 to #{count - 1}.")
+        return int(text[1:])
+    time = time_of(text, int(stream.stamps[0]))
+    index = stream.index_at(time)
+    nearest = int(stream.stamps[index])
+    is_beyond = not int(stream.stamps.min()) <= time <= int(stream.stamps.max())
+    if is_beyond and abs(nearest - time) > _BEYOND_NS:
+        raise FrameNotFoundError(stream.topic, time, "near", nearest)
+    return index
+
+
+def time_of(text: str, start_ns: int) -> int:
+    """Nanoseconds since 1970 of a time as users write it.
+
+    Args:
+        text: ``+2.5``: seconds from the first frame; ``1700000000.123456789``: seconds, all nine
+            digits counting; ``1700000000123456789``: nanoseconds; ``2023-11-14T22:13:20.5``: UTC.
+        start_ns: Of the first frame.
+
+    Raises:
+        OptionError: It is none of these.
+    """
+    clean = text.strip()
+    if match := re.fullmatch(r"\+([0-9]{1,9})(?:\.([0-9]{1,9}))?", clean):
+        return start_ns + _nanoseconds(int(match[1]), match[2])
+    if match := re.fullmatch(r"([0-9]{1,10})\.([0-9]{1,9})", clean):
+        return _nanoseconds(int(match[1]), match[2])
+    if re.fullmatch(r"-?[0-9]{1,19}", clean):
+        return int(clean)
+    if match := _ISO.fullmatch(clean):
+        try:
+            moment = datetime.fromisoformat(match[1]).replace(tzinfo=timezone.utc)
+        except ValueError as error:
+            raise OptionError(f"`at` {text!r} is no date: {error}.") from None
+        return _nanoseconds(int(moment.timestamp()), match[2])
+    raise OptionError(
+        f"`at` {text!r} is no time. Give +SECONDS from the first frame, SECONDS.FRACTION or "
+        "NANOSECONDS since 1970, a date such as 2023-11-14T22:13:20.5, or #NUMBER of the frame."
+    )
+
+
+def _nanoseconds(seconds: int, fraction: str | None) -> int:
+    return seconds * _NS + int((fraction or "0").ljust(9, "0"))
+
+
+# ---------------------------------------------------------------- how
+
+
+def _still(stream: Frames, number: int, kind: str, options: StillOptions) -> tuple[Pixels, str]:
+    """Pixels of one frame, and their encoding."""
+    if options.exact:
+        return stream.get([number])[0].data, stream.encoding
+    encoding = ENCODINGS[stream.encoding]
+    if encoding_as(encoding, "rgb") and (encoding.bytes_per_sample == 1 or kind == "png"):
+        frame = stream.get([number], format="rgb", resize=options.resize)[0]
+        return frame.data, frame.encoding
+    size = stream.image_size
+    if options.resize is not None:
+        size = size_after(stream.topic, size, options.resize)
+    look = Look(stream, size)
+    return look.picture(stream.get([number])[0].data), "rgb8"
+
+
+def _sheet(
+    stream: Frames, numbers: list[int], sheet: tuple[int, int], resize: Resize
+) -> NDArray[np.uint8]:
+    """All frames on one picture, each with its number and time."""
+    width, height = stream.image_size
+    factor = min(1.0, _SHEET_WIDTH / width)
+    size = size_after(stream.topic, (width, height), factor if resize is None else resize)
+    cell = size[0] + _GAP, size[1] + _GAP + _LABEL
+    columns, rows = sheet
+    rows = -(-len(numbers) // columns)
+    whole = columns * cell[0] + _GAP, rows * cell[1] + _GAP + _LABEL
+    if max(whole) > _MOST_SIDE:
+        raise OptionError(
+            f"A sheet of {whole[0]}x{whole[1]} pixels is larger than {_MOST_SIDE}: give `resize`."
+        )
+    look = Look(stream, size)
+    page = Page(whole, paper=_PAGE, ink=_INK, text_size=_TEXT)
+    title = f"{stream.topic}  {look.caption}".strip()
+    page.write((_GAP, 3), _printable(title))
+    start = int(stream.stamps[0])
+    for place, number in enumerate(numbers):
+        frame = stream.get([number])[0]
+        x = _GAP + place % columns * cell[0]
+        y = _LABEL + _GAP + place // columns * cell[1]
+        page.put((x, y), look.picture(frame.data))
+        label = f"#{number}  {(frame.stamp_ns - start) / _NS:+.3f} s"
+        page.write((x, y + size[1] + 2), label)
+    return page.pixels()
+
+
+def _printable(text: str) -> str:
+    return "".join(letter if letter.isprintable() else "?" for letter in text)[:200]

@@ -1,0 +1,410 @@
+"""Integer nanoseconds: columns of them as text, presentation times, intervals, and cameras matched.
+
+numpy only (spec/index.md, "Columns" and "Presentation times").
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from array import array
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from operator import index as as_integer
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.errors import OptionError
+
+TIMESCALE = 1_000_000
+"""Ticks per second of every video track: microseconds."""
+
+MAX_GAP_NS = 1_000 * 10**9
+"""A longer gap is shown as this long: past 2,147 s the container breaks."""
+
+NS_PER_TICK = 10**9 // TIMESCALE
+INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
+_PER_LINE = 32
+_MINUS, _ZERO = ord("-"), ord("0")
+_TOKENS = re.compile(r"\s*-?[0-9]+(?:\*[0-9]+)?(?:\s+-?[0-9]+(?:\*[0-9]+)?)*\s*")
+_COLUMN_BYTES = b"0123456789-* \n"
+
+
+def encode_column(values: Sequence[int] | NDArray[np.int64]) -> dict[str, int | str]:
+    """Encode integers as a start, a step and the residuals of their differences.
+
+    ``value[0] = start`` and ``value[i] = value[i-1] + step + residual[i-1]``.
+
+    Args:
+        values: At least one 64-bit integer.
+
+    Returns:
+        ``start``, ``step`` and ``values``: residuals as text, 32 a line, where ``r*n``
+        stands for n times r.
+    """
+    column = np.asarray(values, dtype=np.int64)
+    with np.errstate(over="ignore"):
+        differences = np.diff(column)  # wraps around like the sum that undoes it
+        middle = len(differences) // 2
+        step = int(np.partition(differences, middle)[middle]) if len(differences) else 0
+        residuals = differences - np.int64(step)
+    return {"start": int(column[0]), "step": step, "values": _encode_residuals(residuals)}
+
+
+def _encode_residuals(residuals: NDArray[np.int64]) -> str:
+    if not len(residuals):
+        return ""
+    edges = np.flatnonzero(np.diff(residuals)) + 1
+    if len(edges) < len(residuals) // 4 or not len(edges):
+        starts = np.concatenate(([0], edges))
+        lengths = np.diff(np.concatenate((starts, [len(residuals)])))
+        tokens = [
+            f"{value}*{count}" if count > 1 else str(value)
+            for value, count in zip(residuals[starts].tolist(), lengths.tolist(), strict=True)
+        ]
+    else:
+        tokens = list(map(str, residuals.tolist()))
+        if residuals.max() == INT64_MAX or residuals.min() == INT64_MIN:
+            tokens[0] += "*1"  # runs are read without saturation
+    lines = (" ".join(tokens[i : i + _PER_LINE]) for i in range(0, len(tokens), _PER_LINE))
+    return "\n".join(lines) + "\n"
+
+
+def decode_column(start: int, step: int, text: str, count: int) -> NDArray[np.int64]:
+    """Decode what `encode_column` wrote.
+
+    Args:
+        start: First value.
+        step: Common difference.
+        text: Residuals.
+        count: Number of values that the column must have, at least one.
+
+    Returns:
+        int64 array of shape (count,).
+
+    Raises:
+        ValueError: The text is not a column of that length; says why.
+    """
+    residuals = _decode_residuals(text, count - 1)
+    column = np.empty(count, dtype=np.int64)
+    column[0] = start
+    with np.errstate(over="ignore"):
+        residuals += np.int64(step)  # in place: a fresh array costs more than the sum
+        np.cumsum(residuals, out=column[1:])
+        column[1:] += np.int64(start)
+    return column
+
+
+def _decode_residuals(text: str, count: int) -> NDArray[np.int64]:
+    raw = text.encode("ascii", "replace")
+    if raw.translate(None, _COLUMN_BYTES):
+        raise ValueError("holds something else than integers")
+    codes = np.frombuffer(raw, np.uint8)
+    signs = codes[:-1] == _MINUS
+    signs &= codes[1:] < _ZERO
+    if raw.endswith(b"-") or signs.any():
+        raise ValueError("holds a sign without digits")
+    if b"*" in raw:
+        return _decode_runs(text, count)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # numpy warns where it stops early
+        try:
+            values = np.fromstring(text, dtype=np.int64, sep=" ")
+        except (DeprecationWarning, ValueError):
+            raise ValueError("holds something else than integers") from None
+    if not raw.strip():
+        values = values[:0]
+    if len(values) != count:
+        raise ValueError(f"holds {len(values) + 1} values where {count + 1} are due")
+    # numpy saturates what does not fit, without a word
+    if len(values) and (values.max() == INT64_MAX or values.min() == INT64_MIN):
+        raise ValueError("holds an integer beyond 64 bits")
+    return values
+
+
+def _decode_runs(text: str, count: int) -> NDArray[np.int64]:
+    if not _TOKENS.fullmatch(text):
+        raise ValueError("holds something else than integers and runs")
+    values: list[int] = []
+    lengths: list[int] = []
+    total = 0
+    for token in text.split():
+        value, _, length = token.partition("*")
+        values.append(int(value))
+        lengths.append(int(length or 1))
+        if not lengths[-1]:
+            raise ValueError("holds a run of no values")
+        total += lengths[-1]
+        if total > count:
+            break
+    if total != count:
+        raise ValueError(f"does not hold the {count + 1} values that are due")
+    if any(not INT64_MIN <= value <= INT64_MAX for value in values):
+        raise ValueError("holds an integer beyond 64 bits")
+    return np.repeat(np.array(values, dtype=np.int64), lengths)
+
+
+class PresentationClock:
+    """Turns stamps into the strictly increasing ticks that a player shows.
+
+    The first frame is shown at 0. The time between two frames is that of their header stamps
+    where these advance by at most `MAX_GAP_NS`, else that of their log times, else one tick.
+    """
+
+    def __init__(self) -> None:
+        self._stamp: int | None = None
+        self._log_time = 0
+        self._elapsed = 0
+        self._tick = -1
+
+    def tick(self, stamp: int, log_time: int) -> int:
+        """Presentation time of the next frame, in ticks of 1 / `TIMESCALE` s."""
+        if self._stamp is not None:
+            gap = stamp - self._stamp
+            if not 0 < gap <= MAX_GAP_NS:
+                gap = min(max(log_time - self._log_time, 0), MAX_GAP_NS)
+            self._elapsed += gap
+        self._stamp, self._log_time = stamp, log_time
+        self._tick = max(self._elapsed // NS_PER_TICK, self._tick + 1)
+        # clamping up counts as elapsed, so that a burst does not make later frames late twice
+        self._elapsed = max(self._elapsed, self._tick * NS_PER_TICK)
+        return self._tick
+
+
+class Int64Column:
+    """A growing column that takes eight bytes a value."""
+
+    def __init__(self) -> None:
+        self._values = array("q")
+
+    def append(self, value: int) -> None:
+        """Append a value.
+
+        Raises:
+            OverflowError: It does not fit into 64 bits.
+        """
+        self._values.append(value)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def to_numpy(self) -> NDArray[np.int64]:
+        """A view of the values; do not append while it is in use."""
+        return (
+            np.frombuffer(self._values, dtype=np.int64) if self._values else np.empty(0, np.int64)
+        )
+
+
+# ---------------------------------------------------------------- intervals
+
+Integers = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+_LOST_FROM = 1.5  # usual intervals without a frame
+
+
+def differences(later: Integers, earlier: Integers) -> Floats:
+    """Differences of times in nanoseconds; exact below 2^53, and right in size beyond 2^63."""
+    with np.errstate(over="ignore"):
+        exact = later - earlier
+    rough: Floats = later.astype(np.float64) - earlier.astype(np.float64)
+    return np.where(np.abs(rough) < 2.0**62, exact.astype(np.float64), rough)
+
+
+def nearest(times: Integers, wanted: Integers) -> Integers:
+    """Places of the times that are nearest to others.
+
+    Of two equally near ones it is the earlier, of several equal ones the first.
+
+    Args:
+        times: Increasing or equal, at least one.
+        wanted: What is looked for, of any shape.
+    """
+    after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    is_later = np.abs(differences(times[after], wanted)) < np.abs(
+        differences(wanted, times[before])
+    )
+    return np.searchsorted(times, times[np.where(is_later, after, before)])
+
+
+def intervals(times: Integers) -> Floats:
+    """Nanoseconds from each frame to the next, shape (frames - 1,)."""
+    return differences(times[1:], times[:-1])
+
+
+def usual_interval(steps: Floats) -> float | None:
+    """Median of the intervals that advance, nanoseconds; None where none does."""
+    advancing = steps[steps > 0]
+    return float(np.median(advancing)) if len(advancing) else None
+
+
+def lost_frames(steps: Floats) -> Integers:
+    """How many frames seem to be missing in each interval.
+
+    An interval of more than 1.5 times the median is taken for as many as fit into it, rounded.
+    Of it is taken off first what the intervals right before and after are shorter than the
+    median: a frame that came late, or early, is not a lost one.
+    """
+    usual = usual_interval(steps)
+    if usual is None:
+        return np.zeros(len(steps), np.int64)
+    short = np.pad(np.clip(usual - steps, 0, usual), 1)
+    spread = steps - short[:-2] - short[2:]
+    missing = np.floor(spread / usual + 0.5) - 1
+    missing[spread <= _LOST_FROM * usual] = 0
+    whole: Integers = np.minimum(missing, 2.0**53).astype(np.int64)
+    return whole
+
+
+# ---------------------------------------------------------------- sync
+
+
+_MOST = 2**64 - 1  # no two stamps are farther apart, nanoseconds
+
+
+@dataclass(frozen=True, eq=False)
+class Sync:
+    """Matches of the frames of several topics. ``len()`` is the number of matches.
+
+    A match has one frame of each topic, and no frame is in two matches. Each topic is matched
+    with the reference by itself: a frame of the one and a frame of the other may go together
+    where no frame of these two topics has a stamp between theirs. The pair that is nearest in
+    time is taken first, of equally near ones the earlier, and neither of them again.
+
+    Attributes:
+        topics: Names of the topics, in the order of the columns.
+        reference: The topic that the others were matched with.
+        tolerance_ns: Most nanoseconds between a frame and that of the reference.
+        indices: Frame numbers, int64, shape (matches, topics), by stamp of the reference.
+        stamps: Stamps of these frames, nanoseconds, int64, shape (matches, topics).
+        unmatched: Numbers of the frames that are in no match, int64, increasing, by topic.
+    """
+
+    topics: tuple[str, ...]
+    reference: str
+    tolerance_ns: int
+    indices: Integers
+    stamps: Integers
+    unmatched: dict[str, Integers]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+
+def synchronize(
+    stamps: Mapping[str, Integers], *, tolerance_ns: int, reference: str | None = None
+) -> Sync:
+    """Match frames by their stamps; see `Sync`.
+
+    Args:
+        stamps: Of each topic's frames, nanoseconds; unsorted and repeated as they may be.
+        tolerance_ns: Most nanoseconds between a frame and that of the reference.
+        reference: One of the topics; None: the one with the fewest frames, of several the first.
+
+    Raises:
+        OptionError: There is no topic, no such reference, or the tolerance is negative.
+    """
+    tolerance = as_integer(tolerance_ns)
+    if tolerance < 0:
+        raise OptionError(f"a tolerance of {tolerance} ns: use 0 or more")
+    if not stamps:
+        raise OptionError("there are no topics to match")
+    if reference is None:
+        reference = min(stamps, key=lambda topic: len(stamps[topic]))
+    if reference not in stamps:
+        raise OptionError(f"reference {reference!r} is not one of {', '.join(stamps)}")
+    own = stamps[reference]
+    columns = [
+        np.arange(len(own)) if topic == reference else match(own, other, tolerance_ns=tolerance)
+        for topic, other in stamps.items()
+    ]
+    indices = np.column_stack(columns).astype(np.int64, copy=False)
+    indices = indices[(indices >= 0).all(axis=1)]
+    place = list(stamps).index(reference)
+    indices = indices[np.argsort(own[indices[:, place]], kind="stable")]
+    unmatched = {}
+    for column, (topic, times) in zip(indices.T, stamps.items(), strict=True):
+        is_left = np.ones(len(times), np.bool_)
+        is_left[column] = False
+        unmatched[topic] = np.flatnonzero(is_left).astype(np.int64, copy=False)
+    found = np.column_stack(
+        [times[column] for times, column in zip(stamps.values(), indices.T, strict=True)]
+    )
+    return Sync(tuple(stamps), reference, tolerance, indices, found, unmatched)
+
+
+def match(reference: Integers, other: Integers, *, tolerance_ns: int) -> Integers:
+    """The frame of the other topic that goes with each of the reference; see `Sync`.
+
+    Args:
+        reference: Stamps, nanoseconds.
+        other: Stamps, nanoseconds.
+        tolerance_ns: Most nanoseconds between both.
+
+    Returns:
+        Frame numbers, int64, shape of `reference`; -1 where there is none.
+    """
+    times, numbers, is_other = _merged(reference, other)
+    # numbers without a sign, since times may be more than 2^63 apart
+    unsigned: NDArray[np.uint64] = times.view(np.uint64)
+    gaps = unsigned[1:] - unsigned[:-1]
+    may_go = (is_other[1:] != is_other[:-1]) & (gaps <= np.uint64(min(tolerance_ns, _MOST)))
+    first = np.flatnonzero(_nearest_first(gaps, may_go))
+    found = np.full(len(reference), -1, np.int64)
+    swapped = is_other[first]
+    found[numbers[np.where(swapped, first + 1, first)]] = numbers[
+        np.where(swapped, first, first + 1)
+    ]
+    return found
+
+
+def _merged(reference: Integers, other: Integers) -> tuple[Integers, Integers, NDArray[np.bool_]]:
+    """Both topics by stamp: stamps, frame numbers, and which are of the other topic.
+
+    Of frames with equal stamps, one of the reference is followed by one of the other.
+    """
+    parts = [_ranked(reference), _ranked(other)]
+    times, numbers, ranks = (np.concatenate(same) for same in zip(*parts, strict=True))
+    is_other = np.arange(len(times)) >= len(reference)
+    order = np.argsort(times, kind="stable")
+    if ranks.any():
+        order = np.lexsort((is_other, ranks, times))
+    return times[order], numbers[order], is_other[order]
+
+
+def _ranked(stamps: Integers) -> tuple[Integers, Integers, Integers]:
+    """Stamps in order, their frames' numbers, and how many equal ones are before each."""
+    numbers = np.argsort(stamps, kind="stable").astype(np.int64, copy=False)
+    times = stamps[numbers]
+    places = np.arange(len(times))
+    is_new = np.append(True, times[1:] != times[:-1])[: len(times)]
+    return times, numbers, places - np.maximum.accumulate(np.where(is_new, places, 0))
+
+
+def _nearest_first(gaps: NDArray[np.uint64], may_go: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which pairs of neighbours are taken, if the nearest is taken first and then its two are not.
+
+    A pair waits for the neighbouring pairs that are nearer. So from each pair that waits for
+    none, along pairs that each wait for the one before, every other one is taken; where two
+    such runs meet, the last pair if it is due in both.
+
+    Args:
+        gaps: Time between each frame and the next one.
+        may_go: Whether the two may go together.
+    """
+    both = may_go[1:] & may_go[:-1]
+    is_later_nearer = gaps[1:] < gaps[:-1]
+    waits_before = np.append(False, both & ~is_later_nearer)[: len(gaps)]
+    waits_after = np.append(both & is_later_nearer, False)[: len(gaps)]
+    is_due = _run_lengths(waits_before) % 2 == 0
+    is_due &= _run_lengths(waits_after[::-1])[::-1] % 2 == 0
+    found: NDArray[np.bool_] = may_go & is_due
+    return found
+
+
+def _run_lengths(waits: NDArray[np.bool_]) -> Integers:
+    """How many places each is after the last one that does not wait."""
+    places = np.arange(len(waits))
+    return places - np.maximum.accumulate(np.where(waits, 0, places))

@@ -1,0 +1,572 @@
+"""Samples by number, and in the order of the recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from operator import index as as_integer
+from typing import Any, Literal, Protocol, SupportsIndex, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.utils.data import Dataset, IterableDataset, get_worker_info
+
+from mp4ds.errors import Mp4dsError, OptionError, SampleError
+from mp4ds.torch.cameras import (
+    Backend,
+    Collection,
+    Crop,
+    Dtype,
+    OpenCamera,
+    OpenCameras,
+    Paths,
+    Pictures,
+    Recording,
+    Resize,
+    pictures_from,
+)
+
+Unit = Literal["frames", "seconds"]
+_MOST_SECONDS = 10**9
+
+
+class Stamped(Protocol):
+    """The stamps of a camera."""
+
+    @property
+    def stamps(self) -> NDArray[np.int64]:
+        """Header stamps, nanoseconds, by frame."""
+        ...
+
+    @property
+    def period_ns(self) -> int:
+        """Median time between frames, nanoseconds."""
+        ...
+
+    def nearest(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The frames whose stamps are nearest to times, of the same shape."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Offsets:
+    """Offsets of the frames of a sample from its own, in rows or in nanoseconds.
+
+    Attributes:
+        steps: The offsets.
+        timed: Whether they are nanoseconds.
+        tolerance_ns: How far a frame may be from its time; None: half a period of the camera.
+    """
+
+    steps: tuple[int, ...] = (0,)
+    timed: bool = False
+    tolerance_ns: int | None = None
+
+    def frames(
+        self, recording: Recording, camera: int, timeline: Stamped, rows: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Frame numbers of samples, and which of them only stand in for what is not there.
+
+        Args:
+            recording: Of the samples.
+            camera: Number of the camera.
+            timeline: The camera's stamps; not used unless offsets are times.
+            rows: The samples, shape (N,).
+
+        Returns:
+            Two arrays of shape (N, offsets).
+        """
+        steps = np.array(self.steps, np.int64)
+        if not self.timed:
+            wanted = rows[:, None] + steps
+            there = np.clip(wanted, 0, recording.rows - 1)
+            return recording.frames(there, camera), there != wanted
+        own = recording.frames(rows, camera)[:, None]
+        stamps = timeline.stamps
+        times = stamps[own] + steps
+        # with equal stamps, the nearest to its own time may be another frame
+        found = np.where(steps == 0, own, timeline.nearest(times))
+        tolerance = timeline.period_ns // 2 if self.tolerance_ns is None else self.tolerance_ns
+        return found, np.abs(stamps[found] - times) > tolerance
+
+
+def offsets_from(values: Sequence[float], unit: Unit, tolerance_ns: int | None) -> Offsets:
+    """The offsets that a user gave.
+
+    Raises:
+        OptionError: They are none, or no numbers of that unit.
+    """
+    given = tuple(values)
+    if not given:
+        raise OptionError("offsets is empty; (0,) is the sample's own frame alone.")
+    if unit == "frames":
+        if any(isinstance(value, bool) or value != int(value) for value in given):
+            raise OptionError(f"offsets are {given}, and those in frames are whole numbers.")
+        if tolerance_ns is not None:
+            raise OptionError('tolerance_ns belongs to offsets_in="seconds".')
+        return Offsets(tuple(int(value) for value in given))
+    if unit != "seconds":
+        raise OptionError(f"offsets_in is {unit!r}, and not one of frames, seconds.")
+    if not all(abs(value) <= _MOST_SECONDS for value in given):
+        raise OptionError(f"offsets are {given}, and those in seconds are at most 1e9.")
+    if tolerance_ns is not None and tolerance_ns < 0:
+        raise OptionError(f"tolerance_ns is {tolerance_ns}, and must not be negative.")
+    return Offsets(tuple(round(value * 10**9) for value in given), True, tolerance_ns)
+
+
+# ---------------------------------------------------------------- windows
+
+_T = TypeVar("_T")
+
+
+def windows(collection: Collection, length: int) -> NDArray[np.int64]:
+    """All windows, as recording and number in it; shape (windows, 2).
+
+    Args:
+        collection: The samples.
+        length: Samples of a window.
+    """
+    counts = [-(-recording.rows // length) for recording in collection.recordings]
+    return np.array(
+        [(number, window) for number, count in enumerate(counts) for window in range(count)],
+        np.int64,
+    ).reshape(-1, 2)
+
+
+def rows_of(
+    recording: Recording, window: int, length: int, keys: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """The samples of a window.
+
+    It begins with the first sample at or after ``window * length`` whose frame of the first
+    camera comes first behind a key frame, and ends where the next one begins. So windows are a
+    partition of the samples, whatever key frames there are, and some may be empty.
+
+    Args:
+        recording: Of the samples.
+        window: Its number.
+        length: Samples of a window.
+        keys: Numbers of the key frames of the first camera, in order.
+    """
+    first = _start(recording, window * length, keys)
+    return np.arange(first, _start(recording, (window + 1) * length, keys), dtype=np.int64)
+
+
+def _start(recording: Recording, row: int, keys: NDArray[np.int64]) -> int:
+    rows = recording.rows
+    if row <= 0 or row >= rows:
+        return min(max(row, 0), rows)
+    frames = recording.frames(np.arange(row - 1, rows, dtype=np.int64), 0)
+    groups = np.searchsorted(keys, frames, side="right")
+    begins = np.flatnonzero(groups[1:] > groups[:-1])
+    return row + int(begins[0]) if len(begins) else rows
+
+
+def shuffled(samples: Iterator[_T], size: int, random: np.random.Generator) -> Iterator[_T]:
+    """Samples in random order, as far as a buffer of `size` allows."""
+    kept: list[_T] = []
+    for sample in samples:
+        if len(kept) < size:
+            kept.append(sample)
+            continue
+        place = int(random.integers(size))
+        kept[place], sample = sample, kept[place]
+        yield sample
+    random.shuffle(kept)
+    yield from kept
+
+
+# ---------------------------------------------------------------- samples
+
+Sample = dict[str, Any]
+Transform = Callable[[Sample], Any]
+
+
+class SampleReader:
+    """Reads the samples of a collection.
+
+    Args:
+        collection: The samples.
+        pictures: How their frames become tensors.
+        offsets: Which frames a sample has.
+        transform: What makes of a sample that which is given; None: nothing.
+        cache_files: How many videos are open at most.
+
+    Raises:
+        OptionError: `cache_files` is less than one.
+    """
+
+    def __init__(
+        self,
+        collection: Collection,
+        pictures: Pictures,
+        offsets: Offsets,
+        transform: Transform | None,
+        cache_files: int,
+    ) -> None:
+        self._collection = collection
+        self._offsets = offsets
+        self._transform = transform
+        self.cameras = OpenCameras(cache_files, pictures)
+
+    def key_frames(self, number: int) -> NDArray[np.int64]:
+        """Numbers of the key frames of a recording's first camera, in order.
+
+        Raises:
+            SampleError: Its video cannot be read.
+        """
+        recording = self._collection.recordings[number]
+        with _named(recording.path, self._collection.topics[0]):
+            return self.cameras.get(recording, 0).key_frames
+
+    def read(self, number: int, rows: NDArray[np.int64]) -> list[Any]:
+        """Samples of one recording; the frames of each camera are decoded in one pass.
+
+        Args:
+            number: Of the recording.
+            rows: The samples, shape (N,), in any order.
+
+        Raises:
+            SampleError: A frame cannot be read.
+        """
+        first = int(self._collection.starts[number])
+        samples: list[Sample] = [{} for _ in rows]
+        masks: list[Sample] = [{} for _ in rows]
+        stamps: list[int] = []
+        for camera_number, topic in enumerate(self._collection.topics):
+            recording = self._collection.recordings[number]
+            with _named(recording.path, topic):
+                camera = self.cameras.get(recording, camera_number)
+                frames, padded = self._offsets.frames(recording, camera_number, camera, rows)
+                tensors = self._windows(camera, frames)
+                if camera_number == 0:
+                    stamps = camera.stamps[recording.frames(rows, 0)].tolist()
+            flags = torch.from_numpy(padded)
+            for place, sample in enumerate(samples):
+                sample[topic] = tensors[place]
+                masks[place][f"{topic}_is_pad"] = flags[place]
+        for place, row in enumerate(rows.tolist()):
+            samples[place] |= masks[place]
+            samples[place] |= {"stamp_ns": stamps[place], "index": first + row, "dataset": number}
+        return samples if self._transform is None else [self._transform(s) for s in samples]
+
+    def _windows(self, camera: OpenCamera, frames: NDArray[np.int64]) -> torch.Tensor:
+        """Frames of shape (N, T) as a tensor of shape (N, T, ...), without T if it is 1."""
+        tensors = camera.read(frames.ravel())
+        if self._offsets == Offsets():
+            return tensors
+        return tensors.unflatten(0, frames.shape)
+
+
+@contextmanager
+def _named(path: str, topic: str) -> Iterator[None]:
+    """Say in an error of which dataset and topic it is."""
+    try:
+        yield
+    except OptionError:
+        raise
+    except SampleError as error:
+        raise SampleError(f"{path}, topic {topic}, {error}") from None
+    except Mp4dsError as error:
+        raise SampleError(f"{path}, topic {topic}: {error}") from None
+
+
+# ---------------------------------------------------------------- dataset
+
+SYNC_TOLERANCE_NS = 20_000_000
+
+
+class FrameDataset(Dataset):
+    """Frames of datasets by number, for a DataLoader that shuffles.
+
+    A sample is a dictionary, here of the topics ``/left`` and ``/right``::
+
+        {"/left": uint8 (T, C, H, W), "/right": ..., "/left_is_pad": bool (T,), ...,
+         "stamp_ns": int, "index": int, "dataset": int}
+
+    T is the number of offsets; with the default, one, tensors are (C, H, W). C is 1 for grey
+    images. ``is_pad`` tells which frames stand in for some that are not there. ``stamp_ns`` is the
+    header stamp of the first topic's frame, ``index`` the sample's number, ``dataset`` that of
+    the path. Tensors are views of an array that they share with no other sample's.
+
+    Of several cameras, a sample has the frames that belong together: they are matched by header
+    stamp (`mp4ds.Dataset.sync`), each frame at most once, and `unmatched` has the others.
+
+    It may be pickled and forked. Videos are opened when first needed, by each process for itself.
+
+    Args:
+        paths: Datasets, one or several: folders, sidecars, videos, URLs.
+        topics: Cameras; None: all of the first dataset. The others must have them, too.
+        offsets: Of the frames of a sample from its own: ``(-1, 0)`` is the one before it and
+            itself.
+        offsets_in: ``frames``: samples of the same recording before and after. ``seconds``: in
+            each camera the frame whose stamp is nearest.
+        tolerance_ns: With seconds, how far a stamp may be from its time without being padding;
+            None: half the median time between the camera's frames.
+        sync_tolerance_ns: How far stamps of different cameras may be apart in a sample.
+        format: ``rgb``, ``bgr``, ``gray`` or ``native``: the pixels as recorded. A mapping by
+            topic gives each camera its own; so do mappings for `resize` and `crop`.
+        resize: Factor, or width and height in pixels.
+        crop: x, y, width, height in pixels; before `resize`.
+        dtype: ``native``: as decoded, which is uint8 but for cameras of more bits. ``uint8``: the
+            same, and refused for those. ``float32``: 0 to 1; native pixels keep their numbers.
+        channels_first: (C, H, W), not (H, W, C).
+        transform: Called with each sample; what it returns takes the sample's place.
+        cache_files: How many videos a process has open at most.
+        fast_colour: See `mp4ds.Dataset`.
+        backend: ``torchcodec`` decodes with that, which converts colours a little differently.
+        device: With ``torchcodec``, where to decode and have the tensors, such as ``cuda``.
+
+    Raises:
+        OptionError: An option is wrong, a topic is not there, or there is no sample.
+        SourceError: A path is no dataset.
+        FormatError: A manifest or sidecar breaks a rule of the format.
+    """
+
+    def __init__(
+        self,
+        paths: Paths,
+        *,
+        topics: Sequence[str] | None = None,
+        offsets: Sequence[float] = (0,),
+        offsets_in: Unit = "frames",
+        tolerance_ns: int | None = None,
+        sync_tolerance_ns: int = SYNC_TOLERANCE_NS,
+        format: str | Mapping[str, str] = "rgb",  # noqa: A002 - as of Stream.read
+        resize: Resize | Mapping[str, Resize] | None = None,
+        crop: Crop | Mapping[str, Crop] | None = None,
+        dtype: Dtype = "native",
+        channels_first: bool = True,
+        transform: Transform | None = None,
+        cache_files: int = 16,
+        fast_colour: bool = False,
+        backend: Backend = "mp4ds",
+        device: str = "cpu",
+    ) -> None:
+        chosen = offsets_from(offsets, offsets_in, tolerance_ns)
+        self._collection = Collection(paths, topics=topics, sync_tolerance_ns=sync_tolerance_ns)
+        pictures = pictures_from(
+            self.topics,
+            format_=format,
+            resize=resize,
+            crop=crop,
+            dtype=dtype,
+            channels_first=channels_first,
+            fast_colour=fast_colour,
+            backend=backend,
+            device=device,
+        )
+        self._reader = SampleReader(self._collection, pictures, chosen, transform, cache_files)
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The cameras of a sample."""
+        return self._collection.topics
+
+    @property
+    def paths(self) -> list[str]:
+        """The datasets; a sample's ``dataset`` is the number of one."""
+        return [recording.path for recording in self._collection.recordings]
+
+    @property
+    def lengths(self) -> list[int]:
+        """Number of samples of each dataset."""
+        return [recording.rows for recording in self._collection.recordings]
+
+    @property
+    def unmatched(self) -> list[dict[str, NDArray[np.int64]]]:
+        """Of each dataset, the numbers of the frames that are in no sample, by topic."""
+        return [recording.unmatched for recording in self._collection.recordings]
+
+    def __len__(self) -> int:
+        return int(self._collection.starts[-1])
+
+    def __getitem__(self, index: SupportsIndex) -> Any:
+        return self.__getitems__([index])[0]
+
+    def __getitems__(self, indices: Sequence[SupportsIndex]) -> list[Any]:
+        """Samples, in the order asked for.
+
+        The frames of each camera are decoded in one pass, in the order that is cheapest.
+
+        Raises:
+            IndexError: There is no sample of a number.
+            SampleError: A frame cannot be read.
+        """
+        wanted = np.array([self._number(index) for index in indices], np.int64)
+        recordings, rows = self._collection.locate(wanted)
+        samples: list[Any] = [None] * len(wanted)
+        for number in np.unique(recordings).tolist():
+            places = np.flatnonzero(recordings == number)
+            for place, sample in zip(
+                places.tolist(), self._reader.read(number, rows[places]), strict=True
+            ):
+                samples[place] = sample
+        return samples
+
+    def _number(self, index: SupportsIndex) -> int:
+        number = as_integer(index)
+        if not -len(self) <= number < len(self):
+            raise IndexError(f"there are {len(self)} samples, and none of number {number}")
+        return number % len(self)
+
+    def close(self) -> None:
+        """Close the videos that this process has open; they are opened again when needed."""
+        self._reader.cameras.close()
+
+
+# ---------------------------------------------------------------- stream
+
+
+class FrameStream(IterableDataset):
+    """Frames of datasets as fast as videos are decoded: from beginning to end.
+
+    The recordings are cut into windows that begin with a key frame. Windows come in random
+    order, shared among the workers of a DataLoader and the processes of a distributed training;
+    each sample is read once an epoch, by one of them. Inside a window frames follow each other,
+    unless a `buffer` mixes them.
+
+    Samples are as those of `FrameDataset` with one frame each. Give no ``shuffle`` to the
+    DataLoader. Processes of a distributed training may get different numbers of samples.
+
+    Args:
+        paths: As of `FrameDataset`, and so are `topics`, `sync_tolerance_ns`, `format`,
+            `resize`, `crop`, `dtype`, `channels_first`, `transform`, `cache_files`, `backend`
+            and `device`.
+        topics: Cameras.
+        sync_tolerance_ns: Of the matches.
+        format: Of the frames.
+        resize: Of the frames.
+        crop: Of the frames.
+        dtype: Of the tensors.
+        channels_first: Of the tensors.
+        transform: Of the samples.
+        window: Samples of a window; the key frames of the first camera make it a little
+            shorter or longer. Several times the distance of key frames, or decoding costs more.
+        shuffle: Whether windows are in random order.
+        seed: Of the order; the same in all processes.
+        buffer: Samples that are kept to mix their order; 0: none.
+        rank: Number of this process of a distributed training.
+        world_size: How many there are.
+        cache_files: Videos that are open at most; one for each camera at least.
+        fast_colour: See `mp4ds.Dataset`.
+        backend: Who decodes.
+        device: Where.
+
+    Raises:
+        OptionError: An option is wrong, a topic is not there, or there is no sample.
+        SourceError: A path is no dataset.
+        FormatError: A manifest or sidecar breaks a rule of the format.
+    """
+
+    def __init__(
+        self,
+        paths: Paths,
+        *,
+        topics: Sequence[str] | None = None,
+        sync_tolerance_ns: int = SYNC_TOLERANCE_NS,
+        format: str | Mapping[str, str] = "rgb",  # noqa: A002 - as of Stream.read
+        resize: Resize | Mapping[str, Resize] | None = None,
+        crop: Crop | Mapping[str, Crop] | None = None,
+        dtype: Dtype = "native",
+        channels_first: bool = True,
+        transform: Transform | None = None,
+        window: int = 256,
+        shuffle: bool = True,
+        seed: int = 0,
+        buffer: int = 0,
+        rank: int = 0,
+        world_size: int = 1,
+        cache_files: int = 16,
+        fast_colour: bool = False,
+        backend: Backend = "mp4ds",
+        device: str = "cpu",
+    ) -> None:
+        _check(window=window, seed=seed, buffer=buffer, rank=rank, world_size=world_size)
+        self._collection = Collection(paths, topics=topics, sync_tolerance_ns=sync_tolerance_ns)
+        if cache_files < len(self.topics):
+            raise OptionError(
+                f"cache_files is {cache_files}, and must be at least {len(self.topics)}: one for "
+                "each camera."
+            )
+        pictures = pictures_from(
+            self.topics,
+            format_=format,
+            resize=resize,
+            crop=crop,
+            dtype=dtype,
+            channels_first=channels_first,
+            fast_colour=fast_colour,
+            backend=backend,
+            device=device,
+        )
+        self._reader = SampleReader(self._collection, pictures, Offsets(), transform, cache_files)
+        self._window = window
+        self._shuffle = shuffle
+        self._seed = seed
+        self._buffer = buffer
+        self._share = (rank, world_size)
+        # in shared memory, so that workers that outlive an epoch learn of the next
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The cameras of a sample."""
+        return self._collection.topics
+
+    @property
+    def samples(self) -> int:
+        """Number of samples of an epoch, of all processes together."""
+        return int(self._collection.starts[-1])
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the order of the next epoch; the same number gives the same order.
+
+        Args:
+            epoch: 0 or more; the same in all processes.
+
+        Raises:
+            OptionError: It is negative.
+        """
+        _check(epoch=epoch)
+        self._epoch.fill_(epoch)
+
+    def __iter__(self) -> Iterator[Any]:
+        rank, world_size = self._share
+        worker = get_worker_info()
+        if worker is not None:
+            rank = rank * worker.num_workers + worker.id
+            world_size *= worker.num_workers
+        order = (self._seed, int(self._epoch))
+        samples = self._samples(order, rank, world_size)
+        if not self._buffer:
+            return samples
+        return shuffled(samples, self._buffer, np.random.default_rng((*order, rank)))
+
+    def _samples(self, order: tuple[int, int], rank: int, world_size: int) -> Iterator[Any]:
+        all_windows = windows(self._collection, self._window)
+        if self._shuffle:
+            all_windows = np.random.default_rng(order).permutation(all_windows)
+        for number, window in all_windows[rank::world_size].tolist():
+            keys = self._reader.key_frames(number)
+            rows = rows_of(self._collection.recordings[number], window, self._window, keys)
+            for row in rows:  # one by one: the decoder goes on where it was
+                yield from self._reader.read(number, row[None])
+
+    def close(self) -> None:
+        """Close the videos that this process has open; they are opened again when needed."""
+        self._reader.cameras.close()
+
+
+def _check(**numbers: int) -> None:
+    for name, value in numbers.items():
+        least = 1 if name in ("window", "world_size") else 0
+        if value < least:
+            raise OptionError(f"{name} is {value}, and must be at least {least}.")
+    if numbers.get("rank", 0) >= numbers.get("world_size", 1):
+        raise OptionError(
+            f"rank is {numbers['rank']}, and must be less than the world_size, "
+            f"{numbers['world_size']}."
+        )

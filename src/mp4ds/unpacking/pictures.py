@@ -1,0 +1,531 @@
+"""The images of a stream in another form, frame by frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.dataset.rebuild import Choice, DecodedColumns, everything, form_for, marked, unbroken
+from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.views import size_after, view_of
+from mp4ds.errors import OptionError
+from mp4ds.format.models import Header, StreamSidecar
+from mp4ds.messages.depth import HEADER_BYTES
+from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Pixels, pixel_view
+from mp4ds.messages.wire import CodedFields, Fields, ImageFields
+from mp4ds.times import intervals, usual_interval
+from mp4ds.unpacking.types import VideoFields, type_of
+from mp4ds.video.images import ImageFile
+from mp4ds.video.packets import PacketReader, StandAlonePackets
+
+_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Reduction:
+    """Smaller images, and fewer of them. Every stream is reduced by itself.
+
+    Attributes:
+        resize: A factor, or width and height in pixels; None for as recorded.
+        every: Only each frame of which the number in its stream is a multiple of this.
+        max_rate: Most frames in a second, on the average; see `at_most`. None for all.
+
+    Raises:
+        OptionError: There is no such size, number or rate.
+    """
+
+    resize: float | tuple[int, int] | None = None
+    every: int = 1
+    max_rate: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.resize is not None:
+            _check_size(self.resize)
+        if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
+            raise OptionError(f"`every` {self.every!r} is no number of frames: use 1 or more.")
+        rate = self.max_rate
+        if rate is not None and not (
+            isinstance(rate, int | float)
+            and not isinstance(rate, bool)
+            and math.isfinite(rate)
+            and 0 < rate <= _NS
+        ):
+            raise OptionError(f"`max_rate` {rate!r} is no rate: use Hz, such as 10.")
+
+    def size_of(self, stream: Stream) -> tuple[int, int] | None:
+        """Width and height that images of a stream get; None where they have them already.
+
+        Raises:
+            OptionError: They are beyond what an image can have.
+        """
+        if self.resize is None:
+            return None
+        size = size_after(stream.topic, stream.image_size, self.resize)
+        return size if size != stream.image_size else None
+
+    def choice_of(self, stream: Stream, choice: Choice = everything) -> Choice:
+        """Of the frames of a stream that are wanted those that are given."""
+        return marked(self.kept(stream.columns), choice) if self.leaves_out else choice
+
+    @property
+    def leaves_out(self) -> bool:
+        """Whether there may be fewer images."""
+        return self.every > 1 or self.max_rate is not None
+
+    def kept(self, columns: DecodedColumns) -> NDArray[np.bool_]:
+        """Which frames of a stream are given, shape (frames,)."""
+        is_kept = np.zeros(len(columns.stamp), np.bool_)
+        is_kept[:: self.every] = True
+        if self.max_rate is not None:
+            chosen = np.flatnonzero(is_kept)
+            is_kept[chosen] = at_most(self.max_rate, times_of(columns)[chosen])
+        return is_kept
+
+
+def _check_size(resize: Any) -> None:
+    sides = [*resize] if isinstance(resize, tuple | list) else [resize]
+    kinds = (int,) if len(sides) == 2 else (int, float)
+    is_known = isinstance(resize, tuple | list) == (len(sides) == 2)
+    for side in sides:
+        is_number = isinstance(side, kinds) and not isinstance(side, bool)
+        is_known = is_known and is_number and 0 < side <= MAX_SIDE
+    if not is_known:
+        raise OptionError(
+            f"`resize` {resize!r} is no size: use a factor such as 0.5, or width and height of 1 "
+            f"to {MAX_SIDE} pixels."
+        )
+
+
+def times_of(columns: DecodedColumns) -> NDArray[np.int64]:
+    """When the frames were taken, nanoseconds: by their stamps, or by their log times.
+
+    The latter where most stamps do not increase, as those of cameras that leave them zero.
+    """
+    steps = np.diff(columns.stamp)
+    is_sound = 2 * int((steps > 0).sum()) >= len(steps)
+    return columns.stamp if is_sound else columns.log_time
+
+
+def at_most(rate: float, times: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which frames are kept of a camera that is to have no more than a rate.
+
+    A grid of points, 1 / rate apart, begins at the first frame. For each point the first frame
+    is kept that comes less than half of the camera's usual interval before it (and less than half
+    of the grid's), or after it. So a camera of 30 Hz loses nothing at 30 Hz, though its frames
+    come a little too early or too late, and two of three frames remain of it at 20 Hz. After a
+    gap, or where the time goes backward, the grid begins anew.
+
+    Args:
+        rate: Hz.
+        times: Nanoseconds, shape (frames,).
+    """
+    period = max(1, round(_NS / rate))
+    usual = usual_interval(intervals(times))
+    early = min(period, int(usual or period)) // 2
+    is_kept = np.zeros(len(times), np.bool_)
+    due: int | None = None
+    for index, time in enumerate(times.tolist()):
+        if due is None or time >= due + period or time < due - period - early:
+            due = time
+        elif time < due - early:
+            continue
+        is_kept[index] = True
+        due += period
+    return is_kept
+
+
+# ---------------------------------------------------------------- forms
+
+_COLOURS = ("rgb8", "bgr8", "rgba8", "bgra8", "rgb16", "bgr16", "rgba16", "bgra16")
+_DEPTHS = ("16UC1", "mono16")
+_INVERSE_DEPTHS = "32FC1"
+
+
+class AsRecorded(ValueError):  # noqa: N818 - no failure: the messages stay as they are
+    """Images that cannot be given in another form; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """An image in its new form.
+
+    Attributes:
+        fields: What its message says of it.
+        body: Pixels, file or packet.
+        is_key: For a packet, whether decoding can begin with it.
+    """
+
+    fields: Fields | VideoFields
+    body: bytes | memoryview
+    is_key: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Undecoded:
+    """A message that stays as recorded, since its picture does not decode.
+
+    Attributes:
+        payload: The message.
+    """
+
+    payload: bytes | bytearray
+
+
+@dataclass(frozen=True, slots=True)
+class ImageForm:
+    """What images are to be given as.
+
+    Attributes:
+        kind: One of `mp4ds.unpacking.republish.KINDS`.
+        ros1: Whether the messages are for ROS 1.
+        jpeg_quality: Of new JPEG files, 1 to 100.
+        size: Width and height in pixels; None for as recorded.
+        keeps_format: Whether files are called what they were called, where they hold the same.
+    """
+
+    kind: str
+    ros1: bool
+    jpeg_quality: int
+    size: tuple[int, int] | None = None
+    keeps_format: bool = False
+
+
+Maker = Callable[[Pixels], Given]
+
+
+def maker(sidecar: StreamSidecar, header: Header, form: ImageForm) -> Maker:
+    """What makes the new form of an image that a header belongs to.
+
+    Raises:
+        AsRecorded: There is no such form of it; says why.
+    """
+    is_inverse = is_inverse_depth(sidecar, header)
+    if is_inverse and len(header.prefix) != 2 * HEADER_BYTES:
+        raise AsRecorded("the parameters of its quantised depths are missing")
+    recorded = encoding_of(sidecar, header)
+    stored = sidecar.image.encoding if is_inverse else recorded
+    resize, resized = resizer(sidecar, stored, form.size)
+    encoding = recorded if is_inverse else resized
+    if form.kind == "raw":
+        prefix = bytes.fromhex(header.prefix)
+        as_metres = partial(_metres, parameters=prefix[4:]) if is_inverse else None
+        return lambda pixels: _raw(resize(pixels), encoding=encoding, convert=as_metres)
+    try:
+        file = ImageFile(encoding, form.kind, quality=form.jpeg_quality)
+    except OptionError:
+        raise AsRecorded(f"{form.kind.upper()} files cannot hold {encoding} images") from None
+    told = format_of(encoding, form, has_mosaic=form.kind == "png")
+    if form.keeps_format and encoding == recorded:
+        told = header.format or ""
+    return lambda pixels: Given(CodedFields(told), file.encode(resize(pixels)))
+
+
+def resizer(
+    sidecar: StreamSidecar, encoding: str, size: tuple[int, int] | None
+) -> tuple[Callable[[Pixels], Pixels], str]:
+    """What makes pixels of a stream smaller, as its frames are, and their encoding after that.
+
+    A Bayer mosaic and the YUV of cameras cannot be resized as they are, and become RGB.
+
+    Args:
+        sidecar: The stream's.
+        encoding: Of the pixels.
+        size: Width and height to make; None for as they are.
+    """
+    if size is None:
+        return lambda pixels: pixels, encoding
+    known = ENCODINGS[encoding]
+    is_plain = not known.mosaic and known.rows == 1 and known.even == (1, 1)
+    view = view_of(
+        sidecar.channel.topic,
+        known,
+        (sidecar.image.width, sidecar.image.height),
+        format="native" if is_plain else "rgb",
+        resize=size,
+        crop=None,
+    )
+
+    def resize(pixels: Pixels) -> Pixels:
+        made: Pixels = np.empty(view.shape, view.dtype)
+        view.give(np.ascontiguousarray(pixels, known.dtype), made)
+        return made
+
+    return resize, view.encoding.name
+
+
+def encoding_of(sidecar: StreamSidecar, header: Header) -> str:
+    """ROS image encoding of the images; their format tells a mosaic or depths from plain grey."""
+    own, told = ENCODINGS[sidecar.image.encoding], _told(header)
+    if sidecar.body == "pixels":
+        return own.name
+    if _is_depth(sidecar, header):
+        if told not in (*_DEPTHS, _INVERSE_DEPTHS):
+            raise AsRecorded(f"its format {header.format!r} does not tell the unit of its depths")
+        return told
+    known = ENCODINGS.get(told, own)
+    is_alike = known.rows == 1 and known.channels == own.channels == 1
+    return known.name if is_alike and known.dtype == own.dtype else own.name
+
+
+def _told(header: Header) -> str:
+    return (header.format or "").partition(";")[0].strip()
+
+
+def _is_depth(sidecar: StreamSidecar, header: Header) -> bool:
+    """Whether the messages are those of compressed_depth_image_transport."""
+    is_coded = sidecar.body in ("png", "rvl") and sidecar.image.encoding == _DEPTHS[0]
+    return is_coded and (bool(header.prefix) or "compressedDepth" in (header.format or ""))
+
+
+def is_inverse_depth(sidecar: StreamSidecar, header: Header) -> bool:
+    """Whether its depths are quantised inverse metres."""
+    return _is_depth(sidecar, header) and _told(header) == _INVERSE_DEPTHS
+
+
+def format_of(encoding: str, form: ImageForm, *, has_mosaic: bool) -> str:
+    """The field ``format``: the image's encoding, then that of the file.
+
+    Args:
+        encoding: Of the image.
+        form: The form.
+        has_mosaic: Whether the file shows a Bayer mosaic as it is, and not its colours.
+    """
+    known = ENCODINGS[encoding]
+    if known.even != (1, 1) or known.rows != 1 or (known.mosaic and not has_mosaic):
+        encoding = "rgb8"
+    elif encoding == "8UC4" and form.kind == "jpeg":
+        encoding = "8UC3"  # alpha is left out
+    if encoding in _COLOURS:
+        inner = "bgr16" if encoding.endswith("16") else "bgr8"
+    else:
+        is_grey = known.channels == 1 and form.kind == "jpeg"
+        inner = "mono8" if is_grey and not form.ros1 else ""  # ROS 1 leaves it empty
+    return f"{encoding}; {form.kind} compressed {inner}"
+
+
+def _raw(
+    pixels: Pixels, *, encoding: str, convert: Callable[[Pixels], Pixels] | None = None
+) -> Given:
+    if convert is not None:
+        pixels = convert(pixels)
+    height, width = pixels.shape[:2]
+    step = width * ENCODINGS[encoding].pixel_bytes
+    plain = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
+    return Given(ImageFields(encoding, width, height, step, 0), plain.tobytes())
+
+
+def _metres(inverse: NDArray[np.uint16], *, parameters: bytes) -> NDArray[np.float32]:
+    """Depths of inverse ones, as compressed_depth_image_transport computes them."""
+    a, b = np.frombuffer(parameters, "<f4")
+    with np.errstate(all="ignore"):
+        metres = a / (inverse.astype(np.float32) - b)
+    metres[inverse == 0] = np.nan
+    found: NDArray[np.float32] = metres.astype(np.float32, copy=False)
+    return found
+
+
+# ---------------------------------------------------------------- pictures
+
+VIDEO_KINDS = ("compressed-video", "ffmpeg")
+"""Kinds whose messages are packets of the video as it is."""
+
+_VIDEO_CODECS = ("h264", "h265", "av1", "vp9")  # formats of Foxglove's CompressedVideo
+
+Frames = Callable[[Choice, bool], Iterator[tuple[int, Given | Undecoded]]]
+"""One for each frame of a stream that is wanted, with its number, in order.
+
+Packets come with those that they refer to, from a key frame on.
+
+Args:
+    choice: Which are wanted.
+    verify: Compare the whole video first, for where no digest tells damage.
+
+Raises:
+    FormatError: The stream is damaged.
+"""
+
+
+def frames_of(stream: Stream, form: ImageForm) -> Frames:
+    """How the images of a stream are given in another form.
+
+    Raises:
+        AsRecorded: They cannot be; says why.
+    """
+    if form.kind in VIDEO_KINDS:
+        return _video(stream, form.kind)
+    if form.size is None and holds_files(stream.sidecar, form.kind):
+        return partial(_own_files, stream, _own_formats(stream.sidecar, form))
+    makers = [maker(stream.sidecar, header, form) for header in stream.sidecar.headers]
+    if stream.sidecar.body == "pixels":
+        return partial(_from_pixels, stream, makers[0], form)
+    return partial(_from_pictures, stream, makers)
+
+
+def holds_files(sidecar: StreamSidecar, kind: str) -> bool:
+    """Whether the messages of a stream hold JPEG or PNG files already."""
+    if kind == "jpeg":
+        return sidecar.body == "packet" and sidecar.video.codec == "mjpeg"
+    is_metres = any(is_inverse_depth(sidecar, header) for header in sidecar.headers)
+    return kind == "png" and sidecar.body == "png" and not is_metres
+
+
+def files_of(
+    stream: Stream, choice: Choice = everything, verify: bool = True
+) -> Iterator[tuple[int, memoryview]]:
+    """The files of a stream that `holds_files`, byte for byte, each with its number.
+
+    Args:
+        stream: The stream.
+        choice: Which are wanted.
+        verify: Compare the whole video first, where messages have no digests.
+
+    Raises:
+        FormatError: A message does not come back as it was recorded.
+    """
+    variants = stream.columns.variant
+    starts = [len(header.prefix) // 2 for header in stream.sidecar.headers]
+    for index, body in _bodies(stream, choice, verify):
+        start = starts[variants[index]] if stream.sidecar.body == "png" else 0
+        yield index, body[start:]
+
+
+def _video(stream: Stream, kind: str) -> Frames:
+    sidecar = stream.sidecar
+    codec = sidecar.video.codec
+    if codec not in _VIDEO_CODECS:
+        known, name = ", ".join(_VIDEO_CODECS), type_of(kind).rpartition("/")[2]
+        raise AsRecorded(f"{name} has the codecs {known}, and this video is {codec}")
+    if sidecar.body != "packet" and not sidecar.layout.is_shown:
+        raise AsRecorded(
+            f"its video does not show the images as they are seen (layout {sidecar.layout.name})"
+        )
+    return partial(_packets_of, stream)
+
+
+def _packets_of(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[int, Given]]:
+    """The packets of the video, which stand alone from each key frame on."""
+    if verify:
+        _verify(stream)
+    codec, image = stream.sidecar.video.codec, stream.sidecar.image
+    with StandAlonePackets(stream.video_path, codec=codec, frames=len(stream)) as packets:
+        fields = VideoFields(codec, image.encoding, image.width, image.height, packets.pixel_format)
+        wanted = choice(stream.columns)
+        for index in unbroken(wanted, packets.key_numbers, from_key=True):
+            is_key = bool(packets.keyframes[index])
+            yield index, Given(fields, packets.packet(index), is_key=is_key)
+
+
+def _own_formats(sidecar: StreamSidecar, form: ImageForm) -> list[str]:
+    encodings = [encoding_of(sidecar, header) for header in sidecar.headers]
+    return [format_of(encoding, form, has_mosaic=True) for encoding in encodings]
+
+
+def _own_files(
+    stream: Stream, formats: list[str], choice: Choice, verify: bool
+) -> Iterator[tuple[int, Given]]:
+    for index, file in files_of(stream, choice, verify):
+        variant = int(stream.columns.variant[index])
+        yield index, Given(CodedFields(formats[variant]), file)
+
+
+def _from_pixels(
+    stream: Stream, make: Maker, form: ImageForm, choice: Choice, verify: bool
+) -> Iterator[tuple[int, Given]]:
+    """From raw images, whose bytes are compared with their digests."""
+    image = stream.sidecar.image
+    fields = ImageFields(image.encoding, image.width, image.height, image.step, image.is_bigendian)
+    for index, body in _bodies(stream, choice, verify):
+        if form.kind == "raw" and form.size is None:
+            yield index, Given(fields, body)
+            continue
+        pixels = pixel_view(
+            body,
+            ENCODINGS[image.encoding],
+            width=image.width,
+            height=image.height,
+            step=image.step,
+            is_bigendian=bool(image.is_bigendian),
+        )
+        yield index, make(pixels)
+
+
+def _bodies(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[int, memoryview]]:
+    """The bodies of the messages, each compared with its digest."""
+    sidecar = stream.sidecar
+    form = form_for(sidecar.channel.to_record(0), sidecar.wire, str(stream.path))
+    if sidecar.digests is None and verify:
+        stream.verify_video()
+    for index, make in stream.numbered_makers(choice):
+        yield index, form.split(memoryview(make())).body
+
+
+def _from_pictures(
+    stream: Stream, makers: list[Maker], choice: Choice, verify: bool
+) -> Iterator[tuple[int, Given | Undecoded]]:
+    """From the decoded pictures of files and packets."""
+    if verify:
+        _verify(stream)
+    columns = stream.columns
+    with stream.open_video(sequential=True) as decoder, ExitStack() as files:
+        if stream.sidecar.body != "packet":
+            for index, picture in stream.pictures_in_order(decoder, choice):
+                make = makers[columns.variant[index]]
+                yield index, make(stream.rebuilder.pixels(picture))
+            return
+        packets = None
+        for index, found in decoder.decodable_pictures(choice(columns)):
+            if found is not None:
+                make = makers[columns.variant[index]]
+                yield index, make(stream.rebuilder.pixels(found))
+                continue
+            packets = packets or files.enter_context(_packets(stream))
+            yield index, Undecoded(stream.rebuilder.packet_payload(index, packets.packet(index)))
+
+
+def _packets(stream: Stream) -> PacketReader:
+    return PacketReader(stream.video_path, codec=stream.sidecar.video.codec, frames=len(stream))
+
+
+def _verify(stream: Stream) -> None:
+    """Compare the video with its SHA-256 or, without one, all messages with their digests."""
+    stream.verify_video()
+    if stream.sidecar.video.sha256 is None and stream.sidecar.digests is not None:
+        for make in stream.makers():
+            make()
+
+
+def image_files(
+    stream: Stream, kind: str, reduction: Reduction, *, jpeg_quality: int
+) -> Iterator[tuple[int, bytes | memoryview]]:
+    """The images of a stream as files, each with its number.
+
+    JPEG files stay as they were recorded if that is what is wanted, all others are those of the
+    stream's frames.
+
+    Args:
+        stream: The stream.
+        kind: ``png`` or ``jpeg``.
+        reduction: How much smaller or fewer they are.
+        jpeg_quality: Of new JPEG files, 1 to 100.
+
+    Raises:
+        OptionError: The files cannot hold the images.
+        FormatError: The stream is damaged.
+    """
+    choice = reduction.choice_of(stream)
+    size = reduction.size_of(stream)
+    if kind == "jpeg" and size is None and holds_files(stream.sidecar, kind):
+        yield from files_of(stream, choice)
+        return
+    resize, encoding = resizer(stream.sidecar, stream.sidecar.image.encoding, size)
+    file = ImageFile(encoding, kind, quality=jpeg_quality)
+    with stream.open_video(sequential=True) as decoder:
+        for index, picture in stream.pictures_in_order(decoder, choice):
+            yield index, file.encode(resize(stream.rebuilder.pixels(picture)))

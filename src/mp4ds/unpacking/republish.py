@@ -1,0 +1,499 @@
+"""Which topics of a dataset are given in another form: raw, as files or packets; smaller, fewer."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.dataset.channels import ImageChannel, MessageSource, PartKey
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.rebuild import CameraInfoRebuilder, Choice, everything, marked, message_at
+from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.views import Placement
+from mp4ds.errors import ConversionError, FormatError, OptionError
+from mp4ds.messages.serializations import is_camera
+from mp4ds.messages.wire import Slots, WireError
+from mp4ds.records import Channel, Message
+from mp4ds.unpacking.pictures import (
+    VIDEO_KINDS,
+    AsRecorded,
+    Frames,
+    ImageForm,
+    Reduction,
+    Undecoded,
+    frames_of,
+    holds_files,
+    is_inverse_depth,
+)
+from mp4ds.unpacking.types import Types, type_of
+from mp4ds.video.packets import PacketReader
+
+KINDS = ("raw", "jpeg", "png", "compressed-video", "ffmpeg")
+"""What images can be given as."""
+
+_SUFFIXES = {
+    "jpeg": "compressed",
+    "png": "compressed",
+    "compressed-video": "compressed_video",
+    "ffmpeg": "ffmpeg",
+}
+_TRANSPORTS = ("compressed", "compressedDepth", "ffmpeg", "foxglove", "compressed_video")
+_FAMILIES = {
+    "Image": "raw",
+    "RawImage": "raw",
+    "CompressedImage": "file",
+    "CompressedVideo": "video",
+    "FFMPEGPacket": "video",
+}
+_FAMILY_OF_KIND = {
+    "raw": "raw",
+    "jpeg": "file",
+    "png": "file",
+    "compressed-video": "video",
+    "ffmpeg": "video",
+}
+
+
+def republished_topic(topic: str, type_name: str, kind: str) -> str:
+    """The topic that image_transport would have for a topic's images.
+
+    Args:
+        topic: As recorded.
+        type_name: Of its messages, which are a camera's.
+        kind: One of `KINDS`.
+    """
+    family = _FAMILIES[type_name.replace(".", "/").rpartition("/")[2]]
+    stem, _, last = topic.rpartition("/")
+    has_transport = family != "raw" and last in _TRANSPORTS and stem != ""
+    suffix = _SUFFIXES.get(kind)
+    if family == _FAMILY_OF_KIND[kind] and not (has_transport and last != suffix):
+        return topic
+    if not has_transport:
+        stem = topic
+    if suffix is None:
+        return stem if has_transport else f"{topic}/raw"
+    return f"{stem}/{suffix}"
+
+
+class FreeTopics:
+    """Gives each republished topic a name that no other one has.
+
+    Args:
+        taken: Topics that are there anyway.
+    """
+
+    def __init__(self, taken: Iterable[str]) -> None:
+        self._taken = set(taken)
+
+    def take(self, topic: str, kind: str) -> str:
+        """The topic, or one made of it and its kind, one of `KINDS`, where it is taken."""
+        while topic in self._taken:
+            topic += "_" + kind.replace("-", "_")
+        self._taken.add(topic)
+        return topic
+
+
+# ---------------------------------------------------------------- calibrations
+
+
+@dataclass(frozen=True)
+class CalibrationSource:
+    """Gives the calibration messages of a stream.
+
+    Attributes:
+        rebuilder: Makes them.
+        is_kept: Which are given, shape (messages,).
+    """
+
+    rebuilder: CameraInfoRebuilder
+    is_kept: NDArray[np.bool_]
+
+    @property
+    def left_out(self) -> int:
+        """How many are not given."""
+        return int((~self.is_kept).sum())
+
+    def messages(self, channel: Channel, choice: Choice) -> Iterator[tuple[int, Message]]:
+        """Those that are wanted, each with its place among the channel's messages."""
+        chosen = choice if self.is_kept.all() else marked(self.is_kept, choice)
+        return self.rebuilder.messages(channel, chosen(self.rebuilder.columns))
+
+
+def calibration_source(
+    stream: Stream, size: tuple[int, int] | None, is_kept: NDArray[np.bool_] | None
+) -> CalibrationSource | None:
+    """What gives the calibration messages of a stream whose images are reduced.
+
+    Where images are left out, so are the calibrations that have the stamps of these alone. Those
+    whose stamps no image has stay.
+
+    Args:
+        stream: The stream; has such messages.
+        size: Width and height that its images get; None for as recorded.
+        is_kept: Which of its images are given; None for all.
+
+    Returns:
+        None where they stay as recorded.
+
+    Raises:
+        AsRecorded: There are no such messages of another size; says why.
+    """
+    info, columns = stream.sidecar.camera_info, stream.camera_info_columns
+    if info is None or columns is None or (size is None and is_kept is None):
+        return None
+    if size is not None:
+        placement = Placement((0, 0, *stream.image_size), size)
+        made = [placement.calibration(calibration) for calibration in info.calibrations]
+        info = info.model_copy(update={"calibrations": made})
+    try:
+        rebuilder = CameraInfoRebuilder(info, columns, str(stream.path))
+    except FormatError:
+        if size is None:
+            raise
+        raise AsRecorded("calibrations of this type are not made for another size") from None
+    stamps = columns.stamp
+    is_wanted = np.ones(len(stamps), np.bool_)
+    if is_kept is not None:
+        frames = stream.stamps
+        is_wanted = ~np.isin(stamps, frames) | np.isin(stamps, frames[is_kept])
+    return CalibrationSource(rebuilder, is_wanted)
+
+
+# ---------------------------------------------------------------- republisher
+
+_NOT_DECODED = "its picture does not decode"
+_REFERS = "packets of a video refer to each other, so that none can be left out; give another form"
+_ALREADY = {
+    "raw": "raw images",
+    "jpeg": "JPEG files",
+    "png": "PNG files",
+    "compressed-video": "CompressedVideo",
+    "ffmpeg": "FFMPEGPackets",
+}
+
+
+@dataclass(frozen=True)
+class Republished:
+    """What became of a topic.
+
+    Attributes:
+        topic: Where its images are now.
+        type_name: Of their messages.
+        instead_of: The topic that they would have had, if another one has it.
+    """
+
+    topic: str
+    type_name: str
+    instead_of: str = ""
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """How the messages of a stream are given.
+
+    Attributes:
+        stream: The stream.
+        kind: Of the new messages; empty for as recorded.
+        frames: Makes them; None for as recorded.
+        is_kept: Which of them are given; None for all.
+        size: Width and height that they get; None for as recorded.
+        is_moved: Whether they go to a channel of their own.
+    """
+
+    stream: Stream
+    kind: str
+    frames: Frames | None
+    is_kept: NDArray[np.bool_] | None
+    size: tuple[int, int] | None
+    is_moved: bool
+
+
+class Republisher:
+    """Gives the images of a dataset in another form: plans when made, works as it is read.
+
+    Messages that only become smaller stay on their channel: raw images, JPEG and PNG files of
+    ROS stay what they are, and packets of video become raw images, unless a kind is given.
+    Messages that only become fewer stay as recorded, byte for byte. Calibrations become those of
+    the smaller images, and fewer with the images whose stamps they have.
+
+    Args:
+        dataset: The dataset.
+        kind: One of `KINDS`; None for as recorded.
+        encoding: Message encoding of the recording to make: ``ros1`` or ``cdr``.
+        selected: Whether a topic is wanted.
+        jpeg_quality: Of new JPEG files, 1 to 100.
+        reduction: How much smaller or fewer images are given; None for as recorded.
+
+    Attributes:
+        channels: The new channels.
+        sources: Makes the messages of streams and calibrations; see `Dataset.records`.
+        republished: What became of each topic.
+        as_recorded: Camera topics of which messages stay as recorded: reason -> how many. Grows
+            while the messages are read.
+        thinned: Topics of which messages are left out -> how many.
+
+    Raises:
+        OptionError: There is no such kind, or it cannot be reduced.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        kind: str | None,
+        *,
+        encoding: str,
+        selected: Callable[[str], bool],
+        jpeg_quality: int,
+        reduction: Reduction | None = None,
+    ) -> None:
+        if kind is not None and kind not in KINDS:
+            raise OptionError(f"`images` {kind!r} is not known. Use {', '.join(KINDS)}.")
+        self._reduction = reduction or Reduction()
+        check_kind(kind, self._reduction)
+        self._kind = kind
+        self._encoding = encoding
+        self._jpeg_quality = jpeg_quality
+        self._types: dict[tuple[str, str], Types] = {}
+        self._omitted: Counter[str] = Counter()
+        self._made: set[int] = set()
+        self.channels: list[Channel] = []
+        self.sources: dict[PartKey, MessageSource] = {}
+        self.republished: dict[str, Republished] = {}
+        self.as_recorded: dict[str, dict[str, int]] = {}
+        self.thinned: dict[str, int] = {}
+        self._emptied: set[int] = set()
+        chosen = [item for item in dataset.image_channels() if selected(item.channel.topic)]
+        planned = [(item, self._plan(item)) for item in chosen]
+        for item, plans in planned:
+            if not item.recorded and sum(plan.is_moved for plan in plans) == len(item.streams):
+                self._emptied.add(item.channel.id)
+        self._declare(dataset, planned)
+        for _, plans in planned:
+            for plan in plans:
+                self._give_calibrations(plan, selected)
+        self._count_verbatim(dataset, selected)
+
+    @property
+    def omitted(self) -> Mapping[str, int]:
+        """What the new messages have no place for: a phrase -> how many."""
+        return self._omitted + sum((Counter(t.omitted) for t in self._types.values()), Counter())
+
+    def empties(self, channel: Channel) -> bool:
+        """Whether all messages of a channel of the dataset go to new ones, as far as is known."""
+        return channel.id in self._emptied
+
+    def makes(self, channel: Channel) -> bool:
+        """Whether a channel is one of the new ones."""
+        return channel.id in self._made
+
+    # ------------------------------------------------------------ what is given how
+
+    def _plan(self, item: ImageChannel) -> list[_Plan]:
+        """The streams of a channel that are given in another form, or fewer, and how."""
+        plans = [self._plan_stream(stream, item.channel.topic) for stream in item.streams]
+        return [plan for plan in plans if plan.frames or plan.is_kept is not None]
+
+    def _plan_stream(self, stream: Stream, topic: str) -> _Plan:
+        size = self._reduction.size_of(stream)
+        kind = self._kind or (_kind_of(stream) if size else "")
+        is_kept = None
+        if self._reduction.leaves_out:
+            is_kept = self._reduction.kept(stream.columns)
+        if kind:
+            is_done = self._is_done(stream, kind)
+            try:
+                if not is_done or size:
+                    form = self._form(stream, kind, size, is_done=is_done)
+                    frames = frames_of(stream, form)
+                    return self._thinned(_Plan(stream, kind, frames, is_kept, size, not is_done))
+                if is_kept is None:
+                    raise AsRecorded(f"they are {_ALREADY[kind]} already")
+            except AsRecorded as reason:
+                count = len(stream) if is_kept is None else int(is_kept.sum())
+                self._keep(topic, str(reason), count)
+        if is_kept is not None and _refers(stream):
+            self._keep(topic, _REFERS, len(stream))
+            is_kept = None
+        return self._thinned(_Plan(stream, "", None, is_kept, None, False))
+
+    def _thinned(self, plan: _Plan) -> _Plan:
+        if plan.is_kept is not None:
+            self._leave_out(plan.stream.topic, int((~plan.is_kept).sum()))
+        return plan
+
+    def _leave_out(self, topic: str, count: int) -> None:
+        if count:
+            self.thinned[topic] = self.thinned.get(topic, 0) + count
+
+    def _form(
+        self, stream: Stream, kind: str, size: tuple[int, int] | None, *, is_done: bool
+    ) -> ImageForm:
+        encoding = self._encoding
+        if is_done:
+            encoding = stream.sidecar.channel.to_record(0).message_encoding
+        return ImageForm(kind, encoding == "ros1", self._jpeg_quality, size, keeps_format=is_done)
+
+    def _is_done(self, stream: Stream, kind: str) -> bool:
+        """Whether the messages are of a kind already, in whichever ROS has the same type."""
+        sidecar = stream.sidecar
+        channel = sidecar.channel.to_record(0)
+        name = channel.type_name.replace("/msg/", "/")
+        if channel.message_encoding not in ("ros1", "cdr") or name != type_of(kind):
+            return False
+        if kind == "ffmpeg":
+            return channel.message_encoding == self._encoding
+        if kind in ("jpeg", "png"):
+            is_file = holds_files(sidecar, kind) or (kind == "jpeg" and sidecar.body == "jpeg")
+            return is_file and not any(header.prefix for header in sidecar.headers)
+        return True
+
+    # ------------------------------------------------------------ channels and sources
+
+    def _types_of(self, encoding: str, kind: str) -> Types:
+        return self._types.setdefault((encoding, kind), Types(encoding, kind))
+
+    def _declare(self, dataset: Dataset, planned: list[tuple[ImageChannel, list[_Plan]]]) -> None:
+        staying = [channel for channel in dataset.channels if channel.id not in self._emptied]
+        free = FreeTopics(channel.topic for channel in staying)
+        next_id = 1 + max((channel.id for channel in dataset.channels), default=0)
+        topics: dict[tuple[str, str], str] = {}
+        for item, plans in planned:
+            recorded = item.channel
+            made: dict[str, Channel] = {}
+            for kind in dict.fromkeys(plan.kind for plan in plans if plan.is_moved):
+                wanted = republished_topic(recorded.topic, recorded.type_name, kind)
+                if (recorded.topic, kind) not in topics:
+                    topics[recorded.topic, kind] = free.take(wanted, kind)
+                topic = topics[recorded.topic, kind]
+                types = self._types_of(self._encoding, kind)
+                made[kind] = types.channel(recorded, next_id + len(self.channels), topic)
+                self.channels.append(made[kind])
+                instead_of = wanted if topic != wanted else ""
+                known = Republished(topic, made[kind].type_name, instead_of)
+                self.republished.setdefault(recorded.topic, known)
+            for plan in plans:
+                channel = made[plan.kind] if plan.is_moved else None
+                self.sources[PartKey(plan.stream.path)] = self._source(plan, channel)
+        self._made = {channel.id for channel in self.channels}
+
+    def _source(self, plan: _Plan, made: Channel | None) -> MessageSource:
+        if plan.frames is None:
+            return partial(_fewer, plan)
+        encoding = self._encoding
+        if made is None:
+            encoding = plan.stream.sidecar.channel.to_record(0).message_encoding
+        types = self._types_of(encoding, plan.kind)
+        return partial(self._messages, plan, plan.frames, types, made)
+
+    def _give_calibrations(self, plan: _Plan, selected: Callable[[str], bool]) -> None:
+        info = plan.stream.sidecar.camera_info
+        if info is None or not info.messages or not selected(info.channel.topic):
+            return
+        try:
+            source: CalibrationSource | None = calibration_source(
+                plan.stream, plan.size, plan.is_kept
+            )
+        except AsRecorded as reason:
+            self._keep(info.channel.topic, str(reason), info.messages)
+            source = calibration_source(plan.stream, None, plan.is_kept)
+        if source is not None:
+            self._leave_out(info.channel.topic, source.left_out)
+            self.sources[PartKey(plan.stream.path, is_calibration=True)] = source.messages
+
+    def _count_verbatim(self, dataset: Dataset, selected: Callable[[str], bool]) -> None:
+        cameras = {channel.topic for channel in dataset.channels if is_camera(channel)}
+        for entry in dataset.manifest.verbatim if dataset.manifest else []:
+            if entry.topic in cameras and selected(entry.topic):
+                self._keep(entry.topic, f"stored as it was: {entry.reason}", entry.messages)
+
+    def _keep(self, topic: str, reason: str, count: int) -> None:
+        reasons = self.as_recorded.setdefault(topic, {})
+        reasons[reason] = reasons.get(reason, 0) + count
+
+    # ------------------------------------------------------------ messages
+
+    def _messages(
+        self,
+        plan: _Plan,
+        frames: Frames,
+        types: Types,
+        made: Channel | None,
+        recorded: Channel,
+        choice: Choice,
+    ) -> Iterator[tuple[int, Message]]:
+        """The messages of a stream, each with its place among those of the recorded channel."""
+        stream = plan.stream
+        columns, headers = stream.columns, stream.sidecar.headers
+        count = 0
+        for index, frame in frames(_chosen(plan, choice), choice is everything):
+            count += 1
+            ordinal = int(columns.ordinal[index])
+            if isinstance(frame, Undecoded):
+                self._keep(recorded.topic, _NOT_DECODED, 1)
+                yield ordinal, message_at(columns, index, recorded, frame.payload)
+                continue
+            frame_id = headers[int(columns.variant[index])].frame_id
+            slots = Slots(int(columns.stamp[index]), columns.slots(index).seq, index)
+            try:
+                payload = types.message(
+                    slots, frame_id, frame.fields, frame.body, is_key=frame.is_key
+                )
+            except WireError as error:
+                raise ConversionError(recorded.topic, f"message {index}: {error}") from None
+            if slots.seq is not None and not types.has_seq:
+                self._omitted[types.no_seq] += 1
+            yield ordinal, message_at(columns, index, made or recorded, payload)
+        due = len(stream) if plan.is_kept is None else int(plan.is_kept.sum())
+        if choice is everything and count != due:
+            problem = f"has {count} frames or more, {due} are due"
+            raise FormatError("frame-count", stream.video_path, problem)
+
+
+def check_kind(kind: str | None, reduction: Reduction) -> None:
+    """Refuse to reduce what is the video as it is.
+
+    Raises:
+        OptionError: Says what to do.
+    """
+    if kind in VIDEO_KINDS and (reduction.leaves_out or reduction.resize is not None):
+        raise OptionError(
+            f"`resize`, `every` and `max_rate` do not go with `images` {kind}, which gives the "
+            "video as it is. Use raw, jpeg or png."
+        )
+
+
+def _chosen(plan: _Plan, choice: Choice) -> Choice:
+    return choice if plan.is_kept is None else marked(plan.is_kept, choice)
+
+
+def _fewer(plan: _Plan, channel: Channel, choice: Choice) -> Iterator[tuple[int, Message]]:
+    """Messages as recorded, some of them left out."""
+    if choice is everything and plan.stream.sidecar.digests is None:
+        plan.stream.verify_video()
+    return plan.stream.messages(channel, _chosen(plan, choice))
+
+
+def _kind_of(stream: Stream) -> str:
+    """What the images of a stream are, or become where there is no smaller form of that kind."""
+    sidecar = stream.sidecar
+    if sidecar.body == "jpeg" or holds_files(sidecar, "jpeg"):
+        return "jpeg"
+    if sidecar.body in ("png", "rvl"):
+        is_metres = any(is_inverse_depth(sidecar, header) for header in sidecar.headers)
+        return "raw" if is_metres else "png"
+    is_png = sidecar.body == "packet" and sidecar.video.codec == "png"
+    return "png" if is_png else "raw"
+
+
+def _refers(stream: Stream) -> bool:
+    """Whether there are messages of a stream that are of no use without those before them."""
+    if stream.sidecar.body != "packet":
+        return False
+    codec = stream.sidecar.video.codec
+    with PacketReader(stream.video_path, codec=codec, frames=len(stream)) as reader:
+        return not all(reader.keyframes)

@@ -1,0 +1,289 @@
+"""The messages of republished images: definitions, channels, and their serialization."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from mp4ds.bags.convert import Converter
+from mp4ds.bags.types import World, make_store, ros1_world, ros2_world, types_of
+from mp4ds.messages.encodings import ENCODINGS
+from mp4ds.messages.serializations import plain_message
+from mp4ds.messages.wire import NS, Fields, PrimitiveWriter, Slots, WireError
+from mp4ds.records import HASH_KEY, Channel, Schema
+from mp4ds.video.codecs import CODECS
+
+_ENCODERS = {"h264": "libx264", "h265": "hevc_nvenc"}
+_KEY_FRAME = 1  # AV_PKT_FLAG_KEY
+
+
+@dataclass(frozen=True, slots=True)
+class VideoFields:
+    """What a message says of a packet of video.
+
+    Attributes:
+        codec: Name in the registry.
+        encoding: ROS image encoding of the images that the video was made of.
+        width: Columns of the images.
+        height: Rows of the images.
+        pixel_format: Of the video as ffmpeg calls it.
+    """
+
+    codec: str
+    encoding: str
+    width: int
+    height: int
+    pixel_format: str
+
+    def ffmpeg_encoding(self, *, ros1: bool) -> str:
+        """The field ``encoding`` of an FFMPEGPacket."""
+        codec = CODECS[self.codec].ffmpeg
+        if ros1:
+            return _ENCODERS.get(self.codec, codec)
+        known = ENCODINGS[self.encoding]
+        if known.channels == 1 and not known.mosaic and known.rows == 1:
+            before = shown = "mono8"
+        else:
+            before = "bgr8"
+            shown = "rgb8" if self.encoding.startswith("rgb") else "bgr8"
+        pixel_format = self.pixel_format.replace("yuvj", "yuv")  # the video itself tells its range
+        return ";".join((codec, pixel_format, before, shown))
+
+
+def video_message(
+    encoding: str, slots: Slots, frame_id: str, codec: str, body: bytes | memoryview
+) -> bytes:
+    """A CompressedVideo: what follows the data is aligned in CDR.
+
+    Args:
+        encoding: ``ros1`` or ``cdr``.
+        slots: Stamp.
+        frame_id: Coordinate frame.
+        codec: Its field ``format``.
+        body: The packet.
+
+    Raises:
+        WireError: The stamp has no place in the serialization.
+    """
+    is_cdr = encoding == "cdr"
+    head = _begun(encoding, slots)
+    head.string(frame_id, terminated=is_cdr)
+    head.put("I", len(body))
+    tail = PrimitiveWriter(b"", "<", aligned=False)
+    tail.string(codec, terminated=is_cdr)
+    gap = bytes(-len(body) % 4 if is_cdr else 0)
+    return b"".join((head.getvalue(), body, gap, tail.getvalue()))
+
+
+def ffmpeg_message(
+    encoding: str,
+    slots: Slots,
+    frame_id: str,
+    fields: VideoFields,
+    body: bytes | memoryview,
+    is_key: bool,
+) -> bytes:
+    """An FFMPEGPacket, whose fields ROS 1 has in another order and under other names.
+
+    Args:
+        encoding: ``ros1`` or ``cdr``.
+        slots: Stamp, sequence number, presentation time.
+        frame_id: Coordinate frame.
+        fields: Of the video.
+        body: The packet.
+        is_key: Whether decoding can begin with it.
+
+    Raises:
+        WireError: The stamp or a number has no place in the serialization.
+    """
+    is_cdr = encoding == "cdr"
+    head = _begun(encoding, slots, has_seq=not is_cdr)
+    head.string(frame_id, terminated=is_cdr)
+    told = PrimitiveWriter(b"", "<", aligned=False) if not is_cdr else head
+    told.put("i", fields.width, fields.height)
+    told.string(fields.ffmpeg_encoding(ros1=not is_cdr), terminated=is_cdr)
+    told.put("Q", slots.pts or 0)
+    told.put("B", _KEY_FRAME if is_key else 0)
+    if is_cdr:
+        head.put("B", 0)  # not of a machine that stores big endian
+        head.put("I", len(body))
+        return b"".join((head.getvalue(), body))
+    head.put("I", len(body))
+    return b"".join((head.getvalue(), body, told.getvalue()))
+
+
+def _begun(encoding: str, slots: Slots, *, has_seq: bool = False) -> PrimitiveWriter:
+    """A message up to its stamp."""
+    is_cdr = encoding == "cdr"
+    seconds, nanoseconds = divmod(slots.stamp, NS)
+    if not (-(2**31) if is_cdr else 0) <= seconds < (2**31 if is_cdr else 2**32):
+        raise WireError("its stamp is beyond what ROS has bits for")
+    writer = PrimitiveWriter(b"\0\1\0\0" if is_cdr else b"", "<", aligned=is_cdr)
+    if has_seq:
+        writer.put("I", slots.seq or 0)
+    writer.put("i" if is_cdr else "I", seconds)
+    writer.put("I", nanoseconds)
+    return writer
+
+
+# ---------------------------------------------------------------- types
+
+_DISTRIBUTION = "humble"
+_TYPES = {
+    "raw": "sensor_msgs/msg/Image",
+    "jpeg": "sensor_msgs/msg/CompressedImage",
+    "png": "sensor_msgs/msg/CompressedImage",
+    "compressed-video": "foxglove_msgs/msg/CompressedVideo",
+    "ffmpeg": "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
+}
+_VIDEO = "string frame_id\nuint8[] data\nstring format\n"
+_DEFINITIONS = {  # of the types that are not among the standard ones
+    ("compressed-video", "ros1"): f"time timestamp\n{_VIDEO}",
+    ("compressed-video", "cdr"): f"builtin_interfaces/Time timestamp\n{_VIDEO}",
+    ("ffmpeg", "ros1"): (
+        "Header header\nuint8[] data\nint32 img_width\nint32 img_height\nstring encoding\n"
+        "uint64 pts\nuint8 flags\n"
+    ),
+    ("ffmpeg", "cdr"): (
+        "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\n"
+        "uint8 flags\nbool is_bigendian\nuint8[] data\n"
+    ),
+}
+_WIRES = {"ros1": "ros1", "cdr": "cdr-le"}
+_HASHES = {"ros1": "md5sum", "cdr": HASH_KEY}
+_DEFINITION = "message_definition"
+_REMEMBERED = "ros1:"  # begins keys that tell what a ROS 2 channel was in ROS 1
+_OF_TYPE = ("type", "md5sum", _DEFINITION)
+
+
+def type_of(kind: str) -> str:
+    """The type that images of a kind have, as ROS 1 spells it."""
+    return _TYPES[kind].replace("/msg/", "/")
+
+
+class Types:
+    """Channels and messages of one kind for one target.
+
+    Args:
+        encoding: Message encoding of the target: ``ros1`` or ``cdr``.
+        kind: One of `mp4ds.unpacking.republish.KINDS`.
+    """
+
+    def __init__(self, encoding: str, kind: str) -> None:
+        self.encoding = encoding
+        self._kind = kind
+        self._worlds = {"ros1": ros1_world(), "cdr": ros2_world(_DISTRIBUTION)}
+        self._converter = Converter({"ros1": "ros1", "cdr": "ros2"}[encoding])
+
+    @property
+    def omitted(self) -> Mapping[str, int]:
+        """What the channels told and the target has no place for: a phrase -> how many."""
+        return self._converter.omitted
+
+    @property
+    def has_seq(self) -> bool:
+        """Whether the messages have a header with a sequence number."""
+        return self.encoding == "ros1" and self._kind != "compressed-video"
+
+    @property
+    def no_seq(self) -> str:
+        """What is left out where they have none."""
+        without = "ROS 2" if self.encoding == "cdr" else "CompressedVideo"
+        return f"messages with a header's sequence number, which {without} has not"
+
+    def channel(self, source: Channel, channel_id: int, topic: str) -> Channel:
+        """The channel for the images of another one.
+
+        Latching, QoS and the publisher's name are kept, what belongs to the type is the new
+        type's.
+
+        Args:
+            source: As recorded.
+            channel_id: Of the channel to make.
+            topic: Of the channel to make.
+        """
+        encoding = source.message_encoding
+        if encoding not in self._worlds:
+            encoding = self.encoding
+        schema, digest = self._defined(encoding)
+        kept = {key: value for key, value in source.metadata.items() if _is_kept(key)}
+        kept[_HASHES[encoding]] = digest
+        for key in ("topic",) if encoding == "ros1" else (f"{_REMEMBERED}topic",):
+            if key in kept:  # a ROS 1 connection header may repeat it
+                kept[key] = topic
+        if encoding == "cdr" and f"{_REMEMBERED}type" in source.metadata:
+            known, md5sum = self._defined("ros1")
+            values = (known.name, md5sum, known.data.decode())
+            kept |= dict(zip((_REMEMBERED + key for key in _OF_TYPE), values, strict=True))
+        made = self._converter.channel(Channel(channel_id, topic, encoding, schema, kept))
+        if self._kind != "ffmpeg" or encoding == self.encoding:
+            return made
+        schema, digest = self._defined(self.encoding)  # the other ROS has another type
+        return replace(
+            made, schema=schema, metadata={**made.metadata, _HASHES[self.encoding]: digest}
+        )
+
+    def _defined(self, encoding: str) -> tuple[Schema, str]:
+        """The type's definition, and its md5sum or hash."""
+        name, world = _TYPES[self._kind], self._worlds[encoding]
+        text = _DEFINITIONS.get((self._kind, encoding), "")
+        schema = Schema(name, world.schema_encoding if text else "", text.encode())
+        return _generated(schema, world)
+
+    def message(
+        self,
+        slots: Slots,
+        frame_id: str,
+        fields: Fields | VideoFields,
+        body: bytes | memoryview,
+        *,
+        is_key: bool = False,
+    ) -> bytes:
+        """A message.
+
+        Args:
+            slots: Stamp, the sequence number that ROS 1 has, and the presentation time of
+                packets.
+            frame_id: Coordinate frame.
+            fields: Of the image.
+            body: Its pixels, file or packet.
+            is_key: For a packet, whether decoding can begin with it.
+
+        Raises:
+            WireError: The stamp or a number has no place in the serialization.
+        """
+        stamp = _wrapped(slots.stamp, signed=self.encoding == "cdr")
+        slots = Slots(stamp, slots.seq, slots.pts)
+        if isinstance(fields, VideoFields):
+            if self._kind == "ffmpeg":
+                return ffmpeg_message(self.encoding, slots, frame_id, fields, body, is_key)
+            return video_message(self.encoding, slots, frame_id, fields.codec, body)
+        wire, name = _WIRES[self.encoding], _TYPES[self._kind]
+        return plain_message(wire, name, frame_id, fields, slots, body)
+
+
+def _is_kept(key: str) -> bool:
+    """Whether metadata belongs to the topic, and not to the type of its messages."""
+    plain = key.removesuffix(";base64").removeprefix(_REMEMBERED)
+    return plain not in (*_OF_TYPE, HASH_KEY) and key != "topic;base64"
+
+
+def _generated(schema: Schema, world: World) -> tuple[Schema, str]:
+    store = make_store(types_of(schema, world), world)
+    if world.encoding == "ros1":
+        text, digest = store.generate_msgdef(schema.name, 1)
+        name = schema.name.replace("/msg/", "/")  # as ROS 1 spells it
+    else:
+        text, digest = store.generate_msgdef(schema.name, 2)[0], store.hash_rihs01(schema.name)
+        name = schema.name
+    return Schema(name, world.schema_encoding, text.encode()), digest
+
+
+def _wrapped(stamp: int, *, signed: bool) -> int:
+    """A stamp whose seconds have the bits that they had in the other ROS."""
+    seconds, nanoseconds = divmod(stamp, NS)
+    if -(2**31) <= seconds < 2**32:
+        seconds %= 2**32
+        if signed and seconds >= 2**31:
+            seconds -= 2**32
+    return seconds * NS + nanoseconds

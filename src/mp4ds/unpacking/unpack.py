@@ -1,0 +1,526 @@
+"""Dataset -> bag, rosbag2, MCAP or images."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import shlex
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from mp4ds.bags.convert import Converter
+from mp4ds.bags.formats import open_writer, recording_names
+from mp4ds.bags.protocols import BagWriter
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.messages import recorded_storage
+from mp4ds.dataset.stream import Stream
+from mp4ds.errors import ConversionError, FormatError, OptionError, WriteError
+from mp4ds.files.outputs import Owned, staged
+from mp4ds.files.uploads import uploaded
+from mp4ds.files.urls import RemotePath, location, remote
+from mp4ds.options import (
+    Options,
+    every,
+    exclude,
+    force,
+    jpeg_quality,
+    max_rate,
+    option,
+    resize,
+    topics,
+)
+from mp4ds.plan import FileNames, Selection
+from mp4ds.records import Attachment, Channel, Message, MetadataRecord
+from mp4ds.unpacking.pictures import Reduction, holds_files, image_files
+from mp4ds.unpacking.republish import KINDS, Republished, Republisher, check_kind
+
+
+@dataclass(frozen=True)
+class UnpackOptions(Options):
+    """How to unpack."""
+
+    storage: str | None = option("sqlite3 or mcap, for rosbag2; as recorded, or mcap.")
+    image_format: str | None = option(
+        "png (exact) or jpeg, for images; JPEG files as recorded, else png."
+    )
+    images: str | None = option(
+        "Give all cameras as raw, jpeg, png, compressed-video or ffmpeg; as recorded by default.",
+        metavar="KIND",
+    )
+    jpeg_quality: int = jpeg_quality()
+    resize: float | tuple[int, int] | None = resize()
+    every: int = every()
+    max_rate: float | None = max_rate()
+    topics: Sequence[str] = topics()
+    exclude: Sequence[str] = exclude()
+    skip_unconvertible: bool = option("Leave out what the output cannot hold, and count it.", False)
+    force: bool = force()
+
+    @property
+    def reduction(self) -> Reduction:
+        """How much smaller or fewer images are given.
+
+        Raises:
+            OptionError: There is no such size, number or rate.
+        """
+        return Reduction(self.resize, self.every, self.max_rate)
+
+
+@dataclass(frozen=True)
+class UnpackProgress:
+    """Where an unpack stands: messages written, and how many there are (0: not known)."""
+
+    messages: int
+    messages_total: int
+
+
+@dataclass(frozen=True)
+class UnpackSummary:
+    """What an unpack did.
+
+    Attributes:
+        output: The recording or folder made.
+        messages: Messages written, by topic.
+        converted: Types converted between ROS 1 and ROS 2, by topic.
+        omitted: What the target cannot hold and was left out: a phrase -> how many.
+        left_out: Topics left out on request.
+        republished: What became of the topics whose images are given in another form.
+        as_recorded: Where another form was asked for, the camera topics of which messages stay
+            as recorded: reason -> how many.
+        unconvertible: Topics of which messages are left out, as the target cannot hold them:
+            reason -> how many.
+        thinned: Topics of which messages are left out, as fewer were asked for -> how many.
+    """
+
+    output: Path
+    messages: dict[str, int] = field(default_factory=dict)
+    converted: list[str] = field(default_factory=list)
+    omitted: dict[str, int] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
+    republished: dict[str, Republished] = field(default_factory=dict)
+    as_recorded: dict[str, dict[str, int]] = field(default_factory=dict)
+    thinned: dict[str, int] = field(default_factory=dict)
+    unconvertible: dict[str, dict[str, int]] = field(default_factory=dict)
+
+
+# ---------------------------------------------------------------- images
+
+_STAMPS_NAME = "stamps.csv"
+_HEAD = ["file", "stamp_ns", "log_time_ns", "frame_id"]
+
+
+def write_images(
+    stream: Stream,
+    folder: Path,
+    *,
+    image_format: str | None,
+    jpeg_quality: int,
+    reduction: Reduction,
+) -> Iterator[None]:
+    """Write one file per frame, called by its number, and stamps.csv that tells the times of each.
+
+    Args:
+        stream: The stream.
+        folder: Where to write; empty.
+        image_format: ``png`` or ``jpeg``; None for JPEG files as they were recorded, else PNG.
+        jpeg_quality: Of JPEG files that are made, 1 to 100.
+        reduction: How much smaller or fewer they are.
+
+    Yields:
+        After each file.
+    """
+    columns, headers = stream.columns, stream.sidecar.headers
+    if image_format is None:
+        keeps = reduction.size_of(stream) is None and holds_files(stream.sidecar, "jpeg")
+        image_format = "jpeg" if keeps else "png"
+    suffix = "jpg" if image_format == "jpeg" else "png"
+    digits = len(str(len(stream) - 1))
+    with (folder / _STAMPS_NAME).open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(_HEAD)
+        files = image_files(stream, image_format, reduction, jpeg_quality=jpeg_quality)
+        for index, data in files:
+            name = f"{index:0{digits}d}.{suffix}"
+            (folder / name).write_bytes(data)
+            frame_id = headers[int(columns.variant[index])].frame_id
+            rows.writerow([name, int(columns.stamp[index]), int(columns.log_time[index]), frame_id])
+            yield
+
+
+def image_names(folder: Path) -> set[str] | None:
+    """Names of the files of image folders, by their stamps.csv; None where there is none."""
+    if not folder.is_dir():
+        return None
+    names: set[str] = set()
+    for place in folder.iterdir():
+        if place.is_dir():
+            names.update(f"{place.name}/{name}" for name in _names_in(place / _STAMPS_NAME))
+    return names or None
+
+
+def _names_in(stamps: Path) -> set[str]:
+    try:
+        rows = csv.reader(io.StringIO(stamps.read_bytes().decode(), newline=""))
+        if next(rows, None) != _HEAD:
+            return set()
+        return {stamps.name, *(row[0] for row in rows if row)}
+    except (OSError, ValueError, csv.Error):
+        return set()
+
+
+# ---------------------------------------------------------------- unpack
+
+TARGETS = ("bag", "rosbag2", "mcap", "images")
+_SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
+_WORLDS = {"bag": "ros1", "rosbag2": "ros2"}
+_OURS = "mp4ds:"  # metadata records by which a dataset remembers what a rosbag2 folder said
+
+
+def unpack(
+    dataset: Path | str,
+    to: str,
+    output: Path | str | None = None,
+    options: UnpackOptions | None = None,
+    *,
+    progress: Callable[[UnpackProgress], None] | None = None,
+) -> UnpackSummary:
+    """Write a dataset's recording again.
+
+    Every message of a lossless stream is compared with its digest on the way.
+
+    Args:
+        dataset: A dataset, or one video with its sidecar; or its URL.
+        to: ``bag``, ``rosbag2``, ``mcap`` or ``images``.
+        output: The file or folder to make, or its URL; None for the dataset's name beside it, or
+            in the current folder where the dataset is at a URL.
+        options: How.
+        progress: Called after every few messages.
+
+    Returns:
+        What was written, and what the target could not hold.
+
+    Raises:
+        FormatError: The dataset is damaged; nothing is left behind.
+        ConversionError: The target cannot hold a topic; names it.
+        TargetError: The output may not be written there.
+        WriteError: The disk refused; nothing is left behind.
+        RemoteError: A store or web server fails.
+    """
+    chosen = options or UnpackOptions()
+    _check(to, chosen)
+    store = remote(location(output)) if output else None
+    if store:
+        return _unpack_to_store(dataset, to, store, chosen, progress)
+    with Dataset(dataset, jpeg_quality=chosen.jpeg_quality) as opened:
+        given = location(output) if output else default_output(opened.path, to)
+        target = Path(os.path.abspath(given))  # noqa: PTH100
+        if to != "images":
+            opened.verify_messages()
+        with staged(target, force=chosen.force, owned=_owned(to), sources=[opened.path]) as path:
+            try:
+                if to == "images":
+                    return _unpack_images(opened, path, target, chosen, progress)
+                return _unpack_recording(opened, path, target, to, chosen, progress)
+            except OSError as error:
+                if error.errno is None:
+                    raise
+                raise WriteError(target, error) from error
+
+
+def _check(to: str, options: UnpackOptions) -> None:
+    """Refuse options that are unknown or contradict each other.
+
+    Raises:
+        OptionError: Says which, and what there is.
+    """
+    if to not in TARGETS:
+        raise OptionError(f"`to` {to!r} is not known. Use {', '.join(TARGETS)}.")
+    if options.storage not in (None, "sqlite3", "mcap"):
+        raise OptionError(f"`storage` {options.storage!r} is not known. Use sqlite3 or mcap.")
+    if options.storage and to != "rosbag2":
+        raise OptionError(f"`storage` goes with `to` rosbag2, not with `to` {to}.")
+    if options.image_format not in (None, "png", "jpeg"):
+        raise OptionError(f"`image_format` {options.image_format!r} is not known. Use png or jpeg.")
+    if options.images not in (None, *KINDS):
+        raise OptionError(f"`images` {options.images!r} is not known. Use {', '.join(KINDS)}.")
+    if options.images and to == "images":
+        raise OptionError("`images` goes with a recording; with `to` images, use `image_format`.")
+    check_kind(options.images, options.reduction)
+    if not 1 <= options.jpeg_quality <= 100:
+        raise OptionError(f"`jpeg_quality` {options.jpeg_quality} is not from 1 to 100.")
+
+
+def default_output(dataset: Path, to: str) -> Path:
+    """The output for a dataset when none is named: beside it, never the source's own name."""
+    if remote(dataset):
+        stem = dataset.name if dataset.is_dir() else dataset.stem
+        return Path(f"{stem}_unpacked{_SUFFIXES[to]}")
+    stem = dataset.resolve().name if dataset.is_dir() else dataset.stem
+    return dataset.resolve().parent / f"{stem}_unpacked{_SUFFIXES[to]}"
+
+
+def _unpack_to_store(
+    dataset: Path | str,
+    to: str,
+    target: RemotePath,
+    options: UnpackOptions,
+    progress: Callable[[UnpackProgress], None] | None,
+) -> UnpackSummary:
+    """Unpack on this machine, then upload."""
+
+    def make(local: Path) -> UnpackSummary:
+        return unpack(dataset, to, local, replace(options, force=True), progress=progress)
+
+    summary = uploaded(
+        target,
+        make,
+        is_folder=to in ("rosbag2", "images"),
+        last="metadata.yaml" if to == "rosbag2" else "",
+        force=options.force,
+        owned=_owned(to),
+    )
+    return replace(summary, output=target)
+
+
+def _owned(to: str) -> Owned:
+    return image_names if to == "images" else recording_names
+
+
+def _unpack_recording(
+    dataset: Dataset,
+    path: Path,
+    target: Path,
+    to: str,
+    options: UnpackOptions,
+    progress: Callable[[UnpackProgress], None] | None,
+) -> UnpackSummary:
+    selected = Selection(options.topics, options.exclude)
+    selected.check(channel.topic for channel in dataset.channels)
+    # a recording returns to its own format as it was, whatever serialization it holds
+    source = dataset.manifest.format if dataset.manifest else ""
+    converter = Converter(None if source == to else _WORLDS.get(to))
+    republisher = _republisher(dataset, to, options, selected)
+    summary = UnpackSummary(target)
+    total = dataset.manifest.messages if dataset.manifest else 0
+    storage = ""
+    if to == "rosbag2":
+        storage = options.storage or recorded_storage(dataset.recorded_records())
+    with open_writer(
+        path,
+        to,
+        name=target.name,
+        profile=dataset.profile,
+        library=dataset.manifest.library if dataset.manifest else "",
+        storage=storage,
+    ) as writer:
+        topics = _Topics(writer, converter, selected, summary, may_skip=options.skip_unconvertible)
+        topics.declare(dataset, republisher)
+        done = found = 0
+        for record in dataset.records(republisher.sources if republisher else None):
+            if not isinstance(record, Message):
+                _write_other(writer, record, to, source)
+                continue
+            found += 1
+            if topics.write(record):
+                done += 1
+                if progress and done % 16 == 0:
+                    progress(UnpackProgress(done, total))
+        if republisher:
+            found += sum(republisher.thinned.values())
+        if dataset.manifest and found != total:
+            raise FormatError(
+                "message-count",
+                dataset.path,
+                f"holds {found} messages where its manifest says {total}",
+            )
+    omitted = Counter(writer.omitted) + Counter(converter.omitted)
+    if republisher:
+        omitted += Counter(republisher.omitted)
+        summary.republished.update(republisher.republished)
+        summary.as_recorded.update(republisher.as_recorded)
+        summary.thinned.update(republisher.thinned)
+    summary.omitted.update(omitted)
+    return summary
+
+
+def _republisher(
+    dataset: Dataset, to: str, options: UnpackOptions, selected: Selection
+) -> Republisher | None:
+    reduction = options.reduction
+    if options.images is None and reduction == Reduction():
+        return None
+    world = _WORLDS.get(to) or ("ros1" if dataset.profile == "ros1" else "ros2")
+    return Republisher(
+        dataset,
+        options.images,
+        encoding="ros1" if world == "ros1" else "cdr",
+        selected=selected,
+        jpeg_quality=options.jpeg_quality,
+        reduction=reduction,
+    )
+
+
+class _Topics:
+    """The channels of a recording that is written, by their ids in the dataset."""
+
+    def __init__(
+        self,
+        writer: BagWriter,
+        converter: Converter,
+        selected: Selection,
+        summary: UnpackSummary,
+        *,
+        may_skip: bool,
+    ) -> None:
+        self._may_skip = may_skip
+        self._refused: dict[int, str] = {}
+        self._writer = writer
+        self._converter = converter
+        self._selected = selected
+        self._summary = summary
+        self._channels: dict[int, Channel] = {}
+        self._republished: set[int] = set()
+
+    def declare(self, dataset: Dataset, republisher: Republisher | None) -> None:
+        """Declare the chosen channels, and the definitions that none refers to.
+
+        Raises:
+            ConversionError: The target cannot hold some of them; names all.
+        """
+        for channel in dataset.channels:
+            topic = channel.topic
+            if self._selected(topic):
+                if republisher is None or not republisher.empties(channel):
+                    self._try_to_add(channel)
+            elif topic not in self._summary.left_out:
+                self._summary.left_out.append(topic)
+        if self._refused and not self._may_skip:
+            topics = {item.id: item.topic for item in dataset.channels}
+            raise _refusal({topics[number]: why for number, why in self._refused.items()})
+        for channel in republisher.channels if republisher else ():
+            self._republished.add(channel.id)
+            self._channels[channel.id] = channel
+            self._writer.add_channel(channel)
+            self._summary.messages.setdefault(channel.topic, 0)
+        for schema in dataset.unused_schemas:
+            self._writer.add_schema(schema)
+
+    def _try_to_add(self, channel: Channel) -> None:
+        try:
+            self._add(channel)
+        except ConversionError as error:
+            self._refused[channel.id] = error.problem
+            if self._may_skip:
+                self._summary.unconvertible.setdefault(channel.topic, {}).setdefault(
+                    error.problem, 0
+                )
+
+    def _add(self, channel: Channel) -> None:
+        converted = self._converter.channel(channel)
+        self._channels[channel.id] = converted
+        self._writer.add_channel(converted)
+        self._summary.messages.setdefault(channel.topic, 0)
+        changed = converted.message_encoding != channel.message_encoding
+        if changed and channel.topic not in self._summary.converted:
+            self._summary.converted.append(channel.topic)
+
+    def write(self, message: Message) -> bool:
+        """Write a message of a chosen channel; returns whether it is of one."""
+        source = message.channel
+        if source.id in self._refused:
+            return self._skip(source, self._refused[source.id])
+        if source.id not in self._channels:
+            if not self._selected(source.topic):
+                return False
+            self._add(source)  # it was to have no message any more, and has one after all
+        channel, payload = self._channels[source.id], message.data
+        try:
+            if source.id not in self._republished:
+                payload = self._converter.payload(source, payload)
+            self._writer.write(replace(message, channel=channel, data=payload))
+        except ConversionError as error:
+            if not self._may_skip:
+                raise
+            return self._skip(source, error.problem)
+        self._summary.messages[channel.topic] += 1
+        return True
+
+    def _skip(self, source: Channel, problem: str) -> bool:
+        counts = self._summary.unconvertible.setdefault(source.topic, {})
+        counts[problem] = counts.get(problem, 0) + 1
+        return False
+
+
+def _refusal(problems: dict[str, str]) -> ConversionError:
+    """What to raise for topics that the target cannot hold; why by topic."""
+    first, *others = problems
+    listed = [problems[first], *(f"topic {topic}: {problems[topic]}" for topic in others)]
+    return ConversionError(
+        first,
+        "; ".join(listed),
+        "Exclude with " + " ".join(f"`exclude` {shlex.quote(topic)}" for topic in problems) + ", "
+        "skip and count with `skip_unconvertible`, or unpack to mcap, which keeps all as it is.",
+    )
+
+
+def _write_other(
+    writer: BagWriter, record: Attachment | MetadataRecord, to: str, source: str
+) -> None:
+    if isinstance(record, Attachment):
+        writer.add_attachment(record)
+        return
+    # what we noted of a rosbag2 folder is of no use to another format
+    ours = source == "rosbag2" and record.name.startswith(_OURS)
+    if not ours or to == "rosbag2":
+        writer.add_metadata(record)
+
+
+def _unpack_images(
+    dataset: Dataset,
+    path: Path,
+    target: Path,
+    options: UnpackOptions,
+    progress: Callable[[UnpackProgress], None] | None,
+) -> UnpackSummary:
+    selected = Selection(options.topics, options.exclude)
+    selected.check(dataset.topics)
+    summary = UnpackSummary(target)
+    path.mkdir()
+    names = FileNames()
+    streams = [stream for stream in dataset.streams if selected(stream.topic)]
+    reduction = options.reduction
+    counts = [_given(stream, reduction, summary) for stream in streams]
+    total, done = sum(counts), 0
+    for stream, count in zip(streams, counts, strict=True):
+        stream.verify_video()
+        stem, _ = names.name_for(stream.topic)
+        folder = path / stem
+        folder.mkdir()
+        for _ in write_images(
+            stream,
+            folder,
+            image_format=options.image_format,
+            jpeg_quality=options.jpeg_quality,
+            reduction=reduction,
+        ):
+            done += 1
+            if progress:
+                progress(UnpackProgress(done, total))
+        summary.messages[stream.topic] = summary.messages.get(stream.topic, 0) + count
+    others = {channel.topic for channel in dataset.channels} - set(summary.messages)
+    summary.left_out.extend(sorted(others))
+    return summary
+
+
+def _given(stream: Stream, reduction: Reduction, summary: UnpackSummary) -> int:
+    """How many frames of a stream are given; tells of those that are left out."""
+    count = len(stream)
+    if reduction.leaves_out:
+        count = int(reduction.kept(stream.columns).sum())
+        if count < len(stream):
+            thinned = summary.thinned.get(stream.topic, 0) + len(stream) - count
+            summary.thinned[stream.topic] = thinned
+    return count

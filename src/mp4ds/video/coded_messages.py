@@ -1,0 +1,228 @@
+"""Coded messages as the packets of a video track, and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from mp4ds.messages import jpeg, png
+from mp4ds.messages.coded import NoPicture, Picture, Refused
+from mp4ds.video import av1, nal
+from mp4ds.video.codecs import CODECS, part_of
+
+if TYPE_CHECKING:
+    from mp4ds.video.av1 import Av1Pictures
+    from mp4ds.video.h264 import H264Pictures
+    from mp4ds.video.h265 import H265Pictures
+    from mp4ds.video.vp9 import Vp9Pictures
+
+
+def packet_codec(message_format: str) -> str:
+    """The codec of the packets of a message.
+
+    Args:
+        message_format: `format` of Foxglove's CompressedVideo, or `encoding` of an
+            FFMPEGPacket, whose first part names the codec or its encoder
+            (``libx264``, ``hevc_nvenc``, ``h264;yuv420p;bgr8;bgr8``).
+
+    Raises:
+        Refused: No video here has that codec.
+    """
+    name = message_format.partition(";")[0].strip().lower()
+    for codec, found in CODECS.items():
+        # hardware encoders are called h264_nvenc, hevc_vaapi ...
+        if name in found.names or name.partition("_")[0] in found.names:
+            return codec
+    raise Refused(f"its codec {message_format[:40]!r} is none that a video here has")
+
+
+# ---------------------------------------------------------------- packets
+
+PACKET_CODECS = tuple(name for name, codec in CODECS.items() if codec.pictures)
+"""Codecs whose packets a video track takes as they are."""
+
+_MAX_BODY = 2**30  # what an mp4 and its readers take for one packet
+
+
+@dataclass(frozen=True, slots=True)
+class CodedPicture:
+    """A body that a video track carries.
+
+    Attributes:
+        width: Columns.
+        height: Rows.
+        keyframe: Whether decoding can begin here.
+        framing: What an mp4 does not keep of the body, see `body_of`.
+    """
+
+    width: int
+    height: int
+    keyframe: bool
+    framing: str = ""
+
+
+class PictureParser:
+    """Looks at the bodies of one topic in the order they go into a video.
+
+    A video that begins in the middle, or lacks a packet, decodes to garbage until the next key
+    frame. So bodies are refused up to the first key frame whose parameters are known, and again
+    after a refused picture.
+
+    Args:
+        codec: One of `PACKET_CODECS`.
+
+    Raises:
+        ValueError: The codec is another one; lists those.
+    """
+
+    def __init__(self, codec: str) -> None:
+        if codec not in PACKET_CODECS:
+            raise ValueError(f"codec {codec!r} is none of {', '.join(PACKET_CODECS)}")
+        self._pictures: _Pictures = _pictures_of(codec)
+        self._whole = False
+
+    @property
+    def parameters(self) -> bytes:
+        """Parameter sets as Annex B, or an AV1 sequence header, seen so far; else empty."""
+        return self._pictures.parameters
+
+    def parse(self, body: bytes | memoryview) -> CodedPicture:
+        """Check that an mp4 carries a body, and find what is needed to get it back.
+
+        Raises:
+            Refused: It does not; says why. A packet of parameters alone is refused too, but
+                they are kept in mind.
+        """
+        if len(body) > _MAX_BODY:
+            raise Refused(f"it has more than {_MAX_BODY} bytes")
+        try:
+            picture = self._pictures.parse(memoryview(body))
+        except NoPicture:
+            raise
+        except Refused:
+            self._whole = False
+            raise
+        if not self._whole and not picture.keyframe:
+            raise Refused("it needs pictures before it that are not in the video")
+        self._whole = True
+        return picture
+
+    def leave_out(self) -> None:
+        """Tell that the picture parsed last does not go into the video after all."""
+        self._whole = False
+
+
+class _Pictures(Protocol):
+    @property
+    def parameters(self) -> bytes: ...
+
+    def parse(self, body: memoryview) -> CodedPicture: ...
+
+
+class Jpegs:
+    """JPEG files, of which none needs another."""
+
+    parameters = b""
+
+    def parse(self, body: memoryview) -> CodedPicture:
+        """See `PictureParser.parse`."""
+        info = jpeg.parse(body)
+        return CodedPicture(info.width, info.height, keyframe=True)
+
+
+class Pngs:
+    """PNG files, of which none needs another."""
+
+    parameters = b""
+
+    def parse(self, body: memoryview) -> CodedPicture:
+        """See `PictureParser.parse`."""
+        info = png.parse(body)
+        png.check_whole(body)
+        return CodedPicture(info.width, info.height, keyframe=True)
+
+
+class _Units:
+    """H.264 or H.265."""
+
+    def __init__(self, pictures: H264Pictures | H265Pictures) -> None:
+        self._pictures = pictures
+
+    @property
+    def parameters(self) -> bytes:
+        return self._pictures.parameters
+
+    def parse(self, body: memoryview) -> CodedPicture:
+        units, framing = nal.split(body)
+        picture = self._pictures.picture(units)
+        if not self.parameters:
+            raise Refused("its parameter sets were not sent before it")
+        return _coded(picture, framing)
+
+
+class _Whole:
+    """AV1 or VP9."""
+
+    def __init__(self, pictures: Av1Pictures | Vp9Pictures, *, delimited: bool) -> None:
+        self._pictures = pictures
+        self._delimited = delimited
+
+    @property
+    def parameters(self) -> bytes:
+        return self._pictures.parameters
+
+    def parse(self, body: memoryview) -> CodedPicture:
+        packet, framing = av1.strip(body) if self._delimited else (body, "")
+        return _coded(self._pictures.picture(packet), framing)
+
+
+def _coded(picture: Picture, framing: str) -> CodedPicture:
+    return CodedPicture(picture.width, picture.height, picture.keyframe, framing)
+
+
+def _pictures_of(codec: str) -> _Pictures:
+    known = CODECS[codec]
+    pictures = part_of(known.pictures)()
+    if known.framing == "units":
+        return _Units(pictures)
+    if codec in ("mjpeg", "png"):
+        return pictures  # type: ignore[no-any-return]
+    return _Whole(pictures, delimited=known.framing == "obus")
+
+
+def plain_body(codec: str, body: bytes | memoryview) -> bytes:
+    """A body as a muxer is given it, with the framing that all muxers read alike.
+
+    Its length is that of the packet in the mp4: a start code of four bytes becomes a length of
+    four bytes.
+
+    Raises:
+        Refused: It is not of the codec.
+    """
+    framed = CODECS[codec].framing
+    if framed == "units":
+        return nal.join_plain(nal.split(body)[0])
+    if framed == "obus":
+        return bytes(av1.strip(body)[0])
+    return bytes(body)
+
+
+def body_of(codec: str, packet: bytes, framing: str) -> bytes:
+    """The body that an mp4 holds as a packet.
+
+    Args:
+        codec: One of `PACKET_CODECS`.
+        packet: As the mp4 holds it.
+        framing: As `CodedPicture` has it.
+
+    Raises:
+        Refused: The framing does not belong to the packet.
+    """
+    framed = CODECS[codec].framing
+    if framed == "units":
+        return nal.join_length_prefixed(packet, framing)
+    if framed == "obus":
+        return av1.join(packet, framing)
+    if framing:
+        raise Refused(f"{framing[:40]!r} is no framing of {codec}")
+    return packet

@@ -1,0 +1,267 @@
+"""H.264 access units: key frames, picture size, and whether pictures are sent in order.
+
+Sections are those of ITU-T H.264 (08/2021).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from mp4ds.messages.coded import REORDERED, BitReader, NoPicture, Picture, Refused, check_size
+from mp4ds.video.nal import PictureOrder, join_plain, unescape
+
+SLICE, PARTITION_A, IDR, SPS, PPS, AUD = 1, 2, 5, 7, 8, 9
+_HEADER_BYTES = 1024
+_SLICE_HEADER_BYTES = 64
+_B_SLICE = 1
+# profiles whose SPS tells the chroma format (7.3.2.1.1)
+_HIGH_PROFILES = frozenset((44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244))
+
+
+def unit_type(unit: bytes) -> int:
+    """Type of a NAL unit (7.4.1)."""
+    return unit[0] & 0x1F
+
+
+def has_parameters(units: Sequence[bytes]) -> bool:
+    """Whether NAL units have both kinds of parameter sets among them."""
+    return {SPS, PPS} <= set(map(unit_type, units))
+
+
+@dataclass(frozen=True, slots=True)
+class Sps:
+    """What is needed of a sequence parameter set.
+
+    Attributes:
+        number: Its id.
+        width: Columns shown.
+        height: Rows shown.
+        planes: Whether the colour planes are coded apart.
+        frames_only: Whether no picture is a field.
+        frame_num_bits: Bits of `frame_num`.
+        poc_type: How the picture order is coded, 0 to 2.
+        poc_bits: Bits of the picture order count, for type 0.
+        reorder: Most pictures sent before one shown earlier; None if it does not tell.
+    """
+
+    number: int
+    width: int
+    height: int
+    planes: bool
+    frames_only: bool
+    frame_num_bits: int
+    poc_type: int
+    poc_bits: int
+    reorder: int | None
+
+
+def parse_sps(unit: bytes) -> Sps:
+    """Parse a sequence parameter set (7.3.2.1.1).
+
+    Raises:
+        Refused: It is malformed.
+    """
+    reader = BitReader(unescape(unit[1:_HEADER_BYTES]))
+    profile = reader.bits(8)
+    reader.bits(16)
+    number = reader.ue()
+    chroma, planes = 1, False
+    if profile in _HIGH_PROFILES:
+        chroma = reader.ue()
+        if chroma > 3:
+            raise Refused("its H.264 parameters are malformed")
+        planes = chroma == 3 and reader.flag()
+        reader.ue()
+        reader.ue()
+        reader.flag()
+        if reader.flag():
+            _skip_scaling_matrix(reader, 12 if chroma == 3 else 8)
+    frame_num_bits = reader.ue() + 4
+    poc_type, poc_bits = _picture_order(reader)
+    reader.ue()
+    reader.flag()
+    width_units, height_units = reader.ue() + 1, reader.ue() + 1
+    frames_only = reader.flag()
+    if not frames_only:
+        reader.flag()
+    reader.flag()
+    crop = [reader.ue() for _ in range(4)] if reader.flag() else [0] * 4
+    rows = 1 if frames_only else 2
+    crop_x = 2 if chroma in (1, 2) and not planes else 1
+    crop_y = rows * (2 if chroma == 1 else 1)
+    width = 16 * width_units - crop_x * (crop[0] + crop[1])
+    height = 16 * rows * height_units - crop_y * (crop[2] + crop[3])
+    check_size(width, height)
+    if number > 31 or frame_num_bits > 16 or poc_bits > 16:
+        raise Refused("its H.264 parameters are malformed")
+    reorder = None
+    if reader.flag():
+        try:
+            reorder = _vui_reorder(reader)
+        except Refused:  # encoders in hardware cut it short
+            reorder = None
+    return Sps(
+        number, width, height, planes, frames_only, frame_num_bits, poc_type, poc_bits, reorder
+    )
+
+
+def _picture_order(reader: BitReader) -> tuple[int, int]:
+    poc_type = reader.ue()
+    if poc_type == 0:
+        return poc_type, reader.ue() + 4
+    if poc_type == 1:
+        reader.flag()
+        reader.se()
+        reader.se()
+        count = reader.ue()
+        if count > 255:
+            raise Refused("its H.264 parameters are malformed")
+        for _ in range(count):
+            reader.se()
+    elif poc_type != 2:
+        raise Refused("its H.264 parameters are malformed")
+    return poc_type, 0
+
+
+def _skip_scaling_matrix(reader: BitReader, lists: int) -> None:
+    for index in range(lists):
+        if reader.flag():
+            last = following = 8
+            for _ in range(16 if index < 6 else 64):
+                if following:
+                    following = (last + reader.se()) % 256
+                last = following or last
+
+
+def _vui_reorder(reader: BitReader) -> int | None:
+    """`max_num_reorder_frames` of the usability information (annex E.1.1)."""
+    if reader.flag() and reader.bits(8) == 255:
+        reader.bits(32)
+    if reader.flag():
+        reader.flag()
+    if reader.flag():
+        reader.bits(4)
+        if reader.flag():
+            reader.bits(24)
+    if reader.flag():
+        reader.ue()
+        reader.ue()
+    if reader.flag():
+        reader.bits(65)
+    buffers = 0
+    for _ in range(2):
+        if reader.flag():
+            _skip_buffering(reader)
+            buffers += 1
+    if buffers:
+        reader.flag()
+    reader.flag()
+    if not reader.flag():
+        return None
+    reader.flag()
+    for _ in range(4):
+        reader.ue()
+    return reader.ue()
+
+
+def _skip_buffering(reader: BitReader) -> None:
+    """Skip `hrd_parameters` (annex E.1.2)."""
+    count = reader.ue() + 1
+    if count > 32:
+        raise Refused("its H.264 parameters are malformed")
+    reader.bits(8)
+    for _ in range(count):
+        reader.ue()
+        reader.ue()
+        reader.flag()
+    reader.bits(20)
+
+
+class H264Pictures:
+    """The pictures of one stream, access unit by access unit."""
+
+    def __init__(self) -> None:
+        self._sets: dict[tuple[int, int], bytes] = {}
+        self._sps: dict[int, Sps] = {}
+        self._sps_of_pps: dict[int, int] = {}
+        self._order = PictureOrder()
+
+    @property
+    def parameters(self) -> bytes:
+        """The parameter sets seen so far, as Annex B; empty unless there are both kinds."""
+        if not self._sps or not self._sps_of_pps:
+            return b""
+        return join_plain([self._sets[key] for key in sorted(self._sets)])
+
+    def picture(self, units: Sequence[bytes]) -> Picture:
+        """The picture in an access unit.
+
+        Raises:
+            NoPicture: There is none.
+            Refused: There are several, it needs parameters that were not sent, or it is sent
+                out of the order shown.
+        """
+        slices: list[bytes] = []
+        for unit in units:
+            kind = unit_type(unit)
+            if kind == SPS:
+                self._take_sps(unit)
+            elif kind == PPS:
+                self._take_pps(unit)
+            elif kind in (SLICE, PARTITION_A, IDR):
+                slices.append(unit)
+        if not slices:
+            raise NoPicture("it holds no picture, only parameters or remarks")
+        first = [unit for unit in slices if len(unit) > 1 and unit[1] & 0x80]
+        if len(first) != 1:
+            raise Refused("it holds more than one picture, or a part of one")
+        keyframe = all(unit_type(unit) == IDR for unit in slices)
+        sps = self._check_order(first[0], slices)
+        return Picture(sps.width, sps.height, keyframe)
+
+    def _take_sps(self, unit: bytes) -> None:
+        sps = parse_sps(unit)
+        self._sps[sps.number] = sps
+        self._sets[SPS, sps.number] = unit
+
+    def _take_pps(self, unit: bytes) -> None:
+        reader = BitReader(unescape(unit[1:_SLICE_HEADER_BYTES]))
+        number, sps = reader.ue(), reader.ue()
+        if number > 255 or sps > 31:
+            raise Refused("its H.264 parameters are malformed")
+        self._sps_of_pps[number] = sps
+        self._sets[PPS, number] = unit
+
+    def _check_order(self, unit: bytes, slices: Sequence[bytes]) -> Sps:
+        """Compare the picture's place in the order shown with the last one's (8.2.1)."""
+        reader = BitReader(unescape(unit[1:_SLICE_HEADER_BYTES]))
+        reader.ue()
+        reader.ue()
+        sps = self._sps.get(self._sps_of_pps.get(reader.ue(), -1))
+        if sps is None:
+            raise Refused("its parameter sets were not sent before it")
+        if sps.planes:
+            reader.bits(2)
+        reader.bits(sps.frame_num_bits)
+        if not sps.frames_only and reader.flag():
+            raise Refused("it holds a field, half of an interlaced picture")
+        if sps.poc_type == 2 or sps.reorder == 0:
+            return sps
+        if sps.poc_type == 1:
+            self._order.is_broken |= any(map(_is_b_slice, slices))
+        else:
+            if unit_type(unit) == IDR:
+                reader.ue()
+                self._order.restart()
+            # only pictures that others refer to are counted from
+            self._order.take(reader.bits(sps.poc_bits), sps.poc_bits, counts=bool(unit[0] & 0x60))
+        if self._order.is_broken:
+            raise Refused(REORDERED)
+        return sps
+
+
+def _is_b_slice(unit: bytes) -> bool:
+    reader = BitReader(unescape(unit[1:_SLICE_HEADER_BYTES]))
+    reader.ue()
+    return reader.ue() % 5 == _B_SLICE

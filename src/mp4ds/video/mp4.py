@@ -1,0 +1,625 @@
+"""The index of an mp4: its boxes, its track, and where each coded frame lies (ISO/IEC 14496-12)."""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.errors import VideoError
+
+_HEADER, _LONG_HEADER = 8, 16
+_MOST_BOXES = 1_000  # beside each other; no video has a tenth of that
+
+
+class DamagedBoxError(ValueError):
+    """A box is missing or contradicts what is around it; the text says which."""
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A box's place.
+
+    Attributes:
+        kind: Its four letters.
+        start: Byte of the file where its contents begin.
+        end: Byte after them.
+    """
+
+    kind: bytes
+    start: int
+    end: int
+
+    @property
+    def size(self) -> int:
+        """Bytes of its contents."""
+        return self.end - self.start
+
+
+def boxes(file: BinaryIO, start: int, end: int, *, outermost: bool = False) -> Iterator[Box]:
+    """The boxes that lie beside each other; only their headers are read.
+
+    Args:
+        file: Where they are.
+        start: Byte where the first begins.
+        end: Byte after the last. Fewer than 8 bytes before it are no box, as in QuickTime.
+        outermost: Whether they are in no other box, so that the last may have no size.
+
+    Raises:
+        DamagedBoxError: One does not lie within `start` and `end`, or they are too many.
+    """
+    for _ in range(_MOST_BOXES):
+        if end - start < _HEADER:
+            return
+        file.seek(start)
+        header = file.read(min(_LONG_HEADER, end - start))
+        if len(header) < _HEADER:
+            raise DamagedBoxError("the file ends before its last box")
+        size, kind = struct.unpack_from(">I4s", header)
+        head = _HEADER
+        if size == 1 and len(header) == _LONG_HEADER:
+            (size,) = struct.unpack_from(">Q", header, _HEADER)
+            head = _LONG_HEADER
+        elif size == 0 and outermost:
+            size = end - start
+        if not head <= size <= end - start:
+            raise DamagedBoxError("a box is damaged")
+        yield Box(kind, start + head, start + size)
+        start += size
+    raise DamagedBoxError(f"there are more than {_MOST_BOXES} boxes in one")
+
+
+def find_box(file: BinaryIO, kind: bytes, start: int, end: int, *, outermost: bool = False) -> Box:
+    """The first box of a kind; the arguments are those of `boxes`.
+
+    Raises:
+        DamagedBoxError: There is none, or one before it is damaged.
+    """
+    for box in boxes(file, start, end, outermost=outermost):
+        if box.kind == kind:
+            return box
+    raise DamagedBoxError(f"box {kind.decode('latin-1')} is missing")
+
+
+# ---------------------------------------------------------------- sample entry
+
+_TO_DESCRIPTION = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
+_ENTRY_BYTES = 78  # of a video's sample entry, between its header and the boxes in it
+_LONGEST_ENTRY = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class SampleEntry:
+    """The description of all packets of a track (ISO/IEC 14496-12, 8.5.2).
+
+    Bit rates are left out: they are of the packets, not of the codec.
+
+    Attributes:
+        codec: Its four letters.
+        values: Size, resolution and depth as they stand.
+        boxes: What follows: parameter sets, colour, aspect ratio, ...
+    """
+
+    codec: str
+    values: bytes
+    boxes: tuple[tuple[str, bytes], ...]
+
+    @property
+    def aspect_ratio(self) -> Fraction:
+        """Width to height of a pixel; 0 if nothing is said."""
+        pasp = dict(self.boxes).get("pasp", b"")
+        across, down = struct.unpack(">II", pasp) if len(pasp) == 8 else (0, 1)
+        return Fraction(across, down) if down else Fraction(0)
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return int.from_bytes(self.values[24:26], "big")
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return int.from_bytes(self.values[26:28], "big")
+
+    @property
+    def size(self) -> str:
+        """Width and height in pixels."""
+        return f"{self.width}x{self.height}"
+
+    def differences(self, other: SampleEntry) -> str:
+        """What differs, in words; empty if nothing does."""
+        if self == other:
+            return ""
+        if self.codec != other.codec:
+            return f"their codec ({self.codec} and {other.codec})"
+        if self.size != other.size:
+            return f"their size ({self.size} and {other.size})"
+        kinds = sorted({kind for kind, _ in set(self.boxes) ^ set(other.boxes)})
+        return f"what they say of their codec ({', '.join(kinds) or 'order or depth'})"
+
+
+def read_sample_entry(path: Path) -> SampleEntry:
+    """The description of the first track's packets.
+
+    Args:
+        path: An mp4 of which nothing needs to be true; at most 1 MiB of it is held.
+
+    Raises:
+        VideoError: ``file-missing``, or ``video-unreadable`` where there is not just one
+            description.
+        OSError: It cannot be read.
+    """
+    if not path.is_file():
+        raise VideoError("file-missing", path, "does not exist")
+    with path.open("rb") as file:
+        try:
+            box = Box(b"", 0, path.stat().st_size)
+            for kind in _TO_DESCRIPTION:
+                box = find_box(file, kind, box.start, box.end, outermost=kind == b"moov")
+            return parse_descriptions(file, box)
+        except DamagedBoxError as error:
+            raise VideoError(
+                "video-unreadable", path, f"has no description of one track: {error}"
+            ) from None
+
+
+def parse_descriptions(file: BinaryIO, stsd: Box) -> SampleEntry:
+    """The only entry of a track's ``stsd``.
+
+    Args:
+        file: Where it is; at most 1 MiB of it is read.
+        stsd: Its place there.
+
+    Raises:
+        DamagedBoxError: There is not just one, or it contradicts itself.
+    """
+    if stsd.size > _LONGEST_ENTRY:
+        raise DamagedBoxError("it is too long")
+    file.seek(stsd.start)
+    data = file.read(stsd.size)
+    if data[4:8] != b"\0\0\0\1":
+        raise DamagedBoxError("there are several")
+    file = io.BytesIO(data)
+    entry = next(boxes(file, 8, len(data)), None)
+    if entry is None or entry.size < _ENTRY_BYTES:
+        raise DamagedBoxError("a box is damaged")
+    values_end = entry.start + _ENTRY_BYTES
+    parts = []
+    for box in boxes(file, values_end, entry.end):
+        if box.kind != b"btrt":
+            body = data[box.start : box.end]
+            body = _without_rates(body) if box.kind == b"esds" else body
+            parts.append((box.kind.decode("latin-1"), body))
+    return SampleEntry(entry.kind.decode("latin-1"), data[entry.start : values_end], tuple(parts))
+
+
+def _without_rates(esds: bytes) -> bytes:
+    """An elementary stream descriptor as ffmpeg writes it, with its size of a buffer and rates 0.
+
+    ISO/IEC 14496-1, 7.2.6.5 and 7.2.6.6: tags, each with a length of four bytes, an ES_ID and
+    flags of three bytes, and two bytes that tell the codec.
+    """
+    if esds[4:5] != b"\3" or esds[12:13] != b"\4" or len(esds) < 30:
+        return esds
+    return esds[:19] + bytes(11) + esds[30:]
+
+
+# ---------------------------------------------------------------- track colour
+
+_UNSPECIFIED = 2
+_LIMITED, _FULL = 1, 2  # ffmpeg's AVColorRange
+_WORDS = 6  # bytes of three numbers, behind the four letters of the box's kind
+# the numbers of ITU-T H.273 that ffmpeg knows
+_PRIMARIES = frozenset((1, *range(4, 13), 22))
+_TRANSFERS = frozenset((1, *range(4, 19)))
+_MATRICES = frozenset((0, 1, *range(4, 18)))
+
+
+@dataclass(frozen=True, slots=True)
+class TrackColour:
+    """The box ``colr`` (ISO/IEC 14496-12, 12.1.5), numbers as in ITU-T H.273.
+
+    Attributes:
+        primaries: Colour primaries.
+        transfer: Transfer characteristics.
+        matrix: Matrix coefficients.
+        full_range: Whether samples use their full range; None if nothing is said of it.
+    """
+
+    primaries: int
+    transfer: int
+    matrix: int
+    full_range: bool | None
+
+    def apply(self, context: Any) -> None:
+        """Tell PyAV's context of a decoder; what the packets say outweighs it."""
+        context.color_primaries = self.primaries
+        context.color_trc = self.transfer
+        context.colorspace = self.matrix
+        if self.full_range is not None:
+            context.color_range = _FULL if self.full_range else _LIMITED
+
+
+def track_colour(entry: SampleEntry) -> TrackColour | None:
+    """The colours of a track, as ffmpeg reads them; None if it says nothing of them.
+
+    QuickTime's ``nclc`` has no range. What nobody defined is unspecified, and profiles are not
+    looked at.
+    """
+    found = None
+    for kind, body in entry.boxes:
+        if kind != "colr" or body[:4] not in (b"nclx", b"nclc") or len(body) < 4 + _WORDS:
+            continue
+        primaries, transfer, matrix = (int.from_bytes(body[at : at + 2], "big") for at in (4, 6, 8))
+        full_range = bool(body[10] & 0x80) if body[:4] == b"nclx" and len(body) > 10 else None
+        found = TrackColour(
+            primaries if primaries in _PRIMARIES else _UNSPECIFIED,
+            transfer if transfer in _TRANSFERS else _UNSPECIFIED,
+            matrix if matrix in _MATRICES else _UNSPECIFIED,
+            full_range,
+        )
+    return found
+
+
+# ---------------------------------------------------------------- samples
+
+Integers = NDArray[np.int64]
+
+_CONFIGURATIONS = ("avcC", "hvcC", "av1C", "vpcC", "glbl")
+_LONGEST_INDEX = 1 << 26  # bytes; about two days at 30 Hz
+_MOST_ALIKE = 1 << 22  # samples of one size: all that bounds the memory for them
+_LARGEST_TIMESCALE = 1 << 31  # negative to some readers
+_LONGEST_STEP = 1 << 31  # ticks; negative to some readers
+_LONGEST_DELAY = 1 << 28  # ticks between decoding and showing; ffmpeg ignores longer ones
+_LATEST = 1 << 62  # ticks
+_NO_EDITS = 8  # bytes of a list
+_MOST_EDITS = 16
+_NORMAL_SPEED = 0x10000
+_IN_THIS_FILE = 1
+
+_NUMBER = np.dtype(">u4")
+_LONG_NUMBER = np.dtype(">u8")
+_STEPS = np.dtype([("count", ">u4"), ("value", ">u4")])
+_DELAYS = np.dtype([("count", ">u4"), ("value", ">i4")])
+_CHUNKS = np.dtype([("first", ">u4"), ("samples", ">u4"), ("description", ">u4")])
+_EDITS = np.dtype([("duration", ">u4"), ("start", ">i4"), ("speed", ">i4")])
+_LONG_EDITS = np.dtype([("duration", ">u8"), ("start", ">i8"), ("speed", ">i4")])
+
+
+class Unindexed(ValueError):  # noqa: N818 - no failure: such a file is read in order
+    """A sound file whose index this module does not read; the text says why."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SampleTable:
+    """What the index says of a video track's samples, which are its coded frames.
+
+    Attributes:
+        codec: Four letters of the sample entry: ``avc1``, ``hev1``, ``hvc1``, ``av01``,
+            ``vp09``, ``FFV1``, ``mp4v``, ...
+        width: Columns, as the sample entry says.
+        height: Rows, as the sample entry says.
+        colour: What the track says of its colours, if anything.
+        configuration: Contents of avcC, hvcC, av1C, vpcC or glbl; empty if there is none.
+        timescale: Ticks per second.
+        places: Byte of the file where each sample begins, in decoding order. All arrays but
+            `sync` are int64.
+        sizes: Bytes of each.
+        decoding: Ticks at which each is decoded, none later than it is shown.
+        presentation: Ticks at which each is shown, the edit list applied.
+        sync: For each whether it is a sync sample, at which decoding can begin; bool.
+        order: Numbers of the samples that the edit list shows, in the order of their showing:
+            frame ``n`` of the video is sample ``order[n]``.
+    """
+
+    codec: str
+    width: int
+    height: int
+    colour: TrackColour | None
+    configuration: bytes
+    timescale: int
+    places: Integers
+    sizes: Integers
+    decoding: Integers
+    presentation: Integers
+    sync: NDArray[np.bool_]
+    order: Integers
+
+
+@dataclass(frozen=True, slots=True)
+class _Edit:
+    """What is shown of a track, in ticks of the track."""
+
+    delay: int
+    start: int
+    duration: int
+
+
+class _Movie:
+    """The movie box, held in memory."""
+
+    def __init__(self, data: bytes) -> None:
+        self.file = io.BytesIO(data)  # shares the bytes
+        self._data = memoryview(data)
+        self.box = Box(b"moov", 0, len(data))
+
+    def inside(self, box: Box) -> dict[bytes, Box]:
+        """The first box of each kind in a box."""
+        found: dict[bytes, Box] = {}
+        for part in boxes(self.file, box.start, box.end):
+            found.setdefault(part.kind, part)
+        return found
+
+    def path(self, box: Box, *kinds: bytes) -> Box:
+        """A box by the kinds of those that it is in, and its own."""
+        for kind in kinds:
+            box = _required(self.inside(box), kind)
+        return box
+
+    def tracks(self) -> list[Box]:
+        """Its video tracks."""
+        tracks = [box for box in boxes(self.file, 0, self.box.end) if box.kind == b"trak"]
+        handlers = [(track, self.path(track, b"mdia", b"hdlr")) for track in tracks]
+        return [
+            track
+            for track, handler in handlers
+            if bytes(self._data[handler.start : handler.end][8:12]) == b"vide"
+        ]
+
+    def number(self, box: Box, at: int) -> int:
+        """The 32-bit number at a byte of a box."""
+        (value,) = self._array(box, at, _NUMBER, 1)
+        return int(value)
+
+    def version(self, box: Box) -> int:
+        """Version of a full box."""
+        return self.number(box, 0) >> 24
+
+    def timescale(self, header: Box) -> int:
+        """Ticks per second of ``mvhd`` or ``mdhd``."""
+        value = self.number(header, 20 if self.version(header) == 1 else 12)
+        if not 0 < value < _LARGEST_TIMESCALE:
+            raise DamagedBoxError(f"a second has {value} ticks")
+        return value
+
+    def table(self, box: Box, row: np.dtype[Any], at: int = 4) -> NDArray[Any]:
+        """A table of as many rows as the number at a byte of its box says."""
+        return self._array(box, at + 4, row, self.number(box, at))
+
+    def _array(self, box: Box, at: int, row: np.dtype[Any], count: int) -> NDArray[Any]:
+        if at + count * row.itemsize > box.size:
+            raise DamagedBoxError(f"box {box.kind.decode('latin-1')} is too short")
+        return np.frombuffer(self._data, row, count, box.start + at)
+
+
+def read_sample_table(stream: BinaryIO, size: int, place: str) -> SampleTable:
+    """Read the index of an mp4 with one video track.
+
+    Only the headers of its outermost boxes and its movie box are read, the latter at once.
+
+    Args:
+        stream: The file, of which nothing needs to be true. The memory that is needed is at most
+            some twenty times its movie box, of no more than 64 MiB, or 400 MiB where all frames
+            have one size.
+        size: Its bytes.
+        place: Its name, for errors.
+
+    Raises:
+        VideoError: ``video-unreadable``: there is no index, it contradicts itself or the file's
+            size, or there is not just one video track.
+        Unindexed: The index says something that this module does not read: fragments, several
+            edits or descriptions, compact sizes, another file, too many frames or none.
+        OSError, RemoteError: The file cannot be read.
+    """
+    try:
+        movie = _read_movie(stream, size)
+        tracks = movie.tracks()
+        if len(tracks) != 1:
+            raise VideoError("video-unreadable", place, f"has {len(tracks)} video tracks, not one")
+        return _parse_track(movie, tracks[0], size)
+    except DamagedBoxError as error:
+        raise VideoError(
+            "video-unreadable", place, f"has no index that can be read: {error}"
+        ) from None
+
+
+def _read_movie(stream: BinaryIO, size: int) -> _Movie:
+    for box in boxes(stream, 0, size, outermost=True):
+        if box.kind == b"moof":
+            raise Unindexed("its frames are in fragments")
+        if box.kind == b"moov":
+            if box.size > _LONGEST_INDEX:
+                raise Unindexed("its index is too long")
+            stream.seek(box.start)
+            data = stream.read(box.size)
+            if len(data) != box.size:
+                raise DamagedBoxError("the file ends before its index")
+            movie = _Movie(data)
+            if movie.inside(movie.box).keys() & {b"mvex", b"cmov"}:
+                raise Unindexed("its frames are in fragments, or its index is compressed")
+            return movie
+    raise DamagedBoxError("box moov is missing")
+
+
+def _parse_track(movie: _Movie, track: Box, file_size: int) -> SampleTable:
+    media = movie.inside(movie.path(track, b"mdia"))
+    timescale = movie.timescale(_required(media, b"mdhd"))
+    information = _required(media, b"minf")
+    _check_references(movie, information)
+    tables = movie.inside(movie.path(information, b"stbl"))
+    entry = _description(movie, _required(tables, b"stsd"))
+    sizes = _sizes(movie, tables, file_size)
+    places = _places(movie, tables, sizes, file_size)
+    decoding, presentation = _times(movie, tables, len(sizes))
+    edit = _edit(movie, track, timescale)
+    order = np.arange(len(sizes), dtype=np.int64)
+    if edit:
+        order = _shown(presentation, edit, order)
+        shift = edit.delay - int(presentation[order].min())
+        decoding += shift
+        presentation += shift
+    times = presentation[order]
+    if np.any(times[1:] < times[:-1]):
+        order = order[np.argsort(times, kind="stable")]
+    return SampleTable(
+        codec=entry.codec,
+        width=entry.width,
+        height=entry.height,
+        colour=track_colour(entry),
+        configuration=_configuration(entry),
+        timescale=timescale,
+        places=places,
+        sizes=sizes,
+        decoding=decoding,
+        presentation=presentation,
+        sync=_sync(movie, tables, len(sizes)),
+        order=order,
+    )
+
+
+def _required(found: dict[bytes, Box], kind: bytes) -> Box:
+    if kind not in found:
+        raise DamagedBoxError(f"box {kind.decode('latin-1')} is missing")
+    return found[kind]
+
+
+def _check_references(movie: _Movie, information: Box) -> None:
+    """Refuse frames that are in other files, as QuickTime may have them."""
+    references = movie.inside(information).get(b"dinf")
+    dref = movie.inside(references).get(b"dref") if references else None
+    if dref is None:
+        return
+    for reference in boxes(movie.file, dref.start + 8, dref.end):
+        if not movie.number(reference, 0) & _IN_THIS_FILE:
+            raise Unindexed("its frames are in another file")
+
+
+def _description(movie: _Movie, stsd: Box) -> SampleEntry:
+    if movie.number(stsd, 4) > 1:
+        raise Unindexed("its frames have several descriptions")
+    return parse_descriptions(movie.file, stsd)
+
+
+def _configuration(entry: SampleEntry) -> bytes:
+    return next((body for kind, body in entry.boxes if kind in _CONFIGURATIONS), b"")
+
+
+def _sizes(movie: _Movie, tables: dict[bytes, Box], file_size: int) -> Integers:
+    if b"stsz" not in tables and b"stz2" in tables:
+        raise Unindexed("the sizes of its frames are compact")
+    stsz = _required(tables, b"stsz")
+    common, count = movie.number(stsz, 4), movie.number(stsz, 8)
+    if not count:
+        raise Unindexed("its index lists no frames")
+    if not common:
+        return movie.table(stsz, _NUMBER, at=8).astype(np.int64)
+    if count * common > file_size:
+        raise DamagedBoxError("its frames are larger than the file")
+    if count > _MOST_ALIKE:
+        raise Unindexed("its index is too long")
+    return np.full(count, common, np.int64)
+
+
+def _places(movie: _Movie, tables: dict[bytes, Box], sizes: Integers, file_size: int) -> Integers:
+    """Samples lie in chunks, one after the other; what a chunk holds is told where it changes."""
+    if b"co64" in tables:
+        chunks = movie.table(tables[b"co64"], _LONG_NUMBER)
+    else:
+        chunks = movie.table(_required(tables, b"stco"), _NUMBER)
+    if np.any(chunks > file_size):
+        raise DamagedBoxError("frames lie beyond the end of the file")
+    runs = movie.table(_required(tables, b"stsc"), _CHUNKS)
+    if np.any(runs["description"] != 1):
+        raise Unindexed("its frames have several descriptions")
+    edges = np.append(runs["first"].astype(np.int64) - 1, len(chunks))
+    if edges[0] != 0 or np.any(np.diff(edges) <= 0) or np.any(runs["samples"] == 0):
+        raise DamagedBoxError("box stsc contradicts the number of chunks")
+    counts = np.repeat(runs["samples"].astype(np.int64), np.diff(edges))
+    if counts.sum() != len(sizes):
+        raise DamagedBoxError("box stsc contradicts the number of frames")
+    before = np.cumsum(sizes) - sizes
+    firsts = np.cumsum(counts) - counts
+    places: Integers = before + np.repeat(chunks.astype(np.int64) - before[firsts], counts)
+    if np.any(places + sizes > file_size):
+        raise DamagedBoxError("frames lie beyond the end of the file")
+    return places
+
+
+def _times(movie: _Movie, tables: dict[bytes, Box], count: int) -> tuple[Integers, Integers]:
+    """Ticks of decoding and of showing, without the edit list; two arrays."""
+    steps = _repeated(movie.table(_required(tables, b"stts"), _STEPS), count, "stts")
+    if np.any(steps >= _LONGEST_STEP):
+        raise Unindexed("a frame lasts too long")
+    decoding = np.cumsum(steps) - steps
+    if b"ctts" not in tables:
+        return decoding, decoding.copy()
+    delays = _repeated(movie.table(tables[b"ctts"], _DELAYS), count, "ctts")
+    if np.any(np.abs(delays) > _LONGEST_DELAY):
+        raise Unindexed("a frame is shown too long after its decoding")
+    # where delays are negative, decoding has to begin earlier
+    return decoding + min(int(delays.min()), 0), decoding + delays
+
+
+def _repeated(rows: NDArray[Any], count: int, kind: str) -> Integers:
+    counts = rows["count"].astype(np.int64)
+    if counts.sum() != count:
+        raise DamagedBoxError(f"box {kind} contradicts the number of frames")
+    values: Integers = np.repeat(rows["value"].astype(np.int64), counts)
+    return values
+
+
+def _sync(movie: _Movie, tables: dict[bytes, Box], count: int) -> NDArray[np.bool_]:
+    if b"stss" not in tables:
+        return np.ones(count, np.bool_)
+    numbers = movie.table(tables[b"stss"], _NUMBER).astype(np.int64)
+    if np.any((numbers < 1) | (numbers > count)):
+        raise DamagedBoxError("box stss contradicts the number of frames")
+    sync = np.zeros(count, np.bool_)
+    sync[numbers - 1] = True
+    return sync
+
+
+def _edit(movie: _Movie, track: Box, timescale: int) -> _Edit | None:
+    """The edit list, where it only delays the track and cuts its ends; None without one.
+
+    Raises:
+        Unindexed: It says more.
+    """
+    parts = movie.inside(track)
+    elst = movie.inside(parts[b"edts"]).get(b"elst") if b"edts" in parts else None
+    if elst is None or elst.size == _NO_EDITS:
+        return None
+    rows = movie.table(elst, _LONG_EDITS if movie.version(elst) == 1 else _EDITS)
+    if len(rows) > _MOST_EDITS:
+        raise Unindexed("it has several edits")
+    if elst.size != _NO_EDITS + rows.nbytes or not len(rows):
+        raise Unindexed("its edits are not as many as it says")  # ffmpeg goes by their size
+    movie_scale = movie.timescale(movie.path(movie.box, b"mvhd"))
+    # durations are in ticks of the movie, rounded to the nearest of the track
+    durations = [
+        (2 * duration * timescale + movie_scale) // (2 * movie_scale)
+        for duration in rows["duration"].tolist()
+    ]
+    starts = rows["start"].tolist()
+    if any(start != -1 for start in starts[:-1]) or starts[-1] < 0:
+        raise Unindexed("it has several edits")
+    if rows["speed"][-1] != _NORMAL_SPEED or not durations[-1]:
+        raise Unindexed("it has an edit that stands still or has no end")
+    edit = _Edit(sum(durations[:-1]), starts[-1], durations[-1])
+    if max(edit.delay, edit.start + edit.duration) > _LATEST:
+        raise DamagedBoxError("an edit is too late")
+    return edit
+
+
+def _shown(presentation: Integers, edit: _Edit, order: Integers) -> Integers:
+    shown = (presentation >= edit.start) & (presentation < edit.start + edit.duration)
+    if not shown.any():
+        raise Unindexed("its edit list shows no frames")
+    return order if shown.all() else order[shown]
