@@ -206,14 +206,3 @@ def decode_depth(data: bytes | memoryview, hint: png.PngRecipe | None = None) ->
     if encode_rvl(depth) != body:
         raise Refused("its RVL does not rebuild byte for byte")
     return DepthImage(header, depth, None)
-
-
-def rebuild_depth(image: DepthImage) -> bytes:
-    """The message's data.
-
-    Raises:
-        Refused: The recipe is none.
-    """
-    if image.recipe is None:
-        return image.header + encode_rvl(image.pixels)
-    return image.header + png.rebuild(image.pixels, image.recipe)
