@@ -76,7 +76,8 @@ def patterns(count: int) -> Iterator[list[int]]:
     yield [0]
 
 
-@each("name", [name for name in RECIPES if name not in ALIKE], one_in=4)
+# JPEG files are given as libjpeg decodes them, and not as PyAV does: see test_republish.py
+@each("name", [name for name in RECIPES if name not in (*ALIKE, "mjpeg")], one_in=4)
 def test_it_is_the_same_frame(name: str, tmp_path: Path) -> None:
     recipe = RECIPES[name]
     path = written(tmp_path, recipe)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ from mp4ds.packing.calibrations import StampPairing, pair_camera_infos
 from mp4ds.packing.look import Looker
 from mp4ds.records import Channel, Message
 from mp4ds.times import intervals, lost_frames
+
+_T = TypeVar("_T")
 
 
 @dataclass
@@ -91,12 +93,18 @@ def info(path: Path | str) -> Info:
         SourceError: It is no recording or cannot be read.
         FormatError: The dataset breaks a rule of the format.
     """
+    return _look(path, _dataset_info, _recording_info)
+
+
+def _look(
+    path: Path | str, at_dataset: Callable[[Dataset], _T], at_recording: Callable[[BagReader], _T]
+) -> _T:
     path = location(path)
     if names_dataset(path):
         with Dataset(path) as dataset:
-            return _dataset_info(dataset)
+            return at_dataset(dataset)
     with open_reader(path) as reader:
-        return _recording_info(reader)
+        return at_recording(reader)
 
 
 def _recording_info(reader: BagReader) -> Info:
@@ -316,12 +324,7 @@ def intrinsics(path: Path | str) -> Intrinsics:
         SourceError: It is no recording or cannot be read.
         FormatError: The dataset breaks a rule of the format.
     """
-    path = location(path)
-    if names_dataset(path):
-        with Dataset(path) as dataset:
-            return _of_dataset(dataset)
-    with open_reader(path) as reader:
-        return _of_recording(reader)
+    return _look(path, _of_dataset, _of_recording)
 
 
 def _rows(values: Sequence[float]) -> Matrix:
