@@ -8,11 +8,14 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
 
 import mp4ds
 from each import each
+from mp4ds.cli import COMMANDS, app_for
 from mp4ds.plugins.demo import demo
 from sources import SOURCES, scene
 from waiting import WATCHDOG_S
@@ -104,6 +107,12 @@ def test_readme_python(demo_dataset: Path, tmp_path: Path) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
     shutil.copy(demo_dataset.parent / "demo.bag", tmp_path / "drive.bag")
     run(sys.executable, "-c", code, cwd=tmp_path)
+
+
+@each("name", COMMANDS)
+def test_the_list_of_commands_says_what_each_says_of_itself(name: str) -> None:
+    group: Any = typer.main.get_command(app_for(name))
+    assert (group.commands[name].help or "").splitlines()[0] == COMMANDS[name][1]
 
 
 @each(

@@ -1,6 +1,6 @@
-"""Make what is made from the models: schemas/ and the field tables in spec/index.md.
+"""Make what is made from the code: schemas/, the field tables in spec/index.md, docs/options.md.
 
-    python tools/generate.py            write the draft schemas and the tables
+    python tools/generate.py            write the draft schemas, the tables and the options
     python tools/generate.py --check    fail where they differ from the models
     python tools/generate.py --release  also write the schemas of the released version
 
@@ -16,11 +16,39 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mp4ds.cli.options import flags_of
 from mp4ds.format.fields import FORMAT_VERSION
 from mp4ds.format.sidecars import generate_schema
+from mp4ds.options import Options, shown_of
+from mp4ds.packing.options import ImageFolder, PackOptions
+from mp4ds.plugins.evaluating.options import EvaluateOptions
+from mp4ds.plugins.exporting.job import ExportOptions
+from mp4ds.plugins.playing.play import PlayOptions
+from mp4ds.plugins.reporting.report import ReportOptions
+from mp4ds.plugins.reporting.stills import StillOptions
+from mp4ds.unpacking.unpack import UnpackOptions
 
 ROOT = Path(__file__).resolve().parents[1]
 KINDS = ("stream", "dataset")
+COMMANDS: dict[str, type[Options]] = {
+    "pack": PackOptions,
+    "unpack": UnpackOptions,
+    "import images": ImageFolder,
+    "export": ExportOptions,
+    "play": PlayOptions,
+    "evaluate": EvaluateOptions,
+    "report": ReportOptions,
+    "frames": StillOptions,
+}
+NOT_OF_THE_COMMAND = {("pack", "images"), ("play", "to"), ("play", "clock")}
+"""Options that the command line has in another form."""
+
+HEAD = """# All options
+
+On the command line, and in Python as fields of the dataclass of each command; made by
+`tools/generate.py` of where they are declared. `mp4ds COMMAND --help` shows them with what else a
+command takes.
+"""
 
 
 def outputs() -> dict[Path, str]:
@@ -36,7 +64,31 @@ def outputs() -> dict[Path, str]:
         for name, model in models.items():
             text = replace_table(text, name, model)
     texts[spec] = text
+    texts[ROOT / "docs" / "options.md"] = options_page()
     return texts
+
+
+def options_page() -> str:
+    """The options of all commands, as tables."""
+    parts = [HEAD]
+    for command, kind in COMMANDS.items():
+        parts.append(f"\n## {command}: `{kind.__name__}`\n\n{option_table(command, kind)}")
+    parts.append("\n`import images` also takes those of `pack` that are not about recordings.\n")
+    return "".join(parts)
+
+
+def option_table(command: str, kind: type[Options]) -> str:
+    """A Markdown table of a command's options."""
+    rows = ["| option | in Python | default | |", "| --- | --- | --- | --- |"]
+    for name, shown in shown_of(kind).items():
+        if (command, name) in NOT_OF_THE_COMMAND:
+            continue
+        flags = ", ".join(f"`{flag}`" for flag in flags_of(name, shown))
+        default = getattr(kind, name)
+        text = shown.default or ("" if default in (None, False, (), "") else str(default))
+        help_text = shown.help.replace("|", "\\|")
+        rows.append(f"| {flags} | `{name}` | {text} | {help_text} |")
+    return "\n".join(rows) + "\n"
 
 
 def replace_table(text: str, name: str, model: dict[str, Any]) -> str:

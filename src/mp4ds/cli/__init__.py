@@ -77,13 +77,13 @@ def app_for(*names: str) -> typer.Typer:
     app.callback(invoke_without_command=True)(_top)
     for name, (home, does) in COMMANDS.items():
         if names and name not in names:
-            app.command(name, help=does)(_listed)
+            app.command(name, short_help=does)(_listed)
             continue
         module = import_module(f"mp4ds.cli.{home}")
         if name == "import":
-            app.add_typer(module.imports)
+            app.add_typer(module.imports, short_help=does)
         else:
-            app.command(name)(getattr(module, name.replace("-", "_")))
+            app.command(name, short_help=does)(getattr(module, name.replace("-", "_")))
     return app
 
 

@@ -46,9 +46,10 @@ def takes(
         for parameter in own:
             for info in get_args(parameter.annotation)[1:]:
                 if isinstance(info, OptionInfo):
-                    _FLAGS[parameter.name] = _long(info.param_decls or (), parameter.name)
+                    _FLAGS[parameter.name] = (info.param_decls or [f"--{parameter.name}"])[0]
         for kind in kinds:
-            _FLAGS.update({name: _long(item.flags, name) for name, item in shown_of(kind).items()})
+            for name, item in shown_of(kind).items():
+                _FLAGS[name] = flags_of(name, item)[0].partition("/")[0]
         made = [_parameters(kind, without) for kind in kinds]
         required = [parameter for parameter in own if parameter.default is parameter.empty]
         others = [parameter for parameter in own if parameter.default is not parameter.empty]
@@ -85,13 +86,10 @@ def _parameters(kind: type[Options], without: Sequence[str]) -> Mapping[str, ins
 
 
 def _parameter(name: str, hint: Any, default: Any, shown: Shown) -> inspect.Parameter:
-    decls = shown.flags
-    if not any(flag.startswith("--") for flag in decls):
-        decls = (_long(decls, name), *decls)
     if shown.parse or default == ():
         default = shown.default
     info = typer.Option(
-        *decls,
+        *flags_of(name, shown),
         help=in_flags(shown.help),
         metavar=shown.metavar,
         min=shown.least,
@@ -105,9 +103,10 @@ def _parameter(name: str, hint: Any, default: Any, shown: Shown) -> inspect.Para
     )
 
 
-def _long(decls: Sequence[str], name: str) -> str:
-    found = [flag for flag in decls if flag.startswith("--")]
-    return found[0].partition("/")[0] if found else "--" + name.replace("_", "-")
+def flags_of(name: str, shown: Shown) -> Sequence[str]:
+    """What an option is called on the command line, the long names before the short ones."""
+    has_long = any(flag.startswith("--") for flag in shown.flags)
+    return shown.flags if has_long else ("--" + name.replace("_", "-"), *shown.flags)
 
 
 def _plain(hint: Any, shown: Shown) -> Any:
