@@ -128,6 +128,15 @@ def test_nothing_is_told_that_is_not_known(state: PackProgress) -> None:
     assert job.share in (None, 0.0)
 
 
+def test_the_least_share_that_there_is() -> None:
+    clock = Clock(0.0)
+    job = PackStanding(clock=clock)
+    for seconds, share in ((0.0, 0.0), (5.0, 0.0), (6.0, 5e-324), (7.0, 1e-323), (8.0, 1e-9)):
+        clock.seconds = seconds
+        job.take(told(share))
+        assert job.seconds_left is None or job.seconds_left > 0
+
+
 def test_no_time_left_is_told_of_a_share_of_a_job() -> None:
     clock = Clock()
     job = PackStanding(whole=False, clock=clock)

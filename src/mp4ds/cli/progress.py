@@ -27,6 +27,7 @@ PACE_SECONDS = 60.0
 _LEFT_SECONDS = 3.0
 _NAME_WIDTH = 60
 _ROUNDING = 1e-6
+_DIGITS = 9  # of a share: with all of a float, the time left may be more than a number
 
 
 class PackStanding:
@@ -94,7 +95,7 @@ def packed_share(state: PackProgress) -> float | None:
     if state.phase != "packing":
         return 1.0
     if state.done is not None:
-        return min(1.0, max(0.0, state.done))
+        return round(min(1.0, max(0.0, state.done)), _DIGITS)
     return min(1.0, state.tasks_done / state.tasks_total) if state.tasks_total else None
 
 
