@@ -418,6 +418,13 @@ def swap(folder: Path, suffix: str) -> None:
     right.write_bytes(first)
 
 
+def test_a_manifest_that_lists_no_streams(dataset: Path) -> None:
+    changed(dataset / "dataset.yaml", lambda manifest: manifest.update(streams=[]))
+    for deep in (False, True):
+        assert codes(dataset, deep=deep) == ["message-count"]
+    assert "message-count" in refused(dataset)
+
+
 def test_two_sidecars_that_were_swapped(two_cameras: Path) -> None:
     swap(two_cameras, ".yaml")
     found = codes(two_cameras)

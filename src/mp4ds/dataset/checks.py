@@ -165,13 +165,13 @@ def _validate_dataset(folder: Path, deep: bool, report: _Report) -> list[Problem
             problems += _check_stream(streams[-1])
     problems += _check_listed(folder, manifest)
     dataset = None if problems else Dataset.of(folder, manifest, streams)
-    if dataset:
+    if dataset is not None:
         problems += _check_messages(dataset, manifest)
     if deep:
         problems += _check_hashes(folder, manifest, report)
         for stream in streams:
             problems += _check_deep(stream, report)
-        if dataset and not problems:
+        if dataset is not None and not problems:
             problems += _check_recorded(dataset, manifest, report)
     return problems
 
