@@ -154,7 +154,7 @@ def test_what_ros1_cannot_have(roscore: Core, tmp_path: Path) -> None:
     for index, topic in enumerate(channels):
         kind_, sentence = published.ask("advertise_one", index)
         assert (kind_, sentence.split(":")[0]) == ("ConversionError", f"topic {topic}")
-        assert "Leave the topic out with --exclude" in sentence
+        assert "Leave the topic out with `exclude`" in sentence
 
 
 def test_two_types_on_one_topic(roscore: Core, tmp_path: Path) -> None:
