@@ -42,7 +42,7 @@ def takes(
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         hints = get_type_hints(command, include_extras=True)
         written = list(inspect.signature(command).parameters.values())[len(kinds) :]
-        own = [parameter.replace(annotation=hints[parameter.name]) for parameter in written]
+        own = [one.replace(annotation=_annotated(hints[one.name])) for one in written]
         for parameter in own:
             for info in get_args(parameter.annotation)[1:]:
                 if isinstance(info, OptionInfo):
@@ -74,6 +74,11 @@ def takes(
         return call
 
     return decorate
+
+
+def _annotated(hint: Any) -> Any:
+    """A hint with its option outermost; Python 3.10 makes it optional where the default is None."""
+    return next((part for part in get_args(hint) if get_origin(part) is Annotated), hint)
 
 
 def _parameters(kind: type[Options], without: Sequence[str]) -> Mapping[str, inspect.Parameter]:
