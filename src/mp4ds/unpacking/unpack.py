@@ -249,8 +249,6 @@ def _check(to: str, options: UnpackOptions) -> None:
     if options.images and to == "images":
         raise OptionError("`images` goes with a recording; with `to` images, use `image_format`.")
     check_kind(options.images, options.reduction)
-    if not 1 <= options.jpeg_quality <= 100:
-        raise OptionError(f"`jpeg_quality` {options.jpeg_quality} is not from 1 to 100.")
 
 
 def default_output(dataset: Path, to: str) -> Path:

@@ -244,16 +244,16 @@ class Intra:
         """There is nothing to forget."""
 
 
-class _Chained:
+class _Chained(ABC):
     """Codecs whose frames take over what the last one left in the decoder, shown or not."""
 
     def __init__(self, configuration: bytes) -> None:
         del configuration
         self._begun = False
 
+    @abstractmethod
     def is_key(self, data: memoryview) -> bool:
         """Whether a packet begins with a key frame."""
-        raise NotImplementedError
 
     def packet(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
         """See `ReferenceParser.packet`."""
