@@ -167,7 +167,7 @@ def test_datasets_count_by_their_size() -> None:
 def jobs(draw: st.DrawFn) -> list[tuple[float, PackProgress]]:
     """Reports in any order, true or not."""
     now, found = 0.0, []
-    for _ in range(draw(st.integers(1, 40))):
+    for _ in range(draw(st.integers(1, 8))):
         now += draw(st.floats(0, 2000))
         share = draw(st.none() | st.floats(0, 1))
         state = told(
@@ -187,7 +187,7 @@ def jobs(draw: st.DrawFn) -> list[tuple[float, PackProgress]]:
     return found
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(jobs(), st.integers(20, 200), st.integers(1, 60))
 def test_whatever_is_told_nothing_silly_is_shown(
     reports: list[tuple[float, PackProgress]], width: int, height: int
