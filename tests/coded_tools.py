@@ -17,7 +17,7 @@ from av.video.frame import PictureType
 from numpy.typing import NDArray
 from PIL import Image
 
-from mp4ds.messages.coded import Refused
+from mp4ds.errors import Refused
 
 WIDTH, HEIGHT = 64, 48
 

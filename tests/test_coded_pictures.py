@@ -23,7 +23,8 @@ from coded_tools import (
 )
 from conftest import real
 from each import each
-from mp4ds.messages.coded import REORDERED, NoPicture, Refused
+from mp4ds.errors import Refused
+from mp4ds.messages.coded import REORDERED, NoPicture
 from mp4ds.video import av1, h264, h265, nal, vp9
 from mp4ds.video.coded_messages import PACKET_CODECS, PictureParser
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from coded_tools import mutations, refusal
 from each import each
-from mp4ds.messages.coded import Refused
+from mp4ds.errors import Refused
 from mp4ds.messages.depth import decode_rvl, encode_rvl
 
 Depth = NDArray[np.uint16]

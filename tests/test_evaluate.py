@@ -25,14 +25,13 @@ from PIL import Image
 import mp4ds
 from coded_scenes import CODED, VERBATIM
 from each import each
-from mp4ds.errors import OptionError, ScoringError, SourceError, TargetError
+from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, TargetError
 from mp4ds.messages.encodings import ENCODINGS as ENCODING_TABLE
 from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.evaluating.clips import (
     Clip,
     ClipFile,
-    Unfit,
     chosen,
     chosen_at_rate,
     make_clip,
@@ -173,7 +172,7 @@ def test_clips_of_a_time() -> None:
     assert abs(np.mean(middle) - 49.5) < 1
     assert chosen(times, origin, replace(given, start=0.0)) == [0, 1, 2]
     for start in (11.0, 1e9):
-        with pytest.raises(Unfit, match="no images in the time"):
+        with pytest.raises(Refused, match="no images in the time"):
             chosen(times, origin, replace(given, start=start))
 
 
@@ -409,7 +408,7 @@ def clips_of(path: Path, folder: Path) -> tuple[dict[str, Clip | str], dict[str,
             try:
                 file = folder / f"{number}.yuv"
                 found[camera.topic] = make_clip(camera, indices, camera.rate, file)
-            except Unfit as reason:
+            except Refused as reason:
                 found[camera.topic] = str(reason)
         return found, source.left_out
 

@@ -30,8 +30,7 @@ from coded_tools import (
 )
 from conftest import real
 from each import each, fresh
-from mp4ds.errors import VideoError
-from mp4ds.messages.coded import Refused
+from mp4ds.errors import Refused, VideoError
 from mp4ds.times import MAX_GAP_NS, NS_PER_TICK
 from mp4ds.video import av1, h264, h265, nal
 from mp4ds.video.codecs import recipe_for

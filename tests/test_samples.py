@@ -21,10 +21,10 @@ from coded_tools import ENCODINGS, IN_ORDER, scene
 from coded_tools import encode as encode_packets
 from conftest import DATA, real
 from each import each
-from mp4ds.errors import VideoError
+from mp4ds.errors import Refused, VideoError
 from mp4ds.times import MAX_GAP_NS, NS_PER_TICK
 from mp4ds.video.codecs import recipe_for
-from mp4ds.video.mp4 import SampleTable, Unindexed, read_sample_table
+from mp4ds.video.mp4 import SampleTable, read_sample_table
 from mp4ds.video.packets import join_segments
 from test_packets import write as write_packets
 from test_video import LOSSLESS, LOSSY, encode, noise
@@ -457,10 +457,10 @@ def test_hours_of_frames_take_milliseconds() -> None:
 def test_fragments(tmp_path: Path) -> None:
     for flags in ("frag_keyframe+empty_moov", "frag_keyframe", "frag_keyframe+dash"):
         path = muxed(tmp_path / "a.mp4", mux={"movflags": flags})
-        with pytest.raises(Unindexed, match="fragments"):
+        with pytest.raises(Refused, match="fragments"):
             read(path)
     data = box(b"ftyp", b"isom") + box(b"moof", bytes(8))
-    with pytest.raises(Unindexed, match="fragments"):
+    with pytest.raises(Refused, match="fragments"):
         read_bytes(data)
 
 
@@ -513,7 +513,7 @@ UNINDEXED: dict[str, tuple[Change, str]] = {
 @each("name", UNINDEXED)
 def test_what_is_not_read(name: str, b_frames: bytes) -> None:
     change, reason = UNINDEXED[name]
-    with pytest.raises(Unindexed, match=reason) as caught:
+    with pytest.raises(Refused, match=reason) as caught:
         read_bytes(change(b_frames))
     assert not isinstance(caught.value, VideoError)
 
@@ -610,7 +610,7 @@ def peak_of(data: bytes, size: int) -> int:
     tracemalloc.start()
     try:
         read_sample_table(file, size, "a.mp4")
-    except (VideoError, Unindexed):
+    except (VideoError, Refused):
         pass
     finally:
         peak = tracemalloc.get_traced_memory()[1]
@@ -626,13 +626,13 @@ def test_memory_is_bounded_by_the_index(b_frames: bytes) -> None:
     for frames in (2**22 + 1, 2**32 - 1):
         alike = in_table(b"stsz", put(4, packed(1, frames)))(b_frames)
         assert peak_of(alike, len(alike)) < 1 << 20
-        with pytest.raises(Unindexed, match="too long"):
+        with pytest.raises(Refused, match="too long"):
             read_sample_table(io.BytesIO(alike + bytes(8)), 1 << 40, "a.mp4")
 
 
 def test_an_index_that_is_too_long() -> None:
     data = struct.pack(">I4sQ", 1, b"moov", 1 << 39)
-    with pytest.raises(Unindexed, match="too long"):
+    with pytest.raises(Refused, match="too long"):
         read_sample_table(io.BytesIO(data), 1 << 39, "a.mp4")
 
 
@@ -685,7 +685,7 @@ def test_damage_anywhere_in_the_index(seed: int, b_frames: bytes) -> None:
             outcomes["read"] += 1
         except VideoError:
             outcomes["damaged"] += 1
-        except Unindexed:
+        except Refused:
             outcomes["unindexed"] += 1
     assert all(outcomes.values()), outcomes
     assert largest < 1 << 20

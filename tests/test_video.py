@@ -22,9 +22,8 @@ from PIL import Image
 
 from coded_tools import jpeg
 from each import each
-from mp4ds.errors import EncoderRefusedError, OptionError, VideoError
+from mp4ds.errors import EncoderRefusedError, OptionError, Refused, VideoError
 from mp4ds.messages.arrangements import CHROMA_SHIFTS
-from mp4ds.messages.coded import Refused
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.layouts import bind, fit, layout_for
 from mp4ds.video.codecs import Recipe, check_codec, lossless_codecs, recipe_for

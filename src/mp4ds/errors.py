@@ -26,7 +26,8 @@
     └── PublishError (OSError)         1  ROS or another receiver that is not there, or was lost
 
 The classes build their sentence from their fields: what, where, and what to do.
-The exit code is the one that the command line ends with.
+The exit code is the one that the command line ends with. `Refused` is not one of them: no user
+meets it.
 """
 
 from __future__ import annotations
@@ -53,6 +54,14 @@ def _restored(kind: type[Mp4dsError], args: tuple[Any, ...], fields: dict[str, A
     error.args = args
     vars(error).update(fields)
     return error
+
+
+class Refused(ValueError):  # noqa: N818 - no failure: another way is taken
+    """One way cannot be taken with what is there; the text says why, as a phrase.
+
+    Whoever catches it takes the next way, and tells the reason where the user gains by it: a
+    message is stored verbatim, a video is read in order, a camera is left out.
+    """
 
 
 def _as_path(path: Path | str) -> Path:

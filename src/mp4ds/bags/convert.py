@@ -32,7 +32,7 @@ from mp4ds.bags.types import (
     translate,
     types_of,
 )
-from mp4ds.errors import ConversionError, OptionError
+from mp4ds.errors import ConversionError, OptionError, Refused
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 
 if TYPE_CHECKING:
@@ -143,10 +143,6 @@ class _Plan:
     times: Where
 
 
-class _TimeBeyond(Exception):  # noqa: N818 - of a message; the topic is told by its caller
-    """A time that the target cannot hold; says so."""
-
-
 class Converter:
     """Converts channels and their messages to ROS 1 or ROS 2.
 
@@ -196,7 +192,7 @@ class Converter:
         plan = self._plan(channel)
         try:
             return self._convert(plan, memoryview(data))
-        except _TimeBeyond as beyond:
+        except Refused as beyond:
             raise ConversionError(channel.topic, str(beyond), _KEPT_AS_IT_IS) from None
         except BAD_PAYLOAD:
             problem = f"a message does not parse as {channel.type_name}"
@@ -283,7 +279,7 @@ class Converter:
             has = f"{seconds} s, and ROS 1 can hold 0 to 2^32 seconds"
             if not to_ros1:
                 has = f"{seconds + 2**32} s, and ROS 2 can hold -2^31 to 2^31 seconds"
-            raise _TimeBeyond(f"a message has a time of {has}")
+            raise Refused(f"a message has a time of {has}")
         if not to_ros1 and HEADER in plan.types:
             self._omitted["messages with a header's sequence number, which ROS 2 has not"] += 1
         return converted

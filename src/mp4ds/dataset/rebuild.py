@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.errors import FormatError
+from mp4ds.errors import FormatError, Refused
 from mp4ds.format.fields import (
     MAX_CAMERA_INFOS,
     MAX_VARIANTS,
@@ -39,10 +39,6 @@ from mp4ds.times import INT64_MAX, INT64_MIN, Int64Column, encode_column
 _DIGESTS_PER_LINE = 12
 
 
-class Unsuited(Exception):  # noqa: N818 - no error: the message is stored verbatim
-    """A message that the stream cannot carry exactly; says why."""
-
-
 class ColumnsWriter:
     """The growing columns of one stream or of its camera_info."""
 
@@ -64,11 +60,11 @@ class ColumnsWriter:
         """Refuse times that a column cannot hold.
 
         Raises:
-            Unsuited: A time is beyond 64 bits with sign.
+            Refused: A time is beyond 64 bits with sign.
         """
         for value in (message.log_time, message.publish_time, parts.pts or 0):
             if not INT64_MIN <= value <= INT64_MAX:
-                raise Unsuited(f"time {value} ns does not fit into 64 bits with sign")
+                raise Refused(f"time {value} ns does not fit into 64 bits with sign")
 
     def append(self, message: Message, parts: Parts, *, variant: int, ordinal: int) -> None:
         """Append one message's values, checked before."""
@@ -158,7 +154,7 @@ class MessageSplitter:
         """The form of a message and its parts.
 
         Raises:
-            Unsuited: It does not parse, or is not modelled.
+            Refused: It does not parse, or is not modelled.
         """
         data = memoryview(message.data)
         schema = self._channel.schema
@@ -170,7 +166,7 @@ class MessageSplitter:
             form = self._forms[wire]
             return form, form.split(data)
         except WireError as error:
-            raise Unsuited(f"it does not parse: {error}") from None
+            raise Refused(f"it does not parse: {error}") from None
 
 
 class HeaderTable(Generic[_ModelT]):
@@ -203,21 +199,21 @@ class HeaderTable(Generic[_ModelT]):
             extra: What else makes a header another one.
 
         Raises:
-            Unsuited: It does not rebuild, or there are too many.
+            Refused: It does not rebuild, or there are too many.
         """
         blank = parts.blank
         try:
             template = self._templates.get(blank) or self.form.template(blank)
             exact = prove(template, parts, data)
         except WireError as error:
-            raise Unsuited(f"its header does not rebuild: {error}") from None
+            raise Refused(f"its header does not rebuild: {error}") from None
         if not exact:
-            raise Unsuited("its header does not rebuild")
+            raise Refused("its header does not rebuild")
         known = self._numbers.get((blank, extra))
         if known is not None:
             return known
         if len(self.items) == MAX_VARIANTS:
-            raise Unsuited(f"more than {MAX_VARIANTS} different message headers")
+            raise Refused(f"more than {MAX_VARIANTS} different message headers")
         plain = self.form.plain(parts.frame_id, parts.fields)
         self.items.append(describe(None if plain == blank else base64.b64encode(blank).decode()))
         self._templates[blank] = template
@@ -245,18 +241,18 @@ class CameraInfoWriter:
             ordinal: Its place among the channel's messages.
 
         Raises:
-            Unsuited: It cannot be modelled exactly; nothing was changed.
+            Refused: It cannot be modelled exactly; nothing was changed.
         """
         form, parts = self._forms.split(message)
         self._columns.check(message, parts)
         if len(self._columns) == MAX_CAMERA_INFOS:
-            raise Unsuited(f"more than {MAX_CAMERA_INFOS} messages")
+            raise Refused(f"more than {MAX_CAMERA_INFOS} messages")
         fields = parts.fields
         if not isinstance(fields, CalibrationFields):
-            raise Unsuited("it is no calibration")
+            raise Refused("it is no calibration")
         heads = self._heads or HeaderTable[Calibration](form)
         if heads.form.wire != form.wire:
-            raise Unsuited("its byte order differs from the first one's")
+            raise Refused("its byte order differs from the first one's")
         variant = heads.number(
             parts,
             memoryview(message.data),

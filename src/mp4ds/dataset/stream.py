@@ -26,14 +26,13 @@ from mp4ds.dataset.rebuild import (
     template_of,
     unbroken,
 )
-from mp4ds.errors import FormatError
+from mp4ds.errors import FormatError, Refused
 from mp4ds.files.outputs import digest_file
 from mp4ds.format.fields import decode_base64
 from mp4ds.format.models import Calibration, StreamSidecar
 from mp4ds.format.sidecars import load_stream
 from mp4ds.messages import depth, png
 from mp4ds.messages.arrangements import Picture
-from mp4ds.messages.coded import Refused
 from mp4ds.messages.encodings import ENCODINGS, Pixels, pixel_view, put_padding
 from mp4ds.messages.png import zlib_build, zlib_fingerprint
 from mp4ds.messages.wire import CodedFields, Fields, ImageFields, Template

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mp4ds.errors import Refused
+
 MAX_SIDE = 16384
 """Largest width and height of a coded picture: what video decoders take."""
 
@@ -11,10 +13,6 @@ MAX_IMAGE_BYTES = 2**28
 """Most bytes of pixels that are unpacked from one coded picture."""
 
 _MAX_UE_BITS = 32
-
-
-class Refused(ValueError):  # noqa: N818 - no failure: the message is stored verbatim
-    """A coded picture that a video cannot be shown to carry; the text says why."""
 
 
 def check_size(width: int, height: int) -> None:

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.errors import Refused
 from mp4ds.messages import png
-from mp4ds.messages.coded import MAX_IMAGE_BYTES, Refused, check_size
+from mp4ds.messages.coded import MAX_IMAGE_BYTES, check_size
 
 _HEADER = struct.Struct("<II")
 _WORD_BYTES, _WORD_NIBBLES = 4, 8

@@ -6,8 +6,8 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from mp4ds.dataset.rebuild import CameraInfoWriter, MessageSplitter, Unsuited
-from mp4ds.errors import OptionError
+from mp4ds.dataset.rebuild import CameraInfoWriter, MessageSplitter
+from mp4ds.errors import OptionError, Refused
 from mp4ds.messages.serializations import is_calibration, is_camera, kind_of
 from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, Parts
 from mp4ds.packing.look import CameraMessage
@@ -472,7 +472,7 @@ class Calibrations:
         forms = self._forms.setdefault(channel.id, MessageSplitter(channel))
         try:
             self._by_stamp.add(channel, forms.split(message)[1])
-        except Unsuited:
+        except Refused:
             return  # it is kept verbatim when it is taken or given up
         if len(state.pending) % INFO_WINDOW == 0:
             self._pairs.update(self._by_stamp.decide(self._pairs, final=False))
@@ -494,7 +494,7 @@ class Calibrations:
         try:
             state.writer.accept(message, ordinal)
             topic.frames += 1
-        except Unsuited as reason:
+        except Refused as reason:
             topic.count_verbatim(str(reason), ordinal)
             self._keep(message)
 

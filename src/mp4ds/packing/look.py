@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from mp4ds.dataset.rebuild import MessageSplitter, Unsuited
+from mp4ds.dataset.rebuild import MessageSplitter
+from mp4ds.errors import Refused
 from mp4ds.format.fields import Body
 from mp4ds.messages import depth, jpeg, png
-from mp4ds.messages.coded import Refused
 from mp4ds.messages.encodings import ENCODINGS, Pixels, pixel_view, row_padding
 from mp4ds.messages.layouts import why_not
 from mp4ds.messages.png import PNG_ENCODINGS
@@ -107,18 +107,15 @@ class Looker:
         """What a message holds.
 
         Raises:
-            Unsuited: No stream can carry it; says why.
+            Refused: No stream can carry it; says why.
         """
         form, parts = self._forms.split(message)
         fields = parts.fields
-        try:
-            if isinstance(fields, ImageFields):
-                return _raw_image(form, parts, fields)
-            if isinstance(fields, CodedFields):
-                return self._kind_of(parts.body, fields)(form, parts)
-        except Refused as reason:
-            raise Unsuited(str(reason)) from None
-        raise Unsuited("it holds no image")
+        if isinstance(fields, ImageFields):
+            return _raw_image(form, parts, fields)
+        if isinstance(fields, CodedFields):
+            return self._kind_of(parts.body, fields)(form, parts)
+        raise Refused("it holds no image")
 
     def leave_out(self, seen: CameraMessage) -> None:
         """Tell that no stream took what was seen last."""
@@ -206,7 +203,7 @@ def depends_on_others(channel: Channel, message: Message) -> bool:
         if not isinstance(fields, CodedFields) or not _holds_packets(channel):
             return False
         return packet_codec(fields.format) != "mjpeg"
-    except (Unsuited, Refused):
+    except Refused:
         return _holds_packets(channel)
 
 
@@ -230,7 +227,7 @@ def _raw_image(form: Form, parts: Parts, fields: ImageFields) -> CameraMessage:
         size=len(parts.body),
     )
     if reason:
-        raise Unsuited(reason)
+        raise Refused(reason)
     encoding = ENCODINGS[fields.encoding]
     size = {"width": fields.width, "height": fields.height, "step": fields.step}
     padding = row_padding(parts.body, encoding, **size)

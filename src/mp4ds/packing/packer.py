@@ -11,8 +11,7 @@ from typing import TypeVar
 from mp4ds.bags.mcap_write import McapWriter
 from mp4ds.bags.protocols import BagReader, BagWriter
 from mp4ds.bags.salvage.losses import losses_of
-from mp4ds.dataset.rebuild import Unsuited
-from mp4ds.errors import OutOfReachError
+from mp4ds.errors import OutOfReachError, Refused
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.messages.transforms import TransformCollector
 from mp4ds.packing.calibrations import Calibrations
@@ -121,7 +120,7 @@ class CameraRouter:
         state.count += 1
         try:
             seen = state.looker.look(message)
-        except Unsuited as reason:
+        except Refused as reason:
             self._settle(state, workers)
             self._keep_verbatim(message, number, str(reason))
             return
@@ -187,7 +186,7 @@ class CameraRouter:
         for stream in self._candidates(state, route, item):
             try:
                 job = stream.accept(item.message, item.seen, item.ordinal)
-            except Unsuited as refusal:
+            except Refused as refusal:
                 reason = str(refusal)
                 continue
             self._topic_of(item.message.channel).frames += 1
@@ -213,7 +212,7 @@ class CameraRouter:
             plan = route.plans.pop(0)
             try:
                 stream = self._new_stream(item, plan)
-            except Unsuited as reason:
+            except Refused as reason:
                 if not route.plans and not route.streams:
                     route.refusal = str(reason)
                 continue

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.protocols import BagReader
-from mp4ds.dataset.rebuild import Unsuited
-from mp4ds.errors import OptionError
+from mp4ds.errors import OptionError, Refused
 from mp4ds.files.sources import SourceState
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.packing.calibrations import choose_pairs, pair_camera_infos, unpaired_infos
@@ -388,7 +387,7 @@ def _assumed_bytes(reader: BagReader, topics: _Topics, settings: StreamSettings)
         if first is None:
             continue
         needed += _ASSUMED_ROW * len(first.data)
-        with suppress(Unsuited):
+        with suppress(Refused):
             seen = Looker(channel, transcode=settings.transcode).look(first)
             if not needs_trial(seen, settings):
                 decision = decide([seen], settings, rate_of(reader, channel))

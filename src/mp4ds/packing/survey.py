@@ -8,7 +8,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from mp4ds.bags.protocols import BagReader
-from mp4ds.dataset.rebuild import MessageSplitter, Unsuited
+from mp4ds.dataset.rebuild import MessageSplitter
+from mp4ds.errors import Refused
 from mp4ds.messages.serializations import is_calibration
 from mp4ds.packing.calibrations import StampPairing
 from mp4ds.packing.look import CameraMessage, Looker, StreamKey
@@ -125,7 +126,7 @@ def decide(
     key = samples[0].key
     try:
         return Decision(key, plan_tracks(samples, settings, rate, runs))
-    except Unsuited as reason:
+    except Refused as reason:
         return Decision(key, [], str(reason))
 
 
@@ -168,7 +169,7 @@ def _run(
     excerpt = Excerpt(start=start, topics=frozenset([channel.topic]), others=False)
     for number, record in enumerate(reader.records(excerpt)):
         if isinstance(record, Message) and record.channel.id == channel.id:
-            with suppress(Unsuited):
+            with suppress(Refused):
                 seen = looker.look(record)
                 if seen.key == key:
                     yield seen
@@ -189,7 +190,7 @@ def _samples(
     excerpt = Excerpt(start=start, topics=frozenset([channel.topic]), others=False)
     for number, record in enumerate(reader.records(excerpt)):
         if isinstance(record, Message) and record.channel.id == channel.id:
-            with suppress(Unsuited):
+            with suppress(Refused):
                 seen = looker.look(record)
                 if not samples or seen.key == samples[0].key:
                     samples.append(seen)
@@ -229,7 +230,7 @@ def survey_pairs(
             elif channel.id in lookers:
                 seen = lookers[channel.id].look(record)
                 pairing.add(channel, seen.parts, size=(seen.key.width, seen.key.height))
-        except Unsuited:
+        except Refused:
             continue
         if number % 100 == 0:
             found.update(pairing.decide(found, final=False))

@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.errors import Refused
 from mp4ds.format.models import SCORE_STEPS
 from mp4ds.format.models import Quality as Measured
 from mp4ds.messages.layouts import Layout
 from mp4ds.packing.look import CameraMessage, StreamKey
-from mp4ds.packing.tracks import OutOfReach, PicturePlan, StreamSettings, TargetPlan, picture_facts
+from mp4ds.packing.tracks import PicturePlan, StreamSettings, TargetPlan, picture_facts
 from mp4ds.plan import QualityTarget
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import LEAST_CRF, MAX_CRF, Recipe
@@ -285,13 +286,13 @@ def target_plan(
         rate: Frames per second, where known.
 
     Raises:
-        OutOfReach: No crf gives it.
+        Refused: No crf gives it.
         EncoderRefusedError: The encoder does not take such pictures.
         ScoringError: VMAF cannot be computed.
     """
     coder = _coder(plan, target, key, settings, rate)
     if min(coder.coded_size) < SMALLEST:
-        raise OutOfReach(f"images with less than {SMALLEST} rows or columns have no {target}")
+        raise Refused(f"images with less than {SMALLEST} rows or columns have no {target}")
     with tempfile.TemporaryDirectory(prefix="mp4ds-") as folder:
         crf = _start_crf(coder, runs, int(plan.recipe.options["crf"]), Path(folder))
     recipe = replace(plan.recipe, options={**plan.recipe.options, "crf": str(crf)})
@@ -355,17 +356,17 @@ def _start_crf(
         # a few frames have less VMAF than many, compared with their originals too: where they fall
         # a little short, the first window tells
         if not reached and crf == least and known[crf] < due - target.tolerance:
-            raise OutOfReach(_far_off(target, due, f"crf {crf} gives {known[crf]:.2f}"))
+            raise _out_of_reach(target, due, f"crf {crf} gives {known[crf]:.2f}")
         return crf
     finally:
         for spool in spools:
             spool.close()
 
 
-def _far_off(target: QualityTarget, due: float, made: str) -> str:
+def _out_of_reach(target: QualityTarget, due: float, made: str) -> Refused:
     """Why a stream is lossless: a score, what is due at least, and what there is."""
     limit = f" of the {due:.2f} that its originals allow" if due < target.score else ""
-    return f"{target} is out of reach: {made}{limit}"
+    return Refused(f"{target} is out of reach: {made}{limit}")
 
 
 class TargetTrack:
@@ -415,7 +416,7 @@ class TargetTrack:
         """See `Track.write`.
 
         Raises:
-            OutOfReach: A window cannot have the score.
+            Refused: A window cannot have the score.
         """
         if seen.pixels is not None:
             self._spool.append(self._maker.make(self._plan.layout.to_picture(seen.pixels)))
@@ -427,7 +428,7 @@ class TargetTrack:
         """Encode the window until it is good enough.
 
         Raises:
-            OutOfReach: It is not with any crf.
+            Refused: It is not with any crf.
         """
         coder, control, target = self._coder, self._control, self._plan.target
         spool, due = self._spool, target.score
@@ -447,7 +448,7 @@ class TargetTrack:
         if kept is None:
             first, least = len(self._ticks) - frames, min(tried)
             made = f"crf {least} gives frames {first} to {first + frames - 1} of a part "
-            raise OutOfReach(_far_off(target, due, f"{made}{tried[least]:.2f}"))
+            raise _out_of_reach(target, due, f"{made}{tried[least]:.2f}")
         control.keep(tried, kept, due, frames)
         for crf in tried.keys() - {kept}:
             self._segment(number, crf).unlink()
@@ -464,7 +465,7 @@ class TargetTrack:
         """See `Track.close`.
 
         Raises:
-            OutOfReach: A window cannot have the score.
+            Refused: A window cannot have the score.
         """
         try:
             if len(self._spool):

@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mp4ds.bags.mcap_write import compressed_size
-from mp4ds.dataset.rebuild import Unsuited
-from mp4ds.errors import EncoderRefusedError, OptionError
+from mp4ds.errors import EncoderRefusedError, OptionError, Refused
 from mp4ds.format.models import Color, LayoutParameters
-from mp4ds.messages.coded import Refused
 from mp4ds.messages.encodings import ENCODINGS, Parameters
 from mp4ds.messages.layouts import Layout, bind, layout_for
 from mp4ds.packing.look import CameraMessage, StreamKey
@@ -65,6 +63,7 @@ class Track(Protocol):
             tick: Presentation time in ticks, greater than the last.
 
         Raises:
+            Refused: The video cannot have the score that was asked for.
             OSError: The disk refused.
         """
         ...
@@ -73,6 +72,7 @@ class Track(Protocol):
         """Finish the file.
 
         Raises:
+            Refused: The video cannot have the score that was asked for.
             OSError: The disk refused.
         """
         ...
@@ -116,7 +116,7 @@ class TrackPlan(Protocol):
             rate: Frames per second, where known.
 
         Raises:
-            Unsuited: The encoder does not take such pictures.
+            Refused: The encoder does not take such pictures.
         """
         ...
 
@@ -151,10 +151,6 @@ class TargetPlan(PicturePlan):
         from mp4ds.packing.target import TargetTrack
 
         return TargetTrack(self, path, seen.key, settings, rate)
-
-
-class OutOfReach(Exception):  # noqa: N818 - no error: the stream is made lossless
-    """A score that frames do not have with any crf; says how far they are from it."""
 
 
 def _recipes(plan: PicturePlan) -> Iterator[Recipe]:
@@ -202,7 +198,7 @@ class _PictureTrack:
                 coded = f"coded as {recipe.codec}: {refusals[0]}"
                 self.note = "; ".join(filter(None, (plan.note, coded)))
             return
-        raise Unsuited(refusals[0])
+        raise Refused(refusals[0])
 
     def refuses(self, seen: CameraMessage) -> str | None:
         """See `Track.refuses`."""
@@ -366,7 +362,7 @@ def plan_tracks(
         The best plan first; the last one takes every message of the key.
 
     Raises:
-        Unsuited: A video would be larger than the messages are by zstd, or cannot have the
+        Refused: A video would be larger than the messages are by zstd, or cannot have the
             score that was asked for.
         ScoringError: VMAF cannot be computed.
     """
@@ -418,10 +414,10 @@ def _target_plans(
     try:
         found = target_plan(plan, target, key, runs or [samples], settings, rate)
     except EncoderRefusedError as error:
-        raise Unsuited(str(error)) from None
-    except OutOfReach as reason:
+        raise Refused(str(error)) from None
+    except Refused as reason:
         if is_jpeg:  # which is smaller than any lossless video of its pixels
-            raise Unsuited(str(reason)) from None
+            raise
         return _lossless_plans(samples, settings, f"kept lossless: {reason}")
     if is_jpeg:
         return [found]
@@ -449,7 +445,7 @@ def _lossless_plans(
             best = tried(codec=None, preset=None)
             note = "; ".join(filter(None, (note, f"coded as {best.recipe.codec}: {error}")))
     except EncoderRefusedError as error:
-        raise Unsuited(str(error)) from None
+        raise Refused(str(error)) from None
     _refuse_noise(samples, best.bytes_per_frame)
     layout = bind(best.layout, encoding, best.parameters)
     plan = PicturePlan(layout, best.recipe, "lossless", exact=True, note=note)
@@ -464,7 +460,7 @@ def _refuse_noise(samples: Sequence[CameraMessage], video_size: float) -> None:
     """Refuse what a video would not make smaller.
 
     Raises:
-        Unsuited: Tells both sizes.
+        Refused: Tells both sizes.
     """
     bodies = [seen.parts.body for seen in samples]
     raw = sum(map(len, bodies)) / len(bodies)
@@ -472,7 +468,7 @@ def _refuse_noise(samples: Sequence[CameraMessage], video_size: float) -> None:
         return
     verbatim = compressed_size(bodies) / len(bodies)
     if video_size > verbatim:
-        raise Unsuited(
+        raise Refused(
             f"a video would not be smaller: about {video_size / verbatim:.2f} times as large"
         )
 

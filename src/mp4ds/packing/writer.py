@@ -11,8 +11,8 @@ from typing import Any
 
 import xxhash
 
-from mp4ds.dataset.rebuild import ColumnsWriter, HeaderTable, Unsuited, digests_model
-from mp4ds.errors import OutOfReachError
+from mp4ds.dataset.rebuild import ColumnsWriter, HeaderTable, digests_model
+from mp4ds.errors import OutOfReachError, Refused
 from mp4ds.format.fields import FORMAT_VERSION, MAX_FRAMES, exceeds_padding
 from mp4ds.format.models import (
     CameraInfo,
@@ -28,7 +28,7 @@ from mp4ds.format.sidecars import dump_document
 from mp4ds.messages.png import PngRecipe, zlib_fingerprint
 from mp4ds.messages.wire import CodedFields
 from mp4ds.packing.look import CameraMessage
-from mp4ds.packing.tracks import OutOfReach, StreamSettings, TrackPlan
+from mp4ds.packing.tracks import StreamSettings, TrackPlan
 from mp4ds.records import Channel, Message
 from mp4ds.times import PresentationClock
 from mp4ds.video.access import digest_video
@@ -73,7 +73,7 @@ class StreamWriter:
         rate: Frames per second, where known.
 
     Raises:
-        Unsuited: The encoder does not take such pictures.
+        Refused: The encoder does not take such pictures.
     """
 
     def __init__(
@@ -121,14 +121,14 @@ class StreamWriter:
             The job that writes its frame, and raises what `finish` does.
 
         Raises:
-            Unsuited: The stream cannot carry it exactly; nothing was changed.
+            Refused: The stream cannot carry it exactly; nothing was changed.
         """
         parts = seen.parts
         self._columns.check(message, parts)
         if self.frames == MAX_FRAMES:
-            raise Unsuited(f"more than {MAX_FRAMES} messages")
+            raise Refused(f"more than {MAX_FRAMES} messages")
         if refusal := self._track.refuses(seen):
-            raise Unsuited(refusal)
+            raise Refused(refusal)
         variant = self._heads.number(
             parts,
             memoryview(message.data),
@@ -143,7 +143,7 @@ class StreamWriter:
                 self._digests.append(xxhash.xxh64_intdigest(message.data))
             try:
                 self._track.write(seen, tick)
-            except OutOfReach as reason:
+            except Refused as reason:
                 raise self._out_of_reach(reason) from None
 
         return write
@@ -160,7 +160,7 @@ class StreamWriter:
         """
         try:
             self._track.close()
-        except OutOfReach as reason:
+        except Refused as reason:
             raise self._out_of_reach(reason) from None
         key = self._key
         sidecar = StreamSidecar(
@@ -187,7 +187,7 @@ class StreamWriter:
         self.sidecar_path.write_bytes(dump_document(sidecar))
         return sidecar
 
-    def _out_of_reach(self, reason: OutOfReach) -> OutOfReachError:
+    def _out_of_reach(self, reason: Refused) -> OutOfReachError:
         stream = (self.channel.id, self._key)
         return OutOfReachError(self.channel.topic, stream, str(reason))
 
@@ -200,12 +200,12 @@ class StreamWriter:
         """The model of a message's header.
 
         Raises:
-            Unsuited: The headers would become too large.
+            Refused: The headers would become too large.
         """
         fields, wrap = seen.parts.fields, seen.wrap
         padding = None if wrap.padding is None else base64.b64encode(wrap.padding).decode()
         if exceeds_padding((padding, *(head.padding for head in self._heads.items))):
-            raise Unsuited("too much padding between rows, another for each image")
+            raise Refused("too much padding between rows, another for each image")
         return Header(
             frame_id=seen.parts.frame_id,
             format=fields.format if isinstance(fields, CodedFields) else None,

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from mp4ds.bags.formats import open_reader
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.rebuild import MessageSplitter, Unsuited, fields_of
+from mp4ds.dataset.rebuild import MessageSplitter, fields_of
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import Matrix, effective
+from mp4ds.errors import Refused
 from mp4ds.files.urls import location
 from mp4ds.format.sidecars import names_dataset
 from mp4ds.messages.serializations import is_calibration, is_camera, kind_of
@@ -158,7 +159,7 @@ def _content(reader: BagReader, channel: Channel) -> str:
         return ""
     try:
         fields = MessageSplitter(channel).split(message)[1].fields
-    except Unsuited as reason:
+    except Refused as reason:
         return f"unreadable: {reason}"
     if isinstance(fields, ImageFields):
         return f"{fields.encoding} {fields.width}x{fields.height}"
@@ -375,7 +376,7 @@ class _History:
         self._messages += 1
         try:
             _, parts = self._forms.split(message)
-        except Unsuited:
+        except Refused:
             return
         stamps.add(message.channel, parts)
         fields = parts.fields
@@ -440,7 +441,7 @@ class _Cameras:
         channel = message.channel
         try:
             _, parts = self._forms.setdefault(channel.id, MessageSplitter(channel)).split(message)
-        except Unsuited:
+        except Refused:
             return
         if channel.id not in self._seen:
             size = parts.fields.width, parts.fields.height
@@ -475,7 +476,7 @@ class _Cameras:
 def _coded_size(message: Message, told: tuple[int, int]) -> tuple[int, int]:
     try:
         key = Looker(message.channel).look(message).key
-    except Unsuited:
+    except Refused:
         return told
     return key.width, key.height
 

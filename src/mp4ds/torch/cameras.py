@@ -21,13 +21,13 @@ from torch import Tensor
 from mp4ds.dataset.dataset import open_dataset
 from mp4ds.dataset.frames import Video
 from mp4ds.dataset.stream import Stream
-from mp4ds.errors import FormatError, Mp4dsError, OptionError, SampleError, VideoError
+from mp4ds.errors import FormatError, Mp4dsError, OptionError, Refused, SampleError, VideoError
 from mp4ds.files.urls import location, remote, spelled
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
 from mp4ds.messages.layouts import LAYOUTS
 from mp4ds.times import nearest, synchronize
 from mp4ds.video.codecs import TEN_BITS
-from mp4ds.video.mp4 import Unindexed, read_sample_table
+from mp4ds.video.mp4 import read_sample_table
 
 Resize = float | tuple[int, int]
 Crop = tuple[int, int, int, int]
@@ -544,7 +544,7 @@ class OpenCamera:
         try:
             with path.open("rb") as file:
                 table = read_sample_table(file, path.stat().st_size, str(path))
-        except Unindexed:
+        except Refused:
             return np.arange(len(self.stream), dtype=np.int64)
         except OSError as error:
             raise VideoError("file-missing", path, f"cannot be read: {error.strerror}") from None

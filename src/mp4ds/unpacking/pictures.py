@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mp4ds.dataset.rebuild import Choice, DecodedColumns, everything, form_for, marked, unbroken
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import size_after, view_of
-from mp4ds.errors import OptionError
+from mp4ds.errors import OptionError, Refused
 from mp4ds.format.models import Header, StreamSidecar
 from mp4ds.messages.depth import HEADER_BYTES
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Pixels, pixel_view
@@ -148,10 +148,6 @@ _DEPTHS = ("16UC1", "mono16")
 _INVERSE_DEPTHS = "32FC1"
 
 
-class AsRecorded(ValueError):  # noqa: N818 - no failure: the messages stay as they are
-    """Images that cannot be given in another form; the text says why."""
-
-
 @dataclass(frozen=True, slots=True)
 class Given:
     """An image in its new form.
@@ -204,11 +200,11 @@ def maker(sidecar: StreamSidecar, header: Header, form: ImageForm) -> Maker:
     """What makes the new form of an image that a header belongs to.
 
     Raises:
-        AsRecorded: There is no such form of it; says why.
+        Refused: There is no such form of it; says why.
     """
     is_inverse = is_inverse_depth(sidecar, header)
     if is_inverse and len(header.prefix) != 2 * HEADER_BYTES:
-        raise AsRecorded("the parameters of its quantised depths are missing")
+        raise Refused("the parameters of its quantised depths are missing")
     recorded = encoding_of(sidecar, header)
     stored = sidecar.image.encoding if is_inverse else recorded
     resize, resized = resizer(sidecar, stored, form.size)
@@ -220,7 +216,7 @@ def maker(sidecar: StreamSidecar, header: Header, form: ImageForm) -> Maker:
     try:
         file = ImageFile(encoding, form.kind, quality=form.jpeg_quality)
     except OptionError:
-        raise AsRecorded(f"{form.kind.upper()} files cannot hold {encoding} images") from None
+        raise Refused(f"{form.kind.upper()} files cannot hold {encoding} images") from None
     told = format_of(encoding, form, has_mosaic=form.kind == "png")
     if form.keeps_format and encoding == recorded:
         told = header.format or ""
@@ -267,7 +263,7 @@ def encoding_of(sidecar: StreamSidecar, header: Header) -> str:
         return own.name
     if _is_depth(sidecar, header):
         if told not in (*_DEPTHS, _INVERSE_DEPTHS):
-            raise AsRecorded(f"its format {header.format!r} does not tell the unit of its depths")
+            raise Refused(f"its format {header.format!r} does not tell the unit of its depths")
         return told
     known = ENCODINGS.get(told, own)
     is_alike = known.rows == 1 and known.channels == own.channels == 1
@@ -356,7 +352,7 @@ def frames_of(stream: Stream, form: ImageForm) -> Frames:
     """How the images of a stream are given in another form.
 
     Raises:
-        AsRecorded: They cannot be; says why.
+        Refused: They cannot be; says why.
     """
     if form.kind in VIDEO_KINDS:
         return _video(stream, form.kind)
@@ -401,9 +397,9 @@ def _video(stream: Stream, kind: str) -> Frames:
     codec = sidecar.video.codec
     if codec not in _VIDEO_CODECS:
         known, name = ", ".join(_VIDEO_CODECS), type_of(kind).rpartition("/")[2]
-        raise AsRecorded(f"{name} has the codecs {known}, and this video is {codec}")
+        raise Refused(f"{name} has the codecs {known}, and this video is {codec}")
     if sidecar.body != "packet" and not sidecar.layout.is_shown:
-        raise AsRecorded(
+        raise Refused(
             f"its video does not show the images as they are seen (layout {sidecar.layout.name})"
         )
     return partial(_packets_of, stream)

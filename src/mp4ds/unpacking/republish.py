@@ -15,13 +15,12 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import CameraInfoRebuilder, Choice, everything, marked, message_at
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import Placement
-from mp4ds.errors import ConversionError, FormatError, OptionError
+from mp4ds.errors import ConversionError, FormatError, OptionError, Refused
 from mp4ds.messages.serializations import is_camera
 from mp4ds.messages.wire import Slots, WireError
 from mp4ds.records import Channel, Message
 from mp4ds.unpacking.pictures import (
     VIDEO_KINDS,
-    AsRecorded,
     Frames,
     ImageForm,
     Reduction,
@@ -141,7 +140,7 @@ def calibration_source(
         None where they stay as recorded.
 
     Raises:
-        AsRecorded: There are no such messages of another size; says why.
+        Refused: There are no such messages of another size; says why.
     """
     info, columns = stream.sidecar.camera_info, stream.camera_info_columns
     if info is None or columns is None or (size is None and is_kept is None):
@@ -155,7 +154,7 @@ def calibration_source(
     except FormatError:
         if size is None:
             raise
-        raise AsRecorded("calibrations of this type are not made for another size") from None
+        raise Refused("calibrations of this type are not made for another size") from None
     stamps = columns.stamp
     is_wanted = np.ones(len(stamps), np.bool_)
     if is_kept is not None:
@@ -312,8 +311,8 @@ class Republisher:
                     frames = frames_of(stream, form)
                     return self._thinned(_Plan(stream, kind, frames, is_kept, size, not is_done))
                 if is_kept is None:
-                    raise AsRecorded(f"they are {_ALREADY[kind]} already")
-            except AsRecorded as reason:
+                    raise Refused(f"they are {_ALREADY[kind]} already")
+            except Refused as reason:
                 count = len(stream) if is_kept is None else int(is_kept.sum())
                 self._keep(topic, str(reason), count)
         if is_kept is not None and _refers(stream):
@@ -398,7 +397,7 @@ class Republisher:
             source: CalibrationSource | None = calibration_source(
                 plan.stream, plan.size, plan.is_kept
             )
-        except AsRecorded as reason:
+        except Refused as reason:
             self._keep(info.channel.topic, str(reason), info.messages)
             source = calibration_source(plan.stream, None, plan.is_kept)
         if source is not None:

@@ -15,15 +15,15 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
-from mp4ds.errors import FormatError, VideoError
+from mp4ds.errors import FormatError, Refused, VideoError
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import expect
 from mp4ds.messages.arrangements import Picture
-from mp4ds.messages.coded import Refused, UnknownStructure
+from mp4ds.messages.coded import UnknownStructure
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.decoder import JpegDecoder
 from mp4ds.video.media import raise_if_scarce
-from mp4ds.video.mp4 import SampleTable, Unindexed, read_sample_table
+from mp4ds.video.mp4 import SampleTable, read_sample_table
 from mp4ds.video.pixels import PictureMaker
 from mp4ds.video.references import (
     RecordedReferences,
@@ -87,7 +87,7 @@ def packets_in_groups(path: Path) -> NDArray[np.int64]:
 
     Raises:
         VideoError: Its index is damaged.
-        Unindexed: Its index is not read.
+        Refused: Its index is not read.
         OSError: It cannot be read.
     """
     with path.open("rb") as file:
@@ -104,7 +104,7 @@ def _table(path: Path) -> SampleTable | None:
     try:
         with path.open("rb") as file:
             table = read_sample_table(file, path.stat().st_size, str(path))
-    except (VideoError, Unindexed):
+    except (VideoError, Refused):
         return None
     ends = table.places + table.sizes
     return table if np.all(table.places[1:] >= ends[:-1]) else None
@@ -346,7 +346,7 @@ class FrameAccess:
     def _read_table(self, frames: int | None) -> SampleTable:
         try:
             table = read_sample_table(self._file, self._path.stat().st_size, str(self._path))
-        except Unindexed as error:
+        except Refused as error:
             raise UnknownStructure(f"its index is not read: {error}") from None
         known = CODECS.get(self._codec)
         if known is None or table.codec not in known.entries:

@@ -6,12 +6,12 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from mp4ds.errors import Refused
 from mp4ds.messages.coded import (
     BitReader,
     CodedFrame,
     NoPicture,
     Picture,
-    Refused,
     UnknownStructure,
     check_size,
 )

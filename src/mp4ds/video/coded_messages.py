@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+from mp4ds.errors import Refused
 from mp4ds.messages import jpeg, png
-from mp4ds.messages.coded import NoPicture, Picture, Refused
+from mp4ds.messages.coded import NoPicture, Picture
 from mp4ds.video import av1, nal
 from mp4ds.video.codecs import CODECS, part_of
 

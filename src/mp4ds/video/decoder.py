@@ -16,9 +16,8 @@ import numpy as np
 from av.error import FFmpegError, InvalidDataError
 from numpy.typing import NDArray
 
-from mp4ds.errors import VideoError
+from mp4ds.errors import Refused, VideoError
 from mp4ds.messages.arrangements import Picture
-from mp4ds.messages.coded import Refused
 from mp4ds.video.media import Media, raise_if_scarce
 from mp4ds.video.pixels import PictureMaker
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from mp4ds.messages.coded import REORDERED, BitReader, NoPicture, Picture, Refused, check_size
+from mp4ds.errors import Refused
+from mp4ds.messages.coded import REORDERED, BitReader, NoPicture, Picture, check_size
 from mp4ds.video.nal import PictureOrder, join_plain, unescape
 
 VPS, SPS, PPS, AUD = 32, 33, 34, 35

@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.errors import VideoError
+from mp4ds.errors import Refused, VideoError
 
 _HEADER, _LONG_HEADER = 8, 16
 _MOST_BOXES = 1_000  # beside each other; no video has a tenth of that
@@ -293,10 +293,6 @@ _EDITS = np.dtype([("duration", ">u4"), ("start", ">i4"), ("speed", ">i4")])
 _LONG_EDITS = np.dtype([("duration", ">u8"), ("start", ">i8"), ("speed", ">i4")])
 
 
-class Unindexed(ValueError):  # noqa: N818 - no failure: such a file is read in order
-    """A sound file whose index this module does not read; the text says why."""
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class SampleTable:
     """What the index says of a video track's samples, which are its coded frames.
@@ -414,7 +410,7 @@ def read_sample_table(stream: BinaryIO, size: int, place: str) -> SampleTable:
     Raises:
         VideoError: ``video-unreadable``: there is no index, it contradicts itself or the file's
             size, or there is not just one video track.
-        Unindexed: The index says something that this module does not read: fragments, several
+        Refused: The index says something that this module does not read: fragments, several
             edits or descriptions, compact sizes, another file, too many frames or none.
         OSError, RemoteError: The file cannot be read.
     """
@@ -433,17 +429,17 @@ def read_sample_table(stream: BinaryIO, size: int, place: str) -> SampleTable:
 def _read_movie(stream: BinaryIO, size: int) -> _Movie:
     for box in boxes(stream, 0, size, outermost=True):
         if box.kind == b"moof":
-            raise Unindexed("its frames are in fragments")
+            raise Refused("its frames are in fragments")
         if box.kind == b"moov":
             if box.size > _LONGEST_INDEX:
-                raise Unindexed("its index is too long")
+                raise Refused("its index is too long")
             stream.seek(box.start)
             data = stream.read(box.size)
             if len(data) != box.size:
                 raise DamagedBoxError("the file ends before its index")
             movie = _Movie(data)
             if movie.inside(movie.box).keys() & {b"mvex", b"cmov"}:
-                raise Unindexed("its frames are in fragments, or its index is compressed")
+                raise Refused("its frames are in fragments, or its index is compressed")
             return movie
     raise DamagedBoxError("box moov is missing")
 
@@ -498,12 +494,12 @@ def _check_references(movie: _Movie, information: Box) -> None:
         return
     for reference in boxes(movie.file, dref.start + 8, dref.end):
         if not movie.number(reference, 0) & _IN_THIS_FILE:
-            raise Unindexed("its frames are in another file")
+            raise Refused("its frames are in another file")
 
 
 def _description(movie: _Movie, stsd: Box) -> SampleEntry:
     if movie.number(stsd, 4) > 1:
-        raise Unindexed("its frames have several descriptions")
+        raise Refused("its frames have several descriptions")
     return parse_descriptions(movie.file, stsd)
 
 
@@ -513,17 +509,17 @@ def _configuration(entry: SampleEntry) -> bytes:
 
 def _sizes(movie: _Movie, tables: dict[bytes, Box], file_size: int) -> Integers:
     if b"stsz" not in tables and b"stz2" in tables:
-        raise Unindexed("the sizes of its frames are compact")
+        raise Refused("the sizes of its frames are compact")
     stsz = _required(tables, b"stsz")
     common, count = movie.number(stsz, 4), movie.number(stsz, 8)
     if not count:
-        raise Unindexed("its index lists no frames")
+        raise Refused("its index lists no frames")
     if not common:
         return movie.table(stsz, _NUMBER, at=8).astype(np.int64)
     if count * common > file_size:
         raise DamagedBoxError("its frames are larger than the file")
     if count > _MOST_ALIKE:
-        raise Unindexed("its index is too long")
+        raise Refused("its index is too long")
     return np.full(count, common, np.int64)
 
 
@@ -537,7 +533,7 @@ def _places(movie: _Movie, tables: dict[bytes, Box], sizes: Integers, file_size:
         raise DamagedBoxError("frames lie beyond the end of the file")
     runs = movie.table(_required(tables, b"stsc"), _CHUNKS)
     if np.any(runs["description"] != 1):
-        raise Unindexed("its frames have several descriptions")
+        raise Refused("its frames have several descriptions")
     edges = np.append(runs["first"].astype(np.int64) - 1, len(chunks))
     if edges[0] != 0 or np.any(np.diff(edges) <= 0) or np.any(runs["samples"] == 0):
         raise DamagedBoxError("box stsc contradicts the number of chunks")
@@ -556,13 +552,13 @@ def _times(movie: _Movie, tables: dict[bytes, Box], count: int) -> tuple[Integer
     """Ticks of decoding and of showing, without the edit list; two arrays."""
     steps = _repeated(movie.table(_required(tables, b"stts"), _STEPS), count, "stts")
     if np.any(steps >= _LONGEST_STEP):
-        raise Unindexed("a frame lasts too long")
+        raise Refused("a frame lasts too long")
     decoding = np.cumsum(steps) - steps
     if b"ctts" not in tables:
         return decoding, decoding.copy()
     delays = _repeated(movie.table(tables[b"ctts"], _DELAYS), count, "ctts")
     if np.any(np.abs(delays) > _LONGEST_DELAY):
-        raise Unindexed("a frame is shown too long after its decoding")
+        raise Refused("a frame is shown too long after its decoding")
     # where delays are negative, decoding has to begin earlier
     return decoding + min(int(delays.min()), 0), decoding + delays
 
@@ -590,7 +586,7 @@ def _edit(movie: _Movie, track: Box, timescale: int) -> _Edit | None:
     """The edit list, where it only delays the track and cuts its ends; None without one.
 
     Raises:
-        Unindexed: It says more.
+        Refused: It says more.
     """
     parts = movie.inside(track)
     elst = movie.inside(parts[b"edts"]).get(b"elst") if b"edts" in parts else None
@@ -598,9 +594,9 @@ def _edit(movie: _Movie, track: Box, timescale: int) -> _Edit | None:
         return None
     rows = movie.table(elst, _LONG_EDITS if movie.version(elst) == 1 else _EDITS)
     if len(rows) > _MOST_EDITS:
-        raise Unindexed("it has several edits")
+        raise Refused("it has several edits")
     if elst.size != _NO_EDITS + rows.nbytes or not len(rows):
-        raise Unindexed("its edits are not as many as it says")  # ffmpeg goes by their size
+        raise Refused("its edits are not as many as it says")  # ffmpeg goes by their size
     movie_scale = movie.timescale(movie.path(movie.box, b"mvhd"))
     # durations are in ticks of the movie, rounded to the nearest of the track
     durations = [
@@ -609,9 +605,9 @@ def _edit(movie: _Movie, track: Box, timescale: int) -> _Edit | None:
     ]
     starts = rows["start"].tolist()
     if any(start != -1 for start in starts[:-1]) or starts[-1] < 0:
-        raise Unindexed("it has several edits")
+        raise Refused("it has several edits")
     if rows["speed"][-1] != _NORMAL_SPEED or not durations[-1]:
-        raise Unindexed("it has an edit that stands still or has no end")
+        raise Refused("it has an edit that stands still or has no end")
     edit = _Edit(sum(durations[:-1]), starts[-1], durations[-1])
     if max(edit.delay, edit.start + edit.duration) > _LATEST:
         raise DamagedBoxError("an edit is too late")
@@ -621,5 +617,5 @@ def _edit(movie: _Movie, track: Box, timescale: int) -> _Edit | None:
 def _shown(presentation: Integers, edit: _Edit, order: Integers) -> Integers:
     shown = (presentation >= edit.start) & (presentation < edit.start + edit.duration)
     if not shown.any():
-        raise Unindexed("its edit list shows no frames")
+        raise Refused("its edit list shows no frames")
     return order if shown.all() else order[shown]

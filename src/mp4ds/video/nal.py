@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from mp4ds.messages.coded import Refused
+from mp4ds.errors import Refused
 
 MAX_UNITS = 512
 """Most NAL units in one packet."""

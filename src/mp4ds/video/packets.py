@@ -14,8 +14,7 @@ from typing import Any
 import av
 from av.error import FFmpegError
 
-from mp4ds.errors import SegmentsDifferError, VideoError
-from mp4ds.messages.coded import Refused
+from mp4ds.errors import Refused, SegmentsDifferError, VideoError
 from mp4ds.times import TIMESCALE
 from mp4ds.video import av1, h264, h265, nal
 from mp4ds.video.codecs import CODECS

@@ -11,7 +11,7 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
-from mp4ds.errors import VideoError
+from mp4ds.errors import Refused, VideoError
 from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.coded import UnknownStructure
 from mp4ds.messages.encodings import MAX_SIDE
@@ -19,7 +19,7 @@ from mp4ds.video.access import FrameAccess
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.decoder import JpegDecoder, VideoDecoder
 from mp4ds.video.media import Media, raise_if_scarce
-from mp4ds.video.mp4 import Unindexed, read_sample_table
+from mp4ds.video.mp4 import read_sample_table
 from mp4ds.video.pixels import PictureMaker
 from mp4ds.video.references import RecordedReferences
 
@@ -201,7 +201,7 @@ class VideoFile:
         try:
             with self._path.open("rb") as file:
                 table = read_sample_table(file, self._path.stat().st_size, str(self._path))
-        except Unindexed:
+        except Refused:
             return self._read_packets()
         except OSError as error:
             raise VideoError("video-unreadable", self._path, f"cannot be read: {error}") from None

@@ -12,7 +12,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.messages.coded import BitReader, CodedFrame, Refused, UnknownStructure
+from mp4ds.errors import Refused
+from mp4ds.messages.coded import BitReader, CodedFrame, UnknownStructure
 from mp4ds.video import h264, h265
 from mp4ds.video.codecs import CODECS, part_of
 from mp4ds.video.nal import MAX_UNITS, parameter_units, unescape

@@ -6,7 +6,8 @@ annex B.
 
 from __future__ import annotations
 
-from mp4ds.messages.coded import BitReader, NoPicture, Picture, Refused, check_size
+from mp4ds.errors import Refused
+from mp4ds.messages.coded import BitReader, NoPicture, Picture, check_size
 
 _SYNC_CODE = 0x498342
 _RGB = 7

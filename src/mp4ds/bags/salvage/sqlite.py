@@ -32,7 +32,7 @@ from mp4ds.bags.salvage.sqlite_pages import (
     value_bytes,
     values,
 )
-from mp4ds.errors import SourceError
+from mp4ds.errors import Refused, SourceError
 from mp4ds.records import Channel, Message, Record, Schema
 
 _MAX_SMALL_ROW = 2**24
@@ -543,43 +543,34 @@ class SqliteSalvage(FileSalvage):
         found = message_row(page, row) if row else None
         if row is None or found is None:
             return None
+        channel = self._channels.get(found.topic_id)
         try:
-            channel, data = self._content(database, page, row, found)
-        except _LostError as lost:
-            problem, topic = lost.args
-            loss = log.lost_of_kind(problem, database.pages.offset(number), problem)
-            loss.add(1, topic)
+            if channel is None:
+                raise Refused(f"messages of topic id {found.topic_id}, of which no row tells")
+            data = self._payload(database, page, row, found, channel.topic)
+        except Refused as lost:
+            loss = log.lost_of_kind(str(lost), database.pages.offset(number), str(lost))
+            loss.add(1, [channel.topic] if channel else [])
             return None
         return Message(channel, found.time, found.time, 0, data)
 
-    def _content(
-        self, database: Database, page: bytes, row: Row, found: MessageRow
-    ) -> tuple[Channel, bytes]:
-        """Channel and payload of a message.
+    def _payload(
+        self, database: Database, page: bytes, row: Row, found: MessageRow, topic: str
+    ) -> bytes:
+        """What a message of a topic holds.
 
         Raises:
-            _LostError: It cannot be read; says why, and the topics where they are known.
+            Refused: It cannot be read.
         """
-        channel = self._channels.get(found.topic_id)
-        if channel is None:
-            raise _LostError(f"messages of topic id {found.topic_id}, of which no row tells", ())
-        topic = channel.topic
         if found.time < 0:
-            raise _LostError(f"messages of {topic} with a time before 1970", [topic])
+            raise Refused(f"messages of {topic} with a time before 1970")
         payload = database.payload(page, row) if row.size <= self._left else None
         if payload is None:
-            problem = f"messages of {topic} of which pages are damaged or missing"
-            raise _LostError(problem, [topic])
+            raise Refused(f"messages of {topic} of which pages are damaged or missing")
         self._left -= len(payload)
         data = payload[found.blob :]
-        if self._decompress:
-            try:
-                data = self._decompress(data)
-            except DamageError:
-                problem = f"messages of {topic} of which the compression is damaged"
-                raise _LostError(problem, [topic]) from None
-        return channel, data
-
-
-class _LostError(Exception):
-    """A message cannot be read: a phrase, and the topics that it is of."""
+        try:
+            return self._decompress(data) if self._decompress else data
+        except DamageError:
+            problem = f"messages of {topic} of which the compression is damaged"
+            raise Refused(problem) from None

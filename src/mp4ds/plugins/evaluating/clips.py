@@ -16,9 +16,8 @@ from mp4ds.bags.formats import open_reader
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.dataset import Dataset, open_dataset
 from mp4ds.dataset.frames import Frames
-from mp4ds.dataset.rebuild import Unsuited
 from mp4ds.dataset.stream import Stream
-from mp4ds.errors import SourceError, SourceNotFoundError
+from mp4ds.errors import Refused, SourceError, SourceNotFoundError
 from mp4ds.files.outputs import write_synced
 from mp4ds.files.urls import location, remote
 from mp4ds.format.sidecars import MANIFEST_NAME
@@ -152,7 +151,7 @@ def _of_recording(reader: BagReader) -> tuple[list[EvaluatedCamera], dict[str, s
 
 
 def _is_jpeg(message: Message) -> bool:
-    with suppress(Unsuited):
+    with suppress(Refused):
         return Looker(message.channel).look(message).key.codec == "mjpeg"
     return False
 
@@ -170,7 +169,7 @@ def _of_channel(
             if not isinstance(record, Message) or record.channel.id != channel.id:
                 continue
             if number in wanted:
-                with suppress(Unsuited):
+                with suppress(Refused):
                     seen = looker.look(record)
                     if seen.pixels is not None:
                         key = seen.key
@@ -241,10 +240,6 @@ def _of_images(folder: Path, paths: Sequence[Path], fps: float) -> EvaluatedCame
 _BLOCK = 2**20
 _DETAIL = (128, 96)  # columns and rows that are shown beside each other
 _MOST_PIXELS = 16  # samples: of less no scores are made
-
-
-class Unfit(Exception):  # noqa: N818 - no error: the camera is left out, and why is told
-    """A camera whose images no lossy codec is for; says why."""
 
 
 @dataclass(frozen=True)
@@ -321,7 +316,7 @@ def chosen(times: NDArray[np.int64], origin: int, options: EvaluateOptions) -> l
         options: Of the evaluation.
 
     Raises:
-        Unfit: There are none.
+        Refused: There are none.
     """
     count = len(times)
     if options.start is None and options.duration is None:
@@ -338,7 +333,7 @@ def chosen(times: NDArray[np.int64], origin: int, options: EvaluateOptions) -> l
         last = int(np.searchsorted(times, begin + round(options.duration * _SECOND)))
     found = list(range(first, min(count, last)))
     if not found:
-        raise Unfit("has no images in the time that was asked for")
+        raise Refused("has no images in the time that was asked for")
     return found
 
 
@@ -371,7 +366,7 @@ def make_clip(camera: EvaluatedCamera, indices: list[int], rate: float | None, p
         path: The file to make of the planes; beside it the clip is described.
 
     Raises:
-        Unfit: The camera's images are of no use.
+        Refused: The camera's images are of no use.
         SourceError: The source is damaged.
         OSError: The disk refused.
     """
@@ -399,7 +394,7 @@ def make_clip(camera: EvaluatedCamera, indices: list[int], rate: float | None, p
                 if len(ticks) <= max(1, len(indices) // 2):
                     middle, number = planes, len(ticks) - 1
         if first is None or middle is None:
-            raise Unfit("has no images that can be read in the time of its clip")
+            raise Refused("has no images that can be read in the time of its clip")
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
@@ -432,12 +427,12 @@ def _kind(shot: Shot) -> tuple[str, int, int]:
 def _layout_of(shot: Shot) -> Layout:
     encoding = ENCODINGS[shot.encoding]
     if encoding.lossy is None:
-        raise Unfit(
+        raise Refused(
             f"has {encoding.name} images, which are no light of 8 bits: mp4ds pack keeps them "
             "lossless"
         )
     if min(shot.width, shot.height) < _MOST_PIXELS:
-        raise Unfit(f"has images of {shot.width}x{shot.height}, too small to be scored")
+        raise Refused(f"has images of {shot.width}x{shot.height}, too small to be scored")
     return layout_for(encoding, lossless=False)
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mp4ds._version import __version__
-from mp4ds.errors import ScoringError, SourceError
+from mp4ds.errors import Refused, ScoringError, SourceError
 from mp4ds.files.outputs import check_place, refuse_not_ours, work_folder, write_synced
 from mp4ds.files.urls import remote
 from mp4ds.plan import FileNames, Selection
@@ -24,7 +24,6 @@ from mp4ds.plugins.evaluating.clips import (
     Clip,
     EvaluatedCamera,
     EvaluatedSource,
-    Unfit,
     chosen,
     chosen_at_rate,
     clip_seconds,
@@ -108,7 +107,7 @@ class CameraTrial:
             origin: Log time at which the source begins, nanoseconds.
 
         Raises:
-            Unfit: The camera's images are of no use.
+            Refused: The camera's images are of no use.
             ScoringError: Nothing could be tried.
         """
         self._tell("reading")
@@ -356,7 +355,7 @@ def evaluate(
                 trial = CameraTrial(camera, name, chosen, grid, trials, work, progress)
                 try:
                     result.cameras.append(trial.run(origin))
-                except Unfit as reason:
+                except Refused as reason:
                     result.left_out[camera.topic] = str(reason)
         _refuse_none(result)
         rated = [(camera.cells, camera.reachable) for camera in result.cameras]

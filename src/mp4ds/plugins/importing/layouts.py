@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
+from mp4ds.errors import OptionError, Refused, SourceError, SourceNotFoundError
 from mp4ds.files.sources import members
 from mp4ds.files.urls import remote
 from mp4ds.messages.encodings import ENCODINGS
@@ -26,7 +26,6 @@ from mp4ds.plugins.importing.benchmarks import (
 from mp4ds.plugins.importing.reader import ImagesReader
 from mp4ds.plugins.importing.scene import (
     UNITS,
-    NoTimeError,
     Rows,
     Scene,
     SceneCamera,
@@ -212,7 +211,7 @@ def _by_rate(folder: Path, images: list[Path], options: ImageFolder) -> list[Sce
             _camera(name, files, at_rate(len(files), options.rate or ""), options)
             for name, files in found.items()
         ]
-    except NoTimeError as error:
+    except Refused as error:
         raise OptionError(f"`rate`: {error}") from None
 
 
@@ -289,7 +288,7 @@ def _by_name(scene: Scene, images: list[Path], unit: str | None) -> NDArray[np.i
     for place, path in enumerate(images):
         try:
             stamps[place] = read(path.stem)
-        except NoTimeError as error:
+        except Refused as error:
             raise SourceError(path, f"has a name that is no time: {error}") from None
     return stamps
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds import yamlio
-from mp4ds.errors import FormatError, SourceError
+from mp4ds.errors import FormatError, Refused, SourceError
 from mp4ds.messages.transforms import Transform
 from mp4ds.messages.wire import CalibrationFields
 
@@ -32,10 +32,6 @@ ROUNDED = "times finer than a nanosecond, which were rounded to it"
 _CERTAIN_DIGITS = 16  # of nanoseconds since 1970; a count of seconds or images has fewer
 _NUMBER = re.compile(r"\+?([0-9]{1,40})(?:(\.[0-9]{0,40})?([eE][-+]?[0-9]{1,2})?)?")
 _DATE = re.compile(r"([0-9]{4}-[0-9]{2}-[0-9]{2}[ T][0-9]{2}:[0-9]{2}:[0-9]{2})(\.[0-9]{1,40})?")
-
-
-class NoTimeError(ValueError):
-    """A text that is no time; the message is a phrase."""
 
 
 def is_number(text: str) -> bool:
@@ -63,13 +59,13 @@ def of_unit(unit: str, found: Counter[str]) -> Callable[[str], int]:
         found: Gets how many were rounded.
 
     Returns:
-        Text -> nanoseconds; it raises NoTimeError.
+        Text -> nanoseconds; it raises Refused.
     """
     scale = UNITS[unit]
 
     def read(text: str) -> int:
         if not _NUMBER.fullmatch(text):
-            raise NoTimeError(f"{text!r} is no time in {unit}")
+            raise Refused(f"{text!r} is no time in {unit}")
         return _checked(Fraction(text) * scale, text, found)
 
     return read
@@ -85,7 +81,7 @@ def of_date(found: Counter[str]) -> Callable[[str], int]:
         except ValueError:
             whole = None
         if match is None or whole is None:
-            raise NoTimeError(f"{text!r} is no date and time")
+            raise Refused(f"{text!r} is no date and time")
         seconds = timegm(whole.timetuple()) + Fraction(f"0{match[2] or ''}")
         return _checked(seconds * UNITS["s"], text, found)
 
@@ -95,7 +91,7 @@ def of_date(found: Counter[str]) -> Callable[[str], int]:
 def _checked(time: Fraction, text: str, found: Counter[str]) -> int:
     nanoseconds = round(time)
     if not 0 <= nanoseconds <= MAX_STAMP:
-        raise NoTimeError(f"{text!r} is not a time from 1970 to 2038, which is what ROS 2 has")
+        raise Refused(f"{text!r} is not a time from 1970 to 2038, which is what ROS 2 has")
     if nanoseconds != time:
         found[ROUNDED] += 1
     return nanoseconds
@@ -109,17 +105,17 @@ def at_rate(count: int, rate: str) -> NDArray[np.int64]:
         rate: Images per second, such as ``20``, ``29.97`` or ``30000/1001``.
 
     Raises:
-        NoTimeError: It is no rate.
+        Refused: It is no rate.
     """
     try:
         found = Fraction(rate)
     except (ValueError, ZeroDivisionError):
         found = Fraction(0)
     if not Fraction(1, 10**6) <= found <= 10**6:
-        raise NoTimeError(f"{rate!r} is no rate in Hz")
+        raise Refused(f"{rate!r} is no rate in Hz")
     times = [round(number * 10**9 / found) for number in range(count)]
     if times and times[-1] > MAX_STAMP:
-        raise NoTimeError(f"{rate!r} Hz is too slow for {count} images")
+        raise Refused(f"{rate!r} Hz is too slow for {count} images")
     return np.array(times, np.int64)
 
 
@@ -482,7 +478,7 @@ def read_times(path: Path, rows: Rows, read: Callable[[str], int]) -> NDArray[np
     for place, (number, values) in enumerate(rows):
         try:
             times[place] = read(values[0])
-        except NoTimeError as error:
+        except Refused as error:
             raise SourceError(path, f"line {number}: {error}") from None
     return times
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mp4ds.bags.types import BAD_DEFINITION, World, field_shape, make_store, types_of
-from mp4ds.errors import ConversionError, OptionError, PublishError
+from mp4ds.errors import ConversionError, OptionError, PublishError, Refused
 from mp4ds.records import HASH_KEY, Channel
 
 _LAST = 232
@@ -123,10 +123,6 @@ def as_is(kind: Any) -> Any:
     return kind
 
 
-class UnsuitableTypeError(Exception):
-    """There is no such type in DDS, or not one that the library can take."""
-
-
 @dataclass(frozen=True, slots=True)
 class DdsType:
     """How messages of a channel are written.
@@ -186,7 +182,7 @@ def message_type(channel: Channel, world: World) -> DdsType:
         types = _known_types(channel, world)
         type_hash = type_hash or make_store(types, world).hash_rihs01(name)
         real = as_is(make_struct(types, name))
-    except (*BAD_DEFINITION, UnsuitableTypeError):
+    except (*BAD_DEFINITION, Refused):
         return DdsType(opaque_type(dds_name(name)), type_hash, False, False)
     is_empty = types[name][1][0][0] == _FILLER
     return DdsType(real, type_hash, True, is_empty)
@@ -200,7 +196,7 @@ def _full_name(name: str) -> str:
 
 def _known_types(channel: Channel, world: World) -> Types:
     if channel.schema is None:
-        raise UnsuitableTypeError
+        raise Refused
     return {
         name: (constants, fields or [_filler(world)])
         for name, (constants, fields) in types_of(channel.schema, world).items()
@@ -220,7 +216,7 @@ def make_struct(types: Types, name: str, *, has_fields: bool = False) -> Any:
         has_fields: Whether messages are made of and taken apart into fields.
 
     Raises:
-        UnsuitableTypeError: There is no such type in DDS.
+        Refused: There is no such type in DDS.
     """
     return _StructMaker(types, has_fields).struct(name)[0]
 
@@ -239,17 +235,17 @@ class _StructMaker:
         if name in self._made:
             return self._made[name]
         if name in self._open or len(self._open) >= _MAX_NESTING or not _NAME.fullmatch(name):
-            raise UnsuitableTypeError
+            raise Refused
         self._open.append(name)
         fields: dict[str, Any] = {}
         total = 0
         for field, desc in self._types[name][1]:
             if field in fields or field.startswith("__"):
-                raise UnsuitableTypeError
+                raise Refused
             fields[field], size = self._field(desc)
             total += size
         if total > _MAX_SIZE:
-            raise UnsuitableTypeError
+            raise Refused
         self._open.pop()
         short = f"{name.rpartition('/')[2]}_"
         made = make_idl_struct(short, dds_name(name), fields, dataclassify=self._has_fields)
@@ -276,7 +272,7 @@ def _base(name: str, bound: int) -> Any:
     from cyclonedds.idl import types
 
     if name not in _BASES:
-        raise UnsuitableTypeError
+        raise Refused
     if name == "string":
         return types.bounded_str[bound] if bound else str
     return bool if name == "bool" else getattr(types, _BASES[name])

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from mp4ds.dataset.frames import Frames
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import view_of
-from mp4ds.errors import VideoError
+from mp4ds.errors import Refused, VideoError
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.video.codecs import recipe_for
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.images import encoding_as
 from mp4ds.video.media import Media, pixel_format_of
-from mp4ds.video.mp4 import Unindexed, read_sample_table
+from mp4ds.video.mp4 import read_sample_table
 
 _8BIT = frozenset({"yuv420p", "yuv422p", "yuv444p", "gbrp"})
 _PLAYED = {
@@ -204,7 +204,7 @@ def presentation_times(stream: Stream) -> NDArray[np.int64]:
     try:
         with path.open("rb") as file:
             table = read_sample_table(file, path.stat().st_size, str(path))
-    except Unindexed as reason:
+    except Refused as reason:
         raise VideoError("video-unreadable", path, f"has no plain index: {reason}") from None
     except OSError as error:
         raise VideoError("video-unreadable", path, f"cannot be read: {error}") from None
