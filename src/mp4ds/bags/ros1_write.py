@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
+import bz2
 import struct
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Literal
 
 import lz4.frame
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag1,
-    MessageDefinition,
-    MessageDefinitionFormat,
-)
-from rosbags.rosbag1 import Writer
-from rosbags.rosbag1.writer import WriteChunk
 
-from mp4ds.bags.ros1_records import MAX_TIME, UINT32, Op, join_header, make_header
+from mp4ds.bags.ros1_records import MAGIC, MAX_TIME, Op, join_header, make_header
 from mp4ds.errors import ConversionError, OptionError, TargetExistsError
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
 
 _MAX_PAYLOAD = 2**32 - 2**24  # lengths are uint32; leaves room for the rest of the chunk
 _CHUNK_BYTES = 2**20
+_BAG_HEADER_BYTES = 4096  # padded, so that it can be written again at the end
+_PAIR = struct.Struct("<II")
+_ENTRY = struct.Struct("<III")  # seconds, nanoseconds, offset in the chunk
 _MESSAGE_HEAD = struct.Struct("<II3sBI5sII5sIII")  # op, conn, time, and the payload's length
 
 
@@ -76,18 +73,13 @@ class Ros1Writer:
     format = "bag"
 
     def __init__(self, path: Path, compression: Literal["none", "bz2", "lz4"] = "none") -> None:
-        if compression not in ("none", "bz2", "lz4"):
+        if compression not in _COMPRESSORS:
             raise OptionError(f"compression {compression!r} is not known. Use none, bz2 or lz4.")
         if path.exists():
             raise TargetExistsError(path)
         self._numbers: dict[int, int] = {}
         self._omitted: Counter[str] = Counter()
-        self._bag = _BagWriter(path)
-        if compression != "none":
-            self._bag.set_compression(Writer.CompressionFormat[compression.upper()])
-        if compression == "lz4":
-            self._bag.compressor = _pack_lz4
-        self._bag.open()
+        self._bag = _BagFile(path, compression)
 
     @property
     def omitted(self) -> Mapping[str, int]:
@@ -98,7 +90,7 @@ class Ros1Writer:
         """Declare a channel. See `BagWriter.add_channel`."""
         check_channel(channel)
         if channel.id not in self._numbers:
-            self._numbers[channel.id] = self._bag.declare(*make_header(channel))
+            self._numbers[channel.id] = self._bag.connect(*make_header(channel))
 
     def add_schema(self, schema: Schema) -> None:
         """Count a definition that no channel refers to as omitted."""
@@ -127,71 +119,110 @@ class Ros1Writer:
     def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
         try:
             if exc_type is None:
-                self._bag.close()
+                self._bag.finish()
         finally:
-            if self._bag.bio:
-                with suppress(OSError):
-                    self._bag.bio.close()
+            with suppress(OSError):
+                self._bag.file.close()
 
 
-class _Connection(Connection):
-    """A connection of rosbags that knows its own record."""
+class _BagFile:
+    """A bag being written: chunks with the index of each, then all connections and chunks.
 
-    record: bytes
+    Args:
+        path: The file, which must not exist.
+        compression: A key of `_COMPRESSORS`.
 
+    Attributes:
+        file: What is written to.
+    """
 
-class _BagWriter(Writer):
-    """rosbags' writer, with verbatim connection headers and an index of bounded size."""
+    def __init__(self, path: Path, compression: str) -> None:
+        self._compression = compression
+        self._connections: list[bytes] = []
+        self._chunk_infos: list[bytes] = []
+        self._chunk = BytesIO()
+        self._index: dict[int, list[tuple[int, int]]] = {}  # connection -> times and offsets
+        self.file = path.open("xb")
+        self.file.write(MAGIC)
+        self._write_bag_header(0)
 
-    def declare(self, topic: bytes, header: Sequence[tuple[bytes, bytes]]) -> int:
-        """Add a connection by its header, and return its number."""
-        connection = _Connection(
-            len(self.connections),
-            "",
-            "",
-            MessageDefinition(MessageDefinitionFormat.NONE, ""),
-            "",
-            0,
-            ConnectionExtRosbag1(None, None),
-            self,
+    def _write_bag_header(self, index_pos: int) -> None:
+        header = _header(
+            Op.BAG,
+            (b"index_pos", index_pos.to_bytes(8, "little")),
+            (b"conn_count", _uint32(len(self._connections))),
+            (b"chunk_count", _uint32(len(self._chunk_infos))),
         )
-        number = UINT32.pack(connection.id)
-        record = ((b"op", bytes([Op.CONNECTION])), (b"conn", number), (b"topic", topic))
-        connection.record = join_header(record) + join_header(header)
-        self.write_connection(connection, self.chunks[-1].data)
-        self.connections.append(connection)
-        return connection.id
+        padding = _BAG_HEADER_BYTES - 4 - len(header)
+        self.file.write(header + _uint32(padding) + b" " * padding)
 
-    @staticmethod
-    def write_connection(connection: Connection, bio: BinaryIO) -> None:
-        """Write a connection record."""
-        if isinstance(connection, _Connection):
-            bio.write(connection.record)
+    def connect(self, topic: bytes, header: Iterable[tuple[bytes, bytes]]) -> int:
+        """Add a connection with a header of its own, and return its number."""
+        number = len(self._connections)
+        record = _header(Op.CONNECTION, (b"conn", _uint32(number)), (b"topic", topic))
+        self._connections.append(record + join_header(header))
+        self._chunk.write(self._connections[-1])
+        return number
 
     def append(self, number: int, time: int, data: bytes | memoryview) -> None:
-        """Write a message; rosbags' own method searches all connections for each."""
-        chunk = self.chunks[-1]
-        chunk.connections[number].append((time, chunk.data.tell()))
-        chunk.start, chunk.end = min(chunk.start, time), max(chunk.end, time)
+        """Add a message of a connection, log time in nanoseconds."""
+        self._index.setdefault(number, []).append((time, self._chunk.tell()))
         op, conn = (4, b"op=", Op.MESSAGE), (9, b"conn=", number)
         stamp = (13, b"time=", *divmod(time, 10**9))
-        chunk.data.write(_MESSAGE_HEAD.pack(38, *op, *conn, *stamp, len(data)))
-        chunk.data.write(data)
-        if chunk.data.tell() > _CHUNK_BYTES:
-            self.write_chunk(chunk)
+        self._chunk.write(_MESSAGE_HEAD.pack(38, *op, *conn, *stamp, len(data)))
+        self._chunk.write(data)
+        if self._chunk.tell() > _CHUNK_BYTES:
+            self._end_chunk()
 
-    def write_chunk(self, chunk: WriteChunk) -> None:
-        """Write a chunk, and keep of its index only the counts, which `close` needs."""
-        super().write_chunk(chunk)
-        counts: Any = {number: range(len(found)) for number, found in chunk.connections.items()}
-        chunk.connections = counts
+    def _end_chunk(self) -> None:
+        content, self._chunk = self._chunk.getvalue(), BytesIO()
+        index, self._index = self._index, {}
+        if not content:
+            return
+        place = self.file.tell()
+        packed = _COMPRESSORS[self._compression](content)
+        compression = (b"compression", self._compression.encode())
+        self.file.write(_header(Op.CHUNK, compression, (b"size", _uint32(len(content)))))
+        self.file.write(_uint32(len(packed)))
+        self.file.write(packed)
+        for number, entries in index.items():
+            data = b"".join(_ENTRY.pack(*divmod(time, 10**9), offset) for time, offset in entries)
+            counted = ((b"conn", _uint32(number)), (b"count", _uint32(len(entries))))
+            self.file.write(_header(Op.INDEX, (b"ver", _uint32(1)), *counted))
+            self.file.write(_uint32(len(data)) + data)
+        times = [time for entries in index.values() for time, _ in entries] or [0]
+        header = _header(
+            Op.CHUNK_INFO,
+            (b"ver", _uint32(1)),
+            (b"chunk_pos", place.to_bytes(8, "little")),
+            (b"start_time", _PAIR.pack(*divmod(min(times), 10**9))),
+            (b"end_time", _PAIR.pack(*divmod(max(times), 10**9))),
+            (b"count", _uint32(len(index))),
+        )
+        counts = b"".join(_PAIR.pack(number, len(entries)) for number, entries in index.items())
+        self._chunk_infos.append(header + _uint32(len(counts)) + counts)
+
+    def finish(self) -> None:
+        """Write what is left and the index, and close the file."""
+        self._end_chunk()
+        place = self.file.tell()
+        self.file.writelines(self._connections)
+        self.file.writelines(self._chunk_infos)
+        self.file.seek(len(MAGIC))
+        self._write_bag_header(place)
+        self.file.close()
+
+
+def _header(op: Op, *fields: tuple[bytes, bytes]) -> bytes:
+    return join_header([(b"op", bytes([op])), *fields])
+
+
+def _uint32(number: int) -> bytes:
+    return number.to_bytes(4, "little")
 
 
 def _pack_lz4(data: bytes) -> bytes:
-    """LZ4 as ROS 1 reads it: independent blocks, a checksum of the content, no size.
-
-    rosbags writes frames that ROS 1 refuses (roslz4, lz4s.c).
-    """
+    """LZ4 as ROS 1 reads it: independent blocks, a checksum of the content, no size (lz4s.c)."""
     packed: bytes = lz4.frame.compress(
         data,
         block_size=lz4.frame.BLOCKSIZE_MAX1MB,
@@ -200,3 +231,10 @@ def _pack_lz4(data: bytes) -> bytes:
         store_size=False,
     )
     return packed
+
+
+_COMPRESSORS: Mapping[str, Callable[[bytes], bytes]] = {
+    "none": bytes,
+    "bz2": bz2.compress,
+    "lz4": _pack_lz4,
+}
