@@ -363,10 +363,11 @@ def test_large_payloads_are_not_deserialised() -> None:
         ("ros1", Schema("my/Type", "ros1msg", b"int8 x\n?!"), "ros2", "cannot be understood"),
         ("ros1", Schema("", "ros1msg", b"int8 x"), "ros2", "type of its messages is not known"),
         ("ros1", Schema("my/1 Type", "ros1msg", b"int8 x"), "ros2", "cannot be understood"),
-        ("ros1", Schema("my/Type", "ros1msg", b"Type x"), "ros2", "cannot be understood"),
+        ("ros1", Schema("my/Type", "ros1msg", b"Type x"), "ros2", "holds itself"),
         ("cdr", Schema("my/msg/Type", "ros2msg", b"wstring x"), "ros1", "no definition of type"),
         ("cdr", Schema("my/srv/Type", "ros2msg", b"int8 x\n---\n"), "ros1", "cannot be understood"),
         ("cdr", Schema("my/msg/Type", "ros2idl", b"module {"), "ros1", "cannot be understood"),
+        ("cdr", Schema("x", "ros2msg", b"bool data\n"), "ros1", "cannot be understood"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_converted(

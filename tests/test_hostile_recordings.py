@@ -373,13 +373,15 @@ DEFINITIONS: dict[str, tuple[str, str, bytes]] = {
     "idl-product": ("cdr", CONSTANT.format("9" + "*9" * 50), CDR + bytes(4)),
 }
 
+REFUSALS = "does not parse|holds itself|holds more|has more than .* fields|takes too long|cannot be"
+
 
 def test_definitions_that_claim_much(tmp_path: Path, jail: Jail) -> None:
     for name, (encoding, definition, payload) in DEFINITIONS.items():
         path = recording(tmp_path / f"{name}.mcap", encoding, "a/msg/A", definition, payload)
         outcome = bounded(jail.converted(path, "ros2" if encoding == "ros1" else "ros1"))
         assert outcome.error == "ConversionError", (name, outcome.text)
-        assert re.search("does not parse as|cannot be understood", outcome.text), name
+        assert re.search(REFUSALS, outcome.text), (name, outcome.text)
         outcome = bounded(jail.decoded(path))
         assert outcome.error in ("OptionError", "SourceError"), (name, outcome.text)
 

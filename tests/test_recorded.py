@@ -226,7 +226,7 @@ def channel(encoding: str, name: str = "", schema: bytes = b"", kind: str = "") 
         (channel(""), "of no known encoding"),
         (channel("ros1"), "the type of its messages is not known"),
         (channel("cdr", "my_msgs/msg/Odd"), "no definition of type my_msgs/msg/Odd"),
-        (channel("ros1", "my_msgs/Odd", b"int32[ x", "ros1msg"), "no definition of type"),
+        (channel("ros1", "my_msgs/Odd", b"int32[ x", "ros1msg"), "cannot be understood"),
         (channel("ros1", "my_msgs/Odd", b"other_msgs/X x", "ros1msg"), "no definition of type"),
         (channel("ros1", "my_msgs/Odd", b"std_msgs/Empty[] x", "ros1msg"), "without fields"),
         (

@@ -8,23 +8,22 @@ import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, is_dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.msg import denormalize_msgtype, normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from mp4ds.bags.types import (
-    BAD_DEFINITION,
-    BAD_PAYLOAD,
     BUILTIN,
     HEADER,
     MAX_TAIL,
+    by_library,
     field_shape,
     fields_of,
+    incomprehensible,
     make_store,
     ros1_world,
     ros2_world,
@@ -64,37 +63,6 @@ def _parts(types: Typesdict, name: str) -> list[tuple[int, str, bool]]:
     ]
 
 
-def time_beyond(where: Where, data: bytes | memoryview, name: str, store: Typestore) -> int | None:
-    """Seconds of a time in a message that only ROS 2 takes for negative; None where there is none.
-
-    Args:
-        where: From `where_times_are`.
-        data: The message in little-endian CDR.
-        name: Its type.
-        store: What parses it.
-    """
-    if where == "nowhere":
-        return None
-    if where == "header":
-        seconds = struct.unpack_from("<i", data, 4)[0]
-        return int(seconds) if seconds < 0 else None
-    words = np.frombuffer(data, "<i4", count=len(data) // 4)
-    if not (words < 0).any():  # as CDR has them: at multiples of four
-        return None
-    return next((sec for sec in _seconds(store.deserialize_cdr(data, name)) if sec < 0), None)
-
-
-def _seconds(value: Any) -> Iterator[int]:
-    if is_dataclass(value):
-        if getattr(value, "__msgtype__", "") == TIME:
-            yield int(getattr(value, "sec"))  # noqa: B009 - of rosbags' making
-        for name in value.__dataclass_fields__:
-            yield from _seconds(getattr(value, name))
-    elif isinstance(value, list):
-        for item in value:
-            yield from _seconds(item)
-
-
 # ---------------------------------------------------------------- convert
 
 LATCHED_QOS = """\
@@ -119,8 +87,6 @@ _ROS1 = "ros1:"  # begins the keys that keep a ROS 1 connection header in ROS 2 
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 _REMEDY = "Exclude the topic with `exclude`, or unpack to mcap, which keeps it as it is."
 
-_KEPT_AS_IT_IS = "Unpack to mcap, which keeps it as it is, or exclude the topic with `exclude`."
-
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
@@ -133,6 +99,7 @@ class _Plan:
         schema: Definition for the target.
         digest: md5sum for ROS 1, type hash for ROS 2.
         times: Where its messages have times.
+        no_message: What is said of a payload that is no message of the type.
     """
 
     name: str
@@ -141,6 +108,7 @@ class _Plan:
     schema: Schema
     digest: str
     times: Where
+    no_message: str
 
 
 class Converter:
@@ -192,11 +160,8 @@ class Converter:
         plan = self._plan(channel)
         try:
             return self._convert(plan, memoryview(data))
-        except Refused as beyond:
-            raise ConversionError(channel.topic, str(beyond), _KEPT_AS_IT_IS) from None
-        except BAD_PAYLOAD:
-            problem = f"a message does not parse as {channel.type_name}"
-            raise ConversionError(channel.topic, problem, _REMEDY) from None
+        except Refused as reason:
+            raise ConversionError(channel.topic, str(reason), _REMEDY) from None
 
     def _completed(self, channel: Channel) -> Channel:
         """A ROS 1 channel with the md5sum without which ROS 1 opens no bag.
@@ -209,8 +174,10 @@ class Converter:
             return channel
         try:
             store = make_store(types_of(schema, self._ros1), self._ros1)
-            definition, digest = store.generate_msgdef(normalize_msgtype(schema.name), 1)
-        except BAD_DEFINITION:
+            name = normalize_msgtype(schema.name)
+            problem = incomprehensible(schema.name)
+            definition, digest = by_library(problem, store.generate_msgdef, name, 1)
+        except Refused:
             return channel
         if not schema.data:
             schema = Schema(schema.name, self._ros1.schema_encoding, definition.encode())
@@ -230,51 +197,51 @@ class Converter:
         if schema not in self._plans:
             try:
                 self._plans[schema] = self._make_plan(schema)
-            except KeyError as error:
-                is_own = error.args[0] == normalize_msgtype(schema.name)
-                missing = schema.name if is_own else error.args[0]
-                problem = f"no definition of type {missing} is known"
-                raise ConversionError(channel.topic, problem, _REMEDY) from None
-            except BAD_DEFINITION:
-                problem = f"the definition of type {channel.type_name} cannot be understood"
-                raise ConversionError(channel.topic, problem, _REMEDY) from None
+            except Refused as reason:
+                raise ConversionError(channel.topic, str(reason), _REMEDY) from None
         return self._plans[schema]
 
     def _make_plan(self, schema: Schema) -> _Plan:
         target = self._target or self._source
+        problem = incomprehensible(schema.name)
         types = types_of(schema, self._source)
         name = normalize_msgtype(schema.name)
         new_name = _RENAMED.get(name, name) if target is self._ros2 else name
         made = make_store(translate(types, name, new_name, target), target)
         if target is self._ros2:
-            definition, digest = made.generate_msgdef(new_name, 2)[0], made.hash_rihs01(new_name)
+            definition, _ = by_library(problem, made.generate_msgdef, new_name, 2)
+            digest = by_library(problem, made.hash_rihs01, new_name)
         else:
-            definition, digest = made.generate_msgdef(new_name, 1)
-            new_name = denormalize_msgtype(new_name)
+            definition, digest = by_library(problem, made.generate_msgdef, new_name, 1)
+            new_name = by_library(problem, denormalize_msgtype, new_name)
         store = make_store(types, self._ros2)
         store.get_msgdef(name)  # compiled now, to fail before any message
         made_schema = Schema(new_name, target.schema_encoding, definition.encode())
-        return _Plan(name, types, store, made_schema, digest, where_times_are(types, name))
+        times = where_times_are(types, name)
+        no_message = f"a message does not parse as {schema.name}"
+        return _Plan(name, types, store, made_schema, digest, times, no_message)
 
     def _convert(self, plan: _Plan, raw: memoryview) -> memoryview:
         to_ros1 = self._target is self._ros1
         store, name = plan.store, plan.name
+        problem = plan.no_message
         if to_ros1 and bytes(raw[:2]) == b"\0\0":
             # rosbags converts bytes of little-endian CDR only.
-            message = store.deserialize_cdr(raw, name)
-            raw = store.serialize_cdr(message, name, little_endian=True)
+            message = by_library(problem, store.deserialize_cdr, raw, name)
+            little_endian = partial(store.serialize_cdr, little_endian=True)
+            raw = by_library(problem, little_endian, message, name)
         convert = store.cdr_to_ros1 if to_ros1 else store.ros1_to_cdr
         try:
-            converted = convert(raw, name)
-        except (SerdeError, AssertionError):
+            converted = by_library(problem, convert, raw, name)
+        except Refused:
             # ROS itself overlooks bytes after a message, such as RealSense cameras' bags hold.
-            end = _end(plan, raw, to_ros1=to_ros1)
+            end = by_library(problem, _end, plan, raw, to_ros1)
             if not (0 < len(raw) - end <= MAX_TAIL and fields_of(plan.types, name)):
                 raise
             raw = raw[:end]
-            converted = convert(raw, name)
+            converted = by_library(problem, convert, raw, name)
             self._omitted["messages with bytes after their end, which were left out"] += 1
-        seconds = time_beyond(plan.times, raw if to_ros1 else converted, name, store)
+        seconds = _time_beyond(plan, raw if to_ros1 else converted)
         if seconds is not None:
             has = f"{seconds} s, and ROS 1 can hold 0 to 2^32 seconds"
             if not to_ros1:
@@ -296,11 +263,14 @@ class Converter:
         encoding = "" if definition is None and encoded is None else self._ros1.schema_encoding
         try:
             data = base64.b64decode(encoded) if encoded else (definition or "").encode()
+        except ValueError:
+            return None
+        try:
             schema = Schema(name, encoding, data)
             types = types_of(schema, self._ros1)
             if not same_wire(plan.types, plan.name, types, normalize_msgtype(name)):
                 return None
-        except BAD_DEFINITION:
+        except Refused:
             return None
         return replace(channel, message_encoding="ros1", schema=schema, metadata=known)
 
@@ -339,12 +309,42 @@ def is_latched(channel: Channel) -> bool:
     return bool(found) and set(found) <= {"1", "transient_local"}
 
 
-def _end(plan: _Plan, raw: memoryview, *, to_ros1: bool) -> int:
+def _end(plan: _Plan, raw: memoryview, to_ros1: bool) -> int:
     """Where the message in `raw` ends."""
     definition = plan.store.get_msgdef(plan.name)
     if to_ros1:
         return 4 + definition.getsize_cdr_to_ros1(raw[4:], 0, None, 0, plan.store)[0]
     return definition.getsize_ros1_to_cdr(raw, 0, None, 0, plan.store)[0]
+
+
+def _time_beyond(plan: _Plan, data: bytes | memoryview) -> int | None:
+    """Seconds of a time in a message that only ROS 2 takes for negative; None where there is none.
+
+    Args:
+        plan: Of its type.
+        data: The message in little-endian CDR.
+    """
+    if plan.times == "nowhere":
+        return None
+    if plan.times == "header":
+        seconds = struct.unpack_from("<i", data, 4)[0]
+        return int(seconds) if seconds < 0 else None
+    words = np.frombuffer(data, "<i4", count=len(data) // 4)
+    if not (words < 0).any():  # as CDR has them: at multiples of four
+        return None
+    message = by_library(plan.no_message, plan.store.deserialize_cdr, data, plan.name)
+    return next((sec for sec in _seconds(message) if sec < 0), None)
+
+
+def _seconds(value: Any) -> Iterator[int]:
+    if is_dataclass(value):
+        if getattr(value, "__msgtype__", "") == TIME:
+            yield int(getattr(value, "sec"))  # noqa: B009 - of rosbags' making
+        for name in value.__dataclass_fields__:
+            yield from _seconds(getattr(value, name))
+    elif isinstance(value, list):
+        for item in value:
+            yield from _seconds(item)
 
 
 # ---------------------------------------------------------------- standard definitions

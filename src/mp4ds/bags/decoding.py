@@ -9,9 +9,8 @@ from typing import Any
 from rosbags.typesys.msg import normalize_msgtype
 
 from mp4ds.bags.types import (
-    BAD_DEFINITION,
-    BAD_PAYLOAD,
     MAX_TAIL,
+    by_library,
     has_empty_items,
     make_store,
     ros1_world,
@@ -19,7 +18,7 @@ from mp4ds.bags.types import (
     sizes_of,
     types_of,
 )
-from mp4ds.errors import OptionError
+from mp4ds.errors import OptionError, Refused
 from mp4ds.messages.wire import WireError
 from mp4ds.records import Channel
 
@@ -62,19 +61,16 @@ def _ros(channel: Channel) -> Decoder:
         raise _undecodable(channel, "the type of its messages is not known")
     is_ros1 = channel.message_encoding == "ros1"
     world = ros1_world() if is_ros1 else ros2_world(_DISTRIBUTION)
-    name = normalize_msgtype(schema.name)
     try:
         types = types_of(schema, world)
         if has_empty_items(types, sizes_of(types)):
             raise _undecodable(channel, f"{schema.name} has arrays of a type without fields")
         store = make_store(types, world)
-        definition = store.get_msgdef(name)  # compiled now, to fail before any message
-    except OptionError:
-        raise
-    except BAD_DEFINITION:
-        raise _undecodable(
-            channel, f"no definition of type {schema.name} is known, or it cannot be understood"
-        ) from None
+        definition = store.get_msgdef(
+            normalize_msgtype(schema.name)
+        )  # compiled now, to fail before any message
+    except Refused as reason:
+        raise _undecodable(channel, str(reason)) from None
 
     def decode(payload: memoryview) -> Any:
         start, read = 0, definition.deserialize_ros1
@@ -84,9 +80,10 @@ def _ros(channel: Channel) -> Decoder:
             start = 4
             read = definition.deserialize_cdr_le if payload[1] else definition.deserialize_cdr_be
         try:
-            message, end = read(payload[start:], 0, definition.cls, store)
-        except BAD_PAYLOAD:
-            raise WireError(f"it is no {schema.name}") from None
+            args = (payload[start:], 0, definition.cls, store)
+            message, end = by_library(f"it is no {schema.name}", read, *args)
+        except Refused as reason:
+            raise WireError(str(reason)) from None
         if len(payload) - start - end > MAX_TAIL:
             raise WireError(f"it is no {schema.name}")
         return message

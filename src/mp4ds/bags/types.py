@@ -7,7 +7,7 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from rosbags.interfaces import Msgdef, Nodetype
 from rosbags.serde import SerdeError
@@ -23,7 +23,7 @@ from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 from rosbags.typesys.stores import empty
 
-from mp4ds.errors import OptionError
+from mp4ds.errors import OptionError, Refused
 from mp4ds.records import Channel, Schema
 
 if TYPE_CHECKING:
@@ -45,6 +45,34 @@ _READING = (
     "getsize_cdr_to_ros1",
     "cdr_to_ros1",
 )
+
+_RAISED = (
+    *(TypesysError, SerdeError, AssertionError, AttributeError, LookupError, MemoryError),
+    *(RecursionError, SyntaxError, TypeError, ValueError, struct.error),
+)
+_Made = TypeVar("_Made")
+
+
+def by_library(problem: str, call: Callable[..., _Made], *args: Any) -> _Made:
+    """What rosbags, or a library like it, makes of a definition or a message.
+
+    It raises errors of all kinds where it cannot use one. No code of ours may run in `call`, or a
+    bug of ours would be taken for a damaged message.
+
+    Raises:
+        Refused: The library cannot use it; says `problem`.
+    """
+    try:
+        return call(*args)
+    except Refused:
+        raise
+    except _RAISED:
+        raise Refused(problem) from None
+
+
+def incomprehensible(name: str) -> str:
+    """What is said of a type whose definition a library cannot use."""
+    return f"the definition of type {name} cannot be understood"
 
 
 class Size(NamedTuple):
@@ -68,8 +96,7 @@ def sizes_of(types: Typesdict) -> dict[str, Size]:
         types: Definitions, complete.
 
     Raises:
-        ValueError: A type holds itself, or more than any message has.
-        KeyError: A type is not defined.
+        Refused: A type holds itself, or more than any message has.
     """
     sizes: dict[str, Size] = {}
     parts = 0
@@ -81,12 +108,12 @@ def sizes_of(types: Typesdict) -> dict[str, Size]:
                 sizes[todo[-1]] = _size(types, todo[-1], sizes)
                 todo.pop()
             elif len(todo) > _MAX_DEPTH:
-                raise ValueError(f"{name} holds itself, or too many levels of messages")
+                raise Refused(f"{name} holds itself, or too many levels of messages")
             else:
                 todo.append(missing[0])
         parts += sum(_spelled_out(desc) for _, desc in types[name][1])
     if parts > _MAX_PARTS:
-        raise ValueError(f"has more than {_MAX_PARTS} fields")
+        raise Refused(f"its definition has more than {_MAX_PARTS} fields")
     return sizes
 
 
@@ -114,7 +141,7 @@ class BoundedStore(Typestore):
     def __init__(self, types: Typesdict) -> None:
         super().__init__(empty)
         self._sizes = sizes_of({**self.fielddefs, **types})
-        self.register(types)
+        by_library("its definition cannot be understood", self.register, types)
         self._data: object = None
         self._empty_left = 0
 
@@ -122,7 +149,7 @@ class BoundedStore(Typestore):
         """See rosbags."""
         found = self.cache.get(typename)
         if found is None:
-            found = super().get_msgdef(typename)
+            found = by_library(incomprehensible(typename), super().get_msgdef, typename)
             least = self._sizes[typename].least
             check = partial(_checked, least=least) if least else self._counted
             checked: dict[str, Any] = {name: check(getattr(found, name)) for name in _READING}
@@ -187,37 +214,13 @@ def _size(types: Typesdict, name: str, sizes: dict[str, Size]) -> Size:
         least += length * part.least
         steps += 1 + length * part.steps
     if steps > _MAX_STEPS or depth > _MAX_DEPTH:
-        raise ValueError(f"{name} holds more than any message has")
+        raise Refused(f"{name} holds more than any message has")
     return Size(least, steps, depth)
 
 
 # ---------------------------------------------------------------- definitions
 
 HEADER = "std_msgs/msg/Header"
-
-BAD_DEFINITION = (
-    TypesysError,
-    SerdeError,
-    SyntaxError,
-    RecursionError,
-    LookupError,
-    ValueError,
-    TypeError,
-    AttributeError,
-    AssertionError,
-)
-"""What rosbags raises for a definition that it cannot use."""
-
-BAD_PAYLOAD = (
-    SerdeError,
-    AssertionError,
-    struct.error,
-    ValueError,
-    LookupError,
-    TypeError,
-    MemoryError,
-)
-"""What rosbags raises for a payload that is not of its type."""
 
 MAX_TAIL = 8
 """Bytes after a message that ROS overlooks; after more, the definition is that of another type."""
@@ -278,25 +281,27 @@ def types_of(schema: Schema, world: World) -> Typesdict:
     """The type of a schema, and all that it refers to; standard ones where it lacks them.
 
     Raises:
-        KeyError: A type is defined nowhere.
-        TypesysError: The definition does not parse.
-        ValueError: It is larger than those of messages.
+        Refused: A type is defined nowhere, the definition does not parse, or it is larger than
+            those of messages.
     """
-    name = normalize_msgtype(schema.name)
-    found = _parse(schema, name)
+    problem = incomprehensible(schema.name)
+    name = by_library(problem, normalize_msgtype, schema.name)
+    found = _parse(schema, name, problem)
     if not fields_of(found, name) and name in world.standard:
         found.pop(name, None)  # the definition is empty, but perhaps not the type
     # Time, duration and header are the world's own, whatever their definition is called.
     for builtin in (*BUILTIN, HEADER):
         found.pop(builtin, None)
+    if name not in found and name not in world.standard:
+        raise Refused(f"no definition of type {schema.name} is known")
     types = closure(found, name, world.standard)
     sizes_of(types)  # refuses what no message can follow
     return types
 
 
-def _parse(schema: Schema, name: str) -> Typesdict:
+def _parse(schema: Schema, name: str, problem: str) -> Typesdict:
     if len(schema.data) > _MAX_TEXT or schema.data.count(b"\n") > _MAX_LINES:
-        raise ValueError("a definition longer than those of messages")
+        raise Refused(f"the definition of type {schema.name} is longer than those of messages")
     text = schema.data.decode(errors="replace").replace("\r\n", "\n")
     if not schema.encoding:
         return {}
@@ -305,26 +310,28 @@ def _parse(schema: Schema, name: str) -> Typesdict:
         code = _NO_CODE.sub("", text)
         brackets = len(_BRACKET.findall(code))
         if len(text) > _MAX_IDL or brackets > _MAX_BRACKETS or _SLOW_IDL.search(code):
-            raise ValueError("IDL that takes too long to parse")
+            raise Refused(f"the IDL of type {schema.name} takes too long to parse")
         parts = re.split(r"(?m)^=+\n(?:IDL: .*\n)?", text)
-        parsed = (get_types_from_idl(part) for part in parts if part.strip())
+        parsed = (by_library(problem, get_types_from_idl, part) for part in parts if part.strip())
         return {key: value for types in parsed for key, value in types.items()}
     text = re.sub(r"(?m)^={20,}[ \t]*$", _RULER, text)
     if schema.encoding == "ros1msg":
         text = re.sub(r"\broslib/Header\b", "std_msgs/Header", text)  # its name before 2010
-    return get_types_from_msg(text, name)
+    return by_library(problem, get_types_from_msg, text, name)
 
 
 def closure(types: Typesdict, root: str, standard: Typesdict) -> Typesdict:
     """A type and all that it refers to, each from the first that has it.
 
     Raises:
-        KeyError: One is in neither.
+        Refused: One is in neither.
     """
     found: Typesdict = {}
     todo = [root]
     while todo:
         name = todo.pop()
+        if name not in types and name not in standard:
+            raise Refused(f"no definition of type {name} is known")
         if name not in found:
             found[name] = types[name] if name in types else standard[name]
             todo += [part for _, desc in found[name][1] if (part := _shape(desc)[3])]
@@ -387,7 +394,7 @@ def field_shape(desc: FieldDesc) -> FieldShape:
         return FieldShape("", str(desc[1]), 0, length, bound)
     if desc[0] == Nodetype.BASE:
         return FieldShape(str(desc[1][0]), "", int(desc[1][1] or 0), length, bound)
-    raise ValueError("an array of arrays")
+    raise Refused("it holds arrays of arrays")
 
 
 def _shape(desc: FieldDesc) -> tuple[int, int, str, str]:
@@ -505,7 +512,7 @@ class HeaderStamps:
         world = ros1_world() if self._is_ros1 else ros2_world(_DISTRIBUTION)
         try:
             fields = fields_of(types_of(schema, world), name)
-        except BAD_DEFINITION:
+        except Refused:
             return None
         if fields and fields[0][1] == (Nodetype.NAME, HEADER):
             return self._of_header

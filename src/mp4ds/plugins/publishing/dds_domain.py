@@ -7,9 +7,11 @@ import re
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from operator import getitem
 from typing import Any
 
-from mp4ds.bags.types import BAD_DEFINITION, World, field_shape, make_store, types_of
+from mp4ds.bags.types import World, by_library, field_shape, incomprehensible, make_store, types_of
 from mp4ds.errors import ConversionError, OptionError, PublishError, Refused
 from mp4ds.records import HASH_KEY, Channel
 
@@ -76,6 +78,7 @@ def _is_local() -> bool:
 
 # ---------------------------------------------------------------- types
 
+_NO_DDS_TYPE = "DDS has no such type"
 Types = dict[str, Any]
 """Definitions by name, as `types_of` finds them."""
 
@@ -180,9 +183,10 @@ def message_type(channel: Channel, world: World) -> DdsType:
     type_hash = recorded if _HASH.fullmatch(recorded) else ""
     try:
         types = _known_types(channel, world)
-        type_hash = type_hash or make_store(types, world).hash_rihs01(name)
+        hashed = make_store(types, world).hash_rihs01
+        type_hash = type_hash or by_library(incomprehensible(name), hashed, name)
         real = as_is(make_struct(types, name))
-    except (*BAD_DEFINITION, Refused):
+    except Refused:
         return DdsType(opaque_type(dds_name(name)), type_hash, False, False)
     is_empty = types[name][1][0][0] == _FILLER
     return DdsType(real, type_hash, True, is_empty)
@@ -196,7 +200,7 @@ def _full_name(name: str) -> str:
 
 def _known_types(channel: Channel, world: World) -> Types:
     if channel.schema is None:
-        raise Refused
+        raise Refused(_NO_DDS_TYPE)
     return {
         name: (constants, fields or [_filler(world)])
         for name, (constants, fields) in types_of(channel.schema, world).items()
@@ -235,20 +239,21 @@ class _StructMaker:
         if name in self._made:
             return self._made[name]
         if name in self._open or len(self._open) >= _MAX_NESTING or not _NAME.fullmatch(name):
-            raise Refused
+            raise Refused(_NO_DDS_TYPE)
         self._open.append(name)
         fields: dict[str, Any] = {}
         total = 0
         for field, desc in self._types[name][1]:
             if field in fields or field.startswith("__"):
-                raise Refused
+                raise Refused(_NO_DDS_TYPE)
             fields[field], size = self._field(desc)
             total += size
         if total > _MAX_SIZE:
-            raise Refused
+            raise Refused(_NO_DDS_TYPE)
         self._open.pop()
         short = f"{name.rpartition('/')[2]}_"
-        made = make_idl_struct(short, dds_name(name), fields, dataclassify=self._has_fields)
+        make = partial(make_idl_struct, dataclassify=self._has_fields)
+        made = by_library(_NO_DDS_TYPE, make, short, dds_name(name), fields)
         self._made[name] = made, total
         return made, total
 
@@ -261,10 +266,11 @@ class _StructMaker:
         else:
             kind, size = _base(shape.base, shape.text_bound), 8
         if shape.length is not None:
-            return types.array[kind, shape.length], size * shape.length
+            made = by_library(_NO_DDS_TYPE, getitem, types.array, (kind, shape.length))
+            return made, size * shape.length
         if shape.bound is not None:
             bounded = (kind, shape.bound) if shape.bound else kind
-            return types.sequence[bounded], 24
+            return by_library(_NO_DDS_TYPE, getitem, types.sequence, bounded), 24
         return kind, size
 
 
@@ -272,7 +278,7 @@ def _base(name: str, bound: int) -> Any:
     from cyclonedds.idl import types
 
     if name not in _BASES:
-        raise Refused
+        raise Refused(_NO_DDS_TYPE)
     if name == "string":
         return types.bounded_str[bound] if bound else str
     return bool if name == "bool" else getattr(types, _BASES[name])
