@@ -22,6 +22,7 @@ from mp4ds.format.models import References
 from mp4ds.format.sidecars import load_stream
 from mp4ds.messages.coded import CodedFrame, UnknownStructure
 from mp4ds.packing.writer import video_facts
+from mp4ds.video import access
 from mp4ds.video import references as structure
 from mp4ds.video.access import Chains, digest_video, packets_of_groups
 from mp4ds.video.codecs import CODECS
@@ -91,6 +92,27 @@ def test_recorded_and_parsed_chains_are_the_same(name: str, tmp_path: Path) -> N
         is_plain = [len(chain) for chain in expected] == before
         assert (video_facts(path, recipe.codec)["references"] is None) == again.is_plain
         assert again.is_plain == is_plain
+
+
+def test_groups_that_were_not_asked_for_long_are_forgotten(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = RECIPES["x264-b3-none-ref4-w2"]
+    path = written(tmp_path, recipe)
+    table, data = index(path), path.read_bytes()
+    most = max(np.diff(np.append(np.flatnonzero(table.sync), len(table.sizes))))
+    monkeypatch.setattr(access, "_KEPT_FRAMES", 2 * most)
+
+    def read(sample: int) -> bytes:
+        return data[table.places[sample] :][: table.sizes[sample]]
+
+    known = [len(pieces) for pieces in chains_of(path, recipe.codec, None)]
+    chains = Chains(table, recipe.codec, read, None)
+    for sample in np.random.default_rng(0).integers(0, len(table.sizes), 200).tolist():
+        group = chains.group(sample, sample)
+        assert len(group.chain([sample])) == known[sample]
+        kept = sum(len(group.pieces) for group in chains._groups.values())
+        assert kept == chains._kept <= 2 * most
 
 
 @each("name", REFUSED)

@@ -204,6 +204,7 @@ class Chains:
         self._recorded = recorded
         self._keys = np.flatnonzero(table.sync)
         self._groups: OrderedDict[int, Group] = OrderedDict()
+        self._kept = 0  # coded frames of these
         ReferenceParser(codec, table.configuration)
 
     def group(self, sample: int, last: int) -> Group:
@@ -214,14 +215,18 @@ class Chains:
             StructureError: What was written down of it contradicts itself.
         """
         place = self._place(sample)
-        group = self._groups.get(place)
+        group = self._groups.pop(place, None)
         if group is None:
             group = self._begin(place)
-            self._groups[place] = group
-        self._groups.move_to_end(place)
+        else:
+            self._kept -= len(group.pieces)
         if group.parser is not None:
             self._parse(group, group.parser, last)
-        self._forget()
+        while self._groups and self._kept + len(group.pieces) > _KEPT_FRAMES:
+            _, forgotten = self._groups.popitem(last=False)
+            self._kept -= len(forgotten.pieces)
+        self._groups[place] = group
+        self._kept += len(group.pieces)
         return group
 
     def cut(self, group: Group, piece: Piece, packet: bytes) -> bytes:
@@ -285,13 +290,6 @@ class Chains:
                 if frame.shown:
                     shown = number
             group.shows.append(shown)
-
-    def _forget(self) -> None:
-        while (
-            len(self._groups) > 1
-            and sum(len(group.pieces) for group in self._groups.values()) > _KEPT_FRAMES
-        ):
-            self._groups.popitem(last=False)
 
 
 # ---------------------------------------------------------------- access
