@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import gc
+import json
 import os
 import pickle
 import re
@@ -11,6 +12,8 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections import Counter
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +34,7 @@ from torch.utils.data import DataLoader, Subset  # noqa: E402
 
 from each import each  # noqa: E402
 from mp4ds.torch import FrameDataset, FrameStream, SampleError  # noqa: E402
-from mp4ds.torch.datasets import rows_of, windows  # noqa: E402
+from mp4ds.torch.streams import mixed, window_count, window_starts  # noqa: E402
 from waiting import WATCHDOG_S  # noqa: E402
 
 LEFT, RIGHT = BOTH = ["/left/image_raw", "/right/image_raw"]
@@ -644,19 +647,121 @@ def test_epochs_differ_and_repeat(drives: list[Path]) -> None:
     assert sorted(mixed) == sorted(order(0))
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("drop_last", [False, True])
 @pytest.mark.parametrize(
-    ("workers", "method", "ranks"), [(0, None, 3), (2, "fork", 2), (1, "spawn", 1)]
+    ("workers", "method", "ranks"),
+    [
+        (0, None, 5),
+        pytest.param(2, "fork", 2, marks=pytest.mark.slow),
+        pytest.param(1, "spawn", 3, marks=pytest.mark.slow),
+    ],
 )
-def test_ranks_and_workers_share_an_epoch(
-    drives: list[Path], workers: int, method: str | None, ranks: int
+def test_processes_of_a_training_get_equal_numbers(
+    drives: list[Path], workers: int, method: str | None, ranks: int, drop_last: bool
 ) -> None:
-    seen: list[int] = []
+    total, shares = 3 * FRAMES, ranks * max(1, workers)
+    of_ranks = []
     for rank in range(ranks):
-        stream = FrameStream(drives, topics=[LEFT], window=GOP, rank=rank, world_size=ranks)
-        for batch in loader(stream, workers, method, batch_size=4):
-            seen += batch["index"].tolist()
+        share: dict[str, Any] = {"rank": rank, "world_size": ranks, "drop_last": drop_last}
+        stream = FrameStream(drives, topics=[LEFT], window=GOP, **share)
+        batches = loader(stream, workers, method, batch_size=4)
+        of_ranks.append([int(number) for batch in batches for number in batch["index"]])
+    assert {len(numbers) for numbers in of_ranks} == {
+        max(1, workers) * (total // shares if drop_last else -(-total // shares))
+    }
+    seen = Counter(number for numbers in of_ranks for number in numbers)
+    if drop_last:
+        assert set(seen.values()) == {1}
+        assert total - len(seen) < shares
+    else:
+        assert set(seen) == set(range(total))
+        assert max(seen.values()) <= 2
+
+
+def test_more_processes_than_samples(drives: list[Path]) -> None:
+    share: dict[str, Any] = {"topics": [LEFT], "rank": 50, "world_size": 60}
+    assert len(list(FrameStream(drives[0], **share))) == 1
+    assert not list(FrameStream(drives[0], **share, drop_last=True))
+
+
+@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_workers_of_one_process_share_an_epoch(drives: list[Path], workers: int) -> None:
+    stream = FrameStream(drives, topics=[LEFT], window=GOP)
+    batches = loader(stream, workers, "fork" if workers else None, batch_size=4)
+    seen = [int(number) for batch in batches for number in batch["index"]]
     assert sorted(seen) == list(range(3 * FRAMES))
+
+
+@pytest.mark.parametrize("buffer", [0, 7])
+@pytest.mark.parametrize("share", [{}, {"rank": 1, "world_size": 2}])
+def test_an_epoch_goes_on_where_it_stood(
+    drives: list[Path], buffer: int, share: dict[str, Any]
+) -> None:
+    def stream() -> FrameStream:
+        return FrameStream(drives[:2], topics=[LEFT], window=GOP, seed=1, buffer=buffer, **share)
+
+    first = stream()
+    first.set_epoch(3)
+    whole = [(sample["index"], sample[LEFT]) for sample in first]
+    for stop in (0, 1, 5, len(whole) - 2, len(whole)):
+        first, other = stream(), stream()
+        first.set_epoch(3)
+        given = indices(islice(iter(first), stop))
+        state = json.loads(json.dumps(first.state_dict()))
+        other.load_state_dict(state)
+        assert other.state_dict() == state
+        rest = [(sample["index"], sample[LEFT]) for sample in other]
+        assert given + [index for index, _ in rest] == [index for index, _ in whole]
+        for (_, image), (_, expected) in zip(rest, whole[stop:], strict=True):
+            assert torch.equal(image, expected)
+        assert indices(other) == [index for index, _ in whole]  # from the beginning again
+
+
+def test_a_state_of_another_order_is_refused(drives: list[Path]) -> None:
+    state = FrameStream(drives[0], topics=[LEFT], seed=1).state_dict()
+    with pytest.raises(mp4ds.OptionError, match="of a stream with seed 1, and this one has 2"):
+        FrameStream(drives[0], topics=[LEFT], seed=2).load_state_dict(state)
+
+
+@pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")  # torchdata still calls it
+@pytest.mark.parametrize("workers", [0, 2])
+def test_torchdata_keeps_where_an_epoch_stands(drives: list[Path], workers: int) -> None:
+    stateful = pytest.importorskip("torchdata.stateful_dataloader")
+
+    def batches() -> Any:
+        stream = FrameStream(drives, topics=[LEFT], window=GOP, buffer=5)
+        context = "fork" if workers else None
+        return stateful.StatefulDataLoader(
+            stream, batch_size=4, num_workers=workers, multiprocessing_context=context
+        )
+
+    def numbers(found: Any) -> list[list[int]]:
+        return [batch["index"].tolist() for batch in found]
+
+    whole = numbers(batches())
+    first, second = batches(), batches()
+    given = numbers(islice(iter(first), 5))
+    second.load_state_dict(first.state_dict())
+    assert given + numbers(second) == whole
+
+
+def test_what_was_given_is_not_read_again() -> None:
+    read: list[int] = []
+
+    def reading(item: int) -> int:
+        read.append(item)
+        return item
+
+    def samples(skip: int) -> list[int]:
+        read.clear()
+        random = np.random.default_rng(0)
+        return list(mixed(range(100), reading, size=10, random=random, skip=skip))
+
+    whole = samples(0)
+    assert sorted(whole) == list(range(100)) != whole
+    for skip in (1, 50, 95, 100):
+        assert samples(skip) == whole[skip:]
+        assert sorted(read) == sorted(whole[skip:])
 
 
 def test_workers_that_stay_learn_of_the_epoch(drives: list[Path]) -> None:
@@ -683,9 +788,12 @@ def test_windows_are_a_partition(drives: list[Path], length: int, keys: list[int
     for topics in ([LEFT], BOTH):
         collection = FrameDataset(drives[:2], topics=topics)._collection
         found: list[list[int]] = [[], []]
-        for number, window in windows(collection, length).tolist():
-            rows = rows_of(collection.recordings[number], window, length, np.array(keys))
-            found[number] += rows.tolist()
+        for number, recording in enumerate(collection.recordings):
+            starts = window_starts(recording, length, np.array(keys, np.int64)).tolist()
+            assert len(starts) == window_count(recording, length) + 1
+            for first, end in pairwise(starts):
+                found[number] += range(first, end)
+                assert recording.matches is not None or first in (0, end, *keys)
         assert found == [list(range(recording.rows)) for recording in collection.recordings]
 
 

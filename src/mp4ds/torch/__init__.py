@@ -13,6 +13,7 @@ if find_spec("torch") is None:
     raise ImportError("mp4ds.torch needs PyTorch. Install it with: pip install 'mp4ds[torch]'")
 
 from mp4ds.errors import SampleError
-from mp4ds.torch.datasets import FrameDataset, FrameStream
+from mp4ds.torch.datasets import FrameDataset
+from mp4ds.torch.streams import FrameStream
 
 __all__ = ["FrameDataset", "FrameStream", "SampleError"]

@@ -1,0 +1,326 @@
+"""Samples in the order of the recordings: windows at random, shared among processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.utils.data import IterableDataset, get_worker_info
+
+from mp4ds.errors import OptionError
+from mp4ds.torch.cameras import (
+    Backend,
+    Collection,
+    Crop,
+    Dtype,
+    Paths,
+    Recording,
+    Resize,
+    pictures_from,
+)
+from mp4ds.torch.datasets import SYNC_TOLERANCE_NS, Offsets, SampleReader, Transform
+
+_T = TypeVar("_T")
+_UNREAD = object()
+
+
+def window_count(recording: Recording, length: int) -> int:
+    """How many windows of `length` samples a recording has."""
+    return -(-recording.rows // length)
+
+
+def window_starts(recording: Recording, length: int, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The first sample of each window, and the end of the last; int64.
+
+    A window begins with the first sample at or after a multiple of `length` whose frame of the
+    first camera comes first behind a key frame, and ends where the next one begins. So windows are
+    a partition of the samples, whatever key frames there are, and some may be empty.
+
+    Args:
+        recording: Of the samples.
+        length: Samples of a window.
+        keys: Numbers of the key frames of the first camera, in order.
+    """
+    rows = recording.rows
+    groups = np.searchsorted(keys, recording.frames(np.arange(rows), 0), side="right")
+    begins = np.append(np.flatnonzero(np.diff(groups) > 0) + 1, rows)
+    asked = np.arange(1, window_count(recording, length)) * length
+    return np.concatenate(([0], begins[np.searchsorted(begins, asked)], [rows])).astype(np.int64)
+
+
+def mixed(
+    items: Iterable[_T],
+    read: Callable[[_T], Any],
+    *,
+    size: int,
+    random: np.random.Generator,
+    skip: int = 0,
+) -> Iterator[Any]:
+    """What is read of items, in random order as far as a buffer allows.
+
+    Args:
+        items: What to read, in the order that is cheapest.
+        read: Reads one.
+        size: Of the buffer; 0 keeps the order.
+        random: Decides.
+        skip: How many of the first are left out. They are not read; those that the buffer has by
+            then are read when they are given.
+    """
+    kept: list[tuple[_T, Any]] = []
+    for item in items:
+        entry = (item, _UNREAD if skip > 0 else read(item))
+        if len(kept) < size:
+            kept.append(entry)
+            continue
+        if size:
+            place = int(random.integers(size))
+            kept[place], entry = entry, kept[place]
+        if skip > 0:
+            skip -= 1
+        else:
+            yield read(entry[0]) if entry[1] is _UNREAD else entry[1]
+    random.shuffle(kept)
+    for item, value in kept[skip:]:
+        yield read(item) if value is _UNREAD else value
+
+
+class FrameStream(IterableDataset):
+    """Frames of datasets as fast as videos are decoded: from beginning to end.
+
+    The recordings are cut into windows that begin with a key frame. Windows come in random
+    order, shared among the workers of a DataLoader and the processes of a distributed training;
+    each sample is read once an epoch, by one of them. Inside a window frames follow each other,
+    unless a `buffer` mixes them.
+
+    Processes of a distributed training get equal numbers of samples, for which some are given
+    twice or left out: see `drop_last`. To share evenly, each process reads the indexes of all
+    videos once; one process alone reads them as it comes to them.
+
+    Samples are as those of `FrameDataset` with one frame each. Give no ``shuffle`` to the
+    DataLoader. torchdata's StatefulDataLoader keeps and restores where an epoch stands.
+
+    Args:
+        paths: As of `FrameDataset`, and so are `topics`, `sync_tolerance_ns`, `format`,
+            `resize`, `crop`, `dtype`, `channels_first`, `transform`, `cache_files`, `backend`
+            and `device`.
+        topics: Cameras.
+        sync_tolerance_ns: Of the matches.
+        format: Of the frames.
+        resize: Of the frames.
+        crop: Of the frames.
+        dtype: Of the tensors.
+        channels_first: Of the tensors.
+        transform: Of the samples.
+        window: Samples of a window; the key frames of the first camera make it a little
+            shorter or longer. Several times the distance of key frames, or decoding costs more.
+        shuffle: Whether windows are in random order.
+        seed: Of the order; the same in all processes.
+        buffer: Samples that are kept to mix their order; 0: none.
+        rank: Number of this process of a distributed training.
+        world_size: How many there are.
+        drop_last: Of a distributed training, as of DistributedSampler: leave out the last samples
+            that cannot be shared evenly. Else the first of the epoch are given again.
+        cache_files: Videos that are open at most; one for each camera at least.
+        fast_colour: See `mp4ds.Dataset`.
+        backend: Who decodes.
+        device: Where.
+
+    Raises:
+        OptionError: An option is wrong, a topic is not there, or there is no sample.
+        SourceError: A path is no dataset.
+        FormatError: A manifest or sidecar breaks a rule of the format.
+    """
+
+    def __init__(
+        self,
+        paths: Paths,
+        *,
+        topics: Sequence[str] | None = None,
+        sync_tolerance_ns: int = SYNC_TOLERANCE_NS,
+        format: str | Mapping[str, str] = "rgb",  # noqa: A002 - as of Stream.read
+        resize: Resize | Mapping[str, Resize] | None = None,
+        crop: Crop | Mapping[str, Crop] | None = None,
+        dtype: Dtype = "native",
+        channels_first: bool = True,
+        transform: Transform | None = None,
+        window: int = 256,
+        shuffle: bool = True,
+        seed: int = 0,
+        buffer: int = 0,
+        rank: int = 0,
+        world_size: int = 1,
+        drop_last: bool = False,
+        cache_files: int = 16,
+        fast_colour: bool = False,
+        backend: Backend = "mp4ds",
+        device: str = "cpu",
+    ) -> None:
+        _check(window=window, seed=seed, buffer=buffer, rank=rank, world_size=world_size)
+        self._collection = Collection(paths, topics=topics, sync_tolerance_ns=sync_tolerance_ns)
+        if cache_files < len(self.topics):
+            raise OptionError(
+                f"cache_files is {cache_files}, and must be at least {len(self.topics)}: one for "
+                "each camera."
+            )
+        pictures = pictures_from(
+            self.topics,
+            format_=format,
+            resize=resize,
+            crop=crop,
+            dtype=dtype,
+            channels_first=channels_first,
+            fast_colour=fast_colour,
+            backend=backend,
+            device=device,
+        )
+        self._reader = SampleReader(self._collection, pictures, Offsets(), transform, cache_files)
+        self._window = window
+        self._shuffle = shuffle
+        self._seed = seed
+        self._buffer = buffer
+        self._rank, self._world_size = rank, world_size
+        self._drop_last = drop_last
+        self._starts: dict[int, NDArray[np.int64]] = {}
+        self._given = self._resumed = 0
+        # in shared memory, so that workers that outlive an epoch learn of the next
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The cameras of a sample."""
+        return self._collection.topics
+
+    @property
+    def samples(self) -> int:
+        """Number of samples of an epoch, of all processes together."""
+        return int(self._collection.starts[-1])
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the order of the next epoch; the same number gives the same order.
+
+        Args:
+            epoch: 0 or more; the same in all processes.
+
+        Raises:
+            OptionError: It is negative.
+        """
+        _check(epoch=epoch)
+        self._epoch.fill_(epoch)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where the epoch stands in this process: what `load_state_dict` takes.
+
+        Of the iterator that was made last.
+        """
+        return {"epoch": int(self._epoch), "given": self._given, "order": self._order()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Let the next iterator go on where another one stood; what that gave is not read.
+
+        Args:
+            state_dict: Of the same process or worker, of a stream with the same options.
+
+        Raises:
+            OptionError: It is of another order of samples.
+        """
+        other = state_dict["order"]
+        for name, own in self._order().items():
+            if other[name] != own:
+                problem = f"the state is of a stream with {name} {other[name]!r}, and this one has"
+                raise OptionError(f"{problem} {own!r}.")
+        self.set_epoch(state_dict["epoch"])
+        self._given = self._resumed = state_dict["given"]
+
+    def _order(self) -> dict[str, Any]:
+        """What the order of samples depends on, besides the epoch."""
+        share, shares = self._share()
+        return {
+            "samples": self.samples,
+            "window": self._window,
+            "shuffle": self._shuffle,
+            "seed": self._seed,
+            "buffer": self._buffer,
+            "drop_last": self._drop_last,
+            "world_size": self._world_size,
+            "share": f"{share} of {shares}",
+        }
+
+    def _share(self) -> tuple[int, int]:
+        """Number of this process among all workers of all processes, and how many there are."""
+        worker = get_worker_info()
+        if worker is None:
+            return self._rank, self._world_size
+        return (
+            self._rank * worker.num_workers + worker.id,
+            self._world_size * worker.num_workers,
+        )
+
+    def __iter__(self) -> Iterator[Any]:
+        share, shares = self._share()
+        self._given, self._resumed = self._resumed, 0
+        order = (self._seed, int(self._epoch))
+        random = np.random.default_rng((*order, share))
+        rows = self._rows(order, share, shares)
+        return self._counted(
+            mixed(rows, self._read, size=self._buffer, random=random, skip=self._given)
+        )
+
+    def _counted(self, samples: Iterator[Any]) -> Iterator[Any]:
+        for sample in samples:
+            self._given += 1
+            yield sample
+
+    def _read(self, place: tuple[int, int]) -> Any:
+        number, row = place
+        return self._reader.read(number, np.array([row], np.int64))[0]
+
+    def _rows(self, order: tuple[int, int], share: int, shares: int) -> Iterator[tuple[int, int]]:
+        """The samples of a share, in order: recording and row of each."""
+        recordings = self._collection.recordings
+        windows = [
+            (number, window)
+            for number, recording in enumerate(recordings)
+            for window in range(window_count(recording, self._window))
+        ]
+        if self._shuffle:
+            np.random.default_rng(order).shuffle(windows)
+        if self._world_size == 1:
+            for number, window in windows[share::shares]:
+                yield from ((number, row) for row in self._window_rows(number, window))
+            return
+        # equal parts of all windows in a row: no more than one window is divided for each share
+        lengths = [len(self._window_rows(*window)) for window in windows]
+        starts = np.cumsum([0, *lengths[:-1]])
+        total = self.samples
+        count = total // shares if self._drop_last else -(-total // shares)
+        for place in np.arange(share * count, (share + 1) * count) % total:
+            at = int(np.searchsorted(starts, place, side="right")) - 1
+            number, window = windows[at]
+            yield number, self._window_rows(number, window)[place - starts[at]]
+
+    def _window_rows(self, number: int, window: int) -> range:
+        if number not in self._starts:
+            keys = self._reader.key_frames(number)
+            recording = self._collection.recordings[number]
+            self._starts[number] = window_starts(recording, self._window, keys)
+        first, end = self._starts[number][window : window + 2].tolist()
+        return range(first, end)
+
+    def close(self) -> None:
+        """Close the videos that this process has open; they are opened again when needed."""
+        self._reader.cameras.close()
+
+
+def _check(**numbers: int) -> None:
+    for name, value in numbers.items():
+        least = 1 if name in ("window", "world_size") else 0
+        if value < least:
+            raise OptionError(f"{name} is {value}, and must be at least {least}.")
+    if numbers.get("rank", 0) >= numbers.get("world_size", 1):
+        raise OptionError(
+            f"rank is {numbers['rank']}, and must be less than the world_size, "
+            f"{numbers['world_size']}."
+        )
