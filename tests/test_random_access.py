@@ -270,6 +270,28 @@ def test_numbers_are_no_colours(encoding: str, tmp_path: Path) -> None:
         assert frame.encoding == encoding
 
 
+@each("encoding", ["16UC1", "mono16", "32FC1"])
+def test_depths_in_metres(encoding: str, tmp_path: Path) -> None:
+    source = scene(encoding, frames=3)
+    expected = [data.astype(np.float64) for data in recorded(source)]
+    if encoding != "32FC1":
+        expected = [data / 1000 for data in expected]
+    with mp4ds.open(packed(tmp_path, source)) as dataset:
+        stream = dataset[TOPIC]
+        found = stream.read(range(3), format="depth_m")
+        assert found.dtype == np.float32
+        for image, metres in zip(found, expected, strict=True):
+            assert same(image, metres.astype(np.float32))
+        (frame,) = stream.get([1], format="depth_m", crop=(4, 2, 24, 18), resize=0.5)
+        assert (frame.encoding, frame.data.dtype) == ("32FC1", np.float32)
+        assert same(frame.data, expected[1][3:20:2, 5:28:2].astype(np.float32))
+
+
+def test_colours_are_no_depths(colour: mp4ds.Stream) -> None:
+    with pytest.raises(mp4ds.OptionError, match=r"rgb8 images, which are no depths.*16UC1"):
+        colour.read([0], format="depth_m")
+
+
 @each("name", ["BGR", "", "rgb8", None])
 def test_no_such_format(name: Any, colour: mp4ds.Stream) -> None:
     with pytest.raises(mp4ds.OptionError, match="native, rgb, bgr, gray"):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -449,6 +450,34 @@ def test_formats_are_those_of_the_transport(
     for to, told in (("bag", ros1), ("rosbag2", ros2 or ros1)):
         found = [m for m in made.unpack(to, kind)[1] if m.type_name == COMPRESSED]
         assert {message.value.format for message in found} == {told}
+
+
+@each("encoding", ["16UC1", "32FC1"])
+@each("codec", ["png", "rvl"])
+def test_coded_depths_in_metres(packed: Pack, encoding: str, codec: str) -> None:
+    name = f"depth-{encoding}-{codec}"
+    made = packed(name, "mcap-ros2-zstd")
+    with mp4ds.open(made.folder / "dataset") as dataset:
+        found = dataset[made.topic].read(range(len(made.cameras)), format="depth_m")
+    for image, original in zip(found, truth(rvl_as_png(name, made.cameras)), strict=True):
+        metres = original if encoding == "32FC1" else original / 1000
+        assert image.dtype == np.float32
+        np.testing.assert_allclose(image, metres, rtol=1e-5)
+
+
+def test_quantised_depths_without_their_parameters(packed: Pack, tmp_path: Path) -> None:
+    made = packed("depth-32FC1-png", "mcap-ros2-zstd")
+    folder = tmp_path / "dataset"
+    shutil.copytree(made.folder / "dataset", folder)
+    (sidecar,) = (path for path in folder.glob("*.yaml") if path.name != "dataset.yaml")
+    lines = sidecar.read_text("utf-8").splitlines()
+    kept = [line for line in lines if "prefix:" not in line and not line.startswith("checksum")]
+    sidecar.write_text("\n".join(kept) + "\n", "utf-8")
+    with mp4ds.open(sidecar) as dataset:
+        stream = dataset[made.topic]
+        assert stream.read([0], format="native").dtype == np.uint16
+        with pytest.raises(mp4ds.OptionError, match="quantised depths without their parameters"):
+            stream.read([0], format="depth_m")
 
 
 @each("quality", [5, 60, 95])

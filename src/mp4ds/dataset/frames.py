@@ -17,6 +17,7 @@ from mp4ds.dataset.views import Crop, Resize, View, view_of
 from mp4ds.errors import FrameNotFoundError, OptionError
 from mp4ds.format.models import Calibration
 from mp4ds.messages.arrangements import Picture
+from mp4ds.messages.depth import metres_of
 from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
 from mp4ds.video.reader import FrameReader, VideoFile, open_file_frames
 
@@ -165,7 +166,8 @@ class Frames(ABC):
 
     * ``format``: ``"native"`` in their ROS encoding; ``"rgb"`` and ``"bgr"``, shape (H, W, 3);
       ``"gray"``, shape (H, W). 16 bits stay 16 bits, a Bayer mosaic is interpolated, alpha is
-      left out. Depths and other numbers are only given as ``"native"``.
+      left out. Depths and other numbers are given as ``"native"``; depths also as ``"depth_m"``,
+      float32 in metres, shape (H, W). Where there is none it is 0 or NaN, as recorded.
     * ``crop``: x, y, width and height in pixels of the image, cut out first.
     * ``resize``: a factor, or width and height. Sizes are reduced by area and enlarged by bicubic
       interpolation; depths and other numbers take the nearest pixel. The frame's `intrinsics`
@@ -419,6 +421,10 @@ class DecodedFrames(Frames):
     def _write_pixels(self, picture: Picture, out: Pixels) -> None:
         """Write the pixels of a picture, as recorded."""
 
+    def _metres(self, index: int, pixels: Pixels) -> NDArray[np.float32]:
+        """The depths of a frame in metres, of its pixels as recorded."""
+        return metres_of(pixels)
+
     @abstractmethod
     def _frame_id(self, index: int) -> str: ...
 
@@ -483,7 +489,7 @@ class DecodedFrames(Frames):
             places.setdefault(number, []).append(place)
         for number, picture in self.pictures_of(sorted(places)):
             first, *others = places[number]
-            self._give(picture, view, out[first])
+            self._give(number, picture, view, out[first])
             for place in others:
                 np.copyto(out[place], out[first])
 
@@ -532,17 +538,17 @@ class DecodedFrames(Frames):
             self._views = {key: view}  # the last one alone: it holds tables of its own
         return view
 
-    def _give(self, picture: Picture, view: View, out: Pixels) -> None:
+    def _give(self, number: int, picture: Picture, view: View, out: Pixels) -> None:
         if view.is_plain:
             self._write_pixels(picture, out)
             return
         pixels: Pixels = np.empty(self.shape, self.dtype)
         self._write_pixels(picture, pixels)
-        view.give(pixels, out)
+        view.give(self._metres(number, pixels) if view.in_metres else pixels, out)
 
     def _frame(self, index: int, picture: Picture, view: View) -> Frame:
         data: Pixels = np.empty(view.shape, view.dtype)
-        self._give(picture, view, data)
+        self._give(index, picture, view, data)
         return Frame(
             data=data,
             index=index,

@@ -26,7 +26,7 @@ from mp4ds.dataset.rebuild import (
     template_of,
     unbroken,
 )
-from mp4ds.errors import FormatError, Refused
+from mp4ds.errors import FormatError, OptionError, Refused
 from mp4ds.files.outputs import digest_file
 from mp4ds.format.fields import decode_base64
 from mp4ds.format.models import Calibration, StreamSidecar
@@ -442,6 +442,18 @@ class Stream(DecodedFrames):
 
     def _write_pixels(self, picture: Picture, out: Pixels) -> None:
         self.rebuilder.write_pixels(picture, out)
+
+    def _metres(self, index: int, pixels: Pixels) -> NDArray[np.float32]:
+        header = self.sidecar.headers[int(self.columns.variant[index])]
+        prefix = bytes.fromhex(header.prefix)
+        if not depth.is_quantised(header.format, prefix):
+            return depth.metres_of(pixels)
+        if len(prefix) != depth.HEADER_BYTES:
+            raise OptionError(
+                f"frame {index} of {self.topic} holds quantised depths without their parameters: "
+                "it is given as format='native' alone"
+            )
+        return depth.metres_of(pixels, prefix)
 
     def _frame_id(self, index: int) -> str:
         return self.sidecar.headers[int(self.columns.variant[index])].frame_id

@@ -12,6 +12,7 @@ import numpy as np
 from mp4ds.dataset.rebuild import fields_of
 from mp4ds.errors import OptionError
 from mp4ds.format.models import Calibration, Roi
+from mp4ds.messages.depth import DEPTHS
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Encoding, Pixels
 from mp4ds.messages.wire import CalibrationFields
 from mp4ds.video.images import Renderer, encoding_as, shown_format
@@ -101,8 +102,8 @@ Resize = float | tuple[int, int] | None
 Crop = tuple[int, int, int, int] | None
 """x, y, width and height in pixels of the image, cut out before anything else."""
 
-FORMATS = ("native", "rgb", "bgr", "gray")
-"""As recorded; (H, W, 3); (H, W, 3); (H, W)."""
+FORMATS = ("native", "rgb", "bgr", "gray", "depth_m")
+"""As recorded; (H, W, 3); (H, W, 3); (H, W); (H, W) of float32, metres."""
 
 _Part = tuple[int, int, int, int]
 _Size = tuple[int, int]
@@ -117,12 +118,14 @@ class View:
         shape: Of one frame.
         dtype: Of its pixels.
         is_plain: Whether the pixels are given as they were recorded.
+        in_metres: Whether they are made depths in metres first.
     """
 
     encoding: Encoding
     shape: tuple[int, ...]
     dtype: np.dtype[np.generic]
     is_plain: bool
+    in_metres: bool = False
     _placement: Placement | None = None
     _renderer: Renderer | None = None
 
@@ -130,7 +133,7 @@ class View:
         """Write what the pixels of an image become.
 
         Args:
-            pixels: As recorded, native byte order.
+            pixels: As recorded, native byte order; depths in metres where the view is in these.
             out: Of the view's shape and type.
         """
         if self._renderer is not None:
@@ -177,19 +180,29 @@ def view_of(
     size = size_after(topic, cut, resize) if resize is not None else cut
     is_whole = cut == size == (width, height)
     given = encoding
-    if format != "native" or not is_whole:
+    if format == "depth_m":
+        if encoding.name not in DEPTHS:
+            raise OptionError(
+                f"{topic} has {encoding.name} images, which are no depths: format='depth_m' is for "
+                f"those of {', '.join(DEPTHS)}"
+            )
+        given = ENCODINGS["32FC1"]
+    elif format != "native" or not is_whole:
         given = _given(topic, encoding, format, part, is_resized=size != cut)
     shape, dtype = given.shape(*size), np.dtype(given.dtype)
-    if is_whole and given is encoding:
+    in_metres = format == "depth_m"
+    if is_whole and given is encoding and not in_metres:
         return View(given, shape, dtype, is_plain=True)
     placement = None if is_whole else Placement(part, size)
-    is_rendered = format != "native" or (size != cut and _is_interpolated(encoding))
+    is_rendered = not in_metres and (
+        format != "native" or (size != cut and _is_interpolated(encoding))
+    )
     renderer = (
         Renderer(encoding, given.name, crop=part if crop is not None else None, size=size)
         if is_rendered
         else None
     )
-    return View(given, shape, dtype, False, placement, renderer)
+    return View(given, shape, dtype, False, in_metres, placement, renderer)
 
 
 def _part(topic: str, image_size: _Size, crop: Sequence[int]) -> _Part:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,6 +166,39 @@ def _ranges(starts: _Numbers, lengths: _Numbers) -> _Numbers:
 # ---------------------------------------------------------------- depth
 
 HEADER_BYTES = 12
+DEPTHS = ("16UC1", "mono16", "32FC1")
+"""Encodings of depth images: of 16 bits in millimetres, of floats in metres (REP 118)."""
+
+_PARAMETERS = slice(4, HEADER_BYTES)  # of quantised inverse depths, in the header: two floats
+
+
+def is_quantised(format_: str | None, header: bytes) -> bool:
+    """Whether a compressedDepth image holds inverse metres, quantised to 16 bits.
+
+    Args:
+        format_: Field ``format`` of its message.
+        header: What stands before the file in its data.
+    """
+    of_depth = bool(header) or "compressedDepth" in (format_ or "")
+    return of_depth and (format_ or "").partition(";")[0].strip() == "32FC1"
+
+
+def metres_of(pixels: NDArray[Any], header: bytes = b"") -> NDArray[np.float32]:
+    """Depths in metres, shape (H, W); where there is none 0 or NaN, as recorded.
+
+    Args:
+        pixels: Of one of `DEPTHS`, shape (H, W).
+        header: Of an image that `is_quantised`; empty for others.
+    """
+    if not header:
+        per_metre = np.float32(1 if pixels.dtype.kind == "f" else 1000)
+        made: NDArray[np.float32] = np.divide(pixels, per_metre, dtype=np.float32)
+        return made
+    a, b = np.frombuffer(header[_PARAMETERS], "<f4")
+    with np.errstate(all="ignore"):  # as compressed_depth_image_transport computes them
+        made = a / (pixels.astype(np.float32) - b)
+    made[pixels == 0] = np.nan
+    return made
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ from torch import Tensor
 from mp4ds.dataset.dataset import open_dataset
 from mp4ds.dataset.frames import Video
 from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.views import FORMATS
 from mp4ds.errors import FormatError, Mp4dsError, OptionError, Refused, SampleError, VideoError
 from mp4ds.files.urls import location, remote, spelled
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
@@ -35,7 +36,6 @@ Dtype = Literal["native", "uint8", "float32"]
 Backend = Literal["mp4ds", "torchcodec"]
 
 _T = TypeVar("_T")
-_FORMATS = ("native", "rgb", "bgr", "gray")
 _DTYPES = ("native", "uint8", "float32")
 _BACKENDS = ("mp4ds", "torchcodec")
 
@@ -45,7 +45,7 @@ class TensorView:
     """What of a camera's frames is wanted.
 
     Attributes:
-        format: ``native``, ``rgb``, ``bgr`` or ``gray``.
+        format: One of `mp4ds.dataset.views.FORMATS`.
         resize: Factor, or width and height, pixels.
         crop: x, y, width, height before that, pixels.
     """
@@ -132,7 +132,7 @@ def pictures_from(
     sizes = _each("resize", resize, topics, None)
     crops = _each("crop", crop, topics, None)
     for name in formats:
-        _one_of("format", name, _FORMATS)
+        _one_of("format", name, FORMATS)
     views = tuple(map(TensorView, formats, sizes, crops))
     if backend == "mp4ds" and device != "cpu":
         raise OptionError(f"device={device!r} needs backend='torchcodec'.")

@@ -244,7 +244,8 @@ class FrameDataset(Dataset):
         tolerance_ns: With seconds, how far a stamp may be from its time without being padding;
             None: half the median time between the camera's frames.
         sync_tolerance_ns: How far stamps of different cameras may be apart in a sample.
-        format: ``rgb``, ``bgr``, ``gray`` or ``native``: the pixels as recorded. A mapping by
+        format: ``rgb``, ``bgr``, ``gray``; ``native``: the pixels as recorded; ``depth_m``: depths
+            in metres, float32. A mapping by
             topic gives each camera its own; so do mappings for `resize` and `crop`.
         resize: Factor, or width and height in pixels.
         crop: x, y, width, height in pixels; before `resize`.

@@ -17,7 +17,7 @@ from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import size_after, view_of
 from mp4ds.errors import OptionError, Refused
 from mp4ds.format.models import Header, StreamSidecar
-from mp4ds.messages.depth import HEADER_BYTES
+from mp4ds.messages.depth import DEPTHS, HEADER_BYTES, is_quantised, metres_of
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Pixels, pixel_view
 from mp4ds.messages.wire import CodedFields, Fields, ImageFields
 from mp4ds.times import intervals, usual_interval
@@ -144,8 +144,6 @@ def at_most(rate: float, times: NDArray[np.int64]) -> NDArray[np.bool_]:
 # ---------------------------------------------------------------- forms
 
 _COLOURS = ("rgb8", "bgr8", "rgba8", "bgra8", "rgb16", "bgr16", "rgba16", "bgra16")
-_DEPTHS = ("16UC1", "mono16")
-_INVERSE_DEPTHS = "32FC1"
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +209,7 @@ def maker(sidecar: StreamSidecar, header: Header, form: ImageForm) -> Maker:
     encoding = recorded if is_inverse else resized
     if form.kind == "raw":
         prefix = bytes.fromhex(header.prefix)
-        as_metres = partial(_metres, parameters=prefix[4:]) if is_inverse else None
+        as_metres = partial(metres_of, header=prefix) if is_inverse else None
         return lambda pixels: _raw(resize(pixels), encoding=encoding, convert=as_metres)
     try:
         file = ImageFile(encoding, form.kind, quality=form.jpeg_quality)
@@ -262,7 +260,7 @@ def encoding_of(sidecar: StreamSidecar, header: Header) -> str:
     if sidecar.body == "pixels":
         return own.name
     if _is_depth(sidecar, header):
-        if told not in (*_DEPTHS, _INVERSE_DEPTHS):
+        if told not in DEPTHS:
             raise Refused(f"its format {header.format!r} does not tell the unit of its depths")
         return told
     known = ENCODINGS.get(told, own)
@@ -276,13 +274,13 @@ def _told(header: Header) -> str:
 
 def _is_depth(sidecar: StreamSidecar, header: Header) -> bool:
     """Whether the messages are those of compressed_depth_image_transport."""
-    is_coded = sidecar.body in ("png", "rvl") and sidecar.image.encoding == _DEPTHS[0]
+    is_coded = sidecar.body in ("png", "rvl") and sidecar.image.encoding == "16UC1"
     return is_coded and (bool(header.prefix) or "compressedDepth" in (header.format or ""))
 
 
 def is_inverse_depth(sidecar: StreamSidecar, header: Header) -> bool:
     """Whether its depths are quantised inverse metres."""
-    return _is_depth(sidecar, header) and _told(header) == _INVERSE_DEPTHS
+    return _is_depth(sidecar, header) and is_quantised(header.format, bytes.fromhex(header.prefix))
 
 
 def format_of(encoding: str, form: ImageForm, *, has_mosaic: bool) -> str:
@@ -315,16 +313,6 @@ def _raw(
     step = width * ENCODINGS[encoding].pixel_bytes
     plain = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
     return Given(ImageFields(encoding, width, height, step, 0), plain.tobytes())
-
-
-def _metres(inverse: NDArray[np.uint16], *, parameters: bytes) -> NDArray[np.float32]:
-    """Depths of inverse ones, as compressed_depth_image_transport computes them."""
-    a, b = np.frombuffer(parameters, "<f4")
-    with np.errstate(all="ignore"):
-        metres = a / (inverse.astype(np.float32) - b)
-    metres[inverse == 0] = np.nan
-    found: NDArray[np.float32] = metres.astype(np.float32, copy=False)
-    return found
 
 
 # ---------------------------------------------------------------- pictures
