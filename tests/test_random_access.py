@@ -30,6 +30,7 @@ from mp4ds.plugins.demo import demo
 from mp4ds.unpacking.unpack import UnpackOptions
 from mp4ds.video.images import Renderer
 from pictures import YUV, picture, pixels
+from republished import psnr
 from sources import ENCODINGS, PERIOD, SOURCES, START, Scene, odd_scene, scene
 
 TOPIC = "/cam/image_raw"
@@ -309,6 +310,33 @@ def test_smaller(size: tuple[int, int], name: str, colour: mp4ds.Stream) -> None
     (small,) = colour.read([3], format=name, resize=size)
     expected = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
     assert np.abs(small.astype(int) - expected).max() <= 2
+
+
+@each("codec", ["h264", "av1", "lossless"])
+@each("size", [(64, 48), (63, 47)])
+def test_a_lossy_video_gives_sizes_at_once(
+    codec: str, size: tuple[int, int], tmp_path: Path
+) -> None:
+    """From its own samples; nearly what the whole picture gives, and without loss the same."""
+    source = scene("bgr8", noisy=False, frames=6, width=size[0], height=size[1])
+    options = {} if codec == "lossless" else {"codec": codec, "quality": "visual"}
+    with mp4ds.open(packed(tmp_path, source, **options)) as dataset:
+        stream = dataset[TOPIC]
+        for name, made in (("rgb", (20, 15)), ("bgr", (100, 80)), ("native", (32, 24))):
+            own = "rgb8" if name == "rgb" else "bgr8"
+            renderer = Renderer(KNOWN[own], own, crop=None, size=made)
+            frames = stream.get(range(6), format=name, resize=made)
+            read = stream.read(range(6), format=name, resize=made)
+            between = stream.between(0, 2**62, format=name, resize=made)
+            wholes = stream.read(range(6), format=name)
+            for frame, other, third, whole in zip(frames, read, between, wholes, strict=True):
+                assert frame.encoding == own
+                assert same(frame.data, other)
+                assert same(frame.data, third.data)
+                expected = np.empty_like(other)
+                renderer.render(whole, expected)
+                near = psnr(other, expected)  # of strong colours in few pixels
+                assert same(other, expected) if codec == "lossless" else near > 36
 
 
 @pytest.mark.parametrize("factor", [2, 1.5, 3.25])

@@ -19,6 +19,7 @@ from mp4ds.format.models import Calibration
 from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.depth import metres_of
 from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
+from mp4ds.video.pixels import Scale
 from mp4ds.video.reader import FrameReader, VideoFile, open_file_frames
 
 _WANTED = {
@@ -396,11 +397,14 @@ class DecodedFrames(Frames):
     # ------------------------------------------------------------ what makes them
 
     @abstractmethod
-    def pictures_of(self, indices: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+    def pictures_of(
+        self, indices: Sequence[int], scale: Scale | None = None
+    ) -> Iterator[tuple[int, Picture]]:
         """Pictures of some frames, each with its number.
 
         Args:
             indices: 0 <= index < frames, increasing.
+            scale: Give them so where that costs less than to convert them; else as they are.
 
         Yields:
             Views that hold until the next one is asked for. Nothing else may be read meanwhile.
@@ -410,7 +414,9 @@ class DecodedFrames(Frames):
         """
 
     @abstractmethod
-    def _pictures_apart(self, runs: Iterable[Sequence[int]]) -> Iterator[tuple[int, Picture]]:
+    def _pictures_apart(
+        self, runs: Iterable[Sequence[int]], scale: Scale | None
+    ) -> Iterator[tuple[int, Picture]]:
         """As `pictures_of` for each run, by a decoder of its own: more may be read meanwhile."""
 
     @abstractmethod
@@ -447,7 +453,7 @@ class DecodedFrames(Frames):
         numbers = numbers_of(self.topic, len(self), indices)
         view = self._view(format, resize, crop)
         found: dict[int, Frame] = {}
-        for number, picture in self.pictures_of(sorted(set(numbers))):
+        for number, picture in self.pictures_of(sorted(set(numbers)), view.scale):
             found[number] = self._frame(number, picture, view)
         given: set[int] = set()
         frames = []
@@ -487,7 +493,7 @@ class DecodedFrames(Frames):
         places: dict[int, list[int]] = {}
         for place, number in enumerate(numbers):
             places.setdefault(number, []).append(place)
-        for number, picture in self.pictures_of(sorted(places)):
+        for number, picture in self.pictures_of(sorted(places), view.scale):
             first, *others = places[number]
             self._give(number, picture, view, out[first])
             for place in others:
@@ -513,7 +519,7 @@ class DecodedFrames(Frames):
         """Frames in an order, of which what increases is decoded in one go."""
         falls = np.flatnonzero(np.diff(indices) < 0) + 1
         runs = (run.tolist() for run in np.split(indices, falls) if len(run))
-        for index, picture in self._pictures_apart(runs):
+        for index, picture in self._pictures_apart(runs, view.scale):
             yield self._frame(index, picture, view)
 
     # ------------------------------------------------------------ how they are given
@@ -541,6 +547,9 @@ class DecodedFrames(Frames):
     def _give(self, number: int, picture: Picture, view: View, out: Pixels) -> None:
         if view.is_plain:
             self._write_pixels(picture, out)
+            return
+        if view.scale and picture[0].shape == view.shape:  # it has its size already
+            np.copyto(out, picture[0])
             return
         pixels: Pixels = np.empty(self.shape, self.dtype)
         self._write_pixels(picture, pixels)
@@ -644,16 +653,20 @@ class Video(DecodedFrames):
     def __len__(self) -> int:
         return len(self._times)
 
-    def pictures_of(self, indices: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+    def pictures_of(
+        self, indices: Sequence[int], scale: Scale | None = None
+    ) -> Iterator[tuple[int, Picture]]:
         """See `DecodedFrames.pictures_of`."""
         if self._reader is None:
             self._reader = self._open_reader()
-        return self._reader.pictures_of(indices)
+        return self._reader.pictures_of(indices, scale)
 
-    def _pictures_apart(self, runs: Iterable[Sequence[int]]) -> Iterator[tuple[int, Picture]]:
+    def _pictures_apart(
+        self, runs: Iterable[Sequence[int]], scale: Scale | None
+    ) -> Iterator[tuple[int, Picture]]:
         with self._open_reader() as reader:
             for run in runs:
-                yield from reader.pictures_of(run)
+                yield from reader.pictures_of(run, scale)
 
     def _open_reader(self) -> FrameReader:
         return open_file_frames(

@@ -41,6 +41,7 @@ from mp4ds.video.coded_messages import body_of
 from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.images import ImageFile
 from mp4ds.video.packets import PacketReader
+from mp4ds.video.pixels import Scale
 from mp4ds.video.reader import FrameReader, open_frames
 
 
@@ -415,18 +416,22 @@ class Stream(DecodedFrames):
     def __len__(self) -> int:
         return self.sidecar.frames
 
-    def pictures_of(self, indices: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+    def pictures_of(
+        self, indices: Sequence[int], scale: Scale | None = None
+    ) -> Iterator[tuple[int, Picture]]:
         """See `DecodedFrames.pictures_of`."""
         if not len(indices):
             return iter(())
         if self._reader is None:
             self._reader = self._open_reader()
-        return self._reader.pictures_of(indices)
+        return self._reader.pictures_of(indices, scale)
 
-    def _pictures_apart(self, runs: Iterable[Sequence[int]]) -> Iterator[tuple[int, Picture]]:
+    def _pictures_apart(
+        self, runs: Iterable[Sequence[int]], scale: Scale | None
+    ) -> Iterator[tuple[int, Picture]]:
         with self._open_reader() as reader:
             for run in runs:
-                yield from reader.pictures_of(run)
+                yield from reader.pictures_of(run, scale)
 
     def _open_reader(self) -> FrameReader:
         return open_frames(

@@ -16,6 +16,7 @@ from mp4ds.messages.depth import DEPTHS
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Encoding, Pixels
 from mp4ds.messages.wire import CalibrationFields
 from mp4ds.video.images import Renderer, encoding_as, shown_format
+from mp4ds.video.pixels import Scale
 
 Matrix = list[list[float]]
 
@@ -105,6 +106,9 @@ Crop = tuple[int, int, int, int] | None
 FORMATS = ("native", "rgb", "bgr", "gray", "depth_m")
 """As recorded; (H, W, 3); (H, W, 3); (H, W); (H, W) of float32, metres."""
 
+_OF_VIDEOS = ("rgb8", "bgr8", "rgba8", "bgra8")
+"""Encodings that are in videos as pictures in colour; alpha is left out where they are shown."""
+
 _Part = tuple[int, int, int, int]
 _Size = tuple[int, int]
 
@@ -119,6 +123,7 @@ class View:
         dtype: Of its pixels.
         is_plain: Whether the pixels are given as they were recorded.
         in_metres: Whether they are made depths in metres first.
+        scale: What a video can give in place of pictures as recorded; they are the view then.
     """
 
     encoding: Encoding
@@ -126,6 +131,7 @@ class View:
     dtype: np.dtype[np.generic]
     is_plain: bool
     in_metres: bool = False
+    scale: Scale | None = None
     _placement: Placement | None = None
     _renderer: Renderer | None = None
 
@@ -202,7 +208,10 @@ def view_of(
         if is_rendered
         else None
     )
-    return View(given, shape, dtype, False, in_metres, placement, renderer)
+    made = shown_format(given)
+    can_scale = size != cut == (width, height) and encoding.name in _OF_VIDEOS
+    scale = Scale(made, *size) if made in ("rgb24", "bgr24") and can_scale else None
+    return View(given, shape, dtype, False, in_metres, scale, placement, renderer)
 
 
 def _part(topic: str, image_size: _Size, crop: Sequence[int]) -> _Part:

@@ -24,7 +24,7 @@ from mp4ds.video.codecs import CODECS
 from mp4ds.video.decoder import JpegDecoder
 from mp4ds.video.media import raise_if_scarce
 from mp4ds.video.mp4 import SampleTable, read_sample_table
-from mp4ds.video.pixels import PictureMaker
+from mp4ds.video.pixels import PictureMaker, Scale
 from mp4ds.video.references import (
     RecordedReferences,
     ReferenceParser,
@@ -372,11 +372,14 @@ class FrameAccess:
             "references-invalid", self._path, f"does not fit the references in its sidecar: {error}"
         )
 
-    def pictures_of(self, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+    def pictures_of(
+        self, numbers: Sequence[int], scale: Scale | None = None
+    ) -> Iterator[tuple[int, Picture]]:
         """Pictures of some frames, each with its number.
 
         Args:
             numbers: 0 <= number < frames, increasing.
+            scale: See `PictureMaker.make`.
 
         Yields:
             Views that hold until the next one is asked for.
@@ -389,9 +392,9 @@ class FrameAccess:
         """
         samples = self.table.order[np.asarray(numbers, np.int64)].tolist()
         for wanted in self._chains.split(samples) if samples else ():
-            yield from self._of_group(wanted)
+            yield from self._of_group(wanted, scale)
 
-    def _of_group(self, wanted: list[int]) -> Iterator[tuple[int, Picture]]:
+    def _of_group(self, wanted: list[int], scale: Scale | None) -> Iterator[tuple[int, Picture]]:
         self._announce(self._chains.unknown(wanted[0], max(wanted)))
         group = self._group(wanted)
         chain = group.chain(wanted)
@@ -407,7 +410,7 @@ class FrameAccess:
                     raise self._damage(due, "is marked as corrupt")
                 number = due.pop(frame.pts, None) if frame.pts is not None else None
                 if number is not None:
-                    yield number, self._maker.make(frame, number)
+                    yield number, self._maker.make(frame, number, scale)
                 if not due:
                     return
         except FFmpegError as error:

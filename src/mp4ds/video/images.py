@@ -20,7 +20,7 @@ from mp4ds.errors import OptionError, SourceError
 from mp4ds.messages.arrangements import CHROMA_SHIFTS
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Encoding, Pixels
 from mp4ds.messages.layouts import Layout, bind
-from mp4ds.video.pixels import PictureConverter, plain_frame
+from mp4ds.video.pixels import PictureConverter, plain_frame, scaling
 
 STILL_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".webp")
 """Endings of the image files that are read."""
@@ -349,8 +349,6 @@ def _layout(encoding: Encoding, *, demosaic: bool) -> Layout:
 # ---------------------------------------------------------------- rendering
 
 # libswscale's flags, as in `mp4ds.video.pixels`: full chroma, accurate rounding, bit-exact
-_CARE = 0x2000 | 0x4000 | 0x40000 | 0x80000
-_AREA, _BICUBIC = 0x20 | _CARE, 0x4 | _CARE
 
 # channels and samples of packed formats
 _PACKED = {
@@ -464,7 +462,6 @@ class Renderer:
         if pixel_format == self._target and (width, height) == self._size:
             np.copyto(out, array)
             return
-        is_smaller = self._size[0] * self._size[1] < width * height
         frame = self._reformatter.reformat(
             _frame(array, pixel_format),
             width=self._size[0],
@@ -474,7 +471,7 @@ class Renderer:
             dst_colorspace=Colorspace.ITU601,
             src_color_range=ColorRange.JPEG,
             dst_color_range=ColorRange.JPEG,
-            interpolation=_AREA if is_smaller else _BICUBIC,
+            interpolation=scaling((width, height), self._size),
             threads=1,  # a pool inherited over fork would never end
         )
         np.copyto(out, _array(frame))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -106,8 +107,9 @@ _BT709 = 1
 # libswscale's flags: bicubic, full chroma in and out, accurate rounding, the same everywhere.
 # As numbers, since older PyAV has no names for them.
 _BICUBIC, _FULL_CHROMA, _ACCURATE, _BITEXACT = 0x4, 0x2000 | 0x4000, 0x40000, 0x80000
-_BILINEAR = 0x2
-_INTERPOLATION = _BICUBIC | _FULL_CHROMA | _ACCURATE | _BITEXACT
+_BILINEAR, _BY_AREA = 0x2, 0x20
+_CARE = _FULL_CHROMA | _ACCURATE | _BITEXACT
+_INTERPOLATION = _BICUBIC | _CARE
 _MATRICES = {"bt709": Colorspace.ITU709, "smpte170m": Colorspace.ITU601}
 
 _CHANNELS = {"rgb24": 3, "bgr24": 3, "rgba": 4, "bgra": 4}
@@ -119,6 +121,27 @@ _DECODED_AS = {
     "gray": ("gray", "yuv420p", "yuvj420p"),
     "gray10le": ("gray10le", "yuv420p10le"),
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Another size of colour pictures, which is made of the video's own samples at once.
+
+    Attributes:
+        pixel_format: ``rgb24`` or ``bgr24``.
+        width: Columns to make.
+        height: Rows to make.
+    """
+
+    pixel_format: str
+    width: int
+    height: int
+
+
+def scaling(size: tuple[int, int], made: tuple[int, int]) -> int:
+    """Libswscale's flags to scale a size: what is smaller by area, what is larger bicubic."""
+    is_smaller = made[0] * made[1] < size[0] * size[1]
+    return (_BY_AREA if is_smaller else _BICUBIC) | _CARE
 
 
 class PictureConverter:
@@ -152,11 +175,7 @@ class PictureConverter:
 
     def convert(self, frame: av.VideoFrame, pixel_format: str) -> av.VideoFrame:
         """The frame in another pixel format, the colours kept."""
-        if self._is_tagged:
-            # untagged video is BT.601, limited, for ffmpeg and most players
-            self._matrix = Colorspace.ITU709 if frame.colorspace == _BT709 else Colorspace.ITU601
-            is_full = frame.color_range == _FULL_RANGE or frame.format.name.startswith("yuvj")
-            self._source_range = ColorRange.JPEG if is_full else ColorRange.MPEG
+        self._look_at_tags(frame)
         if pixel_format in self._via_planes and not frame.format.is_rgb:
             # the same samples in a third of the time: libswscale makes planes with SIMD
             planes = self._reformat(self._to_planes, frame, "gbrp")
@@ -166,17 +185,38 @@ class PictureConverter:
             return rounded(self._reformat(self._to_planes, frame, "yuv420p16le"), pixel_format)
         return self._reformat(self._reformatter, frame, pixel_format)
 
+    def scale(self, frame: av.VideoFrame, scale: Scale) -> av.VideoFrame:
+        """The frame in another size."""
+        self._look_at_tags(frame)
+        return self._reformat(self._reformatter, frame, scale.pixel_format, scale)
+
+    def _look_at_tags(self, frame: av.VideoFrame) -> None:
+        if self._is_tagged:
+            # untagged video is BT.601, limited, for ffmpeg and most players
+            self._matrix = Colorspace.ITU709 if frame.colorspace == _BT709 else Colorspace.ITU601
+            is_full = frame.color_range == _FULL_RANGE or frame.format.name.startswith("yuvj")
+            self._source_range = ColorRange.JPEG if is_full else ColorRange.MPEG
+
     def _reformat(
-        self, reformatter: VideoReformatter, frame: av.VideoFrame, pixel_format: str
+        self,
+        reformatter: VideoReformatter,
+        frame: av.VideoFrame,
+        pixel_format: str,
+        scale: Scale | None = None,
     ) -> av.VideoFrame:
+        interpolation = self._interpolation
+        if scale is not None:
+            interpolation = scaling((frame.width, frame.height), (scale.width, scale.height))
         return reformatter.reformat(
             frame,
+            width=scale.width if scale else None,
+            height=scale.height if scale else None,
             format=pixel_format,
             src_colorspace=self._matrix,
             dst_colorspace=self._matrix,
             src_color_range=self._source_range,
             dst_color_range=self._range,
-            interpolation=self._interpolation,
+            interpolation=interpolation,
             threads=1,  # a pool inherited over fork would never end
         )
 
@@ -317,8 +357,13 @@ def _planes(
 def _packed(
     frame: av.VideoFrame, pixel_format: str, converter: PictureConverter
 ) -> NDArray[np.uint8]:
+    return _array(converter.convert(frame, pixel_format), pixel_format)
+
+
+def _array(frame: av.VideoFrame, pixel_format: str) -> NDArray[np.uint8]:
+    """The pixels of a packed frame as a view of shape (H, W, C)."""
     channels = _CHANNELS[pixel_format]
-    rows = _rows(converter.convert(frame, pixel_format), 0)
+    rows = _rows(frame, 0)
     return rows[: frame.height, : channels * frame.width].reshape(frame.height, -1, channels)
 
 
@@ -367,12 +412,15 @@ class PictureMaker:
         self._picture_size = picture_size
         self._converter = PictureConverter(matrix, source_full_range=full_range, fast=fast_colour)
 
-    def make(self, frame: av.VideoFrame, number: int | None = None) -> Picture:
+    def make(
+        self, frame: av.VideoFrame, number: int | None = None, scale: Scale | None = None
+    ) -> Picture:
         """The picture in a frame; views of it where possible.
 
         Args:
             frame: As decoded.
             number: Of the frame, for errors.
+            scale: Give it so where the frame is a picture in colour of 8 bits, and no mosaic.
 
         Raises:
             VideoError: ``decode-failed``: the decoder found damage; ``geometry-mismatch`` or
@@ -390,6 +438,9 @@ class PictureMaker:
                 f"has {name} of {frame.width}x{frame.height} pixels among others of "
                 f"{width}x{height}",
             )
+        is_shown = self._picture_format in _CHANNELS and self._picture_size == self.coded_size
+        if scale is not None and is_shown:
+            return (_array(self._converter.scale(frame, scale), scale.pixel_format),)
         return frame_to_picture(
             frame, self._picture_format, *self._picture_size, self._converter, str(self._path)
         )

@@ -20,7 +20,7 @@ from mp4ds.video.codecs import CODECS
 from mp4ds.video.decoder import JpegDecoder, VideoDecoder
 from mp4ds.video.media import Media, raise_if_scarce
 from mp4ds.video.mp4 import read_sample_table
-from mp4ds.video.pixels import PictureMaker
+from mp4ds.video.pixels import PictureMaker, Scale
 from mp4ds.video.references import RecordedReferences
 
 
@@ -58,11 +58,14 @@ class FrameReader:
         except (UnknownStructure, VideoError, OSError):
             self._decoder = open_decoder()  # ffmpeg reads more, and tells what it does not
 
-    def pictures_of(self, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+    def pictures_of(
+        self, numbers: Sequence[int], scale: Scale | None = None
+    ) -> Iterator[tuple[int, Picture]]:
         """Pictures of some frames, each with its number.
 
         Args:
             numbers: 0 <= number < frames, increasing.
+            scale: Give them so where that costs less than to convert them; else as they are.
 
         Yields:
             Views that hold until the next one is asked for.
@@ -73,7 +76,7 @@ class FrameReader:
         done = 0
         if self._access is not None:
             try:
-                for pair in self._access.pictures_of(numbers):
+                for pair in self._access.pictures_of(numbers, scale):
                     done += 1
                     yield pair
                 return
