@@ -40,7 +40,7 @@ class Samples:
 
     coded_size = WIDTH, HEIGHT
 
-    def make(self, frame: Any, number: int | None = None) -> Any:
+    def make(self, frame: Any, number: int | None = None, scale: Any = None) -> Any:
         assert number is not None
         return samples(frame)
 

@@ -404,7 +404,7 @@ class DecodedFrames(Frames):
 
         Args:
             indices: 0 <= index < frames, increasing.
-            scale: Give them so where that costs less than to convert them; else as they are.
+            scale: See `PictureMaker.make`.
 
         Yields:
             Views that hold until the next one is asked for. Nothing else may be read meanwhile.

@@ -519,13 +519,14 @@ class Stream(DecodedFrames):
                 yield index, partial(rebuilder.payload, index, picture)
 
     def pictures_in_order(
-        self, decoder: VideoDecoder, choice: Choice = everything
+        self, decoder: VideoDecoder, choice: Choice = everything, scale: Scale | None = None
     ) -> Iterator[tuple[int, Picture]]:
         """Pictures that are wanted, each with its number.
 
         Args:
             decoder: Of `open_video`.
             choice: Which are wanted. Where all are, the video must not go on after them.
+            scale: See `PictureMaker.make`.
 
         Yields:
             Views that hold until the next one is asked for.
@@ -534,9 +535,9 @@ class Stream(DecodedFrames):
             VideoError: See `VideoDecoder.pictures`.
         """
         if choice is everything:
-            yield from enumerate(decoder.pictures())
+            yield from enumerate(decoder.pictures(scale))
         else:
-            yield from decoder.pictures_at(choice(self.columns))
+            yield from decoder.pictures_at(choice(self.columns), scale)
 
     def verify_video(self) -> None:
         """Compare the video with its SHA-256, for where no digest of a message tells damage.

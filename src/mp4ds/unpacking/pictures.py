@@ -17,6 +17,7 @@ from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import size_after, view_of
 from mp4ds.errors import OptionError, Refused
 from mp4ds.format.models import Header, StreamSidecar
+from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.depth import DEPTHS, HEADER_BYTES, is_quantised, metres_of
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Pixels, pixel_view
 from mp4ds.messages.wire import CodedFields, Fields, ImageFields
@@ -24,6 +25,7 @@ from mp4ds.times import intervals, usual_interval
 from mp4ds.unpacking.types import VideoFields, type_of
 from mp4ds.video.images import ImageFile
 from mp4ds.video.packets import PacketReader, StandAlonePackets
+from mp4ds.video.pixels import Scale
 
 _NS = 1_000_000_000
 
@@ -191,7 +193,17 @@ class ImageForm:
     keeps_format: bool = False
 
 
-Maker = Callable[[Pixels], Given]
+@dataclass(frozen=True, slots=True)
+class Maker:
+    """What makes the new form of an image.
+
+    Attributes:
+        resizing: What its pixels become first.
+        give: The form, of pixels of that size.
+    """
+
+    resizing: Resizing
+    give: Callable[[Pixels], Given]
 
 
 def maker(sidecar: StreamSidecar, header: Header, form: ImageForm) -> Maker:
@@ -205,12 +217,12 @@ def maker(sidecar: StreamSidecar, header: Header, form: ImageForm) -> Maker:
         raise Refused("the parameters of its quantised depths are missing")
     recorded = encoding_of(sidecar, header)
     stored = sidecar.image.encoding if is_inverse else recorded
-    resize, resized = resizer(sidecar, stored, form.size)
-    encoding = recorded if is_inverse else resized
+    resizing = resizer(sidecar, stored, form.size)
+    encoding = recorded if is_inverse else resizing.encoding
     if form.kind == "raw":
         prefix = bytes.fromhex(header.prefix)
         as_metres = partial(metres_of, header=prefix) if is_inverse else None
-        return lambda pixels: _raw(resize(pixels), encoding=encoding, convert=as_metres)
+        return Maker(resizing, partial(_raw, encoding=encoding, convert=as_metres))
     try:
         file = ImageFile(encoding, form.kind, quality=form.jpeg_quality)
     except OptionError:
@@ -218,13 +230,33 @@ def maker(sidecar: StreamSidecar, header: Header, form: ImageForm) -> Maker:
     told = format_of(encoding, form, has_mosaic=form.kind == "png")
     if form.keeps_format and encoding == recorded:
         told = header.format or ""
-    return lambda pixels: Given(CodedFields(told), file.encode(resize(pixels)))
+    return Maker(resizing, lambda pixels: Given(CodedFields(told), file.encode(pixels)))
 
 
-def resizer(
-    sidecar: StreamSidecar, encoding: str, size: tuple[int, int] | None
-) -> tuple[Callable[[Pixels], Pixels], str]:
-    """What makes pixels of a stream smaller, as its frames are, and their encoding after that.
+@dataclass(frozen=True, slots=True)
+class Resizing:
+    """How pixels of a stream are made smaller, as its frames are.
+
+    Attributes:
+        resize: Makes them so; what has its size already stays as it is.
+        encoding: Theirs after that.
+        scale: What the video can give at once.
+    """
+
+    resize: Callable[[Pixels], Pixels]
+    encoding: str
+    scale: Scale | None
+
+    def pixels(self, stream: Stream, picture: Picture) -> Pixels:
+        """The pixels of a picture that was decoded with `scale`, in their size."""
+        scale = self.scale
+        if scale and picture[0].shape[:2] == (scale.height, scale.width):
+            return picture[0]
+        return self.resize(stream.rebuilder.pixels(picture))
+
+
+def resizer(sidecar: StreamSidecar, encoding: str, size: tuple[int, int] | None) -> Resizing:
+    """How pixels of a stream are made smaller.
 
     A Bayer mosaic and the YUV of cameras cannot be resized as they are, and become RGB.
 
@@ -234,7 +266,7 @@ def resizer(
         size: Width and height to make; None for as they are.
     """
     if size is None:
-        return lambda pixels: pixels, encoding
+        return Resizing(lambda pixels: pixels, encoding, None)
     known = ENCODINGS[encoding]
     is_plain = not known.mosaic and known.rows == 1 and known.even == (1, 1)
     view = view_of(
@@ -251,7 +283,7 @@ def resizer(
         view.give(np.ascontiguousarray(pixels, known.dtype), made)
         return made
 
-    return resize, view.encoding.name
+    return Resizing(resize, view.encoding.name, view.scale)
 
 
 def encoding_of(sidecar: StreamSidecar, header: Header) -> str:
@@ -347,7 +379,7 @@ def frames_of(stream: Stream, form: ImageForm) -> Frames:
     if form.size is None and holds_files(stream.sidecar, form.kind):
         return partial(_own_files, stream, _own_formats(stream.sidecar, form))
     makers = [maker(stream.sidecar, header, form) for header in stream.sidecar.headers]
-    if stream.sidecar.body == "pixels":
+    if stream.sidecar.body == "pixels" and makers[0].resizing.scale is None:
         return partial(_from_pixels, stream, makers[0], form)
     return partial(_from_pictures, stream, makers)
 
@@ -437,7 +469,7 @@ def _from_pixels(
             step=image.step,
             is_bigendian=bool(image.is_bigendian),
         )
-        yield index, make(pixels)
+        yield index, make.give(make.resizing.resize(pixels))
 
 
 def _bodies(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[int, memoryview]]:
@@ -456,18 +488,18 @@ def _from_pictures(
     """From the decoded pictures of files and packets."""
     if verify:
         _verify(stream)
-    columns = stream.columns
+    columns, scale = stream.columns, makers[0].resizing.scale
     with stream.open_video(sequential=True) as decoder, ExitStack() as files:
         if stream.sidecar.body != "packet":
-            for index, picture in stream.pictures_in_order(decoder, choice):
+            for index, picture in stream.pictures_in_order(decoder, choice, scale):
                 make = makers[columns.variant[index]]
-                yield index, make(stream.rebuilder.pixels(picture))
+                yield index, make.give(make.resizing.pixels(stream, picture))
             return
         packets = None
-        for index, found in decoder.decodable_pictures(choice(columns)):
+        for index, found in decoder.decodable_pictures(choice(columns), scale):
             if found is not None:
                 make = makers[columns.variant[index]]
-                yield index, make(stream.rebuilder.pixels(found))
+                yield index, make.give(make.resizing.pixels(stream, found))
                 continue
             packets = packets or files.enter_context(_packets(stream))
             yield index, Undecoded(stream.rebuilder.packet_payload(index, packets.packet(index)))
@@ -508,8 +540,8 @@ def image_files(
     if kind == "jpeg" and size is None and holds_files(stream.sidecar, kind):
         yield from files_of(stream, choice)
         return
-    resize, encoding = resizer(stream.sidecar, stream.sidecar.image.encoding, size)
-    file = ImageFile(encoding, kind, quality=jpeg_quality)
+    resizing = resizer(stream.sidecar, stream.sidecar.image.encoding, size)
+    file = ImageFile(resizing.encoding, kind, quality=jpeg_quality)
     with stream.open_video(sequential=True) as decoder:
-        for index, picture in stream.pictures_in_order(decoder, choice):
-            yield index, file.encode(resize(stream.rebuilder.pixels(picture)))
+        for index, picture in stream.pictures_in_order(decoder, choice, resizing.scale):
+            yield index, file.encode(resizing.pixels(stream, picture))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import Refused, VideoError
 from mp4ds.messages.arrangements import Picture
 from mp4ds.video.media import Media, raise_if_scarce
-from mp4ds.video.pixels import PictureMaker
+from mp4ds.video.pixels import PictureMaker, Scale
 
 _ENCODINGS = {"L": "mono8", "RGB": "rgb8"}
 _FORMATS = {"mono8": "gray", "rgb8": "rgb24"}
@@ -161,8 +161,11 @@ class VideoDecoder:
         """Frames that the file's index lists."""
         return len(self._stream.index_entries)
 
-    def pictures(self) -> Iterator[Picture]:
+    def pictures(self, scale: Scale | None = None) -> Iterator[Picture]:
         """All pictures in order, as views that hold until the next one is asked for.
+
+        Args:
+            scale: See `PictureMaker.make`.
 
         Raises:
             VideoError: ``decode-failed`` with the frame's number, or ``frame-count`` when the
@@ -175,14 +178,16 @@ class VideoDecoder:
                 raise VideoError(
                     "frame-count", self._path, f"goes on after the {self._frames} frames due"
                 )
-            yield self._maker.make(frame)
+            yield self._maker.make(frame, scale=scale)
             number += 1
         if number != self._frames:
             raise VideoError(
                 "frame-count", self._path, f"ends after {number} of {self._frames} frames"
             )
 
-    def pictures_at(self, indices: Iterable[int]) -> Iterator[tuple[int, Picture]]:
+    def pictures_at(
+        self, indices: Iterable[int], scale: Scale | None = None
+    ) -> Iterator[tuple[int, Picture]]:
         """Some pictures, each with its frame's number, as views that hold until the next one.
 
         Decoding begins at the key frame before the first one. Frames in between are decoded, and
@@ -191,6 +196,7 @@ class VideoDecoder:
         Args:
             indices: 0 <= index < frames, increasing. The next one is asked for only when the
                 picture before was done with.
+            scale: See `PictureMaker.make`.
 
         Raises:
             VideoError: ``decode-failed`` with the frame's number, or ``frame-count``.
@@ -198,15 +204,17 @@ class VideoDecoder:
         for index, frame in self._chosen(indices, self._decoded):
             if frame is None:
                 raise VideoError("decode-failed", self._path, f"frame {index} was not found")
-            yield index, self._maker.make(frame)
+            yield index, self._maker.make(frame, scale=scale)
 
-    def decodable_pictures(self, indices: Iterable[int]) -> Iterator[tuple[int, Picture | None]]:
+    def decodable_pictures(
+        self, indices: Iterable[int], scale: Scale | None = None
+    ) -> Iterator[tuple[int, Picture | None]]:
         """As `pictures_at`, for what others encoded: None for a picture that does not decode.
 
         Where a packet was lost before it was recorded, those that refer to it do not decode.
         """
         for index, frame in self._chosen(indices, lambda _: self._decodable()):
-            yield index, None if frame is None else self._maker.make(frame)
+            yield index, None if frame is None else self._maker.make(frame, scale=scale)
 
     def _chosen(
         self, indices: Iterable[int], decode: Callable[[int], Iterator[av.VideoFrame]]
@@ -231,11 +239,12 @@ class VideoDecoder:
             due = index + 1
             yield index, frame if frame is not None and frame.pts == tick else None
 
-    def picture(self, index: int) -> Picture:
+    def picture(self, index: int, scale: Scale | None = None) -> Picture:
         """One picture, by seeking to the key frame before it.
 
         Args:
             index: 0 <= index < frames.
+            scale: See `PictureMaker.make`.
 
         Raises:
             VideoError: It cannot be decoded.
@@ -246,7 +255,7 @@ class VideoDecoder:
             if frame.pts is not None and frame.pts >= tick:
                 if frame.pts > tick:
                     break
-                return self._maker.make(frame)
+                return self._maker.make(frame, scale=scale)
         raise VideoError("decode-failed", self._path, f"frame {index} was not found")
 
     def _seek(self, tick: int, index: int) -> None:

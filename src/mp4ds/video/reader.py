@@ -27,8 +27,8 @@ from mp4ds.video.references import RecordedReferences
 class Seeking(Protocol):
     """A decoder that gets at a frame by decoding from the key frame before it."""
 
-    def picture(self, index: int) -> Picture:
-        """The picture of a frame."""
+    def picture(self, index: int, scale: Scale | None = None) -> Picture:
+        """The picture of a frame; see `PictureMaker.make`."""
 
     def close(self) -> None:
         """Close the file."""
@@ -65,7 +65,7 @@ class FrameReader:
 
         Args:
             numbers: 0 <= number < frames, increasing.
-            scale: Give them so where that costs less than to convert them; else as they are.
+            scale: See `PictureMaker.make`.
 
         Yields:
             Views that hold until the next one is asked for.
@@ -86,7 +86,7 @@ class FrameReader:
         if self._decoder is None:
             self._decoder = self._open_decoder()
         for number in numbers[done:]:
-            yield number, self._decoder.picture(number)
+            yield number, self._decoder.picture(number, scale)
 
     def close(self) -> None:
         """Close the file."""
@@ -236,11 +236,12 @@ class VideoFile:
         times: NDArray[np.int64] = whole * _SECOND + part * _SECOND // base.denominator
         return times
 
-    def picture(self, index: int) -> Picture:
+    def picture(self, index: int, scale: Scale | None = None) -> Picture:
         """One frame as RGB, 8 bits; the next ones are decoded on, others from their key frame.
 
         Args:
             index: 0 <= index < frames.
+            scale: See `PictureMaker.make`.
 
         Returns:
             One array of shape (H, W, 3), which holds until the next one is asked for.
@@ -267,7 +268,7 @@ class VideoFile:
             frame = self._next_at(tick, index)
         if frame is None:
             raise VideoError("decode-failed", self._path, f"frame {index} was not found")
-        picture = self._maker.make(frame, index)
+        picture = self._maker.make(frame, index, scale)
         self._last = index
         return picture
 
