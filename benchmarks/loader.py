@@ -4,6 +4,7 @@
     python benchmarks/loader.py report [--plot F.svg]
     python benchmarks/loader.py epoch  [--epochs N] ...
     python benchmarks/loader.py open   [--streams N] [--datasets N] ...
+    python benchmarks/loader.py sizes  [--made WxH] [--way CODEC-GOP ...] ...
 
 ``frames``: all readers (loader_peers.py) read the same mp4 files, of the same clip
 (loader_clips.py), encoded with several GOPs; beside them LeRobot's loader with LeRobot's encoding,
@@ -18,14 +19,13 @@ frame than of any other. Frames that are less than 30 dB like ours are told as o
 
 Files stay in ``--folder``, figures in its ``figures.jsonl``, of which ``report`` prints the tables.
 
-``epoch`` and ``open`` are in loader_epoch.py and loader_open.py.
+``epoch``, ``open`` and ``sizes`` are in loader_epoch.py, loader_open.py and loader_sizes.py.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -39,18 +39,22 @@ from numpy.typing import NDArray
 
 import loader_epoch
 import loader_open
-from loader_clips import CODECS, Store, Stored, digest, grid, ways
+import loader_sizes
+from loader_clips import (
+    BATCH,
+    CODECS,
+    PATTERNS,
+    WINDOW,
+    Store,
+    Stored,
+    digest,
+    grid,
+    ways,
+)
 from loader_peers import OURS, Peer, peers_for, versions
 from loader_report import report
-from measure import parse_size, print_machine
+from measure import cpu_seconds, parse_size, print_machine
 
-BATCH, WINDOW = 32, 8
-PATTERNS = {
-    "single": "single frames",
-    "batch": f"{BATCH} random frames",
-    "window": f"windows of {WINDOW}",
-    "order": "all in order",
-}
 GOPS = (2, 30, 120, 240)
 LEAST_DB = 30.0
 _LEAST_READS = 4
@@ -68,6 +72,7 @@ def main() -> None:
         "report": _report_options,
         "epoch": loader_epoch.options,
         "open": loader_open.options,
+        "sizes": loader_sizes.options,
         "job": lambda command: command.add_argument("arguments"),
     }
     for name, add_options in choices.items():
@@ -85,7 +90,8 @@ def main() -> None:
         report(_figures(options.folder), PATTERNS, options.plot)
         return
     print_machine()
-    {"frames": frames, "epoch": loader_epoch.run, "open": loader_open.run}[options.command](options)
+    runs = {"frames": frames, "epoch": loader_epoch.run, "open": loader_open.run}
+    (runs | {"sizes": loader_sizes.run})[options.command](options)
 
 
 def _frames_options(parser: argparse.ArgumentParser) -> None:
@@ -248,12 +254,6 @@ def _reads(peer: Peer, count: int, pattern: str, seed: int) -> Iterator[tuple[li
             first = int(rng.integers(max(count - WINDOW, 1)))
             wanted = list(range(first, min(first + WINDOW, count)))
         yield wanted, peer.read(wanted)
-
-
-def cpu_seconds() -> float:
-    """User and system time of this process, all threads."""
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    return usage.ru_utime + usage.ru_stime
 
 
 # ---------------------------------------------------------------- whether it is right

@@ -39,6 +39,14 @@ CODECS = {"av1": ("crf=30", "8"), "h264": ("crf=23", "medium")}
 """Codec -> quality and preset."""
 LEROBOT_OPTIONS = {"g": "2", "crf": "30", "preset": "12"}
 """Of SVT-AV1, as LeRobot 0.4 to 0.6 set them unless asked."""
+BATCH, WINDOW = 32, 8
+PATTERNS = {
+    "single": "single frames",
+    "batch": f"{BATCH} random frames",
+    "window": f"windows of {WINDOW}",
+    "order": "all in order",
+}
+"""What is measured of each reader."""
 STILLS = {"png": ".png", "jpeg": ".jpg"}
 JPEG_QUALITY = 95
 _PART = 480  # frames of each part of a pack, more than any GOP

@@ -29,6 +29,9 @@ import numpy as np
 from loader_clips import HERTZ, Stored
 from recordings import TOPIC
 
+Size = tuple[int, int]
+"""Width and height, pixels."""
+
 
 class Peer(Protocol):
     """An opened video, or folder of stills."""
@@ -43,14 +46,17 @@ class Peer(Protocol):
 class Mp4ds:
     """Our own."""
 
-    def __init__(self, stored: Stored, *, fast_colour: bool = False) -> None:
+    def __init__(
+        self, stored: Stored, *, fast_colour: bool = False, size: Size | None = None
+    ) -> None:
         import mp4ds
 
+        self._size = size
         self._dataset = mp4ds.open(stored.dataset or stored.path, fast_colour=fast_colour)
         self._stream: Any = self._dataset[TOPIC if stored.dataset else stored.path.stem]
 
     def read(self, numbers: Sequence[int]) -> Any:  # noqa: D102
-        return self._stream.read(numbers, format="rgb")
+        return self._stream.read(numbers, format="rgb", resize=self._size)
 
     def in_order(self) -> Iterator[Any]:  # noqa: D102
         for frame in self._stream:
@@ -60,9 +66,10 @@ class Mp4ds:
 class PyAv:
     """PyAV."""
 
-    def __init__(self, stored: Stored) -> None:
+    def __init__(self, stored: Stored, *, size: Size | None = None) -> None:
         import av
 
+        self._made = {"width": size[0], "height": size[1]} if size else {}
         self._container = av.open(str(stored.path))
         self._stream = self._container.streams.video[0]
         self._pts = stored.reference["pts"]
@@ -84,7 +91,7 @@ class PyAv:
         for frame in self._decoded:
             if frame.pts is not None and frame.pts >= self._pts[number]:
                 self._next = number + 1
-                return frame.to_ndarray(format="rgb24")
+                return frame.to_ndarray(format="rgb24", **self._made)
         raise ValueError(f"frame {number} does not come")
 
     def in_order(self) -> Iterator[Any]:  # noqa: D102
@@ -99,14 +106,19 @@ class TorchCodec:
     Args:
         stored: What to read.
         mode: ``exact``, ``approximate`` or ``mappings``.
+        size: Width and height to make, by its Resize.
     """
 
-    def __init__(self, stored: Stored, mode: str) -> None:
+    def __init__(self, stored: Stored, mode: str, *, size: Size | None = None) -> None:
         from torchcodec.decoders import VideoDecoder
 
-        how = {"seek_mode": mode}
+        how: dict[str, Any] = {"seek_mode": mode}
         if mode == "mappings":
             how = {"custom_frame_mappings": _mappings(stored)}
+        if size:
+            from torchcodec.transforms import Resize
+
+            how["transforms"] = [Resize((size[1], size[0]))]
         self._decoder: Any = VideoDecoder(str(stored.path), dimension_order="NHWC", **how)
 
     def read(self, numbers: Sequence[int]) -> Any:  # noqa: D102

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import resource
 import subprocess
 import sys
 import time
@@ -48,6 +49,12 @@ def python(*arguments: str) -> Run:
     if process.returncode:
         raise SystemExit(f"failed with exit code {process.returncode}: {' '.join(command)}")
     return Run(usage.ru_utime + usage.ru_stime, time.perf_counter() - start, output)
+
+
+def cpu_seconds() -> float:
+    """User and system time of this process, all threads."""
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
 
 
 def job(name: str, **arguments: Any) -> dict[str, Any]:

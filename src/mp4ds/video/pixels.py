@@ -185,10 +185,12 @@ class PictureConverter:
             return rounded(self._reformat(self._to_planes, frame, "yuv420p16le"), pixel_format)
         return self._reformat(self._reformatter, frame, pixel_format)
 
-    def scale(self, frame: av.VideoFrame, scale: Scale) -> av.VideoFrame:
-        """The frame in another size."""
+    def scale(self, frame: av.VideoFrame, scale: Scale) -> NDArray[np.uint8]:
+        """The frame in another size, shape (H, W, 3)."""
         self._look_at_tags(frame)
-        return self._reformat(self._reformatter, frame, scale.pixel_format, scale)
+        made = self._reformat(self._reformatter, frame, "gbrp", scale)  # planes, as in `convert`
+        order = (2, 0, 1) if scale.pixel_format == "rgb24" else (1, 0, 2)
+        return np.stack([samples(made, index) for index in order], axis=-1)
 
     def _look_at_tags(self, frame: av.VideoFrame) -> None:
         if self._is_tagged:
@@ -357,13 +359,8 @@ def _planes(
 def _packed(
     frame: av.VideoFrame, pixel_format: str, converter: PictureConverter
 ) -> NDArray[np.uint8]:
-    return _array(converter.convert(frame, pixel_format), pixel_format)
-
-
-def _array(frame: av.VideoFrame, pixel_format: str) -> NDArray[np.uint8]:
-    """The pixels of a packed frame as a view of shape (H, W, C)."""
     channels = _CHANNELS[pixel_format]
-    rows = _rows(frame, 0)
+    rows = _rows(converter.convert(frame, pixel_format), 0)
     return rows[: frame.height, : channels * frame.width].reshape(frame.height, -1, channels)
 
 
@@ -440,7 +437,7 @@ class PictureMaker:
             )
         is_shown = self._picture_format in _CHANNELS and self._picture_size == self.coded_size
         if scale is not None and is_shown:
-            return (_array(self._converter.scale(frame, scale), scale.pixel_format),)
+            return (self._converter.scale(frame, scale),)
         return frame_to_picture(
             frame, self._picture_format, *self._picture_size, self._converter, str(self._path)
         )
