@@ -1,10 +1,15 @@
 """What the distance of key frames costs and gives: bytes of a frame, and frames at random.
 
     python benchmarks/groups.py [--frames N] [--size WxH] [--gop N ...] [--kind K ...]
+    python benchmarks/groups.py --lossy [--frames N] [--size WxH] [--clip NAME ...]
 
 The moving camera of loader_clips.py is packed by `mp4ds.pack`, without loss and for the eye, with
 each number of frames from one key frame to the next; then frames at random places are read one by
 one. CPU time is of the reading process, opening left out.
+
+``--lossy`` encodes real scenes (clips.py) as `visual` does, with several presets of SVT-AV1 and
+distances of key frames, and two crf. Bytes are compared at equal PSNR of luma, by interpolation of
+their logarithm. A frame at random is read in 64x48, so that decoding is what it costs.
 """
 
 from __future__ import annotations
@@ -15,15 +20,20 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+import clips
 import mp4ds
 from loader_clips import moving
-from measure import parse_size, print_machine, print_table
+from measure import cpu_seconds, parse_size, print_machine, print_table
 from mp4ds import PackOptions
+from mp4ds.times import TIMESCALE
+from mp4ds.video.codecs import recipe_for
+from mp4ds.video.encoder import VideoEncoder
+from mp4ds.video.planes import PLANES_FORMAT, PlaneMaker, Planes, decoded_planes
 from recordings import TOPIC, write_mcap
 
 Pixels = NDArray[Any]
@@ -56,8 +66,15 @@ def main() -> None:
     parser.add_argument("--gop", type=int, nargs="+", default=GOPS)
     parser.add_argument("--kind", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--reads", type=int, default=60)
+    parser.add_argument("--lossy", action="store_true")
+    parser.add_argument(
+        "--clip", nargs="+", choices=clips.MOVING, default=["cups", "people", "arm"]
+    )
     options = parser.parse_args()
     print_machine()
+    if options.lossy:
+        lossy(options)
+        return
     rows = []
     for kind in options.kind:
         with tempfile.TemporaryDirectory(prefix="mp4ds-benchmark-") as folder:
@@ -89,6 +106,92 @@ def measure(folder: Path, kind: str, options: argparse.Namespace) -> list[tuple[
          f"{speed / base[1]:.2f}")
         for gop, (size, speed) in found.items()
     ]  # fmt: skip
+
+
+# ---------------------------------------------------------------- lossy, at equal quality
+
+RECIPES = (("8", 60), ("8", 20), ("7", 20), ("7", 30), ("6", 10))
+"""Preset and distance of key frames; the first is what the others are compared with."""
+CRFS = (18, 32)
+
+
+def lossy(options: argparse.Namespace) -> None:
+    """Measure and print the presets and distances."""
+    clips.check_data()
+    rows: list[tuple[object, ...]] = []
+    for scene in options.clip:
+        spec = clips.ClipSpec(scene, "rgb8", "low", options.frames, options.size)
+        maker = PlaneMaker("rgb24")
+        frames = [maker.make((rgb,)) for rgb in clips.make(spec)]
+        base: list[Encoded] = []
+        for preset, gop in RECIPES:
+            with tempfile.TemporaryDirectory(prefix="mp4ds-benchmark-") as folder:
+                path = Path(folder) / "clip.mp4"
+                made = [encoded(path, frames, preset, gop, crf, options.reads) for crf in CRFS]
+            base = base or made
+            ratios = [f"{size_at(made, item.decibel) / item.size:.3f}" for item in base]
+            rows.append(
+                (
+                    *(scene, preset, gop, *ratios),
+                    f"{1e3 * made[0].read:.1f}",
+                    f"{made[0].read / base[0].read:.2f}",
+                    f"{made[0].encode / base[0].encode:.2f}",
+                )
+            )
+            print("-", *rows[-1], flush=True)
+    bytes_at = [f"bytes at the PSNR of crf {crf}" for crf in CRFS]
+    head = ("clip", "preset", "key frame every", *bytes_at, "random frame, CPU ms", "to the first")
+    print_table((*head, "encoding, CPU, to the first"), rows)
+
+
+class Encoded(NamedTuple):
+    """One video: bytes, PSNR of luma, CPU seconds of encoding and of reading a frame."""
+
+    size: int
+    decibel: float
+    encode: float
+    read: float
+
+
+def encoded(
+    path: Path, frames: list[Planes], preset: str, gop: int, crf: int, reads: int
+) -> Encoded:
+    """Encode as `visual` does, decode, and read frames at random."""
+    recipe = recipe_for("rgb24", lossless=False, codec="av1", crf=crf, preset=preset)
+    height, width = frames[0][0].shape
+    begun = cpu_seconds()
+    encoder = VideoEncoder(
+        path,
+        recipe,
+        picture_format=PLANES_FORMAT,
+        width=width,
+        height=height,
+        gop=gop,
+        threads=0,
+        rate=30.0,
+    )
+    for number, planes in enumerate(frames):
+        encoder.write(planes, round(number * TIMESCALE / 30))
+    encoder.close()
+    encode = cpu_seconds() - begun
+    both = zip(frames, decoded_planes(path), strict=True)
+    error = np.mean([np.square(a[0].astype(np.int32) - b[0]).mean() for a, b in both])
+    numbers = random.Random(0)
+    with mp4ds.open(path) as opened:
+        (video,) = opened.videos
+        video.read([0], resize=(64, 48))
+        begun = cpu_seconds()
+        for _ in range(reads):
+            video.read([numbers.randrange(len(video))], resize=(64, 48))
+        read = (cpu_seconds() - begun) / reads
+    return Encoded(path.stat().st_size, float(10 * np.log10(255**2 / error)), encode, read)
+
+
+def size_at(made: list[Encoded], decibel: float) -> float:
+    """Bytes at a PSNR, by interpolation of their logarithm."""
+    (a, b) = made
+    share = (decibel - a.decibel) / (b.decibel - a.decibel)
+    return float(np.exp((1 - share) * np.log(a.size) + share * np.log(b.size)))
 
 
 def read(dataset: Path, options: argparse.Namespace) -> tuple[float, float]:

@@ -61,12 +61,12 @@ def test_other_qualities_are_refused(text: str) -> None:
 @each(
     ("rate", "setting"),
     [
-        (None, (18, 8)), (0.1, (18, 8)), (2, (18, 8)), (3.5, (18, 8)), (3.6, (17, 8)),
-        (10, (17, 8)), (14.9, (17, 8)), (15.1, (18, 8)), (30, (18, 8)), (45, (18, 8)),
+        (None, (18, 7)), (0.1, (18, 7)), (2, (18, 7)), (3.5, (18, 7)), (3.6, (17, 7)),
+        (10, (17, 7)), (14.9, (17, 7)), (15.1, (18, 7)), (30, (18, 7)), (45, (18, 7)),
         (45.1, (22, 6)), (60, (22, 6)), (1000, (22, 6)),
     ],
 )  # fmt: skip
-def test_the_papers_table(rate: float | None, setting: tuple[int, int]) -> None:
+def test_the_visual_table(rate: float | None, setting: tuple[int, int]) -> None:
     assert visual_setting(rate) == setting
 
 

@@ -80,12 +80,12 @@ class PackOptions(Options):
         metavar="PURPOSE",
     )
     gop: int | None = option(
-        "Most frames from a key frame to the next; 30 by default, 60 where lossy.",
+        "Most frames from a key frame to the next; 10 by default, 30 where lossy.",
         least=1,
         most=100_000,
     )
     window: int | None = option(
-        "Frames of the busiest camera in a part of a long recording; 10 times `gop`.",
+        "Frames of the busiest camera in a part of a long recording; 10 times `gop`, or 300.",
         least=2,
         most=10_000_000,
     )

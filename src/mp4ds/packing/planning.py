@@ -29,6 +29,9 @@ from mp4ds.video.trial import encoder_bytes
 GOPS_PER_WINDOW = 10
 """Groups of pictures of the busiest camera in a window: a cut costs at most one key frame."""
 
+LEAST_WINDOW = 300
+"""Frames of a window, unless a user says something of it: a part takes some time to begin."""
+
 
 def cut_times(times: Sequence[NDArray[np.int64]], frames: int) -> list[int]:
     """Log times at which a recording is cut, each a message of a camera.
@@ -225,6 +228,8 @@ def plan_job(
     if not topics.free:
         return _single(reader, paths, options, means, needed)
     window = options.window or GOPS_PER_WINDOW * options.group_frames
+    if options.window is None and options.gop is None:
+        window = max(window, LEAST_WINDOW)
     times = reader.times()
     columns = [times[channel.id] for channel in topics.free if len(times.get(channel.id, ()))]
     spans = spans_of(cut_times(columns, window))

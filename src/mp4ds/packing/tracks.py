@@ -379,6 +379,11 @@ def plan_tracks(
     return _lossless_plans(samples, settings)
 
 
+_SCORE_PRESET = "8"
+"""Of SVT-AV1 for a score: a window is encoded several times, and preset 7 with its lowest crf comes
+less near to a noisy original."""
+
+
 def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) -> PicturePlan:
     quality = settings.quality
     layout = layout_for(ENCODINGS[key.encoding], lossless=False)
@@ -386,7 +391,7 @@ def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) ->
     if crf is None:  # a score is looked for from there
         crf, table_preset = visual_setting(rate)
         if settings.codec in (None, *AV1):
-            preset = preset or str(table_preset)
+            preset = preset or (_SCORE_PRESET if quality.target else str(table_preset))
     recipe = recipe_for(
         layout.pixel_format,
         lossless=False,

@@ -175,7 +175,7 @@ HARDWARE: Mapping[str, HardwareEncoder] = MappingProxyType(
 
 
 # most frames between key frames, chosen by what they cost (spec/notes.md)
-LOSSLESS_GOP, LOSSY_GOP = 30, 60
+LOSSLESS_GOP, LOSSY_GOP = 10, 30
 GOPS = {"archive": 120, "training": 10}
 
 _X264 = MappingProxyType({"bf": "0"})  # without B-frames, frames are coded in the order shown
