@@ -687,7 +687,8 @@ def test_more_processes_than_samples(drives: list[Path]) -> None:
 @pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_workers_of_one_process_share_an_epoch(drives: list[Path], workers: int) -> None:
     stream = FrameStream(drives, topics=[LEFT], window=GOP)
-    batches = loader(stream, workers, "fork" if workers else None, batch_size=4)
+    # a fork of a process in which other tests have left threads may never end
+    batches = loader(stream, workers, "forkserver" if workers else None, batch_size=4)
     seen = [int(number) for batch in batches for number in batch["index"]]
     assert sorted(seen) == list(range(3 * FRAMES))
 
@@ -724,13 +725,13 @@ def test_a_state_of_another_order_is_refused(drives: list[Path]) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")  # torchdata still calls it
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_torchdata_keeps_where_an_epoch_stands(drives: list[Path], workers: int) -> None:
     stateful = pytest.importorskip("torchdata.stateful_dataloader")
 
     def batches() -> Any:
         stream = FrameStream(drives, topics=[LEFT], window=GOP, buffer=5)
-        context = "fork" if workers else None
+        context = "forkserver" if workers else None
         return stateful.StatefulDataLoader(
             stream, batch_size=4, num_workers=workers, multiprocessing_context=context
         )
