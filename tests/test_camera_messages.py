@@ -66,7 +66,10 @@ NOT_SMALLER = {(m, f"64FC{n}") for m in ("millimetres", "millimetres-product") f
 """Of few digits, which zstd finds better than any codec of pictures."""
 
 EVEN = {("few-values", f"bayer_{name[6:10]}16") for name in BAYER}
-EVEN |= {("few-values", encoding) for encoding in ("rgb16", "bgr16", "16UC3")}
+EVEN |= {
+    ("few-values", encoding)
+    for encoding in ("rgb16", "bgr16", "rgba16", "bgra16", "16UC3", "16UC4")
+}
 EVEN |= {("full", "32FC1")}
 """Where the two are of about one size, so that either may be taken."""
 

@@ -374,8 +374,8 @@ def test_grids_and_names() -> None:
     assert [item.name for item in grid_of(options).settings()] == [
         "h264-nvenc p1 crf 20", "h264-nvenc p7 crf 20", "av1-vaapi crf 20",
     ]  # fmt: skip
-    assert Setting("h264-nvenc", "p4", 20, 30).pack_options == (
-        "--quality crf=20 --codec h264-nvenc --preset p4 --gop 30"
+    assert Setting("h264-nvenc", "p4", 20, 45).pack_options == (
+        "--quality crf=20 --codec h264-nvenc --preset p4 --gop 45"
     )
     with pytest.raises(OptionError, match=r"svtav1 \(av1\), .*h264-nvenc, .*h265-videotoolbox\."):
         grid_of(EvaluateOptions(codecs=["h264-qsv"]))
