@@ -66,10 +66,8 @@ NOT_SMALLER = {(m, f"64FC{n}") for m in ("millimetres", "millimetres-product") f
 """Of few digits, which zstd finds better than any codec of pictures."""
 
 EVEN = {("few-values", f"bayer_{name[6:10]}16") for name in BAYER}
-EVEN |= {
-    ("few-values", encoding)
-    for encoding in ("rgb16", "bgr16", "rgba16", "bgra16", "16UC3", "16UC4")
-}
+EVEN |= {("few-values", f"{name}16") for name in ("rgb", "bgr", "rgba", "bgra")}
+EVEN |= {("few-values", f"16UC{channels}") for channels in "34"}
 EVEN |= {("full", "32FC1")}
 """Where the two are of about one size, so that either may be taken."""
 
@@ -157,7 +155,8 @@ EXPECTED: dict[str, tuple[int, int]] = {
 }
 """Messages of each scene, and how many of them are frames of videos."""
 
-EVEN_PNG = {"png-rgb-cv2", "png-rgb-cv2-9", "png-rgb-pillow", "png-called-jpeg"}
+EVEN_PNG = {f"png-{name}" for name in ("rgb-cv2", "rgb-cv2-9", "rgb-pillow", "rgba-pillow")}
+EVEN_PNG |= {"png-called-jpeg"}
 """Noise in colours, of which a video is about as large: see below for others."""
 
 STREAMS = {"jpeg-mixed-sizes": 2, "video-h264-resized": 2}
