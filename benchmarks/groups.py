@@ -27,13 +27,11 @@ from numpy.typing import NDArray
 
 import clips
 import mp4ds
+import visual
 from loader_clips import moving
 from measure import cpu_seconds, parse_size, print_machine, print_table
 from mp4ds import PackOptions
-from mp4ds.times import TIMESCALE
-from mp4ds.video.codecs import recipe_for
-from mp4ds.video.encoder import VideoEncoder
-from mp4ds.video.planes import PLANES_FORMAT, PlaneMaker, Planes, decoded_planes
+from mp4ds.video.planes import PlaneMaker, Planes, decoded_planes
 from recordings import TOPIC, write_mcap
 
 Pixels = NDArray[Any]
@@ -157,22 +155,8 @@ def encoded(
     path: Path, frames: list[Planes], preset: str, gop: int, crf: int, reads: int
 ) -> Encoded:
     """Encode as `visual` does, decode, and read frames at random."""
-    recipe = recipe_for("rgb24", lossless=False, codec="av1", crf=crf, preset=preset)
-    height, width = frames[0][0].shape
     begun = cpu_seconds()
-    encoder = VideoEncoder(
-        path,
-        recipe,
-        picture_format=PLANES_FORMAT,
-        width=width,
-        height=height,
-        gop=gop,
-        threads=0,
-        rate=30.0,
-    )
-    for number, planes in enumerate(frames):
-        encoder.write(planes, round(number * TIMESCALE / 30))
-    encoder.close()
+    size = visual.encode(path, frames, 30.0, crf, preset, gop)
     encode = cpu_seconds() - begun
     both = zip(frames, decoded_planes(path), strict=True)
     error = np.mean([np.square(a[0].astype(np.int32) - b[0]).mean() for a, b in both])
@@ -184,7 +168,7 @@ def encoded(
         for _ in range(reads):
             video.read([numbers.randrange(len(video))], resize=(64, 48))
         read = (cpu_seconds() - begun) / reads
-    return Encoded(path.stat().st_size, float(10 * np.log10(255**2 / error)), encode, read)
+    return Encoded(size, float(10 * np.log10(255**2 / error)), encode, read)
 
 
 def size_at(made: list[Encoded], decibel: float) -> float:

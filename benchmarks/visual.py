@@ -56,7 +56,9 @@ def rows(spec: clips.ClipSpec, steps: tuple[int, ...], folder: Path) -> Iterator
         ]
 
 
-def encode(path: Path, frames: list[Planes], rate: float, crf: int, preset: str) -> int:
+def encode(
+    path: Path, frames: list[Planes], rate: float, crf: int, preset: str, gop: int = LOSSY_GOP
+) -> int:
     """Make a video; its bytes."""
     recipe = recipe_for("rgb24", lossless=False, codec="av1", crf=crf, preset=preset)
     height, width = frames[0][0].shape
@@ -66,7 +68,7 @@ def encode(path: Path, frames: list[Planes], rate: float, crf: int, preset: str)
         picture_format=PLANES_FORMAT,
         width=width,
         height=height,
-        gop=LOSSY_GOP,
+        gop=gop,
         threads=0,
         rate=rate,
     )

@@ -235,7 +235,7 @@ class Converter:
             converted = by_library(problem, convert, raw, name)
         except Refused:
             # ROS itself overlooks bytes after a message, such as RealSense cameras' bags hold.
-            end = by_library(problem, _end, plan, raw, to_ros1)
+            end = _end(plan, raw, to_ros1=to_ros1)
             if not (0 < len(raw) - end <= MAX_TAIL and fields_of(plan.types, name)):
                 raise
             raw = raw[:end]
@@ -309,12 +309,18 @@ def is_latched(channel: Channel) -> bool:
     return bool(found) and set(found) <= {"1", "transient_local"}
 
 
-def _end(plan: _Plan, raw: memoryview, to_ros1: bool) -> int:
-    """Where the message in `raw` ends."""
+def _end(plan: _Plan, raw: memoryview, *, to_ros1: bool) -> int:
+    """Where the message in `raw` ends.
+
+    Raises:
+        Refused: It is none.
+    """
     definition = plan.store.get_msgdef(plan.name)
+    start, size = 0, definition.getsize_ros1_to_cdr
     if to_ros1:
-        return 4 + definition.getsize_cdr_to_ros1(raw[4:], 0, None, 0, plan.store)[0]
-    return definition.getsize_ros1_to_cdr(raw, 0, None, 0, plan.store)[0]
+        start, size = 4, definition.getsize_cdr_to_ros1
+    end, _ = by_library(plan.no_message, size, raw[start:], 0, None, 0, plan.store)
+    return start + int(end)
 
 
 def _time_beyond(plan: _Plan, data: bytes | memoryview) -> int | None:

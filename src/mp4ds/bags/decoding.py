@@ -66,9 +66,8 @@ def _ros(channel: Channel) -> Decoder:
         if has_empty_items(types, sizes_of(types)):
             raise _undecodable(channel, f"{schema.name} has arrays of a type without fields")
         store = make_store(types, world)
-        definition = store.get_msgdef(
-            normalize_msgtype(schema.name)
-        )  # compiled now, to fail before any message
+        # compiled now, to fail before any message
+        definition = store.get_msgdef(normalize_msgtype(schema.name))
     except Refused as reason:
         raise _undecodable(channel, str(reason)) from None
 

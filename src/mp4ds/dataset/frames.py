@@ -548,7 +548,7 @@ class DecodedFrames(Frames):
         if view.is_plain:
             self._write_pixels(picture, out)
             return
-        if view.scale and picture[0].shape == view.shape:  # it has its size already
+        if view.scale and view.scale.is_of(picture):
             np.copyto(out, picture[0])
             return
         pixels: Pixels = np.empty(self.shape, self.dtype)

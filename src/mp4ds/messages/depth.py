@@ -172,15 +172,24 @@ DEPTHS = ("16UC1", "mono16", "32FC1")
 _PARAMETERS = slice(4, HEADER_BYTES)  # of quantised inverse depths, in the header: two floats
 
 
-def is_quantised(format_: str | None, header: bytes) -> bool:
-    """Whether a compressedDepth image holds inverse metres, quantised to 16 bits.
+def told_encoding(format_: str | None) -> str:
+    """The encoding that the field ``format`` of a message begins with."""
+    return (format_ or "").partition(";")[0].strip()
+
+
+def is_depth(format_: str | None, header: bytes) -> bool:
+    """Whether an image is one of compressedDepth.
 
     Args:
         format_: Field ``format`` of its message.
         header: What stands before the file in its data.
     """
-    of_depth = bool(header) or "compressedDepth" in (format_ or "")
-    return of_depth and (format_ or "").partition(";")[0].strip() == "32FC1"
+    return bool(header) or "compressedDepth" in (format_ or "")
+
+
+def is_quantised(format_: str | None, header: bytes) -> bool:
+    """Whether it `is_depth` and holds inverse metres, quantised to 16 bits."""
+    return is_depth(format_, header) and told_encoding(format_) == "32FC1"
 
 
 def metres_of(pixels: NDArray[Any], header: bytes = b"") -> NDArray[np.float32]:

@@ -245,8 +245,8 @@ class FrameDataset(Dataset):
             None: half the median time between the camera's frames.
         sync_tolerance_ns: How far stamps of different cameras may be apart in a sample.
         format: ``rgb``, ``bgr``, ``gray``; ``native``: the pixels as recorded; ``depth_m``: depths
-            in metres, float32. A mapping by
-            topic gives each camera its own; so do mappings for `resize` and `crop`.
+            in metres, float32. A mapping by topic gives each camera its own; so do mappings for
+            `resize` and `crop`.
         resize: Factor, or width and height in pixels.
         crop: x, y, width, height in pixels; before `resize`.
         dtype: ``native``: as decoded, which is uint8 but for cameras of more bits. ``uint8``: the

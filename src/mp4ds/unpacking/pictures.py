@@ -18,7 +18,14 @@ from mp4ds.dataset.views import size_after, view_of
 from mp4ds.errors import OptionError, Refused
 from mp4ds.format.models import Header, StreamSidecar
 from mp4ds.messages.arrangements import Picture
-from mp4ds.messages.depth import DEPTHS, HEADER_BYTES, is_quantised, metres_of
+from mp4ds.messages.depth import (
+    DEPTHS,
+    HEADER_BYTES,
+    is_depth,
+    is_quantised,
+    metres_of,
+    told_encoding,
+)
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Pixels, pixel_view
 from mp4ds.messages.wire import CodedFields, Fields, ImageFields
 from mp4ds.times import intervals, usual_interval
@@ -238,7 +245,7 @@ class Resizing:
     """How pixels of a stream are made smaller, as its frames are.
 
     Attributes:
-        resize: Makes them so; what has its size already stays as it is.
+        resize: Makes them so.
         encoding: Theirs after that.
         scale: What the video can give at once.
     """
@@ -249,8 +256,7 @@ class Resizing:
 
     def pixels(self, stream: Stream, picture: Picture) -> Pixels:
         """The pixels of a picture that was decoded with `scale`, in their size."""
-        scale = self.scale
-        if scale and picture[0].shape[:2] == (scale.height, scale.width):
+        if self.scale and self.scale.is_of(picture):
             return picture[0]
         return self.resize(stream.rebuilder.pixels(picture))
 
@@ -288,7 +294,7 @@ def resizer(sidecar: StreamSidecar, encoding: str, size: tuple[int, int] | None)
 
 def encoding_of(sidecar: StreamSidecar, header: Header) -> str:
     """ROS image encoding of the images; their format tells a mosaic or depths from plain grey."""
-    own, told = ENCODINGS[sidecar.image.encoding], _told(header)
+    own, told = ENCODINGS[sidecar.image.encoding], told_encoding(header.format)
     if sidecar.body == "pixels":
         return own.name
     if _is_depth(sidecar, header):
@@ -300,14 +306,10 @@ def encoding_of(sidecar: StreamSidecar, header: Header) -> str:
     return known.name if is_alike and known.dtype == own.dtype else own.name
 
 
-def _told(header: Header) -> str:
-    return (header.format or "").partition(";")[0].strip()
-
-
 def _is_depth(sidecar: StreamSidecar, header: Header) -> bool:
     """Whether the messages are those of compressed_depth_image_transport."""
     is_coded = sidecar.body in ("png", "rvl") and sidecar.image.encoding == "16UC1"
-    return is_coded and (bool(header.prefix) or "compressedDepth" in (header.format or ""))
+    return is_coded and is_depth(header.format, bytes.fromhex(header.prefix))
 
 
 def is_inverse_depth(sidecar: StreamSidecar, header: Header) -> bool:

@@ -348,8 +348,6 @@ def _layout(encoding: Encoding, *, demosaic: bool) -> Layout:
 
 # ---------------------------------------------------------------- rendering
 
-# libswscale's flags, as in `mp4ds.video.pixels`: full chroma, accurate rounding, bit-exact
-
 # channels and samples of packed formats
 _PACKED = {
     "gray": (1, "u1"),

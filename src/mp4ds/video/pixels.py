@@ -137,6 +137,10 @@ class Scale:
     width: int
     height: int
 
+    def is_of(self, picture: Picture) -> bool:
+        """Whether a picture has been made so, and is not one as recorded."""
+        return picture[0].shape == (self.height, self.width, 3)
+
 
 def scaling(size: tuple[int, int], made: tuple[int, int]) -> int:
     """Libswscale's flags to scale a size: what is smaller by area, what is larger bicubic."""
