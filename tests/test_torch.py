@@ -17,6 +17,7 @@ from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 
@@ -30,7 +31,7 @@ from test_examples import ROOT, run
 
 torch = pytest.importorskip("torch")
 
-from torch.utils.data import DataLoader, Subset  # noqa: E402
+from torch.utils.data import DataLoader  # noqa: E402
 
 from each import each  # noqa: E402
 from mp4ds.torch import FrameDataset, FrameStream, SampleError  # noqa: E402
@@ -492,22 +493,27 @@ def test_a_forked_child_opens_its_own(drives: list[Path]) -> None:
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
 def test_what_was_dropped_does_not_stop_workers(drives: list[Path]) -> None:
     """A worker that collects the parent's garbage must not wait for threads of its decoders."""
-    gc.collect()  # decoders with threads that other tests have left
-    dropped: list[Any] = [FrameDataset(drives[0], topics=BOTH), mp4ds.open(drives[0])]
-    dropped[0][0], dropped[1][LEFT][0]
+    dataset = FrameDataset(drives[0], topics=BOTH)
+    frames = mp4ds.open(drives[0])[LEFT]
+    video = av.open(frames.video_path)
+    video.streams.video[0].thread_type = "SLICE"
+    video.streams.video[0].thread_count = 2
+    next(video.decode(video=0))
+    dropped: list[Any] = [dataset, frames, video]
+    dataset[0], frames[0]
     dropped.append(dropped)  # so that it waits for the garbage collector
-    del dropped
-    dataset = FrameDataset(drives[0], topics=BOTH, transform=Collector())
-    assert len(list(loader(Subset(dataset, [0, 9]), 1, "fork"))) == 2
-    gc.collect()
-
-
-class Collector:
-    """Collects garbage."""
-
-    def __call__(self, sample: dict[str, Any]) -> dict[str, Any]:
+    gc.disable()
+    try:
+        del dataset, frames, video, dropped
+        child = os.fork()
+        if child == 0:
+            signal.alarm(20)
+            gc.collect()
+            os._exit(0)
+        assert os.waitpid(child, 0)[1] == 0
+    finally:
+        gc.enable()
         gc.collect()
-        return sample
 
 
 class Killer:
@@ -687,8 +693,7 @@ def test_more_processes_than_samples(drives: list[Path]) -> None:
 @pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_workers_of_one_process_share_an_epoch(drives: list[Path], workers: int) -> None:
     stream = FrameStream(drives, topics=[LEFT], window=GOP)
-    # a fork of a process in which other tests have left threads may never end
-    batches = loader(stream, workers, "forkserver" if workers else None, batch_size=4)
+    batches = loader(stream, workers, "fork" if workers else None, batch_size=4)
     seen = [int(number) for batch in batches for number in batch["index"]]
     assert sorted(seen) == list(range(3 * FRAMES))
 
@@ -731,7 +736,7 @@ def test_torchdata_keeps_where_an_epoch_stands(drives: list[Path], workers: int)
 
     def batches() -> Any:
         stream = FrameStream(drives, topics=[LEFT], window=GOP, buffer=5)
-        context = "forkserver" if workers else None
+        context = "fork" if workers else None
         return stateful.StatefulDataLoader(
             stream, batch_size=4, num_workers=workers, multiprocessing_context=context
         )

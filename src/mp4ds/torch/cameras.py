@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -38,6 +39,11 @@ Backend = Literal["mp4ds", "torchcodec"]
 _T = TypeVar("_T")
 _DTYPES = ("native", "uint8", "float32")
 _BACKENDS = ("mp4ds", "torchcodec")
+
+# A worker must not free what its parent left for the garbage collector: a container of PyAV is
+# always in a reference cycle, and to free its decoder is to wait for threads that no fork copies.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=gc.freeze)
 
 
 @dataclass(frozen=True, slots=True)
