@@ -261,7 +261,7 @@ def _parse(kind: type[_Parsed[_RecordT]], body: bytes | memoryview) -> tuple[_Re
     raise DamageError(f"a record of kind {kind.__name__} {problem}")
 
 
-def parse_attachment(body: bytes) -> mcap_records.Attachment:
+def parse_attachment(body: bytes | memoryview) -> mcap_records.Attachment:
     """Parse an attachment and verify its checksum, if it has one."""
     attachment: mcap_records.Attachment
     attachment, length = _parse(mcap_records.Attachment, body)
@@ -280,7 +280,7 @@ def parse_message(body: bytes | memoryview) -> MessageHead:
     return MessageHead(channel_id, sequence, log_time, publish_time, data)
 
 
-def unpack_chunk(body: bytes) -> bytes | memoryview:
+def unpack_chunk(body: bytes | memoryview) -> bytes | memoryview:
     """Decompress a chunk and verify its checksum, if it has one.
 
     Returns:
@@ -472,7 +472,7 @@ class Declared:
             raise DamageError(f"{place} is of channel {head.channel_id}, which is not defined")
         return Message(channel, head.log_time, head.publish_time, head.sequence, head.data)
 
-    def other(self, opcode: int, body: bytes) -> Attachment | MetadataRecord | None:
+    def other(self, opcode: int, body: bytes | memoryview) -> Attachment | MetadataRecord | None:
         """A record that is no message, to pass on; None where there is nothing to pass on.
 
         Raises:

@@ -21,9 +21,11 @@ from mp4ds.bags.mcap_records import (
     MAX_RECORD_BYTES,
     DamageError,
     Declared,
+    chunk_records,
     open_source,
     parse,
     parse_message,
+    unpack_chunk,
 )
 from mp4ds.bags.protocols import HOLD_BYTES, BagReader, Format, HoldBack
 from mp4ds.bags.rosbag2_files import ZstdStream
@@ -165,7 +167,7 @@ class McapPass:
         except DamageError as error:
             self._lose(offset, frame.size, str(error))
 
-    def _other(self, opcode: int, body: bytes) -> Found:
+    def _other(self, opcode: int, body: bytes | memoryview) -> Found:
         """Take a record that is neither message nor chunk.
 
         Raises:
@@ -181,7 +183,9 @@ class McapPass:
                 self._undefined[channel.id] = channel.schema_id
         return self._declared.other(opcode, body)
 
-    def _take(self, body: bytes, offset: int, *, is_doubtful: bool) -> Iterator[Message]:
+    def _take(
+        self, body: bytes | memoryview, offset: int, *, is_doubtful: bool
+    ) -> Iterator[Message]:
         """Give out a message, or keep it until an index tells whether it is one.
 
         Raises:
@@ -282,22 +286,28 @@ class McapPass:
 
     def _content(self, chunk: _Chunk, offset: int, problems: list[str]) -> Iterator[Found]:
         """The records of a chunk."""
+        for kind, body in chunk.records or self._scanned(chunk.content, problems):
+            try:
+                if kind != Opcode.MESSAGE:
+                    self._other(kind, body)
+                else:
+                    yield from self._take(body, offset, is_doubtful=chunk.is_doubtful)
+            except DamageError as error:
+                problems.append(f"in a chunk, {error}")
+
+    def _scanned(
+        self, content: bytes | memoryview, problems: list[str]
+    ) -> Iterator[tuple[int, bytes]]:
+        """Opcodes and bodies of a chunk that nothing vouches for."""
         inner = Scan(
-            Window.of_content(chunk.content, self._path),
+            Window.of_content(bytes(content), self._path),
             self._framing,
             lambda _offset, _size, problem: problems.append(f"in a chunk, {problem}"),
         )
         while frame := inner.next():
             body = inner.body(frame)
-            if body is None:
-                continue
-            try:
-                if frame.kind != Opcode.MESSAGE:
-                    self._other(frame.kind, body)
-                else:
-                    yield from self._take(body, offset, is_doubtful=chunk.is_doubtful)
-            except DamageError as error:
-                problems.append(f"in a chunk, {error}")
+            if body is not None:
+                yield frame.kind, body
 
     def _listed(self, body: bytes, offset: int) -> None:
         """A message index: what it lists must have been read, or is lost."""
@@ -335,15 +345,17 @@ class _Chunk:
         problem: What is wrong with it, a phrase; empty where nothing is.
         is_doubtful: Whether the content may be something else than what was recorded.
         span: Least and greatest log time that its messages can have, ns.
+        records: Opcodes and bodies, where its checksum vouches for them; else empty.
     """
 
-    content: bytes
+    content: bytes | memoryview
     is_plain: bool
     head: int
     used: int
     problem: str
     is_doubtful: bool
     span: tuple[int, int]
+    records: Sequence[tuple[int, memoryview]] = ()
 
     @classmethod
     def unpacked(cls, body: memoryview) -> _Chunk:
@@ -354,6 +366,16 @@ class _Chunk:
         compression = bytes(body[_CHUNK_HEAD.size :][:name_length]).decode(errors="replace")
         records = _CHUNK_HEAD.size + name_length
         length = int.from_bytes(body[records : records + 8], "little")
+        is_plain = not compression
+        if is_plain:
+            start, end = start - _MARGIN, end + _MARGIN
+        if crc:
+            with contextlib.suppress(DamageError):
+                content = unpack_chunk(body)
+                found = [(kind, part) for _, kind, part in chunk_records(content)]
+                used = records + 8 + length
+                span = (start, end)
+                return cls(content, is_plain, records + 8, used, "", False, span, found)
         unpacked = unpack(compression, body[records + 8 :][:length], min(size, MAX_RECORD_BYTES))
         problem = unpacked.problem
         if crc and zlib.crc32(unpacked.content) == crc:
@@ -364,10 +386,7 @@ class _Chunk:
                 "though something of them is not as it was"
             )
         used = records + 8 + unpacked.used if unpacked.used else 0
-        is_plain = not compression
         is_doubtful = bool(problem) and (not unpacked.is_sound or not unpacked.problem)
-        if is_plain:
-            start, end = start - _MARGIN, end + _MARGIN
         return cls(
             unpacked.content, is_plain, records + 8, used, problem, is_doubtful, (start, end)
         )
@@ -381,7 +400,7 @@ def _message_count(statistics: mcap_records.Statistics | None) -> int | None:
     return total if total == sum(counts.values()) else None
 
 
-def _key(message: bytes) -> tuple[int, int]:
+def _key(message: bytes | memoryview) -> tuple[int, int]:
     """Channel id and log time of a message, ns."""
     return int.from_bytes(message[:2], "little"), int.from_bytes(message[6:_TIME_END], "little")
 
