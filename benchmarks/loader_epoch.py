@@ -193,7 +193,7 @@ def _feature(topic: str) -> str:
 # ---------------------------------------------------------------- loaders
 
 
-def _ours(made: Made, dtype: Literal["uint8", "float32"], *, fast_colour: bool = False) -> Any:
+def _ours(made: Made, dtype: Literal["uint8", "float32"]) -> Any:
     from mp4ds.torch import FrameDataset
 
     return FrameDataset(
@@ -202,7 +202,6 @@ def _ours(made: Made, dtype: Literal["uint8", "float32"], *, fast_colour: bool =
         offsets=STEPS,
         sync_tolerance_ns=_TOLERANCE_NS,
         dtype=dtype,
-        fast_colour=fast_colour,
     )
 
 
@@ -251,7 +250,6 @@ class EmulatedLeRobot:
 
 LOADERS: dict[str, Callable[[Made], Any]] = {
     "mp4ds": lambda made: _ours(made, "uint8"),
-    "mp4ds, fast colours": lambda made: _ours(made, "uint8", fast_colour=True),
     "mp4ds, float32": lambda made: _ours(made, "float32"),
     "lerobot": _lerobot,
     "lerobot (emulated)": lambda made: EmulatedLeRobot(made, floats=True),

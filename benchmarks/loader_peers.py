@@ -46,13 +46,11 @@ class Peer(Protocol):
 class Mp4ds:
     """Our own."""
 
-    def __init__(
-        self, stored: Stored, *, fast_colour: bool = False, size: Size | None = None
-    ) -> None:
+    def __init__(self, stored: Stored, *, size: Size | None = None) -> None:
         import mp4ds
 
         self._size = size
-        self._dataset = mp4ds.open(stored.dataset or stored.path, fast_colour=fast_colour)
+        self._dataset = mp4ds.open(stored.dataset or stored.path)
         self._stream: Any = self._dataset[TOPIC if stored.dataset else stored.path.stem]
 
     def read(self, numbers: Sequence[int]) -> Any:  # noqa: D102
@@ -307,10 +305,9 @@ class Kind:
     packages: tuple[str, ...]
 
 
-OURS, OURS_FAST = "mp4ds", "mp4ds, fast colours"
+OURS = "mp4ds"
 VIDEO_PEERS = {
     OURS: Kind(Mp4ds, ("mp4ds",)),
-    OURS_FAST: Kind(lambda s: Mp4ds(s, fast_colour=True), ("mp4ds",)),
     "pyav": Kind(PyAv, ("av",)),
     "torchcodec exact": Kind(lambda s: TorchCodec(s, "exact"), ("torchcodec", "torch")),
     "torchcodec approximate": Kind(lambda s: TorchCodec(s, "approximate"), ("torchcodec", "torch")),

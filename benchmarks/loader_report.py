@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from loader_peers import OURS, OURS_FAST
+from loader_peers import OURS
 from measure import print_table
 
 Figures = Sequence[Mapping[str, Any]]
@@ -94,8 +94,7 @@ def report(figures: Figures, patterns: Mapping[str, str], plot: Path | None) -> 
     best = "frames per CPU second: median (least to most), and frames per second on the clock"
     print(f"\nThe same files, {best}:")
     header: tuple[str, ...]
-    header = ("codec", "GOP", "kB a frame", "pattern", OURS, OURS_FAST, "best other", "")
-    header += ("mp4ds / other", "fast / other")
+    header = ("codec", "GOP", "kB a frame", "pattern", OURS, "best other", "", "mp4ds / other")
     print_table(header, _against_best(cells, sizes, videos, patterns))
     print(f"\nOther ways to store the same frames, {best}:")
     header = ("stored as", "kB a frame", "pattern", "read by", "")
@@ -124,12 +123,8 @@ def _against_best(
         for pattern, text in patterns.items():
             ours = cells.get((way, pattern, OURS), Cell())
             name, best = _best(cells, way, pattern)
-            fast = cells.get((way, pattern, OURS_FAST), Cell())
-            ratios = [
-                f"{cell.rate / best.rate:.2f}" if cell.counts and best.counts else ""
-                for cell in (ours, fast)
-            ]
-            yield codec, gop, f"{sizes[way] / 1000:.1f}", text, ours, fast, name, best, *ratios
+            ratio = f"{ours.rate / best.rate:.2f}" if ours.counts and best.counts else ""
+            yield codec, gop, f"{sizes[way] / 1000:.1f}", text, ours, name, best, ratio
 
 
 def _best(cells: Cells, way: str, pattern: str) -> tuple[str, Cell]:
@@ -137,7 +132,7 @@ def _best(cells: Cells, way: str, pattern: str) -> tuple[str, Cell]:
     found = {
         peer: cell
         for (a, b, peer), cell in cells.items()
-        if (a, b) == (way, pattern) and peer not in (OURS, OURS_FAST) and cell.counts
+        if (a, b) == (way, pattern) and peer != OURS and cell.counts
     }
     if not found:
         return "", Cell()

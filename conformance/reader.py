@@ -3,8 +3,8 @@
     python conformance/reader.py FILE    what a sidecar or dataset holds, as JSON
 
 Needs ffmpeg and ffprobe on the path, and PyYAML. It reads manifests, sidecars, columns, the index
-of messages.mcap, the order of messages, packets and decoded planes. It makes neither pixels nor
-messages of them, and tells the first problem that stops it.
+of messages.mcap, the order of messages, packets and decoded planes. It makes the pixels of lossy
+videos in colour, no others, and no messages, and tells the first problem that stops it.
 """
 
 from __future__ import annotations
@@ -186,8 +186,104 @@ def stream(path):
         "frame_id": [side["headers"][number]["frame_id"] for number in found["variant"]],
         "packets": hashes,
         "planes": told,
+        **colours(side, decoded),
         "camera_info": info,
     }
+
+
+# ---------------------------------------------------------------- colours of lossy videos
+
+SHARES = {"bt709": (0.2126, 0.0722), "smpte170m": (0.299, 0.114)}
+CHANNELS = {"rgb24": (0, 1, 2), "bgr24": (2, 1, 0)}
+
+
+def colours(side, decoded):
+    """The key of the pixels, where they are what a lossy video shows."""
+    video, image = side["video"], side["image"]
+    if side["profile"] == "lossless" or video["layout"] not in (*CHANNELS, "demosaic8"):
+        return {}
+    hashes = []
+    for planes in decoded:
+        rgb = as_rgb(planes, video)
+        rows = [
+            row_of(image["encoding"], y, [channel[y] for channel in rgb], image["width"])
+            for y in range(image["height"])
+        ]
+        hashes.append(sha256(b"".join(rows)))
+    return {"pixels": hashes}
+
+
+def row_of(encoding, y, channels, width):
+    """A row of the image: of a mosaic each sample is that of its place."""
+    if encoding in ("rgb8", "bgr8", "8UC3"):
+        order = CHANNELS["rgb24" if encoding == "rgb8" else "bgr24"]
+        return bytes(channels[channel][x] for x in range(width) for channel in order)
+    mosaic = encoding.removeprefix("bayer_")[2 * (y % 2) :]
+    return bytes(channels["rgb".index(mosaic[x % 2])][x] for x in range(width))
+
+
+def as_rgb(planes, video):
+    """Rows of R, of G and of B: spec/index.md, "Colours"."""
+    width, height, bits = video["width"], video["height"], 8 + 2 * ("10" in video["pixel_format"])
+    is_full = video["color"]["range"] == "full"
+    kr, kb = SHARES[video["color"]["matrix"]]
+    kg = 1 - kr - kb
+    luma, chroma = (32 * 255 * 256 / span for span in (219, 224))
+    if is_full:
+        luma = chroma = 32 * 255 * 2**bits / (2**bits - 1)
+    red, blue = 2 * chroma * (1 - kr), 2 * chroma * (1 - kb)
+    factors = luma, red, blue * kb / kg, red * kr / kg, blue
+    luma, red, green_u, green_v, blue = map(round, factors)
+    black = 0 if is_full else 2 ** (bits - 4)
+    half = -(-width // 2), -(-height // 2)
+    y_rows, u_rows, v_rows = (
+        rows_of(plane, size[0], bits)
+        for plane, size in zip(planes, ((width, height), half, half), strict=True)
+    )
+    found = [], [], []
+    for y in range(height):
+        u, v = (interpolated(rows, y, width, bits) for rows in (u_rows, v_rows))
+        light = [product((s - black) << (15 - bits), luma) + 16 for s in y_rows[y]]
+        rgb = (
+            [a + product(c, red) for a, c in zip(light, v, strict=True)],
+            [
+                a - product(b, green_u) - product(c, green_v)
+                for a, b, c in zip(light, u, v, strict=True)
+            ],
+            [a + product(b, blue) for a, b in zip(light, u, strict=True)],
+        )
+        for rows, values in zip(found, rgb, strict=True):
+            rows.append(bytes(min(max(value >> 5, 0), 255) for value in values))
+    return found
+
+
+def rows_of(plane, width, bits):
+    """Samples of a plane by rows."""
+    samples = plane if bits == 8 else struct.unpack(f"<{len(plane) // 2}H", plane)
+    return [samples[at : at + width] for at in range(0, len(samples), width)]
+
+
+def product(a, k):
+    """Of a sample and a factor."""
+    return (a * k + 2**14) >> 15
+
+
+def between(values, place):
+    """Of samples around a place of the picture, 32 times what is there."""
+    near, side, last = place // 2, 1 if place % 2 else -1, len(values) - 1
+    a, b, c, d = (values[min(max(near + side * far, 0), last)] for far in (0, 1, -1, 2))
+    return 28 * a + 8 * b - 3 * c - d
+
+
+def interpolated(rows, y, width, bits):
+    """Chroma of each pixel of a row."""
+    columns = range(len(rows[0]))
+    half = [between([row[x] - 2 ** (bits - 1) for row in rows], y) for x in columns]
+    half = [(value + 2 ** (bits - 6)) >> (bits - 5) for value in half]
+    return [between(half, x) for x in range(width)]
+
+
+# ---------------------------------------------------------------- calibrations
 
 
 def camera_info(path, info, log_times):

@@ -47,8 +47,8 @@ class Tagged:
 
     coded_size = WIDTH, HEIGHT
 
-    def make(self, frame: Any, number: int | None = None, scale: Any = None) -> Any:
-        del number, scale
+    def make(self, frame: Any, number: int | None = None, *_: Any) -> Any:
+        del number
         return tags(frame)
 
 

@@ -57,8 +57,6 @@ class Dataset:
     Args:
         path: The folder, a manifest, a sidecar, or a video beside its sidecar; or its URL.
         jpeg_quality: Of the JPEG files that messages of transcoded streams get, 1 to 100.
-        fast_colour: Of videos with halved chroma give it to frames as it is, several times as
-            fast as interpolating it as `mp4ds.unpack` does. Messages are not changed by it.
 
     Raises:
         SourceNotFoundError: There is nothing.
@@ -66,9 +64,7 @@ class Dataset:
         FormatError: A file breaks a rule of the format.
     """
 
-    def __init__(
-        self, path: Path | str, *, jpeg_quality: int = 95, fast_colour: bool = False
-    ) -> None:
+    def __init__(self, path: Path | str, *, jpeg_quality: int = 95) -> None:
         self.path = location(path)
         if not self.path.exists():
             raise SourceNotFoundError(self.path)
@@ -88,8 +84,7 @@ class Dataset:
         else:
             sidecars = [self.path.with_suffix(".yaml") if self.path.suffix == ".mp4" else self.path]
         self.streams: list[Stream] = [
-            Stream(sidecar, jpeg_quality=jpeg_quality, fast_colour=fast_colour)
-            for sidecar in sidecars
+            Stream(sidecar, jpeg_quality=jpeg_quality) for sidecar in sidecars
         ]
         self.videos: list[Video] = []
 
@@ -376,11 +371,11 @@ def _time_of(record: Record) -> int:
 class _VideoDataset(Dataset):
     """One video of others."""
 
-    def __init__(self, path: Path, *, fast_colour: bool) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.manifest = None
         self.streams = []
-        self.videos = [Video(path, fast_colour=fast_colour)]
+        self.videos = [Video(path)]
 
     @property
     def profile(self) -> str:
@@ -388,7 +383,7 @@ class _VideoDataset(Dataset):
         return ""
 
 
-def open_dataset(path: Path | str, *, fast_colour: bool = False) -> Dataset:
+def open_dataset(path: Path | str) -> Dataset:
     """Open a dataset, or one video with its sidecar. See `Dataset`.
 
     A video that has no sidecar and is in no dataset is opened, too: `Dataset.videos` then has
@@ -396,11 +391,10 @@ def open_dataset(path: Path | str, *, fast_colour: bool = False) -> Dataset:
 
     Args:
         path: See `Dataset`.
-        fast_colour: See `Dataset`.
     """
     place = location(path)
     if place.suffix.lower() in _VIDEOS and place.is_file():
         beside = (place.with_suffix(".yaml"), place.parent / MANIFEST_NAME)
         if not any(path.exists() for path in beside):
-            return _VideoDataset(place, fast_colour=fast_colour)
-    return Dataset(place, fast_colour=fast_colour)
+            return _VideoDataset(place)
+    return Dataset(place)

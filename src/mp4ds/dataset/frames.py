@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import index as as_integer
@@ -393,35 +393,28 @@ class DecodedFrames(Frames):
 
     def __init__(self) -> None:
         self._views: dict[str, View] = {}
+        self._reader: FrameReader | None = None
+
+    def close(self) -> None:
+        """Close the video, if it is open."""
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
 
     # ------------------------------------------------------------ what makes them
 
     @abstractmethod
-    def pictures_of(
-        self, indices: Sequence[int], scale: Scale | None = None
-    ) -> Iterator[tuple[int, Picture]]:
-        """Pictures of some frames, each with its number.
-
-        Args:
-            indices: 0 <= index < frames, increasing.
-            scale: See `PictureMaker.make`.
-
-        Yields:
-            Views that hold until the next one is asked for. Nothing else may be read meanwhile.
-
-        Raises:
-            VideoError: One cannot be decoded.
-        """
+    def _open_reader(self) -> FrameReader:
+        """A decoder of its own for frames by number."""
 
     @abstractmethod
-    def _pictures_apart(
-        self, runs: Iterable[Sequence[int]], scale: Scale | None
-    ) -> Iterator[tuple[int, Picture]]:
-        """As `pictures_of` for each run, by a decoder of its own: more may be read meanwhile."""
-
-    @abstractmethod
-    def _pictures(self) -> Iterator[Picture]:
+    def _pictures(self, scale: Scale | None) -> Iterator[Picture]:
         """All pictures in order, read by a decoder of their own."""
+
+    @property
+    @abstractmethod
+    def _shows_colours(self) -> bool:
+        """See `mp4ds.video.pixels.shows_colours`."""
 
     @abstractmethod
     def _write_pixels(self, picture: Picture, out: Pixels) -> None:
@@ -434,11 +427,36 @@ class DecodedFrames(Frames):
     @abstractmethod
     def _frame_id(self, index: int) -> str: ...
 
+    def pictures_of(
+        self,
+        indices: Sequence[int],
+        scale: Scale | None = None,
+        outs: Mapping[int, Pixels] | None = None,
+    ) -> Iterator[tuple[int, Picture]]:
+        """Pictures of some frames, each with its number; see `FrameReader.pictures_of`.
+
+        Args:
+            indices: 0 <= index < frames, increasing.
+            scale: See `PictureMaker.make`.
+            outs: Its `out`, by frame, which may be left unused.
+
+        Yields:
+            Views that hold until the next one is asked for. Nothing else may be read meanwhile.
+
+        Raises:
+            VideoError: One cannot be decoded.
+        """
+        if not len(indices):
+            return iter(())
+        if self._reader is None:
+            self._reader = self._open_reader()
+        return self._reader.pictures_of(indices, scale, outs)
+
     # ------------------------------------------------------------ by number
 
     def __iter__(self) -> Iterator[Frame]:
         view = self._view("native", None, None)
-        for index, picture in enumerate(self._pictures()):
+        for index, picture in enumerate(self._pictures(view.scale)):
             yield self._frame(index, picture, view)
 
     def get(
@@ -493,7 +511,8 @@ class DecodedFrames(Frames):
         places: dict[int, list[int]] = {}
         for place, number in enumerate(numbers):
             places.setdefault(number, []).append(place)
-        for number, picture in self.pictures_of(sorted(places), view.scale):
+        outs = {number: out[first] for number, (first, *_) in places.items()} if view.scale else {}
+        for number, picture in self.pictures_of(sorted(places), view.scale, outs):
             first, *others = places[number]
             self._give(number, picture, view, out[first])
             for place in others:
@@ -519,8 +538,10 @@ class DecodedFrames(Frames):
         """Frames in an order, of which what increases is decoded in one go."""
         falls = np.flatnonzero(np.diff(indices) < 0) + 1
         runs = (run.tolist() for run in np.split(indices, falls) if len(run))
-        for index, picture in self._pictures_apart(runs, view.scale):
-            yield self._frame(index, picture, view)
+        with self._open_reader() as reader:  # of its own: more may be read meanwhile
+            for run in runs:
+                for index, picture in reader.pictures_of(run, view.scale):
+                    yield self._frame(index, picture, view)
 
     # ------------------------------------------------------------ how they are given
 
@@ -540,24 +561,29 @@ class DecodedFrames(Frames):
                 format=format,
                 resize=resize,
                 crop=crop,
+                shows_colours=self._shows_colours,
             )
             self._views = {key: view}  # the last one alone: it holds tables of its own
         return view
 
     def _give(self, number: int, picture: Picture, view: View, out: Pixels) -> None:
+        if view.scale:
+            if picture[0] is not out:
+                np.copyto(out, picture[0])
+            return
         if view.is_plain:
             self._write_pixels(picture, out)
-            return
-        if view.scale and view.scale.is_of(picture):
-            np.copyto(out, picture[0])
             return
         pixels: Pixels = np.empty(self.shape, self.dtype)
         self._write_pixels(picture, pixels)
         view.give(self._metres(number, pixels) if view.in_metres else pixels, out)
 
     def _frame(self, index: int, picture: Picture, view: View) -> Frame:
-        data: Pixels = np.empty(view.shape, view.dtype)
-        self._give(index, picture, view, data)
+        if view.scale:
+            data: Pixels = picture[0]
+        else:
+            data = np.empty(view.shape, view.dtype)
+            self._give(index, picture, view, data)
         return Frame(
             data=data,
             index=index,
@@ -597,18 +623,14 @@ class Video(DecodedFrames):
 
     Args:
         path: The video.
-        fast_colour: Of videos with halved chroma give it to frames as it is, several times as
-            fast as interpolating it as `mp4ds.unpack` does. Messages are not changed by it.
 
     Raises:
         VideoError: It cannot be read, or has not one video track.
     """
 
-    def __init__(self, path: Path, *, fast_colour: bool = False) -> None:
+    def __init__(self, path: Path) -> None:
         super().__init__()
         self.path = path
-        self._fast_colour = fast_colour
-        self._reader: FrameReader | None = None
         with VideoFile(path) as file:
             self._codec, self._size, self._times = file.codec, file.size, file.times
 
@@ -653,42 +675,25 @@ class Video(DecodedFrames):
     def __len__(self) -> int:
         return len(self._times)
 
-    def pictures_of(
-        self, indices: Sequence[int], scale: Scale | None = None
-    ) -> Iterator[tuple[int, Picture]]:
-        """See `DecodedFrames.pictures_of`."""
-        if self._reader is None:
-            self._reader = self._open_reader()
-        return self._reader.pictures_of(indices, scale)
-
-    def _pictures_apart(
-        self, runs: Iterable[Sequence[int]], scale: Scale | None
-    ) -> Iterator[tuple[int, Picture]]:
-        with self._open_reader() as reader:
-            for run in runs:
-                yield from reader.pictures_of(run, scale)
-
     def _open_reader(self) -> FrameReader:
         return open_file_frames(
             self.path,
             codec=self._codec,
             size=self._size,
             frames=len(self),
-            fast_colour=self._fast_colour,
         )
 
-    def _pictures(self) -> Iterator[Picture]:
-        with VideoFile(self.path, fast_colour=self._fast_colour) as file:
-            yield from map(file.picture, range(len(self)))
+    def _pictures(self, scale: Scale | None) -> Iterator[Picture]:
+        with VideoFile(self.path) as file:
+            for number in range(len(self)):
+                yield file.picture(number, scale)
+
+    @property
+    def _shows_colours(self) -> bool:
+        return True
 
     def _write_pixels(self, picture: Picture, out: Pixels) -> None:
         np.copyto(out, picture[0])
 
     def _frame_id(self, index: int) -> str:
         return ""
-
-    def close(self) -> None:
-        """Close the video, if it is open."""
-        if self._reader is not None:
-            self._reader.close()
-            self._reader = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -277,8 +277,6 @@ class Stream(DecodedFrames):
         path: The sidecar; the video is beside it.
         sidecar: What it holds, if it was read already.
         jpeg_quality: Of the JPEG files that messages of a transcoded stream get, 1 to 100.
-        fast_colour: Of videos with halved chroma give it to frames as it is, several times as
-            fast as interpolating it as `mp4ds.unpack` does. Messages are not changed by it.
 
     Raises:
         FormatError: The sidecar or its video breaks a rule of the format.
@@ -290,14 +288,11 @@ class Stream(DecodedFrames):
         *,
         sidecar: StreamSidecar | None = None,
         jpeg_quality: int = 95,
-        fast_colour: bool = False,
     ) -> None:
         super().__init__()
         self.path = path
         self._jpeg_quality = jpeg_quality
-        self._fast_colour = fast_colour
         self.sidecar = sidecar or load_stream(path)
-        self._reader: FrameReader | None = None
 
     @property
     def topic(self) -> str:
@@ -385,19 +380,16 @@ class Stream(DecodedFrames):
         place = np.searchsorted(columns.log_time, self.log_times[index], side="right")
         return self.calibrations[int(columns.variant[max(int(place) - 1, 0)])]
 
-    def open_video(self, *, sequential: bool, fast_colour: bool = False) -> VideoDecoder:
+    def open_video(self, *, sequential: bool) -> VideoDecoder:
         """A decoder of its own for the stream's pictures.
 
         Args:
             sequential: Decode with all cores, for reading in order.
-            fast_colour: As of the stream; never for what messages are made of.
 
         Raises:
             VideoError: The video cannot be read, or is not what the sidecar says.
         """
-        return VideoDecoder(
-            self.video_path, **self._promises, sequential=sequential, fast_colour=fast_colour
-        )
+        return VideoDecoder(self.video_path, **self._promises, sequential=sequential)
 
     @property
     def _promises(self) -> dict[str, Any]:
@@ -416,34 +408,20 @@ class Stream(DecodedFrames):
     def __len__(self) -> int:
         return self.sidecar.frames
 
-    def pictures_of(
-        self, indices: Sequence[int], scale: Scale | None = None
-    ) -> Iterator[tuple[int, Picture]]:
-        """See `DecodedFrames.pictures_of`."""
-        if not len(indices):
-            return iter(())
-        if self._reader is None:
-            self._reader = self._open_reader()
-        return self._reader.pictures_of(indices, scale)
-
-    def _pictures_apart(
-        self, runs: Iterable[Sequence[int]], scale: Scale | None
-    ) -> Iterator[tuple[int, Picture]]:
-        with self._open_reader() as reader:
-            for run in runs:
-                yield from reader.pictures_of(run, scale)
-
     def _open_reader(self) -> FrameReader:
         return open_frames(
             self.video_path,
             **self._promises,
-            fast_colour=self._fast_colour,
             references=self.sidecar.video.references,
         )
 
-    def _pictures(self) -> Iterator[Picture]:
-        with self.open_video(sequential=True, fast_colour=self._fast_colour) as decoder:
-            yield from decoder.pictures()
+    def _pictures(self, scale: Scale | None) -> Iterator[Picture]:
+        with self.open_video(sequential=True) as decoder:
+            yield from decoder.pictures(scale)
+
+    @property
+    def _shows_colours(self) -> bool:
+        return self.sidecar.shows_colours
 
     def _write_pixels(self, picture: Picture, out: Pixels) -> None:
         self.rebuilder.write_pixels(picture, out)
@@ -566,9 +544,3 @@ class Stream(DecodedFrames):
         """
         rebuilder = self.info_rebuilder
         return rebuilder.messages(channel, choice(rebuilder.columns)) if rebuilder else iter(())
-
-    def close(self) -> None:
-        """Close the video, if it is open."""
-        if self._reader is not None:
-            self._reader.close()
-            self._reader = None

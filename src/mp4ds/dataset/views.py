@@ -123,7 +123,7 @@ class View:
         dtype: Of its pixels.
         is_plain: Whether the pixels are given as they were recorded.
         in_metres: Whether they are made depths in metres first.
-        scale: What a video can give in place of pictures as recorded; they are the view then.
+        scale: What the video makes in place of pictures as recorded, which is the view.
     """
 
     encoding: Encoding
@@ -164,6 +164,7 @@ def view_of(
     format: str,  # noqa: A002 - as users write it
     resize: Resize,
     crop: Crop,
+    shows_colours: bool = False,
 ) -> View:
     """The view that was asked for.
 
@@ -174,6 +175,7 @@ def view_of(
         format: One of `FORMATS`.
         resize: A factor, or width and height.
         crop: x, y, width, height.
+        shows_colours: See `mp4ds.video.pixels.shows_colours`.
 
     Raises:
         OptionError: There is no such format, part or size, or not of these images.
@@ -197,8 +199,11 @@ def view_of(
         given = _given(topic, encoding, format, part, is_resized=size != cut)
     shape, dtype = given.shape(*size), np.dtype(given.dtype)
     in_metres = format == "depth_m"
+    made = shown_format(given)
+    can_scale = shows_colours and encoding.name in _OF_VIDEOS and cut == (width, height)
+    scale = Scale(made, *size) if can_scale and made in ("rgb24", "bgr24") else None
     if is_whole and given is encoding and not in_metres:
-        return View(given, shape, dtype, is_plain=True)
+        return View(given, shape, dtype, is_plain=True, scale=scale)
     placement = None if is_whole else Placement(part, size)
     is_rendered = not in_metres and (
         format != "native" or (size != cut and _is_interpolated(encoding))
@@ -208,9 +213,6 @@ def view_of(
         if is_rendered
         else None
     )
-    made = shown_format(given)
-    can_scale = size != cut == (width, height) and encoding.name in _OF_VIDEOS
-    scale = Scale(made, *size) if made in ("rgb24", "bgr24") and can_scale else None
     return View(given, shape, dtype, False, in_metres, scale, placement, renderer)
 
 

@@ -41,6 +41,7 @@ from mp4ds.records import Channel, Schema
 from mp4ds.times import encode_column
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.coded_messages import PACKET_CODECS
+from mp4ds.video.pixels import shows_colours
 from mp4ds.video.references import (
     MAX_CHARS,
     MAX_STRUCTURE_CHARS,
@@ -560,6 +561,12 @@ class StreamSidecar(Model):
                 raise ValueError(f"headers.{number}.png is there for the body png, and only there")
             if header.padding is not None and body != "pixels":
                 raise ValueError(f"headers.{number}.padding is there for the body pixels only")
+
+    @property
+    def shows_colours(self) -> bool:
+        """See `mp4ds.video.pixels.shows_colours`."""
+        size = self.layout.picture_size(self.image.width, self.image.height)
+        return shows_colours(self.layout.pixel_format, size, (self.video.width, self.video.height))
 
     @property
     def layout(self) -> Layout:

@@ -38,10 +38,6 @@ def as_json(values: Values) -> str:
     return json.dumps(values, indent=1)
 
 
-_EXACT_LOSSY = ("gray8", "planar420", "halved420")
-"""Layouts whose pixels are the decoded samples in lossy streams, too."""
-
-
 def conformance_dump(
     path: Path | str, *, progress: Callable[[str], None] | None = None
 ) -> dict[str, Any]:
@@ -165,12 +161,11 @@ def _decoded(stream: Stream) -> Values:
     sidecar = stream.sidecar
     is_lossless = sidecar.profile == "lossless"
     is_packet = sidecar.body == "packet"
-    has_exact_pixels = is_lossless or sidecar.video.layout in _EXACT_LOSSY
     made = list(_of_packets(stream) if is_packet else _of_pictures(stream))
     return {
         "packets": _packets(stream),
         "planes": _planes(stream),
-        "pixels": [item[0] for item in made] if has_exact_pixels and not is_packet else None,
+        "pixels": None if is_packet else [item[0] for item in made],
         "payloads": [item[1] for item in made] if is_lossless else None,
     }
 

@@ -69,7 +69,6 @@ class Pictures:
         views: What of each camera, in the order of the topics.
         dtype: ``native``, ``uint8`` or ``float32``.
         channels_first: (C, H, W) instead of (H, W, C).
-        fast_colour: See `mp4ds.Dataset`.
         backend: Who decodes.
         device: Where the tensors are.
     """
@@ -77,7 +76,6 @@ class Pictures:
     views: tuple[TensorView, ...]
     dtype: str
     channels_first: bool
-    fast_colour: bool
     backend: str
     device: str
 
@@ -122,7 +120,6 @@ def pictures_from(
     crop: Crop | Mapping[str, Crop] | None,
     dtype: str,
     channels_first: bool,
-    fast_colour: bool,
     backend: str,
     device: str,
 ) -> Pictures:
@@ -148,7 +145,7 @@ def pictures_from(
                 raise OptionError(
                     "backend='torchcodec' gives format='rgb' without resize; use a transform."
                 )
-    return Pictures(views, dtype, channels_first, fast_colour, backend, device)
+    return Pictures(views, dtype, channels_first, backend, device)
 
 
 def _one_of(name: str, value: str, known: Sequence[str]) -> None:
@@ -392,20 +389,19 @@ class Collection:
         return Recording(str(path), chosen, sync.indices, sync.unmatched)
 
 
-def open_source(source: CameraSource, *, fast_colour: bool = False) -> Stream | Video:
+def open_source(source: CameraSource) -> Stream | Video:
     """The stream or video of a camera; others of its dataset are not touched.
 
     Args:
         source: Which.
-        fast_colour: See `mp4ds.Dataset`.
 
     Raises:
         FormatError: It breaks a rule of the format.
     """
     path = location(source.place)
     if path.suffix == ".yaml":
-        return Stream(path, fast_colour=fast_colour)
-    return open_dataset(path, fast_colour=fast_colour).videos[0]
+        return Stream(path)
+    return open_dataset(path).videos[0]
 
 
 def _sources(path: Path | str) -> list[CameraSource]:
@@ -506,7 +502,7 @@ class OpenCamera:
         self.source = source
         self._view = view
         self._pictures = pictures
-        self.stream = open_source(source, fast_colour=pictures.fast_colour)
+        self.stream = open_source(source)
         if len(self.stream) != source.frames:
             raise FormatError(
                 "frame-count",

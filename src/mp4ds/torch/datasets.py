@@ -254,7 +254,6 @@ class FrameDataset(Dataset):
         channels_first: (C, H, W), not (H, W, C).
         transform: Called with each sample; what it returns takes the sample's place.
         cache_files: How many videos a process has open at most.
-        fast_colour: See `mp4ds.Dataset`.
         backend: ``torchcodec`` decodes with that, which converts colours a little differently.
         device: With ``torchcodec``, where to decode and have the tensors, such as ``cuda``.
 
@@ -280,7 +279,6 @@ class FrameDataset(Dataset):
         channels_first: bool = True,
         transform: Transform | None = None,
         cache_files: int = 16,
-        fast_colour: bool = False,
         backend: Backend = "mp4ds",
         device: str = "cpu",
     ) -> None:
@@ -293,7 +291,6 @@ class FrameDataset(Dataset):
             crop=crop,
             dtype=dtype,
             channels_first=channels_first,
-            fast_colour=fast_colour,
             backend=backend,
             device=device,
         )

@@ -124,7 +124,6 @@ class FrameStream(IterableDataset):
         drop_last: Of a distributed training, as of DistributedSampler: leave out the last samples
             that cannot be shared evenly. Else the first of the epoch are given again.
         cache_files: Videos that are open at most; one for each camera at least.
-        fast_colour: See `mp4ds.Dataset`.
         backend: Who decodes.
         device: Where.
 
@@ -154,7 +153,6 @@ class FrameStream(IterableDataset):
         world_size: int = 1,
         drop_last: bool = False,
         cache_files: int = 16,
-        fast_colour: bool = False,
         backend: Backend = "mp4ds",
         device: str = "cpu",
     ) -> None:
@@ -172,7 +170,6 @@ class FrameStream(IterableDataset):
             crop=crop,
             dtype=dtype,
             channels_first=channels_first,
-            fast_colour=fast_colour,
             backend=backend,
             device=device,
         )

@@ -256,7 +256,7 @@ class Resizing:
 
     def pixels(self, stream: Stream, picture: Picture) -> Pixels:
         """The pixels of a picture that was decoded with `scale`, in their size."""
-        if self.scale and self.scale.is_of(picture):
+        if self.scale:
             return picture[0]
         return self.resize(stream.rebuilder.pixels(picture))
 
@@ -282,6 +282,7 @@ def resizer(sidecar: StreamSidecar, encoding: str, size: tuple[int, int] | None)
         format="native" if is_plain else "rgb",
         resize=size,
         crop=None,
+        shows_colours=sidecar.shows_colours and encoding == sidecar.image.encoding,
     )
 
     def resize(pixels: Pixels) -> Pixels:

@@ -20,6 +20,7 @@ from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import expect
 from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.coded import UnknownStructure
+from mp4ds.messages.encodings import Pixels
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.decoder import JpegDecoder
 from mp4ds.video.media import raise_if_scarce
@@ -373,13 +374,17 @@ class FrameAccess:
         )
 
     def pictures_of(
-        self, numbers: Sequence[int], scale: Scale | None = None
+        self,
+        numbers: Sequence[int],
+        scale: Scale | None = None,
+        outs: Mapping[int, Pixels] | None = None,
     ) -> Iterator[tuple[int, Picture]]:
         """Pictures of some frames, each with its number.
 
         Args:
             numbers: 0 <= number < frames, increasing.
             scale: See `PictureMaker.make`.
+            outs: Its `out`, by frame.
 
         Yields:
             Views that hold until the next one is asked for.
@@ -392,9 +397,11 @@ class FrameAccess:
         """
         samples = self.table.order[np.asarray(numbers, np.int64)].tolist()
         for wanted in self._chains.split(samples) if samples else ():
-            yield from self._of_group(wanted, scale)
+            yield from self._of_group(wanted, scale, outs or {})
 
-    def _of_group(self, wanted: list[int], scale: Scale | None) -> Iterator[tuple[int, Picture]]:
+    def _of_group(
+        self, wanted: list[int], scale: Scale | None, outs: Mapping[int, Pixels]
+    ) -> Iterator[tuple[int, Picture]]:
         self._announce(self._chains.unknown(wanted[0], max(wanted)))
         group = self._group(wanted)
         chain = group.chain(wanted)
@@ -410,7 +417,7 @@ class FrameAccess:
                     raise self._damage(due, "is marked as corrupt")
                 number = due.pop(frame.pts, None) if frame.pts is not None else None
                 if number is not None:
-                    yield number, self._maker.make(frame, number, scale)
+                    yield number, self._maker.make(frame, number, scale, outs.get(number))
                 if not due:
                     return
         except FFmpegError as error:

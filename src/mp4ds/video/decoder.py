@@ -111,7 +111,6 @@ class VideoDecoder:
         matrix: Matrix coefficients of the video's colours; None where the video itself tells.
         full_range: Whether its samples use their full range, unless the video itself tells.
         sequential: Decode with all cores, for reading in order.
-        fast_colour: See `Converter`.
 
     Raises:
         VideoError: ``video-unreadable``, ``codec-mismatch`` or ``geometry-mismatch``.
@@ -129,7 +128,6 @@ class VideoDecoder:
         matrix: str | None = "bt709",
         full_range: bool = True,
         sequential: bool = True,
-        fast_colour: bool = False,
     ) -> None:
         self._path = path
         self._frames = frames
@@ -140,7 +138,6 @@ class VideoDecoder:
             picture_size=picture_size,
             matrix=matrix,
             full_range=full_range,
-            fast_colour=fast_colour,
         )
         self._jpeg = JpegDecoder(coded_size) if codec == "mjpeg" else None
         self._ticks: np.ndarray[tuple[int], np.dtype[np.int64]] | None = None

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mp4ds.errors import VideoError
 from mp4ds.messages.arrangements import CHROMA_SHIFTS, Picture
+from mp4ds.video import colour
 from mp4ds.video.codecs import TEN_BITS
 from mp4ds.video.media import raise_if_scarce
 
@@ -107,7 +108,7 @@ _BT709 = 1
 # libswscale's flags: bicubic, full chroma in and out, accurate rounding, the same everywhere.
 # As numbers, since older PyAV has no names for them.
 _BICUBIC, _FULL_CHROMA, _ACCURATE, _BITEXACT = 0x4, 0x2000 | 0x4000, 0x40000, 0x80000
-_BILINEAR, _BY_AREA = 0x2, 0x20
+_BY_AREA = 0x20
 _CARE = _FULL_CHROMA | _ACCURATE | _BITEXACT
 _INTERPOLATION = _BICUBIC | _CARE
 _MATRICES = {"bt709": Colorspace.ITU709, "smpte170m": Colorspace.ITU601}
@@ -125,7 +126,7 @@ _DECODED_AS = {
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Another size of colour pictures, which is made of the video's own samples at once.
+    """Colours and size of pictures that are made of the video's own samples at once.
 
     Attributes:
         pixel_format: ``rgb24`` or ``bgr24``.
@@ -137,9 +138,12 @@ class Scale:
     width: int
     height: int
 
-    def is_of(self, picture: Picture) -> bool:
-        """Whether a picture has been made so, and is not one as recorded."""
-        return picture[0].shape == (self.height, self.width, 3)
+
+def shows_colours(
+    picture_format: str, picture_size: tuple[int, int], coded_size: tuple[int, int]
+) -> bool:
+    """Whether pictures are what their video shows: colours of 8 bits, no mosaic, of its size."""
+    return picture_format in _CHANNELS and picture_size == coded_size
 
 
 def scaling(size: tuple[int, int], made: tuple[int, int]) -> int:
@@ -156,8 +160,6 @@ class PictureConverter:
             None: what each frame is tagged with.
         source_full_range: Whether the frames to convert use the full range.
         full_range: Whether YUV that is made is to use it.
-        fast: Take halved chroma as it is, several times as fast as interpolating it. Of camera
-            images this is 48 to 49 dB like the other, and 0.9 dB less like the original.
     """
 
     def __init__(
@@ -166,12 +168,9 @@ class PictureConverter:
         *,
         source_full_range: bool = True,
         full_range: bool = True,
-        fast: bool = False,
     ) -> None:
-        self._interpolation = _BILINEAR if fast else _INTERPOLATION
-        self._via_planes = () if fast else _VIA_PLANES
         self._is_tagged = matrix is None
-        self._matrix = _MATRICES.get(matrix or "", Colorspace.ITU709)
+        self._matrix = matrix if matrix in _MATRICES else "bt709"
         self._source_range = ColorRange.JPEG if source_full_range else ColorRange.MPEG
         self._range = ColorRange.JPEG if full_range else ColorRange.MPEG
         self._reformatter = VideoReformatter()
@@ -180,7 +179,10 @@ class PictureConverter:
     def convert(self, frame: av.VideoFrame, pixel_format: str) -> av.VideoFrame:
         """The frame in another pixel format, the colours kept."""
         self._look_at_tags(frame)
-        if pixel_format in self._via_planes and not frame.format.is_rgb:
+        if pixel_format in _VIA_PLANES and self._is_defined(frame):
+            pixels = self._rgb(frame, pixel_format)
+            return av.VideoFrame.from_numpy_buffer(pixels, format=pixel_format)
+        if pixel_format in _VIA_PLANES and not frame.format.is_rgb:
             # the same samples in a third of the time: libswscale makes planes with SIMD
             planes = self._reformat(self._to_planes, frame, "gbrp")
             return self._reformat(self._reformatter, planes, pixel_format)
@@ -189,17 +191,50 @@ class PictureConverter:
             return rounded(self._reformat(self._to_planes, frame, "yuv420p16le"), pixel_format)
         return self._reformat(self._reformatter, frame, pixel_format)
 
-    def scale(self, frame: av.VideoFrame, scale: Scale) -> NDArray[np.uint8]:
-        """The frame in another size, shape (H, W, 3)."""
+    def scale(
+        self, frame: av.VideoFrame, scale: Scale, out: NDArray[np.uint8] | None = None
+    ) -> NDArray[np.uint8]:
+        """The frame in another size, or its own.
+
+        Args:
+            frame: As decoded.
+            scale: What to make.
+            out: Where to write it, of shape (H, W, 3); a new array if None.
+        """
         self._look_at_tags(frame)
-        made = self._reformat(self._reformatter, frame, "gbrp", scale)  # planes, as in `convert`
-        order = (2, 0, 1) if scale.pixel_format == "rgb24" else (1, 0, 2)
-        return np.stack([samples(made, index) for index in order], axis=-1)
+        if (frame.width, frame.height) != (scale.width, scale.height):
+            made = self._reformat(self._reformatter, frame, "gbrp", scale)  # as in `convert`
+            order = (2, 0, 1) if scale.pixel_format == "rgb24" else (1, 0, 2)
+            return np.stack([samples(made, index) for index in order], axis=-1, out=out)
+        if self._is_defined(frame):
+            return self._rgb(frame, scale.pixel_format, out)
+        if out is None:
+            out = np.empty((frame.height, frame.width, 3), np.uint8)
+        np.copyto(out, _packed(frame, scale.pixel_format, self))
+        return out
+
+    def _is_defined(self, frame: av.VideoFrame) -> bool:
+        """Whether spec/index.md, "Colours", says how the frame's colours are made.
+
+        Where others tag their videos with a place of the chroma, libswscale knows of it.
+        """
+        return frame.format.name in colour.BITS and not self._is_tagged
+
+    def _rgb(
+        self, frame: av.VideoFrame, pixel_format: str, out: NDArray[np.uint8] | None = None
+    ) -> NDArray[np.uint8]:
+        return colour.rgb(
+            frame,
+            self._matrix,
+            full_range=self._source_range == ColorRange.JPEG,
+            is_bgr=pixel_format == "bgr24",
+            out=out,
+        )
 
     def _look_at_tags(self, frame: av.VideoFrame) -> None:
         if self._is_tagged:
             # untagged video is BT.601, limited, for ffmpeg and most players
-            self._matrix = Colorspace.ITU709 if frame.colorspace == _BT709 else Colorspace.ITU601
+            self._matrix = "bt709" if frame.colorspace == _BT709 else "smpte170m"
             is_full = frame.color_range == _FULL_RANGE or frame.format.name.startswith("yuvj")
             self._source_range = ColorRange.JPEG if is_full else ColorRange.MPEG
 
@@ -210,7 +245,7 @@ class PictureConverter:
         pixel_format: str,
         scale: Scale | None = None,
     ) -> av.VideoFrame:
-        interpolation = self._interpolation
+        interpolation = _INTERPOLATION
         if scale is not None:
             interpolation = scaling((frame.width, frame.height), (scale.width, scale.height))
         return reformatter.reformat(
@@ -218,8 +253,8 @@ class PictureConverter:
             width=scale.width if scale else None,
             height=scale.height if scale else None,
             format=pixel_format,
-            src_colorspace=self._matrix,
-            dst_colorspace=self._matrix,
+            src_colorspace=_MATRICES[self._matrix],
+            dst_colorspace=_MATRICES[self._matrix],
             src_color_range=self._source_range,
             dst_color_range=self._range,
             interpolation=interpolation,
@@ -393,7 +428,6 @@ class PictureMaker:
         picture_size: Width and height of the pictures wanted.
         matrix: Matrix coefficients of the video's colours; None where the video itself tells.
         full_range: Whether its samples use their full range, unless the video itself tells.
-        fast_colour: See `PictureConverter`.
     """
 
     def __init__(
@@ -405,23 +439,27 @@ class PictureMaker:
         picture_size: tuple[int, int],
         matrix: str | None,
         full_range: bool,
-        fast_colour: bool = False,
     ) -> None:
         self._path = path
         self.coded_size = coded_size
         self._picture_format = picture_format
         self._picture_size = picture_size
-        self._converter = PictureConverter(matrix, source_full_range=full_range, fast=fast_colour)
+        self._converter = PictureConverter(matrix, source_full_range=full_range)
 
     def make(
-        self, frame: av.VideoFrame, number: int | None = None, scale: Scale | None = None
+        self,
+        frame: av.VideoFrame,
+        number: int | None = None,
+        scale: Scale | None = None,
+        out: NDArray[np.uint8] | None = None,
     ) -> Picture:
         """The picture in a frame; views of it where possible.
 
         Args:
             frame: As decoded.
             number: Of the frame, for errors.
-            scale: Give it so where the frame is a picture in colour of 8 bits, and no mosaic.
+            scale: Give it so, in an array of its own; where `shows_colours` only.
+            out: That array; a new one if None.
 
         Raises:
             VideoError: ``decode-failed``: the decoder found damage; ``geometry-mismatch`` or
@@ -439,9 +477,8 @@ class PictureMaker:
                 f"has {name} of {frame.width}x{frame.height} pixels among others of "
                 f"{width}x{height}",
             )
-        is_shown = self._picture_format in _CHANNELS and self._picture_size == self.coded_size
-        if scale is not None and is_shown:
-            return (self._converter.scale(frame, scale),)
+        if scale is not None:
+            return (self._converter.scale(frame, scale, out),)
         return frame_to_picture(
             frame, self._picture_format, *self._picture_size, self._converter, str(self._path)
         )

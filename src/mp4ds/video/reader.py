@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import Refused, VideoError
 from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.coded import UnknownStructure
-from mp4ds.messages.encodings import MAX_SIDE
+from mp4ds.messages.encodings import MAX_SIDE, Pixels
 from mp4ds.video.access import FrameAccess
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.decoder import JpegDecoder, VideoDecoder
@@ -59,13 +59,17 @@ class FrameReader:
             self._decoder = open_decoder()  # ffmpeg reads more, and tells what it does not
 
     def pictures_of(
-        self, numbers: Sequence[int], scale: Scale | None = None
+        self,
+        numbers: Sequence[int],
+        scale: Scale | None = None,
+        outs: Mapping[int, Pixels] | None = None,
     ) -> Iterator[tuple[int, Picture]]:
         """Pictures of some frames, each with its number.
 
         Args:
             numbers: 0 <= number < frames, increasing.
             scale: See `PictureMaker.make`.
+            outs: Its `out`, by frame, which may be left unused.
 
         Yields:
             Views that hold until the next one is asked for.
@@ -76,7 +80,7 @@ class FrameReader:
         done = 0
         if self._access is not None:
             try:
-                for pair in self._access.pictures_of(numbers, scale):
+                for pair in self._access.pictures_of(numbers, scale, outs):
                     done += 1
                     yield pair
                 return
@@ -111,7 +115,6 @@ def open_frames(
     picture_size: tuple[int, int],
     matrix: str | None,
     full_range: bool,
-    fast_colour: bool = False,
     references: RecordedReferences | None = None,
 ) -> FrameReader:
     """The frames of a video of which all is known that `VideoDecoder` asks for.
@@ -131,7 +134,6 @@ def open_frames(
             picture_size=picture_size,
             matrix=matrix,
             full_range=full_range,
-            fast_colour=fast_colour,
         )
         return FrameAccess(path, codec=codec, frames=frames, maker=maker, references=references)
 
@@ -145,7 +147,6 @@ def open_frames(
             picture_size=picture_size,
             matrix=matrix,
             full_range=full_range,
-            fast_colour=fast_colour,
             sequential=False,
         )
 
@@ -164,7 +165,6 @@ class VideoFile:
 
     Args:
         path: The video.
-        fast_colour: See `Converter`.
 
     Attributes:
         codec: Name in the registry, or ffmpeg's.
@@ -175,7 +175,7 @@ class VideoFile:
         VideoError: It cannot be read, or is no such video.
     """
 
-    def __init__(self, path: Path, *, fast_colour: bool = False) -> None:
+    def __init__(self, path: Path) -> None:
         self._path = path
         self._frames: Iterator[av.VideoFrame] = iter(())
         self._last: int | None = None
@@ -190,7 +190,7 @@ class VideoFile:
                 width, height = self.size
                 raise VideoError("video-unreadable", path, f"has frames of {width}x{height} pixels")
             self._stream.thread_count = 1  # threads inherited over a fork would never end
-            self._maker = _maker_of(path, self.size, fast_colour)
+            self._maker = _maker_of(path, self.size)
             self._ticks, self._keys = self._read_ticks()
             if not len(self._ticks):
                 raise VideoError("video-unreadable", path, "has no frames")
@@ -318,9 +318,7 @@ class VideoFile:
         self.close()
 
 
-def open_file_frames(
-    path: Path, *, codec: str, size: tuple[int, int], frames: int, fast_colour: bool
-) -> FrameReader:
+def open_file_frames(path: Path, *, codec: str, size: tuple[int, int], frames: int) -> FrameReader:
     """The frames of a video of others by number, as RGB of 8 bits.
 
     Args:
@@ -328,20 +326,17 @@ def open_file_frames(
         codec: As `VideoFile` tells it.
         size: As `VideoFile` tells it.
         frames: How many there are.
-        fast_colour: See `Converter`.
 
     Raises:
         VideoError: It cannot be read.
     """
     return FrameReader(
-        lambda: FrameAccess(
-            path, codec=codec, frames=frames, maker=_maker_of(path, size, fast_colour)
-        ),
-        lambda: VideoFile(path, fast_colour=fast_colour),
+        lambda: FrameAccess(path, codec=codec, frames=frames, maker=_maker_of(path, size)),
+        lambda: VideoFile(path),
     )
 
 
-def _maker_of(path: Path, size: tuple[int, int], fast_colour: bool) -> PictureMaker:
+def _maker_of(path: Path, size: tuple[int, int]) -> PictureMaker:
     return PictureMaker(
         path,
         coded_size=size,
@@ -349,5 +344,4 @@ def _maker_of(path: Path, size: tuple[int, int], fast_colour: bool) -> PictureMa
         picture_size=size,
         matrix=None,
         full_range=False,
-        fast_colour=fast_colour,
     )

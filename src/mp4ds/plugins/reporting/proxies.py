@@ -131,7 +131,7 @@ def pictures_in_order(stream: Stream) -> Iterator[tuple[int, Pixels | None]]:
         VideoError: The video is damaged.
     """
     make = stream.rebuilder.pixels
-    with stream.open_video(sequential=True, fast_colour=True) as decoder:
+    with stream.open_video(sequential=True) as decoder:
         if stream.sidecar.body == "packet":
             for index, picture in decoder.decodable_pictures(range(len(stream))):
                 yield index, None if picture is None else make(picture)

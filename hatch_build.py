@@ -1,0 +1,49 @@
+"""Compiles src/mp4ds/video/colour.c where there is a C compiler; numpy does its work elsewhere."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sysconfig
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+# Code for several processors, as far as the compiler and its linker can put it in one library.
+_PROCESSORS = (
+    ['-DPROCESSORS="arch=x86-64-v4","arch=x86-64-v3","arch=x86-64-v2","default"'],
+    ['-DPROCESSORS="avx2","ssse3","default"'],
+    [],
+)
+
+
+class CompileColours(BuildHookInterface):  # type: ignore[type-arg]
+    """Puts the library beside its source; wheels with it are for one platform, any Python."""
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """See hatchling."""
+        if self.target_name != "wheel":
+            return
+        source = Path(self.root, "src/mp4ds/video/colour.c")
+        library = source.with_name("_colour.so")
+        compiler = shlex.split(sysconfig.get_config_var("CC") or "cc")[:1]
+        for processors in _PROCESSORS:
+            options = ["-O3", "-shared", "-fPIC", *processors]
+            try:
+                done = subprocess.run(
+                    [*compiler, *options, "-o", str(library), str(source)], capture_output=True
+                )
+            except OSError:
+                break
+            if done.returncode == 0:
+                build_data["artifacts"].append("src/mp4ds/video/_colour.so")
+                build_data["pure_python"] = False
+                platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+                build_data["tag"] = f"py3-none-{platform}"
+                return
+        library.unlink(missing_ok=True)
+        self.app.display_warning(
+            "mp4ds: no C compiler was found, so numpy makes the colours of lossy videos, the same "
+            "ones in a multiple of the time"
+        )
