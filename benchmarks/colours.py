@@ -60,7 +60,7 @@ def libswscale(flags: int, *steps: str) -> Convert:
         for reformatter, step in zip(reformatters, steps, strict=True):
             options: dict[str, Any] = {"interpolation": flags, "threads": 1}
             for side in ("src", "dst"):
-                options |= {f"{side}_colorspace": "itu709", f"{side}_color_range": "jpeg"}
+                options |= {f"{side}_colorspace": "ITU709", f"{side}_color_range": "JPEG"}
             frame = reformatter.reformat(frame, format=step, **options)
         plane: Any = frame.planes[0]
         rows = np.frombuffer(plane, np.uint8).reshape(frame.height, -1)

@@ -571,7 +571,8 @@ def test_a_video_is_copied_where_its_frames_are_even(tmp_path: Path) -> None:
     with mp4ds.open(tmp_path / "out" / path) as video, mp4ds.open(dataset) as own:
         copied, stream = video.videos[0], own["/cam/image_raw"]
         assert len(copied) == summary.messages["/cam/image_raw"]
-        assert (copied.read([4]) == stream.read([4])).all()
+        apart = copied.read([4]).astype(int) - stream.read([4])
+        assert np.abs(apart).max() <= 4, "others' colours are made by libswscale"
 
 
 def test_frames_that_are_dropped_and_doubled(dataset: Path, tmp_path: Path) -> None:

@@ -325,11 +325,11 @@ SHOWN = [name for name, case in CASES.items() if case.codec != "ffv1" and not ca
 
 @each("name", SHOWN)
 def test_ffmpeg_shows_the_same_colours(name: str, datasets: dict[str, Path]) -> None:
-    """Where it is told in which way to interpolate; versions round in their own ways.
+    """Nearly, where it is told in which way to interpolate: its weights are not to a 32nd.
 
     It decodes JPEG in another way than libjpeg, and mp4ds as libjpeg does.
     """
-    most = 40 if name.startswith("jpeg") else 2
+    most, mean = (40, 3) if name.startswith("jpeg") else (8, 0.6)
     place = "in_h_chr_pos=0:in_v_chr_pos=128:" if CASES[name].is_left else ""
     scale = f"scale={place}flags=bicubic+accurate_rnd+full_chroma_int+full_chroma_inp"
     raw = ffmpeg(video_of(datasets[name]), "rgb24", "-vf", scale)
@@ -337,7 +337,7 @@ def test_ffmpeg_shows_the_same_colours(name: str, datasets: dict[str, Path]) -> 
     for frame, picture in zip(frames, shown_pictures(datasets[name]), strict=True):
         apart = np.abs(frame.astype(int) - picture)
         assert apart.max() <= most
-        assert apart.mean() < 3
+        assert apart.mean() < mean
 
 
 def blocks(picture: NDArray[Any]) -> NDArray[np.float64]:
