@@ -185,7 +185,8 @@ def shown_pictures(dataset: Path, *, centred: bool = False) -> list[NDArray[np.u
         frames=frames,
         picture_format="gray" if grey else "yuv420p" if centred else "rgb24",
         picture_size=size,
-        matrix=video.matrix,
+        # a camera's own YUV is shown as it is tagged
+        matrix=None if video.matrix == "smpte170m" else video.matrix,
         full_range=video.full_range,
     ) as decoder:
         pictures = [tuple(plane.copy() for plane in planes) for planes in decoder.pictures()]
