@@ -565,8 +565,9 @@ class StreamSidecar(Model):
     @property
     def shows_colours(self) -> bool:
         """See `mp4ds.video.pixels.shows_colours`."""
-        size = self.layout.picture_size(self.image.width, self.image.height)
-        return shows_colours(self.layout.pixel_format, size, (self.video.width, self.video.height))
+        layout = self.layout
+        size = layout.picture_size(self.image.width, self.image.height)
+        return shows_colours(layout.pixel_format, size, (self.video.width, self.video.height))
 
     @property
     def layout(self) -> Layout:
