@@ -44,6 +44,6 @@ class CompileColours(BuildHookInterface):  # type: ignore[type-arg]
                 return
         library.unlink(missing_ok=True)
         self.app.display_warning(
-            "mp4ds: no C compiler was found, so numpy makes the colours of lossy videos, the same "
-            "ones in a multiple of the time"
+            "mp4ds: colour.c could not be compiled (is there a C compiler?), so numpy makes the "
+            "colours of lossy videos, the same ones in a multiple of the time"
         )

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from measure import print_machine, print_table
 from mp4ds.video import colour
 from mp4ds.video.pixels import PictureConverter
+from mp4ds.video.scores import psnr
 
 _BICUBIC, _NEAREST, _CARE = 0x4, 0x10, 0x6000 | 0x40000 | 0x80000  # libswscale's flags
 _LINEAR = (0, 24), (1, 8), (-1, 0), (2, 0)
@@ -149,11 +150,6 @@ def mean_psnr(
     pairs = zip(frames, pictures, strict=True)
     found = (psnr(colour.rgb(a, "bt709", full_range=full_range), b) for a, b in pairs)
     return float(np.mean(list(found)))
-
-
-def psnr(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
-    """In dB."""
-    return float(10 * np.log10(255**2 / np.mean((one.astype(float) - other) ** 2)))
 
 
 def least_ms(convert: Convert) -> float:

@@ -36,9 +36,10 @@ from numpy.typing import NDArray
 import clips
 from measure import parse_size, print_machine
 from mp4ds.video.codecs import TEN_BITS
+from mp4ds.video.colour import samples
 from mp4ds.video.encoder import ordinary_scheduling
 from mp4ds.video.libvmaf import find_ffmpeg
-from mp4ds.video.pixels import narrowed, samples, widened
+from mp4ds.video.pixels import narrowed, widened
 from mp4ds.video.planes import PlaneMaker, Planes
 from mp4ds.video.scores import Scorer
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from each import each
 from mp4ds.video import colour
-from mp4ds.video.colour import BITS, MATRICES, factors, rgb
-from mp4ds.video.pixels import PictureConverter, Scale, samples
+from mp4ds.video.colour import BITS, MATRICES, factors, rgb, samples
+from mp4ds.video.pixels import PictureConverter, Scale
 
 SIZES = [(1, 1), (2, 3), (3, 2), (5, 6), (16, 37), (33, 4), (66, 130), (640, 70)]
 

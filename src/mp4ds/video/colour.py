@@ -24,7 +24,13 @@ BITS = {"yuv420p": 8, "yuvj420p": 8, "yuv420p10le": 10}
 _TAPS = (0, 28), (1, 8), (-1, -3), (2, -1)  # distance from the nearest sample, and 32nds
 _BAND = 64  # rows that numpy converts at a time: what is between fits the processor's cache
 
-_Samples = NDArray[np.uint8] | NDArray[np.uint16]
+
+def samples(frame: av.VideoFrame, index: int) -> NDArray[Any]:
+    """A plane as a view of shape (rows, columns), uint8 or uint16."""
+    plane: Any = frame.planes[index]  # a buffer, which its type does not tell
+    dtype = np.uint8 if frame.format.components[0].bits == 8 else np.dtype("<u2")
+    rows: NDArray[Any] = np.frombuffer(plane, dtype).reshape(plane.height, -1)
+    return rows[:, : plane.width]
 
 
 class Factors(NamedTuple):
@@ -120,7 +126,7 @@ def _compiled() -> ctypes.CDLL | None:
 
 
 def _by_numpy(frame: av.VideoFrame, bits: int, used: Factors, out: NDArray[np.uint8]) -> None:
-    luma, u, v = (_samples(plane, bits) for plane in frame.planes)
+    luma, u, v = (samples(frame, index) for index in range(3))
     levels = np.arange(2**bits, dtype=np.int16) - used.black
     light_of = _product(levels << (15 - bits), used.luma) + 16
     for start in range(0, frame.height, _BAND):
@@ -136,11 +142,6 @@ def _by_numpy(frame: av.VideoFrame, bits: int, used: Factors, out: NDArray[np.ui
             out[start : start + _BAND, :, number] = np.clip(channel >> 5, 0, 255)
 
 
-def _samples(plane: Any, bits: int) -> _Samples:
-    rows = np.frombuffer(plane, np.uint8 if bits == 8 else np.uint16).reshape(plane.height, -1)
-    return rows[:, : plane.width]
-
-
 def _product(a: NDArray[np.int16], b: int) -> NDArray[np.int16]:
     whole = a * np.int32(b)
     whole += 2**14
@@ -149,7 +150,7 @@ def _product(a: NDArray[np.int16], b: int) -> NDArray[np.int16]:
     return made
 
 
-def _interpolated(plane: _Samples, rows: NDArray[np.int64], bits: int) -> NDArray[np.int16]:
+def _interpolated(plane: NDArray[Any], rows: NDArray[np.int64], bits: int) -> NDArray[np.int16]:
     """Chroma at all columns of some rows of the picture, around 0, of 15 bits."""
     side = np.where(rows % 2, 1, -1)
     first, last = max(rows[0] // 2 - 2, 0), rows[-1] // 2 + 3

@@ -15,6 +15,7 @@ from mp4ds.errors import VideoError
 from mp4ds.messages.arrangements import CHROMA_SHIFTS, Picture
 from mp4ds.video import colour
 from mp4ds.video.codecs import TEN_BITS
+from mp4ds.video.colour import samples
 from mp4ds.video.media import raise_if_scarce
 
 _EIGHT_BITS, _SIXTEEN_BITS = "yuv420p", "yuv420p16le"
@@ -91,14 +92,6 @@ def rounded(frame: av.VideoFrame, pixel_format: str) -> av.VideoFrame:
         samples(made, index)[...] = wide
     made.colorspace, made.color_range = frame.colorspace, frame.color_range
     return made
-
-
-def samples(frame: av.VideoFrame, index: int) -> NDArray[Any]:
-    """A plane as a view of shape (rows, columns), uint8 or uint16."""
-    plane: Any = frame.planes[index]  # a buffer, which its type does not tell
-    dtype = np.uint8 if frame.format.components[0].bits == 8 else np.dtype("<u2")
-    rows: NDArray[Any] = np.frombuffer(plane, dtype).reshape(plane.height, -1)
-    return rows[:, : plane.width]
 
 
 # ---------------------------------------------------------------- convert

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from mp4ds.errors import VideoError
 from mp4ds.messages.arrangements import Picture
 from mp4ds.video.codecs import TEN_BITS, Recipe
+from mp4ds.video.colour import samples
 from mp4ds.video.media import Media, raise_if_scarce
-from mp4ds.video.pixels import PictureConverter, narrowed, picture_to_frame, samples
+from mp4ds.video.pixels import PictureConverter, narrowed, picture_to_frame
 
 PLANES_FORMAT = "yuv420p"
 """Pixel format of the planes."""
