@@ -5,13 +5,14 @@ from __future__ import annotations
 import gc
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import pytest
 
 import mp4ds
 from mp4ds.packing.options import PackOptions
+from mp4ds.video.encoder import ordinary_scheduling
 from sources import SOURCES, load_tool, scene
 
 NETWORKS = {
@@ -71,15 +72,18 @@ def pytest_configure() -> None:
             signal.signal(number, lambda *_: None)  # which no program inherits
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_call() -> None:
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
     """Leave real time.
 
-    SVT-AV1, opened by PyAV itself as root, takes the thread there, and what a test starts from it
-    would hold up all others.
+    SVT-AV1, opened by PyAV itself as root, takes the thread there, and its own, which may outlive
+    the test; what a test starts from them would hold up all others.
     """
-    if hasattr(os, "sched_setscheduler"):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    with ordinary_scheduling():
+        return (yield)
+
+
+pytest_runtest_protocol = pytest_collection
 
 
 @pytest.fixture(scope="session", autouse=True)
