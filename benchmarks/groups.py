@@ -1,11 +1,14 @@
 """What the distance of key frames costs and gives: bytes of a frame, and frames at random.
 
     python benchmarks/groups.py [--frames N] [--size WxH] [--gop N ...] [--kind K ...]
+    python benchmarks/groups.py --purpose [--frames N] [--size WxH] [--kind K ...] [--clip NAME ...]
     python benchmarks/groups.py --lossy [--frames N] [--size WxH] [--clip NAME ...]
 
 The moving camera of loader_clips.py is packed by `mp4ds.pack`, without loss and for the eye, with
 each number of frames from one key frame to the next; then frames at random places are read one by
 one. CPU time is of the reading process, opening left out.
+
+``--purpose`` packs real scenes (clips.py) with each ``--for``, and reads them in order, too.
 
 ``--lossy`` encodes real scenes (clips.py) as `visual` does, with several presets of SVT-AV1 and
 distances of key frames, and two crf. Bytes are compared at equal PSNR of luma, by interpolation of
@@ -19,6 +22,7 @@ import random
 import tempfile
 import time
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,6 +56,7 @@ KINDS: dict[str, tuple[str, str, Callable[[Pixels], Pixels]]] = {
     "rgb8, visual": ("rgb8", "visual", lambda rgb: rgb),
 }
 GOPS = (1, 10, 30, 60, 120, 240)
+PURPOSES = (None, "training", "training=40", "archive")
 
 
 def main() -> None:
@@ -64,6 +69,7 @@ def main() -> None:
     parser.add_argument("--gop", type=int, nargs="+", default=GOPS)
     parser.add_argument("--kind", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--reads", type=int, default=60)
+    parser.add_argument("--purpose", action="store_true")
     parser.add_argument("--lossy", action="store_true")
     parser.add_argument(
         "--clip", nargs="+", choices=clips.MOVING, default=["cups", "people", "arm"]
@@ -72,6 +78,9 @@ def main() -> None:
     print_machine()
     if options.lossy:
         lossy(options)
+        return
+    if options.purpose:
+        purposes(options)
         return
     rows = []
     for kind in options.kind:
@@ -106,9 +115,60 @@ def measure(folder: Path, kind: str, options: argparse.Namespace) -> list[tuple[
     ]  # fmt: skip
 
 
+# ---------------------------------------------------------------- purposes
+
+
+def purposes(options: argparse.Namespace) -> None:
+    """Measure and print what each purpose chooses, and what it costs beside the default."""
+    clips.check_data()
+    rows: list[tuple[object, ...]] = []
+    for scene, kind in product(options.clip, options.kind):
+        encoding, quality, pixels_of = KINDS[kind]
+        base: tuple[float, ...] = ()
+        with tempfile.TemporaryDirectory(prefix="mp4ds-benchmark-") as name:
+            folder = Path(name)
+            spec = clips.ClipSpec(scene, "rgb8", "low", options.frames, options.size)
+            images = map(pixels_of, clips.make(spec))
+            source = folder / "clip.mcap"
+            write_mcap(source, images, options.frames, encoding, compression="none", hertz=30.0)
+            for purpose in PURPOSES:
+                dataset = folder / f"{purpose}"
+                begun = cpu_seconds()
+                mp4ds.pack(source, dataset, PackOptions(quality=quality, purpose=purpose))
+                seconds = cpu_seconds() - begun
+                size, speed = read(dataset, options)
+                found = (size, 1 / speed, in_order(dataset), seconds)
+                base = base or found
+                ratios = [f"{one / other:.2f}" for one, other in zip(found, base, strict=True)]
+                rows.append((scene, kind, purpose or "(default)", form_of(dataset), *ratios))
+                print("-", *rows[-1], flush=True)
+    head = ("clip", "images", "`--for`", "form", "bytes", "CPU at random", "in order", "packing")
+    print_table(head, rows)
+
+
+def form_of(dataset: Path) -> str:
+    """Codec and options of a stream, as far as they differ between purposes."""
+    with mp4ds.open(dataset) as opened:
+        video = opened.streams[0].sidecar.video
+    options = video.options
+    fast = options.get("coder") == "rice" or "cabac=0" in options.get("x264-params", "")
+    preset = f" preset {options['preset']}" if video.codec == "av1" else ""
+    return f"{video.codec}{preset}{', fast coder' * fast}, key frame every {options['g']}"
+
+
+def in_order(dataset: Path) -> float:
+    """CPU seconds of a frame that is read in order."""
+    with mp4ds.open(dataset) as opened:
+        stream = opened[TOPIC]
+        begun = time.process_time()
+        for _ in stream:
+            pass
+        return (time.process_time() - begun) / len(stream)
+
+
 # ---------------------------------------------------------------- lossy, at equal quality
 
-RECIPES = (("8", 60), ("8", 20), ("7", 20), ("7", 30), ("6", 10))
+RECIPES = (("8", 60), ("7", 30), ("7", 20), ("6", 10), ("5", 15), ("4", 15), ("4", 120))
 """Preset and distance of key frames; the first is what the others are compared with."""
 CRFS = (18, 32)
 

@@ -35,7 +35,7 @@ HERTZ = 30
 SENSOR = Sensor(full_well=5_000, read_electrons=5)
 MARGIN = 48  # pixels that the window moves each way
 GRID = 16
-CODECS = {"av1": ("crf=30", "8"), "h264": ("crf=23", "medium")}
+CODECS = {"av1": ("crf=30", "4"), "h264": ("crf=23", "medium")}
 """Codec -> quality and preset."""
 LEROBOT_OPTIONS = {"g": "2", "crf": "30", "preset": "12"}
 """Of SVT-AV1, as LeRobot 0.4 to 0.6 set them unless asked."""

@@ -46,7 +46,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episodes", type=int, default=6, help="recordings")
     parser.add_argument("--frames", type=int, default=300, help="of each camera of a recording")
     parser.add_argument("--size", type=parse_size, default=(640, 480), help="WxH")
-    parser.add_argument("--gop", type=int, default=30)
+    parser.add_argument("--gop", type=int, default=15, help="of ours, by default as for training")
     parser.add_argument("--epochs", type=int, default=20)
     parser.add_argument("--batch", type=int, default=32)
     parser.add_argument("--workers", type=int, default=2)
@@ -148,8 +148,9 @@ class Made:
         recording = self.folder / "recording.mcap"
         write_cameras(recording, self.clips(number), "rgb8")
         path.parent.mkdir(exist_ok=True)
-        quality = mp4ds.PackOptions(quality="crf=30", codec="av1", preset="8", gop=self.gop)
-        mp4ds.pack(recording, path, quality)
+        # with 15 frames, what `--for training` makes
+        options = mp4ds.PackOptions(quality="crf=30", codec="av1", preset="4", gop=self.gop)
+        mp4ds.pack(recording, path, options)
         recording.unlink()
 
     def _make_lerobot(self) -> None:
@@ -266,13 +267,15 @@ def epochs(chosen: dict[str, Any]) -> Iterator[dict[str, Any]]:
     made = Made(
         Path(chosen["folder"]), chosen["episodes"], chosen["frames"], chosen["size"], chosen["gop"]
     )
+    dataset = LOADERS[chosen["loader"]](made)
     loader: Any = DataLoader(
-        LOADERS[chosen["loader"]](made),
+        dataset,
         batch_size=chosen["batch"],
         shuffle=True,
         num_workers=chosen["workers"],
         persistent_workers=chosen["workers"] > 0,
         generator=torch.Generator().manual_seed(0),
+        collate_fn=getattr(dataset, "collate", None),
     )
     before = _cpu_seconds()
     for _ in range(chosen["epochs"]):
