@@ -263,9 +263,9 @@ def test_nothing_is_begun_without_it(absent: str, tmp_path: Path) -> None:
 def test_other_machines_may_have_it(absent: str) -> None:
     options = PackOptions(quality="crf=20", codec=absent)
     with pytest.raises(HardwareError):
-        _checked(options)
-    _checked(replace(options, cluster="tcp://there:8786"))
-    _checked(replace(options, join=True))
+        _checked(options, [])
+    _checked(replace(options, cluster="tcp://there:8786"), [])
+    _checked(replace(options, join=True), [])
 
 
 def test_a_score_is_not_kept_with_it(tmp_path: Path) -> None:

@@ -621,6 +621,10 @@ def test_a_pair_alone(encoding: str, tmp_path: Path) -> None:
     assert len(again) == 16
     assert again == payloads(tmp_path / "source" / "drive.bag", topics)
     assert mp4ds.unpack(video, "images").output == alone / "cam_image_raw_unpacked_images"
+    assert mp4ds.unpack(video).output == alone / "cam_image_raw_unpacked.mcap"
+    own = mp4ds.unpack(dataset).output
+    assert own == dataset.with_name(f"{dataset.name}_unpacked.bag")
+    assert payloads(own, topics) == again
 
 
 def test_a_pair_of_a_topic_with_other_places(tmp_path: Path) -> None:

@@ -87,6 +87,10 @@ BY_NAME: list[tuple[list[str], dict[int, int]]] = [
     (["/cam/image_raw/compressed", "/cam/image_mono", "/cam/camera_info"], {2: 1}),  # raw first
     (["/cam/a/compressed", "/cam/image_raw/ffmpeg", "/cam/camera_info"], {2: 1}),
     (["/cam/image_raw/ffmpeg", "/cam/image_raw/compressed", "/cam/camera_info"], {2: 1}),
+    # librealsense's
+    (["/d/s0/Depth_0/image/data", "/d/s0/Depth_0/info/camera_info",
+      "/d/s1/Color_0/info/camera_info", "/d/s1/Color_0/image/data"], {1: 0, 2: 3}),
+    (["/d/data", "/d/info/camera_info"], {}),
     # Foxglove's name
     (["/cam/video", "/cam/calibration"], {1: 0}),
     (["/cam/image_raw", "/cam/calibration", "/cam/camera_info"], {2: 0}),
@@ -522,7 +526,13 @@ REAL: list[tuple[str, dict[str, str]]] = [
         "bags/fiducials_aruco_marker_raspicam.bag",
         {"/raspicam_node/camera_info": "/raspicam_node/image/compressed"},
     ),
-    ("bags/librealsense_depth_color.bag", {}),
+    (
+        "bags/librealsense_depth_color.bag",
+        {
+            f"/device_0/{name}/info/camera_info": f"/device_0/{name}/image/data"
+            for name in ("sensor_0/Depth_0", "sensor_1/Color_0")
+        },
+    ),
     ("bags/ecto_ros_camera_info.bag", {}),
     (
         "rosbag2/geocamxyz_test_bag_sqlite3",

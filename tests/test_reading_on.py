@@ -17,10 +17,10 @@ from coded_scenes import CODED
 from each import each
 from mp4ds.dataset.channels import when_asked
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.rebuild import DecodedColumns, everything, marked, since, unbroken
+from mp4ds.dataset.rebuild import DecodedColumns, everything, marked, unbroken, within
 from mp4ds.errors import FormatError, VideoError
 from mp4ds.packing.options import PackOptions
-from mp4ds.records import Message, Record
+from mp4ds.records import Excerpt, Message, Record
 from mp4ds.video.decoder import VideoDecoder
 from scenes import TRAITS, Scene, odd_scene, scene
 from sources import SOURCES
@@ -192,8 +192,10 @@ def test_choices() -> None:
     zeros = np.zeros(5, np.int64)
     columns = DecodedColumns(times, times, zeros, times, None, None, zeros, np.arange(5))
     assert list(everything(columns)) == [0, 1, 2, 3, 4]
-    assert list(since(6)(columns)) == [2, 3, 4]
-    assert list(since(6, every(2))(columns)) == [2, 4]
+    assert list(within(Excerpt(start=6))(columns)) == [2, 3, 4]
+    assert list(within(Excerpt(start=6), every(2))(columns)) == [2, 4]
+    assert list(within(Excerpt(end=6))(columns)) == [0, 1]
+    assert list(within(Excerpt())(columns)) == [0, 1, 2, 3, 4]
     assert list(marked(times != 9, every(3))(columns)) == [0, 3]
 
 

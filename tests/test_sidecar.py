@@ -212,6 +212,18 @@ def dataset() -> Document:
         "recording_profile": "ros1",
         "library": "a recorder",
         "sources": [{"name": "drive.bag", "size": 5, "sha256": "a" * 64}],
+        "about": {
+            "title": "Two cameras",
+            "description": "In a workshop.\nBy hand.",
+            "authors": [
+                {"name": "A lab", "affiliation": "A school", "orcid": "0000-0000-0000-000X"}
+            ],
+            "license": "CC-BY-4.0",
+            "doi": "10.5281/zenodo.1",
+            "links": ["https://example.org/drive"],
+            "keywords": ["stereo"],
+        },
+        "derived_from": [{"name": "first", "profile": "visual", "sha256": "b" * 64}],
         "messages": 9,
         "losses": [
             {

@@ -31,7 +31,7 @@ from test_examples import ROOT, run
 
 torch = pytest.importorskip("torch")
 
-from torch.utils.data import DataLoader  # noqa: E402
+from torch.utils.data import DataLoader, default_collate  # noqa: E402
 
 from each import each  # noqa: E402
 from mp4ds.torch import FrameDataset, FrameStream, SampleError  # noqa: E402
@@ -424,6 +424,58 @@ def test_without_torch() -> None:
 WORKERS = [(0, None), (2, "fork"), (2, "spawn")]
 
 
+@each(
+    "options",
+    [
+        {},
+        {"topics": BOTH},
+        {"offsets": (-1, 0), "topics": BOTH},
+        {"dtype": "float32", "offsets": (0, 2)},
+        {"channels_first": False, "resize": (20, 10)},
+        {"format": "gray", "dtype": "float32"},
+        {"format": {LEFT: "native", RIGHT: "gray"}, "topics": BOTH},
+    ],
+    one_in=2,
+)
+@each("batch", [[0], [5, 6, 7], [3, 30, 3, 60, 1]])
+def test_batches_are_collated_as_usual(
+    drives: list[Path], options: dict[str, Any], batch: list[int]
+) -> None:
+    dataset = FrameDataset(drives, **options)
+    samples = dataset.__getitems__(batch)
+    ours, usual = dataset.collate(samples), default_collate(samples)
+    assert ours.keys() == usual.keys()
+    for key in usual:
+        assert ours[key].dtype == usual[key].dtype
+        assert torch.equal(ours[key], usual[key])
+    for topic in dataset.topics:  # nothing was copied
+        assert ours[topic].data_ptr() == samples[0][topic].data_ptr()
+    dataset.close()
+
+
+def test_what_is_not_of_one_batch_is_copied(drives: list[Path]) -> None:
+    dataset = FrameDataset(drives, topics=[LEFT])
+    samples = dataset.__getitems__([1, 2, 3, 4])
+    for some in (samples[::-1], [samples[0], samples[0]], [samples[0], dataset[2]], samples[::2]):
+        assert torch.equal(dataset.collate(some)[LEFT], default_collate(some)[LEFT])
+    collate = dataset.collate
+    assert torch.equal(collate([[one] for one in samples])[0][LEFT], collate(samples)[LEFT])
+    changed = FrameDataset(drives, topics=[LEFT], transform=lambda sample: sample[LEFT] + 1)
+    assert torch.equal(collate(changed.__getitems__([1, 2])), collate(samples[:2])[LEFT] + 1)
+    with pytest.raises(KeyError):
+        collate([samples[0], {}])
+
+
+def test_frames_of_several_sizes_are_no_batch(drives: list[Path], grey: Path) -> None:
+    dataset = FrameDataset([drives[0], grey], topics=[LEFT], format="native")
+    one, other = dataset.__getitems__([0, FRAMES + 1])
+    assert one[LEFT].dtype == torch.uint8
+    assert other[LEFT].dtype == torch.uint16
+    assert other[LEFT].shape[0] == 1
+    with pytest.raises(RuntimeError):
+        dataset.collate([one, other])
+
+
 def loader(dataset: Any, workers: int, method: str | None, **options: Any) -> Any:
     return DataLoader(
         dataset,
@@ -451,7 +503,8 @@ def test_an_epoch(drives: list[Path], workers: int, method: str | None) -> None:
     dataset.__getitems__([0, 30])
     expected = dataset.__getitems__(range(len(dataset)))
     seen = []
-    for batch in loader(dataset, workers, method, batch_size=7, shuffle=True):
+    own = {"collate_fn": dataset.collate} if workers else {}
+    for batch in loader(dataset, workers, method, batch_size=7, shuffle=True, **own):
         for place, number in enumerate(batch["index"].tolist()):
             seen.append(number)
             for key in (LEFT, RIGHT, f"{LEFT}_is_pad", f"{RIGHT}_is_pad"):
@@ -812,6 +865,27 @@ def torchcodec() -> None:
         import torchcodec.decoders  # noqa: F401
     except (ImportError, OSError, RuntimeError) as error:
         pytest.skip(f"torchcodec cannot be used: {error}")
+
+
+@pytest.mark.usefixtures("torchcodec")
+def test_torchcodec_with_the_ffmpeg_of_pyav(drives: list[Path], tmp_path: Path) -> None:
+    if not list((Path(av.__file__).parents[1] / "av.libs").glob("libavcodec*")):
+        pytest.skip("this PyAV has no libraries of its own")
+    env = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    command = [sys.executable, "-m", "mp4ds.torch.ffmpeg"]
+    for _ in range(2):
+        found = subprocess.run(command, capture_output=True, text=True, check=True, env=env)
+    code = (
+        "import sys; from torchcodec._core import ffmpeg_major_version as major\n"
+        "from mp4ds.torch import FrameDataset\n"
+        f"FrameDataset(sys.argv[1], topics=['{LEFT}'], backend='torchcodec')[3]; print(major)"
+    )
+    env["LD_LIBRARY_PATH"] = found.stdout.strip()
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(drives[0])], capture_output=True, text=True, env=env
+    )
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) == av.library_versions["libavcodec"][0] - 54
 
 
 @pytest.mark.usefixtures("torchcodec")

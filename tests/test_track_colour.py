@@ -11,7 +11,7 @@ import numpy as np
 
 from conftest import real
 from each import each
-from mp4ds.dataset.frames import Video
+from mp4ds.dataset.video import Video
 from mp4ds.video.access import FrameAccess
 from mp4ds.video.mp4 import SampleEntry, TrackColour, read_sample_entry, track_colour
 from test_access import opened

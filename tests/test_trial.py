@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,10 @@ from mp4ds.errors import EncoderRefusedError, OptionError
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE
 from mp4ds.messages.layouts import bind, fit
 from mp4ds.packing.options import PackOptions
-from mp4ds.video.codecs import Recipe, lossless_codecs, recipe_for
+from mp4ds.plan import Purpose
+from mp4ds.video.codecs import Recipe, lossless_codecs, recipe_for, remade
 from mp4ds.video.encoder import VideoEncoder, open_encoder
-from mp4ds.video.trial import NEAR, Choice, choose, estimate
+from mp4ds.video.trial import NEAR, Choice, choose, encode_on_trial
 from pictures import picture
 from pixel_kinds import as_message, rounded
 from round_trips import unpacked
@@ -80,10 +82,9 @@ def test_key_frames_are_weighed_by_their_number(codec: str) -> None:
     rng = np.random.default_rng(0)
     pictures = [(texture(rng, 255).astype(np.uint8),)] * 6
     recipe = recipe_for("gray", lossless=True, codec=codec)
-    sizes = [
-        estimate(pictures, recipe, picture_format="gray", gop=gop, threads=1) for gop in (1, 2, 60)
-    ]
-    first = estimate(pictures[:1], recipe, picture_format="gray", gop=60, threads=1)
+    coded = encode_on_trial(pictures, recipe, picture_format="gray", threads=1)
+    sizes = [coded.bytes_per_frame(gop) for gop in (1, 2, 60)]
+    first = encode_on_trial(pictures[:1], recipe, picture_format="gray", threads=1).key
     assert sizes[0] == pytest.approx(first, rel=0.01)
     others = 2 * sizes[1] - first
     assert sizes[2] == pytest.approx((first + 59 * others) / 60, abs=first / 1000)
@@ -94,12 +95,8 @@ def test_key_frames_are_weighed_by_their_number(codec: str) -> None:
 def test_an_encoder_that_refuses() -> None:
     recipe = recipe_for("gray12le", lossless=True, codec="h265")
     with pytest.raises(EncoderRefusedError, match="libx265 does not take pictures of 2x2"):
-        estimate(
-            [(np.zeros((2, 2), np.uint16),)],
-            recipe,
-            picture_format="gray12le",
-            gop=60,
-            threads=1,
+        encode_on_trial(
+            [(np.zeros((2, 2), np.uint16),)], recipe, picture_format="gray12le", threads=1
         )
 
 
@@ -257,14 +254,13 @@ def test_large_images_are_tried_in_part(encoding: str) -> None:
     samples = scene(encoding, 3, width=1602, height=1202)
     choice = chosen(samples, encoding)
     layout = bind(choice.layout, ENCODINGS[encoding], choice.parameters)
-    whole = estimate(
+    whole = encode_on_trial(
         [layout.to_picture(pixels) for pixels in samples],
         choice.recipe,
         picture_format=layout.pixel_format,
-        gop=60,
         threads=1,
     )
-    assert choice.bytes_per_frame == pytest.approx(whole, rel=0.1)
+    assert choice.bytes_per_frame == pytest.approx(whole.bytes_per_frame(60), rel=0.1)
 
 
 @pytest.mark.parametrize("codec", [None, "ffv1"])
@@ -301,3 +297,69 @@ def test_a_codec_that_refuses_the_size_is_not_insisted_on(tmp_path: Path) -> Non
     summary = mp4ds.pack(paths, tmp_path / "dataset", PackOptions(codec="h265"))
     (topic,) = (topic for topic in summary.topics if topic.topic == "/cam/image_raw")
     assert topic.notes[0].startswith("coded as ")
+
+
+# ---------------------------------------------------------------- purposes
+
+
+def test_what_reads_fastest_within_a_budget() -> None:
+    samples = scene("mono8", width=320, height=240)
+    usual = chosen(samples, "mono8", gop=10)
+    sizes = []
+    for larger in (0.0, 0.15, 0.4, 9.0):
+        choice = chosen(samples, "mono8", gop=10, purpose=Purpose("training", larger))
+        assert choice.bytes_per_frame <= (1 + larger) * usual.bytes_per_frame * (1 + 1e-9)
+        sizes.append(choice.bytes_per_frame)
+        if larger == 9.0:
+            assert choice.gop == 1
+            assert choice.recipe == recipe_for(
+                "gray", lossless=True, codec=choice.recipe.codec, fast=True
+            )
+    assert sizes == sorted(sizes)
+
+
+def test_an_archive_has_the_smallest() -> None:
+    samples = scene("mono8", width=320, height=240)
+    archive = chosen(samples, "mono8", purpose=Purpose("archive"))
+    assert archive.bytes_per_frame <= chosen(samples, "mono8").bytes_per_frame
+    assert archive.bytes_per_frame == min(
+        chosen(samples, "mono8", codec=codec).bytes_per_frame for codec in lossless_codecs("gray")
+    )
+
+
+@each("encoding", ENCODINGS, one_in=6)
+def test_fast_forms_are_exact(
+    encoding: str, tmp_path: Path, compare: Callable[..., list[str]]
+) -> None:
+    paths = SOURCES["mcap-ros2-none"](tmp_path, source_scene(encoding, frames=7))
+    options = PackOptions(purpose="training=900", window=3)
+    mp4ds.pack(paths, tmp_path / "dataset", options)
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare(paths, unpacked(tmp_path, "mcap")) == []
+
+
+@each("form", ["libx264", "libx264rgb", "ffv1"])
+def test_the_recipes_of_fast_forms_are_made_again(form: str) -> None:
+    pixel_format = "rgb24" if form == "libx264rgb" else "gray"
+    codec = "ffv1" if form == "ffv1" else "h264"
+    recipe = recipe_for(pixel_format, lossless=True, codec=codec, fast=True)
+    assert recipe.encoder == form
+    assert remade(pixel_format, asdict(recipe)) == recipe
+    assert recipe != recipe_for(pixel_format, lossless=True, codec=codec)
+
+
+def test_lossy_videos_for_a_purpose(tmp_path: Path) -> None:
+    paths = SOURCES["mcap-ros2-none"](tmp_path, source_scene("rgb8", frames=3))
+    found = {}
+    for purpose in (None, "archive", "training"):
+        mp4ds.pack(paths, tmp_path / f"{purpose}", PackOptions(quality="visual", purpose=purpose))
+        with mp4ds.open(tmp_path / f"{purpose}") as dataset:
+            options = dataset.streams[0].sidecar.video.options
+            found[purpose] = options["preset"], options["g"]
+    assert found == {None: ("7", "30"), "archive": ("4", "120"), "training": ("4", "15")}
+
+
+@pytest.mark.parametrize("text", ["", "speed", "training=", "training=x", "archive=3"])
+def test_a_purpose_that_is_none(text: str, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="`purpose`"):
+        mp4ds.pack(tmp_path / "no.bag", tmp_path / "dataset", PackOptions(purpose=text))

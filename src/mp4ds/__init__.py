@@ -29,10 +29,11 @@ if TYPE_CHECKING:
     from mp4ds.dataset.checks import Problem, validate
     from mp4ds.dataset.dataset import Dataset
     from mp4ds.dataset.dataset import open_dataset as open
-    from mp4ds.dataset.frames import Frame, Frames, Video
+    from mp4ds.dataset.frames import Frame, Frames
     from mp4ds.dataset.messages import RecordedMessage
     from mp4ds.dataset.stream import Stream
     from mp4ds.dataset.topic_frames import TopicFrames
+    from mp4ds.dataset.video import Video
     from mp4ds.errors import (
         ClusterError,
         ConversionError,
@@ -80,11 +81,11 @@ _HOMES = {
     "dataset.frames": (
         "Frame",
         "Frames",
-        "Video",
     ),
     "dataset.messages": ("RecordedMessage",),
     "dataset.stream": ("Stream",),
     "dataset.topic_frames": ("TopicFrames",),
+    "dataset.video": ("Video",),
     "packing.options": (
         "ImageFolder",
         "PackOptions",

@@ -15,6 +15,12 @@ import xxhash
 
 from mp4ds.errors import OptionError
 
+LOSSLESS = "lossless"
+"""The quality by which nothing is lost."""
+
+MAX_GOP = 100_000
+"""Most frames from one key frame to the next that may be asked for."""
+
 _MAX_NAME = 100
 _RESERVED = {"dataset", "messages", "con", "prn", "aux", "nul"} | {
     f"{port}{number}" for port in ("com", "lpt") for number in range(10)
@@ -76,7 +82,7 @@ class QualitySetting:
     @property
     def lossless(self) -> bool:
         """Whether every pixel must return as it was."""
-        return self.name == "lossless"
+        return self.name == LOSSLESS
 
     def __str__(self) -> str:
         if self.target is not None:
@@ -90,7 +96,7 @@ def parse_quality(text: str) -> QualitySetting:
     Raises:
         OptionError: Anything else.
     """
-    if text in ("lossless", "visual"):
+    if text in (LOSSLESS, "visual"):
         return QualitySetting(text)
     match = re.fullmatch(r"crf=([0-9]{1,2})", text)
     if match and int(match.group(1)) <= 63:
@@ -104,6 +110,47 @@ def parse_quality(text: str) -> QualitySetting:
         f"`quality` {text!r} is not known. Use lossless, visual, crf=N with N from 0 to 63, or a "
         "score to reach: vmaf=99.5 (below 100), psnr=42 (dB, below 60) or ssim=0.98 (below 1)."
     )
+
+
+TRAINING, ARCHIVE = "training", "archive"
+_LARGER = 15  # per cent that faster reading may cost
+
+
+@dataclass(frozen=True, slots=True)
+class Purpose:
+    """What a dataset is for.
+
+    Attributes:
+        name: ``archive`` or ``training``.
+        larger: For training, share by which lossless videos may be larger than the smallest.
+    """
+
+    name: str
+    larger: float = 0.0
+
+    @property
+    def is_training(self) -> bool:
+        """Whether frames are to be read fast."""
+        return self.name == TRAINING
+
+
+def parse_purpose(text: str | None) -> Purpose | None:
+    """Parse ``archive``, ``training`` or ``training=PERCENT``; None is none.
+
+    Raises:
+        OptionError: Anything else.
+    """
+    if text is None:
+        return None
+    match = re.fullmatch(rf"{ARCHIVE}|{TRAINING}(?:=([0-9]{{1,4}}))?", text)
+    if not match:
+        raise OptionError(
+            f"`purpose` {text!r} is not known. Use archive, training, or training=PERCENT: how "
+            f"much larger lossless videos may be, {_LARGER} by default."
+        )
+    if text == ARCHIVE:
+        return Purpose(ARCHIVE)
+    return Purpose(TRAINING, int(match[1] or _LARGER) / 100)
 
 
 def visual_setting(rate: float | None) -> tuple[int, int]:

@@ -318,7 +318,8 @@ _SALVAGERS: dict[str, Callable[[Path], Salvage]] = {
 
 _MAGIC = {b"#ROSBAG V": "bag", b"\x89MCAP0\r\n": "mcap", b"SQLite format 3\0": "rosbag2"}
 _FILE_MAGIC = [magic for magic, name in _MAGIC.items() if name != "rosbag2"]
-_SUFFIXES = {".bag": "bag", ".mcap": "mcap", ".db3": "rosbag2"}
+RECORDING_SUFFIXES = {".bag": "bag", ".mcap": "mcap", ".db3": "rosbag2"}
+"""Ending of a file's name -> format."""
 
 
 def format_of(path: Path) -> str:
@@ -344,8 +345,8 @@ def format_of(path: Path) -> str:
     for magic, name in _MAGIC.items():
         if start.startswith(magic):
             return name
-    if path.suffix in _SUFFIXES:
-        return _SUFFIXES[path.suffix]
+    if path.suffix in RECORDING_SUFFIXES:
+        return RECORDING_SUFFIXES[path.suffix]
     remedy = "Give a ROS 1 .bag, a rosbag2 folder or an .mcap file."
     if video := video_at(path):
         raise SourceError(path, f"is {video}, and no recording", f"{remedy} {HOW_TO_OPEN}")
@@ -365,6 +366,10 @@ def recording_names(path: Path) -> set[str] | None:
     return {METADATA_FILE, *info.file_names} if info.file_names else None
 
 
+Opener = Callable[[Path], BagReader]
+"""Opens one recording."""
+
+
 def open_reader(path: Path) -> BagReader:
     """Open one recording of any format.
 
@@ -375,19 +380,26 @@ def open_reader(path: Path) -> BagReader:
 
 
 @overload
-def open_sources(paths: Sequence[Path], *, salvage: Literal[True]) -> SalvageReader: ...
+def open_sources(
+    paths: Sequence[Path], *, salvage: Literal[True], opener: Opener = ...
+) -> SalvageReader: ...
 
 
 @overload
-def open_sources(paths: Sequence[Path], *, salvage: bool = False) -> BagReader: ...
+def open_sources(
+    paths: Sequence[Path], *, salvage: bool = False, opener: Opener = ...
+) -> BagReader: ...
 
 
-def open_sources(paths: Sequence[Path], *, salvage: bool = False) -> BagReader:
+def open_sources(
+    paths: Sequence[Path], *, salvage: bool = False, opener: Opener = open_reader
+) -> BagReader:
     """Open recordings that belong together, such as a split bag, as one.
 
     Args:
         paths: The recordings.
         salvage: Read what can be read of damaged ones, with a `SalvageReader`.
+        opener: Opens one of them, where they are not salvaged.
 
     Raises:
         SourceError: One of them cannot be read, or is given twice.
@@ -403,8 +415,8 @@ def open_sources(paths: Sequence[Path], *, salvage: bool = False) -> BagReader:
     if salvage:
         return _open_salvaged(paths)
     if len(paths) == 1:
-        return open_reader(paths[0])
-    return MultiReader([partial(open_reader, path) for path in paths])
+        return opener(paths[0])
+    return MultiReader([partial(opener, path) for path in paths])
 
 
 def _open_salvaged(paths: Sequence[Path]) -> SalvageReader:

@@ -18,7 +18,8 @@ from mp4ds.cli.output import say
 from mp4ds.cli.process import exit_code_of, prepare_process
 
 COMMANDS = {
-    "pack": ("packing", "Pack a recording into a dataset of mp4 files."),
+    "pack": ("packing", "Pack a recording, or a dataset again, into a dataset of mp4 files."),
+    "repack": ("packing", "Pack a recording, or a dataset again, into a dataset of mp4 files."),
     "unpack": (
         "unpacking",
         "Write a dataset's recording again: as a bag, rosbag2, MCAP, or images.",

@@ -68,10 +68,7 @@ def _print_camera(camera: CameraEvaluation) -> None:
         print_table(_RATES, _rate_rows(camera))
     if camera.storage and camera.data_set:
         data_set = camera.data_set
-        say(
-            f"{data_set.streams} cameras for {data_set.hours:g} hours at {data_set.rate:.2f} Hz, "
-            f"{data_set.frames:.0f} frames:"
-        )
+        say(f"{data_set.described}, {data_set.frames:.0f} frames:")
         print_table(_STORAGE, _storage_rows(camera))
     for note in camera.notes:
         say(f"note: {note}")

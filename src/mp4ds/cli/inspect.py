@@ -9,8 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mp4ds.cli.options import ForceFlag, JsonFlag
-from mp4ds.cli.output import print_info, print_json, print_validation, printed, say, status_line
+from mp4ds.cli.output import (
+    print_info,
+    print_json,
+    print_speeds,
+    print_validation,
+    printed,
+    say,
+    status_line,
+)
 from mp4ds.cli.process import told_errors
+from mp4ds.errors import OptionError
 
 if TYPE_CHECKING:
     from mp4ds.plugins.info import CameraCalibrations, Intrinsics, ListedCalibration
@@ -45,11 +54,21 @@ def info(
             "--intrinsics", help="Show the cameras' calibrations, to be pasted into Python."
         ),
     ] = False,
+    speed: Annotated[
+        bool,
+        typer.Option("--speed", help="Read some frames of a dataset, and show what one costs."),
+    ] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Show what is in a recording or a dataset."""
+    if intrinsics and speed:
+        with told_errors(as_json):
+            raise OptionError("--intrinsics and --speed are shown one at a time.")
     if intrinsics:
         _print_intrinsics(path, as_json)
+        return
+    if speed:
+        _print_speeds(path, as_json)
         return
     from mp4ds.plugins.info import info as run
 
@@ -70,6 +89,17 @@ def _print_intrinsics(path: str, as_json: bool) -> None:
         print_json(result)
     else:
         print_intrinsics(result)
+
+
+def _print_speeds(path: str, as_json: bool) -> None:
+    from mp4ds.plugins.info import reading_speeds
+
+    with told_errors(as_json), status_line(as_json, "reading"):
+        speeds = reading_speeds(path)
+    if as_json:
+        print_json(speeds)
+    else:
+        print_speeds(speeds)
 
 
 def demo(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass
 from datetime import datetime, timezone
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from mp4ds.dataset.checks import Problem
     from mp4ds.packing.options import PackSummary, TopicSummary
-    from mp4ds.plugins.info import Info, TopicInfo
+    from mp4ds.plugins.info import Info, ReadingSpeed, TopicInfo
     from mp4ds.records import Loss
     from mp4ds.unpacking.unpack import UnpackProgress, UnpackSummary
 
@@ -269,6 +269,21 @@ def print_info(result: Info) -> None:
         say(note)
 
 
+def print_speeds(speeds: Sequence[ReadingSpeed]) -> None:
+    """Print what frames cost."""
+    rows = [
+        [
+            item.topic,
+            size_text(item.bytes_per_frame),
+            _number(item.random_ms, 1),
+            _number(item.in_order_ms, 1),
+        ]
+        for item in speeds
+    ]
+    if rows:
+        print_table(_SPEED_COLUMNS, rows)
+
+
 def _info_row(topic: TopicInfo) -> list[str]:
     return [
         topic.topic,
@@ -289,6 +304,12 @@ def _number(value: float | None, digits: int) -> str:
 
 
 _PIPE_WIDTH = 160
+_SPEED_COLUMNS = [
+    ("topic", "fold"),
+    ("a frame", "right"),
+    ("ms at random", "right"),
+    ("ms in order", "right"),
+]
 _PACK_COLUMNS = [
     ("topic", "fold"),
     ("type", "fold"),

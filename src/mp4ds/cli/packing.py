@@ -9,10 +9,11 @@ from typing import Annotated, Optional
 import typer
 
 from mp4ds.cli.options import ForceFlag, JsonFlag, parse_share, takes
-from mp4ds.cli.output import print_json, print_pack, say
+from mp4ds.cli.output import print_json, print_pack, print_speeds, say
 from mp4ds.cli.process import told_errors
 from mp4ds.cli.progress import pack_progress
 from mp4ds.errors import OptionError
+from mp4ds.files.urls import remote
 from mp4ds.packing.options import ImageFolder, PackOptions, PackSummary
 
 _ONLY_OF_RECORDINGS = (
@@ -26,7 +27,8 @@ def pack(
     sources: Annotated[
         list[str],
         typer.Argument(
-            metavar="SOURCE...", help="A .bag, a rosbag2 folder or an .mcap; or several parts."
+            metavar="SOURCE...",
+            help="A .bag, a rosbag2 folder, an .mcap or a dataset; or several parts.",
         ),
     ],
     output: Annotated[
@@ -44,10 +46,10 @@ def pack(
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Pack a recording into a dataset of mp4 files.
+    """Pack a recording, or a dataset again, into a dataset of mp4 files.
 
     Lossless by default: `mp4ds unpack` gives every message back as it was. A pack that was
-    interrupted goes on when the same command is run again.
+    interrupted goes on when the same command is run again. Of a dataset, what was exact stays so.
     """
     from mp4ds.packing.pack import pack as run
     from mp4ds.packing.pack import pack_each, pack_share
@@ -68,9 +70,16 @@ def pack(
         return
     for summary in summaries:
         print_pack(summary)
+        if chosen.purpose is not None and not remote(summary.dataset):
+            from mp4ds.plugins.info import reading_speeds
+
+            with told_errors(as_json):
+                print_speeds(reading_speeds(summary.dataset))
     if shard:
         say(f"share {shard} is packed; when all are, --join makes the dataset")
 
+
+repack = pack
 
 # ---------------------------------------------------------------- import
 

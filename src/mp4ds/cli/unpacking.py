@@ -21,7 +21,10 @@ from mp4ds.unpacking.unpack import unpack as run
 def unpack(
     options: Callable[[], UnpackOptions],
     dataset: DatasetArgument,
-    to: Annotated[str, typer.Option("--to", help="bag, rosbag2, mcap or images.")],
+    to: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--to", help="bag, rosbag2, mcap or images; by default as it was recorded."),
+    ] = None,
     output: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option("--output", "-o", metavar="OUT", help="What to make, else NAME_unpacked."),

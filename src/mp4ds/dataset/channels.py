@@ -174,6 +174,27 @@ class ChannelGroup:
             number += place <= number
         return number
 
+    def is_in_time(self, recorded: Sequence[NDArray[np.int64]]) -> bool:
+        """Whether log times tell the order of its messages.
+
+        They do not where an earlier time comes later, or where messages of equal times are in
+        different files.
+
+        Args:
+            recorded: Sorted log times of its messages in messages.mcap, nanoseconds.
+        """
+        columns = [part.columns for part in self.parts]
+        count = sum(len(one.ordinal) for one in columns) + sum(map(len, recorded))
+        if max(int(one.ordinal[-1]) for one in columns) >= count:
+            return False  # there is a gap, which reading the whole tells
+        times = np.empty(count, np.int64)
+        owner = np.zeros(count, np.int64)  # 0: messages.mcap
+        for number, one in enumerate(columns, start=1):
+            times[one.ordinal], owner[one.ordinal] = one.log_time, number
+        times[owner == 0] = np.sort(np.concatenate([times[:0], *recorded]))
+        steps = np.diff(times)
+        return bool((steps >= 0).all() and not ((steps == 0) & (np.diff(owner) != 0)).any())
+
     def gap(self, recorded: int) -> str:
         """What the columns say is missing, empty if nothing.
 

@@ -23,11 +23,12 @@ from mp4ds.dataset.channels import (
     log_times,
     when_asked,
 )
-from mp4ds.dataset.frames import Frames, Video
+from mp4ds.dataset.frames import Frames
 from mp4ds.dataset.messages import MessagesFile, RecordedMessage, as_recorded
-from mp4ds.dataset.rebuild import Choice, everything, last_of, since
+from mp4ds.dataset.rebuild import Choice, everything, last_of, within
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic_frames import TopicFrames
+from mp4ds.dataset.video import Video
 from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
 from mp4ds.files.sources import HOW_TO_OPEN, video_at
 from mp4ds.files.urls import location
@@ -262,13 +263,14 @@ class Dataset:
         sources: Mapping[PartKey, MessageSource] | None = None,
         *,
         start: int | None = None,
+        end: int | None = None,
         choose: Choice = everything,
         topics: Collection[str] | None = None,
         ahead: Ahead = when_asked,
     ) -> Iterator[Record]:
         """Everything that was recorded, merged by log time; each channel in its own order.
 
-        From a time on, a channel's messages that are in messages.mcap are merged with those of
+        Of a span of time, a channel's messages that are in messages.mcap are merged with those of
         its videos by log time. There are only messages then, and what lies before the key frame
         of the first one of a video is not decoded. Where some messages are left out, videos are
         not compared with their SHA-256, while messages still are with their digests.
@@ -276,7 +278,8 @@ class Dataset:
         Args:
             sources: What gives the messages of a video or its calibrations; all others are as
                 recorded.
-            start: The first log time, nanoseconds; None for everything.
+            start: The first log time, nanoseconds; None for the first that there is.
+            end: The log time before which all are, nanoseconds; None for no end.
             choose: Which messages of videos, and of their calibrations, are wanted. Packets
                 that refer to others come with those between two that are wanted.
             topics: Only these topics; None for all.
@@ -287,12 +290,12 @@ class Dataset:
         Raises:
             FormatError: A frame does not decode, or a message does not match its digest.
         """
-        choice = choose if start is None else since(start, choose)
-        reading = Reading(sources or {}, choice, ahead)
+        is_span = start is not None or end is not None
+        span = Excerpt(start, end, None if topics is None else frozenset(topics))
+        reading = Reading(sources or {}, within(span, choose) if is_span else choose, ahead)
         groups = [item for item in self._groups if topics is None or item.channel.topic in topics]
-        if start is not None:
-            excerpt = Excerpt(start=start, topics=None if topics is None else frozenset(topics))
-            recorded = ahead(self._recorded_in(excerpt))
+        if is_span:
+            recorded = ahead(self._recorded_in(span))
             parts = [part for group in groups for part in group.parts_of(reading)]
             return heapq.merge(recorded, *parts, key=_time_of)
         channels = (self._group_messages(group, reading) for group in groups)
@@ -320,6 +323,15 @@ class Dataset:
     def times(self) -> dict[int, NDArray[np.int64]]:
         """Sorted log times of every message, nanoseconds, by channel id; decodes no frame."""
         return log_times(self._groups, self._file.times())
+
+    @property
+    def is_in_time(self) -> bool:
+        """Whether a span of time has, of each channel, what follows each other in the whole."""
+        recorded = self._file.times()
+        return all(
+            group.is_in_time([recorded[key] for key in group.recorded_ids if key in recorded])
+            for group in self._groups
+        )
 
     def gaps(self) -> Iterator[tuple[str, str]]:
         """Topics of which the columns say that messages are missing, and what is missing."""

@@ -7,20 +7,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import index as as_integer
-from pathlib import Path
 from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.views import Crop, Resize, View, view_of
+from mp4ds.dataset.views import Crop, Resize, View, check_outputs, output, view_of
 from mp4ds.errors import FrameNotFoundError, OptionError
 from mp4ds.format.models import Calibration
 from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.depth import metres_of
 from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
 from mp4ds.video.pixels import Scale
-from mp4ds.video.reader import FrameReader, VideoFile, open_file_frames
+from mp4ds.video.reader import FrameReader
 
 _WANTED = {
     "nearest": "near",
@@ -306,6 +305,31 @@ class Frames(ABC):
             VideoError: A frame cannot be decoded.
         """
 
+    @abstractmethod
+    def read_into(
+        self,
+        indices: Indices,
+        outs: Sequence[Pixels],
+        *,
+        format: str = "rgb",  # noqa: A002
+        resize: Resize = None,
+        crop: Crop = None,
+    ) -> None:
+        """As `read`, each frame into an array of its own.
+
+        Args:
+            indices: As for `get`.
+            outs: An array for each, of the shape and type of a row of what `read` returns.
+            format: See `Frames`.
+            resize: See `Frames`.
+            crop: See `Frames`.
+
+        Raises:
+            IndexError: There is no such frame.
+            OptionError: As for `read`.
+            VideoError: A frame cannot be decoded.
+        """
+
     # ------------------------------------------------------------ by stamp
 
     @cached_property
@@ -497,6 +521,21 @@ class DecodedFrames(Frames):
         self._write(numbers, view, list(out))
         return out
 
+    def read_into(
+        self,
+        indices: Indices,
+        outs: Sequence[Pixels],
+        *,
+        format: str = "rgb",  # noqa: A002
+        resize: Resize = None,
+        crop: Crop = None,
+    ) -> None:
+        """See `Frames.read_into`."""
+        numbers = numbers_of(self.topic, len(self), indices)
+        view = self._view(format, resize, crop)
+        check_outputs(outs, len(numbers), view)
+        self._write(numbers, view, outs)
+
     def _write(self, numbers: Sequence[int], view: View, out: Sequence[Pixels]) -> None:
         """Write the pixels of frames.
 
@@ -593,107 +632,3 @@ class DecodedFrames(Frames):
             encoding=view.encoding.name,
             intrinsics=view.calibration(self.intrinsics_at(index)),
         )
-
-
-def output(out: Pixels | None, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> Pixels:
-    """The array to write into.
-
-    Raises:
-        OptionError: It cannot take what is to be written.
-    """
-    if out is None:
-        return np.empty(shape, dtype)
-    if not isinstance(out, np.ndarray) or (out.shape, out.dtype) != (shape, dtype):
-        found = f"{out.dtype} {out.shape}" if isinstance(out, np.ndarray) else type(out).__name__
-        raise OptionError(f"out is {found} where an array of {dtype} {shape} is needed")
-    if not out.flags.writeable:
-        raise OptionError("out cannot be written to")
-    return out
-
-
-# ---------------------------------------------------------------- videos of others
-
-
-class Video(DecodedFrames):
-    """The frames of an mp4 that has no sidecar. See `Frames`.
-
-    Its topic is the file's name without ending. Frames are ``rgb8``, as the video's colours are
-    tagged, in the orientation in which they are coded; stamps are the presentation times, the
-    first one's usually 0.
-
-    Args:
-        path: The video.
-
-    Raises:
-        VideoError: It cannot be read, or has not one video track.
-    """
-
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self.path = path
-        with VideoFile(path) as file:
-            self._codec, self._size, self._times = file.codec, file.size, file.times
-
-    @property
-    def topic(self) -> str:
-        """The file's name without ending."""
-        return self.path.stem
-
-    @property
-    def video_path(self) -> Path:
-        """The video."""
-        return self.path
-
-    @property
-    def stamps(self) -> NDArray[np.int64]:
-        """Presentation times, nanoseconds, shape (frames,)."""
-        return self._times
-
-    @property
-    def log_times(self) -> NDArray[np.int64]:
-        """Presentation times, nanoseconds, shape (frames,)."""
-        return self._times
-
-    @property
-    def encoding(self) -> str:
-        """``rgb8``."""
-        return "rgb8"
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """Width and height of the frames, pixels."""
-        return self._size
-
-    def intrinsics_at(self, index: int) -> Calibration | None:
-        """None: a video has no calibration.
-
-        Args:
-            index: 0 <= index < frames.
-        """
-        return None
-
-    def __len__(self) -> int:
-        return len(self._times)
-
-    def _open_reader(self) -> FrameReader:
-        return open_file_frames(
-            self.path,
-            codec=self._codec,
-            size=self._size,
-            frames=len(self),
-        )
-
-    def _pictures(self, scale: Scale | None) -> Iterator[Picture]:
-        with VideoFile(self.path) as file:
-            for number in range(len(self)):
-                yield file.picture(number, scale)
-
-    @property
-    def _shows_colours(self) -> bool:
-        return True
-
-    def _write_pixels(self, picture: Picture, out: Pixels) -> None:
-        np.copyto(out, picture[0])
-
-    def _frame_id(self, index: int) -> str:
-        return ""

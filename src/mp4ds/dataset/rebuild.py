@@ -33,7 +33,7 @@ from mp4ds.messages.wire import (
     WireError,
     prove,
 )
-from mp4ds.records import Channel, Message
+from mp4ds.records import Channel, Excerpt, Message
 from mp4ds.times import INT64_MAX, INT64_MIN, Int64Column, encode_column
 
 _DIGESTS_PER_LINE = 12
@@ -522,12 +522,12 @@ def everything(columns: DecodedColumns) -> Iterator[int]:
     return iter(range(len(columns.log_time)))
 
 
-def since(start: int, choice: Choice = everything) -> Choice:
-    """Of the messages that are wanted those from a log time on, nanoseconds."""
+def within(excerpt: Excerpt, choice: Choice = everything) -> Choice:
+    """Of the messages that are wanted those of a span of log time."""
 
     def choose(columns: DecodedColumns) -> Iterator[int]:
         times = columns.log_time
-        return (index for index in choice(columns) if times[index] >= start)
+        return (index for index in choice(columns) if excerpt.has_time(int(times[index])))
 
     return choose
 

@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.frames import Frame, Frames, Indices, numbers_of, output
+from mp4ds.dataset.frames import Frame, Frames, Indices, numbers_of
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.views import Crop, Resize
+from mp4ds.dataset.views import Crop, Resize, View, check_outputs, output
 from mp4ds.errors import OptionError
 from mp4ds.format.models import Calibration
 from mp4ds.messages.encodings import Pixels
@@ -201,13 +201,35 @@ class TopicFrames(Frames):
                 are not asked for.
         """
         numbers = numbers_of(self.topic, len(self), indices)
+        views = self._views_alike(format, resize, crop)
+        out = output(out, (len(numbers), *views[0].shape), views[0].dtype)
+        self._write(numbers, views, list(out))
+        return out
+
+    def read_into(
+        self,
+        indices: Indices,
+        outs: Sequence[Pixels],
+        *,
+        format: str = "rgb",  # noqa: A002
+        resize: Resize = None,
+        crop: Crop = None,
+    ) -> None:
+        """See `Frames.read_into`."""
+        numbers = numbers_of(self.topic, len(self), indices)
+        views = self._views_alike(format, resize, crop)
+        check_outputs(outs, len(numbers), views[0])
+        self._write(numbers, views, outs)
+
+    def _views_alike(self, format: str, resize: Resize, crop: Crop) -> list[View]:  # noqa: A002
         views = [stream._view(format, resize, crop) for stream in self.streams]
         self._check_alike([(view.encoding.name, view.shape) for view in views])
-        out = output(out, (len(numbers), *views[0].shape), views[0].dtype)
+        return views
+
+    def _write(self, numbers: Sequence[int], views: Sequence[View], outs: Sequence[Pixels]) -> None:
         for stream, places, own in self._by_stream(numbers):
             view = views[self.streams.index(stream)]
-            stream._write(own.tolist(), view, [out[place] for place in places])
-        return out
+            stream._write(own.tolist(), view, [outs[place] for place in places])
 
     # ------------------------------------------------------------ by stamp
 

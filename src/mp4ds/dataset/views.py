@@ -300,3 +300,31 @@ def _nearest(pixels: Pixels, placement: Placement) -> Pixels:
     )
     found: Pixels = part[rows[:, None], columns]
     return found
+
+
+def output(out: Pixels | None, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> Pixels:
+    """The array to write into.
+
+    Raises:
+        OptionError: It cannot take what is to be written.
+    """
+    if out is None:
+        return np.empty(shape, dtype)
+    if not isinstance(out, np.ndarray) or (out.shape, out.dtype) != (shape, dtype):
+        found = f"{out.dtype} {out.shape}" if isinstance(out, np.ndarray) else type(out).__name__
+        raise OptionError(f"out is {found} where an array of {dtype} {shape} is needed")
+    if not out.flags.writeable:
+        raise OptionError("out cannot be written to")
+    return out
+
+
+def check_outputs(outs: Sequence[Pixels], count: int, view: View) -> None:
+    """Refuse arrays that cannot take so many frames, each its own.
+
+    Raises:
+        OptionError: Says why.
+    """
+    if len(outs) != count:
+        raise OptionError(f"outs has {len(outs)} arrays for {count} frames")
+    for out in outs:
+        output(out, view.shape, view.dtype)

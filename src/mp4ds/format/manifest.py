@@ -20,6 +20,14 @@ class Source(Model):
     sha256: Sha256
 
 
+class EarlierDataset(Model):
+    """A dataset that was packed again."""
+
+    name: str = Field(description="Of its folder.")
+    profile: Profile = Field(description="What was asked for when it was packed.")
+    sha256: Sha256 = Field(description="Of its manifest, which has those of all its files.")
+
+
 class StreamEntry(Model):
     """A stream of the dataset."""
 
@@ -108,6 +116,10 @@ class LossEntry(Model):
             end=loss.end,
         )
 
+    def to_record(self) -> Loss:
+        """The loss."""
+        return Loss(**{**self.model_dump(), "topics": tuple(self.topics)})
+
 
 class TimeRange(Model):
     """Log times of the first and the last message, ns, both included."""
@@ -116,16 +128,74 @@ class TimeRange(Model):
     end: Time
 
 
+_Text = Annotated[str, Field(min_length=1, max_length=10_000)]
+
+
+_Link = Annotated[str, Field(pattern=r"^https?://[^\s]+$")]
+
+
+class Author(Model):
+    """Who made a recording."""
+
+    name: _Text = Field(description="Of the person or group.")
+    affiliation: _Text | None = Field(None, description="Where they work.")
+    orcid: str | None = Field(
+        None, pattern=r"^[0-9]{4}-[0-9]{4}-[0-9]{4}-[0-9]{3}[0-9X]$", description="Their ORCID iD."
+    )
+
+
+class About(Model):
+    """What the recording is, who made it, and how it may be used."""
+
+    title: _Text | None = Field(None, description="A line.")
+    description: _Text | None = Field(None, description="Plain text.")
+    authors: Annotated[list[Author], Field(max_length=1000)] = Field(
+        default_factory=list, description="In their order."
+    )
+    license: _Text | None = Field(
+        None, description="An identifier of SPDX such as CC-BY-4.0, or what else names it."
+    )
+    doi: str | None = Field(
+        None, pattern=r"^10\.[0-9]{4,9}/[^\s]+$", description="Without a resolver's address."
+    )
+    links: Annotated[list[_Link], Field(max_length=100)] = Field(
+        default_factory=list, description="Pages, papers, code."
+    )
+    keywords: Annotated[list[_Text], Field(max_length=100)] = Field(default_factory=list)
+
+    @property
+    def lines(self) -> list[str]:
+        """What is told, a line for each key."""
+        authors = (
+            ", ".join(filter(None, (author.name, author.affiliation, author.orcid)))
+            for author in self.authors
+        )
+        told = {
+            "title": self.title,
+            "authors": "; ".join(authors),
+            "license": self.license,
+            "doi": self.doi,
+            "links": " ".join(self.links),
+            "keywords": ", ".join(self.keywords),
+            "description": self.description,
+        }
+        return [f"{key}: {' '.join(text.split())}" for key, text in told.items() if text]
+
+
 class Manifest(Model):
     """A dataset: its sources, its files, and what is in them."""
 
     mp4ds: Version = Field(description="Version of the format.")
     kind: Literal["dataset"]
+    about: About | None = Field(None, description="Told by whoever packed it.")
     profile: Profile = Field(description="What was asked for.")
     format: Literal["bag", "rosbag2", "mcap"] = Field(description="Format of the recording.")
     recording_profile: str = Field(description="MCAP profile of the recording: ros1, ros2 ...")
     library: str = Field("", description="The recording's own library string.")
     sources: list[Source]
+    derived_from: list[EarlierDataset] = Field(
+        default_factory=list, description="Datasets that were packed again, the oldest first."
+    )
     messages: Size = Field(description="Messages of the recording that were packed.")
     losses: Annotated[list[LossEntry], Field(max_length=MAX_LOSSES)] = Field(
         default_factory=list, description="What of the recording could not be read."

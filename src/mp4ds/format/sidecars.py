@@ -14,9 +14,10 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from mp4ds import yamlio
-from mp4ds.errors import FormatError, VersionError
+from mp4ds.errors import FormatError, SourceError, VersionError
+from mp4ds.files.urls import location
 from mp4ds.format.fields import FORMAT_VERSION, document_of, parse_version
-from mp4ds.format.manifest import Manifest
+from mp4ds.format.manifest import About, Manifest
 from mp4ds.format.models import StreamSidecar
 from mp4ds.times import encode_column
 
@@ -289,6 +290,26 @@ def _model(model: type[_ModelT], document: dict[str, Any], path: Path) -> _Model
         place, problem = problems[0]
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         raise FormatError("model-invalid", f"{path} at {place}", problem + more) from None
+
+
+def load_about(path: Path | str) -> About:
+    """What a user tells of a recording, in a YAML file.
+
+    Raises:
+        SourceError: It cannot be read, or tells what has no place; says what.
+    """
+    place = location(path)
+    remedy = "See spec/index.md, About the recording."
+    try:
+        told = yamlio.build(place.read_bytes().decode(), lambda event: event.value)
+        return About.model_validate(told)
+    except OSError as error:
+        raise SourceError(place, f"cannot be read: {error.strerror}") from None
+    except ValidationError as error:
+        key, problem = model_problems(error)[0]
+        raise SourceError(place, f"at {key}: {problem}", remedy) from None
+    except ValueError as error:
+        raise SourceError(place, f"is no YAML: {error}", remedy) from None
 
 
 def model_problems(error: ValidationError) -> list[tuple[str, str]]:

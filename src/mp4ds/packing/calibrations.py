@@ -137,8 +137,8 @@ def pair_camera_infos(
     the image topic beside it in the same namespace. For coded images the namespace is that of
     the image that they are a transport of: ``/cam/image_raw/compressed`` has its calibration on
     ``/cam/camera_info``. Of several, raw images come first, of these ``image_raw``, else the
-    first by name; of coded ones the largest. Of several publishers on a calibration topic none
-    is paired.
+    first by name; of coded ones the largest. librealsense's ``NAME/info/camera_info`` belongs to
+    ``NAME/image/data``. Of several publishers on a calibration topic none is paired.
 
     Args:
         channels: The recording's, as far as they are packed.
@@ -158,7 +158,7 @@ def pair_camera_infos(
         ((_INFO_NAMES.index(_leaf(topic)), rank, *_preference(image, sizes or {})), own[0], image)
         for topic, own in infos.items()
         if len(own) == 1 and _leaf(topic) in _INFO_NAMES
-        for rank, image in beside.get(_parent(topic), [])
+        for rank, image in beside.get(_namespace_of_images(topic), [])
     ]
     taken = set(pairs.values())
     for _, info, image in sorted(found, key=lambda item: (item[0], item[1].topic)):
@@ -193,6 +193,12 @@ def _leaf(topic: str) -> str:
 
 def _parent(topic: str) -> str:
     return topic.strip("/").rpartition("/")[0]
+
+
+def _namespace_of_images(topic: str) -> str:
+    """Where the images of a calibration topic are: beside it, or where librealsense has them."""
+    parent = _parent(topic)
+    return f"{_parent(parent)}/image" if _leaf(parent) == "info" else parent
 
 
 def _base(image: Channel) -> str:

@@ -24,6 +24,7 @@ from mp4ds.packing.engine import Engine, Outcome
 from mp4ds.packing.job import Job, Task
 from mp4ds.packing.join import Assembler
 from mp4ds.packing.manifest import (
+    Origin,
     PartRecord,
     dataset_files,
     folder_size,
@@ -264,9 +265,11 @@ class Coordinator:
                     for number, path in enumerate(reader.files)
                 ]
                 run.job.check_sources(reader.files)
-                write_manifest(part, reader, digests, run.job.options["quality"])
+                origin = Origin.of(reader.files, digests, run.job.about)
+                write_manifest(part, reader, origin, run.job.options["quality"])
             sync(folder)
-            summary = summarize(part, run.target, sum(source.size for source in run.job.sources))
+            size = sum(source.size for source in run.job.sources)
+            summary = summarize(part, run.target, size, origin)
             move_into_place(
                 folder, run.target, run.place.replaced, force=run.force, owned=dataset_files
             )

@@ -9,17 +9,20 @@ from pathlib import Path
 from typing import Any
 
 from mp4ds._version import __version__
-from mp4ds.bags.formats import open_sources
+from mp4ds.bags.formats import RECORDING_SUFFIXES, open_reader, open_sources
 from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.files.sources import SourceState, source_digest
 from mp4ds.files.urls import location, spelled
+from mp4ds.format.fields import document_of
+from mp4ds.format.manifest import About
+from mp4ds.format.sidecars import MANIFEST_NAME, load_about
 from mp4ds.packing.manifest import dump_kept, load_kept
 from mp4ds.packing.options import ImageFolder, PackOptions
 from mp4ds.packing.packer import Exact, PartSettings
 from mp4ds.packing.survey import Survey
 from mp4ds.packing.tracks import StreamSettings
-from mp4ds.plan import Selection, parse_quality
+from mp4ds.plan import Selection, parse_purpose, parse_quality
 from mp4ds.records import Excerpt
 from mp4ds.registry import plugin
 from mp4ds.video.encoder import tool_versions
@@ -30,7 +33,7 @@ TASK_NAME = r"source-[0-9]{1,9}|whole-[0-9]{1,9}|[0-9]{5,9}-[0-9]{1,9}|all"
 _MOST_THREADS = 4096
 _OUTCOME_OPTIONS = (
     *("topics", "exclude", "quality", "codec", "preset", "transcode", "camera_info"),
-    *("gop", "window", "salvage", "images"),
+    *("gop", "window", "salvage", "images", "purpose", "about"),
 )
 
 
@@ -174,6 +177,7 @@ class Job:
             raise ValueError("too many threads")
         if set(self.options) != set(_OUTCOME_OPTIONS):
             raise ValueError("other options")
+        self.about  # noqa: B018 - refuses what cannot be told
 
     @property
     def is_single(self) -> bool:
@@ -187,6 +191,12 @@ class Job:
             LookupError: There is none.
         """
         return {task.name: task for task in self.tasks}[name]
+
+    @property
+    def about(self) -> About | None:
+        """What is told of the recording."""
+        told = self.options["about"]
+        return None if told is None else About.model_validate(told)
 
     def open(self) -> BagReader:
         """The recording."""
@@ -232,6 +242,7 @@ class Job:
                 gop=options["gop"],
                 threads=self.threads,
                 transcode=options["transcode"],
+                purpose=parse_purpose(options["purpose"]),
             ),
             selected=Selection(options["topics"], options["exclude"]),
             excerpt=task.excerpt,
@@ -255,7 +266,7 @@ def open_recording(
     """Open what is to be packed.
 
     Args:
-        paths: Recordings that belong together, or a folder of images.
+        paths: Recordings and datasets that belong together, or a folder of images.
         salvage: Read what can be read of damaged recordings.
         images: How the folder of images is read; None for recordings.
 
@@ -263,14 +274,36 @@ def open_recording(
         SourceError: It cannot be read.
         OptionError: The options do not suit it.
     """
+    if salvage and any(map(dataset_at, paths)):
+        raise OptionError("`salvage` goes with recordings, not with a dataset.")
     if images is None:
-        return open_sources(paths, salvage=salvage)
+        return open_sources(paths, salvage=salvage, opener=_open_one)
     if salvage:
         raise OptionError("`salvage` goes with recordings, not with a folder of images.")
     if len(paths) != 1:
         raise OptionError(f"One folder of images is read at a time, and {len(paths)} were given.")
     reader: BagReader = plugin("images")(paths[0], images)
     return reader
+
+
+def dataset_at(path: Path) -> Path | None:
+    """The folder of a dataset that is to be packed again; None for a recording."""
+    folder = path.parent if path.name == MANIFEST_NAME else path
+    if folder.suffix in RECORDING_SUFFIXES:  # at a URL, a question less
+        return None
+    try:
+        return folder if (folder / MANIFEST_NAME).is_file() else None
+    except OSError:
+        return None  # whoever opens it says why
+
+
+def _open_one(path: Path) -> BagReader:
+    folder = dataset_at(path)
+    if folder is None:
+        return open_reader(path)
+    from mp4ds.dataset.recording import DatasetReader
+
+    return DatasetReader(folder)
 
 
 def _task(item: Mapping[str, Any]) -> Task:
@@ -288,6 +321,7 @@ def outcome_options(options: PackOptions) -> dict[str, Any]:
     """The options that decide what comes out, as JSON has them."""
     values = {name: getattr(options, name) for name in _OUTCOME_OPTIONS}
     values["gop"] = options.group_frames
+    values["about"] = None if options.about is None else document_of(load_about(options.about))
     values["images"] = None if options.images is None else asdict(options.images)
     return {
         name: list(value) if isinstance(value, (list, tuple)) else value

@@ -6,7 +6,7 @@ import json
 import stat
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,10 +14,13 @@ import xxhash
 
 from mp4ds._version import __version__
 from mp4ds.bags.protocols import BagReader, BagWriter, Format
+from mp4ds.bags.salvage.losses import bounded
 from mp4ds.errors import FormatError, SourceError
 from mp4ds.files.outputs import digest_file, write_synced
 from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME, of_types
 from mp4ds.format.manifest import (
+    About,
+    EarlierDataset,
     FileEntry,
     LossEntry,
     Manifest,
@@ -32,6 +35,7 @@ from mp4ds.format.sidecars import MANIFEST_NAME, dump_document, load_manifest, l
 from mp4ds.messages.png import zlib_build
 from mp4ds.messages.transforms import Transform, TransformCollector
 from mp4ds.packing.options import PackSummary, TopicSummary
+from mp4ds.plan import LOSSLESS
 from mp4ds.records import Channel, Loss
 from mp4ds.video.encoder import tool_versions
 
@@ -280,6 +284,76 @@ class Recorded(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Origin:
+    """What a dataset is made of.
+
+    Attributes:
+        sources: The files of the recording, whatever was made of them in between.
+        derived_from: Datasets that were packed again, the oldest first.
+        losses: What these lost of the recording.
+        left_out: Topics that they left out.
+        about: What is told of the recording.
+    """
+
+    sources: list[Source] = field(default_factory=list)
+    derived_from: list[EarlierDataset] = field(default_factory=list)
+    losses: list[Loss] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+    about: About | None = None
+
+    @classmethod
+    def of(
+        cls,
+        files: Sequence[Path],
+        digests: Iterable[tuple[str, int, str]],
+        about: About | None = None,
+    ) -> Origin:
+        """The origin of what was read.
+
+        Args:
+            files: The files of recordings, and of datasets that are packed again, each of which
+                begins with its manifest.
+            digests: Name, size in bytes and SHA-256 of each.
+            about: What is told of the recording; None for what the datasets tell, if it is one
+                thing.
+
+        Raises:
+            SourceError: A file is not what the manifest of its dataset says.
+        """
+        origin = cls()
+        told: list[About | None] = []
+        expected: dict[Path, FileEntry] = {}
+        for path, (name, size, sha256) in zip(files, digests, strict=True):
+            entry = expected.get(path)
+            if entry is not None:
+                if entry.sha256 != sha256:
+                    raise SourceError(
+                        path,
+                        "does not have the SHA-256 that its dataset's manifest says",
+                        "See `mp4ds validate`, and copy it again.",
+                    )
+            elif path.name == MANIFEST_NAME:
+                manifest = load_manifest(path)
+                origin._add_dataset(manifest, path, sha256)
+                told.append(manifest.about)
+                expected.update((path.with_name(item.name), item) for item in manifest.files)
+            else:
+                origin.sources.append(Source(name=name, size=size, sha256=sha256))
+        if about is None and told and all(item == told[0] for item in told):
+            about = told[0]
+        return replace(origin, about=about)
+
+    def _add_dataset(self, manifest: Manifest, path: Path, sha256: str) -> None:
+        self.sources.extend(manifest.sources)
+        self.derived_from.extend(manifest.derived_from)
+        self.derived_from.append(
+            EarlierDataset(name=path.parent.name, profile=manifest.profile, sha256=sha256)
+        )
+        self.losses.extend(entry.to_record() for entry in manifest.losses)
+        self.left_out.extend(manifest.topics_left_out)
+
+
 def declare_rest(
     part: PartRecord, reader: BagReader, selected: Callable[[str], bool], writer: BagWriter
 ) -> None:
@@ -312,15 +386,13 @@ def _channels_of(part: PartRecord) -> set[tuple[object, ...]]:
     return {model.to_record(0).identity for model in models}
 
 
-def write_manifest(
-    part: PartRecord, recording: Recorded, sources: Sequence[tuple[str, int, str]], profile: str
-) -> None:
+def write_manifest(part: PartRecord, recording: Recorded, origin: Origin, profile: str) -> None:
     """Write the manifest of a whole recording: the dataset is complete then.
 
     Args:
         part: All that was packed.
         recording: The recording.
-        sources: Name, size in bytes and SHA-256 of its files.
+        origin: What it was read from.
         profile: What was asked for.
     """
     digests = {
@@ -335,14 +407,16 @@ def write_manifest(
     manifest = Manifest(
         mp4ds=FORMAT_VERSION,
         kind="dataset",
+        about=origin.about,
         profile=profile,
         format=recording.format,
         recording_profile=recording.profile,
         library=recording.library,
-        sources=[Source(name=name, size=size, sha256=sha256) for name, size, sha256 in sources],
+        sources=origin.sources,
+        derived_from=origin.derived_from,
         messages=sum(topic.messages for topic in part.topics.values()),
-        losses=[LossEntry.from_record(loss) for loss in part.losses],
-        topics_left_out=list(part.left_out),
+        losses=list(map(LossEntry.from_record, bounded([*origin.losses, *part.losses]))),
+        topics_left_out=list(dict.fromkeys([*origin.left_out, *part.left_out])),
         time_range=TimeRange(start=part.span[0], end=part.span[1]) if part.span else None,
         streams=[
             StreamEntry(
@@ -379,13 +453,14 @@ def _static_transforms(part: PartRecord) -> list[StaticTransform]:
     return [StaticTransform.from_record(item) for item in collector.between(frame_ids)]
 
 
-def summarize(part: PartRecord, target: Path, source_bytes: int) -> PackSummary:
+def summarize(part: PartRecord, target: Path, source_bytes: int, origin: Origin) -> PackSummary:
     """What a pack did.
 
     Args:
         part: All that was packed.
         target: The dataset's final name.
         source_bytes: Bytes of the source files.
+        origin: What it was read from.
     """
     for stream in part.streams:
         video = stream.sidecar.video
@@ -408,16 +483,20 @@ def summarize(part: PartRecord, target: Path, source_bytes: int) -> PackSummary:
         left_out=list(part.left_out),
         skipped=dict(part.skipped),
         losses=part.losses,
-        larger=_why_larger(part, source_bytes, dataset_bytes, messages_bytes),
+        larger=_why_larger(part, source_bytes, dataset_bytes, messages_bytes, origin),
     )
 
 
 def _why_larger(
-    part: PartRecord, source_bytes: int, dataset_bytes: int, messages_bytes: int
+    part: PartRecord, source_bytes: int, dataset_bytes: int, messages_bytes: int, origin: Origin
 ) -> str:
     """A sentence where a dataset takes more than its source by more than 5 %; else empty."""
     if dataset_bytes <= _LARGER * source_bytes:
         return ""
+    if any(earlier.profile != LOSSLESS for earlier in origin.derived_from):
+        return "the videos of a lossy dataset are not encoded again as small as they were"
+    if origin.derived_from:
+        return "the dataset that it was read from has the smaller form"
     raw = sum(topic.raw_bytes for topic in part.topics.values())
     if raw <= source_bytes:
         return "a recording this small takes less than the index, definitions and sidecars"

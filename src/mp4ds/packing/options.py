@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mp4ds.errors import OptionError
 from mp4ds.options import Options, cluster, exclude, force, option, parse_size, topics
-from mp4ds.plan import parse_quality
+from mp4ds.plan import LOSSLESS, MAX_GOP, QualitySetting, parse_purpose, parse_quality
 from mp4ds.records import Loss
 
 
@@ -55,9 +55,10 @@ class PackOptions(Options):
 
     topics: Sequence[str] = topics()
     exclude: Sequence[str] = exclude()
-    quality: str = option(
-        "lossless, visual, crf=N, or a score to keep: vmaf=99.5, psnr=42, ssim=0.98.",
-        "lossless",
+    quality: str | None = option(
+        "lossless, visual, crf=N, or a score to keep: vmaf=99.5, psnr=42, ssim=0.98; by default "
+        "lossless, of a dataset as it was packed.",
+        None,
         "-q",
     )
     codec: str | None = option(
@@ -74,7 +75,8 @@ class PackOptions(Options):
         metavar="IMAGE=INFO",
     )
     purpose: str | None = option(
-        "archive: smallest files. training: fastest random access.",
+        "archive: smallest files. training: frames at random in the least time, lossless videos at "
+        "most 15 % larger; training=N: N %.",
         None,
         "--for",
         metavar="PURPOSE",
@@ -82,7 +84,7 @@ class PackOptions(Options):
     gop: int | None = option(
         "Most frames from a key frame to the next; 10 by default, 30 where lossy.",
         least=1,
-        most=100_000,
+        most=MAX_GOP,
     )
     window: int | None = option(
         "Frames of the busiest camera in a part of a long recording; 10 times `gop`, or 300.",
@@ -100,8 +102,20 @@ class PackOptions(Options):
     keep_going: bool = option("Where a part fails, go on with the others.", False)
     salvage: bool = option("Pack what can be read of a damaged recording.", False)
     restart: bool = option("Start over where an unfinished run was left.", False)
+    about: str | None = option(
+        "YAML with title, description, authors, license, doi, links or keywords.", metavar="FILE"
+    )
     force: bool = force()
     images: ImageFolder | None = option("How a folder of images is read as a recording.")
+
+    @property
+    def setting(self) -> QualitySetting:
+        """What `quality` says; lossless where it leaves that to the source.
+
+        Raises:
+            OptionError: `quality` is none.
+        """
+        return parse_quality(LOSSLESS if self.quality is None else self.quality)
 
     @property
     def group_frames(self) -> int:
@@ -110,16 +124,16 @@ class PackOptions(Options):
         Raises:
             OptionError: `quality` or `purpose` is none.
         """
-        from mp4ds.video.codecs import GOPS, LOSSLESS_GOP, LOSSY_GOP
+        from mp4ds.video.codecs import ARCHIVE_GOP, LOSSLESS_GOP, LOSSY_GOP, LOSSY_TRAINING_GOP
 
-        lossless = parse_quality(self.quality).lossless
-        if self.purpose is not None and self.purpose not in GOPS:
-            raise OptionError(f"`purpose` {self.purpose!r} is not one of {', '.join(GOPS)}.")
-        if self.purpose is not None and self.gop is not None:
+        purpose = parse_purpose(self.purpose)
+        if purpose is None:
+            return self.gop or (LOSSLESS_GOP if self.setting.lossless else LOSSY_GOP)
+        if self.gop is not None:
             raise OptionError("`purpose` chooses what `gop` says. Give one of them.")
-        if self.purpose is not None:
-            return GOPS[self.purpose]
-        return self.gop or (LOSSLESS_GOP if lossless else LOSSY_GOP)
+        if not purpose.is_training:
+            return ARCHIVE_GOP
+        return LOSSLESS_GOP if self.setting.lossless else LOSSY_TRAINING_GOP
 
 
 @dataclass(frozen=True)

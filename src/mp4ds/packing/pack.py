@@ -25,18 +25,25 @@ from mp4ds.errors import (
     TargetExistsError,
     WriteError,
 )
-from mp4ds.files.outputs import check_target, staged
+from mp4ds.files.outputs import check_target, digest_file, staged
 from mp4ds.files.sources import source_size, unchanged
 from mp4ds.files.urls import RemotePath, location, remote
-from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.format.sidecars import MANIFEST_NAME, load_about, load_manifest, load_stream
 from mp4ds.messages.serializations import is_camera
-from mp4ds.packing.job import Job, Task, absolute, open_recording, outcome_options
-from mp4ds.packing.manifest import PartRecord, dataset_files, folder_size, summarize, write_manifest
+from mp4ds.packing.job import Job, Task, absolute, dataset_at, open_recording, outcome_options
+from mp4ds.packing.manifest import (
+    Origin,
+    PartRecord,
+    dataset_files,
+    folder_size,
+    summarize,
+    write_manifest,
+)
 from mp4ds.packing.options import PackOptions, PackProgress, PackSummary
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
 from mp4ds.packing.planning import Resources, plan_job
 from mp4ds.packing.workplace import Workplace
-from mp4ds.plan import parse_quality
+from mp4ds.plan import LOSSLESS, parse_quality
 from mp4ds.registry import plugin
 from mp4ds.video.codecs import check_codec
 from mp4ds.video.encoder import check_hardware
@@ -174,9 +181,10 @@ def pack_in_one_pass(
     with unchanged(job.sources), SourceHasher(reader.path, reader.files) as hasher:
         part = Packer(reader, folder, job.settings(task, exact), progress).run()
         hasher.advance(None)
-    write_manifest(part, reader, hasher.digests, job.options["quality"])
+    origin = Origin.of(reader.files, hasher.digests, job.about)
+    write_manifest(part, reader, origin, job.options["quality"])
     progress(part, done=True)
-    return summarize(part, target, total)
+    return summarize(part, target, total, origin)
 
 
 # ---------------------------------------------------------------- pack
@@ -197,8 +205,8 @@ def pack(
     """Pack a recording into a dataset.
 
     Args:
-        sources: A bag, rosbag2 folder or MCAP file, or several that belong together; or URLs. A
-            folder of images where the options have `images`.
+        sources: A bag, rosbag2 folder, MCAP file or dataset, or several that belong together; or
+            URLs. A folder of images where the options have `images`.
         dataset: The folder to make, or its URL.
         options: How; the default loses nothing.
         progress: Called several times a second.
@@ -215,8 +223,9 @@ def pack(
         PartsFailedError: Parts of a long recording failed; those finished are kept beside the
             dataset, and calling again goes on with the others. Else nothing is left behind.
     """
-    chosen = _checked(options or PackOptions())
-    return _pack(_paths(sources), _absolute(dataset), chosen, progress)
+    paths = _paths(sources)
+    chosen = _checked(options or PackOptions(), paths)
+    return _pack(paths, _absolute(dataset), chosen, progress)
 
 
 def _pack(
@@ -275,14 +284,15 @@ def pack_share(
     Raises:
         Mp4dsError: As `pack`.
     """
-    chosen = _checked(options or PackOptions())
+    paths = _paths(sources)
+    chosen = _checked(options or PackOptions(), paths)
     target = _absolute(dataset)
     store = remote(target)
     if store:
         from mp4ds.files.uploads import local_path
 
         target = local_path(store)
-    run = _plan(_paths(sources), target, chosen, is_share=True)
+    run = _plan(paths, target, chosen, is_share=True)
     _pack_runs([run], chosen, progress, share=share)
 
 
@@ -308,10 +318,11 @@ def pack_each(
     Raises:
         Mp4dsError: As `pack`.
     """
-    chosen = _checked(options or PackOptions())
+    paths = _paths(sources)
+    chosen = _checked(options or PackOptions(), paths)
     parent = _absolute(folder)
     targets: dict[Path, Path] = {}
-    for source in map(location, sources):
+    for source in paths:
         target = parent / (source.name if source.is_dir() else source.stem)
         if target in targets:
             raise OptionError(
@@ -336,26 +347,33 @@ def _is_packed(source: Path, target: Path, options: PackOptions) -> bool:
     """Whether a dataset of a recording is there already."""
     if not (target / MANIFEST_NAME).exists() if remote(target) else not os.path.lexists(target):
         return False
-    with open_recording([source], images=options.images) as reader:
-        sizes = sorted(map(source_size, reader.files))
     try:
         manifest = load_manifest(target / MANIFEST_NAME)
     except FormatError:
         raise TargetExistsError(target) from None
-    if sorted(item.size for item in manifest.sources) != sizes:
+    folder = dataset_at(source)
+    if folder:
+        earlier = [item.sha256 for item in manifest.derived_from[-1:]]
+        is_same = earlier == [digest_file(folder / MANIFEST_NAME)[1]]
+    else:
+        with open_recording([source], images=options.images) as reader:
+            sizes = sorted(map(source_size, reader.files))
+        is_same = sorted(item.size for item in manifest.sources) == sizes
+    if not is_same:
         raise TargetExistsError(target)
     return True
 
 
-def _checked(options: PackOptions) -> PackOptions:
-    """Refuse options that contradict each other.
+def _checked(options: PackOptions, paths: Sequence[Path]) -> PackOptions:
+    """The options, with what is left to the sources; refuses those that contradict each other.
 
     Raises:
         OptionError: They do.
         HardwareError: An encoder is asked for that this machine has not.
         ScoringError: VMAF is asked for, and there is nothing that computes it.
     """
-    quality = parse_quality(options.quality)
+    asked = _quality_of(paths) if options.quality is None else options.quality
+    quality = parse_quality(asked)
     if options.transcode and quality.lossless:
         raise OptionError(
             "`transcode` goes with a lossy `quality`, such as visual: without loss, a JPEG file "
@@ -375,8 +393,38 @@ def _checked(options: PackOptions) -> PackOptions:
 
         find_ffmpeg()  # says how to get one before anything is read
     images = options.images.absolute() if options.images else None
-    return replace(
-        options, quality=str(quality), purpose=None, gop=options.group_frames, images=images
+    transcode = options.transcode or (not quality.lossless and _has_transcoded(paths))
+    chosen = replace(options, quality=str(quality), transcode=transcode, images=images)
+    if options.about is not None:
+        load_about(options.about)  # refuses what it cannot tell before anything is read
+    chosen.group_frames  # noqa: B018 - refuses a purpose that is none
+    return chosen
+
+
+def _quality_of(paths: Sequence[Path]) -> str:
+    """The quality of what was packed before; lossless for recordings.
+
+    Raises:
+        OptionError: It does not tell what is wanted now.
+    """
+    folders = [dataset_at(path) for path in paths]
+    found = {
+        load_manifest(folder / MANIFEST_NAME).profile if folder else LOSSLESS for folder in folders
+    }
+    if not found:
+        return LOSSLESS
+    if len(found) == 1 and parse_quality(*found).crf is None:
+        return found.pop()
+    raise OptionError(f"What was packed before has {', '.join(sorted(found))}. Give a `quality`.")
+
+
+def _has_transcoded(paths: Sequence[Path]) -> bool:
+    """Whether JPEG files were encoded anew when something was packed before."""
+    folders = [folder for path in paths if (folder := dataset_at(path))]
+    return any(
+        load_stream(folder / entry.sidecar).body == "jpeg"
+        for folder in folders
+        for entry in load_manifest(folder / MANIFEST_NAME).streams
     )
 
 

@@ -22,7 +22,7 @@ from mp4ds.packing.look import Looker, depends_on_others
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.survey import Decision, Survey, decide, rate_of, survey_channel, survey_pairs
 from mp4ds.packing.tracks import PicturePlan, StreamSettings, TargetPlan, needs_trial
-from mp4ds.plan import QualitySetting, Selection, parse_quality
+from mp4ds.plan import QualitySetting, Selection, parse_purpose
 from mp4ds.records import Channel
 from mp4ds.video.trial import encoder_bytes
 
@@ -217,12 +217,13 @@ def plan_job(
         return _single(reader, paths, options, means, _UNKNOWN_BYTES)
     topics, pairs = _topics(reader, channels, options)
     settings = StreamSettings(
-        quality=parse_quality(options.quality),
+        quality=options.setting,
         codec=options.codec,
         preset=options.preset,
         gop=options.group_frames,
         threads=_side_by_side(reader, means)[1],
         transcode=options.transcode,
+        purpose=parse_purpose(options.purpose),
     )
     needed = _assumed_bytes(reader, topics, settings)
     if not topics.free:

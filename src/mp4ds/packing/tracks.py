@@ -14,8 +14,8 @@ from mp4ds.format.models import Color, LayoutParameters
 from mp4ds.messages.encodings import ENCODINGS, Parameters
 from mp4ds.messages.layouts import Layout, bind, layout_for
 from mp4ds.packing.look import CameraMessage, StreamKey
-from mp4ds.plan import QualitySetting, QualityTarget, visual_setting
-from mp4ds.video.codecs import AV1, Recipe, lossless_codecs, recipe_for, remade
+from mp4ds.plan import MAX_GOP, Purpose, QualitySetting, QualityTarget, visual_setting
+from mp4ds.video.codecs import AV1, PURPOSE_PRESET, Recipe, lossless_codecs, recipe_for, remade
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.packets import PacketWriter
 from mp4ds.video.trial import choose
@@ -32,6 +32,7 @@ class StreamSettings:
         gop: Most frames between key frames.
         threads: Threads of each encoder.
         transcode: Whether JPEG topics are encoded anew.
+        purpose: What the dataset is for; None for nothing in particular.
     """
 
     quality: QualitySetting
@@ -40,6 +41,7 @@ class StreamSettings:
     gop: int
     threads: int
     transcode: bool = False
+    purpose: Purpose | None = None
 
 
 class Track(Protocol):
@@ -123,13 +125,20 @@ class TrackPlan(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PicturePlan:
-    """Pictures, encoded here. See `TrackPlan`."""
+    """Pictures, encoded here. See `TrackPlan`.
+
+    Attributes:
+        layout: How pixels become the picture.
+        recipe: Codec and options.
+        gop: Most frames between key frames; 0 for those of the settings.
+    """
 
     layout: Layout
     recipe: Recipe
     profile: str
     exact: bool
     note: str = ""
+    gop: int = 0
 
     def open(
         self, path: Path, seen: CameraMessage, settings: StreamSettings, rate: float | None
@@ -185,7 +194,7 @@ class _PictureTrack:
                     picture_format=layout.pixel_format,
                     width=width,
                     height=height,
-                    gop=settings.gop,
+                    gop=plan.gop or settings.gop,
                     threads=settings.threads,
                     rate=rate,
                 )
@@ -391,7 +400,8 @@ def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) ->
     if crf is None:  # a score is looked for from there
         crf, table_preset = visual_setting(rate)
         if settings.codec in (None, *AV1):
-            preset = preset or (_SCORE_PRESET if quality.target else str(table_preset))
+            usual = PURPOSE_PRESET if settings.purpose else str(table_preset)
+            preset = preset or (_SCORE_PRESET if quality.target else usual)
     recipe = recipe_for(
         layout.pixel_format,
         lossless=False,
@@ -439,7 +449,14 @@ def _lossless_plans(
     asked = settings.quality.lossless
     if not (asked or note):
         note = f"{encoding.name} is kept lossless"
-    tried = partial(choose, pixels, encoding, gop=settings.gop, threads=settings.threads)
+    tried = partial(
+        choose,
+        pixels,
+        encoding,
+        gop=settings.gop,
+        threads=settings.threads,
+        purpose=settings.purpose,
+    )
     codec = settings.codec if asked else None  # else they were meant for lossy videos
     try:
         try:
@@ -453,7 +470,7 @@ def _lossless_plans(
         raise Refused(str(error)) from None
     _refuse_noise(samples, best.bytes_per_frame)
     layout = bind(best.layout, encoding, best.parameters)
-    plan = PicturePlan(layout, best.recipe, "lossless", exact=True, note=note)
+    plan = PicturePlan(layout, best.recipe, "lossless", exact=True, note=note, gop=best.gop)
     general = layout_for(encoding, lossless=True)
     if general.name == layout.name:
         return [plan]
@@ -487,6 +504,7 @@ def plan_to_values(plan: TrackPlan) -> dict[str, Any]:
         values["encoding"] = layout.encoding.name
         values["parameters"] = layout.parameters.to_values()
         values["recipe"] = asdict(plan.recipe)
+        values["gop"] = plan.gop
     if isinstance(plan, TargetPlan):
         values["target"] = asdict(plan.target)
     return values
@@ -504,6 +522,9 @@ def plan_from_values(values: Mapping[str, Any]) -> TrackPlan:
     parameters = Parameters.from_values(values["parameters"])
     layout = bind(values["layout"], ENCODINGS[values["encoding"]], parameters)
     recipe = remade(layout.pixel_format, values["recipe"])
+    common["gop"] = gop = int(values["gop"])
+    if not 0 <= gop <= MAX_GOP:
+        raise ValueError(f"{gop} frames from one key frame to the next")
     if "target" in values:
         return TargetPlan(layout, recipe, target=QualityTarget(**values["target"]), **common)
     return PicturePlan(layout, recipe, **common)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import random
+import statistics
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -108,6 +112,61 @@ def _look(
         return at_recording(reader)
 
 
+@dataclass(frozen=True, slots=True)
+class ReadingSpeed:
+    """What the frames of a topic cost on this machine, as they are.
+
+    Attributes:
+        topic: The topic.
+        bytes_per_frame: Of its videos.
+        random_ms: Median time of one at a random place, milliseconds.
+        in_order_ms: Mean time of one of several that follow each other, milliseconds.
+    """
+
+    topic: str
+    bytes_per_frame: float
+    random_ms: float
+    in_order_ms: float
+
+
+_READS = 12
+_IN_ORDER = 30
+
+
+def reading_speeds(path: Path | str) -> list[ReadingSpeed]:
+    """Read some frames of each topic, and measure.
+
+    Args:
+        path: A dataset, or a video with its sidecar; or its URL.
+
+    Raises:
+        SourceError: It is no dataset, or cannot be read.
+        FormatError: The dataset breaks a rule of the format.
+    """
+    with Dataset(path) as dataset:
+        return [_reading_speed(dataset, topic) for topic in dataset.topics]
+
+
+def _reading_speed(dataset: Dataset, topic: str) -> ReadingSpeed:
+    streams = [stream for stream in dataset.streams if stream.topic == topic]
+    stream = max(streams, key=len)
+    numbers = random.Random(0)
+    stream.read([0], format="native")
+    times = []
+    for _ in range(_READS):
+        number = numbers.randrange(len(stream))
+        begun = time.perf_counter()
+        stream.read([number], format="native")
+        times.append(time.perf_counter() - begun)
+    count = min(_IN_ORDER, len(stream))
+    begun = time.perf_counter()
+    for _ in islice(stream, count):
+        pass
+    in_order = (time.perf_counter() - begun) / count
+    size = stream.video_path.stat().st_size / len(stream)
+    return ReadingSpeed(topic, size, 1e3 * statistics.median(times), 1e3 * in_order)
+
+
 def _recording_info(reader: BagReader) -> Info:
     size = sum(file.stat().st_size for file in reader.files)
     result = Info(reader.path, reader.format, reader.profile, size)
@@ -198,6 +257,11 @@ def _dataset_info(dataset: Dataset) -> Info:
             f"{item.reason}"
             for item in dataset.manifest.verbatim
         ]
+        if dataset.manifest.about:
+            result.notes += dataset.manifest.about.lines
+        if dataset.manifest.derived_from:
+            earlier = (f"{item.name} ({item.profile})" for item in dataset.manifest.derived_from)
+            result.notes.append(f"packed again from {', '.join(earlier)}")
         if dataset.manifest.topics_left_out:
             left_out = ", ".join(dataset.manifest.topics_left_out)
             result.notes.append(f"left out when packed: {left_out}")

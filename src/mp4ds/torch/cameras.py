@@ -5,12 +5,9 @@ from __future__ import annotations
 import gc
 import os
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
 
@@ -20,15 +17,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mp4ds.dataset.dataset import open_dataset
-from mp4ds.dataset.frames import Video
 from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.video import Video
 from mp4ds.dataset.views import FORMATS
 from mp4ds.errors import FormatError, Mp4dsError, OptionError, Refused, SampleError, VideoError
-from mp4ds.files.urls import location, remote, spelled
+from mp4ds.files.urls import location, spelled
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
-from mp4ds.messages.layouts import LAYOUTS
 from mp4ds.times import nearest, synchronize
-from mp4ds.video.codecs import TEN_BITS
+from mp4ds.torch.torchcodec import TorchcodecReader
 from mp4ds.video.mp4 import read_sample_table
 
 Resize = float | tuple[int, int]
@@ -95,21 +91,36 @@ class Pictures:
         """
         if pixels.ndim == 3:
             pixels = pixels.unsqueeze(-1)
-        if self.dtype == "uint8" and pixels.dtype != torch.uint8:
-            kind = str(pixels.dtype).removeprefix("torch.")
+        self.check(pixels.dtype, topic)
+        if self.dtype == "float32":
+            pixels = _floats(pixels, scaled=format_name != "native")
+        return self.arranged(pixels)
+
+    def check(self, dtype: torch.dtype, topic: str) -> None:
+        """Refuse pixels that are no bytes, where these were asked for.
+
+        Raises:
+            OptionError: They are not.
+        """
+        if self.dtype == "uint8" and dtype != torch.uint8:
+            kind = str(dtype).removeprefix("torch.")
             raise OptionError(
                 f"topic {topic}: has frames of {kind}, not uint8. Give dtype='native' to have "
                 "them as they are, or dtype='float32'."
             )
-        if self.dtype == "float32":
-            pixels = _floats(pixels, scaled=format_name != "native")
-        return pixels.permute(0, 3, 1, 2) if self.channels_first else pixels
+
+    def arranged(self, pixels: Tensor) -> Tensor:
+        """Pixels of shape (..., H, W, C) with the channels where they are wanted; a view."""
+        return pixels.movedim(-1, -3) if self.channels_first else pixels
 
 
-def _floats(pixels: Tensor, *, scaled: bool) -> Tensor:
+def _floats(pixels: Tensor, *, scaled: bool, out: Tensor | None = None) -> Tensor:
+    """Pixels as float32, in a new tensor or in `out`."""
+    if out is None:
+        out = torch.empty(pixels.shape, dtype=torch.float32)
     if not scaled or pixels.dtype.is_floating_point:
-        return pixels.to(torch.float32)
-    return pixels.to(torch.float32).div_(torch.iinfo(pixels.dtype).max)
+        return out.copy_(pixels)
+    return torch.div(pixels, torch.iinfo(pixels.dtype).max, out=out)
 
 
 def pictures_from(
@@ -164,110 +175,6 @@ def _each(name: str, given: _T | Mapping[str, _T], topics: Sequence[str], defaul
             f"{', '.join(topics)}."
         )
     return [given.get(topic, default) for topic in topics]
-
-
-# ---------------------------------------------------------------- codec
-
-
-class TorchcodecReader:
-    """Decodes a stream's video by ``torchcodec.decoders.VideoDecoder``.
-
-    Args:
-        stream: The stream.
-        crop: x, y, width, height, pixels; None: all.
-        device: Such as ``cpu`` or ``cuda``.
-
-    Raises:
-        OptionError: torchcodec is missing, mistakes the video's range, or the video's pictures
-            are not the images.
-        VideoError: It cannot open the video.
-    """
-
-    def __init__(self, stream: Stream | Video, crop: Crop | None, device: str) -> None:
-        self._path = stream.video_path
-        if isinstance(stream, Stream):
-            _check_layout(stream)
-        if remote(self._path):
-            raise OptionError(f"{self._path}: backend='torchcodec' reads local files alone.")
-        columns, rows = stream.image_size
-        x, y, width, height = crop or (0, 0, columns, rows)
-        if not (0 <= x < x + width <= columns and 0 <= y < y + height <= rows):
-            raise OptionError(f"topic {stream.topic}: crop {crop} is not within {columns}x{rows}.")
-        self._rows, self._columns = slice(y, y + height), slice(x, x + width)
-        self._decoder = self._opened(device)
-        self._check_range(stream)
-
-    def _opened(self, device: str) -> Any:
-        if find_spec("torchcodec") is None:
-            raise OptionError(
-                "backend='torchcodec' needs torchcodec. Install it with: pip install torchcodec"
-            )
-        try:
-            module = import_module("torchcodec.decoders")
-        except (ImportError, OSError, RuntimeError) as error:
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-            raise OptionError(f"torchcodec is installed but cannot be used: {reason}") from None
-        try:
-            # with exact seeking, frame n is the n-th shown, whatever its presentation time
-            return module.VideoDecoder(
-                str(self._path), dimension_order="NHWC", device=device, seek_mode="exact"
-            )
-        except (RuntimeError, ValueError) as error:
-            raise self._refused(error) from None
-
-    def _check_range(self, stream: Stream | Video) -> None:
-        """Refuse a video whose range torchcodec mistakes.
-
-        Of AV1, torchcodec 0.13 on a CPU was seen to take the full range for the limited one: the
-        contrast is then 255 / 219 of what it is, and what is dark or bright is lost.
-        """
-        if not len(stream):
-            return
-        with closing(stream):  # it opens its video again where that is asked of it
-            first = stream.read([0], format="rgb")[0]
-        ours = first[self._rows, self._columns].astype(np.int16)
-        mistaken = ((ours - 16) * (255 / 219)).clip(0, 255)
-        theirs = self.read([0])[0].cpu().numpy()
-        if np.abs(theirs - mistaken).mean() < np.abs(theirs - ours).mean():
-            raise OptionError(
-                f"topic {stream.topic}: torchcodec takes its video of the full range for one of "
-                "the limited, so that the contrast would be wrong. Use backend='mp4ds', or a "
-                "dataset that was packed with `codec` h264."
-            )
-
-    def _refused(self, error: Exception) -> VideoError:
-        reason = " ".join(str(error).split()[:40])
-        return VideoError("decode-failed", self._path, f"torchcodec cannot decode it: {reason}")
-
-    def read(self, frames: list[int]) -> Tensor:
-        """Frames in the order asked for, repeated as asked; shape (N, H, W, 3), uint8.
-
-        Raises:
-            VideoError: One does not decode.
-        """
-        try:
-            pixels: Tensor = self._decoder.get_frames_at(frames).data
-        except (RuntimeError, IndexError, ValueError) as error:
-            raise self._refused(error) from None
-        return pixels[:, self._rows, self._columns]
-
-    def close(self) -> None:
-        """Let the decoder go."""
-        self._decoder = None
-
-
-def _check_layout(stream: Stream) -> None:
-    """Refuse pictures that are not the images, or that have more than 8 bits.
-
-    Of lossy videos, 10 bits hold images of 8.
-    """
-    image, video = stream.sidecar.image, stream.sidecar.video
-    is_8_bits = video.pixel_format in (None, TEN_BITS) or not video.pixel_format.endswith("le")
-    if not LAYOUTS[video.layout].is_shown or not is_8_bits:
-        raise OptionError(
-            f"topic {stream.topic}: {image.encoding} images are stored in the layout "
-            f"{video.layout}, which torchcodec does not turn into colours. Use backend='mp4ds'."
-        )
 
 
 # ---------------------------------------------------------------- recordings
@@ -464,7 +371,7 @@ class TensorReader(Protocol):
 
 
 class StreamReader:
-    """Decodes by ``read`` of a stream.
+    """Decodes by ``read`` of a stream; see `TensorReader`.
 
     Args:
         stream: The stream.
@@ -480,6 +387,14 @@ class StreamReader:
         view = self._view
         pixels = self._stream.read(frames, format=view.format, resize=view.resize, crop=view.crop)
         return torch.from_numpy(pixels)  # shares the memory
+
+    def read_into(self, frames: list[int], outs: Sequence[Tensor]) -> None:
+        """Frames into tensors of their own, each of shape (H, W) or (H, W, C)."""
+        view = self._view
+        arrays = [out.numpy() for out in outs]  # which share the memory
+        self._stream.read_into(
+            frames, arrays, format=view.format, resize=view.resize, crop=view.crop
+        )
 
     def close(self) -> None:
         """As `TensorReader.close`."""
@@ -566,13 +481,59 @@ class OpenCamera:
             OptionError: They cannot be had as asked.
         """
         numbers: list[int] = frames.tolist()
+        pixels = self._decoded(numbers, lambda: self._reader.read(numbers))
+        return self._pictures.tensor(pixels, self.source.topic, self._view.format)
+
+    def empty(self, shape: tuple[int, ...]) -> Tensor | None:
+        """A tensor for frames, such as `read_into` takes.
+
+        Args:
+            shape: That its frames are to have among each other.
+
+        Returns:
+            Shape (*shape, H, W, C); None where frames are not decoded into tensors that are there.
+
+        Raises:
+            OptionError: The frames cannot be had as asked.
+        """
+        if not isinstance(self._reader, StreamReader):
+            return None
+        row = self._reader.read([])
+        self._pictures.check(row.dtype, self.source.topic)
+        dtype = torch.float32 if self._pictures.dtype == "float32" else row.dtype
+        channels = row.shape[3:] or (1,)
+        return torch.empty((*shape, *row.shape[1:3], *channels), dtype=dtype)
+
+    def read_into(self, frames: NDArray[np.int64], outs: Sequence[Tensor]) -> None:
+        """Frames into tensors that are there, decoded in one pass.
+
+        Args:
+            frames: Numbers, shape (N,), in any order.
+            outs: A row for each of a tensor as `empty` gives, shape (H, W, C).
+
+        Raises:
+            SampleError: One of them cannot be decoded.
+        """
+        reader = self._reader
+        if not isinstance(reader, StreamReader):
+            raise TypeError("the frames are not decoded into memory")
+        numbers: list[int] = frames.tolist()
+        if self._pictures.dtype == "float32":
+            pixels = self._decoded(numbers, lambda: reader.read(numbers))
+            for row, out in zip(pixels, outs, strict=True):
+                _floats(row.view(out.shape), scaled=self._view.format != "native", out=out)
+            return
+        is_grey = outs[0].shape[-1] == 1
+        rows = [out.squeeze(-1) for out in outs] if is_grey else list(outs)
+        self._decoded(numbers, lambda: reader.read_into(numbers, rows))
+
+    def _decoded(self, numbers: list[int], decode: Callable[[], _T]) -> _T:
         try:
-            pixels = self._reader.read(numbers)
+            return decode()
         except OptionError:
             raise
         except Mp4dsError as error:
             raise self._first_failure(numbers, error) from None
-        return self._pictures.tensor(pixels, self.source.topic, self._view.format)
 
     def _first_failure(self, numbers: list[int], error: Mp4dsError) -> Mp4dsError:
         """Which frame it was, since a sentence about many does not always tell."""

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from math import prod
 from operator import index as as_integer
 from typing import Any, Literal, Protocol, SupportsIndex
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, default_collate, get_worker_info
 
 from mp4ds.errors import Mp4dsError, OptionError, SampleError
 from mp4ds.torch.cameras import (
@@ -122,6 +123,65 @@ Sample = dict[str, Any]
 Transform = Callable[[Sample], Any]
 
 
+class Batch:
+    """Tensors that the samples of a batch are rows of, so that collating copies nothing.
+
+    Args:
+        samples: How many there are.
+        frames: Of each.
+        shared: Whether other processes are to have them.
+    """
+
+    def __init__(self, samples: int, frames: int, *, shared: bool) -> None:
+        self._shape = (samples, frames)
+        self._shared = shared
+        self._tensors: dict[int, torch.Tensor] = {}
+
+    def tensor_for(self, camera: OpenCamera, number: int) -> torch.Tensor | None:
+        """The tensor of the camera of a number, of shape (samples, frames, H, W, C).
+
+        Returns:
+            None where frames of this recording are not made in such a one.
+        """
+        found = camera.empty((0, 0))
+        if found is None:
+            return None
+        if number not in self._tensors:
+            self._tensors[number] = self._empty(found)
+        known = self._tensors[number]
+        alike = (known.shape[2:], known.dtype) == (found.shape[2:], found.dtype)
+        return known if alike else None
+
+    def _empty(self, like: torch.Tensor) -> torch.Tensor:
+        shape = (*self._shape, *like.shape[2:])
+        if not self._shared:
+            return like.new_empty(shape)
+        # as torch's own collation does in a worker
+        storage = torch.UntypedStorage._new_shared(prod(shape) * like.itemsize)
+        return like.new_empty(0).set_(storage, 0, shape)
+
+
+def _whole(rows: Sequence[Any]) -> Any:
+    """The tensor that rows make up in their order; a new one where they do not."""
+    first = rows[0]
+    if not all(isinstance(row, torch.Tensor) for row in rows):
+        return default_collate(rows)
+    begin = first.storage_offset()
+    step = rows[1].storage_offset() - begin if len(rows) > 1 else first.numel()
+    kind = _kind(first)
+    if step < first.numel() or any(
+        _kind(row) != kind or row.storage_offset() != begin + number * step
+        for number, row in enumerate(rows)
+    ):
+        return default_collate(rows)
+    return first.as_strided((len(rows), *first.shape), (step, *first.stride()), begin)
+
+
+def _kind(row: torch.Tensor) -> tuple[object, ...]:
+    """What rows of one tensor have in common."""
+    return row.untyped_storage().data_ptr(), row.dtype, row.device, row.shape, row.stride()
+
+
 class SampleReader:
     """Reads the samples of a collection.
 
@@ -147,6 +207,7 @@ class SampleReader:
         self._collection = collection
         self._offsets = offsets
         self._transform = transform
+        self._pictures = pictures
         self.cameras = OpenCameras(cache_files, pictures)
 
     def key_frames(self, number: int) -> NDArray[np.int64]:
@@ -159,12 +220,24 @@ class SampleReader:
         with _named(recording.path, self._collection.topics[0]):
             return self.cameras.get(recording, 0).key_frames
 
-    def read(self, number: int, rows: NDArray[np.int64]) -> list[Any]:
+    def batch(self, samples: int, *, shared: bool) -> Batch:
+        """For so many samples; see `Batch`."""
+        return Batch(samples, len(self._offsets.steps), shared=shared)
+
+    def read(
+        self,
+        number: int,
+        rows: NDArray[np.int64],
+        batch: Batch | None = None,
+        places: Sequence[int] = (),
+    ) -> list[Any]:
         """Samples of one recording; the frames of each camera are decoded in one pass.
 
         Args:
             number: Of the recording.
             rows: The samples, shape (N,), in any order.
+            batch: What they are part of; None: nothing.
+            places: Their places in it.
 
         Raises:
             SampleError: A frame cannot be read.
@@ -178,7 +251,11 @@ class SampleReader:
             with _named(recording.path, topic):
                 camera = self.cameras.get(recording, camera_number)
                 frames, padded = self._offsets.frames(recording, camera_number, camera, rows)
-                tensors = self._windows(camera, frames)
+                whole = None if batch is None else batch.tensor_for(camera, camera_number)
+                if whole is None:
+                    tensors = self._windows(camera, frames)
+                else:
+                    tensors = self._rows(camera, frames, [whole[place] for place in places])
                 if camera_number == 0:
                     stamps = camera.stamps[recording.frames(rows, 0)].tolist()
             flags = torch.from_numpy(padded)
@@ -196,6 +273,14 @@ class SampleReader:
         if self._offsets == Offsets():
             return tensors
         return tensors.unflatten(0, frames.shape)
+
+    def _rows(
+        self, camera: OpenCamera, frames: NDArray[np.int64], rows: Sequence[torch.Tensor]
+    ) -> list[torch.Tensor]:
+        """As `_windows`, read into rows of a batch's tensor, each of shape (T, H, W, C)."""
+        camera.read_into(frames.ravel(), [frame for row in rows for frame in row])
+        arranged = [self._pictures.arranged(row) for row in rows]
+        return [row[0] for row in arranged] if self._offsets == Offsets() else arranged
 
 
 @contextmanager
@@ -227,7 +312,8 @@ class FrameDataset(Dataset):
     T is the number of offsets; with the default, one, tensors are (C, H, W). C is 1 for grey
     images. ``is_pad`` tells which frames stand in for some that are not there. ``stamp_ns`` is the
     header stamp of the first topic's frame, ``index`` the sample's number, ``dataset`` that of
-    the path. Tensors are views of an array that they share with no other sample's.
+    the path. The samples of a batch are rows of one tensor for each camera, which `collate` gives
+    as it is: copy those that you keep.
 
     Of several cameras, a sample has the frames that belong together: they are matched by header
     stamp (`mp4ds.Dataset.sync`), each frame at most once, and `unmatched` has the others.
@@ -295,6 +381,7 @@ class FrameDataset(Dataset):
             device=device,
         )
         self._reader = SampleReader(self._collection, pictures, chosen, transform, cache_files)
+        self._collates = False
 
     @property
     def topics(self) -> tuple[str, ...]:
@@ -334,13 +421,31 @@ class FrameDataset(Dataset):
         wanted = np.array([self._number(index) for index in indices], np.int64)
         recordings, rows = self._collection.locate(wanted)
         samples: list[Any] = [None] * len(wanted)
+        shared = self._collates and get_worker_info() is not None
+        batch = self._reader.batch(len(wanted), shared=shared)
         for number in np.unique(recordings).tolist():
-            places = np.flatnonzero(recordings == number)
-            for place, sample in zip(
-                places.tolist(), self._reader.read(number, rows[places]), strict=True
-            ):
+            places = np.flatnonzero(recordings == number).tolist()
+            found = self._reader.read(number, rows[places], batch, places)
+            for place, sample in zip(places, found, strict=True):
                 samples[place] = sample
         return samples
+
+    def collate(self, samples: Sequence[Any]) -> Any:
+        """What `torch.utils.data.default_collate` makes of samples, without copying frames.
+
+        For ``DataLoader(dataset, collate_fn=dataset.collate)``. Samples of one batch are rows of
+        one tensor for each camera, which is given as it is; with channels first, it is in the
+        memory format ``channels_last``. Workers then read into memory that is shared with the
+        process of the loader. What is not so, such as what a `transform` made, is collated as
+        usual.
+
+        Args:
+            samples: Of one batch.
+        """
+        self._collates = True  # the next batch is read where it can stay
+        if not samples or not all(isinstance(sample, dict) for sample in samples):
+            return default_collate(samples)
+        return {key: _whole([sample[key] for sample in samples]) for key in samples[0]}
 
     def _number(self, index: SupportsIndex) -> int:
         number = as_integer(index)

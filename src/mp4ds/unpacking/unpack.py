@@ -181,7 +181,7 @@ _OURS = "mp4ds:"  # metadata records by which a dataset remembers what a rosbag2
 
 def unpack(
     dataset: Path | str,
-    to: str,
+    to: str | None = None,
     output: Path | str | None = None,
     options: UnpackOptions | None = None,
     *,
@@ -193,7 +193,8 @@ def unpack(
 
     Args:
         dataset: A dataset, or one video with its sidecar; or its URL.
-        to: ``bag``, ``rosbag2``, ``mcap`` or ``images``.
+        to: ``bag``, ``rosbag2``, ``mcap`` or ``images``; None for the recording's own format, of
+            one video ``mcap``.
         output: The file or folder to make, or its URL; None for the dataset's name beside it, or
             in the current folder where the dataset is at a URL.
         options: How.
@@ -210,6 +211,8 @@ def unpack(
         RemoteError: A store or web server fails.
     """
     chosen = options or UnpackOptions()
+    if to is None:
+        to = _own_format(dataset)
     _check(to, chosen)
     store = remote(location(output)) if output else None
     if store:
@@ -228,6 +231,11 @@ def unpack(
                 if error.errno is None:
                     raise
                 raise WriteError(target, error) from error
+
+
+def _own_format(dataset: Path | str) -> str:
+    with Dataset(dataset) as opened:
+        return opened.manifest.format if opened.manifest else "mcap"
 
 
 def _check(to: str, options: UnpackOptions) -> None:

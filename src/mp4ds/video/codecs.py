@@ -176,7 +176,9 @@ HARDWARE: Mapping[str, HardwareEncoder] = MappingProxyType(
 
 # most frames between key frames, chosen by what they cost (spec/notes.md)
 LOSSLESS_GOP, LOSSY_GOP = 10, 30
-GOPS = {"archive": 120, "training": 10}
+ARCHIVE_GOP, LOSSY_TRAINING_GOP = 120, 15
+PURPOSE_PRESET = "4"
+"""Of SVT-AV1 where it is known what a dataset is for."""
 
 _X264 = MappingProxyType({"bf": "0"})  # without B-frames, frames are coded in the order shown
 _X265 = "bframes=0:open-gop=0"  # an open GOP cannot be sought exactly
@@ -215,6 +217,7 @@ class _Coding:
     options: Mapping[str, str]
     default_preset: str = ""
     tuning: str = ""  # further x264 parameters of the default preset
+    fast: Mapping[str, str] | None = None  # further options by which it decodes in less time
     tried: bool = True  # without being asked for
     codec: str = ""  # name in the registry, where that is another one
 
@@ -224,6 +227,9 @@ _SAME_HEADERS = "stitchable=1"  # parameter sets that do not depend on the crf
 _CENTRED = "chromaloc=1"
 _FFV1 = MappingProxyType({"level": "3", "slicecrc": "1", "slices": "4"})
 _FFV1_8BIT = MappingProxyType({**_FFV1, "coder": "range_tab", "context": "1"})
+# its Golomb-Rice coder takes 8 bits
+_FFV1_FAST = MappingProxyType({"coder": "rice", "context": "0"})
+_X264_FAST = MappingProxyType({"x264-params": "cabac=0"})
 _YUV = ("yuv420p", "yuv422p", "yuv444p")
 
 
@@ -232,12 +238,18 @@ _TUNING = "ref=3:mixed-refs=1:subme=5:me=dia:weightp=0:scenecut=0"
 
 
 def _x264_lossless(pixel_format: str) -> _Coding:
-    return _Coding("libx264", pixel_format, {**_X264, "qp": "0"}, "veryfast", _TUNING)
+    given = {**_X264, "qp": "0"}
+    return _Coding("libx264", pixel_format, given, "veryfast", _TUNING, _X264_FAST)
+
+
+def _ffv1_8bit(pixel_format: str) -> _Coding:
+    return _Coding("ffv1", pixel_format, _FFV1_8BIT, fast=_FFV1_FAST)
 
 
 def _x264_rgb(pixel_format: str) -> _Coding:
     tuning = f"{_TUNING}:8x8dct=0:partitions=p8x8"
-    return _Coding("libx264rgb", pixel_format, {**_X264, "qp": "0"}, "veryfast", tuning)
+    given = {**_X264, "qp": "0"}
+    return _Coding("libx264rgb", pixel_format, given, "veryfast", tuning, _X264_FAST)
 
 
 def _x265_lossless(pixel_format: str) -> _Coding:
@@ -249,7 +261,7 @@ def _x265_lossless(pixel_format: str) -> _Coding:
 
 # picture format -> codec -> coding; the first is the default
 _LOSSLESS: dict[str, dict[str, _Coding]] = {
-    "gray": {"h264": _x264_lossless("gray"), "ffv1": _Coding("ffv1", "gray", _FFV1_8BIT)},
+    "gray": {"h264": _x264_lossless("gray"), "ffv1": _ffv1_8bit("gray")},
     "gray10le": {
         "h264": _x264_lossless("gray10le"),
         "ffv1": _Coding("ffv1", "gray10le", _FFV1),
@@ -263,21 +275,18 @@ _LOSSLESS: dict[str, dict[str, _Coding]] = {
     "gray16le": {"ffv1": _Coding("ffv1", "gray16le", _FFV1)},
     **{
         packed: {
-            "ffv1": _Coding("ffv1", "bgr0", _FFV1_8BIT),
+            "ffv1": _ffv1_8bit("bgr0"),
             "h264": _x264_rgb(packed),
         }
         for packed in ("rgb24", "bgr24")
     },
-    **{packed: {"ffv1": _Coding("ffv1", "bgra", _FFV1_8BIT)} for packed in ("rgba", "bgra")},
+    **{packed: {"ffv1": _ffv1_8bit("bgra")} for packed in ("rgba", "bgra")},
     **{
         planar: {"ffv1": _Coding("ffv1", planar, _FFV1)}
         for bits in (10, 12, 14, 16)
         for planar in (f"gbrp{bits}le", f"gbrap{bits}le")
     },
-    **{
-        planar: {"h264": _x264_lossless(planar), "ffv1": _Coding("ffv1", planar, _FFV1_8BIT)}
-        for planar in _YUV
-    },
+    **{planar: {"h264": _x264_lossless(planar), "ffv1": _ffv1_8bit(planar)} for planar in _YUV},
 }
 _X26X_PRESETS = (
     *("ultrafast", "superfast", "veryfast", "faster", "fast"),
@@ -418,6 +427,7 @@ def recipe_for(
     crf: int | None = None,
     preset: str | None = None,
     varied: bool = False,
+    fast: bool = False,
 ) -> Recipe:
     """The recipe for pictures of a pixel format.
 
@@ -429,6 +439,7 @@ def recipe_for(
         crf: Constant rate factor of a lossy recipe.
         preset: The encoder's preset, or None for the default; encoders without ignore it.
         varied: Whether videos with several crf are to be joined to one.
+        fast: Of a lossless recipe, the form that decodes in less time and is larger.
 
     Raises:
         OptionError: The codec is unknown or cannot do it; names those that can.
@@ -455,6 +466,12 @@ def recipe_for(
         options["preset"] = preset or coding.default_preset
     if coding.tuning and preset is None:
         options["x264-params"] = coding.tuning
+    if fast:
+        if coding.fast is None or not lossless:
+            raise OptionError(f"codec {name} has no faster form for {pixel_format} pictures")
+        for key, value in coding.fast.items():
+            known = options.get(key) if key.endswith("-params") else None
+            options[key] = f"{known}:{value}" if known else value
     is_yuv = pixel_format in _YUV
     is_rgb = coding.pixel_format.startswith(("rgb", "bgr", "gbr"))
     return Recipe(
@@ -483,12 +500,14 @@ def remade(pixel_format: str, values: Mapping[str, Any]) -> Recipe:
     lossless = bool(values["lossless"])
     preset, crf = (values["options"].get(name) for name in ("preset", "crf"))
     for name in _LOSSLESS[pixel_format] if lossless else (*_LOSSY, *HARDWARE):
+        fast = (False, True) if lossless and _LOSSLESS[pixel_format][name].fast else (False,)
+        varied = (False,) if lossless else (False, True)
         known = preset if preset in _PRESETS[name] else None
         if name in HARDWARE:
             crfs: Iterable[int | None] = range(1, MAX_CRF[name] + 1)
         else:
             crfs = [None if crf is None else int(crf)]
-        for choice in product(crfs, {known, None}, (False, True)):
+        for choice in product(crfs, {known, None}, varied, fast):
             recipe = recipe_for(
                 pixel_format,
                 lossless=lossless,
@@ -496,6 +515,7 @@ def remade(pixel_format: str, values: Mapping[str, Any]) -> Recipe:
                 crf=choice[0],
                 preset=choice[1],
                 varied=choice[2],
+                fast=choice[3],
             )
             if asdict(recipe) == values:
                 return recipe

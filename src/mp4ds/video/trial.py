@@ -1,11 +1,13 @@
-"""Which layout and codec make the smallest video of a stream, and how much memory encoders take."""
+"""Which layout and codec suit a stream best, and how much memory encoders take."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from itertools import product
 from typing import Any
 
 import av
@@ -16,7 +18,8 @@ from mp4ds.errors import EncoderRefusedError, OptionError
 from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.encodings import MAX_SIDE, Encoding, Parameters, Pixels
 from mp4ds.messages.layouts import Layout, fit
-from mp4ds.video.codecs import TEN_BITS, Recipe, codecs_to_try, recipe_for
+from mp4ds.plan import Purpose
+from mp4ds.video.codecs import CODECS, TEN_BITS, Recipe, codecs_to_try, recipe_for
 from mp4ds.video.encoder import coded_size, color_range, open_encoder
 from mp4ds.video.media import raise_if_scarce
 from mp4ds.video.pixels import PictureConverter, picture_to_frame
@@ -180,49 +183,63 @@ class Choice:
         parameters: Of the layout; with them, it may refuse later images.
         recipe: Codec and options.
         bytes_per_frame: Estimated size of a coded image.
+        gop: Frames from one key frame to the next.
     """
 
     layout: str
     parameters: Parameters
     recipe: Recipe
     bytes_per_frame: float
+    gop: int
 
 
-def estimate(
+@dataclass(frozen=True, slots=True)
+class Coded:
+    """What a few consecutive pictures cost, of which the first is a key frame.
+
+    That the others are like all others of a group of pictures is what is assumed.
+
+    Attributes:
+        key: Bytes of the key frame.
+        other: Mean bytes of the others.
+        key_seconds: CPU time of decoding the key frame; 0 where it was not measured.
+        other_seconds: Mean CPU time of decoding another.
+    """
+
+    key: float
+    other: float
+    key_seconds: float = 0.0
+    other_seconds: float = 0.0
+
+    def bytes_per_frame(self, gop: int) -> float:
+        """Bytes of a coded frame of a long video with a key frame every `gop` frames."""
+        return (self.key + (gop - 1) * self.other) / gop
+
+    def random_seconds(self, gop: int) -> float:
+        """Mean CPU time until a frame at a random place is decoded."""
+        return self.key_seconds + (gop - 1) / 2 * self.other_seconds
+
+
+def encode_on_trial(
     pictures: Sequence[Picture],
     recipe: Recipe,
     *,
     picture_format: str,
-    gop: int,
     threads: int,
-) -> float:
-    """Bytes of a coded frame of a long video, from a few consecutive pictures.
-
-    The first is a key frame; that the others are like all others of a group of pictures is
-    what is assumed.
+    timed: bool = False,
+) -> Coded:
+    """What pictures cost.
 
     Args:
-        pictures: At least one, all of one size.
+        pictures: Consecutive ones, at least one, all of one size.
         recipe: Codec and options.
         picture_format: Pixel format of the pictures.
-        gop: Frames from one key frame to the next.
         threads: Threads of the encoder.
+        timed: Measure decoding, too.
 
     Raises:
         EncoderRefusedError: The codec does not take such pictures.
     """
-    sizes = [0] * len(pictures)
-    for number, size in _packets(pictures, recipe, picture_format, threads):
-        sizes[number] += size
-    if gop == 1 or len(sizes) == 1:
-        return float(sizes[0])
-    return (sizes[0] + (gop - 1) * sum(sizes[1:]) / (len(sizes) - 1)) / gop
-
-
-def _packets(
-    pictures: Sequence[Picture], recipe: Recipe, picture_format: str, threads: int
-) -> Iterator[tuple[int, int]]:
-    """Picture number and bytes of each packet."""
     rows, columns = pictures[0][0].shape[:2]
     width, height = coded_size(recipe, columns, rows)
     converter = PictureConverter()
@@ -230,6 +247,7 @@ def _packets(
     context.options = {**recipe.options, "g": str(len(pictures))}
     context.time_base = Fraction(1, 30)
     context.framerate = Fraction(30)
+    packets: list[Any] = []
     try:
         open_encoder(context, recipe, width, height, threads=threads)
         for number, picture in enumerate(pictures):
@@ -237,10 +255,9 @@ def _packets(
             frame.pts = number
             frame.time_base = context.time_base
             frame.color_range = color_range(recipe)
-            for packet in context.encode(frame):
-                yield packet.pts, packet.size
-        for packet in context.encode(None):
-            yield packet.pts, packet.size
+            packets += context.encode(frame)
+        packets += context.encode(None)
+        seconds = _decoding_seconds(context, packets, CODECS[recipe.codec].ffmpeg) if timed else []
     except MemoryError:
         raise
     except (FFmpegError, ValueError) as error:
@@ -248,6 +265,38 @@ def _packets(
         raise EncoderRefusedError(
             f"{recipe.encoder} does not take pictures of {columns}x{rows}"
         ) from None
+    sizes = [0] * len(pictures)
+    for packet in packets:
+        sizes[packet.pts] += packet.size
+    return Coded(*_key_and_others(sizes), *(_key_and_others(seconds) if timed else ()))
+
+
+def _key_and_others(values: Sequence[float]) -> tuple[float, float]:
+    """The first of some values, and the mean of the others."""
+    return float(values[0]), float(np.mean(values[1:] or values))
+
+
+def _decoding_seconds(encoder: Any, packets: Sequence[Any], codec: str) -> list[float]:
+    """CPU time of decoding each packet, the least of some turns."""
+    turns = []
+    for _ in range(_TURNS):
+        decoder: Any = av.CodecContext.create(codec, "r")
+        decoder.thread_count = 1
+        decoder.width, decoder.height = encoder.width, encoder.height
+        decoder.pix_fmt = encoder.pix_fmt
+        if encoder.extradata:
+            decoder.extradata = encoder.extradata
+        seconds = []
+        for packet in packets:
+            begun = time.thread_time()
+            decoder.decode(packet)
+            seconds.append(time.thread_time() - begun)
+        turns.append(seconds)
+    return [min(those) for those in zip(*turns, strict=True)]
+
+
+_TURNS = 3
+_DISTANCES = (1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30)  # of key frames, where reading is to be fast
 
 
 def choose(
@@ -258,46 +307,79 @@ def choose(
     preset: str | None,
     gop: int,
     threads: int,
+    purpose: Purpose | None = None,
 ) -> Choice:
-    """The lossless layout and recipe that make the smallest video, by trying each.
+    """The lossless layout, recipe and distance of key frames that suit best, by trying each.
 
     Args:
         samples: Pixels of consecutive images, at least one; about six tell enough.
         encoding: Of the images.
         codec: The only codec to try, or None for all.
         preset: The encoder's preset, or None for the default.
-        gop: Frames from one key frame to the next.
+        gop: Frames from one key frame to the next, where the purpose leaves that alone.
         threads: Threads of the encoder.
+        purpose: What the video is for.
 
     Returns:
         The smallest or, of those within 2 % of it, the first in the order of the encoding's
-        layouts and their codecs.
+        layouts and their codecs. For ``archive`` the smallest; for ``training`` the one of which
+        a frame at random is decoded in the least time, among those that are not larger than
+        the smallest by more than the purpose allows.
 
     Raises:
         OptionError: The codec has no form for any layout of the encoding.
         EncoderRefusedError: No codec takes such pictures.
     """
     crops, share = _crops(samples, encoding)
-    tried: list[Choice] = []
+    is_fast = purpose is not None and purpose.is_training
+    tried: list[tuple[Choice, Coded]] = []
     refusals: list[Exception] = []
     for layout in _candidates(samples, encoding):
         pictures = [layout.to_picture(pixels) for pixels in crops]
         picture_format = layout.pixel_format
-        for name in codecs_to_try(picture_format) if codec is None else [codec]:
+        names = codecs_to_try(picture_format) if codec is None else [codec]
+        for name, fast in product(names, (False, True) if is_fast else (False,)):
             try:
-                recipe = recipe_for(picture_format, lossless=True, codec=name, preset=preset)
-                size = estimate(
-                    pictures, recipe, picture_format=picture_format, gop=gop, threads=threads
+                recipe = recipe_for(
+                    picture_format, lossless=True, codec=name, preset=preset, fast=fast
+                )
+                coded = encode_on_trial(
+                    pictures,
+                    recipe,
+                    picture_format=picture_format,
+                    threads=threads,
+                    timed=is_fast,
                 )
             except (OptionError, EncoderRefusedError) as error:
                 refusals.append(error)
             else:
-                tried.append(Choice(layout.name, layout.parameters, recipe, size / share))
+                size = coded.bytes_per_frame(gop) / share
+                tried.append((Choice(layout.name, layout.parameters, recipe, size, gop), coded))
     if not tried:
         # that an encoder refuses the size says more than that another has no such format
         raise next((e for e in refusals if isinstance(e, EncoderRefusedError)), refusals[0])
-    smallest = min(choice.bytes_per_frame for choice in tried)
-    return next(choice for choice in tried if choice.bytes_per_frame <= NEAR * smallest)
+    smallest = min(choice.bytes_per_frame for choice, _ in tried)
+    if purpose is not None and purpose.is_training:
+        return _fastest(tried, share, most=(1 + purpose.larger) * smallest)
+    near = NEAR if purpose is None else 1.0
+    return next(choice for choice, _ in tried if choice.bytes_per_frame <= near * smallest)
+
+
+def _fastest(tried: Sequence[tuple[Choice, Coded]], share: float, most: float) -> Choice:
+    """The choice, with its best distance of key frames, whose frames at random cost least time.
+
+    Args:
+        tried: All, with what they cost.
+        share: Of the images' pixels that were tried.
+        most: Bytes of a frame that are not too many; one of them has no more.
+    """
+    found = [
+        (coded.random_seconds(gop), replace(choice, bytes_per_frame=size, gop=gop))
+        for choice, coded in tried
+        for gop in {*_DISTANCES, choice.gop}
+        if (size := coded.bytes_per_frame(gop) / share) <= most
+    ]
+    return min(found, key=lambda pair: (pair[0], pair[1].bytes_per_frame))[1]
 
 
 def _candidates(samples: Sequence[Pixels], encoding: Encoding) -> list[Layout]:

@@ -313,10 +313,7 @@ def _storage(camera: CameraEvaluation) -> Iterator[str]:
     data_set = camera.data_set
     if data_set is None:
         return
-    yield (
-        f"<h3>{data_set.streams} cameras for {data_set.hours:g} hours "
-        f"at {data_set.rate:.2f} Hz</h3>"
-    )
+    yield f"<h3>{data_set.described}</h3>"
     rows = (
         (
             row.days is not None,

@@ -118,6 +118,13 @@ class DataSet:
         """Frames of all cameras."""
         return self.streams * self.hours * 3600 * self.rate
 
+    @property
+    def described(self) -> str:
+        """In words."""
+        cameras = f"{self.streams} camera{'s' * (self.streams != 1)}"
+        hours = f"{self.hours:g} hour{'s' * (self.hours != 1)}"
+        return f"{cameras} for {hours} at {self.rate:.2f} Hz"
+
 
 @dataclass(frozen=True, slots=True)
 class Recommendation:

@@ -18,7 +18,14 @@ from mp4ds.files.sources import SourceState, unchanged
 from mp4ds.files.urls import location, remote
 from mp4ds.format.models import ChannelModel, StreamSidecar
 from mp4ds.format.sidecars import dump_document, load_stream
-from mp4ds.packing.manifest import PartRecord, PartStream, dataset_files, summarize, write_manifest
+from mp4ds.packing.manifest import (
+    Origin,
+    PartRecord,
+    PartStream,
+    dataset_files,
+    summarize,
+    write_manifest,
+)
 from mp4ds.packing.options import PackSummary
 from mp4ds.packing.writer import video_facts
 from mp4ds.plan import FileNames
@@ -81,9 +88,11 @@ def import_ros_mp4(
         _check(source, described, old)
         folder.mkdir()
         part = _part_of(source, old, folder)
-        digests = [(path.name, *digest_file(path)) for path in (source, described)]
-        write_manifest(part, _Bag(), digests, old.profile)
-        return summarize(part, target, sum(size for _, size, _ in digests))
+        paths = (source, described)
+        digests = [(path.name, *digest_file(path)) for path in paths]
+        origin = Origin.of(paths, digests)
+        write_manifest(part, _Bag(), origin, old.profile)
+        return summarize(part, target, sum(size for _, size, _ in digests), origin)
 
 
 def _local(path: Path | str) -> Path:

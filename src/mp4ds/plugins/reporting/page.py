@@ -277,6 +277,8 @@ def _notes(dataset: Dataset) -> Iterable[str]:
         yield "Times are record times that were stored as float seconds: they are not exact."
     if manifest is None:
         return
+    if manifest.about:
+        yield from manifest.about.lines
     for item in manifest.verbatim:
         yield (
             f"{item.topic}: {item.messages} messages are in messages.mcap as they were, from "

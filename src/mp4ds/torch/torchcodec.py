@@ -1,0 +1,124 @@
+"""Decoding by torchcodec, on a processor or a graphics card."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.video import Video
+from mp4ds.dataset.views import Crop
+from mp4ds.errors import OptionError, VideoError
+from mp4ds.files.urls import remote
+from mp4ds.messages.layouts import LAYOUTS
+from mp4ds.video.codecs import TEN_BITS
+
+
+class TorchcodecReader:
+    """Decodes a stream's video by ``torchcodec.decoders.VideoDecoder``.
+
+    Args:
+        stream: The stream.
+        crop: x, y, width, height, pixels; None: all.
+        device: Such as ``cpu`` or ``cuda``.
+
+    Raises:
+        OptionError: torchcodec is missing, mistakes the video's range, or the video's pictures
+            are not the images.
+        VideoError: It cannot open the video.
+    """
+
+    def __init__(self, stream: Stream | Video, crop: Crop | None, device: str) -> None:
+        self._path = stream.video_path
+        if isinstance(stream, Stream):
+            _check_layout(stream)
+        if remote(self._path):
+            raise OptionError(f"{self._path}: backend='torchcodec' reads local files alone.")
+        columns, rows = stream.image_size
+        x, y, width, height = crop or (0, 0, columns, rows)
+        if not (0 <= x < x + width <= columns and 0 <= y < y + height <= rows):
+            raise OptionError(f"topic {stream.topic}: crop {crop} is not within {columns}x{rows}.")
+        self._rows, self._columns = slice(y, y + height), slice(x, x + width)
+        self._decoder = self._opened(device)
+        self._check_range(stream)
+
+    def _opened(self, device: str) -> Any:
+        if find_spec("torchcodec") is None:
+            raise OptionError(
+                "backend='torchcodec' needs torchcodec. Install it with: pip install torchcodec"
+            )
+        try:
+            module = import_module("torchcodec.decoders")
+        except (ImportError, OSError, RuntimeError) as error:
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            raise OptionError(
+                f"torchcodec is installed but cannot be used: {reason} If it finds no FFmpeg, "
+                "install that, or start with the one of PyAV: "
+                "LD_LIBRARY_PATH=$(python -m mp4ds.torch.ffmpeg) python ..."
+            ) from None
+        try:
+            # with exact seeking, frame n is the n-th shown, whatever its presentation time
+            return module.VideoDecoder(
+                str(self._path), dimension_order="NHWC", device=device, seek_mode="exact"
+            )
+        except (RuntimeError, ValueError) as error:
+            raise self._refused(error) from None
+
+    def _check_range(self, stream: Stream | Video) -> None:
+        """Refuse a video whose range torchcodec mistakes.
+
+        Of AV1, torchcodec 0.13 on a CPU was seen to take the full range for the limited one: the
+        contrast is then 255 / 219 of what it is, and what is dark or bright is lost.
+        """
+        if not len(stream):
+            return
+        with closing(stream):  # it opens its video again where that is asked of it
+            first = stream.read([0], format="rgb")[0]
+        ours = first[self._rows, self._columns].astype(np.int16)
+        mistaken = ((ours - 16) * (255 / 219)).clip(0, 255)
+        theirs = self.read([0])[0].cpu().numpy()
+        if np.abs(theirs - mistaken).mean() < np.abs(theirs - ours).mean():
+            raise OptionError(
+                f"topic {stream.topic}: torchcodec takes its video of the full range for one of "
+                "the limited, so that the contrast would be wrong. Use backend='mp4ds', or a "
+                "dataset that was packed with `codec` h264."
+            )
+
+    def _refused(self, error: Exception) -> VideoError:
+        reason = " ".join(str(error).split()[:40])
+        return VideoError("decode-failed", self._path, f"torchcodec cannot decode it: {reason}")
+
+    def read(self, frames: list[int]) -> Tensor:
+        """Frames in the order asked for, repeated as asked; shape (N, H, W, 3), uint8.
+
+        Raises:
+            VideoError: One does not decode.
+        """
+        try:
+            pixels: Tensor = self._decoder.get_frames_at(frames).data
+        except (RuntimeError, IndexError, ValueError) as error:
+            raise self._refused(error) from None
+        return pixels[:, self._rows, self._columns]
+
+    def close(self) -> None:
+        """Let the decoder go."""
+        self._decoder = None
+
+
+def _check_layout(stream: Stream) -> None:
+    """Refuse pictures that are not the images, or that have more than 8 bits.
+
+    Of lossy videos, 10 bits hold images of 8.
+    """
+    image, video = stream.sidecar.image, stream.sidecar.video
+    is_8_bits = video.pixel_format in (None, TEN_BITS) or not video.pixel_format.endswith("le")
+    if not LAYOUTS[video.layout].is_shown or not is_8_bits:
+        raise OptionError(
+            f"topic {stream.topic}: {image.encoding} images are stored in the layout "
+            f"{video.layout}, which torchcodec does not turn into colours. Use backend='mp4ds'."
+        )

@@ -1,0 +1,252 @@
+"""A dataset packed again: what was exact stays so, and the manifest tells where it comes from."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import mp4ds
+from coded_scenes import CODED
+from each import each
+from mp4ds.errors import OptionError, SourceError, TargetExistsError
+from mp4ds.format.manifest import Manifest
+from mp4ds.format.sidecars import load_manifest
+from mp4ds.packing.job import open_recording
+from mp4ds.packing.options import PackOptions
+from mp4ds.packing.pack import pack_each
+from mp4ds.plugins.info import info
+from mp4ds.records import Excerpt, Message
+from round_trips import Compare, journey, own_target, unpacked
+from sources import PERIOD, SOURCES, START, TRAITS, odd_scene, scene, write_bag
+
+
+def manifest(dataset: Path) -> Manifest:
+    return load_manifest(dataset / "dataset.yaml")
+
+
+def codec(dataset: Path, topic: str = "/camera/image_raw") -> str:
+    with mp4ds.open(dataset) as opened:
+        return next(one.sidecar.video.codec for one in opened.streams if one.topic == topic)
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    write_bag(tmp_path / "drive.bag", scene("rgb8", frames=12))
+    return tmp_path / "drive.bag"
+
+
+def images(dataset: Path) -> list[str]:
+    with mp4ds.open(dataset) as opened:
+        return opened.topics
+
+
+@each("source", SOURCES, one_in=4)
+def test_what_was_exact_stays_so(source: str, tmp_path: Path, compare: Compare) -> None:
+    first = tmp_path / "first"
+    first.mkdir()
+    before = journey(first, SOURCES[source], scene("mono16"), own_target(source))
+    (topic,) = images(before.dataset)
+    mp4ds.pack(before.dataset, tmp_path / "dataset", PackOptions(codec="ffv1"))
+    assert codec(tmp_path / "dataset", topic) == "ffv1"
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare(before.sources, unpacked(tmp_path, own_target(source))) == []
+    told, known = manifest(tmp_path / "dataset"), manifest(before.dataset)
+    assert told.sources == known.sources
+    digest = hashlib.sha256((before.dataset / "dataset.yaml").read_bytes()).hexdigest()
+    (earlier,) = told.derived_from
+    assert (earlier.name, earlier.profile, earlier.sha256) == ("dataset", "lossless", digest)
+    for fact in ("format", "recording_profile", "library", "messages", "time_range", "transforms"):
+        assert getattr(told, fact) == getattr(known, fact)
+
+
+@each("trait", TRAITS, one_in=4)
+def test_odd_recordings(trait: str, tmp_path: Path, compare: Compare) -> None:
+    first = tmp_path / "first"
+    first.mkdir()
+    before = journey(first, SOURCES["bag-lz4"], odd_scene(trait), "bag")
+    mp4ds.pack(before.dataset, tmp_path / "dataset", PackOptions(codec="ffv1"))
+    assert compare(before.sources, unpacked(tmp_path, "bag")) == []
+
+
+@each("kind", CODED, one_in=6)
+def test_coded_images(kind: str, tmp_path: Path, compare: Compare) -> None:
+    first = tmp_path / "first"
+    first.mkdir()
+    before = journey(first, SOURCES["mcap-ros2-zstd"], CODED[kind](frames=6), "mcap")
+    mp4ds.pack(before.dataset, tmp_path / "dataset")
+    assert compare(before.sources, unpacked(tmp_path, "mcap")) == []
+
+
+def test_in_parts(recording: Path, tmp_path: Path, compare: Compare) -> None:
+    mp4ds.pack(recording, tmp_path / "whole")
+    mp4ds.pack(tmp_path / "whole", tmp_path / "dataset", PackOptions(window=4))
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare([recording], unpacked(tmp_path, "bag")) == []
+
+
+def test_log_times_that_do_not_tell_the_order(tmp_path: Path, compare: Compare) -> None:
+    """Messages of equal times in different files: such a dataset is read as a whole."""
+    made = odd_scene("encoding-change")
+    equal = [
+        replace(record, log_time=START + n // 6 * PERIOD) for n, record in enumerate(made.messages)
+    ]
+    sources = SOURCES["bag-lz4"](tmp_path, replace(made, messages=equal))
+    mp4ds.pack(sources, tmp_path / "first")
+    with open_recording([tmp_path / "first"]) as reader:
+        assert not reader.is_indexed
+    mp4ds.pack(tmp_path / "first", tmp_path / "dataset", PackOptions(window=2))
+    assert compare(sources, unpacked(tmp_path, "bag")) == []
+
+
+def test_a_lossy_one_stays_as_it_was_asked_for(recording: Path, tmp_path: Path) -> None:
+    mp4ds.pack(recording, tmp_path / "eye", PackOptions(quality="visual"))
+    mp4ds.pack(tmp_path / "eye", tmp_path / "again")
+    assert manifest(tmp_path / "again").profile == "visual"
+    (topic,) = images(tmp_path / "eye")
+    mp4ds.pack(tmp_path / "eye", tmp_path / "kept", PackOptions(quality="lossless"))
+    mp4ds.pack(tmp_path / "kept", tmp_path / "fast", PackOptions(purpose="training"))
+    told = manifest(tmp_path / "fast")
+    assert [(item.name, item.profile) for item in told.derived_from] == [
+        ("eye", "visual"),
+        ("kept", "lossless"),
+    ]
+    assert [item.name for item in told.sources] == [recording.name]
+    with mp4ds.open(tmp_path / "eye") as eye, mp4ds.open(tmp_path / "fast") as fast:
+        numbers = range(len(eye[topic]))
+        assert (eye[topic].read(numbers) == fast[topic].read(numbers)).all()
+    found = info(tmp_path / "fast")
+    assert "packed again from eye (visual), kept (lossless)" in found.notes
+
+
+def test_a_quality_that_says_nothing_of_another_codec(recording: Path, tmp_path: Path) -> None:
+    mp4ds.pack(recording, tmp_path / "small", PackOptions(quality="crf=30", codec="h264"))
+    with pytest.raises(OptionError, match=r"has crf=30\. Give a `quality`"):
+        mp4ds.pack(tmp_path / "small", tmp_path / "again")
+    with pytest.raises(OptionError, match="has crf=30, lossless"):
+        mp4ds.pack([tmp_path / "small", recording], tmp_path / "again")
+    assert not (tmp_path / "again").exists()
+
+
+def test_jpeg_files_that_were_encoded_anew_are_again(tmp_path: Path) -> None:
+    options = PackOptions(quality="visual", transcode=True)
+    (source,) = SOURCES["mcap-ros2-zstd"](tmp_path, CODED["jpeg-rgb"](frames=6))
+    mp4ds.pack(source, tmp_path / "eye", options)
+    mp4ds.pack(tmp_path / "eye", tmp_path / "again")
+    with mp4ds.open(tmp_path / "again") as opened:
+        assert [stream.sidecar.body for stream in opened.streams] == ["jpeg"]
+
+
+def test_a_file_that_is_not_as_it_was_packed(recording: Path, tmp_path: Path) -> None:
+    mp4ds.pack(recording, tmp_path / "whole")
+    video = next((tmp_path / "whole").glob("*.mp4"))
+    video.write_bytes(video.read_bytes() + b"\0\0\0\x08free")
+    for options in (PackOptions(), PackOptions(window=4)):
+        with pytest.raises((SourceError, mp4ds.FormatError), match="SHA-256"):
+            mp4ds.pack(tmp_path / "whole", tmp_path / "again", options)
+        assert not (tmp_path / "again").exists()
+
+
+def test_topics_that_were_left_out(recording: Path, tmp_path: Path) -> None:
+    mp4ds.pack(recording, tmp_path / "less", PackOptions(exclude=["/imu"]))
+    mp4ds.pack(tmp_path / "less", tmp_path / "again", PackOptions(exclude=["/tf*"]))
+    told = manifest(tmp_path / "again").topics_left_out
+    assert told[0] == "/imu"
+    assert len(told) > 1
+
+
+def test_what_was_lost_stays_told(recording: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged.bag"
+    damaged.write_bytes(recording.read_bytes()[:-4000])
+    mp4ds.pack(damaged, tmp_path / "saved", PackOptions(salvage=True))
+    mp4ds.pack(tmp_path / "saved", tmp_path / "again")
+    assert manifest(tmp_path / "again").losses == manifest(tmp_path / "saved").losses != []
+
+
+def test_several_datasets_and_a_recording(
+    recording: Path, tmp_path: Path, compare: Compare
+) -> None:
+    write_bag(tmp_path / "later.bag", scene("mono8", frames=5))
+    mp4ds.pack(recording, tmp_path / "whole")
+    mp4ds.pack([tmp_path / "whole", tmp_path / "later.bag"], tmp_path / "dataset")
+    assert compare([recording, tmp_path / "later.bag"], unpacked(tmp_path, "bag")) == []
+    told = manifest(tmp_path / "dataset")
+    assert {item.name for item in told.sources} == {"drive.bag", "later.bag"}
+
+
+def test_one_dataset_each(recording: Path, tmp_path: Path) -> None:
+    mp4ds.pack(recording, tmp_path / "drive")
+    assert len(pack_each([tmp_path / "drive"], tmp_path / "out")) == 1
+    assert pack_each([tmp_path / "drive"], tmp_path / "out") == []
+    shutil.rmtree(tmp_path / "drive")
+    mp4ds.pack(recording, tmp_path / "drive", PackOptions(exclude=["/imu"]))
+    with pytest.raises(TargetExistsError):
+        pack_each([tmp_path / "drive"], tmp_path / "out")
+
+
+def test_no_dataset_is_salvaged(recording: Path, tmp_path: Path) -> None:
+    mp4ds.pack(recording, tmp_path / "whole")
+    with pytest.raises(OptionError, match="`salvage` goes with recordings"):
+        mp4ds.pack(tmp_path / "whole", tmp_path / "again", PackOptions(salvage=True))
+
+
+def test_who_made_it(recording: Path, tmp_path: Path) -> None:
+    told = tmp_path / "about.yaml"
+    told.write_text(
+        "title: A drive\nlicense: CC0-1.0\nkeywords: [a, b]\nauthors: [{name: A lab}]\n"
+    )
+    mp4ds.pack(recording, tmp_path / "whole", PackOptions(about=str(told)))
+    mp4ds.pack(tmp_path / "whole", tmp_path / "again", PackOptions(window=4))
+    for dataset in ("whole", "again"):
+        about = manifest(tmp_path / dataset).about
+        assert about is not None
+        assert (about.title, about.license, about.keywords) == ("A drive", "CC0-1.0", ["a", "b"])
+        assert {"title: A drive", "authors: A lab"} <= set(info(tmp_path / dataset).notes)
+    mp4ds.pack([tmp_path / "whole", recording], tmp_path / "more")
+    assert manifest(tmp_path / "more").about == manifest(tmp_path / "whole").about
+
+
+@each(
+    ("text", "problem"),
+    [
+        ("author: me", "at author"),
+        ("title: [", "is no YAML"),
+        ("doi: https://doi.org/10.5281/zenodo.1", "at doi"),
+        ("- title", "at the top"),
+        ("title:", "at title"),
+    ],
+)
+def test_what_has_no_place(text: str, problem: str, recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "about.yaml").write_text(text)
+    with pytest.raises(SourceError, match=f"about.yaml: {problem}"):
+        mp4ds.pack(recording, tmp_path / "no", PackOptions(about=str(tmp_path / "about.yaml")))
+    assert not (tmp_path / "no").exists()
+
+
+def test_excerpts_add_up(recording: Path, tmp_path: Path) -> None:
+    mp4ds.pack(recording, tmp_path / "whole")
+    with open_recording([tmp_path / "whole" / "dataset.yaml"]) as reader:
+        assert reader.is_indexed
+        everything = list(reader.records())
+        times = sorted(record.log_time for record in everything if isinstance(record, Message))
+        middle = times[len(times) // 2]
+        parts = [
+            record
+            for span in (Excerpt(end=middle), Excerpt(start=middle, others=False))
+            for record in reader.records(span)
+        ]
+        by_topic = [
+            {
+                topic: [bytes(one.data) for one in found if one.channel.topic == topic]
+                for topic in {channel.topic for channel in reader.channels}
+            }
+            for found in (everything, parts)
+        ]
+        assert by_topic[0] == by_topic[1]
+        for channel in filter(lambda channel: by_topic[0][channel.topic], reader.channels):
+            first = reader.first(channel)
+            assert first is not None
+            assert bytes(first.data) == by_topic[0][channel.topic][0]
