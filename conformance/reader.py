@@ -108,9 +108,11 @@ def decode(video, side, coded):
     command += ["-map", "0:v", "-c", "copy", "-f", "framehash", "-hash", "sha256", "pipe:2"]
     command += ["-map", "0:v", "-fps_mode", "passthrough", "-pix_fmt", coded]
     done = subprocess.run([*command, "-f", "rawvideo", "pipe:1"], capture_output=True, check=False)
-    lines = [line for line in done.stderr.decode().splitlines() if not line.startswith("#")]
-    hashes, raw = [line.split(",")[-1].strip() for line in lines], done.stdout
-    return hashes, *pictures(raw, name, width, height, side.get("pixel_format", ""))
+    lines = [line.split(",") for line in done.stderr.decode().splitlines() if line[0] != "#"]
+    hashes = [words[-1].strip() for words in lines if int(words[2]) >= 0]
+    name, frames = pictures(done.stdout, name, width, height, side.get("pixel_format", ""))
+    hidden = len(lines) - len(hashes)  # by an edit list; older versions of ffmpeg show them
+    return hashes, name, frames[hidden:] if len(frames) == len(lines) else frames
 
 
 def pictures(raw, name, width, height, told):

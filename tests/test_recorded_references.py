@@ -18,10 +18,9 @@ from in_parts import InlineEngine
 from mp4ds import yamlio
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import FormatError, VideoError
-from mp4ds.format.models import References
+from mp4ds.format.models import References, video_facts
 from mp4ds.format.sidecars import load_stream
 from mp4ds.messages.coded import CodedFrame, UnknownStructure
-from mp4ds.packing.writer import video_facts
 from mp4ds.video import access
 from mp4ds.video import references as structure
 from mp4ds.video.access import Chains, digest_video, packets_of_groups

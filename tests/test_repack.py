@@ -124,8 +124,10 @@ def test_a_lossy_one_stays_as_it_was_asked_for(recording: Path, tmp_path: Path) 
 
 def test_a_quality_that_says_nothing_of_another_codec(recording: Path, tmp_path: Path) -> None:
     mp4ds.pack(recording, tmp_path / "small", PackOptions(quality="crf=30", codec="h264"))
+    mp4ds.pack(tmp_path / "small", tmp_path / "copy")
+    assert manifest(tmp_path / "copy").streams == manifest(tmp_path / "small").streams
     with pytest.raises(OptionError, match=r"has crf=30\. Give a `quality`"):
-        mp4ds.pack(tmp_path / "small", tmp_path / "again")
+        mp4ds.pack(tmp_path / "small", tmp_path / "again", PackOptions(codec="av1"))
     with pytest.raises(OptionError, match="has crf=30, lossless"):
         mp4ds.pack([tmp_path / "small", recording], tmp_path / "again")
     assert not (tmp_path / "again").exists()

@@ -15,6 +15,7 @@ import pytest
 import mp4ds
 from each import each
 from mp4ds.errors import FrameNotFoundError, OptionError, TargetExistsError
+from mp4ds.options import time_of
 from mp4ds.plugins.reporting.proxies import Look
 from mp4ds.plugins.reporting.stills import (
     StillOptions,
@@ -22,7 +23,6 @@ from mp4ds.plugins.reporting.stills import (
     number_at,
     parse_sheet,
     spread,
-    time_of,
 )
 from report_scenes import COLOUR, DEPTH, FRAMES, HEIGHT, WIDTH, blocks, pack_cameras, two_cameras
 from sources import COMMON, ENCODINGS, odd_scene, scene
@@ -54,21 +54,24 @@ def read(path: Path) -> np.ndarray[Any, Any]:
         ("1700000000.123456789", START),
         ("1700000000.5", 1_700_000_000_500_000_000),
         ("1700000000123456789", START),
-        ("-5", -5),
+        ("2.5", START + 2_500_000_000),
+        ("60", START + 60_000_000_000),
+        ("1700000000", 1_700_000_000_000_000_000),
         ("2023-11-14T22:13:20.123456789Z", START),
         ("2023-11-14 22:13:21", 1_700_000_001_000_000_000),
     ],
 )
 def test_times_as_they_are_written(text: str, time: int) -> None:
-    assert time_of(text, START) == time
+    assert time_of(text, START, "at") == time
 
 
 @each(
-    "text", ["", "now", "1e9", "+", "+1.0000000001", "2023-13-14T22:13:20", "1.5 s", "12:30", "٣"]
+    "text",
+    ["", "now", "1e9", "+", "+1.0000000001", "-5", "2023-13-14T22:13:20", "1.5 s", "12:30", "٣"],
 )
 def test_what_is_no_time(text: str) -> None:
     with pytest.raises(OptionError, match="`at`"):
-        time_of(text, START)
+        time_of(text, START, "at")
 
 
 def test_the_nearest_frame_is_meant(drive: Path) -> None:

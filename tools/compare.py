@@ -2,7 +2,7 @@
 
 Usage::
 
-    python tools/compare.py A B [--ignore-pixels TOPIC_GLOB] [--json]
+    python tools/compare.py A B [--ignore-pixels TOPIC_GLOB] [--start NS --end NS] [--json]
 
 A and B are a ROS 1 ``.bag``, a rosbag2 folder, an ``.mcap`` or a ``.db3``; a split recording is
 given as ``a1.bag,a2.bag``. Exit code: 0 equal, 1 different, 2 unreadable.
@@ -335,6 +335,8 @@ def examine(
     *,
     ignore_pixels: Sequence[str] = (),
     limit: int = 5,
+    start: int = -(2**63),
+    end: int = 2**64,
 ) -> Report:
     """Compare two recordings.
 
@@ -343,14 +345,18 @@ def examine(
         b: The second one.
         ignore_pixels: Globs of topics whose pixels may differ; all else of them must be equal.
         limit: How many differing messages are listed per channel.
+        start: Messages of A from this log time on, ns, are compared.
+        end: Messages of A before this log time, ns, are compared.
 
     Raises:
         UnreadableError: One of them cannot be read.
     """
     files = [[x] if isinstance(x, Path) else list(x) for x in (a, b)]
-    one, two = (read(paths, Digester(ignore_pixels)) for paths in files)
+    one = read(files[0], Digester(ignore_pixels), start, end)
+    two = read(files[1], Digester(ignore_pixels))
     if crossed := _crossed(one, two):
-        one, two = (read(paths, Digester(ignore_pixels, crossed)) for paths in files)
+        one = read(files[0], Digester(ignore_pixels, crossed), start, end)
+        two = read(files[1], Digester(ignore_pixels, crossed))
     report = Report(notes=one.notes + two.notes)
     _compare_channels(one, two, report, limit)
     _compare_silent(one, two, report)
@@ -374,12 +380,15 @@ def compare(
     *,
     ignore_pixels: Sequence[str] = (),
     limit: int = 5,
+    start: int = -(2**63),
+    end: int = 2**64,
 ) -> list[str]:
     """Differences of two recordings, one sentence each; none when they are equal.
 
     See `examine` for the arguments and errors.
     """
-    return examine(a, b, ignore_pixels=ignore_pixels, limit=limit).differences
+    found = examine(a, b, ignore_pixels=ignore_pixels, limit=limit, start=start, end=end)
+    return found.differences
 
 
 def table(report: Report) -> str:
@@ -416,6 +425,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("b", metavar="B")
     parser.add_argument("--ignore-pixels", metavar="TOPIC_GLOB", action="append", default=[])
     parser.add_argument("--limit", type=int, default=5, help="messages listed per channel")
+    parser.add_argument("--start", type=int, default=-(2**63), help="of A, log time in ns")
+    parser.add_argument("--end", type=int, default=2**64, help="of A, log time in ns; not included")
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
     options = parser.parse_args(arguments)
     try:
@@ -424,6 +435,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _paths(options.b),
             ignore_pixels=options.ignore_pixels,
             limit=options.limit,
+            start=options.start,
+            end=options.end,
         )
     except UnreadableError as error:
         print(error, file=sys.stderr)

@@ -61,6 +61,8 @@ class Recording:
     """What was read of one recording."""
 
     digester: Digester
+    start: int = -(2**63)
+    end: int = 2**64
     kind: str = ""
     folder: bool = False
     holds: frozenset[str] = MCAP_HOLDS
@@ -82,6 +84,8 @@ class Recording:
     def add(self, channel: Channel, log: int, publish: int, sequence: int, payload: bytes) -> None:
         """Append one message, as digest and times."""
         series = self.series.setdefault(channel, Series())
+        if not self.start <= log < self.end:
+            return
         series.position.append(self.count)
         series.log.append(log & 0xFFFF_FFFF_FFFF_FFFF)  # sqlite's are signed
         series.publish.append(publish & 0xFFFF_FFFF_FFFF_FFFF)
@@ -97,13 +101,15 @@ class Recording:
         return found
 
 
-def read(paths: Sequence[Path], digester: Digester) -> Recording:
-    """Read a recording of one or more files.
+def read(
+    paths: Sequence[Path], digester: Digester, start: int = -(2**63), end: int = 2**64
+) -> Recording:
+    """Read a recording of one or more files; of its messages those from `start` to before `end`.
 
     Raises:
         UnreadableError: Names the file and says why.
     """
-    recording = Recording(digester)
+    recording = Recording(digester, start, end)
     for path in paths:
         if path.is_dir():
             with _blamed(path):

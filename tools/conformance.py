@@ -59,7 +59,10 @@ def make(folder: Path) -> list[Case]:
 def _pack(name: str, target: Path) -> None:
     recording = RECORDINGS[name] if name in RECORDINGS else recording_of(name)
     with tempfile.TemporaryDirectory() as place, chosen_layouts(recording.wanted):
-        pack(recording.write(Path(place)), target, PackOptions(**recording.options))
+        whole = Path(place) / "whole" if recording.part is not None else target
+        pack(recording.write(Path(place)), whole, PackOptions(**recording.options))
+        if recording.part is not None:
+            pack(whole, target, PackOptions(**recording.part))
 
 
 def _case(

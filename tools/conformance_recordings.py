@@ -23,7 +23,7 @@ from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES  # noqa: E402
 from mp4ds.messages.encodings import Encoding, Parameters, Pixels  # noqa: E402
 from mp4ds.messages.layouts import bind, fit  # noqa: E402
 from mp4ds.packing import tracks  # noqa: E402
-from mp4ds.video.codecs import recipe_for  # noqa: E402
+from mp4ds.video.codecs import LOSSLESS_GOP, recipe_for  # noqa: E402
 from mp4ds.video.trial import Choice  # noqa: E402
 from pictures import picture  # noqa: E402
 from scenes import IMAGE, PERIOD, START, Record, Scene, image_cdr, odd_scene, scene  # noqa: E402
@@ -47,6 +47,7 @@ class Recording:
         source: Name in `sources.SOURCES` or `foxglove_scenes.FOXGLOVE_SOURCES`.
         options: Of the pack.
         wanted: Layout and codec by encoding and number of columns.
+        part: Options of another pack, which copies a part of the dataset; None for the whole.
     """
 
     shows: str
@@ -54,6 +55,7 @@ class Recording:
     source: str
     options: Mapping[str, Any] = field(default_factory=dict)
     wanted: Mapping[tuple[str, int], Wanted] = field(default_factory=dict)
+    part: Mapping[str, Any] | None = None
 
     def write(self, folder: Path) -> list[Path]:
         """Write it into a folder."""
@@ -73,7 +75,7 @@ def chosen_layouts(wanted: Mapping[tuple[str, int], Wanted]) -> Iterator[None]:
         if layout is None:
             raise ValueError(f"{encoding.name} of {columns} columns does not fit {name}")
         recipe = recipe_for(layout.pixel_format, lossless=True, codec=codec)
-        return Choice(name, layout.parameters, recipe, bytes_per_frame=0)
+        return Choice(name, layout.parameters, recipe, bytes_per_frame=0, gop=LOSSLESS_GOP)
 
     before = tracks.choose
     tracks.choose = choose  # type: ignore[assignment]
@@ -296,6 +298,16 @@ RECORDINGS: dict[str, Recording] = {
             {"quality": "crf=30", "codec": codec},
         )
         for codec in ("av1", "h264", "h265")
+    },
+    **{
+        f"slice-{codec}": Recording(
+            f"a slice of a dataset of {codec}: an edit list hides the frames before it",
+            _lossy,
+            "mcap-ros2-zstd",
+            {"quality": "crf=30", "codec": codec},
+            part={"start": "0.04", "topics": ["/rgb8*", "/mono8*"]},
+        )
+        for codec in ("av1", "h264")
     },
     "packets": Recording(
         "packets as they came: H.264, H.265, AV1, VP9, JPEG, with their framing",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields
+from datetime import datetime, timezone
 from typing import Any
 
 from mp4ds.errors import OptionError
@@ -125,6 +126,126 @@ def parse_words(text: str) -> tuple[str, ...]:
     return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
+# ---------------------------------------------------------------- times
+
+_NS = 10**9
+_NUMBER = re.compile(r"\+?([0-9]{1,19})(?:\.([0-9]{0,9}))?")
+_ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?Z?")
+_SINCE_1970, _IN_NS = 10**8, 10**11  # smaller numbers are seconds from the beginning, or of 1970
+
+
+def time_of(text: str, start_ns: int, option: str) -> int:
+    """Nanoseconds since 1970 of a time as users write it.
+
+    Args:
+        text: ``2.5`` or ``+2.5``: seconds from the beginning; from 1e8 on, ``1700000000.5``:
+            seconds since 1970, all nine digits counting; from 1e11 on, ``1700000000123456789``:
+            nanoseconds; ``2023-11-14T22:13:20.5``: UTC.
+        start_ns: The beginning.
+        option: What is told, for errors.
+
+    Raises:
+        OptionError: It is none of these.
+    """
+    clean = text.strip()
+    if clean.isascii() and (match := _NUMBER.fullmatch(clean)):
+        number = int(match[1])
+        if number >= _IN_NS and match[2] is None:
+            return number
+        is_since_1970 = number >= _SINCE_1970 and not clean.startswith("+")
+        return (0 if is_since_1970 else start_ns) + _nanoseconds(number, match[2])
+    if clean.isascii() and (match := _ISO.fullmatch(clean)):
+        try:
+            moment = datetime.fromisoformat(match[1]).replace(tzinfo=timezone.utc)
+        except ValueError as error:
+            raise OptionError(f"`{option}` {text!r} is no date: {error}.") from None
+        return _nanoseconds(int(moment.timestamp()), match[2])
+    raise OptionError(
+        f"`{option}` {text!r} is no time. Give seconds from the beginning or since 1970, "
+        "nanoseconds since 1970, or a date such as 2023-11-14T22:13:20.5."
+    )
+
+
+def _nanoseconds(seconds: int, fraction: str | None) -> int:
+    return seconds * _NS + int((fraction or "0").ljust(9, "0"))
+
+
+def iso_text(time_ns: int) -> str:
+    """A time as an ISO date, UTC, without the digits that say nothing; outside of them a number."""
+    seconds, rest = divmod(time_ns, _NS)
+    try:
+        moment = datetime.fromtimestamp(seconds, timezone.utc)
+    except (ValueError, OverflowError, OSError):
+        return f"{time_ns} ns"
+    fraction = f".{rest:09d}".rstrip("0") if rest else ""
+    return f"{moment:%Y-%m-%dT%H:%M:%S}{fraction}Z"
+
+
+@dataclass(frozen=True, slots=True)
+class Slice:
+    """A slice of time, as users write it. False where none is asked for.
+
+    Attributes:
+        start: The first time that is taken; None for the beginning.
+        end: The time before which all is taken; None for no end.
+        duration: Seconds from `start`, or before `end`; None where the others tell.
+    """
+
+    start: str | float | None = None
+    end: str | float | None = None
+    duration: str | float | None = None
+
+    def __bool__(self) -> bool:
+        return (self.start, self.end, self.duration) != (None, None, None)
+
+    def times(self, first: int, last: int, place: object) -> tuple[int | None, int | None]:
+        """The first log time that is taken, and the first one after; None for open.
+
+        Args:
+            first: Of the recording, nanoseconds.
+            last: Of the recording, nanoseconds.
+            place: The recording, for errors.
+
+        Raises:
+            OptionError: A time is none, or nothing of the recording is taken.
+        """
+        start = None if self.start is None else time_of(str(self.start), first, "start")
+        end = None if self.end is None else time_of(str(self.end), first, "end")
+        if self.duration is not None:
+            length = time_of(f"+{self.duration}", 0, "duration")
+            if start is not None and end is not None:
+                raise OptionError("Give two of `start`, `end` and `duration`.")
+            if end is not None:
+                start = end - length
+            else:
+                end = (first if start is None else start) + length
+        begin, stop = first if start is None else start, last + 1 if end is None else end
+        if begin >= stop or begin > last or stop <= first:
+            raise OptionError(
+                f"{place}: nothing is from {iso_text(begin)} to before {iso_text(stop)}. It has "
+                f"messages from {iso_text(first)} to {iso_text(last)}, "
+                f"{(last - first) / _NS:.9g} seconds."
+            )
+        return start, end
+
+
+WHOLE = Slice()
+"""No slice: all that was recorded."""
+
+
+class SliceOptions(Options):
+    """Base of options that have these three."""
+
+    start: str | float | None
+    end: str | float | None
+    duration: str | float | None
+
+    @property
+    def slice(self) -> Slice:
+        """What is taken of the recording; false for all."""
+        return Slice(self.start, self.end, self.duration)
+
+
 # ---------------------------------------------------------------- options of several kinds
 
 
@@ -156,6 +277,25 @@ def max_rate() -> Any:
 def jpeg_quality() -> Any:
     """The option of the quality of JPEG files."""
     return option("Of JPEG files that are made.", 95, least=1, most=100)
+
+
+def start() -> Any:
+    """The option of the first time that is taken."""
+    return option(
+        "Take what was recorded from here on: seconds from the beginning, or since 1970; "
+        "nanoseconds since 1970; or an ISO date.",
+        metavar="TIME",
+    )
+
+
+def end() -> Any:
+    """The option of the time before which all is taken."""
+    return option("Take what was recorded before.", metavar="TIME")
+
+
+def duration() -> Any:
+    """The option of how much is taken."""
+    return option("Take so much from `start` on, or before `end`.", metavar="SECONDS")
 
 
 def cluster() -> Any:

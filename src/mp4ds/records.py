@@ -7,7 +7,7 @@ A ROS 1 connection and a rosbag2 topic are channels too (spec/index.md, "Channel
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 QOS_KEY = "offered_qos_profiles"
 """Key of a ROS 2 channel's metadata with the recorded QoS profiles, a YAML text."""
@@ -140,6 +140,12 @@ class Excerpt:
     def has_time(self, time: int) -> bool:
         """Whether messages of a log time, nanoseconds, are part of it."""
         return (self.start is None or self.start <= time) and (self.end is None or time < self.end)
+
+    def within(self, other: Excerpt) -> Excerpt:
+        """It, as far as it lies in the span of another."""
+        starts = [time for time in (self.start, other.start) if time is not None]
+        ends = [time for time in (self.end, other.end) if time is not None]
+        return replace(self, start=max(starts, default=None), end=min(ends, default=None))
 
     def touches(self, first: int, last: int) -> bool:
         """Whether some log time from `first` to `last`, both included, is part of it."""

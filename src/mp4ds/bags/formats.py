@@ -20,7 +20,6 @@ from mp4ds.files.sources import (
     HOW_TO_OPEN,
     is_folder,
     source_digest,
-    source_name,
     source_size,
     video_at,
 )
@@ -40,12 +39,10 @@ class SourceHasher:
     the reader is past its bytes. A context manager.
 
     Args:
-        path: The recording; a folder's name is put before those of its files.
         files: All files, in reading order.
     """
 
-    def __init__(self, path: Path, files: Sequence[Path]) -> None:
-        self._folder = path if path.is_dir() else None
+    def __init__(self, files: Sequence[Path]) -> None:
         self._files = list(files)
         self._sizes = {path: source_size(path) for path in files if is_folder(path)}
         self._position = 0
@@ -53,7 +50,7 @@ class SourceHasher:
         self._offset = 0
         self._hash = hashlib.sha256()
         self._stream: BinaryIO | None = None  # held, as another file may take the name
-        self.digests: list[tuple[str, int, str]] = []
+        self._digests: list[tuple[int, str]] = []
 
     def advance(self, position: int | None) -> None:
         """Hash up to a position in all files, None for the end.
@@ -68,7 +65,7 @@ class SourceHasher:
                 return
             try:
                 if path in self._sizes:
-                    self._finish(path, *source_digest(path))
+                    self._finish(*source_digest(path))
                     self._position = end
                     continue
                 if self._stream is None:
@@ -77,7 +74,17 @@ class SourceHasher:
             except OSError as error:
                 raise SourceError(path, f"cannot be read: {error.strerror}") from None
             if at_end:
-                self._finish(path, self._offset, self._hash.hexdigest())
+                self._finish(self._offset, self._hash.hexdigest())
+
+    def digest(self, number: int) -> tuple[int, str]:
+        """Size in bytes and SHA-256 of a file by its number; all are read to their ends first.
+
+        Raises:
+            SourceError: It cannot be read.
+        """
+        if number >= len(self._digests):
+            self.advance(None)
+        return self._digests[number]
 
     def _hash_file(self, stream: BinaryIO, position: int | None) -> bool:
         while position is None or self._position < position:
@@ -89,8 +96,8 @@ class SourceHasher:
             self._position += len(block)
         return False
 
-    def _finish(self, path: Path, size: int, sha256: str) -> None:
-        self.digests.append((source_name(path, self._folder), size, sha256))
+    def _finish(self, size: int, sha256: str) -> None:
+        self._digests.append((size, sha256))
         self._hash = hashlib.sha256()
         self._offset = 0
         self._number += 1

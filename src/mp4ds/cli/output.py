@@ -181,6 +181,11 @@ def print_pack(summary: PackSummary) -> None:
         say(f"lost: {len(summary.losses) - _LOSSES_SHOWN} places more; dataset.yaml lists them")
     if not any(topic.files for topic in summary.topics):
         say("no topic became a video: all messages are in messages.mcap as they were")
+    if summary.not_copied:
+        say(f"encoded again, as it cannot be copied: {summary.not_copied}")
+    if summary.is_copy:
+        say(f"{summary.dataset}: {size_text(summary.dataset_bytes)}, copied")
+        return
     ratio = summary.source_bytes / summary.dataset_bytes
     change = f"{ratio:.2f} times smaller" if ratio >= 1 else f"{1 / ratio:.2f} times as large"
     say(
@@ -205,15 +210,15 @@ def _pack_row(topic: TopicSummary) -> list[str]:
     if not stored:
         modelled = topic.messages and topic.frames == topic.messages
         stored = "sidecar" if modelled else "messages.mcap"
-    ratio = topic.raw_bytes / topic.packed_bytes if topic.packed_bytes else None
+    ratio = topic.raw_bytes / topic.packed_bytes if topic.packed_bytes else 0
     return [
         topic.topic,
         topic.type_name,
         str(topic.messages),
         str(topic.frames) if topic.files else "",
-        size_text(topic.raw_bytes),
+        size_text(topic.raw_bytes) if topic.raw_bytes else "",
         size_text(topic.packed_bytes) if topic.packed_bytes else "",
-        _number(ratio, 2),
+        _number(ratio or None, 2),
         stored,
     ]
 

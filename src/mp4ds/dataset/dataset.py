@@ -39,6 +39,7 @@ from mp4ds.records import Channel, Excerpt, Message, Record, Schema
 from mp4ds.times import Sync, synchronize
 
 _VIDEOS = (".mp4", ".m4v", ".mov")
+_JPEG_QUALITY = 95
 
 
 class Dataset:
@@ -54,6 +55,7 @@ class Dataset:
         manifest: Of the folder; None for one video.
         streams: Its streams.
         videos: Videos of others, which have no sidecar; see `mp4ds.open`.
+        jpeg_quality: Of the JPEG files that messages of transcoded streams get.
 
     Args:
         path: The folder, a manifest, a sidecar, or a video beside its sidecar; or its URL.
@@ -65,12 +67,13 @@ class Dataset:
         FormatError: A file breaks a rule of the format.
     """
 
-    def __init__(self, path: Path | str, *, jpeg_quality: int = 95) -> None:
+    def __init__(self, path: Path | str, *, jpeg_quality: int = _JPEG_QUALITY) -> None:
         self.path = location(path)
         if not self.path.exists():
             raise SourceNotFoundError(self.path)
         if self.path.name == MANIFEST_NAME:
             self.path = self.path.parent
+        self.jpeg_quality = jpeg_quality
         self.manifest: Manifest | None = None
         holds_one = (self.path / MANIFEST_NAME).exists()
         if not holds_one and self.path.suffix not in (".yaml", ".yml", ".mp4"):
@@ -93,7 +96,7 @@ class Dataset:
     def of(cls, folder: Path, manifest: Manifest, streams: Sequence[Stream]) -> Dataset:
         """A folder of which all sidecars were read already."""
         dataset = cls.__new__(cls)
-        dataset.path, dataset.manifest = folder, manifest
+        dataset.path, dataset.manifest, dataset.jpeg_quality = folder, manifest, _JPEG_QUALITY
         dataset.streams, dataset.videos = list(streams), []
         return dataset
 
@@ -165,6 +168,10 @@ class Dataset:
         """
         if self.manifest:
             self._file.verify(self.manifest)
+
+    def other_records(self) -> Iterator[Record]:
+        """The attachments and metadata records."""
+        return self._file.others()
 
     def recorded_records(self) -> Iterator[Record]:
         """Everything in messages.mcap, in file order."""
@@ -295,7 +302,7 @@ class Dataset:
         reading = Reading(sources or {}, within(span, choose) if is_span else choose, ahead)
         groups = [item for item in self._groups if topics is None or item.channel.topic in topics]
         if is_span:
-            recorded = ahead(self._recorded_in(span))
+            recorded = ahead(self.recorded_messages(span))
             parts = [part for group in groups for part in group.parts_of(reading)]
             return heapq.merge(recorded, *parts, key=_time_of)
         channels = (self._group_messages(group, reading) for group in groups)
@@ -310,7 +317,7 @@ class Dataset:
         """
         found: dict[int, Message] = {}
         topics = frozenset(channel.topic for channel in channels)
-        for message in self._recorded_in(Excerpt(end=time_ns, topics=topics)):
+        for message in self.recorded_messages(Excerpt(end=time_ns, topics=topics)):
             found[message.channel.id] = message
         reading = Reading(choice=last_of(time_ns))
         for group in self._groups:
@@ -323,6 +330,12 @@ class Dataset:
     def times(self) -> dict[int, NDArray[np.int64]]:
         """Sorted log times of every message, nanoseconds, by channel id; decodes no frame."""
         return log_times(self._groups, self._file.times())
+
+    def recorded_times(self, topic: str) -> NDArray[np.int64]:
+        """Sorted log times, nanoseconds, of a topic's messages that are in messages.mcap."""
+        times = self._file.times()
+        found = [times[c.id] for c in self._file.channels if c.topic == topic and c.id in times]
+        return np.sort(np.concatenate([np.empty(0, np.int64), *found]))
 
     @property
     def is_in_time(self) -> bool:
@@ -350,7 +363,7 @@ class Dataset:
             if not isinstance(record, Message) or record.channel.id in wanted:
                 yield record
 
-    def _recorded_in(self, excerpt: Excerpt) -> Iterator[Message]:
+    def recorded_messages(self, excerpt: Excerpt) -> Iterator[Message]:
         """Messages in messages.mcap, by log time, on the channels that they belong to."""
         owners = {key: group.channel for group in self._groups for key in group.recorded_ids}
         for message in self._file.in_time(excerpt):

@@ -94,6 +94,10 @@ class MessagesFile:
         """All that is in it, as it stands there."""
         return self._reader.as_it_stands() if self._reader else iter(())
 
+    def others(self) -> Iterator[Record]:
+        """The attachments and metadata records in it."""
+        return self._reader.records(Excerpt(start=0, end=0)) if self._reader else iter(())
+
     def in_time(self, excerpt: Excerpt) -> Iterator[Message]:
         """The messages of an excerpt, by log time."""
         records = self._reader.records(replace(excerpt, others=False)) if self._reader else ()

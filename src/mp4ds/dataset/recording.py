@@ -87,9 +87,8 @@ class DatasetReader:
         return self._span(excerpt, start, end)
 
     def _span(self, excerpt: Excerpt, start: int | None, end: int | None) -> Iterator[Record]:
-        for record in self._dataset.recorded_records() if excerpt.others else ():
-            if not isinstance(record, Message):
-                yield record
+        if excerpt.others:
+            yield from self._dataset.other_records()
         if excerpt.has_messages:
             topics = self._topics(excerpt)
             yield from self._dataset.records(start=start, end=end, topics=topics)

@@ -468,6 +468,12 @@ class Stream(DecodedFrames):
         """As `numbered_makers`, without the numbers."""
         return (make for _, make in self.numbered_makers(choice))
 
+    @property
+    def hidden_frames(self) -> int:
+        """How many frames the video hides before its first one, which may refer to them."""
+        with PacketReader(self.video_path, codec=self.sidecar.video.codec) as reader:
+            return reader.hidden
+
     def numbered_makers(
         self, choice: Choice = everything
     ) -> Iterator[tuple[int, Callable[[], bytes | bytearray]]]:

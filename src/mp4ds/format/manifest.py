@@ -7,9 +7,17 @@ from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, model_validator
 
+from mp4ds import records
 from mp4ds.format.fields import Count, FileName, Model, Profile, Sha256, Size, Time, Version
 from mp4ds.messages.transforms import MAX_TRANSFORMS, Transform
 from mp4ds.records import MAX_LOSSES, MAX_LOST_TOPICS, Loss
+
+
+class Excerpt(Model):
+    """A span of log time, ns."""
+
+    start: Time | None = Field(None, description="The first time in it; absent: no bound.")
+    end: Time | None = Field(None, description="The first time after it; absent: no bound.")
 
 
 class Source(Model):
@@ -17,7 +25,20 @@ class Source(Model):
 
     name: str = Field(description="File name, for a rosbag2 folder with the folder's name.")
     size: Size = Field(description="Bytes.")
-    sha256: Sha256
+    sha256: Sha256 | None = Field(
+        None, description="Absent where only a part was packed, and so only that was read."
+    )
+    excerpt: Excerpt | None = Field(
+        None, description="What of it was packed; absent where all was, but topics left out."
+    )
+
+    def within(self, span: records.Excerpt) -> Source:
+        """The same, of which only what lies in the span of an excerpt is packed."""
+        if span.start is None and span.end is None:
+            return self
+        own = self.excerpt or Excerpt()
+        span = span.within(records.Excerpt(own.start, own.end))
+        return self.model_copy(update={"excerpt": Excerpt(start=span.start, end=span.end)})
 
 
 class EarlierDataset(Model):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,7 @@ from mp4ds.messages.serializations import WIRES
 from mp4ds.plan import TOLERANCES, QualityTarget
 from mp4ds.records import Channel, Schema
 from mp4ds.times import encode_column
+from mp4ds.video.access import digest_video
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.coded_messages import PACKET_CODECS
 from mp4ds.video.pixels import shows_colours
@@ -139,6 +141,25 @@ class Quality(Model):
             windows=sum(part.windows for part, _ in parts),
             reencoded=sum(part.reencoded for part, _ in parts),
             limited=sum(part.limited for part, _ in parts),
+        )
+
+    def of(self, numbers: NDArray[np.int64], frames: int) -> Quality:
+        """What holds of some frames; what is told of windows stays that of the whole.
+
+        Args:
+            numbers: Of the frames, at least one.
+            frames: How many there are.
+
+        Raises:
+            ValueError: There is no score for each of them.
+        """
+        return self.from_scores(
+            QualityTarget(self.metric, self.target),
+            self.scores.decode(frames)[numbers],
+            worst_window=self.worst_window,
+            windows=self.windows,
+            reencoded=self.reencoded,
+            limited=self.limited,
         )
 
     def decode(self, frames: int) -> NDArray[np.float64]:
@@ -580,3 +601,26 @@ class StreamSidecar(Model):
         values = given.model_dump(exclude_none=True) if given else {}
         encoding = ENCODINGS[self.image.encoding]
         return bind(self.video.layout, encoding, Parameters.from_values(values))
+
+
+# ---------------------------------------------------------------- facts of a finished video
+
+FACTS = ("file", "size", "sha256", "references")
+"""Keys of `mp4ds.format.models.Video`."""
+
+
+def video_facts(path: Path, codec: str) -> dict[str, Any]:
+    """The values of `FACTS` for a finished video, which is read once.
+
+    Args:
+        path: The video.
+        codec: Name in the registry.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    found = digest_video(path, codec)
+    structures = found.structures
+    useful = structures is not None and not structures.is_plain
+    references = References.from_structures(structures) if structures and useful else None
+    return dict(zip(FACTS, (path.name, found.size, found.sha256, references), strict=True))

@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,8 @@ from mp4ds.errors import (
     WriteError,
 )
 from mp4ds.files.outputs import is_seen, move_into_place, sync
-from mp4ds.files.sources import source_name
 from mp4ds.packing.engine import Engine, Outcome
-from mp4ds.packing.job import Job, Task
+from mp4ds.packing.job import Job, Task, span_of
 from mp4ds.packing.join import Assembler
 from mp4ds.packing.manifest import (
     Origin,
@@ -259,17 +259,13 @@ class Coordinator:
             folder.mkdir()
             part = self._join(run, folder, progress)
             with run.job.open() as reader:
-                where = reader.path if reader.path.is_dir() else None
-                digests = [
-                    (source_name(path, where), *_digest(run.place, number))
-                    for number, path in enumerate(reader.files)
-                ]
+                digests = run.job.digests(reader, partial(_digest, run.place))
                 run.job.check_sources(reader.files)
-                origin = Origin.of(reader.files, digests, run.job.about)
+                origin = Origin.of(reader.files, digests, run.job.about, span_of(reader))
                 write_manifest(part, reader, origin, run.job.options["quality"])
             sync(folder)
             size = sum(source.size for source in run.job.sources)
-            summary = summarize(part, run.target, size, origin)
+            summary = summarize(part, run.target, None if run.job.slice else size, origin)
             move_into_place(
                 folder, run.target, run.place.replaced, force=run.force, owned=dataset_files
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,19 +11,21 @@ from typing import Any
 from mp4ds._version import __version__
 from mp4ds.bags.formats import RECORDING_SUFFIXES, open_reader, open_sources
 from mp4ds.bags.protocols import BagReader
+from mp4ds.bags.slices import SliceReader
 from mp4ds.errors import OptionError, SourceError
-from mp4ds.files.sources import SourceState, source_digest
+from mp4ds.files.sources import SourceState, source_digest, source_name, source_size
 from mp4ds.files.urls import location, spelled
 from mp4ds.format.fields import document_of
 from mp4ds.format.manifest import About
 from mp4ds.format.sidecars import MANIFEST_NAME, load_about
+from mp4ds.options import WHOLE, Slice
 from mp4ds.packing.manifest import dump_kept, load_kept
 from mp4ds.packing.options import ImageFolder, PackOptions
 from mp4ds.packing.packer import Exact, PartSettings
 from mp4ds.packing.survey import Survey
 from mp4ds.packing.tracks import StreamSettings
 from mp4ds.plan import Selection, parse_purpose, parse_quality
-from mp4ds.records import Excerpt
+from mp4ds.records import EVERYTHING, Excerpt
 from mp4ds.registry import plugin
 from mp4ds.video.encoder import tool_versions
 
@@ -33,7 +35,7 @@ TASK_NAME = r"source-[0-9]{1,9}|whole-[0-9]{1,9}|[0-9]{5,9}-[0-9]{1,9}|all"
 _MOST_THREADS = 4096
 _OUTCOME_OPTIONS = (
     *("topics", "exclude", "quality", "codec", "preset", "transcode", "camera_info"),
-    *("gop", "window", "salvage", "images", "purpose", "about"),
+    *("gop", "window", "salvage", "images", "purpose", "about", "start", "end", "duration"),
 )
 
 
@@ -206,7 +208,32 @@ class Job:
             paths,
             salvage=bool(self.options["salvage"]),
             images=None if images is None else ImageFolder(**images),
+            asked=self.slice,
         )
+
+    @property
+    def slice(self) -> Slice:
+        """What of the recording is packed; false for all."""
+        return Slice(*(self.options[name] for name in ("start", "end", "duration")))
+
+    def digests(
+        self, reader: BagReader, digest_of: Callable[[int], tuple[int, str]]
+    ) -> list[tuple[str, int, str | None]]:
+        """Name, size in bytes and SHA-256 of each file of the recording.
+
+        Those that are read in part only are not hashed.
+
+        Args:
+            reader: The recording.
+            digest_of: Gives size and SHA-256 of a file by its number.
+        """
+        folder = reader.path if reader.path.is_dir() else None
+        found: list[tuple[str, int, str | None]] = []
+        for number, path in enumerate(reader.files):
+            is_read = is_hashed(path, self.slice)
+            size, sha256 = digest_of(number) if is_read else (source_size(path), None)
+            found.append((source_name(path, folder), size, sha256))
+        return found
 
     def check_sources(self, files: Sequence[Path] | None = None) -> None:
         """Refuse a recording that is not what it was when the job was planned.
@@ -261,7 +288,11 @@ class Job:
 
 
 def open_recording(
-    paths: Sequence[Path], *, salvage: bool = False, images: ImageFolder | None = None
+    paths: Sequence[Path],
+    *,
+    salvage: bool = False,
+    images: ImageFolder | None = None,
+    asked: Slice = WHOLE,
 ) -> BagReader:
     """Open what is to be packed.
 
@@ -269,11 +300,23 @@ def open_recording(
         paths: Recordings and datasets that belong together, or a folder of images.
         salvage: Read what can be read of damaged recordings.
         images: How the folder of images is read; None for recordings.
+        asked: What of it is to be packed.
 
     Raises:
         SourceError: It cannot be read.
         OptionError: The options do not suit it.
     """
+    reader = _open_whole(paths, salvage, images)
+    if not asked:
+        return reader
+    try:
+        return SliceReader(reader, asked)
+    except BaseException:
+        reader.__exit__()
+        raise
+
+
+def _open_whole(paths: Sequence[Path], salvage: bool, images: ImageFolder | None) -> BagReader:
     if salvage and any(map(dataset_at, paths)):
         raise OptionError("`salvage` goes with recordings, not with a dataset.")
     if images is None:
@@ -337,6 +380,16 @@ def tools() -> dict[str, str]:
 def absolute(paths: Sequence[Path]) -> list[str]:
     """Recordings as a job names them."""
     return [spelled(path) for path in paths]
+
+
+def is_hashed(path: Path, asked: Slice) -> bool:
+    """Whether a file of a recording is hashed: it is not where only a slice of it is read."""
+    return not asked or path.name == MANIFEST_NAME
+
+
+def span_of(reader: BagReader) -> Excerpt:
+    """What of a recording is read."""
+    return reader.span if isinstance(reader, SliceReader) else EVERYTHING
 
 
 def digest_source(source: SourceState) -> Sequence[object]:

@@ -26,10 +26,17 @@ from mp4ds.format.fields import (
     Digests,
     exceeds_padding,
 )
-from mp4ds.format.models import Calibration, CameraInfo, Header, Quality, StreamSidecar
+from mp4ds.format.models import (
+    FACTS,
+    Calibration,
+    CameraInfo,
+    Header,
+    Quality,
+    StreamSidecar,
+    video_facts,
+)
 from mp4ds.format.sidecars import dump_document
 from mp4ds.packing.manifest import PartRecord, PartStream, declare_rest
-from mp4ds.packing.writer import FACTS, video_facts
 from mp4ds.plan import FileNames
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord
 from mp4ds.times import PresentationClock

@@ -36,7 +36,7 @@ from mp4ds.messages.png import zlib_build
 from mp4ds.messages.transforms import Transform, TransformCollector
 from mp4ds.packing.options import PackSummary, TopicSummary
 from mp4ds.plan import LOSSLESS
-from mp4ds.records import Channel, Loss
+from mp4ds.records import EVERYTHING, Channel, Excerpt, Loss
 from mp4ds.video.encoder import tool_versions
 
 _MARK = b',\n"xxh64": "'
@@ -306,17 +306,19 @@ class Origin:
     def of(
         cls,
         files: Sequence[Path],
-        digests: Iterable[tuple[str, int, str]],
+        digests: Iterable[tuple[str, int, str | None]],
         about: About | None = None,
+        span: Excerpt = EVERYTHING,
     ) -> Origin:
         """The origin of what was read.
 
         Args:
             files: The files of recordings, and of datasets that are packed again, each of which
                 begins with its manifest.
-            digests: Name, size in bytes and SHA-256 of each.
+            digests: Name, size in bytes and SHA-256 of each; None of those that were read in part.
             about: What is told of the recording; None for what the datasets tell, if it is one
                 thing.
+            span: What was packed of them.
 
         Raises:
             SourceError: A file is not what the manifest of its dataset says.
@@ -327,13 +329,13 @@ class Origin:
         for path, (name, size, sha256) in zip(files, digests, strict=True):
             entry = expected.get(path)
             if entry is not None:
-                if entry.sha256 != sha256:
+                if sha256 not in (None, entry.sha256):
                     raise SourceError(
                         path,
                         "does not have the SHA-256 that its dataset's manifest says",
                         "See `mp4ds validate`, and copy it again.",
                     )
-            elif path.name == MANIFEST_NAME:
+            elif path.name == MANIFEST_NAME and sha256 is not None:
                 manifest = load_manifest(path)
                 origin._add_dataset(manifest, path, sha256)
                 told.append(manifest.about)
@@ -342,7 +344,7 @@ class Origin:
                 origin.sources.append(Source(name=name, size=size, sha256=sha256))
         if about is None and told and all(item == told[0] for item in told):
             about = told[0]
-        return replace(origin, about=about)
+        return replace(origin, sources=[it.within(span) for it in origin.sources], about=about)
 
     def _add_dataset(self, manifest: Manifest, path: Path, sha256: str) -> None:
         self.sources.extend(manifest.sources)
@@ -453,15 +455,20 @@ def _static_transforms(part: PartRecord) -> list[StaticTransform]:
     return [StaticTransform.from_record(item) for item in collector.between(frame_ids)]
 
 
-def summarize(part: PartRecord, target: Path, source_bytes: int, origin: Origin) -> PackSummary:
+def summarize(
+    part: PartRecord, target: Path, source_bytes: int | None, origin: Origin
+) -> PackSummary:
     """What a pack did.
 
     Args:
         part: All that was packed.
         target: The dataset's final name.
-        source_bytes: Bytes of the source files.
+        source_bytes: Bytes of the source files; None where a slice was taken, for the bytes of
+            its messages.
         origin: What it was read from.
     """
+    if source_bytes is None:
+        source_bytes = sum(topic.raw_bytes for topic in part.topics.values())
     for stream in part.streams:
         video = stream.sidecar.video
         topic = part.topics[stream.sidecar.channel.topic]

@@ -8,7 +8,19 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mp4ds.errors import OptionError
-from mp4ds.options import Options, cluster, exclude, force, option, parse_size, topics
+from mp4ds.options import (
+    Options,
+    SliceOptions,
+    cluster,
+    duration,
+    end,
+    exclude,
+    force,
+    option,
+    parse_size,
+    start,
+    topics,
+)
 from mp4ds.plan import LOSSLESS, MAX_GOP, QualitySetting, parse_purpose, parse_quality
 from mp4ds.records import Loss
 
@@ -50,11 +62,14 @@ _OTHER = "other reasons"
 
 
 @dataclass(frozen=True)
-class PackOptions(Options):
+class PackOptions(SliceOptions):
     """How to pack."""
 
     topics: Sequence[str] = topics()
     exclude: Sequence[str] = exclude()
+    start: str | float | None = start()
+    end: str | float | None = end()
+    duration: str | float | None = duration()
     quality: str | None = option(
         "lossless, visual, crf=N, or a score to keep: vmaf=99.5, psnr=42, ssim=0.98; by default "
         "lossless, of a dataset as it was packed.",
@@ -239,6 +254,8 @@ class PackSummary:
         skipped: What the source holds and no dataset can: a phrase -> how many.
         losses: What could not be read of a damaged recording.
         larger: Why the dataset is larger than its source, where it is by more than 5 %.
+        is_copy: Whether the videos of a dataset were copied; `raw_bytes` of topics are not known.
+        not_copied: Why a dataset's videos were encoded anew, where that was not asked for.
     """
 
     dataset: Path
@@ -250,3 +267,5 @@ class PackSummary:
     skipped: dict[str, int]
     losses: list[Loss] = field(default_factory=list)
     larger: str = ""
+    is_copy: bool = False
+    not_copied: str = ""

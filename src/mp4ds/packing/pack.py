@@ -21,16 +21,25 @@ from mp4ds.errors import (
     FormatError,
     OptionError,
     PartsFailedError,
+    Refused,
     SourceError,
     TargetExistsError,
     WriteError,
 )
 from mp4ds.files.outputs import check_target, digest_file, staged
-from mp4ds.files.sources import source_size, unchanged
+from mp4ds.files.sources import source_digest, source_size, unchanged
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.sidecars import MANIFEST_NAME, load_about, load_manifest, load_stream
 from mp4ds.messages.serializations import is_camera
-from mp4ds.packing.job import Job, Task, absolute, dataset_at, open_recording, outcome_options
+from mp4ds.packing.job import (
+    Job,
+    Task,
+    absolute,
+    dataset_at,
+    open_recording,
+    outcome_options,
+    span_of,
+)
 from mp4ds.packing.manifest import (
     Origin,
     PartRecord,
@@ -153,10 +162,17 @@ def pack_in_one_pass(
         known = counts.get(channel.topic, 0)
         counts[channel.topic] = None if count is None or known is None else known + count
     next_report = 0.0
+    due = sum(item.count for item in stats.values())
+
+    def share(part: PartRecord) -> float:
+        if job.slice:
+            return sum(topic.messages for topic in part.topics.values()) / max(1, due)
+        hasher.advance(reader.position)
+        return reader.position / max(1, total)
 
     def progress(part: PartRecord, *, done: bool = False) -> None:
         nonlocal next_report
-        hasher.advance(reader.position)
+        packed = share(part)
         now = time.monotonic()
         if report is None or (now < next_report and not done):
             return
@@ -165,7 +181,7 @@ def pack_in_one_pass(
             PackProgress(
                 dataset=target,
                 phase="packing",
-                done=1.0 if done else min(1.0, reader.position / max(1, total)),
+                done=1.0 if done else min(1.0, packed),
                 bytes_read=sum(topic.raw_bytes for topic in part.topics.values()),
                 bytes_total=total,
                 bytes_written=folder_size(folder),
@@ -178,13 +194,17 @@ def pack_in_one_pass(
         )
 
     (task,) = (task for task in job.tasks if task.whole)
-    with unchanged(job.sources), SourceHasher(reader.path, reader.files) as hasher:
+    with unchanged(job.sources), SourceHasher(reader.files) as hasher:
         part = Packer(reader, folder, job.settings(task, exact), progress).run()
-        hasher.advance(None)
-    origin = Origin.of(reader.files, hasher.digests, job.about)
+        digests = job.digests(reader, partial(_digest, reader) if job.slice else hasher.digest)
+    origin = Origin.of(reader.files, digests, job.about, span_of(reader))
     write_manifest(part, reader, origin, job.options["quality"])
     progress(part, done=True)
-    return summarize(part, target, total, origin)
+    return summarize(part, target, None if job.slice else total, origin)
+
+
+def _digest(reader: BagReader, number: int) -> tuple[int, str]:
+    return source_digest(reader.files[number])
 
 
 # ---------------------------------------------------------------- pack
@@ -234,10 +254,26 @@ def _pack(
     store = remote(target)
     if store:
         return _pack_to_store(paths, store, options, progress)
+    if options.quality is None:
+        return _copied(paths, target, options, progress)
     run = _plan(paths, target, options)
     if run.is_new and run.job.is_single and not options.cluster:
         return until_in_reach(partial(_pack_in_one_pass, run, progress))
     return _pack_runs([run], options, progress)[0]
+
+
+def _copied(
+    paths: Sequence[Path], target: Path, options: PackOptions, progress: Report | None
+) -> PackSummary:
+    """Copy a dataset, or encode it anew where it cannot be copied."""
+    from mp4ds.packing.copying import copy
+
+    try:
+        return copy(paths[0], target, options)
+    except Refused as reason:
+        encoded = replace(options, quality=_quality_of(paths), transcode=_has_transcoded(paths))
+        summary = _pack(paths, target, _checked(encoded, paths), progress)
+        return replace(summary, not_copied=str(reason))
 
 
 def _pack_to_store(
@@ -329,13 +365,15 @@ def pack_each(
                 f"{targets[target]} and {source} would both become {target}. Pack one elsewhere."
             )
         targets[target] = source
-    if remote(parent):  # one after the other, so that only one is on this machine at a time
+    if not remote(parent):
+        parent.mkdir(exist_ok=True)
+    # what goes to a URL is on this machine one after the other
+    if remote(parent) or chosen.quality is None:
         return [
             _pack([source], target, chosen, progress)
             for target, source in targets.items()
             if chosen.force or not _is_packed(source, target, chosen)
         ]
-    parent.mkdir(exist_ok=True)
     runs = []
     for target, source in targets.items():
         if chosen.force or not _is_packed(source, target, chosen):
@@ -352,13 +390,18 @@ def _is_packed(source: Path, target: Path, options: PackOptions) -> bool:
     except FormatError:
         raise TargetExistsError(target) from None
     folder = dataset_at(source)
+    with open_recording([source], images=options.images, asked=options.slice) as reader:
+        span = span_of(reader)
+        sizes = sorted(map(source_size, reader.files))
     if folder:
+        due = [item.within(span) for item in load_manifest(folder / MANIFEST_NAME).sources]
         earlier = [item.sha256 for item in manifest.derived_from[-1:]]
-        is_same = earlier == [digest_file(folder / MANIFEST_NAME)[1]]
+        is_same = earlier == [digest_file(folder / MANIFEST_NAME)[1]] and manifest.sources == due
     else:
-        with open_recording([source], images=options.images) as reader:
-            sizes = sorted(map(source_size, reader.files))
-        is_same = sorted(item.size for item in manifest.sources) == sizes
+        is_same = sorted(item.size for item in manifest.sources) == sizes and all(
+            item.within(span) == item.model_copy(update={"excerpt": None}).within(span)
+            for item in manifest.sources
+        )
     if not is_same:
         raise TargetExistsError(target)
     return True
@@ -367,11 +410,21 @@ def _is_packed(source: Path, target: Path, options: PackOptions) -> bool:
 def _checked(options: PackOptions, paths: Sequence[Path]) -> PackOptions:
     """The options, with what is left to the sources; refuses those that contradict each other.
 
+    Without a quality where a dataset is only copied.
+
     Raises:
         OptionError: They do.
         HardwareError: An encoder is asked for that this machine has not.
         ScoringError: VMAF is asked for, and there is nothing that computes it.
     """
+    images = options.images.absolute() if options.images else None
+    if options.about is not None:
+        load_about(options.about)  # refuses what it cannot tell before anything is read
+    if options.quality is None and any(map(dataset_at, paths)):
+        from mp4ds.packing.copying import is_copy
+
+        if is_copy(paths, options):
+            return options
     asked = _quality_of(paths) if options.quality is None else options.quality
     quality = parse_quality(asked)
     if options.transcode and quality.lossless:
@@ -392,11 +445,8 @@ def _checked(options: PackOptions, paths: Sequence[Path]) -> PackOptions:
         from mp4ds.video.libvmaf import find_ffmpeg
 
         find_ffmpeg()  # says how to get one before anything is read
-    images = options.images.absolute() if options.images else None
     transcode = options.transcode or (not quality.lossless and _has_transcoded(paths))
     chosen = replace(options, quality=str(quality), transcode=transcode, images=images)
-    if options.about is not None:
-        load_about(options.about)  # refuses what it cannot tell before anything is read
     chosen.group_frames  # noqa: B018 - refuses a purpose that is none
     return chosen
 
@@ -447,7 +497,9 @@ def _plan(
         raise OptionError(
             f"There is nothing to join: {place.folder} holds no pack. Run the shards first."
         )
-    with open_recording(paths, salvage=options.salvage, images=options.images) as reader:
+    with open_recording(
+        paths, salvage=options.salvage, images=options.images, asked=options.slice
+    ) as reader:
         job = plan_job(reader, paths, options, Resources.of(options).for_one_of(recordings))
     return PackRun(job, place, paths, target, options.force, is_new=True)
 

@@ -16,8 +16,9 @@ from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import OptionError, Refused
 from mp4ds.files.sources import SourceState
 from mp4ds.messages.serializations import is_calibration, is_camera
+from mp4ds.options import Slice
 from mp4ds.packing.calibrations import choose_pairs, pair_camera_infos, unpaired_infos
-from mp4ds.packing.job import Job, Task, absolute, outcome_options, tools
+from mp4ds.packing.job import Job, Task, absolute, is_hashed, outcome_options, tools
 from mp4ds.packing.look import Looker, depends_on_others
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.survey import Decision, Survey, decide, rate_of, survey_channel, survey_pairs
@@ -240,7 +241,7 @@ def plan_job(
     costs = _costs(reader, topics, survey, threads=1)
     budget = max(max(costs.values()), means.memory // (means.jobs or means.cores) - TASK_BYTES)
     groups = group_topics(costs, budget)
-    tasks = _tasks(spans, groups, topics, reader)
+    tasks = _tasks(spans, groups, topics, reader, options.slice)
     spare = max(1, means.cores // len(tasks))
     workers = min(spare, max(map(len, groups)))
     threads = max(1, spare // workers)
@@ -275,7 +276,7 @@ def _single(
         workers=workers,
         task_bytes=needed,
         survey=Survey(),
-        tasks=[*_digest_tasks(reader), Task("all", others=True, whole=True)],
+        tasks=[*_digest_tasks(reader, options.slice), Task("all", others=True, whole=True)],
         work={},
         cameras=[],
         tools=tools(),
@@ -289,8 +290,12 @@ def _side_by_side(reader: BagReader, means: Resources) -> tuple[int, int]:
     return workers, max(1, -(-cores // workers))
 
 
-def _digest_tasks(reader: BagReader) -> list[Task]:
-    return [Task(f"source-{number}", source=number) for number in range(len(reader.files))]
+def _digest_tasks(reader: BagReader, asked: Slice) -> list[Task]:
+    return [
+        Task(f"source-{number}", source=number)
+        for number, path in enumerate(reader.files)
+        if is_hashed(path, asked)
+    ]
 
 
 def _work(
@@ -406,6 +411,7 @@ def _tasks(
     groups: Sequence[Sequence[str]],
     topics: _Topics,
     reader: BagReader,
+    asked: Slice,
 ) -> list[Task]:
     """All tasks, those of one time together; the first group takes what is no camera's, too."""
     apart = [_with_infos(group, topics) for group in groups[1:]]
@@ -414,7 +420,7 @@ def _tasks(
         for topic in dict.fromkeys(channel.topic for channel in topics.bound)
     ]
     without = tuple(sorted(topic for group in (*apart, *solo) for topic in group))
-    tasks = _digest_tasks(reader)
+    tasks = _digest_tasks(reader, asked)
     tasks += [Task(f"whole-{n}", topics=group, solo=True) for n, group in enumerate(solo)]
     for number, (start, end) in enumerate(spans):
         name = f"{number:05}"

@@ -7,7 +7,6 @@ from array import array
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import xxhash
 
@@ -20,9 +19,9 @@ from mp4ds.format.models import (
     Header,
     Image,
     PngFile,
-    References,
     StreamSidecar,
     VideoModel,
+    video_facts,
 )
 from mp4ds.format.sidecars import dump_document
 from mp4ds.messages.png import PngRecipe, zlib_fingerprint
@@ -31,28 +30,6 @@ from mp4ds.packing.look import CameraMessage
 from mp4ds.packing.tracks import StreamSettings, TrackPlan
 from mp4ds.records import Channel, Message
 from mp4ds.times import PresentationClock
-from mp4ds.video.access import digest_video
-
-FACTS = ("file", "size", "sha256", "references")
-"""Keys of `mp4ds.format.models.Video`."""
-
-
-def video_facts(path: Path, codec: str) -> dict[str, Any]:
-    """The values of `FACTS` for a finished video, which is read once.
-
-    Args:
-        path: The video.
-        codec: Name in the registry.
-
-    Raises:
-        OSError: It cannot be read.
-    """
-    found = digest_video(path, codec)
-    structures = found.structures
-    useful = structures is not None and not structures.is_plain
-    references = References.from_structures(structures) if structures and useful else None
-    return dict(zip(FACTS, (path.name, found.size, found.sha256, references), strict=True))
-
 
 # ---------------------------------------------------------------- writer
 

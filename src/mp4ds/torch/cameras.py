@@ -465,7 +465,8 @@ class OpenCamera:
             return np.arange(len(self.stream), dtype=np.int64)
         except OSError as error:
             raise VideoError("file-missing", path, f"cannot be read: {error.strerror}") from None
-        return np.flatnonzero(table.sync[table.order]).astype(np.int64)
+        keys = np.flatnonzero(table.sync[table.order])
+        return np.union1d(0, keys).astype(np.int64)  # a slice may begin between two
 
     def read(self, frames: NDArray[np.int64]) -> Tensor:
         """Frames as a tensor, decoded in one pass.

@@ -28,8 +28,8 @@ class TorchcodecReader:
         device: Such as ``cpu`` or ``cuda``.
 
     Raises:
-        OptionError: torchcodec is missing, mistakes the video's range, or the video's pictures
-            are not the images.
+        OptionError: torchcodec is missing, mistakes the video's range or beginning, or the
+            video's pictures are not the images.
         VideoError: It cannot open the video.
     """
 
@@ -37,6 +37,12 @@ class TorchcodecReader:
         self._path = stream.video_path
         if isinstance(stream, Stream):
             _check_layout(stream)
+            if stream.hidden_frames:
+                raise OptionError(
+                    f"topic {stream.topic}: torchcodec shows wrong frames at the beginning of a "
+                    "video that was cut out of another. Use backend='mp4ds', or a dataset that was "
+                    "packed with a `codec`."
+                )
         if remote(self._path):
             raise OptionError(f"{self._path}: backend='torchcodec' reads local files alone.")
         columns, rows = stream.image_size

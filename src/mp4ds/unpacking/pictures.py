@@ -425,6 +425,8 @@ def _video(stream: Stream, kind: str) -> Frames:
         raise Refused(
             f"its video does not show the images as they are seen (layout {sidecar.layout.name})"
         )
+    if stream.hidden_frames:
+        raise Refused("the first packets of a slice refer to others, which are not part of it")
     return partial(_packets_of, stream)
 
 

@@ -16,13 +16,16 @@ from mp4ds.bags.formats import open_writer, recording_names
 from mp4ds.bags.protocols import BagWriter
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import recorded_storage
+from mp4ds.dataset.slicing import sliced
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import ConversionError, FormatError, OptionError, WriteError
 from mp4ds.files.outputs import Owned, staged
 from mp4ds.files.uploads import uploaded
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.options import (
-    Options,
+    SliceOptions,
+    duration,
+    end,
     every,
     exclude,
     force,
@@ -30,6 +33,7 @@ from mp4ds.options import (
     max_rate,
     option,
     resize,
+    start,
     topics,
 )
 from mp4ds.plan import FileNames, Selection
@@ -39,7 +43,7 @@ from mp4ds.unpacking.republish import KINDS, Republished, Republisher, check_kin
 
 
 @dataclass(frozen=True)
-class UnpackOptions(Options):
+class UnpackOptions(SliceOptions):
     """How to unpack."""
 
     storage: str | None = option("sqlite3 or mcap, for rosbag2; as recorded, or mcap.")
@@ -56,6 +60,9 @@ class UnpackOptions(Options):
     max_rate: float | None = max_rate()
     topics: Sequence[str] = topics()
     exclude: Sequence[str] = exclude()
+    start: str | float | None = start()
+    end: str | float | None = end()
+    duration: str | float | None = duration()
     skip_unconvertible: bool = option("Leave out what the output cannot hold, and count it.", False)
     force: bool = force()
 
@@ -217,16 +224,17 @@ def unpack(
     store = remote(location(output)) if output else None
     if store:
         return _unpack_to_store(dataset, to, store, chosen, progress)
-    with Dataset(dataset, jpeg_quality=chosen.jpeg_quality) as opened:
-        given = location(output) if output else default_output(opened.path, to)
+    with Dataset(dataset, jpeg_quality=chosen.jpeg_quality) as whole:
+        given = location(output) if output else default_output(whole.path, to)
         target = Path(os.path.abspath(given))  # noqa: PTH100
-        if to != "images":
-            opened.verify_messages()
-        with staged(target, force=chosen.force, owned=_owned(to), sources=[opened.path]) as path:
+        if to != "images" and not chosen.slice:
+            whole.verify_messages()
+        with staged(target, force=chosen.force, owned=_owned(to), sources=[whole.path]) as path:
             try:
-                if to == "images":
-                    return _unpack_images(opened, path, target, chosen, progress)
-                return _unpack_recording(opened, path, target, to, chosen, progress)
+                with sliced(whole, chosen.slice, path.parent) as opened:
+                    if to == "images":
+                        return _unpack_images(opened, path, target, chosen, progress)
+                    return _unpack_recording(opened, path, target, to, chosen, progress)
             except OSError as error:
                 if error.errno is None:
                     raise

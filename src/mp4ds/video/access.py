@@ -337,7 +337,8 @@ class FrameAccess:
         except BaseException:
             self._file.close()
             raise
-        self._numbers = np.empty_like(self.table.order)
+        hidden = len(self.table.sizes) - len(self.table.order)
+        self._numbers = np.arange(len(self.table.sizes)) - hidden
         self._numbers[self.table.order] = np.arange(len(self.table.order))
         self._context: Any = None
         self._session: _Session | None = None
@@ -356,9 +357,9 @@ class FrameAccess:
             )
         if (table.width, table.height) != self._maker.coded_size:
             raise UnknownStructure("its frames have another size")
-        if len(table.order) != len(table.sizes) or not table.sync[:1].all():
+        if int(table.order.min()) + len(table.order) != len(table.sizes) or not table.sync[0]:
             raise UnknownStructure(
-                "it has frames that are not shown, or begins without a key frame"
+                "it has later frames that are not shown, or begins without a key frame"
             )
         return table
 

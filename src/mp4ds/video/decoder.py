@@ -155,8 +155,8 @@ class VideoDecoder:
 
     @property
     def coded_frames(self) -> int:
-        """Frames that the file's index lists."""
-        return len(self._stream.index_entries)
+        """Frames that the file's index lists, and no edit list hides at the beginning."""
+        return len(self._stream.index_entries) - self._media.hidden
 
     def pictures(self, scale: Scale | None = None) -> Iterator[Picture]:
         """All pictures in order, as views that hold until the next one is asked for.
@@ -267,7 +267,7 @@ class VideoDecoder:
     def _presentation_ticks(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
         if self._ticks is None:
             # without B-frames the index's decoding times are the presentation times
-            ticks = [entry.timestamp for entry in self._stream.index_entries]
+            ticks = [entry.timestamp for entry in self._stream.index_entries][self._media.hidden :]
             if len(ticks) != self._frames:
                 raise VideoError(
                     "frame-count", self._path, f"has {len(ticks)} frames, {self._frames} are due"
@@ -277,7 +277,8 @@ class VideoDecoder:
 
     @cached_property
     def _key_numbers(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-        return np.flatnonzero([entry.is_keyframe for entry in self._stream.index_entries])
+        keys = [entry.is_keyframe for entry in self._stream.index_entries]
+        return np.flatnonzero(keys[self._media.hidden :])
 
     def _decoded(self, first: int) -> Iterator[av.VideoFrame]:
         number = first

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -94,6 +95,12 @@ class Media:
         if tracks[0].codec_context is None or tracks[0].codec_context.codec is None:
             raise VideoError("video-unreadable", self._path, "has a video track of no known codec")
         return tracks[0]
+
+    @cached_property
+    def hidden(self) -> int:
+        """How many coded frames an edit list hides before the first that is shown."""
+        entries = self.track.index_entries
+        return next((n for n, item in enumerate(entries) if not item.is_discard), len(entries))
 
     def check(self, codec: str, coded_size: tuple[int, int] | None) -> None:
         """Compare what the header promises with what a sidecar says.

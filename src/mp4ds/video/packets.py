@@ -177,7 +177,11 @@ def new_mp4(path: Path) -> Any:
         str(path.absolute()),  # ffmpeg takes a relative name with a colon for an address
         "w",
         format="mp4",
-        options={"video_track_timescale": str(TIMESCALE), "movie_timescale": str(TIMESCALE)},
+        options={
+            "video_track_timescale": str(TIMESCALE),
+            "movie_timescale": str(TIMESCALE),
+            "avoid_negative_ts": "disabled",  # an edit list hides what comes before 0
+        },
     )
 
 
@@ -214,7 +218,8 @@ class PacketReader:
     """The packets of an mp4's video track. A context manager.
 
     They are read from where the file's index says, which ffmpeg reads; a forged index costs no
-    memory beyond the file's size.
+    memory beyond the file's size. Packet 0 is the first that is shown; those that an edit list
+    hides before it have negative numbers.
 
     Args:
         path: The video.
@@ -223,9 +228,10 @@ class PacketReader:
         coded_size: Width and height that are due, if known.
 
     Attributes:
-        ticks: Decoding times in ticks of the track.
-        sizes: Bytes of each packet.
-        keyframes: For each packet whether decoding can begin there, as 0 or 1.
+        hidden: How many packets are hidden, to which the first that are shown refer.
+        ticks: Decoding times of the shown packets in ticks of the track.
+        sizes: Bytes of each shown packet.
+        keyframes: For each shown packet whether decoding can begin there, as 0 or 1.
         extradata: What the track says about the codec: avcC, hvcC or av1C.
         pixel_format: Of its pictures as ffmpeg calls it; empty where not known.
 
@@ -249,26 +255,28 @@ class PacketReader:
             self.extradata: bytes = bytes(context.extradata or b"")
             self.pixel_format = pixel_format_of(context)
             entries = media.track.index_entries
-            if not len(entries):
+            self.hidden = media.hidden
+            count = len(entries) - self.hidden
+            if not count:
                 raise VideoError("frame-count", path, "has no frames")
-            if frames is not None and len(entries) != frames:
-                raise VideoError(
-                    "frame-count", path, f"has {len(entries)} frames, {frames} are due"
-                )
-            self.ticks, self.sizes, self._places = array("q"), array("q"), array("q")
-            self.keyframes = bytearray()
+            if frames is not None and count != frames:
+                raise VideoError("frame-count", path, f"has {count} frames, {frames} are due")
+            ticks, self._sizes, self._places = array("q"), array("q"), array("q")
+            self._keyframes = bytearray()
             for entry in entries:
-                self.ticks.append(entry.timestamp)
-                self.sizes.append(entry.size)
+                ticks.append(entry.timestamp)
+                self._sizes.append(entry.size)
                 self._places.append(entry.pos)
-                self.keyframes.append(entry.is_keyframe)
+                self._keyframes.append(entry.is_keyframe)
+        self.ticks, self.sizes = ticks[self.hidden :], self._sizes[self.hidden :]
+        self.keyframes = self._keyframes[self.hidden :]
         self._file = path.open("rb")
         self._check_index()
 
     def _check_index(self) -> None:
         length = self._file.seek(0, io.SEEK_END)
         total = 0
-        for place, size in zip(self._places, self.sizes, strict=True):
+        for place, size in zip(self._places, self._sizes, strict=True):
             total += size
             if place < 0 or size < 0 or place + size > length or total > length:
                 self._file.close()
@@ -282,18 +290,30 @@ class PacketReader:
         """Numbers of the packets at which decoding can begin, increasing."""
         return [number for number, is_key in enumerate(self.keyframes) if is_key]
 
+    def key_before(self, index: int) -> int:
+        """Number of the packet at which decoding begins for a shown one to be had.
+
+        Raises:
+            VideoError: ``video-unreadable``: there is none.
+        """
+        key = self._keyframes.rfind(1, 0, self.hidden + index + 1)
+        if key < 0:
+            raise VideoError("video-unreadable", self._path, "begins without a key frame")
+        return key - self.hidden
+
     def packet(self, index: int) -> bytes:
         """One packet.
 
         Args:
-            index: 0 <= index < len(self).
+            index: -hidden <= index < len(self).
 
         Raises:
             VideoError: ``decode-failed``: the file ends before it.
         """
-        self._file.seek(self._places[index])
-        packet = self._file.read(self.sizes[index])
-        if len(packet) != self.sizes[index]:
+        size = self._sizes[self.hidden + index]
+        self._file.seek(self._places[self.hidden + index])
+        packet = self._file.read(size)
+        if len(packet) != size:
             raise VideoError("decode-failed", self._path, f"ends before frame {index}")
         return packet
 
@@ -316,7 +336,58 @@ class PacketReader:
         self.close()
 
 
-# ---------------------------------------------------------------- join
+# ---------------------------------------------------------------- cut, join
+
+
+def cut_segment(
+    source: Path, codec: str, numbers: range, ticks: Sequence[int], target: Path
+) -> None:
+    """Write consecutive frames of a video into a file of their own.
+
+    What stands between the first of them and the key frame before it comes, too, since they refer
+    to it; an edit list hides it.
+
+    Args:
+        source: A file of `VideoEncoder` or `PacketWriter`, of which frames may be cut off already.
+        codec: Name in the registry.
+        numbers: Of the frames, at least one.
+        ticks: Their presentation times, in ticks of 1 / `TIMESCALE` s, strictly increasing from 0.
+        target: The file to make. It is removed if it cannot be finished.
+
+    Raises:
+        VideoError: The source cannot be read, or the result does not hold every packet as it was.
+        OSError: The disk refused.
+    """
+    entry = read_sample_entry(source)
+    try:
+        with (
+            closing(Media(source)) as media,
+            PacketReader(source, codec=codec) as reader,
+            closing(new_mp4(target)) as container,
+        ):
+            written = _Written(codec)
+            stream = _new_stream(container, media.track, entry)
+            first = numbers[0]
+            duration = max(1, ticks[-1] - ticks[-2]) if len(ticks) > 1 else _last_duration(source)
+            for number in range(reader.key_before(first), numbers[-1] + 1):
+                is_shown = number >= first
+                tick = (
+                    ticks[number - first]
+                    if is_shown
+                    else number - first  # of what nobody sees, any that increases does
+                )
+                is_key = number == reader.key_before(number)
+                data = reader.packet(number)
+                packet = _packet_at(data, stream, tick, duration, is_key=is_key)
+                with _damage_told(source, f"packet {number} is damaged"):
+                    container.mux(packet)
+                if is_shown:
+                    written.add(tick, len(data), is_key=is_key)
+            _finish(container, target)
+        written.check(target, entry)
+    except BaseException:
+        target.unlink(missing_ok=True)
+        raise
 
 
 def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) -> int:
@@ -364,6 +435,12 @@ class _Written:
         self.codec = codec
         self.ticks, self.sizes = array("q"), array("q")
         self.keyframes = bytearray()
+
+    def add(self, tick: int, size: int, *, is_key: bool) -> None:
+        """Take a packet."""
+        self.ticks.append(tick)
+        self.sizes.append(size)
+        self.keyframes.append(is_key)
 
     def check(self, path: Path, entry: SampleEntry) -> None:
         """Compare it with what it says.
@@ -452,17 +529,22 @@ def _copy_segment(
                 )
             if written.ticks and tick <= written.ticks[-1]:
                 raise ValueError(f"tick {tick} does not follow {written.ticks[-1]}")
-            packet = av.Packet(data)
-            packet.stream = stream
-            packet.time_base = _TIME_BASE
-            packet.pts = packet.dts = tick
-            packet.duration = duration
-            packet.is_keyframe = bool(reader.keyframes[index])
+            is_key = bool(reader.keyframes[index])
+            packet = _packet_at(data, stream, tick, duration, is_key=is_key)
             with _damage_told(path, f"packet {index} is damaged"):
                 container.mux(packet)
-            written.ticks.append(tick)
-            written.sizes.append(len(data))
-            written.keyframes.append(reader.keyframes[index])
+            written.add(tick, len(data), is_key=is_key)
+
+
+def _packet_at(data: bytes, stream: Any, tick: int, duration: int, *, is_key: bool) -> Any:
+    """A packet to be muxed, shown from a tick on."""
+    packet = av.Packet(data)
+    packet.stream = stream
+    packet.time_base = _TIME_BASE
+    packet.pts = packet.dts = tick
+    packet.duration = duration
+    packet.is_keyframe = is_key
+    return packet
 
 
 def _finish(container: Any, target: Path) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from mp4ds._version import __version__
 from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.slicing import sliced
 from mp4ds.errors import OptionError
 from mp4ds.files.outputs import begins_with, listed_names, staged
 from mp4ds.files.urls import location, remote
@@ -94,6 +95,10 @@ def export(
                 sources=[dataset.path for dataset in opened],
             )
         )
+        opened = [
+            stack.enter_context(sliced(one, chosen.slice, path.parent / str(number)))
+            for number, one in enumerate(opened)
+        ]
         if to == "lerobot":  # whose videos are of colours
             chosen = replace(chosen, pixels="rgb")
         sources = [ExportedDataset(dataset, chosen) for dataset in opened]

@@ -19,7 +19,19 @@ from mp4ds.errors import OptionError
 from mp4ds.format.models import Calibration
 from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
 from mp4ds.messages.serializations import is_camera
-from mp4ds.options import Options, every, exclude, force, max_rate, option, resize, topics
+from mp4ds.options import (
+    SliceOptions,
+    duration,
+    end,
+    every,
+    exclude,
+    force,
+    max_rate,
+    option,
+    resize,
+    start,
+    topics,
+)
 from mp4ds.plan import Selection
 from mp4ds.records import Channel
 from mp4ds.times import intervals, synchronize, usual_interval
@@ -42,11 +54,14 @@ def _nanoseconds(milliseconds: str) -> int:
 
 
 @dataclass(frozen=True)
-class ExportOptions(Options):
+class ExportOptions(SliceOptions):
     """How to export."""
 
     topics: Sequence[str] = topics()
     exclude: Sequence[str] = exclude()
+    start: str | float | None = start()
+    end: str | float | None = end()
+    duration: str | float | None = duration()
     resize: float | tuple[int, int] | None = resize()
     every: int = every()
     max_rate: float | None = max_rate()

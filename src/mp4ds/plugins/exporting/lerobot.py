@@ -356,6 +356,7 @@ class _Maker:
             and sidecar.video.codec in _PLAYED
             and (sidecar.video.codec in _RANGE_TOLD or not sidecar.video.full_range)
             and size == camera.size == camera.stream.image_size
+            and not camera.stream.hidden_frames
         ):
             camera.stream.verify_video()
             join_segments([camera.stream.video_path], ticks.tolist(), path)

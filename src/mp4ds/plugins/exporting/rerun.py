@@ -182,7 +182,13 @@ class _Writer:
         is_shown = sidecar.body == "packet" or sidecar.layout.is_shown
         # a viewer decodes in the order of the times
         is_later = len(camera) < 2 or bool((np.diff(camera.times) > 0).all())
-        return camera.is_as_recorded and is_shown and is_later and sidecar.video.codec in _CODECS
+        return (
+            camera.is_as_recorded
+            and is_shown
+            and is_later
+            and sidecar.video.codec in _CODECS
+            and not camera.stream.hidden_frames
+        )
 
     def _write_packets(self, camera: ExportedCamera, path: str) -> None:
         stream, codec = camera.stream, camera.stream.sidecar.video.codec

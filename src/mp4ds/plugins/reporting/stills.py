@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from mp4ds.dataset.views import Resize, size_after
 from mp4ds.errors import FrameNotFoundError, OptionError
 from mp4ds.files.outputs import begins_with, staged
 from mp4ds.messages.encodings import ENCODINGS, Pixels
-from mp4ds.options import Options, force, option, resize
+from mp4ds.options import Options, force, option, resize, time_of
 from mp4ds.plugins.reporting.proxies import Look
 from mp4ds.video.drawing import Page
 from mp4ds.video.images import ImageFile, encoding_as
@@ -31,7 +30,6 @@ _PAGE, _INK = (24, 28, 32), (222, 226, 230)
 _BEYOND_NS = 10**9  # that a time may be before the first frame, or after the last one
 _QUALITY = 92
 _NS = 10**9
-_ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?Z?")
 
 
 def parse_sheet(text: str) -> tuple[int, int]:
@@ -52,8 +50,8 @@ class StillOptions(Options):
 
     topic: str = option("Of the camera, where there are several.", "", "-t")
     at: str | None = option(
-        "+SECONDS from the first frame, SECONDS.FRACTION or NANOSECONDS since 1970, an ISO date, "
-        "or #NUMBER of the frame.",
+        "Seconds from the first frame, or since 1970; nanoseconds since 1970; an ISO date; or "
+        "#NUMBER of the frame.",
         metavar="TIME",
     )
     sheet: tuple[int, int] | None = option(
@@ -200,47 +198,13 @@ def number_at(stream: Frames, text: str) -> int:
         if not re.fullmatch(r"#[0-9]{1,9}", text) or int(text[1:]) >= count:
             raise OptionError(f"`at` {text!r}: frames of {stream.topic} are #0 to #{count - 1}.")
         return int(text[1:])
-    time = time_of(text, int(stream.stamps[0]))
+    time = time_of(text, int(stream.stamps[0]), "at")
     index = stream.index_at(time)
     nearest = int(stream.stamps[index])
     is_beyond = not int(stream.stamps.min()) <= time <= int(stream.stamps.max())
     if is_beyond and abs(nearest - time) > _BEYOND_NS:
         raise FrameNotFoundError(stream.topic, time, "near", nearest)
     return index
-
-
-def time_of(text: str, start_ns: int) -> int:
-    """Nanoseconds since 1970 of a time as users write it.
-
-    Args:
-        text: ``+2.5``: seconds from the first frame; ``1700000000.123456789``: seconds, all nine
-            digits counting; ``1700000000123456789``: nanoseconds; ``2023-11-14T22:13:20.5``: UTC.
-        start_ns: Of the first frame.
-
-    Raises:
-        OptionError: It is none of these.
-    """
-    clean = text.strip()
-    if match := re.fullmatch(r"\+([0-9]{1,9})(?:\.([0-9]{1,9}))?", clean):
-        return start_ns + _nanoseconds(int(match[1]), match[2])
-    if match := re.fullmatch(r"([0-9]{1,10})\.([0-9]{1,9})", clean):
-        return _nanoseconds(int(match[1]), match[2])
-    if re.fullmatch(r"-?[0-9]{1,19}", clean):
-        return int(clean)
-    if match := _ISO.fullmatch(clean):
-        try:
-            moment = datetime.fromisoformat(match[1]).replace(tzinfo=timezone.utc)
-        except ValueError as error:
-            raise OptionError(f"`at` {text!r} is no date: {error}.") from None
-        return _nanoseconds(int(moment.timestamp()), match[2])
-    raise OptionError(
-        f"`at` {text!r} is no time. Give +SECONDS from the first frame, SECONDS.FRACTION or "
-        "NANOSECONDS since 1970, a date such as 2023-11-14T22:13:20.5, or #NUMBER of the frame."
-    )
-
-
-def _nanoseconds(seconds: int, fraction: str | None) -> int:
-    return seconds * _NS + int((fraction or "0").ljust(9, "0"))
 
 
 # ---------------------------------------------------------------- how

@@ -1,0 +1,412 @@
+"""A dataset of a part of another: packets are copied, nothing is encoded."""
+
+from __future__ import annotations
+
+import heapq
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.bags.mcap_write import McapWriter
+from mp4ds.bags.slices import in_span
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.rebuild import DecodedColumns, columns_model, digests_model, within
+from mp4ds.dataset.stream import Stream
+from mp4ds.errors import OptionError, Refused
+from mp4ds.files.outputs import digest_file
+from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME, Columns
+from mp4ds.format.manifest import (
+    About,
+    EarlierDataset,
+    FileEntry,
+    Manifest,
+    StreamEntry,
+    TimeRange,
+    Verbatim,
+)
+from mp4ds.format.models import CameraInfo, ChannelModel, StreamSidecar, video_facts
+from mp4ds.format.sidecars import MANIFEST_NAME, dump_document
+from mp4ds.options import Slice
+from mp4ds.records import EVERYTHING, Attachment, Channel, Excerpt, Message
+from mp4ds.times import PresentationClock
+from mp4ds.video.packets import cut_segment
+
+Integers = NDArray[np.int64]
+_BLOCK = 2**20
+_NO_TIMES = np.empty(0, np.int64)
+
+
+def span_in(dataset: Dataset, asked: Slice) -> Excerpt:
+    """A slice, as times of a dataset.
+
+    Raises:
+        OptionError: There is nothing in it, or a time is none.
+    """
+    if not asked:
+        return EVERYTHING
+    times = [one for one in dataset.times().values() if len(one)]
+    if not times:
+        raise OptionError(f"{dataset.path} has no messages, of which a slice could be taken.")
+    first, last = min(int(one[0]) for one in times), max(int(one[-1]) for one in times)
+    return Excerpt(*asked.times(first, last, dataset.path))
+
+
+@contextmanager
+def sliced(dataset: Dataset, asked: Slice, folder: Path) -> Iterator[Dataset]:
+    """A dataset of a slice, which is gone afterwards; the dataset itself where none is asked for.
+
+    Args:
+        dataset: A folder that `mp4ds pack` made.
+        asked: The slice.
+        folder: Where there is room for it.
+
+    Raises:
+        OptionError: There is nothing in it, or it cannot be taken.
+        FormatError: The dataset is damaged.
+        OSError: The disk refused.
+    """
+    if not asked:
+        yield dataset
+        return
+    path = folder / "slice" / dataset.path.name
+    path.mkdir(parents=True)
+    try:
+        copy_part(dataset, path, span=span_in(dataset, asked))
+    except Refused as reason:
+        raise OptionError(f"{dataset.path}: no slice can be taken: {reason}.") from None
+    try:
+        with Dataset(path, jpeg_quality=dataset.jpeg_quality) as opened:
+            yield opened
+    finally:
+        shutil.rmtree(path.parent, ignore_errors=True)
+
+
+def copy_part(
+    dataset: Dataset,
+    folder: Path,
+    *,
+    span: Excerpt = EVERYTHING,
+    selected: Callable[[str], bool] = lambda _: True,
+    about: About | None = None,
+) -> Manifest:
+    """Copy what was recorded in a span of log time, and of some topics.
+
+    Frames that come before the span, but belong to the group of pictures in which it begins, are
+    in the new video, too, hidden by its edit list (spec, "The video").
+
+    Args:
+        dataset: A folder that `mp4ds pack` made.
+        folder: The folder to fill, empty.
+        span: What to copy; topics that it names are not looked at.
+        selected: Whether a topic is to be copied.
+        about: What is told of the recording; None for what the dataset tells.
+
+    Returns:
+        The new manifest, which is written.
+
+    Raises:
+        Refused: It cannot be copied; says why. Nothing was written.
+        FormatError: A file is not what its dataset says.
+        OSError: The disk refused.
+    """
+    part = _Part(dataset, folder, span, selected)
+    part.check()
+    return part.write(about)
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """A stream of the part.
+
+    Attributes:
+        stream: Of the dataset.
+        images: Numbers of the frames that are copied.
+        infos: Numbers of the calibrations that are copied.
+    """
+
+    stream: Stream
+    images: Integers
+    infos: Integers
+
+    @property
+    def has_all(self) -> bool:
+        """Whether the whole video is copied."""
+        return len(self.images) == len(self.stream)
+
+
+class _Part:
+    def __init__(
+        self, dataset: Dataset, folder: Path, span: Excerpt, selected: Callable[[str], bool]
+    ) -> None:
+        if dataset.manifest is None:
+            raise Refused("it is one video, and no dataset")
+        self._old = dataset.manifest
+        self._dataset = dataset
+        self._folder = folder
+        self._span = span
+        self._selected = selected
+        self._is_slice = span.start is not None or span.end is not None
+        self._cuts = [self._cut(stream) for stream in dataset.streams]
+
+    def _cut(self, stream: Stream) -> _Cut:
+        info, columns = stream.sidecar.camera_info, stream.camera_info_columns
+        infos = np.empty(0, np.int64)
+        if info and columns and self._selected(info.channel.topic):
+            infos = self._numbers(columns)
+        has_images = self._selected(stream.topic)
+        images = self._numbers(stream.columns) if has_images else np.empty(0, np.int64)
+        return _Cut(stream, images, infos)
+
+    def _numbers(self, columns: DecodedColumns) -> Integers:
+        return np.fromiter(within(self._span)(columns), np.int64)
+
+    def check(self) -> None:
+        """Refuse what cannot be copied.
+
+        Raises:
+            Refused: Says why.
+        """
+        if self._is_slice and not self._dataset.is_in_time:
+            raise Refused("log times do not tell the order of its messages")
+        for cut in self._cuts:
+            info = cut.stream.sidecar.camera_info
+            if (
+                info
+                and info.messages
+                and self._selected(info.channel.topic) != self._selected(cut.stream.topic)
+            ):
+                raise Refused(f"{cut.stream.topic} and {info.channel.topic} are one stream")
+            if np.any(np.diff(cut.images) != 1):
+                raise Refused(f"frames of {cut.stream.topic} are not in the order of their times")
+
+    def write(self, about: About | None) -> Manifest:
+        """Write all files, and the manifest at last."""
+        dataset, folder, old = self._dataset, self._folder, self._old
+        made = self._write_streams()
+        self._write_messages(folder / MESSAGES_NAME)
+        digests = {
+            sidecar.video.file: (sidecar.video.size or 0, sidecar.video.sha256 or "")
+            for _, sidecar in made
+        }
+        for name in (MESSAGES_NAME, *(name for name, _ in made)):
+            digests[name] = digest_file(folder / name)
+        times = [in_span(one, self._span) for one in self._times.values()]
+        times = [one for one in times if len(one)]
+        left_out = [item.topic for item in dataset.channels if not self._selected(item.topic)]
+        manifest = old.model_copy(
+            update={
+                "mp4ds": FORMAT_VERSION,
+                "about": about or old.about,
+                "sources": [source.within(self._span) for source in old.sources],
+                "derived_from": [
+                    *old.derived_from,
+                    EarlierDataset(
+                        name=dataset.path.name,
+                        profile=old.profile,
+                        sha256=digest_file(dataset.path / MANIFEST_NAME)[1],
+                    ),
+                ],
+                "messages": sum(map(len, times)),
+                "topics_left_out": list(dict.fromkeys([*old.topics_left_out, *left_out])),
+                "time_range": TimeRange(
+                    start=min(int(one[0]) for one in times),
+                    end=max(int(one[-1]) for one in times),
+                )
+                if times
+                else None,
+                "streams": [
+                    StreamEntry(
+                        topic=sidecar.channel.topic,
+                        sidecar=name,
+                        video=sidecar.video.file,
+                        frames=sidecar.frames,
+                    )
+                    for name, sidecar in made
+                ],
+                "verbatim": self._verbatim(),
+                "files": [
+                    FileEntry(name=name, size=size, sha256=sha256)
+                    for name, (size, sha256) in sorted(digests.items())
+                ],
+            }
+        )
+        (folder / MANIFEST_NAME).write_bytes(dump_document(manifest))
+        return manifest
+
+    def _verbatim(self) -> list[Verbatim]:
+        """Camera messages that are in messages.mcap, by topic, with the reasons that are known."""
+        old = self._old
+        if not self._is_slice:
+            return [item for item in old.verbatim if self._selected(item.topic)]
+        found = []
+        for topic in dict.fromkeys(item.topic for item in old.verbatim):
+            reasons = [item.reason for item in old.verbatim if item.topic == topic]
+            times = np.sort(np.concatenate(self._times_of(topic)))
+            recorded = self._dataset.recorded_times(topic)
+            inside = in_span(recorded, self._span)
+            if self._selected(topic) and len(inside):
+                first = int(np.searchsorted(in_span(times, self._span), inside[0]))
+                entry = Verbatim(
+                    topic=topic, messages=len(inside), first=first, reason="; or ".join(reasons)
+                )
+                found.append(entry)
+        return found
+
+    def _times_of(self, topic: str) -> list[Integers]:
+        times = self._dataset.times()
+        channels = [item for item in self._dataset.channels if item.topic == topic]
+        return [times[item.id] for item in channels if item.id in times]
+
+    # ------------------------------------------------------------ videos
+
+    def _write_streams(self) -> list[tuple[str, StreamSidecar]]:
+        made = []
+        for cut in self._cuts:
+            if len(cut.images):
+                sidecar = self._write_video(cut)
+                name = cut.stream.path.name
+                (self._folder / name).write_bytes(dump_document(sidecar))
+                made.append((name, sidecar))
+        return made
+
+    def _write_video(self, cut: _Cut) -> StreamSidecar:
+        stream, numbers = cut.stream, cut.images
+        sidecar, video = stream.sidecar, stream.sidecar.video
+        path = self._folder / stream.video_path.name
+        if cut.has_all:
+            stream.verify_video()
+            _copy(stream.video_path, path)
+        else:
+            frames = range(int(numbers[0]), int(numbers[-1]) + 1)
+            cut_segment(stream.video_path, video.codec, frames, self._ticks(cut), path)
+        changes = video_facts(path, video.codec)
+        if video.quality is not None:
+            changes["quality"] = video.quality.of(numbers, len(stream))
+        digests = None
+        if sidecar.digests is not None:
+            digests = digests_model(sidecar.digests.decode(len(stream))[numbers].tolist())
+        columns, kinds = self._columns(stream.columns, numbers, sidecar.channel)
+        return sidecar.model_copy(
+            update={
+                "mp4ds": FORMAT_VERSION,
+                "frames": len(numbers),
+                "headers": [sidecar.headers[kind] for kind in kinds],
+                "video": video.model_copy(update=changes),
+                "camera_info": self._camera_info(cut),
+                "columns": columns,
+                "digests": digests,
+            }
+        )
+
+    @staticmethod
+    def _ticks(cut: _Cut) -> Sequence[int]:
+        clock, columns = PresentationClock(), cut.stream.columns
+        stamps, times = columns.stamp[cut.images], columns.log_time[cut.images]
+        return list(map(clock.tick, stamps.tolist(), times.tolist()))
+
+    def _camera_info(self, cut: _Cut) -> CameraInfo | None:
+        info, columns = cut.stream.sidecar.camera_info, cut.stream.camera_info_columns
+        if info is None or columns is None or not len(cut.infos):
+            return None
+        found, kinds = self._columns(columns, cut.infos, info.channel)
+        return info.model_copy(
+            update={
+                "messages": len(cut.infos),
+                "calibrations": [info.calibrations[kind] for kind in kinds],
+                "columns": found,
+            }
+        )
+
+    def _columns(
+        self, columns: DecodedColumns, numbers: Integers, channel: ChannelModel
+    ) -> tuple[Columns, list[int]]:
+        """Columns of some messages, and the numbers of the variants that they are of."""
+        values = {
+            name: getattr(columns, name)[numbers]
+            for name in Columns.model_fields
+            if getattr(columns, name) is not None
+        }
+        kinds, values["variant"] = np.unique(values["variant"], return_inverse=True)
+        values["ordinal"] = values["ordinal"] - self._before(channel)
+        return columns_model(values), kinds.tolist()
+
+    # ------------------------------------------------------------ messages
+
+    @cached_property
+    def _times(self) -> dict[tuple[object, ...], Integers]:
+        """Sorted log times of the messages of what is copied, by the identity of channels."""
+        times = self._dataset.times()
+        found: dict[tuple[object, ...], list[Integers]] = {}
+        for channel in self._dataset.channels:  # several may be alike
+            if self._selected(channel.topic):
+                found.setdefault(channel.identity, []).append(times.get(channel.id, _NO_TIMES))
+        return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items()}
+
+    def _before(self, channel: ChannelModel) -> int:
+        """How many messages of a channel come before the span."""
+        if self._span.start is None:
+            return 0
+        return int(np.searchsorted(self._times[channel.to_record(0).identity], self._span.start))
+
+    def _write_messages(self, path: Path) -> None:
+        dataset = self._dataset
+        if not self._is_slice and all(self._selected(item.topic) for item in dataset.channels):
+            dataset.verify_messages()
+            _copy(dataset.path / MESSAGES_NAME, path)
+            return
+        in_videos: set[tuple[object, ...]] = set()
+        for cut in self._cuts:
+            if len(cut.images):
+                in_videos.add(cut.stream.sidecar.channel.to_record(0).identity)
+            info = cut.stream.sidecar.camera_info
+            if info and len(cut.images) and len(cut.infos):
+                in_videos.add(info.channel.to_record(0).identity)
+        with McapWriter(path, profile=dataset.profile) as writer:
+            for record in chain(dataset.other_records(), self._verbatim_messages()):
+                if isinstance(record, Message):
+                    writer.add_channel(record.channel)
+                    writer.write(record)
+                elif isinstance(record, Attachment):
+                    writer.add_attachment(record)
+                else:
+                    writer.add_metadata(record)
+            for channel in dataset.channels:
+                if self._selected(channel.topic) and channel.identity not in in_videos:
+                    writer.add_channel(channel)
+            for schema in dataset.unused_schemas:
+                writer.add_schema(schema)
+
+    def _verbatim_messages(self) -> Iterator[Message]:
+        """What goes into messages.mcap, by log time.
+
+        Also the calibrations of streams that have no frames in the span.
+        """
+        recorded = (
+            message
+            for message in self._dataset.recorded_messages(self._span)
+            if self._selected(message.channel.topic)
+        )
+        channels = {channel.identity: channel for channel in self._dataset.channels}
+        orphans = [self._orphans(cut, channels) for cut in self._cuts if not len(cut.images)]
+        return heapq.merge(recorded, *orphans, key=lambda message: message.log_time)
+
+    def _orphans(self, cut: _Cut, channels: dict[tuple[object, ...], Channel]) -> Iterator[Message]:
+        info = cut.stream.sidecar.camera_info
+        if info is None or not len(cut.infos):
+            return iter(())
+        channel = channels[info.channel.to_record(0).identity]
+        found = cut.stream.camera_info_messages(channel, within(self._span))
+        return (message for _, message in found)
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy a file, which may be at a URL."""
+    with source.open("rb") as file, target.open("wb") as copy:
+        shutil.copyfileobj(file, copy, _BLOCK)

@@ -1,0 +1,88 @@
+"""A dataset packed again as it is: in part, or with other facts, and nothing encoded anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mp4ds.dataset.checks import validate
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.slicing import copy_part, span_in
+from mp4ds.errors import FormatError
+from mp4ds.files.outputs import staged
+from mp4ds.format.sidecars import load_about
+from mp4ds.packing.job import dataset_at
+from mp4ds.packing.manifest import dataset_files, folder_size
+from mp4ds.packing.options import PackOptions, PackSummary, TopicSummary
+from mp4ds.plan import Selection
+
+_OF_ENCODERS = (
+    *("quality", "codec", "preset", "transcode", "camera_info", "purpose", "gop", "window"),
+    *("cluster", "join", "salvage", "images"),
+)
+
+
+def is_copy(paths: Sequence[Path], options: PackOptions) -> bool:
+    """Whether it is one dataset, and nothing is said of how its videos are to be encoded."""
+    usual = PackOptions()
+    is_usual = all(getattr(options, name) == getattr(usual, name) for name in _OF_ENCODERS)
+    return is_usual and len(paths) == 1 and dataset_at(paths[0]) is not None
+
+
+def copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
+    """Copy a dataset or a part of it.
+
+    Args:
+        path: The dataset.
+        target: The folder to make.
+        options: What of it, and what is told of it.
+
+    Raises:
+        Refused: It cannot be copied; says why. Nothing is left behind.
+        FormatError: It is damaged.
+        TargetError: The dataset may not be written there.
+        WriteError: The disk refused.
+        OptionError: There is no such topic or time.
+    """
+    about = load_about(options.about) if options.about is not None else None
+    with (
+        Dataset(path) as dataset,
+        staged(target, force=options.force, owned=dataset_files, sources=[path]) as folder,
+    ):
+        selected = Selection(options.topics, options.exclude)
+        selected.check(channel.topic for channel in dataset.channels)
+        folder.mkdir()
+        span = span_in(dataset, options.slice)
+        manifest = copy_part(dataset, folder, span=span, selected=selected, about=about)
+        if options.slice:  # of a whole file its SHA-256 was compared
+            for problem in validate(folder, deep=True):
+                raise FormatError(problem.code, dataset.path, f"is damaged: {problem}")
+        with Dataset(folder) as made:
+            topics = _topics(made)
+        return PackSummary(
+            dataset=target,
+            topics=topics,
+            source_bytes=folder_size(dataset.path),
+            dataset_bytes=folder_size(folder),
+            messages_bytes=sum(item.size for item in manifest.files if item.name[-5:] == ".mcap"),
+            left_out=[item.topic for item in dataset.channels if not selected(item.topic)],
+            skipped={},
+            is_copy=True,
+        )
+
+
+def _topics(dataset: Dataset) -> list[TopicSummary]:
+    times = dataset.times()
+    found: dict[str, TopicSummary] = {}
+    for channel in dataset.channels:
+        topic = found.setdefault(channel.topic, TopicSummary(channel.topic, channel.type_name))
+        topic.messages += len(times.get(channel.id, ()))
+    for stream in dataset.streams:
+        topic = found[stream.topic]
+        topic.frames += len(stream)
+        topic.files.append(stream.video_path.name)
+        topic.packed_bytes += stream.video_path.stat().st_size + stream.path.stat().st_size
+        info = stream.sidecar.camera_info
+        if info:
+            found[info.channel.topic].frames += info.messages
+    return list(found.values())

@@ -1,0 +1,315 @@
+"""A slice of time: the same messages, whatever it is taken of and whatever it becomes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mp4ds
+from coded_scenes import CODED
+from each import each
+from mp4ds.errors import FormatError, OptionError, SourceError
+from mp4ds.format.manifest import Manifest
+from mp4ds.format.sidecars import load_manifest
+from mp4ds.options import Slice
+from mp4ds.packing.options import PackOptions
+from mp4ds.packing.pack import pack_each
+from mp4ds.plugins.exporting.export import export
+from mp4ds.plugins.exporting.job import ExportOptions
+from mp4ds.unpacking.unpack import UnpackOptions
+from round_trips import TARGETS, Compare, output_of, own_target
+from sources import PERIOD, SOURCES, START, TRAITS, Scene, odd_scene, scene, write_bag
+
+FRAMES = 40
+FIRST, LAST = START + 17 * PERIOD + 5, START + 26 * PERIOD  # of what is taken, and after it
+SPAN = {"start": str(FIRST), "end": str(LAST)}
+BETWEEN = {"start": FIRST, "end": LAST}
+
+
+def manifest(dataset: Path) -> Manifest:
+    return load_manifest(dataset / "dataset.yaml")
+
+
+def unpacked(dataset: Path, target: str, **options: Any) -> Path:
+    to, storage = TARGETS[target]
+    output = dataset.parent / f"{dataset.name}-{output_of(dataset.parent, target).name}"
+    mp4ds.unpack(dataset, to, output, UnpackOptions(storage=storage, **options))
+    return output
+
+
+def hidden(dataset: Path) -> list[int]:
+    """How many frames each video hides."""
+    with mp4ds.open(dataset) as opened:
+        return [stream.hidden_frames for stream in opened.streams]
+
+
+# ---------------------------------------------------------------- of recordings and datasets
+
+
+@each("source", SOURCES, one_in=3)
+@each("way", ["one-pass", "parts", "dataset", "dataset-anew", "unpack"])
+def test_what_is_taken(source: str, way: str, tmp_path: Path, compare: Compare) -> None:
+    """Of a recording in one pass and in parts, and of a dataset of it, copied and anew."""
+    paths = SOURCES[source](tmp_path, scene("rgb8", frames=FRAMES))
+    dataset, whole = tmp_path / "dataset", tmp_path / "whole"
+    if way == "one-pass":
+        mp4ds.pack(paths, dataset, PackOptions(**SPAN))
+    elif way == "parts":
+        mp4ds.pack(paths, dataset, PackOptions(**SPAN, window=4, jobs=2))
+    else:
+        mp4ds.pack(paths, whole, PackOptions(codec="h264", gop=8))
+    if way == "dataset":
+        mp4ds.pack(whole, dataset, PackOptions(**SPAN))
+        assert max(hidden(dataset)) > 0
+    elif way == "dataset-anew":
+        mp4ds.pack(whole, dataset, PackOptions(**SPAN, codec="ffv1"))
+    if way == "unpack":
+        output = unpacked(whole, own_target(source), **SPAN)
+    else:
+        assert mp4ds.validate(dataset, deep=True) == []
+        for item in manifest(dataset).sources:
+            assert item.excerpt is not None
+            assert (item.excerpt.start, item.excerpt.end) == (FIRST, LAST)
+            assert (item.sha256 is None) == (way in ("one-pass", "parts"))
+        output = unpacked(dataset, own_target(source))
+    assert compare(paths, output, **BETWEEN) == []
+    assert compare(paths, output) != []
+
+
+@each("trait", TRAITS, one_in=3)
+def test_of_odd_recordings(trait: str, tmp_path: Path, compare: Compare) -> None:
+    """Also where log times do not tell the order of messages, and so nothing can be copied."""
+    paths = SOURCES["mcap-ros1-zstd"](tmp_path, odd_scene(trait, frames=12))
+    start, end = START + 3 * PERIOD, START + 8 * PERIOD
+    mp4ds.pack(paths, tmp_path / "whole")
+    span = {"start": str(start), "end": str(end)}
+    for name, sources in (("dataset", paths), ("again", [tmp_path / "whole"])):
+        mp4ds.pack(sources, tmp_path / name, PackOptions(**span))
+        output = tmp_path / f"{name}.mcap"
+        mp4ds.unpack(tmp_path / name, "mcap", output)
+        assert compare(paths, output, start=start, end=end) == []
+
+
+@each(
+    "kind", ["video-h264", "video-h265", "video-av1", "ffmpeg-libx264", "jpeg-rgb", "png-rgb-cv2"]
+)
+def test_of_coded_messages(kind: str, tmp_path: Path, compare: Compare) -> None:
+    paths = SOURCES["mcap-ros2-zstd"](tmp_path, CODED[kind](frames=12))
+    start, end = START + 5 * PERIOD, START + 9 * PERIOD
+    span = {"start": str(start), "end": str(end)}
+    mp4ds.pack(paths, tmp_path / "whole")
+    mp4ds.pack(tmp_path / "whole", tmp_path / "dataset", PackOptions(**span))
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare(paths, unpacked(tmp_path / "dataset", "mcap"), start=start, end=end) == []
+
+
+# ---------------------------------------------------------------- what is copied
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("slices") / "drive.bag"
+    write_bag(path, scene("rgb8", frames=FRAMES))
+    return path
+
+
+@pytest.fixture(scope="module")
+def visual(recording: Path) -> Path:
+    mp4ds.pack(recording, recording.parent / "visual", PackOptions(quality="visual", gop=8))
+    return recording.parent / "visual"
+
+
+@each("lossy", ["av1", "h264", "h265"])
+def test_no_pixel_of_a_lossy_video_changes(lossy: str, recording: Path, tmp_path: Path) -> None:
+    mp4ds.pack(recording, tmp_path / "whole", PackOptions(quality="crf=30", codec=lossy, gop=8))
+    mp4ds.pack(tmp_path / "whole", tmp_path / "part", PackOptions(**SPAN))
+    mp4ds.pack(tmp_path / "part", tmp_path / "less", PackOptions(start="0.1"))
+    with (
+        mp4ds.open(tmp_path / "whole") as whole,
+        mp4ds.open(tmp_path / "part") as part,
+        mp4ds.open(tmp_path / "less") as less,
+    ):
+        topic = whole.topics[0]
+        first = int(np.searchsorted(whole[topic].log_times, FIRST))
+        assert len(part[topic]) == 9
+        for sliced in (part, less):
+            offset = first + len(part[topic]) - len(sliced[topic])
+            numbers = [*range(len(sliced[topic]))]
+            for chosen in (numbers, numbers[::-2], numbers[3:4]):  # in order, and at random
+                ours = sliced[topic].read(chosen)
+                assert np.array_equal(ours, whole[topic].read([offset + n for n in chosen]))
+            for number, frame in enumerate(sliced[topic]):
+                assert np.array_equal(frame.data, whole[topic][offset + number].data)
+    assert mp4ds.validate(tmp_path / "less", deep=True) == []
+    told = manifest(tmp_path / "less")
+    assert [item.name for item in told.derived_from] == ["whole", "part"]
+    assert told.profile == "crf=30"
+
+
+def test_a_score_is_that_of_the_frames_that_are_left(recording: Path, tmp_path: Path) -> None:
+    mp4ds.pack(recording, tmp_path / "whole", PackOptions(quality="psnr=38", codec="h264"))
+    mp4ds.pack(tmp_path / "whole", tmp_path / "part", PackOptions(**SPAN))
+    assert mp4ds.validate(tmp_path / "part", deep=True) == []
+    with mp4ds.open(tmp_path / "whole") as whole, mp4ds.open(tmp_path / "part") as part:
+        (old,), (new,) = whole.streams, part.streams
+        all_scores = old.sidecar.video.quality.decode(len(old))
+        first = int(np.searchsorted(old.log_times, FIRST))
+        scores = new.sidecar.video.quality.decode(len(new))
+        assert np.array_equal(scores, all_scores[first : first + len(new)])
+
+
+def test_topics_and_facts_without_a_slice(visual: Path, tmp_path: Path) -> None:
+    (tmp_path / "about.yaml").write_text("title: A drive\n")
+    options = PackOptions(exclude=["/imu"], about=str(tmp_path / "about.yaml"))
+    summary = mp4ds.pack(visual, tmp_path / "copy", options)
+    assert summary.is_copy
+    assert summary.left_out == ["/imu"]
+    assert mp4ds.validate(tmp_path / "copy", deep=True) == []
+    old, new = manifest(visual), manifest(tmp_path / "copy")
+    assert new.about is not None
+    assert new.about.title == "A drive"
+    assert new.topics_left_out == ["/imu"]
+    assert new.sources == old.sources
+    videos = {item.name: item.sha256 for item in old.files if item.name.endswith(".mp4")}
+    assert videos.items() <= {item.name: item.sha256 for item in new.files}.items()
+
+
+def test_images_without_their_calibrations(
+    recording: Path, tmp_path: Path, compare: Compare
+) -> None:
+    mp4ds.pack(recording, tmp_path / "whole")
+    with mp4ds.open(tmp_path / "whole") as opened:
+        info = opened.streams[0].sidecar.camera_info
+    assert info is not None
+    summary = mp4ds.pack(
+        tmp_path / "whole", tmp_path / "copy", PackOptions(exclude=[info.channel.topic])
+    )
+    assert "are one stream" in summary.not_copied
+    mp4ds.pack(recording, tmp_path / "due", PackOptions(exclude=[info.channel.topic]))
+    due, found = (unpacked(tmp_path / name, "bag") for name in ("due", "copy"))
+    assert compare(due, found) == []
+
+
+def test_a_damaged_group_is_not_copied(recording: Path, tmp_path: Path) -> None:
+    mp4ds.pack(recording, tmp_path / "whole", PackOptions(codec="h264", gop=8))
+    (video,) = (tmp_path / "whole").glob("*.mp4")
+    data = bytearray(video.read_bytes())
+    middle = data.index(b"mdat") + (len(data) * 45) // 100
+    for place in range(middle, middle + 3000, 7):
+        data[place] ^= 0x55
+    video.write_bytes(data)
+    with pytest.raises(FormatError, match="whole"):
+        mp4ds.pack(tmp_path / "whole", tmp_path / "part", PackOptions(**SPAN))
+    assert not (tmp_path / "part").exists()
+    with pytest.raises(FormatError):
+        mp4ds.pack(tmp_path / "whole", tmp_path / "part")
+    assert not (tmp_path / "part").exists()
+
+
+def test_a_span_without_frames_keeps_the_rest(tmp_path: Path, compare: Compare) -> None:
+    """Calibrations whose images are outside are kept as they are."""
+    recorded = scene("rgb8", frames=FRAMES)
+    kept = [
+        message
+        for message in recorded.messages
+        if "image" not in message.topic or message.log_time < START + 10 * PERIOD
+    ]
+    write_bag(tmp_path / "drive.bag", replace(recorded, messages=kept))
+    mp4ds.pack(tmp_path / "drive.bag", tmp_path / "whole")
+    mp4ds.pack(tmp_path / "whole", tmp_path / "part", PackOptions(**SPAN))
+    assert manifest(tmp_path / "part").streams == []
+    assert mp4ds.validate(tmp_path / "part", deep=True) == []
+    output = unpacked(tmp_path / "part", "bag")
+    assert compare(tmp_path / "drive.bag", output, **BETWEEN) == []
+
+
+# ---------------------------------------------------------------- what is made of a slice
+
+
+def test_a_slice_is_unpacked_as_images_and_packets(visual: Path, tmp_path: Path) -> None:
+    mp4ds.unpack(visual, "images", tmp_path / "images", UnpackOptions(**SPAN, every=2))
+    assert len(list((tmp_path / "images").glob("*/*.png"))) == 5
+    # packets that refer to hidden frames are of no use without them
+    options = UnpackOptions(**SPAN, images="compressed-video")
+    summary = mp4ds.unpack(visual, "mcap", tmp_path / "video.mcap", options)
+    (reasons,) = summary.as_recorded.values()
+    assert [(count, "slice" in reason) for reason, count in reasons.items()] == [(9, True)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["images", "video.mcap"]
+
+
+def test_a_slice_is_exported(visual: Path, tmp_path: Path) -> None:
+    export(visual, "euroc", tmp_path / "euroc", ExportOptions(**SPAN))
+    assert len(list((tmp_path / "euroc").rglob("*.png"))) == 9
+    assert [path.name for path in tmp_path.iterdir()] == ["euroc"]
+
+
+def test_torchcodec_is_not_asked(visual: Path, tmp_path: Path) -> None:
+    """It was seen to show another frame than the first."""
+    torch = pytest.importorskip("mp4ds.torch")
+    mp4ds.pack(visual, tmp_path / "part", PackOptions(**SPAN))
+    assert len(torch.FrameDataset(tmp_path / "part")) == 9
+    with pytest.raises(OptionError, match="cut out of another"):
+        torch.FrameDataset(tmp_path / "part", backend="torchcodec", format="rgb")[0]
+
+
+def test_one_slice_each(recording: Path, tmp_path: Path) -> None:
+    assert len(pack_each([recording], tmp_path / "out", PackOptions(duration=0.5))) == 1
+    assert pack_each([recording], tmp_path / "out", PackOptions(duration=0.5)) == []
+    with pytest.raises(mp4ds.TargetError):
+        pack_each([recording], tmp_path / "out", PackOptions(duration=0.6))
+    with pytest.raises(mp4ds.TargetError):
+        pack_each([recording], tmp_path / "out")
+
+
+# ---------------------------------------------------------------- times
+
+
+@each(
+    ("asked", "start", "end"),
+    [
+        (Slice(), None, None),
+        (Slice("1"), START + 10**9, None),
+        (Slice(1.5), START + 1_500_000_000, None),
+        (Slice("+1", "2"), START + 10**9, START + 2 * 10**9),
+        (Slice("1", None, "2"), START + 10**9, START + 3 * 10**9),
+        (Slice(None, None, 2), None, START + 2 * 10**9),
+        (Slice(None, "2", "0.5"), START + 1_500_000_000, START + 2 * 10**9),
+        (Slice("1700000001.000000001"), START + 10**9 + 1, None),
+        (Slice(str(START + 7)), START + 7, None),
+        (Slice("2023-11-14T22:13:21"), START + 10**9, None),
+    ],
+)
+def test_how_it_is_written(asked: Slice, start: int | None, end: int | None) -> None:
+    assert asked.times(START, START + 3 * 10**9, "drive.bag") == (start, end)
+    assert bool(asked) == (asked != Slice())
+
+
+@each(
+    ("asked", "message"),
+    [
+        (Slice("1", "2", "3"), "two of `start`, `end` and `duration`"),
+        (Slice("soon"), "`start` 'soon' is no time"),
+        (Slice(duration="-1"), "`duration`"),
+        (Slice("2", "1"), "nothing is from .*22:13:22Z to before .*22:13:21Z"),
+        (Slice("3.1"), r"drive.bag: nothing is from .* 3 seconds"),
+        (Slice(end="2023-11-14T22:13:20"), "nothing"),
+        (Slice(duration="0"), "nothing"),
+    ],
+)
+def test_what_is_none(asked: Slice, message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        asked.times(START, START + 3 * 10**9, "drive.bag")
+
+
+def test_of_nothing_there_is_no_slice(tmp_path: Path) -> None:
+    write_bag(tmp_path / "drive.bag", Scene([]))
+    with pytest.raises(SourceError, match="no messages"):
+        mp4ds.pack(tmp_path / "drive.bag", tmp_path / "part", PackOptions(start="1"))
+    mp4ds.pack(tmp_path / "drive.bag", tmp_path / "whole")
+    with pytest.raises(OptionError, match="no messages"):
+        mp4ds.pack(tmp_path / "whole", tmp_path / "part", PackOptions(start="1"))
+    assert not (tmp_path / "part").exists()
