@@ -211,7 +211,14 @@ def dataset() -> Document:
         "format": "bag",
         "recording_profile": "ros1",
         "library": "a recorder",
-        "sources": [{"name": "drive.bag", "size": 5, "sha256": "a" * 64}],
+        "sources": [
+            {
+                "name": "drive.bag",
+                "size": 5,
+                "sha256": "a" * 64,
+                "excerpt": {"start": 1, "end": 2},
+            }
+        ],
         "about": {
             "title": "Two cameras",
             "description": "In a workshop.\nBy hand.",

@@ -17,7 +17,7 @@ import pytest
 
 import mp4ds
 from mp4ds.cli import app_for
-from mp4ds.cli.output import status_line
+from mp4ds.cli.progress import progress_of
 from scenes import Scene
 from sources import scene, write_mcap
 
@@ -118,10 +118,10 @@ def test_topics_steer_no_terminal(
     assert "http://x" not in re.sub(r"\\x1b]8;;http://x|\[link=http://x\]", "", shown)
 
 
-def test_a_status_line_is_no_markup(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_is_no_markup(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm-256color")
     err = Screen()
-    with contextlib.redirect_stderr(err), status_line(False) as told:
+    with contextlib.redirect_stderr(err), progress_of("reading", as_json=False) as told:
         assert told is not None
         told("/x[/foo][link=http://x]\x1b]0;title\x07")
     assert "/x[/foo][link=http://x]\\x1b]0;title\\x07" in err.getvalue()
@@ -181,7 +181,7 @@ def test_a_standard_stream_that_takes_nothing(name: str, recording: Path, tmp_pa
 def test_an_error_that_nobody_thought_of(
     as_json: bool, debug: bool, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(_: object) -> None:
+    def broken(*_: object) -> None:
         raise TypeError("open() got an unexpected keyword argument 'x'\n\x1b[31m.")
 
     monkeypatch.setattr("mp4ds.plugins.info.info", broken)

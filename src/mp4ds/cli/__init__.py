@@ -6,6 +6,7 @@ options are wrong; 130 interrupted.
 
 from __future__ import annotations
 
+import os
 import sys
 from importlib import import_module
 from typing import Annotated, NoReturn
@@ -13,9 +14,11 @@ from typing import Annotated, NoReturn
 import typer
 
 from mp4ds._version import __version__
-from mp4ds.cli.options import spelled
-from mp4ds.cli.output import say
-from mp4ds.cli.process import exit_code_of, prepare_process
+from mp4ds.cli.options import Command, spelled
+from mp4ds.cli.output import be_quiet, say
+from mp4ds.cli.process import DEBUG, exit_code_of, prepare_process
+
+_COMPLETE = "_MP4DS_COMPLETE"  # set by the shell that completes
 
 COMMANDS = {
     "pack": ("packing", "Pack a recording, or a dataset again, into a dataset of mp4 files."),
@@ -45,7 +48,7 @@ COMMANDS = {
         "evaluate",
         "Try encoder settings on clips of a recording: quality, size and time.",
     ),
-    "validate": ("inspect", "List every problem of a dataset; exit code 1 if there is one."),
+    "validate": ("inspect", "List every problem of datasets; exit code 1 if there is one."),
     "info": ("inspect", "Show what is in a recording or a dataset."),
     "demo": (
         "inspect",
@@ -59,18 +62,19 @@ COMMANDS = {
 """Commands -> their module, and what they do."""
 
 
-def app_for(*names: str) -> typer.Typer:
+def app_for(*names: str, is_completing: bool = False) -> typer.Typer:
     """The command line.
 
     Args:
         names: Commands that are built, with the modules that they use; the others are only
             listed. None: all are built.
+        is_completing: Whether a shell asks for what may follow, or is told how to ask.
     """
     app = typer.Typer(
         name="mp4ds",
         help="Robot camera recordings as ordinary mp4 files, and back again exactly.",
         no_args_is_help=True,
-        add_completion=False,
+        add_completion=is_completing,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
         context_settings={"help_option_names": ["-h", "--help"]},
@@ -84,13 +88,24 @@ def app_for(*names: str) -> typer.Typer:
         if name == "import":
             app.add_typer(module.imports, short_help=does)
         else:
-            app.command(name, short_help=does)(getattr(module, name.replace("-", "_")))
+            made = getattr(module, name.replace("-", "_"))
+            app.command(name, short_help=does, cls=Command)(made)
     return app
 
 
 def _top(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Print errors only, and what --json prints.")
+    ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Show where errors come from.")
+    ] = False,
 ) -> None:
+    if quiet:
+        be_quiet()
+    if verbose:
+        os.environ[DEBUG] = "1"
     if version:
         say(f"mp4ds {__version__}")
         raise typer.Exit
@@ -104,5 +119,9 @@ def main() -> NoReturn:
     """Run the command line and exit."""
     arguments = spelled(sys.argv[1:])
     prepare_process()
-    app = app_for(*(arguments[:1] or [""]))
+    command = next((word for word in arguments if not word.startswith("-")), "")
+    # what shells complete by is not built for a command that runs
+    is_completing = _COMPLETE in os.environ or not command or command not in COMMANDS
+    names = () if _COMPLETE in os.environ else (command,)
+    app = app_for(*names, is_completing=is_completing)
     sys.exit(exit_code_of(lambda: app(args=arguments), as_json="--json" in arguments))

@@ -3,51 +3,70 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from mp4ds.cli.options import ForceFlag, JsonFlag
+from mp4ds.cli.options import DatasetsArgument, ForceFlag, JobsOption, JsonFlag, cores
 from mp4ds.cli.output import (
     print_info,
     print_json,
+    print_overview,
     print_speeds,
     print_validation,
     printed,
     say,
-    status_line,
 )
 from mp4ds.cli.process import told_errors
+from mp4ds.cli.progress import progress_of
 from mp4ds.errors import OptionError
+from mp4ds.options import Slice
 
 if TYPE_CHECKING:
+    from mp4ds.dataset.checks import Problem
     from mp4ds.plugins.info import CameraCalibrations, Intrinsics, ListedCalibration
 
 
 def validate(
-    path: Annotated[str, typer.Argument(help="A sidecar, a dataset, or a folder of datasets.")],
+    paths: DatasetsArgument,
     deep: Annotated[
         bool, typer.Option("--deep", help="Also hash and decode all, and compare every message.")
     ] = False,
+    jobs: JobsOption = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """List every problem of a dataset; exit code 1 if there is one."""
+    """List every problem of datasets; exit code 1 if there is one."""
     from mp4ds.dataset.checks import validate as run
-    from mp4ds.files.urls import location
+    from mp4ds.dataset.collections import datasets_in, each
 
-    with told_errors(as_json), status_line(as_json) as report:
-        where = location(path)
-        problems = run(where, deep=deep, progress=report)
+    found: dict[Path, list[Problem]] = {}
+    with told_errors(as_json), progress_of("validating", as_json) as tell:
+        where = datasets_in(paths)
+        if len(where) == 1:
+            found[where[0]] = run(where[0], deep=deep, progress=tell)
+        else:
+            for path, problems in each(partial(run, deep=deep), where, cores(jobs)):
+                found[path] = problems
+                if tell:
+                    tell(f"{len(found)} of {len(where)} datasets", len(found) / len(where))
     if as_json:
-        print_json({"path": where, "deep": deep, "problems": problems})
+        told = [{"path": path, "deep": deep, "problems": item} for path, item in found.items()]
+        print_json(told[0] if len(told) == 1 else told)
     else:
-        print_validation(where, problems, deep=deep)
-    raise typer.Exit(1 if problems else 0)
+        print_validation(found, deep=deep)
+    raise typer.Exit(1 if any(found.values()) else 0)
 
 
 def info(
-    path: Annotated[str, typer.Argument(help="A bag, rosbag2 folder, MCAP, dataset or sidecar.")],
+    paths: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="PATH...",
+            help="A bag, rosbag2 folder, MCAP, dataset or sidecar; datasets, or a folder of them.",
+        ),
+    ],
     intrinsics: Annotated[
         bool,
         typer.Option(
@@ -58,32 +77,101 @@ def info(
         bool,
         typer.Option("--speed", help="Read some frames of a dataset, and show what one costs."),
     ] = False,
+    checksums: Annotated[
+        bool,
+        typer.Option(
+            "--checksums", help="Print the SHA-256 of a dataset's files, as sha256sum does."
+        ),
+    ] = False,
+    start: Annotated[
+        Optional[str],  # noqa: UP045 - read at run time by typer
+        typer.Option("--start", metavar="TIME", help="Look into a slice, as `pack` takes it."),
+    ] = None,
+    end: Annotated[Optional[str], typer.Option("--end", metavar="TIME")] = None,  # noqa: UP045
+    duration: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--duration", metavar="SECONDS"),
+    ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Show what is in a recording or a dataset."""
     if intrinsics and speed:
         with told_errors(as_json):
             raise OptionError("--intrinsics and --speed are shown one at a time.")
+    with told_errors(as_json):
+        found = _found(paths)
+        asked = Slice(start, end, duration)
+        if len(found) > 1 and (intrinsics or speed or asked or checksums):
+            raise OptionError("These options go with one recording or dataset.")
     if intrinsics:
-        _print_intrinsics(path, as_json)
-        return
-    if speed:
-        _print_speeds(path, as_json)
-        return
-    from mp4ds.plugins.info import info as run
+        _print_intrinsics(paths[0], as_json)
+    elif speed:
+        _print_speeds(paths[0], as_json)
+    elif checksums:
+        _print_checksums(found[0], as_json)
+    elif len(found) > 1:
+        _print_overview(found, as_json)
+    else:
+        from mp4ds.plugins.info import info as run
+
+        with told_errors(as_json):
+            result = run(found[0], asked)
+        if as_json:
+            print_json(result)
+        else:
+            print_info(result)
+
+
+def _found(paths: Sequence[str]) -> list[Path]:
+    """What is to be looked into: one recording, or datasets."""
+    from mp4ds.dataset.collections import datasets_in
+    from mp4ds.errors import SourceError
+    from mp4ds.files.urls import location
+
+    try:
+        return datasets_in(paths)
+    except SourceError:
+        if len(paths) > 1:
+            raise
+        return [location(paths[0])]  # a recording's folder, or nothing
+
+
+def _print_checksums(path: Path, as_json: bool) -> None:
+    """The files of a dataset as its manifest tells them, and the manifest itself."""
+    from mp4ds.files.outputs import digest_file
+    from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
 
     with told_errors(as_json):
-        result = run(path)
+        if not (path / MANIFEST_NAME).is_file():
+            raise OptionError(f"{path} is no dataset: checksums are those of a dataset.")
+        told = {item.name: item.sha256 for item in load_manifest(path / MANIFEST_NAME).files}
+        told[MANIFEST_NAME] = digest_file(path / MANIFEST_NAME)[1]
     if as_json:
-        print_json(result)
+        print_json(told)
+        return
+    for name, sha256 in told.items():
+        say(f"{sha256}  {name}")
+
+
+def _print_overview(found: Sequence[Path], as_json: bool) -> None:
+    from mp4ds.plugins.reporting.overview import brief
+
+    with told_errors(as_json), progress_of("reading", as_json) as tell:
+        rows = []
+        for number, path in enumerate(found):
+            if tell:
+                tell(path.name, number / len(found))
+            rows.append(brief(path))
+    if as_json:
+        print_json(rows)
     else:
-        print_info(result)
+        print_overview(rows)
 
 
 def _print_intrinsics(path: str, as_json: bool) -> None:
     from mp4ds.plugins.info import intrinsics as run
 
-    with told_errors(as_json), status_line(as_json, "reading"):
+    with told_errors(as_json), progress_of("reading", as_json):
         result = run(path)
     if as_json:
         print_json(result)
@@ -94,7 +182,7 @@ def _print_intrinsics(path: str, as_json: bool) -> None:
 def _print_speeds(path: str, as_json: bool) -> None:
     from mp4ds.plugins.info import reading_speeds
 
-    with told_errors(as_json), status_line(as_json, "reading"):
+    with told_errors(as_json), progress_of("reading", as_json):
         speeds = reading_speeds(path)
     if as_json:
         print_json(speeds)
@@ -104,7 +192,9 @@ def _print_speeds(path: str, as_json: bool) -> None:
 
 def demo(
     output: Annotated[Path, typer.Argument(help="The .bag file to make.")] = Path("demo.bag"),
-    seconds: Annotated[float, typer.Option("--seconds", min=0.1, max=3600.0)] = 3.0,
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=0.1, max=3600.0, help="That it lasts.")
+    ] = 3.0,
     force: ForceFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
@@ -129,7 +219,7 @@ def conformance_dump(
     from mp4ds.plugins.conformance import as_json
     from mp4ds.plugins.conformance import conformance_dump as run
 
-    with told_errors(as_json=True), status_line(as_json=False) as report:
+    with told_errors(as_json=True), progress_of("validating", as_json=False) as report:
         found = run(path, progress=report)
     with printed():
         print(as_json(found))

@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import update_wrapper
 from typing import Annotated, Any, Optional, Union, get_args, get_origin, get_type_hints
 
 import typer
+import typer.core
 from typer.models import OptionInfo
 
 from mp4ds.errors import OptionError
 from mp4ds.options import Options, Shown, shown_of
 
 DatasetArgument = Annotated[str, typer.Argument(help="A dataset, or a sidecar beside its video.")]
+DatasetsArgument = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="DATASET...", help="Datasets, or folders of them; or a sidecar beside its video."
+    ),
+]
+JobsOption = Annotated[
+    Optional[int],  # noqa: UP045 - read at run time by typer
+    typer.Option("--jobs", "-j", min=1, max=1024, help="Datasets at a time; all cores by default."),
+]
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 ForceFlag = Annotated[bool, typer.Option("--force", "-f", help="Replace an existing output.")]
 
@@ -24,6 +36,99 @@ _FLAGS: dict[str, str] = {}  # what the options of the commands that were made a
 def in_flags(text: str) -> str:
     """A sentence of the library, with the flags of the command line for the names of options."""
     return re.sub("`([a-z_0-9]+)`", lambda match: _FLAGS.get(match[1], match[0]), text)
+
+
+# ---------------------------------------------------------------- help
+
+_PANELS = {
+    "What": (
+        *("topics", "exclude", "regex", "start", "end", "duration", "start_offset", "topic", "at"),
+        *("sheet", "every", "max_rate", "sync", "tolerance_ns", "camera_info", "salvage", "poses"),
+        *("state", "action", "task", "cameras", "frames", "clips"),
+    ),
+    "How": (
+        *("quality", "codec", "preset", "transcode", "purpose", "gop", "images", "image_format"),
+        *("jpeg_quality", "resize", "pixels", "fps", "crf", "proxies", "proxy_width", "scores"),
+        *("publish_as", "storage", "exact", "about", "skip_unconvertible", "rate", "loop"),
+        *("delay", "paused", "immediate", "drop", "restamp", "lock_step", "clock", "hz"),
+        *("follow_clock", "wait_for_subscribers", "qos_overrides", "read_ahead", "deep"),
+        *("intrinsics", "speed", "seconds"),
+    ),
+    "Where": (
+        *(
+            "output",
+            "to",
+            "ros1",
+            "ros2",
+            "foxglove",
+            "force",
+            "remap",
+            "prefix",
+            "host",
+            "port",
+            "origins",
+            "serve",
+        ),
+        *("layout", "stamps", "unit", "calibration", "frame_id", "encoding"),
+    ),
+    "Long jobs": (
+        *("jobs", "memory", "window", "cluster", "shard", "join", "keep_going", "restart"),
+    ),
+}
+_PANEL_OF = {name: panel for panel, names in _PANELS.items() for name in names}
+_TYPES = {"int": "N", "float": "N", "str": "TEXT", "path": "PATH"}
+_EXTRAS = re.compile(r"(?:^|  )\[([^\]]*)\]$")
+
+
+class Command(typer.core.TyperCommand):
+    """A command whose help has its options by what they are about."""
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """The usage line, arguments by the names that its help gives them."""
+        del ctx
+        names = [
+            name if parameter.required else f"[{name}]"
+            for parameter in self.params
+            if (name := _argument(parameter))
+        ]
+        return ["[OPTIONS]", *names]
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write arguments and options into their panels."""
+        panels: dict[str, list[tuple[str, str]]] = {
+            name: [] for name in ("Arguments", *_PANELS, "Options")
+        }
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is None:
+                continue
+            name = _argument(parameter)
+            panel = "Arguments" if name else _PANEL_OF.get(parameter.name or "", "Options")
+            words = re.sub(
+                "<([a-z]+)(?: range)?>", lambda match: _TYPES.get(match[1], "TEXT"), record[0]
+            )
+            panels[panel].append((name or words, _EXTRAS.sub(_without_bounds, record[1])))
+        for panel, rows in panels.items():
+            if rows:
+                with formatter.section(panel):
+                    formatter.write_dl(rows)
+
+
+def _without_bounds(extras: re.Match[str]) -> str:
+    """What stands in brackets behind a help text, but for bounds of numbers."""
+    kept = [part for part in extras[1].split("; ") if not re.search(r"\bx[<>]=?", part)]
+    return f"  [{'; '.join(kept)}]" if kept else ""
+
+
+def _argument(parameter: Any) -> str:
+    """Name of an argument; empty for an option."""
+    if parameter.param_type_name != "argument":
+        return ""
+    name: str = parameter.metavar or parameter.name.upper()
+    return name
+
+
+# ---------------------------------------------------------------- options of dataclasses
 
 
 def takes(
@@ -133,6 +238,15 @@ def _made(kind: type[Options], given: Mapping[str, Any]) -> Options:
         if value is not None:
             values[name] = parse(value) if parse else value
     return kind(**values)
+
+
+def cores(jobs: int | None) -> int:
+    """Processes at a time: as many as were asked for, or as there are processors."""
+    if jobs is not None:
+        return jobs
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def parse_share(text: str) -> tuple[int, int]:

@@ -3,28 +3,42 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass
 from datetime import datetime, timezone
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 from mp4ds.errors import Mp4dsError
+from mp4ds.options import iso_text
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from mp4ds.dataset.checks import Problem
     from mp4ds.packing.options import PackSummary, TopicSummary
     from mp4ds.plugins.info import Info, ReadingSpeed, TopicInfo
+    from mp4ds.plugins.reporting.overview import Brief
     from mp4ds.records import Loss
-    from mp4ds.unpacking.unpack import UnpackProgress, UnpackSummary
+    from mp4ds.unpacking.unpack import UnpackSummary
 
 _LOSSES_SHOWN = 20
+_quiet = False
+
+
+def be_quiet() -> None:
+    """Print no results for people from now on, and no progress."""
+    global _quiet
+    _quiet = True
+
+
+def is_quiet() -> bool:
+    """Whether nothing but errors and JSON is printed."""
+    return _quiet
 
 
 def _jsonable(value: Any) -> Any:
@@ -59,58 +73,6 @@ def print_json(value: Any) -> None:
         print(text)
 
 
-def _console() -> Console:
-    from rich.console import Console
-
-    return Console(stderr=True)
-
-
-@contextmanager
-def unpack_progress(as_json: bool) -> Iterator[Callable[[UnpackProgress], None] | None]:
-    """A bar on a terminal: messages written, time left."""
-    console = _console()
-    if as_json or not console.is_terminal:
-        yield None
-        return
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
-    with Progress(
-        TextColumn("unpacking"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("messages"),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-    ) as bar:
-        task = bar.add_task("unpack", total=None)
-
-        def report(state: UnpackProgress) -> None:
-            bar.update(task, completed=state.messages, total=state.messages_total or None)
-
-        yield report
-
-
-@contextmanager
-def status_line(as_json: bool, text: str = "validating") -> Iterator[Callable[[str], None] | None]:
-    """On a terminal, a line that tells what is being done."""
-    console = _console()
-    if as_json or not console.is_terminal:
-        yield None
-        return
-    from rich.text import Text
-
-    with console.status(Text(text)) as status:
-        # of a plain string, what a topic is called would be taken for markup
-        yield lambda told: status.update(Text(shown(told)))
-
-
 def shown(value: object) -> str:
     """A text without what would steer a terminal: a topic or file may be named so."""
     text = str(value)
@@ -121,6 +83,8 @@ def shown(value: object) -> str:
 
 def say(value: object) -> None:
     """Print one line."""
+    if _quiet:
+        return
     with printed():
         print(shown(value))
 
@@ -142,6 +106,8 @@ def size_text(count: float) -> str:
 
 def print_table(columns: list[tuple[str, str]], rows: list[list[str]]) -> None:
     """Print a table; a column is right-aligned, or folds where the screen is too narrow."""
+    if _quiet:
+        return
     from rich.console import Console
     from rich.table import Table
 
@@ -246,18 +212,59 @@ def print_unpack(summary: UnpackSummary, noun: str) -> None:
         say(f"left out: {', '.join(summary.left_out)}")
 
 
-def print_validation(path: Path, problems: list[Problem], *, deep: bool) -> None:
-    """Print all problems, and how deep was looked for them."""
-    for problem in problems:
+def print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> None:
+    """Print all problems of datasets, and how deep was looked for them."""
+    for problem in chain.from_iterable(found.values()):
         say(problem)
-    count = len(problems)
-    found = f"{count} problem{'s' * (count > 1)}" if count else "no problem"
+    count = sum(map(len, found.values()))
+    problems = f"{count} problem{'s' * (count > 1)}" if count else "no problem"
     depth = (
         "every video was read to its end, every message with a digest compared"
         if deep
         else "frames were not decoded (--deep does)"
     )
-    say(f"{path}: {found}; {depth}")
+    if len(found) == 1:
+        say(f"{next(iter(found))}: {problems}; {depth}")
+        return
+    wrong = sum(map(bool, found.values()))
+    where = f" in {wrong} of them" if wrong else ""
+    say(f"{len(found)} datasets: {problems}{where}; {depth}")
+
+
+def print_overview(rows: Sequence[Brief]) -> None:
+    """Print a line for each dataset, and what they are together."""
+    base = os.path.commonpath([str(row.path.parent) for row in rows])
+    table = [
+        [
+            os.path.relpath(str(row.path), base) if base else str(row.path),
+            _moment(row.start),
+            f"{row.seconds:.1f}",
+            str(row.messages),
+            str(len(row.frames)),
+            str(sum(row.frames.values())),
+            size_text(row.bytes),
+            row.profile,
+        ]
+        for row in rows
+    ]
+    total = [
+        f"{len(rows)} datasets",
+        "",
+        f"{sum(row.seconds for row in rows):.1f}",
+        str(sum(row.messages for row in rows)),
+        str(len({topic for row in rows for topic in row.frames})),
+        str(sum(sum(row.frames.values()) for row in rows)),
+        size_text(sum(row.bytes for row in rows)),
+        "",
+    ]
+    print_table(_OVERVIEW_COLUMNS, [*table, total])
+
+
+def _moment(time_ns: int | None) -> str:
+    """A time, UTC; empty where it is none."""
+    if time_ns is None:
+        return ""
+    return iso_text(time_ns - time_ns % 10**9)
 
 
 def print_info(result: Info) -> None:
@@ -324,6 +331,16 @@ _PACK_COLUMNS = [
     ("packed", "right"),
     ("ratio", "right"),
     ("stored in", "fold"),
+]
+_OVERVIEW_COLUMNS = [
+    ("dataset", "fold"),
+    ("begins", "left"),
+    ("seconds", "right"),
+    ("messages", "right"),
+    ("cameras", "right"),
+    ("frames", "right"),
+    ("size", "right"),
+    ("profile", "left"),
 ]
 _INFO_COLUMNS = [
     ("topic", "fold"),

@@ -8,7 +8,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from mp4ds.cli.options import ForceFlag, JsonFlag, parse_share, takes
+from mp4ds.cli.options import Command, ForceFlag, JsonFlag, parse_share, takes
 from mp4ds.cli.output import print_json, print_pack, print_speeds, say
 from mp4ds.cli.process import told_errors
 from mp4ds.cli.progress import pack_progress
@@ -95,7 +95,7 @@ _Output = Annotated[
 ]
 
 
-@imports.command()
+@imports.command(cls=Command)
 @takes(ImageFolder, PackOptions, without=("images", *_ONLY_OF_RECORDINGS))
 def images(
     images_as: Callable[[], ImageFolder],
@@ -122,7 +122,7 @@ def images(
         print_pack(summary)
 
 
-@imports.command("ros-mp4")
+@imports.command("ros-mp4", cls=Command)
 def ros_mp4(
     video: Annotated[str, typer.Argument(metavar="VIDEO", help="The mp4.")],
     sidecar: Annotated[str, typer.Argument(metavar="YAML", help="The YAML that came with it.")],

@@ -26,7 +26,7 @@ from mp4ds.errors import Mp4dsError, sentence_of
 
 _AGAIN = "run the same command again to go on"
 _BAD_PATH = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EACCES, errno.EINVAL)
-_DEBUG = "MP4DS_DEBUG"
+DEBUG = "MP4DS_DEBUG"
 _NO_MEMORY = "out of memory; try fewer --jobs"
 _MEMORY_REFUSED = ("can't start new thread", "failed to map segment", "Cannot allocate memory")
 _LONGEST = 500
@@ -62,7 +62,7 @@ def told_errors(as_json: bool) -> Iterator[None]:
 def _fail(
     message: str, code: Any, as_json: bool, *, versions: dict[str, str] | None = None
 ) -> NoReturn:
-    if os.environ.get(_DEBUG):
+    if os.environ.get(DEBUG):
         for line in traceback.format_exc().splitlines():
             complain(line)
     if as_json:
@@ -86,7 +86,7 @@ def _unexpected(error: Exception) -> str:
             place = f" in {path.relative_to(_PACKAGE).as_posix()}:{frame.lineno}"
     return (
         f"{type(error).__name__}{place}: {said}. This is not meant to happen: please report it, "
-        f"with the versions told here and what {_DEBUG}=1 shows."
+        f"with the versions told here and what {DEBUG}=1 shows."
     )
 
 

@@ -1,4 +1,4 @@
-"""What `mp4ds pack` tells of its progress, always on stderr: live, in lines, and as events."""
+"""What commands tell of their progress, always on stderr: live, in lines, of packs as events."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
-from mp4ds.cli.output import shown, size_text
+from mp4ds.cli.output import is_quiet, shown, size_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -368,6 +368,9 @@ def pack_progress(as_json: bool, *, whole: bool = True) -> Iterator[Take]:
         What takes the progress, several times a second.
     """
     stream = sys.stderr
+    if is_quiet() and not as_json:
+        yield lambda _: None
+        return
     if not as_json and stream.isatty():
         from rich.console import Console
 
@@ -477,3 +480,97 @@ def told_by(teller: ProgressWriter, *, tick_seconds: float) -> Iterator[Take]:
         stop.set()
         thread.join()
         teller.end(outcome)
+
+
+# ---------------------------------------------------------------- other commands
+
+_LINE_PAUSE = 10.0  # seconds
+_SURE_SECONDS = 2.0  # from when on the time left is told
+
+
+class Telling(Protocol):
+    """What takes the progress of a command."""
+
+    def __call__(self, what: str, share: float | None = None) -> None:
+        """Tell what is being done, and the share of all that is done, 0 to 1, where it is known."""
+
+
+@contextmanager
+def progress_of(doing: str, as_json: bool) -> Iterator[Telling | None]:
+    """Tell of the progress of a command while the context lasts.
+
+    On a terminal a bar with percent and time left, once a share is told; else a line every 10 s.
+
+    Args:
+        doing: Such as ``validating``.
+        as_json: Tell nothing.
+    """
+    if as_json or is_quiet():
+        yield None
+        return
+    if sys.stderr.isatty():
+        from rich.console import Console
+
+        console = Console(stderr=True)
+        if not console.is_dumb_terminal:
+            with _bar(console, doing) as tell:
+                yield tell
+            return
+    yield _LogOf(doing, Lines(sys.stderr))
+
+
+@contextmanager
+def _bar(console: Console, doing: str) -> Iterator[Telling]:
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = [
+        TextColumn(doing, markup=False),
+        BarColumn(bar_width=20),
+        TextColumn("{task.fields[percent]}", markup=False),
+        TimeRemainingColumn(),
+        # of a plain string, what a topic is called would be taken for markup
+        TextColumn("{task.fields[told]}", markup=False),
+    ]
+    with Progress(
+        *columns, console=console, transient=True, speed_estimate_period=PACE_SECONDS
+    ) as bar:
+        task = bar.add_task("", total=None, told="", percent="")
+
+        def tell(what: str, share: float | None = None) -> None:
+            bar.update(task, told=shown(what))
+            if share is not None:
+                bar.update(task, total=1.0, completed=share, percent=percent_text(share))
+
+        yield tell
+
+
+class _LogOf:
+    """Writes a line every 10 s.
+
+    Args:
+        doing: What is done.
+        lines: Take the lines.
+        clock: Seconds; does not go back.
+    """
+
+    def __init__(
+        self, doing: str, lines: Lines, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._doing = doing
+        self._lines = lines
+        self._clock = clock
+        self._began = self._told = clock()
+        self._share: float | None = None
+
+    def __call__(self, what: str, share: float | None = None) -> None:
+        now = self._clock()
+        self._share = self._share if share is None else share
+        if now - self._told < _LINE_PAUSE:
+            return
+        self._told = now
+        left = None
+        if self._share and now - self._began >= _SURE_SECONDS:
+            left = (now - self._began) * (1 - self._share) / self._share
+        texts = [plain(what), percent_text(self._share), left_text(left)]
+        told = " | ".join(filter(None, texts))
+        self._lines.write(f"{datetime.now():%H:%M:%S} {self._doing}: {told}")

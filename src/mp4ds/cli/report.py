@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from mp4ds.cli.options import DatasetArgument, JsonFlag, takes
-from mp4ds.cli.output import print_json, printed, say, size_text, status_line
+from mp4ds.cli.options import (
+    DatasetArgument,
+    DatasetsArgument,
+    JobsOption,
+    JsonFlag,
+    cores,
+    takes,
+)
+from mp4ds.cli.output import print_json, printed, say, size_text
 from mp4ds.cli.process import told_errors
+from mp4ds.cli.progress import progress_of
+from mp4ds.dataset.collections import datasets_in
+from mp4ds.errors import OptionError
 from mp4ds.plugins.reporting.report import ReportOptions, ReportSummary
 from mp4ds.plugins.reporting.report import report as run_report
 from mp4ds.plugins.reporting.stills import StillOptions
@@ -21,22 +32,30 @@ from mp4ds.plugins.reporting.stills import frames as run_frames
 @takes(ReportOptions)
 def report(
     options: Callable[[], ReportOptions],
-    dataset: DatasetArgument,
+    datasets: DatasetsArgument,
     serve: Annotated[
         bool, typer.Option("--serve", help="Then show it to this machine's browsers.")
     ] = False,
     port: Annotated[
         int, typer.Option("--port", min=0, max=65535, help="Of --serve; a free one by default.")
     ] = 0,
+    jobs: JobsOption = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Make a page of a dataset: all cameras in step, timing, topics, calibrations.
 
-    Open its index.html in a browser, from the disk or by --serve; it needs no network.
+    Open its index.html in a browser, from the disk or by --serve; it needs no network. Of several
+    datasets, or a folder of them, a page with a picture of each leads to their reports.
     """
     with told_errors(as_json):
-        with status_line(as_json, "making the report") as tell:
-            summary = run_report(dataset, options(), progress=tell)
+        found, chosen = datasets_in(datasets), options()
+        if len(found) > 1:
+            if serve:
+                raise OptionError("--serve goes with one dataset.")
+            _reports(datasets, found, chosen, cores(jobs), as_json)
+            return
+        with progress_of("reporting", as_json) as tell:
+            summary = run_report(found[0], chosen, progress=tell)
         if as_json:
             print_json(
                 {
@@ -50,6 +69,33 @@ def report(
             _print_report(summary)
         if serve:
             _serve(summary, port, as_json)
+    if summary.problems:
+        raise typer.Exit(1)
+
+
+def _reports(
+    datasets: Sequence[str],
+    found: Sequence[Path],
+    options: ReportOptions,
+    jobs: int,
+    as_json: bool,
+) -> None:
+    """Make the reports of several datasets, and the page that leads to them."""
+    from mp4ds.plugins.reporting.overview import reports
+
+    folder = options.output
+    if folder is None and len(datasets) == 1 and Path(datasets[0]).is_dir():
+        folder = Path(datasets[0])
+    if folder is None:
+        raise OptionError("Give `output`, for the page of several datasets.")
+    with progress_of("reporting", as_json) as tell:
+        summary = reports(found, folder, replace(options, output=None), jobs=jobs, progress=tell)
+    if as_json:
+        print_json(summary)
+    else:
+        for problem in summary.problems:
+            say(f"not shown: {problem}")
+        say(f"{summary.index}: {summary.datasets} datasets")
     if summary.problems:
         raise typer.Exit(1)
 

@@ -8,39 +8,61 @@ from typing import Annotated, Optional
 
 import typer
 
-from mp4ds.cli.options import DatasetArgument, JsonFlag, takes
-from mp4ds.cli.output import print_json, print_unpack, say, status_line, unpack_progress
+from mp4ds.cli.options import DatasetsArgument, JobsOption, JsonFlag, cores, takes
+from mp4ds.cli.output import print_json, print_unpack, say
 from mp4ds.cli.process import told_errors
+from mp4ds.cli.progress import progress_of
+from mp4ds.dataset.collections import datasets_in
 from mp4ds.plugins.exporting.export import export as run_export
 from mp4ds.plugins.exporting.job import ExportOptions, ExportSummary
-from mp4ds.unpacking.unpack import UnpackOptions
+from mp4ds.unpacking.unpack import UnpackOptions, UnpackProgress, unpack_each
 from mp4ds.unpacking.unpack import unpack as run
 
 
 @takes(UnpackOptions)
 def unpack(
     options: Callable[[], UnpackOptions],
-    dataset: DatasetArgument,
+    datasets: DatasetsArgument,
     to: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option("--to", help="bag, rosbag2, mcap or images; by default as it was recorded."),
     ] = None,
     output: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option("--output", "-o", metavar="OUT", help="What to make, else NAME_unpacked."),
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="OUT",
+            help="What to make, of several the folder to make them in; NAME_unpacked by default.",
+        ),
     ] = None,
+    jobs: JobsOption = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Write a dataset's recording again: as a bag, rosbag2, MCAP, or images.
 
     Messages are converted between ROS 1 and ROS 2 where the target asks for it.
     """
-    with told_errors(as_json), unpack_progress(as_json) as progress:
-        summary = run(dataset, to, output, options(), progress=progress)
+    with told_errors(as_json), progress_of("unpacking", as_json) as tell:
+        noun = "images" if to == "images" else "messages"
+        found, chosen = datasets_in(datasets), options()
+
+        def progress(state: UnpackProgress) -> None:
+            total = state.messages_total
+            if tell:
+                unit = noun if len(found) == 1 else "datasets"
+                told = f"{state.messages} of {total or '?'} {unit}"
+                tell(told, state.messages / total if total else None)
+
+        if len(found) == 1:
+            summaries = [run(found[0], to, output, chosen, progress=progress)]
+        else:
+            summaries = unpack_each(found, to, output, chosen, jobs=cores(jobs), progress=progress)
     if as_json:
-        print_json(summary)
+        print_json(summaries[0] if len(found) == 1 else summaries)
         return
-    print_unpack(summary, "images" if to == "images" else "messages")
+    for summary in summaries:
+        print_unpack(summary, noun)
 
 
 @takes(ExportOptions)
@@ -68,7 +90,7 @@ def export(
 
     What it cannot hold is counted by topic and told, here and in mp4ds_export.json.
     """
-    with told_errors(as_json), status_line(as_json, "exporting") as tell:
+    with told_errors(as_json), progress_of("exporting", as_json) as tell:
         summary = run_export(datasets, to, output, options(), progress=tell)
     if as_json:
         print_json(summary)

@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from mp4ds.bags.formats import limits_of
+from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import recorded_storage
 from mp4ds.dataset.stream import Stream
@@ -32,7 +33,8 @@ from mp4ds.records import Message, Record
 from mp4ds.video.access import digest_video, packets_in_groups
 from mp4ds.video.references import Structures
 
-_Report = Callable[[str], None]
+_Report = Callable[[str, float | None], None]
+_TELL_EVERY = 16  # frames
 _Checked = TypeVar("_Checked")
 _Model = TypeVar("_Model", StreamSidecar, Manifest)
 
@@ -56,14 +58,15 @@ class Problem:
 
 
 def validate(
-    path: Path | str, *, deep: bool = False, progress: Callable[[str], None] | None = None
+    path: Path | str, *, deep: bool = False, progress: _Report | None = None
 ) -> list[Problem]:
     """Find all problems of a sidecar, a video with its sidecar, a dataset, or a folder of them.
 
     Args:
         path: What to validate, or its URL.
         deep: Also hash every file, decode every frame, rebuild every message, and compare.
-        progress: Called with a phrase before each costly step.
+        progress: Called with a phrase, and the share of the work that is done, 0 to 1, where
+            that is known.
 
     Returns:
         All problems; empty if there is none.
@@ -72,7 +75,7 @@ def validate(
         SourceNotFoundError: There is nothing at the path.
         SourceError: It is nothing that can be validated.
     """
-    return list(dict.fromkeys(_problems(location(path), deep, progress or (lambda _: None))))
+    return list(dict.fromkeys(_problems(location(path), deep, progress or (lambda *_: None))))
 
 
 def _problems(path: Path, deep: bool, report: _Report) -> list[Problem]:
@@ -81,10 +84,11 @@ def _problems(path: Path, deep: bool, report: _Report) -> list[Problem]:
     if path.name == MANIFEST_NAME:
         path = path.parent
     if path.is_dir():
+        folders = datasets_in(path)
         return [
             problem
-            for folder in _datasets_in(path)
-            for problem in _validate_dataset(folder, deep, report)
+            for number, folder in enumerate(folders)
+            for problem in _validate_dataset(folder, deep, _scaled(report, number, len(folders)))
         ]
     sidecar = path.with_suffix(".yaml") if path.suffix == ".mp4" else path
     if sidecar.suffix not in (".yaml", ".yml"):
@@ -101,17 +105,20 @@ def _problems(path: Path, deep: bool, report: _Report) -> list[Problem]:
     return [*problems, *_check_deep(stream, report)] if deep else problems
 
 
-def _datasets_in(folder: Path) -> list[Path]:
-    if (folder / MANIFEST_NAME).is_file():
-        return [folder]
-    found = sorted(manifest.parent for manifest in folder.rglob(MANIFEST_NAME))
-    if not found:
-        raise SourceError(
-            folder,
-            f"holds no dataset: there is no {MANIFEST_NAME} in it or below it",
-            "Give the folder that `mp4ds pack` made.",
-        )
-    return found
+def _scaled(report: _Report, before: int, total: int, size: int = 1) -> _Report:
+    """What takes the progress of a part of the work.
+
+    Args:
+        report: Takes that of the whole.
+        before: What is done before the part, in any unit.
+        total: The whole.
+        size: The part.
+    """
+
+    def scaled(what: str, share: float | None = None) -> None:
+        report(what, (before + size * (share or 0.0)) / max(1, total))
+
+    return scaled
 
 
 def _read(path: Path, kind: str, model: type[_Model]) -> tuple[_Model | None, list[Problem]]:
@@ -169,8 +176,10 @@ def _validate_dataset(folder: Path, deep: bool, report: _Report) -> list[Problem
         problems += _check_messages(dataset, manifest)
     if deep:
         problems += _check_hashes(folder, manifest, report)
-        for stream in streams:
-            problems += _check_deep(stream, report)
+        frames = [len(stream) for stream in streams]
+        for number, stream in enumerate(streams):
+            part = _scaled(report, sum(frames[:number]), sum(frames), frames[number])
+            problems += _check_deep(stream, part)
         if dataset is not None and not problems:
             problems += _check_recorded(dataset, manifest, report)
     return problems
@@ -201,7 +210,7 @@ def _check_hashes(folder: Path, manifest: Manifest, report: _Report) -> Iterator
 
 
 def _check_hash(path: Path, entry: FileEntry, report: _Report) -> Iterator[Problem]:
-    report(f"hashing {path.name}")
+    report(f"hashing {path.name}", None)
     if digest_file(path)[1] != entry.sha256:
         yield Problem(
             "hash-mismatch", str(path), "does not have the SHA-256 that the manifest says"
@@ -270,7 +279,7 @@ def _check_deep(stream: Stream, report: _Report) -> list[Problem]:
     """A video has its hash, and every frame decodes to the message that was recorded."""
     problems: list[Problem] = []
     try:
-        report(f"hashing {stream.video_path.name}")
+        report(f"hashing {stream.video_path.name}", None)
         problems += _check_video_file(stream, deep=True)
         with stream.open_video(sequential=True) as decoder:
             if any(_check_count(stream, decoder.coded_frames)):
@@ -305,8 +314,9 @@ def _check_video_file(stream: Stream, *, deep: bool) -> Iterator[Problem]:
 
 def _check_frames(stream: Stream, report: _Report) -> Iterator[Problem]:
     """Every frame decodes and, where there is a digest, its message is the original one."""
-    report(f"decoding {stream.video_path.name}")
-    for make in stream.makers():
+    for number, make in enumerate(stream.makers()):
+        if number % _TELL_EVERY == 0:
+            report(f"decoding {stream.video_path.name}", number / len(stream))
         try:
             make()
         except FormatError as error:
@@ -333,7 +343,7 @@ def _check_messages(dataset: Dataset, manifest: Manifest) -> list[Problem]:
 
 def _check_recorded(dataset: Dataset, manifest: Manifest, report: _Report) -> list[Problem]:
     """All of messages.mcap can be read, and unpacked again."""
-    report(f"reading {MESSAGES_NAME}")
+    report(f"reading {MESSAGES_NAME}", 1.0)
     place = str(dataset.path / MESSAGES_NAME)
     try:
         return list(_check_limits(dataset, manifest, _counted(dataset, place), place))

@@ -335,6 +335,8 @@ def _color(recipe: Recipe) -> Color:
 # ---------------------------------------------------------------- planning
 
 _KEPT_JPEG = "JPEG files are kept as they are; --transcode encodes them anew"
+_MANY = 6  # files, of which there may be any number more
+_STREAM_BYTES = 3_000  # of a video without frames, and of its sidecar
 _NEGLIGIBLE = 1 / 50
 """Of the raw size: a video as small as this is kept although zstd would be smaller still."""
 
@@ -469,6 +471,7 @@ def _lossless_plans(
     except EncoderRefusedError as error:
         raise Refused(str(error)) from None
     _refuse_noise(samples, best.bytes_per_frame)
+    _refuse_few(samples, best.bytes_per_frame)
     layout = bind(best.layout, encoding, best.parameters)
     plan = PicturePlan(layout, best.recipe, "lossless", exact=True, note=note, gop=best.gop)
     general = layout_for(encoding, lossless=True)
@@ -493,6 +496,20 @@ def _refuse_noise(samples: Sequence[CameraMessage], video_size: float) -> None:
         raise Refused(
             f"a video would not be smaller: about {video_size / verbatim:.2f} times as large"
         )
+
+
+def _refuse_few(samples: Sequence[CameraMessage], video_size: float) -> None:
+    """Refuse a few files that are smaller than a video of them with its index and sidecar.
+
+    Raises:
+        Refused: Says so.
+    """
+    is_file = samples[0].key.body in ("png", "rvl")
+    if not is_file or len(samples) >= _MANY:
+        return
+    stored = sum(len(seen.parts.body) for seen in samples)
+    if stored < _STREAM_BYTES + len(samples) * video_size:
+        raise Refused("so few small files take less than a video with its sidecar")
 
 
 def plan_to_values(plan: TrackPlan) -> dict[str, Any]:

@@ -39,7 +39,7 @@ def as_json(values: Values) -> str:
 
 
 def conformance_dump(
-    path: Path | str, *, progress: Callable[[str], None] | None = None
+    path: Path | str, *, progress: Callable[[str, float | None], None] | None = None
 ) -> dict[str, Any]:
     """What is in a sidecar with its video, or in a dataset, as JSON has it.
 

@@ -26,7 +26,9 @@ from mp4ds.format.sidecars import names_dataset
 from mp4ds.messages.serializations import is_calibration, is_camera, kind_of
 from mp4ds.messages.transforms import Transform, TransformCollector
 from mp4ds.messages.wire import CalibrationFields, CodedFields, ImageFields
+from mp4ds.options import WHOLE, Slice
 from mp4ds.packing.calibrations import StampPairing, pair_camera_infos
+from mp4ds.packing.job import open_recording
 from mp4ds.packing.look import Looker
 from mp4ds.records import Channel, Message
 from mp4ds.times import intervals, lost_frames
@@ -88,16 +90,21 @@ class Info:
     notes: list[str] = field(default_factory=list)
 
 
-def info(path: Path | str) -> Info:
+def info(path: Path | str, asked: Slice = WHOLE) -> Info:
     """Look into a recording, a dataset, or a video with its sidecar.
 
     Args:
         path: Where it is, or its URL.
+        asked: What of it is looked into. Of a slice of a dataset, what would be unpacked.
 
     Raises:
         SourceError: It is no recording or cannot be read.
         FormatError: The dataset breaks a rule of the format.
+        OptionError: There is nothing in the slice.
     """
+    if asked:
+        with open_recording([location(path)], asked=asked) as reader:
+            return _recording_info(reader)
     return _look(path, _dataset_info, _recording_info)
 
 

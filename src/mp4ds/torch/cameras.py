@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import open_dataset
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.video import Video
@@ -236,7 +237,7 @@ class Collection:
     Of a dataset with one camera only the manifest is read; to match several, their stamps.
 
     Args:
-        paths: The datasets.
+        paths: The datasets, or folders of them.
         topics: Topics or names of streams; None: those of the first dataset. All must have them.
         sync_tolerance_ns: How far header stamps of a match may be apart, nanoseconds.
 
@@ -249,8 +250,7 @@ class Collection:
     def __init__(
         self, paths: Paths, *, topics: Sequence[str] | None, sync_tolerance_ns: int
     ) -> None:
-        given = [paths] if isinstance(paths, (str, Path)) else list(paths)
-        if not given:
+        if not isinstance(paths, (str, Path)) and not list(paths):
             raise OptionError("There are no datasets: the list of paths is empty.")
         if isinstance(topics, str):
             raise OptionError(f"topics is a list of topics, such as [{topics!r}].")
@@ -258,6 +258,7 @@ class Collection:
             raise OptionError(
                 f"sync_tolerance_ns is {sync_tolerance_ns}, and must not be negative."
             )
+        given = datasets_in(paths)
         known = _sources(given[0])
         self.topics = tuple(topics) if topics is not None else tuple(s.topic for s in known)
         _check_topics(self.topics, given[0])

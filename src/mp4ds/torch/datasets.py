@@ -321,7 +321,8 @@ class FrameDataset(Dataset):
     It may be pickled and forked. Videos are opened when first needed, by each process for itself.
 
     Args:
-        paths: Datasets, one or several: folders, sidecars, videos, URLs.
+        paths: Datasets, one or several: folders, sidecars, videos, URLs; or folders of datasets
+            and patterns such as ``drives/*``.
         topics: Cameras; None: all of the first dataset. The others must have them, too.
         offsets: Of the frames of a sample from its own: ``(-1, 0)`` is the one before it and
             itself.

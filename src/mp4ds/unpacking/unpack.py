@@ -9,11 +9,13 @@ import shlex
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.formats import open_writer, recording_names
 from mp4ds.bags.protocols import BagWriter
+from mp4ds.dataset.collections import Paths, datasets_in, each
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import recorded_storage
 from mp4ds.dataset.slicing import sliced
@@ -239,6 +241,57 @@ def unpack(
                 if error.errno is None:
                     raise
                 raise WriteError(target, error) from error
+
+
+def unpack_each(
+    datasets: Paths,
+    to: str | None = None,
+    folder: Path | str | None = None,
+    options: UnpackOptions | None = None,
+    *,
+    jobs: int = 1,
+    progress: Callable[[UnpackProgress], None] | None = None,
+) -> list[UnpackSummary]:
+    """Write the recordings of several datasets again; see `unpack`.
+
+    Args:
+        datasets: Datasets, folders of them, or patterns.
+        to: See `unpack`.
+        folder: Where to write, each named as its dataset; made if it is not there. None: each
+            beside its dataset.
+        options: How.
+        jobs: Datasets at a time.
+        progress: Called after each dataset, with the numbers of these.
+
+    Raises:
+        OptionError: Two would get one name.
+        Mp4dsError: As `unpack`; those written before stay.
+    """
+    outputs: dict[Path, Path | None] = {}
+    for dataset in datasets_in(datasets):
+        kind = to or _own_format(dataset)
+        stem = dataset.name if dataset.is_dir() else dataset.stem
+        outputs[dataset] = location(folder) / f"{stem}{_SUFFIXES[kind]}" if folder else None
+    named = [output for output in outputs.values() if output is not None]
+    twice = [output for output, count in Counter(named).items() if count > 1]
+    if twice:
+        raise OptionError(f"Two datasets would become {twice[0]}. Unpack one elsewhere.")
+    if folder is not None and not remote(location(folder)):
+        location(folder).mkdir(exist_ok=True)
+    work = partial(_unpack_one, to=to, options=options)
+    summaries = []
+    for _, summary in each(work, [*outputs.items()], jobs):
+        summaries.append(summary)
+        if progress:
+            progress(UnpackProgress(len(summaries), len(outputs)))
+    return summaries
+
+
+def _unpack_one(
+    item: tuple[Path, Path | None], to: str | None, options: UnpackOptions | None
+) -> UnpackSummary:
+    dataset, output = item
+    return unpack(dataset, to, output, options)
 
 
 def _own_format(dataset: Path | str) -> str:

@@ -26,6 +26,7 @@ from mp4ds.messages.layouts import Layout, layout_for
 from mp4ds.messages.serializations import is_camera, kind_of
 from mp4ds.messages.wire import CodedFields
 from mp4ds.packing.look import Looker, depends_on_others
+from mp4ds.plan import LOSSLESS
 from mp4ds.plugins.evaluating.options import EvaluateOptions
 from mp4ds.records import Channel, Excerpt, Message
 from mp4ds.times import NS_PER_TICK, PresentationClock, nearest
@@ -68,12 +69,14 @@ class EvaluatedCamera:
         read: Images by number, which increase; those that hold none are left out.
         is_jpeg: Whether its images are recorded as JPEG files, which ``mp4ds pack`` encodes anew
             only if it is told to.
+        lossy: What took something from them before, if anything is known to.
     """
 
     topic: str
     times: NDArray[np.int64]
     read: Callable[[Sequence[int]], Iterator[Shot]]
     is_jpeg: bool = False
+    lossy: str = ""
 
     @property
     def rate(self) -> float | None:
@@ -179,7 +182,7 @@ def _of_channel(
                         )  # fmt: skip
             number += 1
 
-    return EvaluatedCamera(channel.topic, times, read, is_jpeg)
+    return EvaluatedCamera(channel.topic, times, read, is_jpeg, "JPEG" if is_jpeg else "")
 
 
 # ---------------------------------------------------------------- datasets and videos
@@ -191,7 +194,7 @@ def _of_dataset(dataset: Dataset) -> list[EvaluatedCamera]:
 
 def _of_frames(frames: Frames) -> EvaluatedCamera:
     # a lossy video has been demosaiced already, and would not be the better for it twice
-    is_lossy = isinstance(frames, Stream) and frames.sidecar.profile != "lossless"
+    is_lossy = isinstance(frames, Stream) and frames.sidecar.profile != LOSSLESS
     form = "rgb" if is_lossy and ENCODINGS[frames.encoding].mosaic else "native"
     order = np.argsort(frames.log_times, kind="stable")
 
@@ -205,7 +208,10 @@ def _of_frames(frames: Frames) -> EvaluatedCamera:
                 )
 
     is_jpeg = isinstance(frames, Stream) and frames.sidecar.video.codec == "mjpeg"
-    return EvaluatedCamera(frames.topic, frames.log_times[order], read, is_jpeg)
+    lossy = "JPEG" if is_jpeg else ""
+    if isinstance(frames, Stream) and is_lossy:
+        lossy = f"a dataset of {frames.sidecar.profile}"
+    return EvaluatedCamera(frames.topic, frames.log_times[order], read, is_jpeg, lossy)
 
 
 # ---------------------------------------------------------------- folders of images

@@ -178,6 +178,11 @@ class CameraTrial:
 
     def _note(self, clip: Clip, reachable: float, cells: Sequence[Cell]) -> None:
         target, options = self._target, self._options
+        if self._camera.lossy:
+            self._notes.append(
+                f"its images are lossy already ({self._camera.lossy}): scores tell how near to "
+                "these a setting comes, not to what the camera saw"
+            )
         if reachable < target.score:
             self._notes.append(
                 f"the clip beside itself has {target.metric} {reachable + CEILING_MARGIN:.2f}: "

@@ -172,6 +172,7 @@ figure { margin: 0; }
 figure img { display: block; image-rendering: pixelated; }
 figcaption { font-size: 12px; }
 code { background: #f2f2f2; padding: 1px 4px; }
+.first { font-size: 16px; line-height: 1.8; }
 """
 _CELL_HEADS = (
     *("codec", "preset", "crf", "kbit/s", "bytes/frame", "frames/s", "CPU s/frame"),
@@ -199,8 +200,15 @@ def page(result: Evaluation) -> str:
 
 
 def _head(result: Evaluation) -> Iterator[str]:
-    for item in result.recommended if len(result.cameras) > 1 else ():
-        yield _paragraph(f"{item.why} for all cameras", item.options, f"at least {item.score:.2f}")
+    source = escape(result.source.name)
+    for item in result.recommended:
+        yield (
+            f"<p class=first>The {escape(item.why)} that reaches the target of every camera "
+            f"(at least {item.score:.2f}): <code>mp4ds pack {source} -o DATASET "
+            f"{escape(item.options)}</code></p>"
+        )
+    if not result.recommended:
+        yield "<p class=first>No setting that was tried reaches the target of every camera.</p>"
     for topic, reason in result.left_out.items():
         yield f"<p>{escape(topic)} is left out: {escape(reason)}.</p>"
     versions = ", ".join(f"{name} {version}" for name, version in result.versions.items())
@@ -214,10 +222,10 @@ def _paragraph(what: str, options: str, score: str) -> str:
 def _sections(result: Evaluation) -> Iterator[str]:
     for camera in result.cameras:
         yield f"<h2>{escape(camera.topic)}</h2>"
-        yield f"<p>{escape(_facts(camera))}</p>"
         for item in camera.recommended:
             score = f"{camera.target.metric} {item.score:.2f}"
             yield _paragraph(f"{item.why} that reaches the target", item.options, score)
+        yield f"<p>{escape(_facts(camera))}</p>"
         yield from (f"<p>Note: {escape(note)}.</p>" for note in camera.notes)
         plots = "".join(f"<figure>{svg_of(plot(camera, kind), SIZE)}</figure>" for kind in COSTS)
         yield f'<div class="plots">{plots}</div>'

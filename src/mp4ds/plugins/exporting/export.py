@@ -11,6 +11,7 @@ from importlib import import_module
 from pathlib import Path
 
 from mp4ds._version import __version__
+from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.slicing import sliced
 from mp4ds.errors import OptionError
@@ -51,7 +52,7 @@ def export(
     output: Path | str,
     options: ExportOptions | None = None,
     *,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[str, float | None], None] | None = None,
 ) -> ExportSummary:
     """Write a dataset in the format of another tool, as far as that can hold it.
 
@@ -61,7 +62,8 @@ def export(
         to: ``euroc``, ``tum``, ``kitti``, ``colmap``, ``rerun`` or ``lerobot``.
         output: The folder to make; for rerun the file.
         options: How.
-        progress: Called with a phrase now and then.
+        progress: Called with a phrase now and then, and the share of the frames that are given
+            where that is known.
 
     Returns:
         What was written, and every message that was not, counted by its reason.
@@ -74,7 +76,9 @@ def export(
         RemoteError: A store or web server fails.
     """
     chosen = options or ExportOptions()
-    paths = [datasets] if isinstance(datasets, (str, Path)) else [*datasets]
+    if not isinstance(datasets, (str, Path)) and not [*datasets]:
+        raise OptionError("there is no dataset to export")
+    paths = datasets_in(datasets)
     _check(to, paths, chosen)
     if remote(location(output)):
         raise OptionError(f"{output} is a URL: export to this machine, then upload it.")
@@ -102,7 +106,7 @@ def export(
         if to == "lerobot":  # whose videos are of colours
             chosen = replace(chosen, pixels="rgb")
         sources = [ExportedDataset(dataset, chosen) for dataset in opened]
-        job = ExportJob(path, target, chosen, sources, progress or (lambda _: None))
+        job = ExportJob(path, target, chosen, sources, progress or (lambda *_: None))
         writer(job)
         summary = _summary(job, to)
         if not any(summary.messages.values()):
@@ -118,7 +122,7 @@ def export(
         return summary
 
 
-def _check(to: str, paths: Sequence[Path | str], options: ExportOptions) -> None:
+def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
     """Refuse options that are unknown or contradict each other.
 
     Raises:
@@ -126,8 +130,6 @@ def _check(to: str, paths: Sequence[Path | str], options: ExportOptions) -> None
     """
     if to not in FORMATS:
         raise OptionError(f"format {to!r} is not known. Use {', '.join(FORMATS)}.")
-    if not paths:
-        raise OptionError("there is no dataset to export")
     if len(paths) > 1 and to not in _SEVERAL:
         raise OptionError(
             f"{FORMATS[to]} holds one dataset, and {len(paths)} are given: export each by itself."

@@ -441,7 +441,7 @@ class ExportJob:
         target: What it will be called.
         options: How.
         sources: The datasets, one but for formats that hold several.
-        tell: Called with a phrase now and then.
+        tell: Called with a phrase now and then, and the share of the frames that are given.
         places: Part of the output -> the topic that is in it.
     """
 
@@ -449,8 +449,9 @@ class ExportJob:
     target: Path
     options: ExportOptions
     sources: Sequence[ExportedDataset]
-    tell: Callable[[str], None]
+    tell: Callable[[str, float | None], None]
     places: dict[str, str] = field(default_factory=dict)
+    _given: int = 0
 
     @property
     def source(self) -> ExportedDataset:
@@ -484,5 +485,7 @@ class ExportJob:
         """The same items; tells how many there were now and then."""
         for number, item in enumerate(items):
             if number % _TELL_EVERY == 0:
-                self.tell(f"{what}: frame {number} of {total}")
+                due = sum(len(camera) for source in self.sources for camera in source.cameras)
+                self.tell(f"{what}: frame {number} of {total}", (self._given + number) / due)
             yield item
+        self._given += total

@@ -212,7 +212,7 @@ def write(job: ExportJob) -> None:
     features: dict[str, dict[str, Any]] = {}
     first = 0
     for number, (source, own) in enumerate(zip(job.sources, cameras, strict=True)):
-        job.tell(f"episode {number + 1} of {len(job.sources)}")
+        job.tell(f"episode {number + 1} of {len(job.sources)}", number / len(job.sources))
         episode = _Maker(job, source, own, number, fps).make()
         found = _features(source, job, episode, fps)
         if features and found != features:
@@ -384,7 +384,7 @@ class _Maker:
         try:
             for number, (place, pixels) in enumerate(camera.pictures()):
                 if number % _TELL_EVERY == 0:
-                    self._job.tell(f"{camera.topic}: frame {number} of {len(camera)}")
+                    self._job.tell(f"{camera.topic}: frame {number} of {len(camera)}", None)
                 for _ in range(repeats[place]):
                     encoder.write((pixels,), next(due))
         except BaseException:

@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import OptionError
 from mp4ds.options import Options, every, exclude, jpeg_quality, max_rate, option, resize, topics
@@ -133,7 +134,7 @@ def open_player(
     _check(chosen)
     kind = chosen.to or ("" if publisher else sourced())
     world = publisher.world if publisher else WORLDS.get(kind)
-    places = [datasets] if isinstance(datasets, str | Path) else datasets
+    places = datasets_in(datasets)
     with ExitStack() as stack:
         opened = [
             stack.enter_context(Dataset(place, jpeg_quality=chosen.jpeg_quality))

@@ -12,7 +12,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from urllib.parse import quote
 
@@ -32,7 +32,7 @@ from mp4ds.files.outputs import (
     write_synced,
 )
 from mp4ds.files.urls import remote
-from mp4ds.options import Options, force, option
+from mp4ds.options import SliceOptions, duration, end, force, option, start
 from mp4ds.plugins.reporting.cameras import ReportedCamera, Scores, read_scores, scores_of
 from mp4ds.plugins.reporting.page import (
     FOLDER_NAME,
@@ -57,12 +57,15 @@ _KEYS_NAME = "proxies.json"
 
 
 @dataclass(frozen=True)
-class ReportOptions(Options):
+class ReportOptions(SliceOptions):
     """How a report is made."""
 
     output: Path | None = option(
         "Where to write it; into the dataset if not said.", None, "-o", metavar="FOLDER"
     )
+    start: str | float | None = start()
+    end: str | float | None = end()
+    duration: str | float | None = duration()
     proxies: str = option(
         "Small videos for what no browser shows (auto), for all, or none.", "auto", metavar="WHICH"
     )
@@ -127,7 +130,7 @@ def report(
 
     Args:
         dataset: A dataset, or one video with its sidecar, on this machine.
-        options: How.
+        options: How. Of a slice a dataset is made first, at `output`.
         progress: Called with a phrase now and then.
 
     Raises:
@@ -140,6 +143,8 @@ def report(
     """
     chosen = options or ReportOptions()
     tell = progress or (lambda _: None)
+    if chosen.slice:
+        return _report_slice(dataset, chosen, tell)
     with Dataset(dataset) as opened:
         if remote(opened.path):
             raise SourceError(opened.path, "is not on this machine", "Copy the dataset first.")
@@ -160,6 +165,24 @@ def report(
                 raise
         except OSError as error:
             raise as_write_error(error, folder) from error
+
+
+def _report_slice(
+    dataset: Path | str, options: ReportOptions, tell: Callable[[str], None]
+) -> ReportSummary:
+    """The report of a slice, which becomes a dataset for it."""
+    from mp4ds.packing.options import PackOptions
+    from mp4ds.packing.pack import pack
+
+    if options.output is None:
+        raise OptionError("Give `output`, for a dataset of the slice with its report in it.")
+    tell("copying the slice")
+    span = PackOptions(
+        start=options.start, end=options.end, duration=options.duration, force=options.force
+    )
+    pack(dataset, options.output, span)
+    whole = replace(options, start=None, end=None, duration=None, output=None)
+    return report(options.output, whole, progress=tell)
 
 
 def _scores(dataset: Dataset, path: Path | None) -> Mapping[str, Scores]:

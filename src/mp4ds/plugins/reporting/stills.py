@@ -16,7 +16,17 @@ from mp4ds.dataset.views import Resize, size_after
 from mp4ds.errors import FrameNotFoundError, OptionError
 from mp4ds.files.outputs import begins_with, staged
 from mp4ds.messages.encodings import ENCODINGS, Pixels
-from mp4ds.options import Options, force, option, resize, time_of
+from mp4ds.options import (
+    Slice,
+    SliceOptions,
+    duration,
+    end,
+    force,
+    option,
+    resize,
+    start,
+    time_of,
+)
 from mp4ds.plugins.reporting.proxies import Look
 from mp4ds.video.drawing import Page
 from mp4ds.video.images import ImageFile, encoding_as
@@ -45,7 +55,7 @@ def parse_sheet(text: str) -> tuple[int, int]:
 
 
 @dataclass(frozen=True)
-class StillOptions(Options):
+class StillOptions(SliceOptions):
     """Which frames are saved, and how."""
 
     topic: str = option("Of the camera, where there are several.", "", "-t")
@@ -57,6 +67,9 @@ class StillOptions(Options):
     sheet: tuple[int, int] | None = option(
         "So many frames beside and below each other.", metavar="5x4", parse=parse_sheet
     )
+    start: str | float | None = start()
+    end: str | float | None = end()
+    duration: str | float | None = duration()
     resize: float | tuple[int, int] | None = resize(
         "Size of the frame, or of each; 320 columns on a sheet by default."
     )
@@ -67,6 +80,8 @@ class StillOptions(Options):
         super().__post_init__()
         if (self.at is None) == (self.sheet is None):
             raise OptionError("Give either `at` TIME or `sheet` 5x4.")
+        if self.slice and not self.sheet:
+            raise OptionError("`start`, `end` and `duration` go with `sheet`.")
         if self.exact and (self.sheet or self.resize is not None):
             raise OptionError("`exact` goes neither with `sheet` nor with `resize`.")
         if self.sheet and not 1 <= self.sheet[0] * self.sheet[1] <= _MOST_FRAMES:
@@ -130,7 +145,8 @@ def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> St
     with Dataset(dataset) as opened:
         stream = _chosen(opened, options.topic)
         if options.sheet:
-            numbers = spread(len(stream), options.sheet[0] * options.sheet[1])
+            first, end = _places(stream, options.slice)
+            numbers = [first + n for n in spread(end - first, options.sheet[0] * options.sheet[1])]
             pixels, encoding = _sheet(stream, numbers, options.sheet, options.resize), "rgb8"
         else:
             numbers = [number_at(stream, options.at or "")]
@@ -183,6 +199,20 @@ def spread(count: int, wanted: int) -> list[int]:
     if count <= wanted:
         return list(range(count))
     return [(2 * number + 1) * count // (2 * wanted) for number in range(wanted)]
+
+
+def _places(stream: Frames, asked: Slice) -> tuple[int, int]:
+    """The first frame of a slice, by header stamps, and the one after its last."""
+    stamps = stream.stamps
+    first, last = int(stamps.min()), int(stamps.max())
+    start, end = asked.times(first, last, stream.topic)
+    inside = np.ones(len(stamps), np.bool_)
+    inside &= True if start is None else stamps >= start
+    inside &= True if end is None else stamps < end
+    numbers = np.flatnonzero(inside)
+    if not len(numbers):
+        raise OptionError(f"{stream.topic} has no frame in the slice.")
+    return int(numbers[0]), int(numbers[-1]) + 1
 
 
 def number_at(stream: Frames, text: str) -> int:

@@ -1,0 +1,135 @@
+"""Many datasets: found below a folder or by a pattern, and worked on side by side."""
+
+from __future__ import annotations
+
+import glob
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+from mp4ds.errors import Mp4dsError, SourceError, SourceNotFoundError
+from mp4ds.files.urls import RemotePath, location
+from mp4ds.format.sidecars import MANIFEST_NAME
+
+_Item = TypeVar("_Item")
+_Made = TypeVar("_Made")
+
+Paths = str | Path | Sequence[str | Path]
+"""A path or several."""
+
+
+def datasets_in(paths: Paths) -> list[Path]:
+    """The datasets that are meant by paths, in the order of these.
+
+    Args:
+        paths: Datasets, sidecars, videos; folders of datasets, however deep; patterns such as
+            ``drives/*``; or URLs, but no patterns of these.
+
+    Raises:
+        SourceNotFoundError: There is nothing, or nothing of a pattern.
+        SourceError: A folder has no dataset in it or below it.
+    """
+    several = [paths] if isinstance(paths, (str, Path, RemotePath)) else paths
+    return [dataset for path in several for dataset in _datasets_at(location(path))]
+
+
+def _datasets_at(path: Path) -> list[Path]:
+    if path.exists():
+        return _below(path)
+    # Path.glob takes no absolute patterns
+    matches = sorted(glob.glob(str(path))) if glob.has_magic(str(path)) else []  # noqa: PTH207
+    folders = [Path(match) for match in matches if Path(match).is_dir()]
+    if not folders:
+        raise SourceNotFoundError(path)
+    found: list[Path] = []
+    for folder in folders:
+        try:
+            found += _below(folder)
+        except SourceError:
+            continue  # a pattern matches other folders, too
+    if not found:
+        raise SourceError(path, "matches no dataset", "Give folders that `mp4ds pack` made.")
+    return found
+
+
+def _below(path: Path) -> list[Path]:
+    if path.name == MANIFEST_NAME:
+        return [path.parent]
+    if not path.is_dir() or (path / MANIFEST_NAME).is_file():
+        return [path]
+    found = sorted(manifest.parent for manifest in path.rglob(MANIFEST_NAME))
+    # what begins with a dot is being made
+    found = [one for one in found if not _is_hidden(one, path)]
+    if not found:
+        raise SourceError(
+            path,
+            f"holds no dataset: there is no {MANIFEST_NAME} in it or below it",
+            "Give the folder that `mp4ds pack` made.",
+        )
+    return found
+
+
+def _is_hidden(dataset: Path, folder: Path) -> bool:
+    if isinstance(dataset, RemotePath):
+        return False
+    return any(part.startswith(".") for part in dataset.relative_to(folder).parts)
+
+
+def each(
+    work: Callable[[_Item], _Made], items: Sequence[_Item], jobs: int = 1
+) -> Iterator[tuple[_Item, _Made]]:
+    """Work on items, several at a time.
+
+    Args:
+        work: A function that other processes can import, of arguments that they can be sent.
+        items: What it is given.
+        jobs: Processes at a time; of one, it is this one.
+
+    Yields:
+        Each item with what became of it, in their order.
+
+    Raises:
+        Mp4dsError: A process died, as where memory is short; else what the work raises.
+    """
+    if min(jobs, len(items)) < 2:
+        for item in items:
+            yield item, work(item)
+        return
+    before = set(multiprocessing.active_children())
+    with ProcessPoolExecutor(
+        min(jobs, len(items)), multiprocessing.get_context("spawn"), initializer=_leave_to_parent
+    ) as pool:
+        try:
+            yield from zip(items, pool.map(partial(_worked, work), items), strict=True)
+        except BrokenProcessPool:
+            raise Mp4dsError("A process died: memory may be short. Try fewer `jobs`.") from None
+        except BaseException:  # nobody waits for what is being worked on
+            for process in set(multiprocessing.active_children()) - before:
+                process.terminate()
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _leave_to_parent() -> None:
+    """Let the parent decide what Ctrl-C does; on its word, tidy up and end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _end)
+
+
+def _end(number: int, _: object) -> None:
+    signal.signal(number, signal.SIG_IGN)  # the pool sends it, too, when another process ended
+    sys.exit(128 + number)
+
+
+def _worked(work: Callable[[_Item], _Made], item: _Item) -> _Made:
+    try:
+        return work(item)
+    except SystemExit as ended:
+        os._exit(int(ended.code or 0))  # the pool would go on with the next item

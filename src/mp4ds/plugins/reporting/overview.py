@@ -1,0 +1,233 @@
+"""Many datasets in one table, and as one page with a picture and the report of each."""
+
+from __future__ import annotations
+
+import html
+import os
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
+from urllib.parse import quote
+
+from mp4ds.dataset.collections import Paths, datasets_in, each
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.errors import Mp4dsError, OptionError, SourceError, TargetExistsError
+from mp4ds.files.outputs import (
+    as_write_error,
+    is_page,
+    listed_names,
+    staged,
+    write_listing,
+    write_synced,
+)
+from mp4ds.files.urls import remote
+from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.plugins.reporting.page import FOLDER_NAME, INDEX_NAME
+from mp4ds.plugins.reporting.report import ReportOptions, report
+from mp4ds.plugins.reporting.stills import StillOptions, frames
+
+_ASSETS = files("mp4ds.plugins.reporting") / "page"
+_PICTURES = "pictures"
+_WIDTH = 240  # of a picture
+_NS = 10**9
+
+
+@dataclass(frozen=True)
+class Brief:
+    """What a manifest says of its dataset.
+
+    Attributes:
+        path: The dataset.
+        profile: What was asked for.
+        format: Of the recording.
+        messages: How many there are.
+        frames: Of these, frames of videos, by topic.
+        start: First log time, nanoseconds; None without messages.
+        end: Last log time, nanoseconds.
+        bytes: Of its files.
+        title: What it is called.
+    """
+
+    path: Path
+    profile: str
+    format: str
+    messages: int
+    frames: dict[str, int]
+    start: int | None
+    end: int | None
+    bytes: int
+    title: str = ""
+
+    @property
+    def seconds(self) -> float:
+        """From the first message to the last."""
+        return 0.0 if self.start is None or self.end is None else (self.end - self.start) / _NS
+
+
+def brief(path: Path) -> Brief:
+    """What the manifest of a dataset says.
+
+    Raises:
+        SourceError: It is no dataset.
+        FormatError: The manifest breaks a rule of the format.
+    """
+    if not (path / MANIFEST_NAME).is_file():
+        raise SourceError(path, "is no dataset", "Give folders that `mp4ds pack` made.")
+    manifest = load_manifest(path / MANIFEST_NAME)
+    by_topic: dict[str, int] = {}
+    for stream in manifest.streams:
+        by_topic[stream.topic] = by_topic.get(stream.topic, 0) + stream.frames
+    span = manifest.time_range
+    return Brief(
+        path=path,
+        profile=manifest.profile,
+        format=manifest.format,
+        messages=manifest.messages,
+        frames=by_topic,
+        start=span.start if span else None,
+        end=span.end if span else None,
+        bytes=sum(entry.size for entry in manifest.files),
+        title=(manifest.about and manifest.about.title) or "",
+    )
+
+
+# ---------------------------------------------------------------- page
+
+
+@dataclass(frozen=True)
+class OverviewSummary:
+    """A page of several datasets.
+
+    Attributes:
+        index: The page.
+        datasets: How many it shows.
+        problems: What could not be shown.
+    """
+
+    index: Path
+    datasets: int
+    problems: list[str] = field(default_factory=list)
+
+
+def reports(
+    datasets: Paths,
+    folder: Path | str,
+    options: ReportOptions | None = None,
+    *,
+    jobs: int = 1,
+    progress: Callable[[str, float | None], None] | None = None,
+) -> OverviewSummary:
+    """Make the report of each dataset, and a page that shows them all.
+
+    Args:
+        datasets: Datasets, folders of them, or patterns; on this machine.
+        folder: Where the page is made. The report of each stands in its dataset.
+        options: How the reports are made.
+        jobs: Datasets at a time.
+        progress: Called with a phrase, and the share that is done.
+
+    Raises:
+        SourceError: There is no dataset.
+        OptionError: An option is of one report.
+        TargetError: The page may not be written there.
+        WriteError: The disk refused.
+    """
+    chosen = options or ReportOptions()
+    if chosen.output is not None or chosen.scores is not None or chosen.slice:
+        raise OptionError("`scores`, `start`, `end` and `duration` go with one dataset.")
+    found = datasets_in(datasets)
+    for path in found:
+        if remote(path):
+            raise SourceError(path, "is not on this machine", "Copy the dataset first.")
+    place = Path(os.path.abspath(folder))  # noqa: PTH100 - as named
+    index = place / INDEX_NAME
+    if os.path.lexists(index) and not is_page(index) and not chosen.force:
+        raise TargetExistsError(index)
+    tell = progress or (lambda *_: None)
+    rows, problems = [], []
+    try:
+        place.mkdir(exist_ok=True)
+        with staged(place / FOLDER_NAME, force=True, owned=listed_names) as made:
+            (made / _PICTURES).mkdir(parents=True)
+            (made / "report.css").write_bytes((_ASSETS / "report.css").read_bytes())
+            work = partial(_shown, options=chosen, pictures=made / _PICTURES)
+            numbered = [*enumerate(found)]
+            for (number, path), (told, wrong) in each(work, numbered, jobs):
+                tell(f"{number + 1} of {len(found)}: {path.name}", (number + 1) / len(found))
+                problems += wrong
+                rows.append(_row(path, told, number, place, made))
+            write_listing(made)
+        page = _page(html.escape(place.name), _facts(found, problems), rows)
+        write_synced(index, page.encode())
+    except OSError as error:
+        raise as_write_error(error, place) from error
+    return OverviewSummary(index, len(found), problems)
+
+
+def _shown(
+    item: tuple[int, Path], options: ReportOptions, pictures: Path
+) -> tuple[Brief | None, list[str]]:
+    """Make report and picture of one dataset; what its manifest says, and what is wrong."""
+    number, path = item
+    try:
+        told = brief(path)
+        problems = report(path, replace(options)).problems
+        with Dataset(path) as dataset:
+            topic = next(iter(dataset.topics), None)
+            count = len(dataset[topic]) if topic else 0
+        if topic and count:
+            at = StillOptions(topic=topic, at=f"#{count // 2}", resize=_scale(path, topic))
+            frames(path, pictures / f"{number}.jpg", at)
+    except Mp4dsError as error:
+        with suppress(Mp4dsError):
+            return brief(path), [str(error)]
+        return None, [str(error)]
+    return told, problems
+
+
+def _scale(path: Path, topic: str) -> float:
+    with Dataset(path) as dataset:
+        return min(1.0, _WIDTH / dataset[topic].image_size[0])
+
+
+def _page(title: str, facts: str, rows: Sequence[str]) -> str:
+    page = (_ASSETS / "overview.html").read_text(encoding="utf-8")
+    for name, text in (("title", title), ("facts", facts), ("rows", "\n".join(rows))):
+        page = page.replace(f"<!--{name}-->", text)
+    return page
+
+
+def _facts(found: Sequence[Path], problems: Sequence[str]) -> str:
+    told = [f"{len(found)} dataset{'s' * (len(found) != 1)}"]
+    told += [f"not shown: {html.escape(problem)}" for problem in problems]
+    return "<br>".join(told)
+
+
+def _row(path: Path, told: Brief | None, number: int, place: Path, made: Path) -> str:
+    link = quote(Path(os.path.relpath(path / INDEX_NAME, place)).as_posix())
+    name = html.escape(os.path.relpath(path, place))
+    picture = ""
+    if (made / _PICTURES / f"{number}.jpg").exists():
+        picture = f'<img src="{FOLDER_NAME}/{_PICTURES}/{number}.jpg" alt="" loading="lazy">'
+    cells = ["", "", "", "", ""]
+    if told is not None:
+        name += f"<br><span class=muted>{html.escape(told.title)}</span>" if told.title else ""
+        begun = ""
+        if told.start is not None:
+            with suppress(ValueError, OverflowError, OSError):
+                moment = datetime.fromtimestamp(told.start // _NS, timezone.utc)
+                begun = f"{moment:%Y-%m-%d %H:%M:%S}"
+        cameras = "<br>".join(f"{html.escape(t)}: {n}" for t, n in told.frames.items())
+        cells = [
+            begun,
+            f"{told.seconds:.1f} s",
+            cameras,
+            f"{told.bytes / 1e6:.1f} MB",
+            html.escape(told.profile),
+        ]
+    body = "".join(f"<td>{cell}</td>" for cell in cells)
+    return f'<tr><td>{picture}</td><td><a href="{link}">{name}</a></td>{body}</tr>'

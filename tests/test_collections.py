@@ -1,0 +1,237 @@
+"""Many datasets: found below a folder, worked on side by side, shown in a table and on a page."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+import mp4ds
+from each import each as each_case
+from mp4ds.dataset.collections import datasets_in, each
+from mp4ds.errors import (
+    Mp4dsError,
+    OptionError,
+    SourceError,
+    SourceNotFoundError,
+    TargetExistsError,
+)
+from mp4ds.plugins.reporting.overview import brief, reports
+from mp4ds.plugins.reporting.report import ReportOptions
+from mp4ds.unpacking.unpack import unpack_each
+from waiting import WATCHDOG_S
+
+
+@pytest.fixture
+def drives(packed_bag: Path, tmp_path: Path) -> Path:
+    """A folder of three datasets, and of other things."""
+    folder = tmp_path / "drives"
+    for name in ("b", "a", "deep/c", "deep/.d.part/new"):
+        shutil.copytree(packed_bag, folder / name)
+    (folder / "notes.txt").write_text("windy")
+    (folder / "empty").mkdir()
+    return folder
+
+
+def run(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "mp4ds", *words],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=WATCHDOG_S,
+        check=False,
+    )
+
+
+# ---------------------------------------------------------------- which
+
+
+@each_case(
+    ("paths", "names"),
+    [
+        (".", ["a", "b", "deep/c"]),
+        (["b", "."], ["b", "a", "b", "deep/c"]),
+        ("deep", ["deep/c"]),
+        ("a", ["a"]),
+        ("a/dataset.yaml", ["a"]),
+        ("*", ["a", "b", "deep/c"]),
+        ("[ab]", ["a", "b"]),
+        (["a/camera_image_raw.yaml"], ["a/camera_image_raw.yaml"]),
+    ],
+)
+def test_what_is_meant(paths: str | list[str], names: list[str], drives: Path) -> None:
+    given = drives / paths if isinstance(paths, str) else [drives / path for path in paths]
+    if names == ["a/camera_image_raw.yaml"]:
+        sidecar = next(path for path in (drives / "a").glob("*.yaml") if path.stem != "dataset")
+        assert datasets_in([sidecar]) == [sidecar]
+        return
+    found = datasets_in(given)
+    assert [os.path.relpath(path, drives) for path in found] == names
+
+
+def test_what_is_not_there(drives: Path) -> None:
+    for path in ("nothing", "x*"):
+        with pytest.raises(SourceNotFoundError):
+            datasets_in(drives / path)
+    for path in ("empty", "e*"):
+        with pytest.raises(SourceError, match="dataset"):
+            datasets_in(drives / path)
+
+
+# ---------------------------------------------------------------- side by side
+
+
+def squared(number: int) -> tuple[int, int]:
+    return number * number, os.getpid()
+
+
+def failing(number: int) -> int:
+    if number == 2:
+        raise OptionError("two")
+    return number
+
+
+def dying(number: int) -> int:
+    if number == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+@each_case("jobs", [1, 3])
+def test_items_in_their_order(jobs: int) -> None:
+    found = list(each(squared, range(6), jobs))
+    assert [(item, made[0]) for item, made in found] == [(n, n * n) for n in range(6)]
+    assert (os.getpid() in {made[1] for _, made in found}) == (jobs == 1)
+    with pytest.raises(OptionError, match="two"):
+        list(each(failing, range(5), jobs))
+
+
+def test_a_process_that_dies() -> None:
+    with pytest.raises(Mp4dsError, match="memory may be short"):
+        list(each(dying, range(5), 2))
+
+
+def held(place: Path, number: int) -> int:
+    """Work that lasts until it is ended, and tidies up then."""
+    made = place / str(number)
+    try:
+        made.write_text("")
+        while True:
+            time.sleep(0.05)
+    finally:
+        made.unlink()
+
+
+_INTERRUPTED = """
+import sys
+from functools import partial
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from mp4ds.dataset.collections import each
+from test_collections import held
+if __name__ == "__main__":
+    try:
+        list(each(partial(held, Path(sys.argv[2])), range(4), 2))
+    except KeyboardInterrupt:
+        print("interrupted")
+"""
+
+
+def test_an_interrupt_ends_all_and_tidies_up(tmp_path: Path) -> None:
+    program, place = tmp_path / "program.py", tmp_path / "place"
+    program.write_text(_INTERRUPTED)
+    place.mkdir()
+    with subprocess.Popen(
+        [sys.executable, program, Path(__file__).parent, place], stdout=subprocess.PIPE, text=True
+    ) as process:
+        deadline = time.monotonic() + WATCHDOG_S
+        while len(list(place.iterdir())) < 2 and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        out, _ = process.communicate(timeout=WATCHDOG_S)
+    assert out == "interrupted\n"
+    assert list(place.iterdir()) == []
+
+
+# ---------------------------------------------------------------- what is made of them
+
+
+def test_all_are_unpacked(drives: Path, tmp_path: Path) -> None:
+    summaries = unpack_each(drives, None, tmp_path / "out", jobs=2)
+    assert [item.output.name for item in summaries] == ["a.bag", "b.bag", "c.bag"]
+    assert len({path.read_bytes() for path in (tmp_path / "out").iterdir()}) == 1
+    with pytest.raises(TargetExistsError):
+        unpack_each(drives, None, tmp_path / "out")
+    shutil.copytree(drives / "a", drives / "deep" / "a")
+    with pytest.raises(OptionError, match="Two datasets would become"):
+        unpack_each(drives, None, tmp_path / "more")
+    assert not (tmp_path / "more").exists()
+
+
+def test_the_table_of_all(drives: Path, tmp_path: Path) -> None:
+    done = run("info", "drives", folder=tmp_path)
+    lines = done.stdout.splitlines()
+    assert [line.split()[0] for line in lines] == ["dataset", "a", "b", "deep/c", "3"]
+    rows = json.loads(run("info", "drives", "--json", folder=tmp_path).stdout)
+    one = brief(drives / "a")
+    assert [row["messages"] for row in rows] == [one.messages] * 3
+    assert re.search(rf" {3 * one.messages} ", lines[-1])
+    assert run("info", "drives", "--speed", folder=tmp_path).returncode == 2
+
+
+def test_all_are_validated(drives: Path, tmp_path: Path) -> None:
+    done = run("validate", "drives", folder=tmp_path)
+    assert (done.returncode, done.stdout) == (
+        0,
+        "3 datasets: no problem; frames were not decoded (--deep does)\n",
+    )
+    (drives / "a" / "messages.mcap").unlink()
+    done = run("validate", "drives/a", "drives/b", "-j", "2", folder=tmp_path)
+    assert done.returncode == 1
+    assert "2 datasets: 1 problem in 1 of them" in done.stdout
+    rows = json.loads(run("validate", "drives", "--json", folder=tmp_path).stdout)
+    assert [len(row["problems"]) for row in rows] == [1, 0, 0]
+
+
+def test_the_page_of_all(drives: Path, tmp_path: Path) -> None:
+    (drives / "b" / "dataset.yaml").write_text("mp4ds: no\n")
+    summary = reports(drives, tmp_path / "page", jobs=2)
+    assert summary.datasets == 3
+    assert len(summary.problems) == 1
+    page = summary.index.read_text()
+    links = re.findall(r'href="([^"]+/index.html)"', page)
+    assert links == [f"../drives/{name}/index.html" for name in ("a", "b", "deep/c")]
+    assert [(tmp_path / "page" / link).exists() for link in links] == [True, False, True]
+    pictures = re.findall(r'src="([^"]+)"', page)
+    assert len(pictures) == 2
+    assert all((tmp_path / "page" / picture).exists() for picture in pictures)
+    assert "not shown" in page
+    assert reports(drives, tmp_path / "page").datasets == 3  # replaces its own
+    with pytest.raises(OptionError):
+        reports(drives, tmp_path / "page", ReportOptions(start="1"))
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "index.html").write_text("mine")
+    with pytest.raises(TargetExistsError):
+        reports(drives, tmp_path / "mine")
+
+
+def test_loaders_take_folders(drives: Path) -> None:
+    torch = pytest.importorskip("mp4ds.torch")
+    one = torch.FrameDataset(drives / "a")
+    assert len(torch.FrameDataset(drives)) == 3 * len(one)
+    assert len(torch.FrameDataset(str(drives / "[ab]"))) == 2 * len(one)
+
+
+def test_work_that_is_a_method_of_the_library(drives: Path) -> None:
+    found = list(each(partial(mp4ds.validate, deep=True), datasets_in(drives), 2))
+    assert [problems for _, problems in found] == [[], [], []]

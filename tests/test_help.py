@@ -1,0 +1,80 @@
+"""What the command line says of itself, on a terminal of 80 columns; and how it keeps quiet."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from each import each
+from mp4ds.cli import COMMANDS
+from waiting import WATCHDOG_S
+
+PANELS = ["Arguments", "What", "How", "Where", "Long jobs", "Options"]
+
+
+def run(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "mp4ds", *words],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=WATCHDOG_S,
+        check=False,
+        env={**os.environ, "COLUMNS": "80"},
+    )
+
+
+@each("command", [name for name in COMMANDS if name != "import"] + ["import images"])
+def test_options_stand_by_what_they_are_about(command: str, tmp_path: Path) -> None:
+    done = run(*command.split(), "--help", folder=tmp_path)
+    assert done.returncode == 0
+    assert max(map(len, done.stdout.splitlines())) <= 80
+    found = re.findall(r"^(\w[\w ]*):$", done.stdout, re.MULTILINE)
+    assert found == [name for name in PANELS if name in found]
+    assert "Options" in found
+    # no type or bound as the library calls it
+    assert not re.search(r"<[a-z]+( range)?>|x<=|x>=|\{|\]\]", done.stdout)
+
+
+def test_sentences_are_whole(tmp_path: Path) -> None:
+    done = run("--help", folder=tmp_path)
+    text = " ".join(done.stdout.split())
+    assert all(does in text for _, does in COMMANDS.values())
+    assert "..." not in text.replace("[ARGS]...", "")
+
+
+def test_nothing_is_printed_but_errors(packed_bag: Path, tmp_path: Path) -> None:
+    for words in (("info",), ("validate",), ("unpack", "-o", "again.bag")):
+        done = run("-q", words[0], str(packed_bag), *words[1:], folder=tmp_path)
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert (tmp_path / "again.bag").exists()
+    done = run("-q", "info", "nothing", folder=tmp_path)
+    assert done.returncode == 2
+    assert "no such file" in done.stderr
+    assert run("-q", "info", str(packed_bag), "--json", folder=tmp_path).stdout.startswith("{")
+
+
+def test_where_errors_come_from(tmp_path: Path) -> None:
+    assert "Traceback" not in run("info", "nothing", folder=tmp_path).stderr
+    assert "Traceback" in run("-v", "info", "nothing", folder=tmp_path).stderr
+
+
+@each(
+    ("words", "number", "expected"),
+    [("mp4ds rep", 1, {"repack", "report"}), ("mp4ds pack --dura", 2, {"--duration"})],
+)
+def test_shells_complete(words: str, number: int, expected: set[str], tmp_path: Path) -> None:
+    asked = {"_MP4DS_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(number)}
+    done = subprocess.run(
+        [Path(sys.executable).with_name("mp4ds")],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=WATCHDOG_S,
+        check=False,
+        env={**os.environ, **asked},
+    )
+    assert set(done.stdout.split()) == expected
