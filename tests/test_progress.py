@@ -29,6 +29,7 @@ from mp4ds.cli.progress import (
     Events,
     Lines,
     Log,
+    LogOf,
     PackStanding,
     duration_text,
     left_text,
@@ -583,6 +584,24 @@ def test_a_short_pack_does_not_import_rich() -> None:
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
     assert (result.stdout, result.stderr) == ("[]\n", "")
+
+
+# ---------------------------------------------------------------- other commands
+
+
+def test_a_line_every_ten_seconds() -> None:
+    stream, seconds = io.StringIO(), [0.0]
+    tell = LogOf("validating", Lines(stream), clock=lambda: seconds[0])
+    for second in range(40):
+        seconds[0] = float(second)
+        tell(f"frame {second}\x1b", second / 80)
+    tell("hashing")
+    lines = stream.getvalue().splitlines()
+    assert [line.partition(" ")[2] for line in lines] == [
+        "validating: frame 10\\x1b | 12 % | 70 s left",
+        "validating: frame 20\\x1b | 25 % | 60 s left",
+        "validating: frame 30\\x1b | 37 % | 50 s left",
+    ]
 
 
 # ---------------------------------------------------------------- terminals

@@ -17,7 +17,7 @@ from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import load_manifest
 from mp4ds.options import Slice
 from mp4ds.packing.options import PackOptions
-from mp4ds.packing.pack import pack_each
+from mp4ds.packing.pack import pack_each, pack_share
 from mp4ds.plugins.exporting.export import export
 from mp4ds.plugins.exporting.job import ExportOptions
 from mp4ds.unpacking.unpack import UnpackOptions
@@ -313,3 +313,23 @@ def test_of_nothing_there_is_no_slice(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="no messages"):
         mp4ds.pack(tmp_path / "whole", tmp_path / "part", PackOptions(start="1"))
     assert not (tmp_path / "part").exists()
+
+
+def test_datasets_and_recordings_each(recording: Path, visual: Path, tmp_path: Path) -> None:
+    """Datasets are copied, whatever else is packed in the same run."""
+    summaries = pack_each([visual, recording], tmp_path / "out", PackOptions(**SPAN))
+    assert [(item.dataset.name, item.is_copy) for item in summaries] == [
+        ("visual", True),
+        ("drive", False),
+    ]
+    assert manifest(tmp_path / "out" / "visual").profile == "visual"
+    assert pack_each([visual, recording], tmp_path / "out", PackOptions(**SPAN)) == []
+
+
+def test_a_share_of_a_dataset_is_encoded(recording: Path, tmp_path: Path) -> None:
+    mp4ds.pack(recording, tmp_path / "whole")
+    for number in (1, 2):
+        pack_share(tmp_path / "whole", tmp_path / "again", (number, 2), PackOptions(window=10))
+    options = PackOptions(window=10, join=True)
+    assert not mp4ds.pack(tmp_path / "whole", tmp_path / "again", options).is_copy
+    assert mp4ds.validate(tmp_path / "again", deep=True) == []

@@ -127,6 +127,19 @@ def test_progress_is_no_markup(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "/x[/foo][link=http://x]\\x1b]0;title\\x07" in err.getvalue()
 
 
+def test_a_bar_shows_per_cent_and_what_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    err = Screen()
+    with contextlib.redirect_stderr(err), progress_of("validating", as_json=False) as tell:
+        assert tell is not None
+        tell("decoding left.mp4", 0.42)
+    assert "validating" in err.getvalue()
+    assert "42 %" in err.getvalue()
+    assert "decoding left.mp4" in err.getvalue()
+    with progress_of("validating", as_json=True) as tell:
+        assert tell is None
+
+
 # ---------------------------------------------------------------- standard streams
 
 

@@ -516,7 +516,7 @@ def progress_of(doing: str, as_json: bool) -> Iterator[Telling | None]:
             with _bar(console, doing) as tell:
                 yield tell
             return
-    yield _LogOf(doing, Lines(sys.stderr))
+    yield LogOf(doing, Lines(sys.stderr))
 
 
 @contextmanager
@@ -544,7 +544,7 @@ def _bar(console: Console, doing: str) -> Iterator[Telling]:
         yield tell
 
 
-class _LogOf:
+class LogOf:
     """Writes a line every 10 s.
 
     Args:
@@ -563,6 +563,7 @@ class _LogOf:
         self._share: float | None = None
 
     def __call__(self, what: str, share: float | None = None) -> None:
+        """See `Telling`."""
         now = self._clock()
         self._share = self._share if share is None else share
         if now - self._told < _LINE_PAUSE:

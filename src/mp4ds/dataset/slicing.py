@@ -165,7 +165,14 @@ class _Part:
         return _Cut(stream, images, infos)
 
     def _numbers(self, columns: DecodedColumns) -> Integers:
-        return np.fromiter(within(self._span)(columns), np.int64)
+        """Numbers of the messages in the span."""
+        start, end = self._span.start, self._span.end
+        is_in = np.ones(len(columns.log_time), np.bool_)
+        if start is not None:
+            is_in &= columns.log_time >= start
+        if end is not None:
+            is_in &= columns.log_time < end
+        return np.flatnonzero(is_in).astype(np.int64)
 
     def check(self) -> None:
         """Refuse what cannot be copied.

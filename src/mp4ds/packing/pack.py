@@ -321,7 +321,7 @@ def pack_share(
         Mp4dsError: As `pack`.
     """
     paths = _paths(sources)
-    chosen = _checked(options or PackOptions(), paths)
+    chosen = _checked(options or PackOptions(), paths, may_copy=False)
     target = _absolute(dataset)
     store = remote(target)
     if store:
@@ -355,7 +355,9 @@ def pack_each(
         Mp4dsError: As `pack`.
     """
     paths = _paths(sources)
-    chosen = _checked(options or PackOptions(), paths)
+    asked = options or PackOptions()
+    copied = [path for path in paths if _is_copy([path], asked)]
+    chosen = _checked(asked, [path for path in paths if path not in copied], may_copy=False)
     parent = _absolute(folder)
     targets: dict[Path, Path] = {}
     for source in paths:
@@ -367,18 +369,23 @@ def pack_each(
         targets[target] = source
     if not remote(parent):
         parent.mkdir(exist_ok=True)
-    # what goes to a URL is on this machine one after the other
-    if remote(parent) or chosen.quality is None:
-        return [
-            _pack([source], target, chosen, progress)
-            for target, source in targets.items()
-            if chosen.force or not _is_packed(source, target, chosen)
-        ]
+    missing = {
+        target: source
+        for target, source in targets.items()
+        if asked.force or not _is_packed(source, target, asked)
+    }
+    made: dict[Path, PackSummary] = {}
     runs = []
-    for target, source in targets.items():
-        if chosen.force or not _is_packed(source, target, chosen):
+    for target, source in missing.items():
+        # what is copied, or goes to a URL, is made one after the other
+        if source in copied or remote(parent):
+            own = _checked(asked, [source])
+            made[target] = _pack([source], target, own, progress)
+        else:
             runs.append(_plan([source], target, chosen, recordings=len(targets)))
-    return _pack_runs(runs, chosen, progress)
+    for summary in _pack_runs(runs, chosen, progress) if runs else ():
+        made[summary.dataset] = summary
+    return [made[target] for target in missing if target in made]
 
 
 def _is_packed(source: Path, target: Path, options: PackOptions) -> bool:
@@ -407,10 +414,21 @@ def _is_packed(source: Path, target: Path, options: PackOptions) -> bool:
     return True
 
 
-def _checked(options: PackOptions, paths: Sequence[Path]) -> PackOptions:
+def _is_copy(paths: Sequence[Path], options: PackOptions) -> bool:
+    if options.quality is not None or not any(map(dataset_at, paths)):
+        return False
+    from mp4ds.packing.copying import is_copy
+
+    return is_copy(paths, options)
+
+
+def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = True) -> PackOptions:
     """The options, with what is left to the sources; refuses those that contradict each other.
 
-    Without a quality where a dataset is only copied.
+    Args:
+        options: As they were given.
+        paths: What is to be packed.
+        may_copy: A dataset may be copied; there is no quality then.
 
     Raises:
         OptionError: They do.
@@ -420,11 +438,8 @@ def _checked(options: PackOptions, paths: Sequence[Path]) -> PackOptions:
     images = options.images.absolute() if options.images else None
     if options.about is not None:
         load_about(options.about)  # refuses what it cannot tell before anything is read
-    if options.quality is None and any(map(dataset_at, paths)):
-        from mp4ds.packing.copying import is_copy
-
-        if is_copy(paths, options):
-            return options
+    if may_copy and _is_copy(paths, options):
+        return options
     asked = _quality_of(paths) if options.quality is None else options.quality
     quality = parse_quality(asked)
     if options.transcode and quality.lossless:

@@ -279,11 +279,17 @@ def unpack_each(
     if folder is not None and not remote(location(folder)):
         location(folder).mkdir(exist_ok=True)
     work = partial(_unpack_one, to=to, options=options)
-    summaries = []
-    for _, summary in each(work, [*outputs.items()], jobs):
-        summaries.append(summary)
-        if progress:
-            progress(UnpackProgress(len(summaries), len(outputs)))
+    summaries: list[UnpackSummary] = []
+    try:
+        for _, summary in each(work, [*outputs.items()], jobs):
+            summaries.append(summary)
+            if progress:
+                progress(UnpackProgress(len(summaries), len(outputs)))
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"interrupted; {len(summaries)} of {len(outputs)} datasets are unpacked, and nothing "
+            "unfinished was left behind"
+        ) from None
     return summaries
 
 
