@@ -19,7 +19,7 @@ from mp4ds.bags.slices import in_span
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import DecodedColumns, columns_model, digests_model, within
 from mp4ds.dataset.stream import Stream
-from mp4ds.errors import OptionError, Refused
+from mp4ds.errors import OptionError, Refused, VideoError
 from mp4ds.files.outputs import digest_file
 from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME, Columns
 from mp4ds.format.manifest import (
@@ -288,12 +288,17 @@ class _Part:
         sidecar, video = stream.sidecar, stream.sidecar.video
         path = self._folder / stream.video_path.name
         if cut.has_all:
-            stream.verify_video()
             _copy(stream.video_path, path)
         else:
             frames = range(int(numbers[0]), int(numbers[-1]) + 1)
             cut_segment(stream.video_path, video.codec, frames, self._ticks(cut), path)
         changes = video_facts(path, video.codec)
+        if cut.has_all and video.sha256 not in (None, changes["sha256"]):
+            raise VideoError(
+                "hash-mismatch",
+                stream.video_path,
+                "does not have the SHA-256 that its sidecar says",
+            )
         if video.quality is not None:
             changes["quality"] = video.quality.of(numbers, len(stream))
         digests = None
