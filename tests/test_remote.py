@@ -301,6 +301,31 @@ def test_an_excerpt_reads_its_chunks(name: str, large: Path) -> None:
             ]
 
 
+@pytest.mark.parametrize("name", ["drive.bag", "drive.mcap", "dataset"])
+def test_a_slice_fetches_what_is_in_it(
+    name: str, large: Path, tmp_path: Path, compare: Compare
+) -> None:
+    """Of a dataset whole groups of pictures; it is given as the recording's own slice."""
+    if name == "dataset":
+        (tmp_path / "there").mkdir()
+        mp4ds.pack(large / "drive.bag", tmp_path / "there" / name, PackOptions(gop=4))
+    with open_sources([large / "drive.bag"]) as reader:
+        (channel,) = (channel for channel in reader.channels if channel.topic == TOPIC)
+        times = reader.times()[channel.id]
+    start, end = int(times[30]), int(times[36])
+    folder = tmp_path / "there" if name == "dataset" else large
+    with web_server(folder) as web:
+        span = PackOptions(start=str(start), end=str(end))
+        mp4ds.pack(f"{web.url}/{name}", tmp_path / "slice", span)
+        names = ["image_raw.mp4"] if name == "dataset" else [name]
+        fetched = sum(covered(web.fetched(ending)) for ending in names)
+    size = sum(path.stat().st_size for path in (folder / name).glob("*.mp4"))
+    assert 0 < fetched < 0.5 * (size or (large / name).stat().st_size)
+    source = large / ("drive.mcap" if name == "drive.mcap" else "drive.bag")
+    mp4ds.unpack(tmp_path / "slice", None, tmp_path / ("again" + source.suffix))
+    assert compare(source, tmp_path / ("again" + source.suffix), start=start, end=end) == []
+
+
 @pytest.mark.parametrize("name", ["drive.bag", "drive.mcap"])
 def test_a_pass_fetches_the_file_once(name: str, large: Path, tmp_path: Path) -> None:
     """It is hashed, too; some is read before, for planning."""
