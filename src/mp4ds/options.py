@@ -222,7 +222,7 @@ class Slice:
         begin, stop = first if start is None else start, last + 1 if end is None else end
         if begin >= stop or begin > last or stop <= first:
             raise OptionError(
-                f"{place}: nothing is from {iso_text(begin)} to before {iso_text(stop)}. It has "
+                f"{place}: nothing was recorded from {iso_text(begin)} to before {iso_text(stop)}. It has "
                 f"messages from {iso_text(first)} to {iso_text(last)}, "
                 f"{(last - first) / _NS:.9g} seconds."
             )
@@ -290,12 +290,12 @@ def start() -> Any:
 
 def end() -> Any:
     """The option of the time before which all is taken."""
-    return option("Take what was recorded before.", metavar="TIME")
+    return option("Take what was recorded before this time.", metavar="TIME")
 
 
 def duration() -> Any:
     """The option of how much is taken."""
-    return option("Take so much from `start` on, or before `end`.", metavar="SECONDS")
+    return option("Take that many seconds from `start` on, or before `end`.", metavar="SECONDS")
 
 
 def cluster() -> Any:

@@ -193,7 +193,7 @@ def _print_speeds(path: str, as_json: bool) -> None:
 def demo(
     output: Annotated[Path, typer.Argument(help="The .bag file to make.")] = Path("demo.bag"),
     seconds: Annotated[
-        float, typer.Option("--seconds", min=0.1, max=3600.0, help="That it lasts.")
+        float, typer.Option("--seconds", min=0.1, max=3600.0, help="Its length.")
     ] = 3.0,
     force: ForceFlag = False,
     as_json: JsonFlag = False,
