@@ -689,3 +689,12 @@ def test_what_is_not_ours_is_kept(dataset: Path, tmp_path: Path) -> None:
     assert (tmp_path / "out/thesis.txt").read_text() == "mine"
     with pytest.raises(mp4ds.OptionError, match="holds one dataset"):
         mp4ds.export([dataset, dataset], "euroc", tmp_path / "two")
+
+
+def test_who_made_it_goes_along(dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "about.yaml").write_text("title: A drive\nlicense: CC-BY-4.0\n")
+    about = mp4ds.PackOptions(about=str(tmp_path / "about.yaml"))
+    mp4ds.pack(dataset, tmp_path / "told", about)
+    mp4ds.export(tmp_path / "told", "euroc", tmp_path / "out", mp4ds.ExportOptions(every=4))
+    note = json.loads((tmp_path / "out" / "mp4ds_export.json").read_text())
+    assert note["about"] == [{"title": "A drive", "license": "CC-BY-4.0"}]

@@ -222,8 +222,8 @@ class Slice:
         begin, stop = first if start is None else start, last + 1 if end is None else end
         if begin >= stop or begin > last or stop <= first:
             raise OptionError(
-                f"{place}: nothing was recorded from {iso_text(begin)} to before {iso_text(stop)}. It has "
-                f"messages from {iso_text(first)} to {iso_text(last)}, "
+                f"{place}: nothing was recorded from {iso_text(begin)} to before "
+                f"{iso_text(stop)}. It has messages from {iso_text(first)} to {iso_text(last)}, "
                 f"{(last - first) / _NS:.9g} seconds."
             )
         return start, end

@@ -17,6 +17,7 @@ from mp4ds.dataset.slicing import sliced
 from mp4ds.errors import OptionError
 from mp4ds.files.outputs import begins_with, listed_names, staged
 from mp4ds.files.urls import location, remote
+from mp4ds.format.fields import document_of
 from mp4ds.plugins.exporting.job import ExportedDataset, ExportJob, ExportOptions, ExportSummary
 
 NOTE_NAME = "mp4ds_export.json"
@@ -117,7 +118,10 @@ def export(
         if path.is_dir():
             files = sorted(p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file())
             told = {**asdict(summary), "output": target.name, "files": files}
-            note = {"mp4ds": __version__, **told}
+            note: dict[str, object] = {"mp4ds": __version__, **told}
+            abouts = [one.manifest.about for one in opened if one.manifest and one.manifest.about]
+            if abouts:
+                note["about"] = [document_of(about) for about in abouts]
             (path / NOTE_NAME).write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
         return summary
 

@@ -32,6 +32,12 @@ def write(job: ExportJob) -> None:
     stream = rerun.RecordingStream("mp4ds")
     stream.save(str(job.path))
     try:
+        manifest = job.source.dataset.manifest
+        if manifest and manifest.about:
+            if manifest.about.title:
+                stream.send_recording_name(manifest.about.title)
+            text = "\n".join(manifest.about.lines)
+            stream.log("about", rerun.TextDocument(text), static=True)
         _Writer(job, stream).write()
         stream.flush()
     finally:
