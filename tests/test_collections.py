@@ -126,8 +126,10 @@ def held(place: Path, number: int) -> int:
     made = place / str(number)
     try:
         made.write_text("")
-        while True:
+        deadline = time.monotonic() + WATCHDOG_S
+        while time.monotonic() < deadline:
             time.sleep(0.05)
+        return number
     finally:
         made.unlink()
 
@@ -158,7 +160,10 @@ def test_an_interrupt_ends_all_and_tidies_up(tmp_path: Path) -> None:
         while len(list(place.iterdir())) < 2 and time.monotonic() < deadline:
             time.sleep(0.02)
         process.send_signal(signal.SIGINT)
-        out, _ = process.communicate(timeout=WATCHDOG_S)
+        try:
+            out, _ = process.communicate(timeout=WATCHDOG_S)
+        finally:
+            process.kill()
     assert out == "interrupted\n"
     assert list(place.iterdir()) == []
 

@@ -281,6 +281,7 @@ def test_one_slice_each(recording: Path, tmp_path: Path) -> None:
         (Slice("1700000001.000000001"), START + 10**9 + 1, None),
         (Slice(str(START + 7)), START + 7, None),
         (Slice("2023-11-14T22:13:21"), START + 10**9, None),
+        (Slice("1", None, "9000000000"), START + 10**9, 2**63 - 1),
     ],
 )
 def test_how_it_is_written(asked: Slice, start: int | None, end: int | None) -> None:
@@ -297,6 +298,9 @@ def test_how_it_is_written(asked: Slice, start: int | None, end: int | None) -> 
         (Slice("2", "1"), "nothing was recorded from .*22:13:22Z to before .*22:13:21Z"),
         (Slice("3.1"), r"drive.bag: nothing was recorded from .* 3 seconds"),
         (Slice(end="2023-11-14T22:13:20"), "nothing"),
+        (Slice("9999999999999999999"), "is no time"),
+        (Slice("99999999999.5"), "is no time"),
+        (Slice(duration="9999999999999999999"), "is no time"),
         (Slice(duration="0"), "nothing"),
     ],
 )

@@ -129,6 +129,7 @@ def parse_words(text: str) -> tuple[str, ...]:
 # ---------------------------------------------------------------- times
 
 _NS = 10**9
+_LATEST = 2**63 - 1
 _NUMBER = re.compile(r"\+?([0-9]{1,19})(?:\.([0-9]{0,9}))?")
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?Z?")
 _SINCE_1970, _IN_NS = 10**8, 10**11  # smaller numbers are seconds from the beginning, or of 1970
@@ -150,11 +151,13 @@ def time_of(text: str, start_ns: int, option: str) -> int:
     clean = text.strip()
     if clean.isascii() and (match := _NUMBER.fullmatch(clean)):
         number = int(match[1])
-        if number >= _IN_NS and match[2] is None:
-            return number
         is_since_1970 = number >= _SINCE_1970 and not clean.startswith("+")
-        return (0 if is_since_1970 else start_ns) + _nanoseconds(number, match[2])
-    if clean.isascii() and (match := _ISO.fullmatch(clean)):
+        time = (0 if is_since_1970 else start_ns) + _nanoseconds(number, match[2])
+        if is_since_1970 and number >= _IN_NS and match[2] is None:
+            time = number
+        if abs(time) <= _LATEST:
+            return time
+    elif clean.isascii() and (match := _ISO.fullmatch(clean)):
         try:
             moment = datetime.fromisoformat(match[1]).replace(tzinfo=timezone.utc)
         except ValueError as error:
@@ -216,9 +219,9 @@ class Slice:
             if start is not None and end is not None:
                 raise OptionError("Give two of `start`, `end` and `duration`.")
             if end is not None:
-                start = end - length
+                start = max(end - length, -_LATEST)
             else:
-                end = (first if start is None else start) + length
+                end = min((first if start is None else start) + length, _LATEST)
         begin, stop = first if start is None else start, last + 1 if end is None else end
         if begin >= stop or begin > last or stop <= first:
             raise OptionError(
