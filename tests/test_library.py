@@ -172,7 +172,7 @@ PNG_ENCODINGS = {
 
 @each("name", PNG_ENCODINGS)
 def test_frames_of_png_files_are_their_pixels(name: str, tmp_path: Path) -> None:
-    source = CODED[name](frames=5)
+    source = CODED[name](frames=6)
     with mp4ds.open(packed(tmp_path, source)) as dataset:
         (stream,) = dataset.streams
         for number, (frame, message) in enumerate(zip(stream, camera(source), strict=True)):
@@ -193,10 +193,10 @@ def test_frames_of_png_files_are_their_pixels(name: str, tmp_path: Path) -> None
 def test_frames_of_rvl_are_those_of_png(encoding: str, tmp_path: Path) -> None:
     found = []
     for codec in ("png", "rvl"):
-        dataset = packed(tmp_path / codec, CODED[f"depth-{encoding}-{codec}"](frames=5))
+        dataset = packed(tmp_path / codec, CODED[f"depth-{encoding}-{codec}"](frames=6))
         with mp4ds.open(dataset) as opened:
             found.append([frame.data for frame in opened.streams[0]])
-    assert len(found[0]) == 5
+    assert len(found[0]) == 6
     assert np.array_equal(*found)
 
 

@@ -926,7 +926,7 @@ def test_latching_is_kept_as_qos(tmp_path: Path) -> None:
     messages = made.unpack("bag", "png")[1]
     assert {message.metadata["latching"] for message in messages} == {1}
     made.unpack("rosbag2", "png")
-    mp4ds.pack(made.folder / "again", tmp_path / "second")
+    mp4ds.pack(made.folder / "again", tmp_path / "second", mp4ds.PackOptions(codec="h264"))
     mp4ds.unpack(tmp_path / "second", "bag", tmp_path / "back.bag", UnpackOptions(images="raw"))
     back = [m for m in read(tmp_path / "back.bag") if m.topic == "/cam/image_raw"]
     assert {(m.metadata["latching"], m.metadata["callerid"]) for m in back} == {(1, "/second")}

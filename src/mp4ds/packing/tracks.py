@@ -471,7 +471,8 @@ def _lossless_plans(
     except EncoderRefusedError as error:
         raise Refused(str(error)) from None
     _refuse_noise(samples, best.bytes_per_frame)
-    _refuse_few(samples, best.bytes_per_frame)
+    if codec is None:
+        _refuse_few(samples, best.bytes_per_frame)
     layout = bind(best.layout, encoding, best.parameters)
     plan = PicturePlan(layout, best.recipe, "lossless", exact=True, note=note, gop=best.gop)
     general = layout_for(encoding, lossless=True)
