@@ -6,7 +6,7 @@ import html
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from functools import partial
 from importlib.resources import files
@@ -175,23 +175,19 @@ def _shown(
     number, path = item
     try:
         told = brief(path)
-        problems = report(path, replace(options)).problems
-        with Dataset(path) as dataset:
-            topic = next(iter(dataset.topics), None)
-            count = len(dataset[topic]) if topic else 0
-        if topic and count:
-            at = StillOptions(topic=topic, at=f"#{count // 2}", resize=_scale(path, topic))
-            frames(path, pictures / f"{number}.jpg", at)
+        problems = report(path, options).problems
+        if told.frames:
+            topic = next(iter(told.frames))
+            with Dataset(path) as dataset:
+                middle = f"#{len(dataset[topic]) // 2}"
+                scale = min(1.0, _WIDTH / dataset[topic].image_size[0])
+            still = StillOptions(topic=topic, at=middle, resize=scale)
+            frames(path, pictures / f"{number}.jpg", still)
     except Mp4dsError as error:
         with suppress(Mp4dsError):
             return brief(path), [str(error)]
         return None, [str(error)]
     return told, problems
-
-
-def _scale(path: Path, topic: str) -> float:
-    with Dataset(path) as dataset:
-        return min(1.0, _WIDTH / dataset[topic].image_size[0])
 
 
 def _page(title: str, facts: str, rows: Sequence[str]) -> str:
