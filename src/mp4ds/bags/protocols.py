@@ -164,6 +164,17 @@ class BagWriter(Protocol):
     def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None: ...
 
 
+def write_record(writer: BagWriter, record: Record) -> None:
+    """Append a record, its channel declared first where that is not done."""
+    if isinstance(record, Message):
+        writer.add_channel(record.channel)
+        writer.write(record)
+    elif isinstance(record, Attachment):
+        writer.add_attachment(record)
+    else:
+        writer.add_metadata(record)
+
+
 # ---------------------------------------------------------------- ordering
 
 HOLD_BYTES = 256 * 2**20

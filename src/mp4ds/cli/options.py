@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import update_wrapper
@@ -244,9 +243,9 @@ def cores(jobs: int | None) -> int:
     """Processes at a time: as many as were asked for, or as there are processors."""
     if jobs is not None:
         return jobs
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    from mp4ds.packing.planning import available_cores
+
+    return available_cores()
 
 
 def parse_share(text: str) -> tuple[int, int]:

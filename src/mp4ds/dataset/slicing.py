@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.mcap_write import McapWriter
+from mp4ds.bags.protocols import write_record
 from mp4ds.bags.slices import in_span
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import DecodedColumns, columns_model, digests_model, within
@@ -34,7 +35,7 @@ from mp4ds.format.manifest import (
 from mp4ds.format.models import CameraInfo, ChannelModel, StreamSidecar, video_facts
 from mp4ds.format.sidecars import MANIFEST_NAME, dump_document
 from mp4ds.options import Slice
-from mp4ds.records import EVERYTHING, Attachment, Channel, Excerpt, Message
+from mp4ds.records import EVERYTHING, Channel, Excerpt, Message
 from mp4ds.times import PresentationClock
 from mp4ds.video.packets import cut_segment
 
@@ -382,13 +383,7 @@ class _Part:
                 in_videos.add(info.channel.to_record(0).identity)
         with McapWriter(path, profile=dataset.profile) as writer:
             for record in chain(dataset.other_records(), self._verbatim_messages()):
-                if isinstance(record, Message):
-                    writer.add_channel(record.channel)
-                    writer.write(record)
-                elif isinstance(record, Attachment):
-                    writer.add_attachment(record)
-                else:
-                    writer.add_metadata(record)
+                write_record(writer, record)
             for channel in dataset.channels:
                 if self._selected(channel.topic) and channel.identity not in in_videos:
                     writer.add_channel(channel)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mp4ds.bags.mcap import McapReader
 from mp4ds.bags.mcap_write import McapWriter
-from mp4ds.bags.protocols import BagReader
+from mp4ds.bags.protocols import BagReader, write_record
 from mp4ds.dataset.rebuild import columns_model, digests_model
 from mp4ds.errors import FormatError, SourceError
 from mp4ds.files.outputs import digest_file
@@ -374,13 +374,7 @@ class Assembler:
         with McapWriter(whole.messages_path, profile=self._reader.profile) as writer:
             chains = [self._records(parts) for parts in self._chains.values()]
             for record in heapq.merge(*chains, key=_time_of):
-                if isinstance(record, Message):
-                    writer.add_channel(record.channel)
-                    writer.write(record)
-                elif isinstance(record, Attachment):
-                    writer.add_attachment(record)
-                else:
-                    writer.add_metadata(record)
+                write_record(writer, record)
             declare_rest(whole, self._reader, self._selected, writer)
 
     def _records(
