@@ -36,6 +36,10 @@ COMMANDS = {
         "play",
         "Publish datasets as if they were the recording: into ROS 1, ROS 2 or Foxglove.",
     ),
+    "record": (
+        "record",
+        "Record topics of a live robot, ROS 1 or ROS 2, into a dataset.",
+    ),
     "report": (
         "report",
         "Make a page of a dataset: all cameras in step, timing, topics, calibrations.",

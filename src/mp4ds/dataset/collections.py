@@ -132,8 +132,8 @@ def _leave_to_parent() -> None:
 def _worked(work: Callable[[_Item], _Made], item: _Item) -> _Made:
     """Work, and tidy up if the parent's word to end comes meanwhile.
 
-    Where the pool itself is at work, ending is left to the system: the pool would take what a handler
-    raises for a result that cannot be sent, and go on.
+    Where the pool itself is at work, ending is left to the system: the pool would take what a
+    handler raises for a result that cannot be sent, and go on.
     """
     try:
         signal.signal(signal.SIGTERM, _end)
