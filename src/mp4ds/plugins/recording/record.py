@@ -306,6 +306,11 @@ class Recorder:
         self._rates: dict[str, tuple[float, int, int, float, float]] = {}
         self.address = source.address
 
+    @property
+    def received(self) -> int:
+        """Messages that came so far."""
+        return sum(self._intake.received.values())
+
     # ------------------------------------------------------------ controls
 
     @property
