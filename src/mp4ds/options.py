@@ -254,57 +254,57 @@ class SliceOptions(Options):
 
 def topics() -> Any:
     """The option of topics to take."""
-    return option("Only topics that match; may be repeated.", (), "-t", metavar="GLOB")
+    return option("Only matching topics; repeatable.", (), "-t", metavar="GLOB")
 
 
 def exclude(*flags: str) -> Any:
     """The option of topics to leave out."""
-    return option("Leave out topics that match.", (), *flags, "-x", metavar="GLOB")
+    return option("Leave out matching topics.", (), *flags, "-x", metavar="GLOB")
 
 
-def resize(help: str = "Smaller images, calibrations to match.") -> Any:  # noqa: A002
+def resize(help: str = "Scale images down, calibrations to match.") -> Any:  # noqa: A002
     """The option of another size of images: a factor, or width and height in pixels."""
     return option(help, None, metavar="0.5|WxH", parse=parse_resize)
 
 
 def every() -> Any:
     """The option of fewer frames, by number."""
-    return option("Every Nth frame only, from the first one on.", 1, metavar="N", least=1)
+    return option("Keep only every Nth frame, starting with the first.", 1, metavar="N", least=1)
 
 
 def max_rate() -> Any:
     """The option of fewer frames, by time."""
-    return option("So many frames a second at most.", None, metavar="HZ")
+    return option("Maximum frames per second.", None, metavar="HZ")
 
 
 def jpeg_quality() -> Any:
     """The option of the quality of JPEG files."""
-    return option("Of JPEG files that are made.", 95, least=1, most=100)
+    return option("Quality of the JPEG files that are made.", 95, least=1, most=100)
 
 
 def start() -> Any:
     """The option of the first time that is taken."""
     return option(
-        "Take what was recorded from here on: seconds from the beginning, or since 1970; "
-        "nanoseconds since 1970; or an ISO date.",
+        "Begin at this time: seconds from the beginning or since 1970, nanoseconds since 1970, "
+        "or an ISO date.",
         metavar="TIME",
     )
 
 
 def end() -> Any:
     """The option of the time before which all is taken."""
-    return option("Take what was recorded before this time.", metavar="TIME")
+    return option("Stop before this time.", metavar="TIME")
 
 
 def duration() -> Any:
     """The option of how much is taken."""
-    return option("Take that many seconds from `start` on, or before `end`.", metavar="SECONDS")
+    return option("Seconds from `start` on, or up to `end`.", metavar="SECONDS")
 
 
 def cluster() -> Any:
     """The option of what runs tasks."""
     return option(
-        "Dask scheduler, tcp://HOST:PORT, or slurm; this machine by default.",
+        "Dask scheduler at tcp://HOST:PORT, or slurm; default: this machine.",
         None,
         metavar="ADDRESS",
     )

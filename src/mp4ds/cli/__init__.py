@@ -21,16 +21,16 @@ from mp4ds.cli.process import DEBUG, exit_code_of, prepare_process
 _COMPLETE = "_MP4DS_COMPLETE"  # set by the shell that completes
 
 COMMANDS = {
-    "pack": ("packing", "Pack a recording, or a dataset again, into a dataset of mp4 files."),
-    "repack": ("packing", "Pack a recording, or a dataset again, into a dataset of mp4 files."),
+    "pack": ("packing", "Pack a recording into a dataset of mp4 files, or repack a dataset."),
+    "repack": ("packing", "Pack a recording into a dataset of mp4 files, or repack a dataset."),
     "unpack": (
         "unpacking",
-        "Write a dataset's recording again: as a bag, rosbag2, MCAP, or images.",
+        "Turn a dataset back into a recording: a bag, rosbag2, MCAP or images.",
     ),
-    "import": ("packing", "Make a dataset of images, or of a video of the paper's tool."),
+    "import": ("packing", "Make a dataset from images, or from a video made by the paper's tool."),
     "export": (
         "unpacking",
-        "Write a dataset in the format of another tool, as far as that can hold it.",
+        "Export a dataset to another tool's format, keeping what that format supports.",
     ),
     "play": (
         "play",
@@ -38,25 +38,28 @@ COMMANDS = {
     ),
     "report": (
         "report",
-        "Make a page of a dataset: all cameras in step, timing, topics, calibrations.",
+        "Make an HTML report: synchronised cameras, timing, topics, calibrations.",
     ),
     "frames": (
         "report",
-        "Save the frame of a time as an image, or many frames as a contact sheet.",
+        "Save one frame as an image, or many frames as a contact sheet.",
     ),
     "evaluate": (
         "evaluate",
-        "Try encoder settings on clips of a recording: quality, size and time.",
+        "Compare encoder settings on clips of a recording: quality, size and time.",
     ),
-    "validate": ("inspect", "List every problem of datasets; exit code 1 if there is one."),
+    "validate": (
+        "inspect",
+        "Check datasets and list every problem; exits with 1 if there are any.",
+    ),
     "info": ("inspect", "Show what is in a recording or a dataset."),
     "demo": (
         "inspect",
-        "Make a small recording: two cameras (Bayer and rgb), calibrations, imu and tf.",
+        "Make a small test recording: two cameras (Bayer and RGB), calibrations, IMU, tf.",
     ),
     "conformance-dump": (
         "inspect",
-        "Print what a file holds as JSON, to compare other readers with (conformance/README.md).",
+        "Dump a file's contents as JSON, to check other readers against (conformance/README.md).",
     ),
 }
 """Commands -> their module, and what they do."""
@@ -72,7 +75,7 @@ def app_for(*names: str, is_completing: bool = False) -> typer.Typer:
     """
     app = typer.Typer(
         name="mp4ds",
-        help="Robot camera recordings as ordinary mp4 files, and back again exactly.",
+        help="Turn robot camera recordings into ordinary mp4 files, and back again exactly.",
         no_args_is_help=True,
         add_completion=is_completing,
         pretty_exceptions_enable=False,
@@ -96,10 +99,10 @@ def app_for(*names: str, is_completing: bool = False) -> typer.Typer:
 def _top(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
     quiet: Annotated[
-        bool, typer.Option("--quiet", "-q", help="Print errors only, and what --json prints.")
+        bool, typer.Option("--quiet", "-q", help="Print nothing but errors and --json output.")
     ] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Show where errors come from.")
+        bool, typer.Option("--verbose", "-v", help="Show tracebacks of errors.")
     ] = False,
 ) -> None:
     if quiet:

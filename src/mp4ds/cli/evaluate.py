@@ -157,7 +157,10 @@ def evaluate(
     output: Annotated[
         Optional[str],  # noqa: UP045 - read at run time by typer
         typer.Option(
-            "--output", "-o", metavar="DIR", help="For the results; NAME_evaluation by default."
+            "--output",
+            "-o",
+            metavar="DIR",
+            help="Folder for the results; default: NAME_evaluation.",
         ),
     ] = None,
     as_json: JsonFlag = False,

@@ -15,16 +15,23 @@ from typer.models import OptionInfo
 from mp4ds.errors import OptionError
 from mp4ds.options import Options, Shown, shown_of
 
-DatasetArgument = Annotated[str, typer.Argument(help="A dataset, or a sidecar beside its video.")]
+DatasetArgument = Annotated[str, typer.Argument(help="A dataset, or a sidecar next to its video.")]
 DatasetsArgument = Annotated[
     list[str],
     typer.Argument(
-        metavar="DATASET...", help="Datasets, or folders of them; or a sidecar beside its video."
+        metavar="DATASET...",
+        help="Datasets or folders of datasets; or a sidecar next to its video.",
     ),
 ]
 JobsOption = Annotated[
     Optional[int],  # noqa: UP045 - read at run time by typer
-    typer.Option("--jobs", "-j", min=1, max=1024, help="Datasets at a time; all cores by default."),
+    typer.Option(
+        "--jobs",
+        "-j",
+        min=1,
+        max=1024,
+        help="Datasets to process in parallel; default: one per core.",
+    ),
 ]
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 ForceFlag = Annotated[bool, typer.Option("--force", "-f", help="Replace an existing output.")]
@@ -256,7 +263,7 @@ def parse_share(text: str) -> tuple[int, int]:
     """
     match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
     if not match or not 1 <= int(match[1]) <= int(match[2]):
-        raise OptionError(f"`shard` {text!r} is not I/N, such as 3/16, with I from 1 to N.")
+        raise OptionError(f"`shard` {text!r} is not I/N with I from 1 to N, such as 3/16.")
     return int(match[1]), int(match[2])
 
 

@@ -48,12 +48,15 @@ from mp4ds.unpacking.republish import KINDS, Republished, Republisher, check_kin
 class UnpackOptions(SliceOptions):
     """How to unpack."""
 
-    storage: str | None = option("sqlite3 or mcap, for rosbag2; as recorded, or mcap.")
+    storage: str | None = option(
+        "Storage of rosbag2: sqlite3 or mcap; default: as recorded, else mcap."
+    )
     image_format: str | None = option(
-        "png (exact) or jpeg, for images; JPEG files as recorded, else png."
+        "png (exact) or jpeg, for `to` images; default: JPEG files as recorded, others as png."
     )
     images: str | None = option(
-        "Give all cameras as raw, jpeg, png, compressed-video or ffmpeg; as recorded by default.",
+        "Convert all cameras to raw, jpeg, png, compressed-video or ffmpeg messages; "
+        "default: as recorded.",
         metavar="KIND",
     )
     jpeg_quality: int = jpeg_quality()
@@ -65,7 +68,9 @@ class UnpackOptions(SliceOptions):
     start: str | float | None = start()
     end: str | float | None = end()
     duration: str | float | None = duration()
-    skip_unconvertible: bool = option("Leave out what the output cannot hold, and count it.", False)
+    skip_unconvertible: bool = option(
+        "Leave out, and count, what the output format cannot hold.", False
+    )
     force: bool = force()
 
     @property

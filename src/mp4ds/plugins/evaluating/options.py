@@ -84,42 +84,46 @@ class EvaluateOptions(Options):
     """How to evaluate."""
 
     codecs: Sequence[str] = option(
-        "Of svtav1, x264 and x265, with commas between; or as `mp4ds pack` calls them.",
+        "Comma-separated: svtav1, x264, x265, or codec names of `mp4ds pack`.",
         ("svtav1", "x264", "x265"),
         parse=parse_words,
         default_text="svtav1,x264,x265",
     )
     crf: Sequence[str] = option(
-        "Such as 16:25, 16:25:3 or 16,20,24.",
+        "crf values to try, such as 16:25, 16:25:3 or 16,20,24.",
         ("16:25:3",),
         parse=parse_words,
         default_text="16:25:3",
     )
     presets: Sequence[str] = option(
-        "Such as 6,8,medium; each is tried with the codecs that have it.", (), parse=parse_words
+        "Presets, such as 6,8,medium; each is tried with the codecs that have it.",
+        (),
+        parse=parse_words,
     )
-    topics: Sequence[str] = option("Only cameras that match.", (), "-t", metavar="GLOB")
-    exclude: Sequence[str] = option("Leave out cameras that match.", (), "-x", metavar="GLOB")
+    topics: Sequence[str] = option("Only matching cameras.", (), "-t", metavar="GLOB")
+    exclude: Sequence[str] = option("Leave out matching cameras.", (), "-x", metavar="GLOB")
     start: float | None = option(
-        "Where the clips begin; from the middle by default.", metavar="SECONDS"
+        "Where the clips begin; default: clips from the middle.", metavar="SECONDS"
     )
-    duration: float | None = option("Of the clips, instead of `frames`.", metavar="SECONDS")
+    duration: float | None = option("Length of the clips, instead of `frames`.", metavar="SECONDS")
     frames: int = option("Of a clip.", 150, least=1)
-    fps: float = option("Of a folder of images.", 30.0)
-    target: str = option("The score to reach: vmaf, psnr_y ... or ssim.", "vmaf=99.5")
+    fps: float = option("Frame rate of a folder of images.", 30.0)
+    target: str = option("Score to reach, such as vmaf=99.5, psnr_y=42 or ssim=0.98.", "vmaf=99.5")
     rates: Sequence[float] = option(
-        "Such as 2,5,10,20,30,60: the crf that reaches the target at these rates.",
+        "Also find the crf that reaches the target at these frame rates, such as 2,5,10,20,30,60.",
         (),
         metavar="HZ",
         parse=_rates,
     )
-    streams: int | None = option("Cameras of a data set, whose size is told.", least=1)
-    hours: float | None = option("How long they record.")
-    gop: int = option("Most frames from a key frame to the next.", LOSSY_GOP, least=1, most=100_000)
+    streams: int | None = option("Number of cameras to estimate a dataset's size for.", least=1)
+    hours: float | None = option("Hours of recording to estimate it for.")
+    gop: int = option("Maximum key frame interval in frames.", LOSSY_GOP, least=1, most=100_000)
     threads: int | None = option(
-        "Of an encoder; all cores by default, one on a cluster.", least=1, most=1024
+        "Threads per encoder; default: all cores, or one on a cluster.", least=1, most=1024
     )
-    jobs: int = option("Settings at a time; 1 for true times.", 1, "-j", least=1, most=1024)
+    jobs: int = option(
+        "Settings tried in parallel; use 1 for accurate times.", 1, "-j", least=1, most=1024
+    )
     cluster: str | None = cluster()
 
     @property

@@ -66,26 +66,26 @@ class ExportOptions(SliceOptions):
     every: int = every()
     max_rate: float | None = max_rate()
     pixels: str = option(
-        "seen: as recorded, but Bayer and YUV as RGB; native keeps a mosaic; rgb; gray.",
+        "seen: as recorded, but Bayer and YUV as RGB; native: keep Bayer mosaics; rgb; gray.",
         "seen",
         metavar="KIND",
     )
     tolerance_ns: int | None = option(
-        "Only frames of which every camera has one within this time.",
+        "Keep only frames that all cameras have within this time of each other.",
         None,
         "--sync",
         metavar="MS",
         parse=_nanoseconds,
     )
-    poses: str | None = option("Of poses, for euroc, tum and colmap.", metavar="TOPIC")
+    poses: str | None = option("Topic with poses, for euroc, tum and colmap.", metavar="TOPIC")
     fps: int | None = option(
-        "Of lerobot; the rate of the first camera by default.", least=1, most=1000
+        "Frame rate for lerobot; default: that of the first camera.", least=1, most=1000
     )
-    state: str | None = option("observation.state of lerobot.", metavar="TOPIC")
-    action: str | None = option("action of lerobot.", metavar="TOPIC")
-    task: str = option("What the robot does, for lerobot.", "", metavar="TEXT")
-    codec: str = option("av1, h264 or h265: of videos made for lerobot.", "av1")
-    crf: int = option("Their quality; less is better.", 30, least=0, most=63)
+    state: str | None = option("Topic for lerobot's observation.state.", metavar="TOPIC")
+    action: str | None = option("Topic for lerobot's action.", metavar="TOPIC")
+    task: str = option("Task description, for lerobot.", "", metavar="TEXT")
+    codec: str = option("Video codec for lerobot: av1, h264 or h265.", "av1")
+    crf: int = option("Quality of lerobot's videos; lower is better.", 30, least=0, most=63)
     force: bool = force()
 
     def __post_init__(self) -> None:

@@ -61,19 +61,21 @@ class ReportOptions(SliceOptions):
     """How a report is made."""
 
     output: Path | None = option(
-        "Where to write it; into the dataset if not said.", None, "-o", metavar="FOLDER"
+        "Folder to write to; default: the dataset itself.", None, "-o", metavar="FOLDER"
     )
     start: str | float | None = start()
     end: str | float | None = end()
     duration: str | float | None = duration()
     proxies: str = option(
-        "Small videos for what no browser shows (auto), for all, or none.", "auto", metavar="WHICH"
+        "Make small videos for cameras browsers cannot play (auto), for all, or for none.",
+        "auto",
+        metavar="WHICH",
     )
     proxy_width: int = option(
-        "Most columns of a proxy.", 640, metavar="PIXELS", least=64, most=3840
+        "Maximum width of a proxy.", 640, metavar="PIXELS", least=64, most=3840
     )
-    scores: Path | None = option("Quality scores of frames, to be plotted.", metavar="JSON")
-    force: bool = force("Replace an index.html that is no report.")
+    scores: Path | None = option("Quality scores per frame, to plot.", metavar="JSON")
+    force: bool = force("Replace an index.html that is not a report.")
 
     def __post_init__(self) -> None:
         super().__post_init__()

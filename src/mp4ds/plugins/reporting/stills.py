@@ -58,22 +58,22 @@ def parse_sheet(text: str) -> tuple[int, int]:
 class StillOptions(SliceOptions):
     """Which frames are saved, and how."""
 
-    topic: str = option("Of the camera, where there are several.", "", "-t")
+    topic: str = option("Camera topic, if there are several.", "", "-t")
     at: str | None = option(
-        "Seconds from the first frame, or since 1970; nanoseconds since 1970; an ISO date; or "
-        "#NUMBER of the frame.",
+        "Seconds from the first frame or since 1970, nanoseconds since 1970, an ISO date, or #N "
+        "for frame number N.",
         metavar="TIME",
     )
     sheet: tuple[int, int] | None = option(
-        "So many frames beside and below each other.", metavar="5x4", parse=parse_sheet
+        "Columns and rows of a contact sheet.", metavar="5x4", parse=parse_sheet
     )
     start: str | float | None = start()
     end: str | float | None = end()
     duration: str | float | None = duration()
     resize: float | tuple[int, int] | None = resize(
-        "Size of the frame, or of each; 320 columns on a sheet by default."
+        "Size of the image, or of each frame on a sheet (default there: 320 columns)."
     )
-    exact: bool = option("The samples as recorded, as unpack --to images has them.", False)
+    exact: bool = option("Keep the samples as recorded, as unpack --to images does.", False)
     force: bool = force()
 
     def __post_init__(self) -> None:
