@@ -23,8 +23,8 @@ from mp4ds.records import Channel, Schema
 from sources import INFO, image_cdr, image_ros1, scene, typestore
 
 HEADER = "std_msgs/msg/Header"
-NO_SEQ = "messages with a header's sequence number, which ROS 2 has not"
-TAILS = "messages with bytes after their end, which were left out"
+NO_SEQ = "messages with a header sequence number, which ROS 2 does not have"
+TAILS = "messages with trailing bytes, which were dropped"
 REAL_BAGS = (
     "bag_reader_java/Int64MultiArray",
     "ecto_ros_camera_info",
@@ -356,12 +356,12 @@ def test_large_payloads_are_not_deserialised() -> None:
     [
         ("protobuf", Schema("foxglove.RawImage", "protobuf", b""), "ros1", "messages are protobuf"),
         ("json", None, "ros2", "messages are json"),
-        ("", None, "ros2", "of no known encoding"),
-        ("ros1", None, "ros2", "the type of its messages is not known"),
+        ("", None, "ros2", "in an unknown encoding"),
+        ("ros1", None, "ros2", "its message type is not known"),
         ("ros1", Schema("my/Type", "", b""), "ros2", "no definition of type my/Type is known"),
         ("ros1", Schema("my/Type", "ros1msg", b"Other x"), "ros2", "type my/msg/Other is known"),
         ("ros1", Schema("my/Type", "ros1msg", b"int8 x\n?!"), "ros2", "cannot be understood"),
-        ("ros1", Schema("", "ros1msg", b"int8 x"), "ros2", "type of its messages is not known"),
+        ("ros1", Schema("", "ros1msg", b"int8 x"), "ros2", "message type is not known"),
         ("ros1", Schema("my/1 Type", "ros1msg", b"int8 x"), "ros2", "cannot be understood"),
         ("ros1", Schema("my/Type", "ros1msg", b"Type x"), "ros2", "holds itself"),
         ("cdr", Schema("my/msg/Type", "ros2msg", b"wstring x"), "ros1", "no definition of type"),

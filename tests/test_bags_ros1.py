@@ -391,7 +391,7 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
     for data, problem in (
         (b"", "is empty"),
         (b"not a bag at all", "is not a ROS 1 bag"),
-        (b"#ROSBAG V2.0\r\n", "is a ROS 1 bag whose line ends were converted"),
+        (b"#ROSBAG V2.0\r\n", "is a ROS 1 bag with converted line endings"),
         (b"#ROSBAG V1.2\n", "version 1.2, and only 2.0 is read. Rewrite it with `rosbag filter"),
         (b"#ROSRECORD V1.1\n", "version 1.1"),
         (b"version https://git-lfs.github.com/spec/v1\noid", "is a git-lfs pointer"),
@@ -464,17 +464,17 @@ def test_damage_has_a_sentence(tmp_path: Path) -> None:
     for options, problem in (
         ({"shift": 1}, "topic /a, chunk at byte 4109: "),
         ({"shift": 500}, "topic /a, chunk at byte 4109: a record is cut short. Copy it again"),
-        ({"counted": 1}, "the index of the chunk at byte 4109 contradicts that of the bag"),
+        ({"counted": 1}, "the index of the chunk at byte 4109 contradicts the bag's index"),
         ({"compression": "zstd"}, "it is compressed by 'zstd', which is not known"),
         ({"size": 3}, "it unpacks to 49 bytes instead of 3"),
         ({"size": 3, "compression": "bz2"}, "its bz2 data does not unpack to 3 bytes"),
         ({"size": 2**31, "compression": "bz2"}, "it promises 2147483648 bytes and has"),
     ):
         refuse(make_bag(path, [plain()], one, **options), problem)
-    refuse(make_bag(path, [], one), "contradicts that of the bag")
+    refuse(make_bag(path, [], one), "contradicts the bag's index")
     two = make_bag(path, [plain()], [[(0, 1, b"one")], [(0, 2, b"two")]]).read_bytes()
     path.write_bytes(two.replace(b"chunk_count=\2", b"chunk_count=\1"))
-    refuse(path, "its header counts fewer chunks than its index lists")
+    refuse(path, "its header declares fewer chunks than its index lists")
     good = make_bag(path, [plain("/a"), plain("/b")], [[(0, 1, b"one"), (1, 2, b"two")]])
     data = good.read_bytes()
     path.write_bytes(data.replace(b"chunk_count=\1", b"chunk_count=\0"))

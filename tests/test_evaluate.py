@@ -172,7 +172,7 @@ def test_clips_of_a_time() -> None:
     assert abs(np.mean(middle) - 49.5) < 1
     assert chosen(times, origin, replace(given, start=0.0)) == [0, 1, 2]
     for start in (11.0, 1e9):
-        with pytest.raises(Refused, match="no images in the time"):
+        with pytest.raises(Refused, match="no images in the requested time"):
             chosen(times, origin, replace(given, start=start))
 
 

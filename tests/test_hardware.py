@@ -104,7 +104,7 @@ def test_what_is_refused() -> None:
                 check_codec(name, None, lossless=False, crf=crf)
         with pytest.raises(OptionError, match=r"lossless packing\. Use ffv1, h264, h265"):
             check_codec(name, None, lossless=True)
-        with pytest.raises(OptionError, match="goes with `quality` visual or crf=N"):
+        with pytest.raises(OptionError, match="works with `quality` visual or crf=N"):
             check_codec(name, None, lossless=False, varied=True)
     check_codec("h265-nvenc", "p7", lossless=False)
     with pytest.raises(OptionError, match="Use one of p1, p2, p3, p4, p5, p6, p7"):
@@ -205,7 +205,7 @@ def test_one_sentence_says_what_is_missing(name: str) -> None:
     if found.encoder not in av.codecs_available:
         assert said == (
             f"`codec` {name}: PyAV {av.__version__} was built without {found.encoder}. It needs "
-            f"{found.needs}, and a PyAV whose ffmpeg has {found.encoder}{end}"
+            f"{found.needs}, and a PyAV whose FFmpeg has {found.encoder}{end}"
         )
     else:
         assert said.startswith(f"`codec` {name}: {found.encoder} could not be opened: ")
@@ -298,7 +298,11 @@ def refusing(sizes: list[tuple[int, int]], tried: list[Any]) -> Callable[..., No
     [
         ([(64, 48)], EncoderRefusedError, "does not take pictures of 64x48"),
         ([(64, 48), (640, 480)], HardwareError, "refused"),
-        ([], HardwareError, "too many at a time. Give fewer `jobs`; `codec` h264 needs no device"),
+        (
+            [],
+            HardwareError,
+            "too many were open at once. Use fewer `jobs`; `codec` h264 needs no device",
+        ),
     ],
 )
 def test_pictures_and_devices_are_told_apart(

@@ -179,7 +179,7 @@ def test_pages_that_are_found_by_many_ways(table: str, tmp_path: Path, jail: Jai
             data += page
     with_pages(path, data + leaf)
     outcome = bounded(jail.records(path))
-    assert "its tables list more than a file of its size can hold" in outcome.text
+    assert "its tables list more data than a file of its size can hold" in outcome.text
     bounded(jail.records(path, salvage=True))
 
 
@@ -206,7 +206,7 @@ def test_rows_that_share_their_pages(tmp_path: Path, jail: Jail) -> None:
     data[at : at + PAGE] = page
     with_pages(path, data)
     outcome = bounded(jail.records(path))
-    assert "its tables list more than a file of its size can hold" in outcome.text
+    assert "its tables list more data than a file of its size can hold" in outcome.text
     outcome = bounded(jail.records(path, salvage=True))
     assert outcome.messages == 1
     assert "messages of /a of which pages are damaged or missing" in outcome.problems
@@ -548,7 +548,7 @@ def test_files_of_a_folder_that_are_no_files(name: str, tmp_path: Path, jail: Ja
     for make in (os.mkfifo, lambda path: path.symlink_to("/dev/zero")):
         (tmp_path / name).unlink()
         make(tmp_path / name)
-        assert f"{name}: is no regular file" in bounded(jail.records(tmp_path)).text
+        assert f"{name}: is not a regular file" in bounded(jail.records(tmp_path)).text
         bounded(jail.records(tmp_path, salvage=True))
 
 

@@ -347,7 +347,7 @@ def test_a_rate_is_that_of_one_camera(names: list[str], tmp_path: Path) -> None:
 @each(
     ("names", "options", "words"),
     [
-        (["color_1.png", "color_2.png", "depth_1.png", "depth_3.png"], [], "not the same numbers"),
+        (["color_1.png", "color_2.png", "depth_1.png", "depth_3.png"], [], "their numbers differ"),
         (["1.png", "2_deep.png", "3.png", "4_deep.png"], [], "--stamps FILE"),
         (["1.png", "deep1.png", "2.png", "deep2.png"], ["--encoding", "16UC1"], "camera, deep"),
     ],
@@ -883,7 +883,7 @@ WITH_CALIBRATION = ["--rate", "2", "--calibration", "c"]
 PLAIN_BAD: dict[str, tuple[list[str], dict[str, str], list[str], str]] = {
     "no-times": (["a.png"], {}, [], "--rate HZ"),
     "frame-numbers": (["0.png", "1.png"], {}, [], "--rate HZ"),
-    "names-of-no-unit": (["a.png"], {}, ["--unit", "ns"], "name that is no time"),
+    "names-of-no-unit": (["a.png"], {}, ["--unit", "ns"], "name that is not a time"),
     "unknown-unit": (["a.png"], {"t": "17\n"}, ["--stamps", "t"], "Give --unit"),
     "no-unit": (["a.png"], {}, ["--unit", "h"], "s, ms, us, ns"),
     "fewer-times": (
@@ -893,10 +893,10 @@ PLAIN_BAD: dict[str, tuple[list[str], dict[str, str], list[str], str]] = {
         "1 times, and there are 2",
     ),
     "empty-list": (["a.png"], {"t": "# none\n"}, ["--stamps", "t"], "holds no times"),
-    "binary-list": (["a.png"], {}, ["--stamps", "in/a.png"], "is no text"),
+    "binary-list": (["a.png"], {}, ["--stamps", "in/a.png"], "is not a text file"),
     "no-list": (["a.png"], {}, ["--stamps", "none"], "cannot be read"),
     "unlisted": (["a.png"], {"t": "1.5 b.png\n"}, ["--stamps", "t"], "not there"),
-    "both": (["a.png"], {}, ["--stamps", "t", "--rate", "2"], "Give one of them"),
+    "both": (["a.png"], {}, ["--stamps", "t", "--rate", "2"], "Give only one of them"),
     "bad-rate": (["a.png"], {}, ["--rate", "fast"], "'fast' is no rate"),
     "bad-encoding": (["a.png"], {}, ["--rate", "2", "--encoding", "x"], "--encoding 'x'"),
     "other-encoding": (["a.png"], {}, ["--rate", "2", "--encoding", "rgb8"], "cannot be rgb8"),
@@ -952,7 +952,7 @@ def test_targets_are_kept(tmp_path: Path) -> None:
     options = replace(folder(rate="1"), salvage=True)
     with pytest.raises(mp4ds.OptionError, match="salvage"):
         mp4ds.pack(tmp_path / "in", tmp_path / "x", options)
-    with pytest.raises(mp4ds.OptionError, match="One folder"):
+    with pytest.raises(mp4ds.OptionError, match="Only one folder"):
         mp4ds.pack([tmp_path / "in", tmp_path / "ds"], tmp_path / "x", folder(rate="1"))
 
 
@@ -1031,4 +1031,4 @@ def test_bad_pairs_are_refused(tmp_path: Path) -> None:
     mp4ds.pack(tmp_path / "in", tmp_path / "own", folder(rate="2"))
     own = tmp_path / "own" / "camera_image_raw.yaml"
     done = run("import", "ros-mp4", own.with_suffix(".mp4"), own, "-o", tmp_path / "x")
-    refused(done, "a sidecar of mp4ds already")
+    refused(done, "already an mp4ds sidecar")

@@ -363,7 +363,7 @@ def test_what_cannot_be_opened(tmp_path: Path, colour: tuple[Path, Scene]) -> No
     with pytest.raises(mp4ds.SourceNotFoundError) as missing:
         mp4ds.open(tmp_path / "none")
     assert isinstance(missing.value, FileNotFoundError)
-    with pytest.raises(mp4ds.SourceError, match="is no dataset"):
+    with pytest.raises(mp4ds.SourceError, match="is not a dataset"):
         mp4ds.open(tmp_path)
     for start, kind in (
         (b"RIFF\0\0\0\0AVI LIST", "AVI"),
@@ -372,7 +372,7 @@ def test_what_cannot_be_opened(tmp_path: Path, colour: tuple[Path, Scene]) -> No
         video = tmp_path / "clip.avi"
         video.write_bytes(start + bytes(99))
         with pytest.raises(
-            mp4ds.SourceError, match=rf"{kind} video, and no dataset.*\.mp4 or \.mov"
+            mp4ds.SourceError, match=rf"{kind} video, not a dataset.*\.mp4 or \.mov"
         ):
             mp4ds.open(video)
         with pytest.raises(

@@ -32,7 +32,7 @@ EXPECTED: dict[str, tuple[str, str] | None] = {
     "error": ("SourceError", "drive.bag: is damaged."),
     "crash": ("Failed", "its process ended with code 3: last words"),
     "quiet": ("Failed", "its process ended with code 0"),
-    "killed": ("Killed", "its process was ended by SIGKILL, perhaps for want of memory"),
+    "killed": ("Killed", "its process was ended by SIGKILL, perhaps for lack of memory"),
 }
 
 

@@ -223,8 +223,8 @@ def channel(encoding: str, name: str = "", schema: bytes = b"", kind: str = "") 
     ("odd", "problem"),
     [
         (channel("flatbuffer", "foxglove.Log", b"", "flatbuffer"), "they are flatbuffer encoding"),
-        (channel(""), "of no known encoding"),
-        (channel("ros1"), "the type of its messages is not known"),
+        (channel(""), "in an unknown encoding"),
+        (channel("ros1"), "its message type is not known"),
         (channel("cdr", "my_msgs/msg/Odd"), "no definition of type my_msgs/msg/Odd"),
         (channel("ros1", "my_msgs/Odd", b"int32[ x", "ros1msg"), "cannot be understood"),
         (channel("ros1", "my_msgs/Odd", b"other_msgs/X x", "ros1msg"), "no definition of type"),

@@ -402,7 +402,7 @@ def test_distances_that_contradict_themselves(change: Change, packed: Path, tmp_
     path = edited(packed, tmp_path, change)
     assert [problem.code for problem in mp4ds.validate(path)] == ["references-invalid"]
     with closing(Stream(path)) as stream:
-        with pytest.raises(FormatError, match="does not fit the references") as raised:
+        with pytest.raises(FormatError, match="does not match the references") as raised:
             stream.get([3])
         assert raised.value.code == "references-invalid"
         assert stream.get([49])[0].index == 49  # of another group

@@ -191,7 +191,7 @@ def test_one_dataset_each(recording: Path, tmp_path: Path) -> None:
 
 def test_no_dataset_is_salvaged(recording: Path, tmp_path: Path) -> None:
     mp4ds.pack(recording, tmp_path / "whole")
-    with pytest.raises(OptionError, match="`salvage` goes with recordings"):
+    with pytest.raises(OptionError, match="`salvage` works with recordings"):
         mp4ds.pack(tmp_path / "whole", tmp_path / "again", PackOptions(salvage=True))
 
 

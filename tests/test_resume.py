@@ -57,7 +57,7 @@ def use(monkeypatch: pytest.MonkeyPatch, engine: InlineEngine) -> InlineEngine:
 
 def fail_at(tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     use(monkeypatch, InlineEngine(lambda task: task == name))
-    with pytest.raises(PartsFailedError, match=r"run the same command again to go on"):
+    with pytest.raises(PartsFailedError, match=r"run the same command again to resume"):
         mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
 
 
@@ -245,7 +245,7 @@ def test_an_interrupt_keeps_what_is_finished(
         return False
 
     use(monkeypatch, InlineEngine(interrupt))
-    with pytest.raises(KeyboardInterrupt, match=r"run the same command again to go on"):
+    with pytest.raises(KeyboardInterrupt, match=r"run the same command again to resume"):
         mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
     engine = use(monkeypatch, InlineEngine())
     mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)

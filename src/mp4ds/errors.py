@@ -117,7 +117,9 @@ class TargetExistsError(TargetError, FileExistsError):
     """The output exists and ``force`` was not given."""
 
     def __init__(self, path: Path | str) -> None:
-        super().__init__(path, "exists already", "Choose another name, or replace it with `force`.")
+        super().__init__(
+            path, "already exists", "Choose another name, or use `force` to replace it."
+        )
 
 
 class OptionError(Mp4dsError, ValueError):
@@ -143,7 +145,7 @@ class FrameNotFoundError(Mp4dsError, LookupError):
         self.stamp_ns = stamp_ns
         self.nearest_ns = nearest_ns
         super().__init__(
-            f"{topic} has no frame {wanted} {stamp_ns} ns; the nearest one is of {nearest_ns} ns, "
+            f"{topic} has no frame {wanted} {stamp_ns} ns; the nearest is at {nearest_ns} ns, "
             f"{abs(nearest_ns - stamp_ns)} ns {'later' if nearest_ns > stamp_ns else 'earlier'}."
         )
 
@@ -171,7 +173,7 @@ class VersionError(FormatError):
         super().__init__(
             "version-unsupported",
             place,
-            f"is of format version {found!r}, and this mp4ds reads up to {supported!r}; "
+            f"has format version {found!r}; this mp4ds reads versions up to {supported!r}: "
             "install a newer mp4ds",
         )
 
@@ -195,8 +197,8 @@ class WriteError(Mp4dsError, OSError):
     def __init__(self, path: Path | str, cause: BaseException) -> None:
         self.path = _as_path(path)
         super().__init__(
-            f"{path}: could not be written: {reason_of(cause)}. "
-            "The source is untouched and the unfinished output was removed."
+            f"{path}: could not be written: {reason_of(cause)}. The source is untouched, and the "
+            "partial output was removed."
         )
 
 
@@ -222,7 +224,7 @@ class PartsFailedError(Mp4dsError):
         more = f" And {len(failures) - 5} more." if len(failures) > 5 else ""
         super().__init__(
             f"{dataset}: {len(failures)} of {total} parts could not be packed. {listed}{more} "
-            "What is finished is kept: run the same command again to go on."
+            "Finished parts are kept: run the same command again to resume."
         )
 
 
@@ -293,7 +295,9 @@ class OutOfReachError(Mp4dsError):
 
     def __init__(self, topic: str, stream: Any, reason: str) -> None:
         self.stream, self.reason = stream, reason
-        super().__init__(f"{topic}: {reason}. Ask for less, or pack it with `quality` lossless.")
+        super().__init__(
+            f"{topic}: {reason}. Lower the target, or pack it with `quality` lossless."
+        )
 
 
 class SegmentsDifferError(Mp4dsError):
@@ -308,8 +312,8 @@ class SegmentsDifferError(Mp4dsError):
     def __init__(self, first: Path, other: Path, differences: str) -> None:
         self.first, self.other = first, other
         super().__init__(
-            f"{other}: cannot be joined to {first}, since they differ in {differences}. "
-            "Encode both with the same options, or keep them as two streams."
+            f"{other}: cannot be joined to {first}: they differ in {differences}. Encode both "
+            "with the same options, or keep them as two streams."
         )
 
 

@@ -100,7 +100,7 @@ def parse_size(text: str) -> int:
     match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) *([kmgt]?)(?:i?b)?", text.strip().lower())
     size = int(float(match[1]) * _UNITS[match[2]]) if match else 0
     if not size:
-        raise OptionError(f"`memory` {text!r} is no size. Give one such as 8G or 500M.")
+        raise OptionError(f"`memory` {text!r} is not a size. Use a value such as 8G or 500M.")
     return size
 
 
@@ -117,7 +117,7 @@ def parse_resize(text: str) -> float | tuple[int, int]:
         return float(text)
     except ValueError:
         raise OptionError(
-            f"`resize` {text!r} is no size. Give a factor such as 0.5, or WxH such as 640x480."
+            f"`resize` {text!r} is not a size. Use a factor such as 0.5, or WxH such as 640x480."
         ) from None
 
 
@@ -161,10 +161,10 @@ def time_of(text: str, start_ns: int, option: str) -> int:
         try:
             moment = datetime.fromisoformat(match[1]).replace(tzinfo=timezone.utc)
         except ValueError as error:
-            raise OptionError(f"`{option}` {text!r} is no date: {error}.") from None
+            raise OptionError(f"`{option}` {text!r} is not a valid date: {error}.") from None
         return _nanoseconds(int(moment.timestamp()), match[2])
     raise OptionError(
-        f"`{option}` {text!r} is no time. Give seconds from the beginning or since 1970, "
+        f"`{option}` {text!r} is not a valid time. Use seconds from the beginning or since 1970, "
         "nanoseconds since 1970, or a date such as 2023-11-14T22:13:20.5."
     )
 
@@ -217,7 +217,7 @@ class Slice:
         if self.duration is not None:
             length = time_of(f"+{self.duration}", 0, "duration")
             if start is not None and end is not None:
-                raise OptionError("Give two of `start`, `end` and `duration`.")
+                raise OptionError("Give at most two of `start`, `end` and `duration`.")
             if end is not None:
                 start = max(end - length, -_LATEST)
             else:
@@ -225,8 +225,8 @@ class Slice:
         begin, stop = first if start is None else start, last + 1 if end is None else end
         if begin >= stop or begin > last or stop <= first:
             raise OptionError(
-                f"{place}: nothing was recorded from {iso_text(begin)} to before "
-                f"{iso_text(stop)}. It has messages from {iso_text(first)} to {iso_text(last)}, "
+                f"{place}: nothing was recorded from {iso_text(begin)} until {iso_text(stop)}. It "
+                f"has messages from {iso_text(first)} to {iso_text(last)}, "
                 f"{(last - first) / _NS:.9g} seconds."
             )
         return start, end

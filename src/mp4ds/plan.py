@@ -194,7 +194,7 @@ class Selection:
                 if not any(_matches(topic, (pattern,)) for topic in known):
                     listed = ", ".join(known[:20]) + (", ..." if len(known) > 20 else "")
                     raise OptionError(
-                        f"`{option}` {pattern!r} matches no topic. There are: {listed or 'none'}."
+                        f"`{option}` {pattern!r} matches no topic. Topics: {listed or 'none'}."
                     )
 
 

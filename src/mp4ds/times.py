@@ -99,7 +99,7 @@ def decode_column(start: int, step: int, text: str, count: int) -> NDArray[np.in
 def _decode_residuals(text: str, count: int) -> NDArray[np.int64]:
     raw = text.encode("ascii", "replace")
     if raw.translate(None, _COLUMN_BYTES):
-        raise ValueError("holds something else than integers")
+        raise ValueError("holds something other than integers")
     codes = np.frombuffer(raw, np.uint8)
     signs = codes[:-1] == _MINUS
     signs &= codes[1:] < _ZERO
@@ -112,11 +112,11 @@ def _decode_residuals(text: str, count: int) -> NDArray[np.int64]:
         try:
             values = np.fromstring(text, dtype=np.int64, sep=" ")
         except (DeprecationWarning, ValueError):
-            raise ValueError("holds something else than integers") from None
+            raise ValueError("holds something other than integers") from None
     if not raw.strip():
         values = values[:0]
     if len(values) != count:
-        raise ValueError(f"holds {len(values) + 1} values where {count + 1} are due")
+        raise ValueError(f"holds {len(values) + 1} values, not {count + 1}")
     # numpy saturates what does not fit, without a word
     if len(values) and (values.max() == INT64_MAX or values.min() == INT64_MIN):
         raise ValueError("holds an integer beyond 64 bits")
@@ -125,7 +125,7 @@ def _decode_residuals(text: str, count: int) -> NDArray[np.int64]:
 
 def _decode_runs(text: str, count: int) -> NDArray[np.int64]:
     if not _TOKENS.fullmatch(text):
-        raise ValueError("holds something else than integers and runs")
+        raise ValueError("holds something other than integers and runs")
     values: list[int] = []
     lengths: list[int] = []
     total = 0
@@ -139,7 +139,7 @@ def _decode_runs(text: str, count: int) -> NDArray[np.int64]:
         if total > count:
             break
     if total != count:
-        raise ValueError(f"does not hold the {count + 1} values that are due")
+        raise ValueError(f"does not hold {count + 1} values")
     if any(not INT64_MIN <= value <= INT64_MAX for value in values):
         raise ValueError("holds an integer beyond 64 bits")
     return np.repeat(np.array(values, dtype=np.int64), lengths)
@@ -308,7 +308,7 @@ def synchronize(
     """
     tolerance = as_integer(tolerance_ns)
     if tolerance < 0:
-        raise OptionError(f"a tolerance of {tolerance} ns: use 0 or more")
+        raise OptionError(f"tolerance is {tolerance} ns: use 0 or more")
     if not stamps:
         raise OptionError("there are no topics to match")
     if reference is None:

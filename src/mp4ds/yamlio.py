@@ -131,12 +131,12 @@ def load(data: bytes, place: str) -> dict[str, Any]:
             raise FormatError(
                 "checksum-mismatch",
                 place,
-                "does not match the checksum in its last line: it was damaged or edited; "
-                "after an intended edit, remove that line",
+                "does not match the checksum in its last line: it was damaged or edited; if the "
+                "edit was intended, remove that line",
             )
     structure, columns = _slice_columns(data, end)
     if len(structure) > MAX_STRUCTURE_BYTES:
-        raise FormatError("yaml-invalid", place, "has too much structure outside of its columns")
+        raise FormatError("yaml-invalid", place, "has too many values outside its columns")
     document = _parse(structure, place)
     marks = structure.count(_MARK.encode())
     if columns and not marks == _restore_columns(document, columns) == len(columns):
@@ -153,7 +153,7 @@ def _parse(data: bytes, place: str) -> dict[str, Any]:
             "yaml-invalid", place, f"is not valid YAML of the subset: {reason}"
         ) from None
     if not isinstance(document, dict):
-        raise FormatError("yaml-invalid", place, "is not a map of keys and values")
+        raise FormatError("yaml-invalid", place, "is not a mapping")
     return document
 
 
@@ -266,7 +266,7 @@ def _attach(parent: _Node, value: Any, line: int) -> None:
     elif not isinstance(value, str):
         raise ValueError(f"line {line}: key {value!r} is not a string")
     elif value in parent.value:
-        raise ValueError(f"line {line}: key {value!r} stands twice")
+        raise ValueError(f"line {line}: key {value!r} is repeated")
     else:
         parent.key = value
 
@@ -286,7 +286,7 @@ def _scalar(event: Any) -> Any:
         return int(text)
     value = float(text)
     if value - value != 0:
-        raise ValueError(f"line {_line(event)}: {text} is no finite number")
+        raise ValueError(f"line {_line(event)}: {text} is not a finite number")
     return value
 
 

@@ -356,8 +356,8 @@ def format_of(path: Path) -> str:
         return RECORDING_SUFFIXES[path.suffix]
     remedy = "Give a ROS 1 .bag, a rosbag2 folder or an .mcap file."
     if video := video_at(path):
-        raise SourceError(path, f"is {video}, and no recording", f"{remedy} {HOW_TO_OPEN}")
-    raise SourceError(path, "is not a recording that mp4ds knows", remedy)
+        raise SourceError(path, f"is {video}, not a recording", f"{remedy} {HOW_TO_OPEN}")
+    raise SourceError(path, "is not in a recording format that mp4ds supports", remedy)
 
 
 def recording_names(path: Path) -> set[str] | None:
@@ -428,7 +428,7 @@ def open_sources(
 
 def _open_salvaged(paths: Sequence[Path]) -> SalvageReader:
     for path in filter(remote, paths):
-        raise SourceError(path, "is not salvaged where it is", "Download it first.")
+        raise SourceError(path, "cannot be salvaged from a remote location", "Download it first.")
     openers = [partial(_SALVAGERS[format_of(path)], path) for path in paths]
     if len(paths) == 1:
         return openers[0]()

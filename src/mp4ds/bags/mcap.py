@@ -83,7 +83,7 @@ def _other_at(stream: RecordStream, place: int, declared: Declared) -> Attachmen
     except DamageError as error:
         raise stream.damaged(error) from None
     if record is None:
-        raise stream.damaged("it was another one before")
+        raise stream.damaged("it differs from the one read before")
     return record
 
 
@@ -149,7 +149,7 @@ def _records(stream: RecordStream, chunk: ChunkEntry) -> Iterator[tuple[int, mem
         raise DamageError("it is not the chunk that the index lists there")
     content = unpack_chunk(body)
     if len(content) > chunk.size:
-        raise DamageError(f"it unpacks to {len(content)} bytes, and its index tells of less")
+        raise DamageError(f"it unpacks to {len(content)} bytes, more than its index says")
     for _, kind, part in chunk_records(content):
         yield kind, part
 
@@ -164,7 +164,7 @@ def _check(head: MessageHead, chunk: ChunkEntry, summary: McapSummary) -> None:
         problem = f"of channel {head.channel_id}"
     else:
         return
-    raise DamageError(f"it holds a message {problem}, of which its index does not tell")
+    raise DamageError(f"it holds a message {problem} that its index does not list")
 
 
 # ---------------------------------------------------------------- the reader
@@ -214,7 +214,7 @@ class McapReader:
     def _read_ends(self, stream: RecordStream) -> None:
         opcode, body = stream.next()
         if opcode != Opcode.HEADER:
-            raise DamageError("it stands where the header should")
+            raise DamageError("it is in the place of the header")
         header = parse(mcap_records.Header, body)
         self.profile: str = header.profile
         self.library: str = header.library
@@ -347,7 +347,7 @@ class McapReader:
         if excerpt == EVERYTHING and not summary.covers(count):
             raise SourceError(
                 self.path,
-                f"is damaged: its chunks hold {count} messages, its statistics others",
+                f"is damaged: its chunks hold {count} messages, which its statistics contradict",
                 SALVAGE_REMEDY,
             )
 
@@ -468,12 +468,12 @@ class McapReader:
                 stream.seek(chunk)
                 opcode, body = stream.next()
                 if opcode != Opcode.CHUNK:
-                    raise DamageError("it stands where a chunk should")
+                    raise DamageError("it is in the place of a chunk")
                 content, at = unpack_chunk(body), chunk
             kind, part, _ = chunk_record(memoryview(content), offset)
             head = parse_message(part) if kind == Opcode.MESSAGE else None
             if head is None or head.channel_id != channel_id:
-                raise DamageError("its message index points beside the messages")
+                raise DamageError("its message index does not point to messages")
             message = self._declared.message(head, "the first message")
             yield channel_id, with_own_payload(self._unpacked(message))
 

@@ -331,7 +331,7 @@ class McapSummary:
             while stream.tell() < end:
                 opcode, body = stream.next()
                 if opcode != Opcode.MESSAGE_INDEX:
-                    raise DamageError("it stands where a message index should")
+                    raise DamageError("it is in the place of a message index")
                 yield _parse_entries(chunk, body)
 
     def covers(self, count: int) -> bool:
@@ -486,7 +486,7 @@ def read_frame(stream: RecordStream, place: int) -> tuple[int, int]:
     stream.start = place
     opcode, length = _FRAME.unpack(stream.read(_FRAME.size))
     if length > MAX_RECORD_BYTES:
-        raise DamageError(f"it tells of {length} bytes")
+        raise DamageError(f"it says it has {length} bytes")
     return opcode, place + _FRAME.size + length
 
 

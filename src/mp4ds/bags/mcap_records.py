@@ -41,8 +41,8 @@ OF_SUMMARY = frozenset(
         Opcode.SUMMARY_OFFSET,
     }
 )
-SALVAGE_REMEDY = "`mp4ds pack --salvage` packs what can be read."
-CUT_SHORT_REMEDY = f"The recording was cut short: use `mcap recover`; without it, {SALVAGE_REMEDY}"
+SALVAGE_REMEDY = "`mp4ds pack --salvage` packs what is still readable."
+CUT_SHORT_REMEDY = f"The recording was cut short: use `mcap recover`, or {SALVAGE_REMEDY}"
 
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 _PIECE_BYTES = 16 * 2**20
@@ -105,7 +105,7 @@ def open_source(path: Path, shown: Path | None = None) -> BinaryIO:
     shown = shown or path
     try:
         if not path.is_file() and not path.is_dir() and path.exists():
-            raise SourceError(shown, "is no regular file")  # to open a pipe could wait for ever
+            raise SourceError(shown, "is not a regular file")  # to open a pipe could wait for ever
         stream = path.open("rb")
     except FileNotFoundError:
         raise SourceNotFoundError(shown) from None
@@ -124,10 +124,10 @@ def open_source(path: Path, shown: Path | None = None) -> BinaryIO:
 def other_begin(path: Path, kind: str, magic: bytes, start: bytes) -> SourceError:
     """The error for a file that does not begin with the magic bytes of its kind."""
     if start.startswith(magic.rstrip()):
-        problem = f"is {kind} whose line ends were converted, as copying it as text does"
-        return SourceError(path, problem, f"Copy it again as binary; {SALVAGE_REMEDY}")
-    remedy = f"If it is a damaged one, {SALVAGE_REMEDY}"
-    return SourceError(path, f"is not {kind}: it does not begin like one", remedy)
+        problem = f"is {kind} with converted line endings, as if copied in text mode"
+        return SourceError(path, problem, f"Copy it again in binary mode, or {SALVAGE_REMEDY}")
+    remedy = f"If it is damaged, {SALVAGE_REMEDY}"
+    return SourceError(path, f"is not {kind}: it does not start like one", remedy)
 
 
 class RecordStream:
@@ -311,7 +311,7 @@ def _decompress(compression: str, data: memoryview, size: int) -> bytes | memory
     if compression == "":
         return data
     if size > most_unpacked(len(data)):
-        raise DamageError(f"a chunk promises {size} bytes and has {len(data)}")
+        raise DamageError(f"a chunk declares {size} bytes but has {len(data)}")
     if compression == "zstd":
         return unzstd(data, size)
     if compression == "lz4":
@@ -319,11 +319,13 @@ def _decompress(compression: str, data: memoryview, size: int) -> bytes | memory
         try:
             content: bytes = machine.decompress(data, max_length=size + 1)
         except RuntimeError as error:
-            raise DamageError(f"the lz4 compression of a chunk is damaged: {error}") from None
+            raise DamageError(f"the lz4 data of a chunk is damaged: {error}") from None
         if not machine.eof:
-            raise DamageError(f"the lz4 compression of a chunk does not end after {size} bytes")
+            raise DamageError(f"the lz4 data of a chunk does not end after {size} bytes")
         return content
-    raise DamageError(f"a chunk is compressed by {compression!r}, and only zstd and lz4 are known")
+    raise DamageError(
+        f"a chunk is compressed with {compression!r}; only zstd and lz4 are supported"
+    )
 
 
 def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
@@ -343,7 +345,7 @@ def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
         if size is not None and stated not in (-1, size):
             raise DamageError(f"zstd data holds {stated} bytes instead of {size}")
         if stated > most_unpacked(len(data)):
-            raise DamageError(f"zstd data promises {stated} bytes and has {len(data)}")
+            raise DamageError(f"zstd data declares {stated} bytes but has {len(data)}")
         return zstandard.ZstdDecompressor().decompress(
             data, max_output_size=size or 0, allow_extra_data=False
         )
@@ -469,7 +471,7 @@ class Declared:
         """
         channel = self.channels.get(head.channel_id)
         if channel is None:
-            raise DamageError(f"{place} is of channel {head.channel_id}, which is not defined")
+            raise DamageError(f"{place} belongs to channel {head.channel_id}, which is not defined")
         return Message(channel, head.log_time, head.publish_time, head.sequence, head.data)
 
     def other(self, opcode: int, body: bytes | memoryview) -> Attachment | MetadataRecord | None:

@@ -48,7 +48,6 @@ from mp4ds.records import (
 
 StorageReader = McapReader | SqliteReader
 _NO_STATS = ChannelStats(0, 0, 0)
-_GO_ON = "go without: " + SALVAGE_REMEDY
 
 
 class Rosbag2Reader:
@@ -303,8 +302,8 @@ def _folder_info(path: Path) -> BagInfo:
         raise SourceError(
             path,
             f"has no {METADATA_FILE}",
-            f"If it is a rosbag2 recording, run `ros2 bag reindex` on it first, or {_GO_ON} "
-            "A folder of images is for `mp4ds import images`.",
+            "If it is a rosbag2 recording, run `ros2 bag reindex` on it first, or "
+            f"{SALVAGE_REMEDY} If it is a folder of images, use `mp4ds import images`.",
         )
     info = read_bag_info(path / METADATA_FILE)
     missing = [name for name in info.file_names if not (path / name).exists()]
@@ -312,15 +311,15 @@ def _folder_info(path: Path) -> BagInfo:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise SourceError(
             path,
-            f"is incomplete: {missing[0]}{more}, which its {METADATA_FILE} names, is missing",
-            f"Add what is missing, or run `ros2 bag reindex` to go without it, or {_GO_ON}",
+            f"is incomplete: {missing[0]}{more}, listed in its {METADATA_FILE}, is missing",
+            f"Add the missing file, run `ros2 bag reindex` to do without it, or {SALVAGE_REMEDY}",
         )
     unlisted = [] if remote(path) else unlisted_storage(path, info.file_names)
     if unlisted:
         raise SourceError(
             path,
-            f"has {unlisted[0]}, which its {METADATA_FILE} does not name",
-            f"Move it away, or run `ros2 bag reindex` to add it; {SALVAGE_REMEDY}",
+            f"has {unlisted[0]}, which its {METADATA_FILE} does not list",
+            f"Move it away, run `ros2 bag reindex` to add it, or {SALVAGE_REMEDY}",
         )
     return info
 

@@ -64,7 +64,7 @@ class ZstdStream:
         while len(self._left) < length and not self._ended:
             piece = self._file.read(ZSTD_PIECE)
             if not piece:
-                self._end("its zstd compression is cut short" if self._is_within else "")
+                self._end("its zstd data is cut short" if self._is_within else "")
             self._take(piece)
             self.consumed += len(piece)
         data = bytes(self._left[:length])
@@ -77,7 +77,7 @@ class ZstdStream:
             try:
                 self._left += self._frame.decompress(piece)
             except zstandard.ZstdError as error:
-                self._end(f"its zstd compression is damaged near byte {self.consumed}: {error}")
+                self._end(f"its zstd data is damaged near byte {self.consumed}: {error}")
                 return
             if self._given + len(self._left) > self._most:
                 self._end(f"it unpacks to more than {self._most} bytes, too many for its size")
@@ -114,7 +114,7 @@ class ZstdFile(ZstdStream):
         """
         data = super().read(length)
         if self.problem and len(data) < length:
-            raise SourceError(self._path, self.problem, f"Copy it again; {SALVAGE_REMEDY}")
+            raise SourceError(self._path, self.problem, f"Copy it again, or {SALVAGE_REMEDY}")
         return data
 
     def tell(self) -> int:
@@ -140,9 +140,9 @@ def copy_file(path: Path, target: Path) -> None:
     if size > shutil.disk_usage(target.parent).free:
         raise SourceError(
             path,
-            f"is an sqlite3 database of {size} bytes, which is copied to {target.parent} to be "
-            "read, and there is no room for it",
-            "Name another folder by TMPDIR.",
+            f"is an sqlite3 database of {size} bytes, which must be copied to {target.parent} to "
+            "be read, and there is not enough space",
+            "Set TMPDIR to another folder.",
         )
     for side in found:
         ending = side.name.removeprefix(path.name)

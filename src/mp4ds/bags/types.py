@@ -72,7 +72,7 @@ def by_library(problem: str, call: Callable[..., _Made], *args: Any) -> _Made:
 
 def incomprehensible(name: str) -> str:
     """What is said of a type whose definition a library cannot use."""
-    return f"the definition of type {name} cannot be understood"
+    return f"the definition of type {name} cannot be parsed"
 
 
 class Size(NamedTuple):
@@ -108,7 +108,7 @@ def sizes_of(types: Typesdict) -> dict[str, Size]:
                 sizes[todo[-1]] = _size(types, todo[-1], sizes)
                 todo.pop()
             elif len(todo) > _MAX_DEPTH:
-                raise Refused(f"{name} holds itself, or too many levels of messages")
+                raise Refused(f"{name} contains itself, or is nested too deeply")
             else:
                 todo.append(missing[0])
         parts += sum(_spelled_out(desc) for _, desc in types[name][1])
@@ -141,7 +141,7 @@ class BoundedStore(Typestore):
     def __init__(self, types: Typesdict) -> None:
         super().__init__(empty)
         self._sizes = sizes_of({**self.fielddefs, **types})
-        by_library("its definition cannot be understood", self.register, types)
+        by_library("its definition cannot be parsed", self.register, types)
         self._data: object = None
         self._empty_left = 0
 
@@ -162,7 +162,7 @@ class BoundedStore(Typestore):
                 self._data, self._empty_left = data, _MAX_EMPTY + 2 * len(data)
             self._empty_left -= 1
             if self._empty_left < 0:
-                raise SerdeError("a message in it claims too many without any byte")
+                raise SerdeError("an array in it declares too many elements of no bytes")
             return read(data, *rest)
 
         return counted
@@ -214,7 +214,7 @@ def _size(types: Typesdict, name: str, sizes: dict[str, Size]) -> Size:
         least += length * part.least
         steps += 1 + length * part.steps
     if steps > _MAX_STEPS or depth > _MAX_DEPTH:
-        raise Refused(f"{name} holds more than any message has")
+        raise Refused(f"{name} has more fields than any real message")
     return Size(least, steps, depth)
 
 
@@ -301,7 +301,7 @@ def types_of(schema: Schema, world: World) -> Typesdict:
 
 def _parse(schema: Schema, name: str, problem: str) -> Typesdict:
     if len(schema.data) > _MAX_TEXT or schema.data.count(b"\n") > _MAX_LINES:
-        raise Refused(f"the definition of type {schema.name} is longer than those of messages")
+        raise Refused(f"the definition of type {schema.name} is longer than any real one")
     text = schema.data.decode(errors="replace").replace("\r\n", "\n")
     if not schema.encoding:
         return {}

@@ -253,13 +253,13 @@ def _print_camera(camera: CameraCalibrations) -> None:
     if camera.topic:
         say(f"# {camera.topic}: {sizes}, frame {camera.frame_id!r}")
     else:
-        say(f"# {camera.info_topic}: calibrations that belong to no images")
+        say(f"# {camera.info_topic}: calibrations without an image topic")
     if not camera.calibrations:
         say("# no calibration")
     for calibration in camera.calibrations:
         _print_calibration(camera, calibration)
     if camera.more:
-        say(f"# ... and {camera.more} more changes of the calibration")
+        say(f"# ... and {camera.more} more calibration changes")
 
 
 def _print_calibration(camera: CameraCalibrations, calibration: ListedCalibration) -> None:
@@ -285,7 +285,7 @@ def _print_calibration(camera: CameraCalibrations, calibration: ListedCalibratio
     if calibration.roi:
         say(f"roi = {calibration.roi}")
     if calibration.k_effective or calibration.p_effective:
-        say("# of the images as they are, cut to the ROI and binned (REP 104):")
+        say("# for the recorded images, cropped to the ROI and binned (REP 104):")
         _print_matrix("K_effective", calibration.k_effective or calibration.k)
         _print_matrix("P_effective", calibration.p_effective or calibration.p)
 

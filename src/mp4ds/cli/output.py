@@ -61,8 +61,8 @@ def printed() -> Iterator[None]:
         raise typer.Exit(1) from None
     except OSError as error:
         raise Mp4dsError(
-            f"standard output: {error.strerror or error}. What the command was to print is lost, "
-            "what it made is whole."
+            f"standard output: {error.strerror or error}. The command's output text is lost; the "
+            "files it wrote are complete."
         ) from None
 
 
@@ -138,17 +138,17 @@ def print_pack(summary: PackSummary) -> None:
         for note in topic.notes:
             say(f"{topic.topic}: {note}")
     for what, count in summary.skipped.items():
-        say(f"not packed as it was: {count} {what}")
+        say(f"not packed exactly: {count} {what}")
     if summary.left_out:
         say(f"left out: {', '.join(summary.left_out)}")
     for loss in summary.losses[:_LOSSES_SHOWN]:
         say(f"lost: {_loss_text(loss)}")
     if len(summary.losses) > _LOSSES_SHOWN:
-        say(f"lost: {len(summary.losses) - _LOSSES_SHOWN} places more; dataset.yaml lists them")
+        say(f"lost: {len(summary.losses) - _LOSSES_SHOWN} more places, listed in dataset.yaml")
     if not any(topic.files for topic in summary.topics):
-        say("no topic became a video: all messages are in messages.mcap as they were")
+        say("no topic became a video: all messages are stored unchanged in messages.mcap")
     if summary.not_copied:
-        say(f"encoded again, as it cannot be copied: {summary.not_copied}")
+        say(f"re-encoded, because it cannot be copied: {summary.not_copied}")
     if summary.is_copy:
         say(f"{summary.dataset}: {size_text(summary.dataset_bytes)}, copied")
         return
@@ -194,8 +194,8 @@ def print_unpack(summary: UnpackSummary, noun: str) -> None:
     total = sum(summary.messages.values())
     say(f"{summary.output}: {total} {noun} of {len(summary.messages)} topics")
     for topic, now in summary.republished.items():
-        taken = f" ({now.instead_of} is taken)" if now.instead_of else ""
-        say(f"{topic}: given as {now.topic}, {now.type_name}{taken}")
+        taken = f" (the name {now.instead_of} is taken)" if now.instead_of else ""
+        say(f"{topic}: written as {now.topic}, {now.type_name}{taken}")
     for topic, reasons in summary.as_recorded.items():
         for reason, count in reasons.items():
             say(f"{topic}: {count} messages as recorded: {reason}")
@@ -207,7 +207,7 @@ def print_unpack(summary: UnpackSummary, noun: str) -> None:
     if summary.converted:
         say(f"converted between ROS 1 and ROS 2: {', '.join(summary.converted)}")
     for what, count in summary.omitted.items():
-        say(f"not held by this format: {count} {what}")
+        say(f"not supported by this format: {count} {what}")
     if summary.left_out:
         say(f"left out: {', '.join(summary.left_out)}")
 
@@ -217,9 +217,9 @@ def print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> None
     for problem in chain.from_iterable(found.values()):
         say(problem)
     count = sum(map(len, found.values()))
-    problems = f"{count} problem{'s' * (count > 1)}" if count else "no problem"
+    problems = f"{count} problem{'s' * (count > 1)}" if count else "no problems"
     depth = (
-        "every video was read to its end, every message with a digest compared"
+        "every video was decoded, every message with a digest checked"
         if deep
         else "frames were not decoded (--deep does)"
     )
@@ -227,7 +227,7 @@ def print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> None
         say(f"{next(iter(found))}: {problems}; {depth}")
         return
     wrong = sum(map(bool, found.values()))
-    where = f" in {wrong} of them" if wrong else ""
+    where = f" in {wrong} datasets" if wrong else ""
     say(f"{len(found)} datasets: {problems}{where}; {depth}")
 
 
@@ -318,9 +318,9 @@ def _number(value: float | None, digits: int) -> str:
 _PIPE_WIDTH = 160
 _SPEED_COLUMNS = [
     ("topic", "fold"),
-    ("a frame", "right"),
-    ("ms at random", "right"),
-    ("ms in order", "right"),
+    ("per frame", "right"),
+    ("ms, random access", "right"),
+    ("ms, in order", "right"),
 ]
 _PACK_COLUMNS = [
     ("topic", "fold"),

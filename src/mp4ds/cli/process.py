@@ -24,7 +24,7 @@ from mp4ds.cli.options import in_flags
 from mp4ds.cli.output import complain, print_json, printed
 from mp4ds.errors import Mp4dsError, sentence_of
 
-_AGAIN = "run the same command again to go on"
+_AGAIN = "run the same command again to resume"
 _BAD_PATH = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EACCES, errno.EINVAL)
 DEBUG = "MP4DS_DEBUG"
 _NO_MEMORY = "out of memory; try fewer --jobs"
@@ -41,9 +41,9 @@ def told_errors(as_json: bool) -> Iterator[None]:
     except (typer.Exit, typer.Abort, typer.BadParameter):
         raise
     except KeyboardInterrupt as interrupt:
-        _fail(str(interrupt) or "interrupted; nothing unfinished was left behind", 130, as_json)
+        _fail(str(interrupt) or "interrupted; no partial output was left behind", 130, as_json)
     except SystemExit as ended:  # by SIGTERM
-        _fail("ended; what is finished of a pack in parts is kept: " + _AGAIN, ended.code, as_json)
+        _fail("terminated; finished parts of a pack are kept: " + _AGAIN, ended.code, as_json)
     except Mp4dsError as error:
         _fail(in_flags(str(error)), error.exit_code, as_json)
     except OSError as error:
@@ -78,15 +78,15 @@ def _fail(
 
 def _unexpected(error: Exception) -> str:
     """A sentence about an error that nobody thought of."""
-    said = " ".join(str(error).split())[:_LONGEST].rstrip(".") or "no more is told"
+    said = " ".join(str(error).split())[:_LONGEST].rstrip(".") or "no details"
     place = ""
     for frame in traceback.extract_tb(error.__traceback__):
         path = Path(frame.filename)
         if _PACKAGE in path.parents:
             place = f" in {path.relative_to(_PACKAGE).as_posix()}:{frame.lineno}"
     return (
-        f"{type(error).__name__}{place}: {said}. This is not meant to happen: please report it, "
-        f"with the versions told here and what {DEBUG}=1 shows."
+        f"{type(error).__name__}{place}: {said}. This is a bug: please report it, with the "
+        f"versions listed here and the output with {DEBUG}=1."
     )
 
 

@@ -302,7 +302,7 @@ class Log:
             self._line(
                 f"started {began:%Y-%m-%d}",
                 f"{size_text(sum(state.bytes_total for state in states))} to pack",
-                f"{before} parts were done before" if before else "",
+                f"{before} parts were already done" if before else "",
                 at=began,
             )
         elif seconds - self._told < min(

@@ -156,7 +156,8 @@ class ChannelGroup:
                     raise FormatError(
                         "messages-missing",
                         place,
-                        f"message {self._free(given)} of topic {self.channel.topic} is in no file",
+                        f"message {self._free(given)} of topic {self.channel.topic} is not in "
+                        "any file",
                     )
                 yield verbatim
                 given += 1
@@ -207,9 +208,9 @@ class ChannelGroup:
         places = self.places
         total = len(places) + recorded
         if len(np.unique(places)) < len(places):
-            return "two messages have the same place"
+            return "two messages have the same number"
         if places[-1] >= total:
-            return f"has {total} messages and one of number {places[-1]}"
+            return f"has {total} messages, and one with number {places[-1]}"
         return ""
 
     def _placed(self, reading: Reading) -> Iterator[tuple[int, Message]]:

@@ -94,8 +94,8 @@ def _problems(path: Path, deep: bool, report: _Report) -> list[Problem]:
     if sidecar.suffix not in (".yaml", ".yml"):
         raise SourceError(
             path,
-            "is neither a dataset, a sidecar nor a video of one",
-            "Give a dataset folder, a .yaml sidecar, or an .mp4 beside its sidecar.",
+            "is not a dataset, a sidecar or a dataset's video",
+            "Give a dataset folder, a .yaml sidecar, or an .mp4 next to its sidecar.",
         )
     model, problems = _read(sidecar, "stream", StreamSidecar)
     if model is None:
@@ -128,7 +128,7 @@ def _read(path: Path, kind: str, model: type[_Model]) -> tuple[_Model | None, li
     except FormatError as error:
         return None, [Problem(error.code, error.place, error.problem)]
     if document["kind"] != kind:
-        return None, [Problem("kind-unknown", str(path), f"is no {kind}")]
+        return None, [Problem("kind-unknown", str(path), f"is not a {kind}")]
     problems = [
         Problem("schema-invalid", f"{path} at {'.'.join(map(str, error.absolute_path))}", reason)
         for error in _schema_validator(kind).iter_errors(document)
@@ -190,12 +190,12 @@ def _check_files(folder: Path, manifest: Manifest, report: _Report) -> Iterator[
     for entry in manifest.files:
         path = folder / entry.name
         if not path.is_file():
-            yield Problem("file-missing", str(path), "is listed in the manifest and not there")
+            yield Problem("file-missing", str(path), "is listed in the manifest but missing")
             continue
         size = path.stat().st_size
         if size != entry.size:
             yield Problem(
-                "size-mismatch", str(path), f"has {size} bytes where the manifest says {entry.size}"
+                "size-mismatch", str(path), f"has {size} bytes, but the manifest says {entry.size}"
             )
         elif path.suffix == ".yaml":
             yield from _check_hash(path, entry, report)
@@ -212,9 +212,7 @@ def _check_hashes(folder: Path, manifest: Manifest, report: _Report) -> Iterator
 def _check_hash(path: Path, entry: FileEntry, report: _Report) -> Iterator[Problem]:
     report(f"hashing {path.name}", None)
     if digest_file(path)[1] != entry.sha256:
-        yield Problem(
-            "hash-mismatch", str(path), "does not have the SHA-256 that the manifest says"
-        )
+        yield Problem("hash-mismatch", str(path), "does not match the SHA-256 in the manifest")
 
 
 def _check_listed(folder: Path, manifest: Manifest) -> Iterator[Problem]:
@@ -247,7 +245,7 @@ def _check_entry(folder: Path, entry: StreamEntry, sidecar: StreamSidecar) -> It
             yield Problem(
                 "manifest-inconsistent",
                 str(folder / MANIFEST_NAME),
-                f"says {what} {listed} for {entry.sidecar}, which says {own}",
+                f"gives {what} {listed} for {entry.sidecar}, which gives {own}",
             )
 
 
@@ -271,7 +269,7 @@ def _check_count(stream: Stream, coded: int) -> Iterator[Problem]:
         yield Problem(
             "frame-count",
             str(stream.video_path),
-            f"has {coded} frames where its sidecar says {len(stream)}",
+            f"has {coded} frames, but its sidecar says {len(stream)}",
         )
 
 
@@ -332,7 +330,7 @@ def _check_messages(dataset: Dataset, manifest: Manifest) -> list[Problem]:
             return gaps
         total = sum(map(_modelled, dataset.streams)) + sum(dataset.recorded_counts.values())
         if total != manifest.messages:
-            problem = f"and the videos hold {total} messages where the manifest says "
+            problem = f"and the videos hold {total} messages, but the manifest says "
             return [Problem("message-count", place, f"{problem}{manifest.messages}")]
         return list(_check_limits(dataset, manifest, (), place))
     except FormatError as error:
@@ -367,7 +365,7 @@ def _counted(dataset: Dataset, place: str) -> Iterator[Record]:
     told = dataset.recorded_counts
     for key in counts.keys() | told.keys():
         if counts[key] != told.get(key, 0):
-            problem = f"holds {counts[key]} messages of channel {key}, its index tells of "
+            problem = f"holds {counts[key]} messages of channel {key}, but its index lists "
             raise FormatError("messages-unreadable", place, f"{problem}{told.get(key, 0)}")
 
 
@@ -441,7 +439,7 @@ def wrong_facts(path: Path, video: VideoModel, *, deep: bool) -> Iterator[Format
     size = path.stat().st_size
     if video.size is not None and size != video.size:
         yield VideoError(
-            "size-mismatch", path, f"has {size} bytes where its sidecar says {video.size}"
+            "size-mismatch", path, f"has {size} bytes, but its sidecar says {video.size}"
         )
         return
     references = video.references
@@ -457,7 +455,7 @@ def wrong_facts(path: Path, video: VideoModel, *, deep: bool) -> Iterator[Format
         return
     found = digest_video(path, video.codec)
     if video.sha256 not in (None, found.sha256):
-        yield VideoError("hash-mismatch", path, "does not have the SHA-256 that its sidecar says")
+        yield VideoError("hash-mismatch", path, "does not match the SHA-256 in its sidecar")
     elif due is not None and (problem := _difference(due, found.structures)):
         yield _unfit(path, problem)
 
@@ -481,14 +479,14 @@ def _structures(path: Path, references: References) -> Structures:
 
 def _difference(told: Structures, found: Structures | None) -> str:
     if found is None or len(found.groups) != len(told.groups):
-        return "its packets do not tell any"
+        return "its packets do not show any"
     numbers = {text: number for number, text in enumerate(found.texts)}
     as_found = np.array([numbers.get(text, -1) for text in told.texts])
     wrong = np.flatnonzero(as_found[told.groups] != found.groups)
-    return f"the packets of its group of pictures {wrong[0]} tell others" if len(wrong) else ""
+    return f"the packets of its group of pictures {wrong[0]} show others" if len(wrong) else ""
 
 
 def _unfit(path: Path, problem: str) -> FormatError:
     return FormatError(
-        "references-invalid", path, f"does not fit the references in its sidecar: {problem}"
+        "references-invalid", path, f"does not match the references in its sidecar: {problem}"
     )

@@ -55,7 +55,7 @@ def _datasets_at(path: Path) -> list[Path]:
         except SourceError:
             continue  # a pattern matches other folders, too
     if not found:
-        raise SourceError(path, "matches no dataset", "Give folders that `mp4ds pack` made.")
+        raise SourceError(path, "matches no dataset", "Give folders made by `mp4ds pack`.")
     return found
 
 
@@ -71,7 +71,7 @@ def _below(path: Path) -> list[Path]:
         raise SourceError(
             path,
             f"holds no dataset: there is no {MANIFEST_NAME} in it or below it",
-            "Give the folder that `mp4ds pack` made.",
+            "Give a folder made by `mp4ds pack`.",
         )
     return found
 
@@ -109,7 +109,9 @@ def each(
         try:
             yield from zip(items, pool.map(partial(_worked, work), items), strict=True)
         except BrokenProcessPool:
-            raise Mp4dsError("A process died: memory may be short. Try fewer `jobs`.") from None
+            raise Mp4dsError(
+                "A worker process died, perhaps out of memory. Try fewer `jobs`."
+            ) from None
         except BaseException:  # nobody waits for what is being worked on
             for process in set(multiprocessing.active_children()) - before:
                 process.terminate()

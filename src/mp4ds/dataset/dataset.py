@@ -63,7 +63,7 @@ class Dataset:
 
     Raises:
         SourceNotFoundError: There is nothing.
-        SourceError: What is there is no dataset.
+        SourceError: What is there is not a dataset.
         FormatError: A file breaks a rule of the format.
     """
 
@@ -77,10 +77,10 @@ class Dataset:
         self.manifest: Manifest | None = None
         holds_one = (self.path / MANIFEST_NAME).exists()
         if not holds_one and self.path.suffix not in (".yaml", ".yml", ".mp4"):
-            problem = "is no dataset"
-            remedy = "Give a folder that `mp4ds pack` made, or a sidecar beside its video."
+            problem = "is not a dataset"
+            remedy = "Give a folder made by `mp4ds pack`, or a sidecar next to its video."
             if video := video_at(self.path):
-                problem, remedy = f"is {video}, and no dataset", HOW_TO_OPEN
+                problem, remedy = f"is {video}, not a dataset", HOW_TO_OPEN
             raise SourceError(self.path, problem, remedy)
         if self.path.is_dir():
             self.manifest = load_manifest(self.path / MANIFEST_NAME)
@@ -262,7 +262,7 @@ class Dataset:
         except KeyError as error:
             raise OptionError(str(error.args[0])) from None
         if len(stamps) < len(topics):
-            raise OptionError(f"a topic stands twice among {', '.join(topics)}")
+            raise OptionError(f"a topic is given twice: {', '.join(topics)}")
         return synchronize(stamps, tolerance_ns=tolerance_ns, reference=reference)
 
     def records(

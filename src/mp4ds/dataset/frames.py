@@ -57,11 +57,11 @@ class StampIndex:
             OptionError: There is no such mode or tolerance.
         """
         if mode not in _WANTED:
-            raise OptionError(f"there is no mode {mode!r}: use {', '.join(_WANTED)}")
+            raise OptionError(f"mode {mode!r} is not known: use {', '.join(_WANTED)}")
         stamp = as_integer(stamp_ns)
         tolerance = None if tolerance_ns is None else as_integer(tolerance_ns)
         if tolerance is not None and tolerance < 0:
-            raise OptionError(f"a tolerance of {tolerance} ns: use 0 or more")
+            raise OptionError(f"tolerance is {tolerance} ns: use 0 or more")
         earlier, later = self._around(stamp)
         near = [place for place in (earlier, later) if place is not None]
         nearest = min(near, key=lambda place: abs(self._stamp(place) - stamp))
@@ -115,13 +115,13 @@ def numbers_of(topic: str, count: int, indices: Sequence[int] | NDArray[np.int64
     numbers = []
     for index in indices.tolist() if isinstance(indices, np.ndarray) else indices:
         if isinstance(index, bool):
-            raise TypeError("frames are chosen by number: give np.flatnonzero(mask) of a mask")
+            raise TypeError("frames are selected by number: for a mask, give np.flatnonzero(mask)")
         asked = as_integer(index)
         number = asked + count if asked < 0 else asked
         if not 0 <= number < count:
             raise IndexError(
-                f"{topic} has {count} frames, and no frame {asked}: they are 0 to {count - 1}, "
-                f"or {-count} to -1 from the end"
+                f"{topic} has no frame {asked}: its {count} frames are 0 to {count - 1}, or "
+                f"{-count} to -1 from the end"
             )
         numbers.append(number)
     return numbers

@@ -42,7 +42,7 @@ class MessagesFile:
         entry = next((item for item in manifest.files if item.name == MESSAGES_NAME), None)
         if entry is None or digest_file(self.path)[1] != entry.sha256:
             raise FormatError(
-                "hash-mismatch", self.path, "does not have the SHA-256 that the manifest says"
+                "hash-mismatch", self.path, "does not match the SHA-256 in the manifest"
             )
 
     @staticmethod
@@ -66,7 +66,7 @@ class MessagesFile:
             raise FormatError(
                 "messages-unreadable",
                 self.path,
-                "has no index of all that it holds; copy it again, or see `mcap recover`",
+                "has no complete index; copy it again, or run `mcap recover`",
             )
         return reader
 

@@ -54,7 +54,7 @@ def span_in(dataset: Dataset, asked: Slice) -> Excerpt:
         return EVERYTHING
     times = [one for one in dataset.times().values() if len(one)]
     if not times:
-        raise OptionError(f"{dataset.path} has no messages, of which a slice could be taken.")
+        raise OptionError(f"{dataset.path} has no messages to take a slice of.")
     first, last = min(int(one[0]) for one in times), max(int(one[-1]) for one in times)
     return Excerpt(*asked.times(first, last, dataset.path))
 
@@ -81,7 +81,7 @@ def sliced(dataset: Dataset, asked: Slice, folder: Path) -> Iterator[Dataset]:
     try:
         copy_part(dataset, path, span=span_in(dataset, asked))
     except Refused as reason:
-        raise OptionError(f"{dataset.path}: no slice can be taken: {reason}.") from None
+        raise OptionError(f"{dataset.path} cannot be sliced: {reason}.") from None
     try:
         with Dataset(path, jpeg_quality=dataset.jpeg_quality) as opened:
             yield opened
@@ -147,7 +147,7 @@ class _Part:
         self, dataset: Dataset, folder: Path, span: Excerpt, selected: Callable[[str], bool]
     ) -> None:
         if dataset.manifest is None:
-            raise Refused("it is one video, and no dataset")
+            raise Refused("it is a single video, not a dataset")
         self._old = dataset.manifest
         self._dataset = dataset
         self._folder = folder
@@ -182,7 +182,7 @@ class _Part:
             Refused: Says why.
         """
         if self._is_slice and not self._dataset.is_in_time:
-            raise Refused("log times do not tell the order of its messages")
+            raise Refused("its messages are not ordered by log time")
         for cut in self._cuts:
             info = cut.stream.sidecar.camera_info
             if (
@@ -190,9 +190,9 @@ class _Part:
                 and info.messages
                 and self._selected(info.channel.topic) != self._selected(cut.stream.topic)
             ):
-                raise Refused(f"{cut.stream.topic} and {info.channel.topic} are one stream")
+                raise Refused(f"{cut.stream.topic} and {info.channel.topic} share one stream")
             if np.any(np.diff(cut.images) != 1):
-                raise Refused(f"frames of {cut.stream.topic} are not in the order of their times")
+                raise Refused(f"frames of {cut.stream.topic} are not ordered by time")
 
     def write(self, about: About | None) -> Manifest:
         """Write all files, and the manifest at last."""
@@ -298,7 +298,7 @@ class _Part:
             raise VideoError(
                 "hash-mismatch",
                 stream.video_path,
-                "does not have the SHA-256 that its sidecar says",
+                "does not match the SHA-256 in its sidecar",
             )
         if video.quality is not None:
             changes["quality"] = video.quality.of(numbers, len(stream))

@@ -131,7 +131,7 @@ class MessageRebuilder:
             else:
                 body = prefix + depth.encode_rvl(pixels)
         except Refused as error:
-            raise self._failure("header-mismatch", index, f"cannot be made: {error}") from None
+            raise self._failure("header-mismatch", index, f"cannot be rebuilt: {error}") from None
         if self._digests is None:  # its length may be another than the recorded one's
             body += bytes(self._templates[variant].padding(len(body)))
         return self._verified(index, self._around(index, body))
@@ -150,7 +150,7 @@ class MessageRebuilder:
         try:
             body = body_of(self._sidecar.video.codec, packet, framing)
         except Refused as error:
-            raise self._failure("decode-failed", index, f"cannot be made: {error}") from None
+            raise self._failure("decode-failed", index, f"cannot be rebuilt: {error}") from None
         return self._verified(index, self._around(index, body))
 
     def _with_pixels(self, index: int, picture: Picture) -> bytes | bytearray:
@@ -191,13 +191,11 @@ class MessageRebuilder:
         remark = ""
         if header.png and header.png.deflate != zlib_fingerprint():
             remark = (
-                f": its PNG file is made again by zlib, and this Python has {zlib_build()}, which "
-                "makes other bytes. Use a Python that is linked with zlib itself, or unpack with "
-                "`images` raw"
+                f": its PNG file is rebuilt with zlib, and this Python has {zlib_build()}, which "
+                "compresses to different bytes. Use a Python linked with plain zlib, or unpack "
+                "with `images` raw"
             )
-        raise self._failure(
-            "digest-mismatch", index, f"does not come back as it was recorded{remark}"
-        )
+        raise self._failure("digest-mismatch", index, f"differs from what was recorded{remark}")
 
     def _failure(self, code: str, index: int, problem: str) -> FormatError:
         topic = self._sidecar.channel.topic
@@ -228,7 +226,7 @@ class MessageRebuilder:
             dues = (self._padding_size, self._padding_size - per_row)
             if padding is not None and (not per_row or len(padding) not in dues):
                 raise FormatError(
-                    "header-mismatch", place, f"has not the {dues[0]} bytes that rows leave"
+                    "header-mismatch", place, f"does not have the {dues[0]} bytes that rows leave"
                 )
             self._paddings = {variant: padding}  # one of them: they may be large
         return self._paddings[variant]
@@ -263,7 +261,7 @@ def _inflated(text: str, most: int) -> bytes:
     except zlib.error as error:
         raise ValueError(f"cannot be inflated: {error}") from None
     if len(data) <= most and (not inflater.eof or inflater.unused_data):
-        raise ValueError("is not one whole stream of zlib")
+        raise ValueError("is not a single complete zlib stream")
     return data
 
 
@@ -315,7 +313,7 @@ class Stream(DecodedFrames):
             ) from None
         if self.sidecar.frames > size:  # a coded frame takes a byte at least
             raise FormatError(
-                "frame-count", self.path, f"claims {self.sidecar.frames} frames in {size} bytes"
+                "frame-count", self.path, f"declares {self.sidecar.frames} frames in {size} bytes"
             )
         count, variants = self.sidecar.frames, len(self.sidecar.headers)
         return decode_columns(self.sidecar.columns, count, variants, str(self.path))
@@ -434,7 +432,7 @@ class Stream(DecodedFrames):
         if len(prefix) != depth.HEADER_BYTES:
             raise OptionError(
                 f"frame {index} of {self.topic} holds quantised depths without their parameters: "
-                "it is given as format='native' alone"
+                "only format='native' is available"
             )
         return depth.metres_of(pixels, prefix)
 
@@ -536,7 +534,7 @@ class Stream(DecodedFrames):
             raise FormatError(
                 "hash-mismatch",
                 self.video_path,
-                "does not have the SHA-256 that its sidecar says",
+                "does not match the SHA-256 in its sidecar",
             )
 
     def camera_info_messages(

@@ -157,7 +157,7 @@ class TopicFrames(Frames):
         kinds = ["{}x{} {}".format(*stream.image_size, stream.encoding) for stream in self.streams]
         names = ", ".join(stream.path.stem for stream in self.streams)
         raise OptionError(
-            f"{self.topic} changes its size or encoding: {', '.join(dict.fromkeys(kinds))}. Ask "
+            f"{self.topic} changes its size or encoding: {', '.join(dict.fromkeys(kinds))}. Check "
             "each frame, read them with resize=(width, height) and format='rgb' or 'gray', or "
             f"choose one of the streams {names}"
         )

@@ -181,7 +181,7 @@ def view_of(
         OptionError: There is no such format, part or size, or not of these images.
     """
     if format not in FORMATS:
-        raise OptionError(f"there is no format {format!r} of frames: use {', '.join(FORMATS)}")
+        raise OptionError(f"format {format!r} is not known: use {', '.join(FORMATS)}")
     width, height = image_size
     part = _part(topic, image_size, crop) if crop is not None else (0, 0, width, height)
     cut = part[2:]
@@ -191,8 +191,8 @@ def view_of(
     if format == "depth_m":
         if encoding.name not in DEPTHS:
             raise OptionError(
-                f"{topic} has {encoding.name} images, which are no depths: format='depth_m' is for "
-                f"those of {', '.join(DEPTHS)}"
+                f"{topic} has {encoding.name} images, which are not depths: format='depth_m' is "
+                f"for {', '.join(DEPTHS)}"
             )
         given = ENCODINGS["32FC1"]
     elif format != "native" or not is_whole:
@@ -221,9 +221,11 @@ def _part(topic: str, image_size: _Size, crop: Sequence[int]) -> _Part:
     try:
         x, y, columns, rows = (as_integer(value) for value in crop)
     except (TypeError, ValueError):
-        raise OptionError(f"a crop is (x, y, width, height) in pixels, not {crop!r}") from None
+        raise OptionError(f"crop must be (x, y, width, height) in pixels, not {crop!r}") from None
     if min(x, y) < 0 or min(columns, rows) < 1 or x + columns > width or y + rows > height:
-        raise OptionError(f"a crop of {tuple(crop)} is not within the {width}x{height} of {topic}")
+        raise OptionError(
+            f"crop {tuple(crop)} is not inside the {width}x{height} images of {topic}"
+        )
     return x, y, columns, rows
 
 
@@ -265,15 +267,15 @@ def _given(
         name = encoding_as(encoding, colours)
         if name is None:
             raise OptionError(
-                f"{topic} has {encoding.name} images, which are numbers and no light: they are "
-                f"given as format='native', not {colours!r}"
+                f"{topic} has {encoding.name} images, which are measurements, not colour: use "
+                f"format='native', not {colours!r}"
             )
         return ENCODINGS[name]
     is_yuv = encoding.even != (1, 1) or encoding.rows != 1
     if is_yuv or (encoding.mosaic and is_resized):
         raise OptionError(
-            f"{topic} has {encoding.name} images, which can be cut and resized as rgb, bgr or "
-            "gray only: give format="
+            f"{topic} has {encoding.name} images, which can only be cropped and resized as rgb, "
+            "bgr or gray: give format="
         )
     if not encoding.mosaic:
         return encoding
@@ -312,9 +314,9 @@ def output(out: Pixels | None, shape: tuple[int, ...], dtype: np.dtype[np.generi
         return np.empty(shape, dtype)
     if not isinstance(out, np.ndarray) or (out.shape, out.dtype) != (shape, dtype):
         found = f"{out.dtype} {out.shape}" if isinstance(out, np.ndarray) else type(out).__name__
-        raise OptionError(f"out is {found} where an array of {dtype} {shape} is needed")
+        raise OptionError(f"out is {found}, not an array of {dtype} {shape}")
     if not out.flags.writeable:
-        raise OptionError("out cannot be written to")
+        raise OptionError("out is not writeable")
     return out
 
 

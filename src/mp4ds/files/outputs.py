@@ -144,7 +144,7 @@ def check_replaceable(target: Path, owned: Owned) -> None:
         raise TargetError(
             target,
             "is a symbolic link, which `force` does not replace",
-            f"Name {os.path.realpath(target)} itself, or remove the link.",
+            f"Give {os.path.realpath(target)} itself, or remove the link.",
         )
     is_folder = target.is_dir()
     if is_folder and not any(target.iterdir()):
@@ -163,7 +163,7 @@ def refuse_not_ours(target: Path, names: Iterable[str] | None) -> set[str]:
     if names is None:
         raise TargetError(
             target,
-            "exists and is not something that mp4ds wrote, so `force` does not replace it",
+            "exists and was not written by mp4ds, so `force` does not replace it",
             "Choose another name, or remove it yourself.",
         )
     return set(names)
@@ -178,11 +178,11 @@ def refuse_strangers(target: Path, others: Collection[str]) -> None:
     if not others:
         return
     listed = ", ".join(sorted(others)[:_NAMED]) + (", ..." if len(others) > _NAMED else "")
-    what = "1 thing" if len(others) == 1 else f"{len(others)} things"
+    what = "1 item" if len(others) == 1 else f"{len(others)} items"
     raise TargetError(
         target,
         f"holds {what} that mp4ds did not write ({listed}), so `force` does not replace it",
-        "Move that elsewhere, or choose another name.",
+        "Move them elsewhere, or choose another name.",
     )
 
 
@@ -434,10 +434,12 @@ def check_place(target: Path, sources: Sequence[Path]) -> None:
     for source in (path.resolve() for path in sources):
         if place == source or source in place.parents or place in source.parents:
             raise TargetError(
-                target, f"overlaps with the source {source}", "Choose a place beside the source."
+                target,
+                f"overlaps with the source {source}",
+                "Choose a location outside the source.",
             )
     if not target.parent.is_dir():
-        raise TargetError(target, f"{target.parent} is no folder", "Make the folder first.")
+        raise TargetError(target, f"{target.parent} is not a folder", "Create the folder first.")
 
 
 def as_write_error(error: OSError, target: Path) -> OSError:

@@ -38,8 +38,8 @@ _CONTAINERS = [
     )
 ]
 HOW_TO_OPEN = (
-    "`mp4ds.open` reads the frames of an .mp4 or .mov, without packing; "
-    "`ffmpeg -i VIDEO -c copy VIDEO.mp4` makes one of others."
+    "`mp4ds.open` reads frames of an .mp4 or .mov without packing; to convert other videos, run "
+    "`ffmpeg -i VIDEO -c copy VIDEO.mp4`."
 )
 """What to do with a video that is given instead of a recording or dataset."""
 
@@ -173,8 +173,8 @@ class SourceState:
         if SourceState.of(path) != self:
             raise SourceError(
                 path,
-                "has changed since its packing began",
-                "Start over with `restart`, or give the file back as it was.",
+                "has changed since packing began",
+                "Start over with `restart`, or restore the file as it was.",
             )
 
 
@@ -209,8 +209,8 @@ def unchanged(states: Sequence[SourceState]) -> Iterator[None]:
             if SourceState.of(path) != state or any(map(_differ, identities, _identities(path))):
                 raise SourceError(
                     path,
-                    "changed while it was read",
-                    "Pack it again when nothing writes to it any more.",
+                    "changed while it was being read",
+                    "Pack it again when nothing is writing to it.",
                 )
 
     try:

@@ -89,11 +89,11 @@ class Store:
             from fsspec.config import conf
             from fsspec.core import url_to_fs
         except ImportError:
-            raise OptionError(f"{path}: URLs need more than is installed. Run: {INSTALL}") from None
+            raise OptionError(f"{path}: URLs need an optional dependency. Run: {INSTALL}") from None
         if self.scheme not in fsspec.available_protocols():
             raise OptionError(
-                f"{path}: {self.scheme}:// is not known. Use s3, gs, https, http, file, or "
-                "another scheme of fsspec."
+                f"{path}: {self.scheme}:// is not supported. Use s3, gs, https, http, file, or "
+                "another fsspec scheme."
             )
         options: dict[str, Any] = {}
         if self.scheme in _S3 and "config_kwargs" not in conf.get("s3", {}):
@@ -105,7 +105,7 @@ class Store:
 
                 self._fs = RangeFileSystem(**self._fs.storage_options)
         except ImportError as error:
-            problem = f"{path}: URLs of {self.scheme}:// need more than is installed"
+            problem = f"{path}: {self.scheme}:// URLs need an optional dependency"
             remedy = f"Run: {INSTALL}." if self.scheme in _INSTALLED else f"{_text(error)}."
             raise OptionError(f"{problem}. {remedy}") from None
         except Exception as error:
@@ -152,10 +152,10 @@ class Store:
                     if isinstance(error, BaseException):
                         raise error
         except FileNotFoundError:
-            raise _remote_error(path, "could not be read: it is gone") from None
+            raise _remote_error(path, "could not be read: it no longer exists") from None
         for (start, end), data in zip(ranges, found, strict=True):
             if len(data) != end - start:
-                problem = f"{len(data)} bytes came of {end - start} from byte {start} on"
+                problem = f"got {len(data)} of {end - start} bytes from byte {start} on"
                 raise _remote_error(path, f"could not be read: {problem}", _NETWORK)
         return found
 
@@ -172,7 +172,7 @@ class Store:
             with _sentences(path):
                 self._fs.cat_file(self._key(path), start=size - 1, end=size)
         except FileNotFoundError:
-            raise _remote_error(path, "could not be read: it is gone") from None
+            raise _remote_error(path, "could not be read: it no longer exists") from None
 
     def names(self, path: Place) -> list[str]:
         """Names of what is directly in a folder; none where the store does not list."""
@@ -245,15 +245,13 @@ def _sentences(path: Place, done: str = "read") -> Iterator[None]:
     except Mp4dsError:
         raise
     except NoRangesError:
-        problem = "its web server does not serve parts of files (byte ranges)"
-        raise _refusal(
-            path, f"cannot be read where it is: {problem}", "Download it first."
-        ) from None
+        problem = "its web server does not support range requests"
+        raise _refusal(path, f"cannot be read remotely: {problem}", "Download it first.") from None
     except Exception as error:
         verdict, reason = explained(error)
         if verdict == "missing" and done != "uploaded":
             raise FileNotFoundError(str(path)) from None
-        what = "access is refused: " if verdict == "refused" else ""
+        what = "access denied: " if verdict == "refused" else ""
         if verdict == "failed" or done == "fetched":  # the latter was allowed before
             done = "read" if done == "fetched" else done
             raise _remote_error(path, f"could not be {done}: {what}{reason}", _NETWORK) from None

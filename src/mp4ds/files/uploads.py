@@ -60,8 +60,8 @@ def uploaded(
         old = _replaced(target, is_folder=is_folder, force=force, owned=owned)
         _probe(target / _PROBE if is_folder else target.with_name(f"{target.name}{_PROBE}"))
         made = make(local)
-        kept = f"What was made is kept in {local}: copy it there with a tool of your own"
-        kept += f", {last} last, or run the command again." if last else ", or run again."
+        kept = f"The output is kept in {local}: copy it with a tool of your choice"
+        kept += f"({last} last), or run the command again." if last else ", or run again."
         try:
             _send(local, target, old, last, report)
         except (TargetError, RemoteError) as error:
@@ -80,10 +80,10 @@ def local_path(target: RemotePath) -> Path:
     """
     shown = target
     if not target.is_writable:
-        problem = "is on a web server, which takes no uploads"
-        raise TargetError(shown, problem, "Name a place in a store, such as s3://.")
+        problem = "is on a web server, which does not accept uploads"
+        raise TargetError(shown, problem, "Give a location in a store, such as s3://.")
     if target.parent == target:
-        raise TargetError(shown, "is a whole bucket", "Name a folder in it.")
+        raise TargetError(shown, "is an entire bucket", "Give a folder in it.")
     digest = hashlib.sha256(str(target).encode()).hexdigest()
     folder = _own_folder() / f"{target.name[:60]}-{digest[:16]}"
     folder.mkdir(exist_ok=True)
@@ -98,10 +98,10 @@ def _own_folder() -> Path:
         stat = folder.lstat()
     except OSError as error:
         raise TargetError(
-            folder, f"cannot be made: {error.strerror}", "Name another folder by TMPDIR."
+            folder, f"cannot be created: {error.strerror}", "Set TMPDIR to another folder."
         ) from None
     if not folder.is_dir() or folder.is_symlink() or stat.st_uid != os.getuid():
-        raise TargetError(folder, "belongs to somebody else", "Name another folder by TMPDIR.")
+        raise TargetError(folder, "belongs to another user", "Set TMPDIR to another folder.")
     return folder
 
 
@@ -113,7 +113,7 @@ def _claimed(folder: Path, target: RemotePath) -> Iterator[None]:
             lock(file)
         except BlockingIOError:
             raise TargetError(
-                target, "another mp4ds is making it here", "Wait for it, or end it."
+                target, "another mp4ds is already making it here", "Wait for it, or stop it."
             ) from None
         try:
             yield

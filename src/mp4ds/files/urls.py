@@ -471,7 +471,7 @@ class RemotePath(Place):
         if facts.size is None:
             raise SourceError(
                 self,
-                "cannot be read where it is: its size is not told",
+                "cannot be read remotely: the server does not report its size",
                 "Download it first.",
             )
         return facts.size
@@ -543,7 +543,7 @@ class RemotePath(Place):
         now = RemotePath(self.url, self._store)
         sizes = now.stat().st_size if now.exists() else 0, local.stat().st_size
         if sizes[0] != sizes[1]:
-            problem = f"could not be uploaded: {sizes[0]} of {sizes[1]} bytes are there"
+            problem = f"could not be uploaded: only {sizes[0]} of {sizes[1]} bytes arrived"
             raise RemoteError(self, problem)
         return now
 

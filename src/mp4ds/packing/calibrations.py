@@ -68,12 +68,13 @@ def choose_pairs(choices: Sequence[str], channels: Sequence[Channel]) -> dict[in
         if info in image_of:
             raise OptionError(
                 f"`camera_info` gives {info} to {image_of[info]} and to {image}: a calibration "
-                "topic belongs to one stream only. The other can do without: its messages are kept."
+                "topic can belong to one stream only. Leave one of the two out: all messages are "
+                "kept."
             )
         if image in image_of.values():
             other = next(key for key, value in image_of.items() if value == image)
             raise OptionError(
-                f"`camera_info` gives {other} and {info} to {image}: a stream has one "
+                f"`camera_info` gives {other} and {info} to {image}: a stream can have one "
                 "calibration topic only."
             )
         image_of[info] = image
@@ -115,9 +116,9 @@ def _check_kind(
         return
     listed = ", ".join(sorted(wanted)[:_LISTED]) + (", ..." if len(wanted) > _LISTED else "")
     problem = (
-        f"{topic!r} holds {known[topic] or 'messages without a type'}, no {noun}"
+        f"{topic!r} holds {known[topic] or 'messages without a type'}, not {noun}"
         if topic in known
-        else f"there is no topic {topic!r} among those that are packed"
+        else f"{topic!r} is not among the packed topics"
     )
     raise OptionError(f"`camera_info` {choice!r}: {problem}. Topics of {noun}: {listed or 'none'}.")
 

@@ -130,8 +130,8 @@ class JobProgress:
 
 _LISTED = 10
 _JOINED_AT_ONCE = 4  # more would only wait for the disk
-_SHARED = "all machines must share the folder of the dataset"
-_KEPT = "interrupted; what is finished is kept: run the same command again to go on"
+_SHARED = "all machines must share the dataset's folder"
+_KEPT = "interrupted; finished parts are kept: run the same command again to resume"
 
 
 class Coordinator:
@@ -174,7 +174,7 @@ class Coordinator:
                 listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
                 raise OptionError(
                     f"{run.target}: {len(names)} of {len(run.job.tasks)} parts are missing: "
-                    f"{listed}. Run their shards, or pack without `join` to make them here."
+                    f"{listed}. Run their shards, or pack without `join` to pack them here."
                 )
 
     def run(self) -> Iterator[PackRun]:
@@ -224,7 +224,7 @@ class Coordinator:
         run, progress = self._runs[folder], self._progress[folder]
         error, task = outcome.error, run.job.task(name)
         if error is None and not is_seen(lambda: run.place.is_done(task), run.place.parts):
-            error = ("TargetError", f"its result is not seen in {run.place.parts}; {_SHARED}")
+            error = ("TargetError", f"its result did not appear in {run.place.parts}; {_SHARED}")
         if error is None:
             self._tell_done(run, [task], before=False)
         else:
@@ -314,7 +314,7 @@ def _digest(place: Workplace, number: int) -> tuple[int, str]:
     record = read_record(folder) or {}
     size, sha256 = record.get("size"), str(record.get("sha256"))
     if not isinstance(size, int) or not re.fullmatch("[0-9a-f]{64}", sha256):
-        raise FormatError("file-missing", folder, "is gone, or damaged since it was made")
+        raise FormatError("file-missing", folder, "disappeared or was damaged after it was made")
     return size, sha256
 
 

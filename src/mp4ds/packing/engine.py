@@ -180,9 +180,9 @@ class _Worker:
         said = f": {tail[-1]}" if tail else ""
         if code < 0:
             name = signal.Signals(-code).name if -code in list(signal.Signals) else str(-code)
-            hint = ", perhaps for want of memory" if -code == signal.SIGKILL else ""
-            return Outcome(task, ("Killed", f"its process was ended by {name}{hint}{said}"))
-        return Outcome(task, ("Failed", f"its process ended with code {code}{said}"))
+            hint = ", perhaps for lack of memory" if -code == signal.SIGKILL else ""
+            return Outcome(task, ("Killed", f"its process was killed by {name}{hint}{said}"))
+        return Outcome(task, ("Failed", f"its process exited with code {code}{said}"))
 
     def order(self, task: tuple[str, ...]) -> None:
         """Give it its next task."""

@@ -167,18 +167,18 @@ class Job:
         names = {task.name for task in self.tasks}
         numbers = (self.threads, self.workers, self.task_bytes)
         if len(names) != len(self.tasks):
-            raise ValueError("tasks of one name")
+            raise ValueError("two tasks with the same name")
         paths = [*self.paths, *(source.path for source in self.sources)]
         if not all(isinstance(path, str) and "\0" not in path for path in paths):
-            raise ValueError("a file whose name is none")
+            raise ValueError("a file with an invalid name")
         if any(not 0 <= (task.source or 0) < len(self.sources) for task in self.tasks):
-            raise ValueError("a task of a file that is none of the recording")
+            raise ValueError("a task of a file that is not in the recording")
         if not all(isinstance(number, int) and number > 0 for number in numbers):
-            raise ValueError("no number of threads or bytes")
+            raise ValueError("not a number of threads or bytes")
         if max(self.threads, self.workers) > _MOST_THREADS:
             raise ValueError("too many threads")
         if set(self.options) != set(_OUTCOME_OPTIONS):
-            raise ValueError("other options")
+            raise ValueError("different options")
         self.about  # noqa: B018 - refuses what cannot be told
 
     @property
@@ -247,7 +247,7 @@ class Job:
         if files is not None and absolute(files) != [source.path for source in self.sources]:
             raise SourceError(
                 location(self.paths[0]),
-                "consists of other files than when its packing began",
+                "consists of different files than when packing began",
                 "Start over with `restart`.",
             )
         for source in self.sources:
@@ -318,13 +318,15 @@ def open_recording(
 
 def _open_whole(paths: Sequence[Path], salvage: bool, images: ImageFolder | None) -> BagReader:
     if salvage and any(map(dataset_at, paths)):
-        raise OptionError("`salvage` goes with recordings, not with a dataset.")
+        raise OptionError("`salvage` works with recordings, not with a dataset.")
     if images is None:
         return open_sources(paths, salvage=salvage, opener=_open_one)
     if salvage:
-        raise OptionError("`salvage` goes with recordings, not with a folder of images.")
+        raise OptionError("`salvage` works with recordings, not with a folder of images.")
     if len(paths) != 1:
-        raise OptionError(f"One folder of images is read at a time, and {len(paths)} were given.")
+        raise OptionError(
+            f"Only one folder of images can be imported at a time, but {len(paths)} were given."
+        )
     reader: BagReader = plugin("images")(paths[0], images)
     return reader
 

@@ -365,8 +365,8 @@ class Assembler:
                 if found != due:
                     raise SourceError(
                         self._reader.path,
-                        f"is damaged: its index tells of {due} messages on {channel.topic}, "
-                        f"and {found} were found",
+                        f"is damaged: its index lists {due} messages on {channel.topic}, but "
+                        f"{found} were found",
                     )
 
     def _write_messages(self) -> None:
@@ -399,7 +399,7 @@ def _rotten(part: PartRecord, path: Path) -> FormatError:
     return FormatError(
         "checksum-mismatch",
         path,
-        "was damaged since it was written; run the same command again to make this part anew",
+        "was damaged after it was written; run the same command again to redo this part",
     )
 
 

@@ -61,7 +61,7 @@ def load_kept(data: bytes) -> dict[str, Any]:
     """
     text, mark, rest = data.rpartition(_MARK)
     if not mark or rest != xxhash.xxh64_hexdigest(text).encode() + _END:
-        raise ValueError("which is damaged, or another version's")
+        raise ValueError("which is damaged, or of another version")
     try:
         values: dict[str, Any] = json.loads(text + b"}")
     except RecursionError:
@@ -237,7 +237,7 @@ class _Record:
 
 
 def _damaged(folder: Path) -> FormatError:
-    return FormatError("file-missing", folder, "is gone, or damaged since it was made")
+    return FormatError("file-missing", folder, "disappeared or was damaged after it was made")
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
@@ -332,8 +332,8 @@ class Origin:
                 if sha256 not in (None, entry.sha256):
                     raise SourceError(
                         path,
-                        "does not have the SHA-256 that its dataset's manifest says",
-                        "See `mp4ds validate`, and copy it again.",
+                        "does not match the SHA-256 in its dataset's manifest",
+                        "Run `mp4ds validate` and copy it again.",
                     )
             elif path.name == MANIFEST_NAME and sha256 is not None:
                 manifest = load_manifest(path)
@@ -479,7 +479,7 @@ def summarize(
         if video.quality is not None:
             topic.notes.append(str(video.quality))
         if stream.is_renamed:
-            topic.notes.append(f"stored as {video.file}: the plain name was taken")
+            topic.notes.append(f"stored as {video.file}: its usual name was taken")
     dataset_bytes, messages_bytes = folder_size(part.folder), part.messages_path.stat().st_size
     return PackSummary(
         dataset=target,
@@ -501,20 +501,23 @@ def _why_larger(
     if dataset_bytes <= _LARGER * source_bytes:
         return ""
     if any(earlier.profile != LOSSLESS for earlier in origin.derived_from):
-        return "the videos of a lossy dataset are not encoded again as small as they were"
+        return "re-encoding the videos of a lossy dataset does not make them as small as they were"
     if origin.derived_from:
-        return "the dataset that it was read from has the smaller form"
+        return "the source dataset was stored in a smaller form"
     raw = sum(topic.raw_bytes for topic in part.topics.values())
     if raw <= source_bytes:
-        return "a recording this small takes less than the index, definitions and sidecars"
+        return "a recording this small takes less space than the index, definitions and sidecars"
     if 2 * messages_bytes > dataset_bytes:
-        return "the source's own compression (bz2, say) packs small messages closer than zstd does"
+        return (
+            "the source's own compression (such as bz2) stores small messages more compactly "
+            "than zstd"
+        )
     if any(stream.sidecar.body == "packet" for stream in part.streams):
         return (
-            "JPEG files and video packets are kept as they are, those that repeat, too, which the "
-            "source's own compression stores once"
+            "JPEG files and video packets are kept as they are, including repeated ones, which "
+            "the source's own compression stores only once"
         )
-    return "the source's own compression packs its images closer than a video does"
+    return "the source's own compression stores its images more compactly than a video"
 
 
 def folder_size(folder: Path) -> int:

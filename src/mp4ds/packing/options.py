@@ -151,7 +151,10 @@ class PackOptions(SliceOptions):
         if purpose is None:
             return self.gop or (LOSSLESS_GOP if self.setting.lossless else LOSSY_GOP)
         if self.gop is not None:
-            raise OptionError("`purpose` chooses what `gop` says. Give one of them.")
+            raise OptionError(
+                "`purpose` chooses the key frame interval itself. Give `purpose` or `gop`, not "
+                "both."
+            )
         if not purpose.is_training:
             return ARCHIVE_GOP
         return LOSSLESS_GOP if self.setting.lossless else LOSSY_TRAINING_GOP

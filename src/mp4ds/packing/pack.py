@@ -364,7 +364,8 @@ def pack_each(
         target = parent / (source.name if source.is_dir() else source.stem)
         if target in targets:
             raise OptionError(
-                f"{targets[target]} and {source} would both become {target}. Pack one elsewhere."
+                f"{targets[target]} and {source} would both become {target}. Pack one of them "
+                "elsewhere."
             )
         targets[target] = source
     if not remote(parent):
@@ -444,8 +445,8 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
     quality = parse_quality(asked)
     if options.transcode and quality.lossless:
         raise OptionError(
-            "`transcode` goes with a lossy `quality`, such as visual: without loss, a JPEG file "
-            "is smaller than any video of its pixels."
+            "`transcode` needs a lossy `quality`, such as visual: a JPEG file is smaller than "
+            "any lossless video of its pixels."
         )
     check_codec(
         options.codec,
@@ -480,7 +481,10 @@ def _quality_of(paths: Sequence[Path]) -> str:
         return LOSSLESS
     if len(found) == 1 and parse_quality(*found).crf is None:
         return found.pop()
-    raise OptionError(f"What was packed before has {', '.join(sorted(found))}. Give a `quality`.")
+    raise OptionError(
+        f"The source datasets have different qualities: {', '.join(sorted(found))}. Give a "
+        "`quality`."
+    )
 
 
 def _has_transcoded(paths: Sequence[Path]) -> bool:
@@ -510,7 +514,8 @@ def _plan(
         return PackRun(job, place, paths, target, options.force, is_new=False)
     if options.join:
         raise OptionError(
-            f"There is nothing to join: {place.folder} holds no pack. Run the shards first."
+            f"There is nothing to join: {place.folder} holds no pack in progress. Run the "
+            "shards first."
         )
     with open_recording(
         paths, salvage=options.salvage, images=options.images, asked=options.slice

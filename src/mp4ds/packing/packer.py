@@ -28,7 +28,9 @@ from mp4ds.records import EVERYTHING, Attachment, Channel, Excerpt, Message, Rec
 Exact = Mapping[tuple[int, StreamKey], str]
 """Id of a channel and key of streams that no score is asked of any more -> why."""
 
-NOT_SURVEYED = "images of its size or encoding were not met where the recording was looked into"
+NOT_SURVEYED = (
+    "images of its size or encoding were not in the parts of the recording that were surveyed"
+)
 
 
 @dataclass(frozen=True, slots=True)

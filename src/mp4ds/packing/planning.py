@@ -155,8 +155,8 @@ class Resources:
         if fitting < 1 and self.memory < job.task_bytes:
             needed = -(-job.task_bytes // 2**20)
             raise OptionError(
-                f"`memory` of {self.memory // 2**20} MiB is too little: one encoder of the "
-                f"largest images takes about {needed} MiB with what is around it."
+                f"`memory` of {self.memory // 2**20} MiB is too little: encoding the largest "
+                f"images takes about {needed} MiB."
             )
         return min(self.jobs or busy, max(1, fitting))
 

@@ -365,7 +365,7 @@ def _start_crf(
 
 def _out_of_reach(target: QualityTarget, due: float, made: str) -> Refused:
     """Why a stream is lossless: a score, what is due at least, and what there is."""
-    limit = f" of the {due:.2f} that its originals allow" if due < target.score else ""
+    limit = f" of the {due:.2f} that the originals allow" if due < target.score else ""
     return Refused(f"{target} is out of reach: {made}{limit}")
 
 

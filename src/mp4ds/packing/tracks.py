@@ -334,7 +334,7 @@ def _color(recipe: Recipe) -> Color:
 
 # ---------------------------------------------------------------- planning
 
-_KEPT_JPEG = "JPEG files are kept as they are; --transcode encodes them anew"
+_KEPT_JPEG = "JPEG files are kept as they are; --transcode re-encodes them"
 _MANY = 6  # files, of which there may be any number more
 _STREAM_BYTES = 3_000  # of a video without frames, and of its sidecar
 _NEGLIGIBLE = 1 / 50

@@ -63,7 +63,7 @@ class Tasks:
         place = Workplace(Path(folder))
         job = place.job(shared=True)  # who runs the task has looked whose it is
         if job is None:
-            raise Mp4dsError(f"{folder} holds no pack that was begun.")
+            raise Mp4dsError(f"{folder} holds no pack in progress.")
         task = job.task(name)
         with place.making(task) as into:
             if into is None:

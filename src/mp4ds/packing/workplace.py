@@ -88,14 +88,14 @@ class Workplace:
                 self._remove_empty()
                 raise WriteError(self.folder, error) from None
             raise TargetError(
-                self.folder, f"cannot be made: {error.strerror}", "Choose another folder."
+                self.folder, f"cannot be created: {error.strerror}", "Choose another folder."
             ) from None
         with os.fdopen(handle, "r+b") as file:
             try:
                 lock(file, shared=shared)  # without locks, results appear whole all the same
             except BlockingIOError:
                 raise TargetError(
-                    self.folder, "another mp4ds is at work there", "Wait for it, or end it."
+                    self.folder, "another mp4ds is working there", "Wait for it, or stop it."
                 ) from None
             self._check()
             self._give_back()
@@ -112,7 +112,9 @@ class Workplace:
                 found = path.lstat()
                 if not stat.S_ISDIR(found.st_mode):
                     raise TargetError(
-                        path, "is no folder, or a symbolic link", "Remove it; mp4ds makes its own."
+                        path,
+                        "is not a folder, or is a symbolic link",
+                        "Remove it; mp4ds creates its own.",
                     )
                 if not is_mine(found, self.folder.parent):
                     raise TargetError(path, "belongs to another user", "Choose another folder.")
@@ -143,8 +145,8 @@ class Workplace:
             listed = ", ".join(sorted(strange)[:_NAMED]) + ", ..." * (len(strange) > _NAMED)
             raise TargetError(
                 self.folder,
-                f"holds {len(strange)} names that mp4ds did not make there: {listed}",
-                "See what they are; without the folder, packing starts over.",
+                f"holds {len(strange)} entries that mp4ds did not make: {listed}",
+                "Check what they are; if you remove the folder, packing starts over.",
             )
 
     def _give_back(self) -> None:
@@ -166,7 +168,7 @@ class Workplace:
         path = self.folder / _JOB_NAME
         try:
             if not stat.S_ISREG(path.lstat().st_mode):
-                raise TargetError(path, "is no file, or a symbolic link", "Remove it.")
+                raise TargetError(path, "is not a file, or is a symbolic link", "Remove it.")
             data = path.read_bytes()
         except OSError as error:
             if isinstance(error, TargetError):
@@ -178,12 +180,12 @@ class Workplace:
             raise TargetError(self.folder, f"holds an unfinished pack, {error}", _ANEW) from None
         if not shared and job.place != self.folder.lstat().st_ino:
             raise TargetError(
-                self.folder, "holds an unfinished pack that was not begun there", _ANEW
+                self.folder, "holds an unfinished pack that was started elsewhere", _ANEW
             )
         if job.tools != tools():
             theirs = ", ".join(f"{name} {version}" for name, version in job.tools.items())
             raise TargetError(
-                self.folder, f"holds a pack begun with other versions: {theirs}", _ANEW
+                self.folder, f"holds a pack started with other versions: {theirs}", _ANEW
             )
         return job
 
@@ -211,9 +213,8 @@ class Workplace:
         for name, value in options.items():
             if job.options.get(name) != value:
                 raise OptionError(
-                    f"The pack was begun with another `{name}`: "
-                    f"{job.options.get(name)!r}, and now it is {value!r}. Give the same to go on. "
-                    + _ANEW
+                    f"The pack was started with a different `{name}`: {job.options.get(name)!r}, "
+                    f"and now it is {value!r}. Give the same value to resume. " + _ANEW
                 )
         job.check_sources()
 

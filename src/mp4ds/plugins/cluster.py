@@ -164,7 +164,7 @@ def batch_cluster(system: str, tasks: int) -> Iterator[tuple[JobQueueCluster, Ca
             raise ClusterError(
                 system,
                 f"the jobs could not be submitted: {problem.rstrip('.')}",
-                f"Their settings are in {_SETTINGS}.",
+                f"The settings are in {_SETTINGS}.",
             )
 
         def refill() -> None:
@@ -187,8 +187,8 @@ def _opened_jobs(kind: type[JobQueueCluster], system: str) -> Iterator[JobQueueC
         cluster = kind()
     except (ValueError, TypeError, RuntimeError, OSError) as error:
         raise OptionError(
-            f"`cluster` {system}: {_line(error)} The settings are in {_SETTINGS}, "
-            f"under jobqueue: {system}."
+            f"`cluster` {system}: {_line(error)} The settings are in {_SETTINGS}, under jobqueue: "
+            f"{system}."
         ) from None
     with cluster:
         yield cluster
@@ -233,8 +233,8 @@ def _jobs() -> int:
     jobs = dask.config.get("mp4ds.jobs", _MOST_JOBS)
     if not isinstance(jobs, int) or jobs < 1:
         raise OptionError(
-            f"DASK_MP4DS__JOBS, or mp4ds.jobs in the configuration of Dask, is {jobs!r}. "
-            "Give a number of jobs, from 1."
+            f"DASK_MP4DS__JOBS, or mp4ds.jobs in Dask's configuration, is {jobs!r}. Give a number "
+            "of jobs, 1 or more."
         )
     return jobs
 
@@ -258,7 +258,7 @@ _ENDED = ("closing", "closed")
 _LOOK_SECONDS = 5.0
 _WORKER_SECONDS = 5 * 60.0
 _BATCH_WORKER_SECONDS = 12 * 3600.0
-_GO_ON = "What is finished is kept: run the same command again to go on."
+_GO_ON = "Finished work is kept: run the same command again to resume."
 
 
 class Watch:
@@ -324,7 +324,7 @@ class Watch:
             raise ClusterError(
                 self._address,
                 f"has had no worker for {self._patience:g} s",
-                f"Start some, or see why they ended. {_GO_ON}",
+                f"Start some, or find out why they ended. {_GO_ON}",
             )
 
     def wait_until_connected(self) -> None:
@@ -342,8 +342,8 @@ class Watch:
         """What to raise when the scheduler does not know the tasks any more."""
         return ClusterError(
             self._address,
-            "the connection to the Dask scheduler was lost, or it has dropped the tasks",
-            f"See whether it still runs. {_GO_ON}",
+            "the connection to the Dask scheduler was lost, or it dropped the tasks",
+            f"Check whether it is still running. {_GO_ON}",
         )
 
 
@@ -472,8 +472,8 @@ async def _greet(address: str) -> None:
         arguments = Security().get_connection_args("client")
         if address.startswith("tls:") and arguments.get("ssl_context") is None:
             raise OptionError(
-                f"`cluster` {address} needs certificates: name them under distributed.comm.tls "
-                "in the configuration of Dask, ~/.config/dask/distributed.yaml."
+                f"`cluster` {address} needs certificates: set them under distributed.comm.tls in "
+                "Dask's configuration, ~/.config/dask/distributed.yaml."
             )
         greeting = connect(address, timeout=_CONNECT_SECONDS, **arguments)
         comm = await asyncio.wait_for(greeting, _CONNECT_SECONDS)
@@ -483,7 +483,7 @@ async def _greet(address: str) -> None:
         raise _unreachable(address, error) from None
     except Exception:  # of any kind, as it takes what it reads for lengths
         raise ClusterError(
-            address, "what answers there is not a Dask scheduler", "Check the port."
+            address, "the server there is not a Dask scheduler", "Check the port."
         ) from None
     comm.abort()
 
@@ -492,8 +492,9 @@ def _unreachable(address: str, error: Exception) -> ClusterError:
     reason = str(error.__cause__ or error)
     return ClusterError(
         address,
-        "no Dask scheduler could be reached" + (f" ({reason})" if reason else ""),
-        "Check the address, that `dask scheduler` runs there, and that a firewall lets it through.",
+        "no Dask scheduler can be reached" + (f" ({reason})" if reason else ""),
+        "Check the address, that `dask scheduler` is running there, and that no firewall "
+        "blocks it.",
     )
 
 
@@ -543,8 +544,8 @@ def _patience(seconds: float) -> float:
         return float(parse_timedelta(patience))
     except (AttributeError, KeyError, TypeError, ValueError):
         raise OptionError(
-            "DASK_MP4DS__WORKER_TIMEOUT, or mp4ds.worker-timeout in the configuration of Dask, "
-            f"is {patience!r}. Give a time, such as '10 minutes'."
+            "DASK_MP4DS__WORKER_TIMEOUT, or mp4ds.worker-timeout in Dask's configuration, is "
+            f"{patience!r}. Give a time, such as '10 minutes'."
         ) from None
 
 
@@ -661,8 +662,8 @@ class ClusterEngine:
             return Outcome(task, (error.kind, error.sentence))
         if type(error).__name__ == "KilledWorker":
             said = (
-                f"{error.allowed_failures + 1} workers died over it, perhaps for want of memory: "
-                f"it takes up to {-(-self._task_bytes // _MIB)} MiB. Their logs tell more."
+                f"{error.allowed_failures + 1} workers died on it, perhaps for lack of memory: it "
+                f"takes up to {-(-self._task_bytes // _MIB)} MiB. See their logs."
             )
             return Outcome(task, ("Killed", said))
         lines = str(error.__cause__ or error).strip().splitlines() or [""]

@@ -62,7 +62,7 @@ def conformance_dump(
         path = path.parent
     if path.is_dir() and not (path / MANIFEST_NAME).exists():
         raise SourceError(
-            path, f"is no dataset: there is no {MANIFEST_NAME} in it", "Give one dataset."
+            path, f"is not a dataset: there is no {MANIFEST_NAME} in it", "Give one dataset."
         )
     problems = [_problem(problem) for problem in validate(path, deep=True, progress=progress)]
     if problems:

@@ -260,15 +260,15 @@ def _dataset_info(dataset: Dataset) -> Info:
         _add_stream(by_topic, stream)
     if dataset.manifest:
         result.notes += [
-            f"{item.topic}: {item.messages} messages stored verbatim from number {item.first} on: "
-            f"{item.reason}"
+            f"{item.topic}: {item.messages} messages stored verbatim, the first is number "
+            f"{item.first}: {item.reason}"
             for item in dataset.manifest.verbatim
         ]
         if dataset.manifest.about:
             result.notes += dataset.manifest.about.lines
         if dataset.manifest.derived_from:
             earlier = (f"{item.name} ({item.profile})" for item in dataset.manifest.derived_from)
-            result.notes.append(f"packed again from {', '.join(earlier)}")
+            result.notes.append(f"repacked from {', '.join(earlier)}")
         if dataset.manifest.topics_left_out:
             left_out = ", ".join(dataset.manifest.topics_left_out)
             result.notes.append(f"left out when packed: {left_out}")
@@ -278,7 +278,7 @@ def _dataset_info(dataset: Dataset) -> Info:
         if stream.sidecar.video.quality
     ]
     if any(stream.sidecar.stamps == "record-float" for stream in dataset.streams):
-        result.notes.append("times are record times that were stored as float seconds: not exact")
+        result.notes.append("times are record times stored as float seconds, so they are not exact")
     return result
 
 

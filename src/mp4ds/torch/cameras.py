@@ -106,8 +106,8 @@ class Pictures:
         if self.dtype == "uint8" and dtype != torch.uint8:
             kind = str(dtype).removeprefix("torch.")
             raise OptionError(
-                f"topic {topic}: has frames of {kind}, not uint8. Give dtype='native' to have "
-                "them as they are, or dtype='float32'."
+                f"topic {topic}: has frames of {kind}, not uint8. Give dtype='native' to get them "
+                "as stored, or dtype='float32'."
             )
 
     def arranged(self, pixels: Tensor) -> Tensor:
@@ -155,14 +155,14 @@ def pictures_from(
         for view in views:
             if view.format != "rgb" or view.resize is not None:
                 raise OptionError(
-                    "backend='torchcodec' gives format='rgb' without resize; use a transform."
+                    "backend='torchcodec' only gives format='rgb' without resize; use a transform."
                 )
     return Pictures(views, dtype, channels_first, backend, device)
 
 
 def _one_of(name: str, value: str, known: Sequence[str]) -> None:
     if value not in known:
-        raise OptionError(f"{name} is {value!r}, and not one of {', '.join(known)}.")
+        raise OptionError(f"{name} is {value!r}, not one of {', '.join(known)}.")
 
 
 def _each(name: str, given: _T | Mapping[str, _T], topics: Sequence[str], default: _T) -> list[_T]:
@@ -256,7 +256,7 @@ class Collection:
             raise OptionError(f"topics is a list of topics, such as [{topics!r}].")
         if sync_tolerance_ns < 0:
             raise OptionError(
-                f"sync_tolerance_ns is {sync_tolerance_ns}, and must not be negative."
+                f"sync_tolerance_ns is {sync_tolerance_ns}, but must not be negative."
             )
         given = datasets_in(paths)
         known = _sources(given[0])
@@ -269,7 +269,7 @@ class Collection:
         if not self.starts[-1]:
             raise OptionError(
                 f"{given[0]}: no frames of {', '.join(self.topics)} have header stamps within "
-                f"{sync_tolerance_ns} ns of each other. Give a larger sync_tolerance_ns."
+                f"{sync_tolerance_ns} ns of each other. Use a larger sync_tolerance_ns."
             )
 
     @cached_property
@@ -330,12 +330,12 @@ def _sources(path: Path | str) -> list[CameraSource]:
 
 def _check_topics(topics: Sequence[str], path: Path | str) -> None:
     if not topics:
-        raise OptionError(f"{path}: has no camera, or no topics were chosen.")
+        raise OptionError(f"{path}: has no camera, or no topics were selected.")
     twice = [topic for topic in topics if topics.count(topic) > 1]
     if twice:
         raise OptionError(
-            f"{path}: {twice[0]} stands twice among the topics. If it has several streams, choose "
-            "one by the name of its file."
+            f"{path}: {twice[0]} is given twice among the topics. If it has several streams, "
+            "choose one by its file name."
         )
     taken = [topic for topic in topics if topic in RESERVED]
     if taken:
@@ -423,7 +423,7 @@ class OpenCamera:
             raise FormatError(
                 "frame-count",
                 source.place,
-                f"has {len(self.stream)} frames where {source.frames} are due",
+                f"has {len(self.stream)} frames, not {source.frames}",
             )
         self._reader: TensorReader = (
             TorchcodecReader(self.stream, view.crop, pictures.device)
@@ -571,7 +571,7 @@ class OpenCameras:
         self._pictures = pictures
         self._start()
         if most < 1:
-            raise OptionError(f"cache_files is {most}, and must be at least 1.")
+            raise OptionError(f"cache_files is {most}, but must be at least 1.")
 
     def _start(self) -> None:
         self._process = os.getpid()

@@ -101,19 +101,19 @@ def offsets_from(values: Sequence[float], unit: Unit, tolerance_ns: int | None) 
     """
     given = tuple(values)
     if not given:
-        raise OptionError("offsets is empty; (0,) is the sample's own frame alone.")
+        raise OptionError("offsets is empty; use (0,) for the sample's own frame alone.")
     if unit == "frames":
         if any(isinstance(value, bool) or value != int(value) for value in given):
-            raise OptionError(f"offsets are {given}, and those in frames are whole numbers.")
+            raise OptionError(f"offsets are {given}, but offsets in frames must be integers.")
         if tolerance_ns is not None:
             raise OptionError('tolerance_ns belongs to offsets_in="seconds".')
         return Offsets(tuple(int(value) for value in given))
     if unit != "seconds":
-        raise OptionError(f"offsets_in is {unit!r}, and not one of frames, seconds.")
+        raise OptionError(f"offsets_in is {unit!r}, not one of frames, seconds.")
     if not all(abs(value) <= _MOST_SECONDS for value in given):
-        raise OptionError(f"offsets are {given}, and those in seconds are at most 1e9.")
+        raise OptionError(f"offsets are {given}, but offsets in seconds can be at most 1e9.")
     if tolerance_ns is not None and tolerance_ns < 0:
-        raise OptionError(f"tolerance_ns is {tolerance_ns}, and must not be negative.")
+        raise OptionError(f"tolerance_ns is {tolerance_ns}, but must not be negative.")
     return Offsets(tuple(round(value * 10**9) for value in given), True, tolerance_ns)
 
 
@@ -451,7 +451,7 @@ class FrameDataset(Dataset):
     def _number(self, index: SupportsIndex) -> int:
         number = as_integer(index)
         if not -len(self) <= number < len(self):
-            raise IndexError(f"there are {len(self)} samples, and none of number {number}")
+            raise IndexError(f"there are {len(self)} samples, and none with number {number}")
         return number % len(self)
 
     def close(self) -> None:

@@ -31,7 +31,7 @@ def link_libraries(folder: Path | None = None) -> Path:
     parts = [part for part in files("av") or () if part.parent.name == "av.libs"]
     names = {part.name: Path(str(part.locate())).resolve() for part in parts}
     if not names:
-        raise OptionError("This PyAV brings no shared libraries (.so) of its own.")
+        raise OptionError("This PyAV does not bundle shared libraries (.so).")
     if folder is None:
         cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(cache) / "mp4ds" / f"ffmpeg-av{version('av')}"

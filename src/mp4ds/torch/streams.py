@@ -160,8 +160,8 @@ class FrameStream(IterableDataset):
         self._collection = Collection(paths, topics=topics, sync_tolerance_ns=sync_tolerance_ns)
         if cache_files < len(self.topics):
             raise OptionError(
-                f"cache_files is {cache_files}, and must be at least {len(self.topics)}: one for "
-                "each camera."
+                f"cache_files is {cache_files}, but must be at least {len(self.topics)}: one per "
+                "camera."
             )
         pictures = pictures_from(
             self.topics,
@@ -226,7 +226,9 @@ class FrameStream(IterableDataset):
         other = state_dict["order"]
         for name, own in self._order().items():
             if other[name] != own:
-                problem = f"the state is of a stream with {name} {other[name]!r}, and this one has"
+                problem = (
+                    f"the state is from a stream with {name} {other[name]!r}, but this one has"
+                )
                 raise OptionError(f"{problem} {own!r}.")
         self.set_epoch(state_dict["epoch"])
         self._given = self._resumed = state_dict["given"]
@@ -315,9 +317,9 @@ def _check(**numbers: int) -> None:
     for name, value in numbers.items():
         least = 1 if name in ("window", "world_size") else 0
         if value < least:
-            raise OptionError(f"{name} is {value}, and must be at least {least}.")
+            raise OptionError(f"{name} is {value}, but must be at least {least}.")
     if numbers.get("rank", 0) >= numbers.get("world_size", 1):
         raise OptionError(
-            f"rank is {numbers['rank']}, and must be less than the world_size, "
+            f"rank is {numbers['rank']}, but must be less than the world_size, "
             f"{numbers['world_size']}."
         )

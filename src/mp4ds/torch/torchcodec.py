@@ -39,16 +39,16 @@ class TorchcodecReader:
             _check_layout(stream)
             if stream.hidden_frames:
                 raise OptionError(
-                    f"topic {stream.topic}: torchcodec shows wrong frames at the beginning of a "
-                    "video that was cut out of another. Use backend='mp4ds', or a dataset that was "
-                    "packed with a `codec`."
+                    f"topic {stream.topic}: torchcodec returns wrong frames at the beginning of a "
+                    "video cut out of another. Use backend='mp4ds', or a dataset packed with a "
+                    "`codec`."
                 )
         if remote(self._path):
-            raise OptionError(f"{self._path}: backend='torchcodec' reads local files alone.")
+            raise OptionError(f"{self._path}: backend='torchcodec' only reads local files.")
         columns, rows = stream.image_size
         x, y, width, height = crop or (0, 0, columns, rows)
         if not (0 <= x < x + width <= columns and 0 <= y < y + height <= rows):
-            raise OptionError(f"topic {stream.topic}: crop {crop} is not within {columns}x{rows}.")
+            raise OptionError(f"topic {stream.topic}: crop {crop} is not inside {columns}x{rows}.")
         self._rows, self._columns = slice(y, y + height), slice(x, x + width)
         self._decoder = self._opened(device)
         self._check_range(stream)
@@ -64,8 +64,8 @@ class TorchcodecReader:
             reason = (str(error).strip() or type(error).__name__).splitlines()[0]
             raise OptionError(
                 f"torchcodec is installed but cannot be used: {reason} If it finds no FFmpeg, "
-                "install that, or start with the one of PyAV: "
-                "LD_LIBRARY_PATH=$(python -m mp4ds.torch.ffmpeg) python ..."
+                "install it, or use the one in PyAV: LD_LIBRARY_PATH=$(python -m "
+                "mp4ds.torch.ffmpeg) python ..."
             ) from None
         try:
             # with exact seeking, frame n is the n-th shown, whatever its presentation time
@@ -90,9 +90,9 @@ class TorchcodecReader:
         theirs = self.read([0])[0].cpu().numpy()
         if np.abs(theirs - mistaken).mean() < np.abs(theirs - ours).mean():
             raise OptionError(
-                f"topic {stream.topic}: torchcodec takes its video of the full range for one of "
-                "the limited, so that the contrast would be wrong. Use backend='mp4ds', or a "
-                "dataset that was packed with `codec` h264."
+                f"topic {stream.topic}: torchcodec decodes its full-range video as limited-range, "
+                "so the contrast would be wrong. Use backend='mp4ds', or a dataset packed with "
+                "`codec` h264."
             )
 
     def _refused(self, error: Exception) -> VideoError:
@@ -126,5 +126,5 @@ def _check_layout(stream: Stream) -> None:
     if not LAYOUTS[video.layout].is_shown or not is_8_bits:
         raise OptionError(
             f"topic {stream.topic}: {image.encoding} images are stored in the layout "
-            f"{video.layout}, which torchcodec does not turn into colours. Use backend='mp4ds'."
+            f"{video.layout}, which torchcodec cannot convert to colour. Use backend='mp4ds'."
         )

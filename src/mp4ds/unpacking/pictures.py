@@ -58,7 +58,7 @@ class Reduction:
         if self.resize is not None:
             _check_size(self.resize)
         if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
-            raise OptionError(f"`every` {self.every!r} is no number of frames: use 1 or more.")
+            raise OptionError(f"`every` {self.every!r} is not a number of frames: use 1 or more.")
         rate = self.max_rate
         if rate is not None and not (
             isinstance(rate, int | float)
@@ -66,7 +66,7 @@ class Reduction:
             and math.isfinite(rate)
             and 0 < rate <= _NS
         ):
-            raise OptionError(f"`max_rate` {rate!r} is no rate: use Hz, such as 10.")
+            raise OptionError(f"`max_rate` {rate!r} is not a rate: use Hz, such as 10.")
 
     def size_of(self, stream: Stream) -> tuple[int, int] | None:
         """Width and height that images of a stream get; None where they have them already.
@@ -107,8 +107,8 @@ def _check_size(resize: Any) -> None:
         is_known = is_known and is_number and 0 < side <= MAX_SIDE
     if not is_known:
         raise OptionError(
-            f"`resize` {resize!r} is no size: use a factor such as 0.5, or width and height of 1 "
-            f"to {MAX_SIDE} pixels."
+            f"`resize` {resize!r} is not a size: use a factor such as 0.5, or width and height of "
+            f"1 to {MAX_SIDE} pixels."
         )
 
 
@@ -300,7 +300,7 @@ def encoding_of(sidecar: StreamSidecar, header: Header) -> str:
         return own.name
     if _is_depth(sidecar, header):
         if told not in DEPTHS:
-            raise Refused(f"its format {header.format!r} does not tell the unit of its depths")
+            raise Refused(f"its format {header.format!r} does not give the unit of its depths")
         return told
     known = ENCODINGS.get(told, own)
     is_alike = known.rows == 1 and known.channels == own.channels == 1
@@ -420,13 +420,13 @@ def _video(stream: Stream, kind: str) -> Frames:
     codec = sidecar.video.codec
     if codec not in _VIDEO_CODECS:
         known, name = ", ".join(_VIDEO_CODECS), type_of(kind).rpartition("/")[2]
-        raise Refused(f"{name} has the codecs {known}, and this video is {codec}")
+        raise Refused(f"{name} supports the codecs {known}, but this video is {codec}")
     if sidecar.body != "packet" and not sidecar.layout.is_shown:
         raise Refused(
-            f"its video does not show the images as they are seen (layout {sidecar.layout.name})"
+            f"its video does not show the images as they look (layout {sidecar.layout.name})"
         )
     if stream.hidden_frames:
-        raise Refused("the first packets of a slice refer to others, which are not part of it")
+        raise Refused("the first packets of the slice depend on packets outside it")
     return partial(_packets_of, stream)
 
 

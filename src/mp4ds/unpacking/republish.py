@@ -154,7 +154,7 @@ def calibration_source(
     except FormatError:
         if size is None:
             raise
-        raise Refused("calibrations of this type are not made for another size") from None
+        raise Refused("calibrations of this type cannot be adapted to another size") from None
     stamps = columns.stamp
     is_wanted = np.ones(len(stamps), np.bool_)
     if is_kept is not None:
@@ -165,8 +165,8 @@ def calibration_source(
 
 # ---------------------------------------------------------------- republisher
 
-_NOT_DECODED = "its picture does not decode"
-_REFERS = "packets of a video refer to each other, so that none can be left out; give another form"
+_NOT_DECODED = "its picture cannot be decoded"
+_REFERS = "video packets depend on each other, so none can be left out; use another form"
 _ALREADY = {
     "raw": "raw images",
     "jpeg": "JPEG files",
@@ -311,7 +311,7 @@ class Republisher:
                     frames = frames_of(stream, form)
                     return self._thinned(_Plan(stream, kind, frames, is_kept, size, not is_done))
                 if is_kept is None:
-                    raise Refused(f"they are {_ALREADY[kind]} already")
+                    raise Refused(f"they are already {_ALREADY[kind]}")
             except Refused as reason:
                 count = len(stream) if is_kept is None else int(is_kept.sum())
                 self._keep(topic, str(reason), count)
@@ -408,7 +408,7 @@ class Republisher:
         cameras = {channel.topic for channel in dataset.channels if is_camera(channel)}
         for entry in dataset.manifest.verbatim if dataset.manifest else []:
             if entry.topic in cameras and selected(entry.topic):
-                self._keep(entry.topic, f"stored as it was: {entry.reason}", entry.messages)
+                self._keep(entry.topic, f"stored verbatim: {entry.reason}", entry.messages)
 
     def _keep(self, topic: str, reason: str, count: int) -> None:
         reasons = self.as_recorded.setdefault(topic, {})
@@ -449,7 +449,7 @@ class Republisher:
             yield ordinal, message_at(columns, index, made or recorded, payload)
         due = len(stream) if plan.is_kept is None else int(plan.is_kept.sum())
         if choice is everything and count != due:
-            problem = f"has {count} frames or more, {due} are due"
+            problem = f"has {count} frames or more, not {due}"
             raise FormatError("frame-count", stream.video_path, problem)
 
 
@@ -461,8 +461,8 @@ def check_kind(kind: str | None, reduction: Reduction) -> None:
     """
     if kind in VIDEO_KINDS and (reduction.leaves_out or reduction.resize is not None):
         raise OptionError(
-            f"`resize`, `every` and `max_rate` do not go with `images` {kind}, which gives the "
-            "video as it is. Use raw, jpeg or png."
+            f"`resize`, `every` and `max_rate` cannot be combined with `images` {kind}, which "
+            "copies the video. Use raw, jpeg or png."
         )
 
 

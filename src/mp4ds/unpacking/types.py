@@ -117,7 +117,7 @@ def _begun(encoding: str, slots: Slots, *, has_seq: bool = False) -> PrimitiveWr
     is_cdr = encoding == "cdr"
     seconds, nanoseconds = divmod(slots.stamp, NS)
     if not (-(2**31) if is_cdr else 0) <= seconds < (2**31 if is_cdr else 2**32):
-        raise WireError("its stamp is beyond what ROS has bits for")
+        raise WireError("its stamp is outside the range of ROS")
     writer = PrimitiveWriter(b"\0\1\0\0" if is_cdr else b"", "<", aligned=is_cdr)
     if has_seq:
         writer.put("I", slots.seq or 0)
@@ -189,7 +189,7 @@ class Types:
     def no_seq(self) -> str:
         """What is left out where they have none."""
         without = "ROS 2" if self.encoding == "cdr" else "CompressedVideo"
-        return f"messages with a header's sequence number, which {without} has not"
+        return f"messages with a header sequence number, which {without} does not have"
 
     def channel(self, source: Channel, channel_id: int, topic: str) -> Channel:
         """The channel for the images of another one.

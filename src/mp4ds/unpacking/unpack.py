@@ -280,7 +280,7 @@ def unpack_each(
     named = [output for output in outputs.values() if output is not None]
     twice = [output for output, count in Counter(named).items() if count > 1]
     if twice:
-        raise OptionError(f"Two datasets would become {twice[0]}. Unpack one elsewhere.")
+        raise OptionError(f"Two datasets would become {twice[0]}. Unpack one of them elsewhere.")
     if folder is not None and not remote(location(folder)):
         location(folder).mkdir(exist_ok=True)
     work = partial(_unpack_one, to=to, options=options)
@@ -292,8 +292,8 @@ def unpack_each(
                 progress(UnpackProgress(len(summaries), len(outputs)))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"interrupted; {len(summaries)} of {len(outputs)} datasets are unpacked, and nothing "
-            "unfinished was left behind"
+            f"interrupted; {len(summaries)} of {len(outputs)} datasets were unpacked, and no "
+            "partial output was left behind"
         ) from None
     return summaries
 
@@ -321,13 +321,13 @@ def _check(to: str, options: UnpackOptions) -> None:
     if options.storage not in (None, "sqlite3", "mcap"):
         raise OptionError(f"`storage` {options.storage!r} is not known. Use sqlite3 or mcap.")
     if options.storage and to != "rosbag2":
-        raise OptionError(f"`storage` goes with `to` rosbag2, not with `to` {to}.")
+        raise OptionError(f"`storage` works with `to` rosbag2, not with `to` {to}.")
     if options.image_format not in (None, "png", "jpeg"):
         raise OptionError(f"`image_format` {options.image_format!r} is not known. Use png or jpeg.")
     if options.images not in (None, *KINDS):
         raise OptionError(f"`images` {options.images!r} is not known. Use {', '.join(KINDS)}.")
     if options.images and to == "images":
-        raise OptionError("`images` goes with a recording; with `to` images, use `image_format`.")
+        raise OptionError("`images` is for recordings; with `to` images, use `image_format`.")
     check_kind(options.images, options.reduction)
 
 
@@ -412,7 +412,7 @@ def _unpack_recording(
             raise FormatError(
                 "message-count",
                 dataset.path,
-                f"holds {found} messages where its manifest says {total}",
+                f"holds {found} messages, but its manifest says {total}",
             )
     omitted = Counter(writer.omitted) + Counter(converter.omitted)
     if republisher:
@@ -539,8 +539,10 @@ def _refusal(problems: dict[str, str]) -> ConversionError:
     return ConversionError(
         first,
         "; ".join(listed),
-        "Exclude with " + " ".join(f"`exclude` {shlex.quote(topic)}" for topic in problems) + ", "
-        "skip and count with `skip_unconvertible`, or unpack to mcap, which keeps all as it is.",
+        "Exclude with "
+        + " ".join(f"`exclude` {shlex.quote(topic)}" for topic in problems)
+        + ", leave out and count with `skip_unconvertible`, or unpack to mcap, which keeps "
+        "everything unchanged.",
     )
 
 

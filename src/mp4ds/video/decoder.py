@@ -172,9 +172,7 @@ class VideoDecoder:
         number = 0
         for frame in self._decoded(0):
             if number == self._frames:
-                raise VideoError(
-                    "frame-count", self._path, f"goes on after the {self._frames} frames due"
-                )
+                raise VideoError("frame-count", self._path, f"has more than {self._frames} frames")
             yield self._maker.make(frame, scale=scale)
             number += 1
         if number != self._frames:
@@ -270,7 +268,7 @@ class VideoDecoder:
             ticks = [entry.timestamp for entry in self._stream.index_entries][self._media.hidden :]
             if len(ticks) != self._frames:
                 raise VideoError(
-                    "frame-count", self._path, f"has {len(ticks)} frames, {self._frames} are due"
+                    "frame-count", self._path, f"has {len(ticks)} frames, not {self._frames}"
                 )
             self._ticks = np.sort(np.array(ticks, dtype=np.int64))
         return self._ticks

@@ -320,8 +320,9 @@ def refuse_if_unusable(codec: str, width: int, height: int) -> None:
         return
     raise hardware_error(
         codec,
-        "the device refused an encoder, and took one a moment later: there were too many at a time",
-        "Give fewer `jobs`",
+        "the device refused an encoder, but accepted one a moment later: too many were open "
+        "at once",
+        "Use fewer `jobs`",
     )
 
 
@@ -350,13 +351,13 @@ def _open_once(codec: str, width: int, height: int) -> None:
         raise hardware_error(
             codec,
             f"PyAV {av.__version__} was built without {found.encoder}",
-            f"It needs {found.needs}, and a PyAV whose ffmpeg has {found.encoder}",
+            f"It needs {found.needs}, and a PyAV whose FFmpeg has {found.encoder}",
         )
     if found.device and int(av.__version__.split(".")[0]) < _UPLOADS_SINCE:
         raise hardware_error(
             codec,
-            f"PyAV {av.__version__} cannot bring pictures to {found.encoder}",
-            f"Install PyAV {_UPLOADS_SINCE}, whose ffmpeg has to have it",
+            f"PyAV {av.__version__} cannot upload pictures to {found.encoder}",
+            f"Install PyAV {_UPLOADS_SINCE} with an FFmpeg that has it",
         )
     with _told() as lines:
         try:

@@ -142,7 +142,7 @@ class SampleEntry:
         if self.size != other.size:
             return f"their size ({self.size} and {other.size})"
         kinds = sorted({kind for kind, _ in set(self.boxes) ^ set(other.boxes)})
-        return f"what they say of their codec ({', '.join(kinds) or 'order or depth'})"
+        return f"their codec configuration ({', '.join(kinds) or 'order or depth'})"
 
 
 def read_sample_entry(path: Path) -> SampleEntry:
@@ -166,7 +166,7 @@ def read_sample_entry(path: Path) -> SampleEntry:
             return parse_descriptions(file, box)
         except DamagedBoxError as error:
             raise VideoError(
-                "video-unreadable", path, f"has no description of one track: {error}"
+                "video-unreadable", path, f"has no track description: {error}"
             ) from None
 
 
@@ -421,9 +421,7 @@ def read_sample_table(stream: BinaryIO, size: int, place: str) -> SampleTable:
             raise VideoError("video-unreadable", place, f"has {len(tracks)} video tracks, not one")
         return _parse_track(movie, tracks[0], size)
     except DamagedBoxError as error:
-        raise VideoError(
-            "video-unreadable", place, f"has no index that can be read: {error}"
-        ) from None
+        raise VideoError("video-unreadable", place, f"has no readable index: {error}") from None
 
 
 def _read_movie(stream: BinaryIO, size: int) -> _Movie:
@@ -607,7 +605,7 @@ def _edit(movie: _Movie, track: Box, timescale: int) -> _Edit | None:
     if any(start != -1 for start in starts[:-1]) or starts[-1] < 0:
         raise Refused("it has several edits")
     if rows["speed"][-1] != _NORMAL_SPEED or not durations[-1]:
-        raise Refused("it has an edit that stands still or has no end")
+        raise Refused("it has an edit that freezes a frame or has no end")
     edit = _Edit(sum(durations[:-1]), starts[-1], durations[-1])
     if max(edit.delay, edit.start + edit.duration) > _LATEST:
         raise DamagedBoxError("an edit is too late")

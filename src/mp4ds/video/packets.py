@@ -58,7 +58,7 @@ class PacketWriter:
         rate: float | None = None,
     ) -> None:
         if codec not in PACKET_CODECS:
-            raise ValueError(f"codec {codec!r} is none of {', '.join(PACKET_CODECS)}")
+            raise ValueError(f"codec {codec!r} is not one of {', '.join(PACKET_CODECS)}")
         self.codec = codec
         self.width, self.height = width, height
         self._path = path
@@ -260,7 +260,7 @@ class PacketReader:
             if not count:
                 raise VideoError("frame-count", path, "has no frames")
             if frames is not None and count != frames:
-                raise VideoError("frame-count", path, f"has {count} frames, {frames} are due")
+                raise VideoError("frame-count", path, f"has {count} frames, not {frames}")
             ticks, self._sizes, self._places = array("q"), array("q"), array("q")
             self._keyframes = bytearray()
             for entry in entries:
@@ -298,7 +298,7 @@ class PacketReader:
         """
         key = self._keyframes.rfind(1, 0, self.hidden + index + 1)
         if key < 0:
-            raise VideoError("video-unreadable", self._path, "begins without a key frame")
+            raise VideoError("video-unreadable", self._path, "does not start with a key frame")
         return key - self.hidden
 
     def packet(self, index: int) -> bytes:
@@ -450,7 +450,7 @@ class _Written:
         """
         if not self._is_in(path):
             raise VideoError(
-                "decode-failed", path, "would not hold the packets as they are: one is damaged"
+                "decode-failed", path, "would not hold the packets unchanged: one is damaged"
             )
         if difference := entry.differences(read_sample_entry(path)):
             raise VideoError(
@@ -478,7 +478,7 @@ def _copy(
                 _copy_segment(segment, ticks, container, stream, duration, written)
             if next(ticks, None) is not None:
                 raise VideoError(
-                    "frame-count", target, f"would have {len(written.ticks)} frames, more are due"
+                    "frame-count", target, f"would have only {len(written.ticks)} frames"
                 )
         except BaseException:
             # closing completes the file, which may fail, too; the first error tells more
@@ -525,7 +525,7 @@ def _copy_segment(
             tick = next(ticks, None)
             if tick is None:
                 raise VideoError(
-                    "frame-count", path, f"has {len(reader)} frames, {index} of them are due"
+                    "frame-count", path, f"has {len(reader)} frames, but {index} are needed"
                 )
             if written.ticks and tick <= written.ticks[-1]:
                 raise ValueError(f"tick {tick} does not follow {written.ticks[-1]}")

@@ -347,7 +347,7 @@ def frame_to_picture(
         raise VideoError(
             "geometry-mismatch",
             place,
-            f"has frames of {frame.width}x{frame.height} where {width}x{height} are due",
+            f"has frames of {frame.width}x{frame.height}, not {width}x{height}",
         )
     if picture_format.startswith("bayer_"):
         colours = _packed(frame, "rgb24", converter)
@@ -373,7 +373,7 @@ def _planes(
         raise VideoError(
             "codec-mismatch",
             place,
-            f"decodes to {frame.format.name} where {' or '.join(expected)} is due",
+            f"decodes to {frame.format.name}, not {' or '.join(expected)}",
         )
     if picture_format.startswith("gray"):
         sizes = [(height, width)]

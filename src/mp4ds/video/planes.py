@@ -212,7 +212,7 @@ class PlaneSpool:
         while rest:
             count = self._file.readinto(rest)
             if not count:
-                raise OSError("frames that were kept on disk have been cut short")
+                raise OSError("frames kept on disk were truncated")
             rest = rest[count:]
         return planes_in(data, self.width, self.height)
 

@@ -299,7 +299,7 @@ def _pairs(
     for number, (original, made) in enumerate(zip_longest(reference, decoded)):
         if original is None or made is None:
             longer = "decoded frames" if original is None else "originals"
-            raise ScoringError(f"There are more {longer} than the {number} of the others.")
+            raise ScoringError(f"There are more {longer} than the {number} in the other sequence.")
         if first is None:
             first = _kind(original)
             _check(original)

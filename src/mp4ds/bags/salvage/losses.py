@@ -146,7 +146,7 @@ class LossLog:
         """
         drafts = [*self._drafts, *self._more]
         if messages and not drafts:
-            drafts = [Draft(None, None, "the file counts more messages than it holds", messages)]
+            drafts = [Draft(None, None, "the file declares more messages than it holds", messages)]
         unknown = [draft for draft in drafts if draft.messages is None]
         if messages is not None and unknown:
             known = sum(draft.messages or 0 for draft in drafts)
@@ -348,7 +348,7 @@ class Tally:
             for draft in losses[1:]:
                 draft.add(0, ())
         elif total:
-            problem = "an index lists other messages than there are"
+            problem = "an index does not match the messages"
             self._log.lost(None, None, problem).add(0 if self._is_verified else total, topics)
         self._losses = []
 

@@ -114,7 +114,7 @@ class McapPass:
         for channel_id, schema_id in self._undefined.items():
             topic = self._topic_of(channel_id)
             if schema_id not in self._schemas and topic is not None:
-                problem = f"the definition of its messages, schema {schema_id}, is not there"
+                problem = f"the definition of its messages, schema {schema_id}, is missing"
                 self._log.lost(None, None, problem).add(0, [topic])
 
     def _begin(self) -> Iterator[Found]:
@@ -211,14 +211,14 @@ class McapPass:
         channel = self._channel(head.channel_id)
         data: bytes | memoryview = head.data
         if channel is None:
-            problem = f"messages of channel {head.channel_id}, of which no record tells"
+            problem = f"messages of channel {head.channel_id}, whose record is missing"
             self._lose_message(head.channel_id, head.log_time, offset, problem)
             return None
         if self._decompress:
             try:
                 data = self._decompress(head.data)
             except DamageError:
-                problem = f"messages of {channel.topic} of which the compression is damaged"
+                problem = f"messages of {channel.topic} whose compressed data is damaged"
                 loss = self._lose_message(head.channel_id, head.log_time, offset, problem)
                 loss.topics[channel.topic] = None
                 return None
@@ -382,8 +382,7 @@ class _Chunk:
             problem = ""
         elif crc and not problem:
             problem = (
-                "a chunk does not match its checksum: its messages were kept, "
-                "though something of them is not as it was"
+                "a chunk does not match its checksum: its messages were kept, but some are altered"
             )
         used = records + 8 + unpacked.used if unpacked.used else 0
         is_doubtful = bool(problem) and (not unpacked.is_sound or not unpacked.problem)
@@ -546,4 +545,4 @@ class McapSalvage(FileSalvage):
             self._position = window.position
             self._count = reading.count
             if self.is_alone and not reading.found and not self._declared.channels:
-                raise SourceError(self.path, "holds no record of an MCAP file")
+                raise SourceError(self.path, "holds no MCAP records")

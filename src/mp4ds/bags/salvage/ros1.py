@@ -346,7 +346,7 @@ class Ros1Salvage(FileSalvage):
                 yield from held.release(None)
             self._position = window.offset
             if self.is_alone and not reading.found and not self._channels:
-                raise SourceError(self.path, "holds no record of a ROS 1 bag")
+                raise SourceError(self.path, "holds no ROS 1 bag records")
 
 
 class _Pass:
@@ -439,11 +439,15 @@ class _Pass:
         connection, log_time = number(frame.fields[b"conn"]), time(frame.fields[b"time"])
         channel = self._channels.get(connection)
         if log_time >= MAX_TIME:
-            self._lose(offset, frame.size, "a message has a time past 2^32 seconds, none of ROS")
+            self._lose(
+                offset,
+                frame.size,
+                "a message has a time past 2^32 seconds, which ROS cannot represent",
+            )
             return None
         if channel is None:
             self._tally.stray(connection, log_time)
-            problem = f"messages of connection {connection}, of which no record tells"
+            problem = f"messages of connection {connection}, whose record is missing"
             loss = self._log.lost_of_kind(connection, offset, problem)
             loss.add(1, ())
             return None

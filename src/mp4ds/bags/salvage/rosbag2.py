@@ -113,7 +113,9 @@ def _names(folder: Path, info: BagInfo | None, losses: list[Loss]) -> Sequence[s
     others = unlisted_storage(folder, listed)
     if info:
         for name in sorted(others, key=_number):
-            losses.append(Loss(name, None, None, f"is not listed in {METADATA_FILE}; was read", 0))
+            losses.append(
+                Loss(name, None, None, f"is not listed in {METADATA_FILE}, but was read", 0)
+            )
     found = [name for name in listed if (folder / name).is_file()]
     return sorted([*found, *others], key=_number) if others else found
 
@@ -296,7 +298,7 @@ class Rosbag2Salvage(Salvage):
         lost = [loss for number in sorted(found) for loss in found[number]]
         losses += bounded([*self._missing, *lost])
         if losses and not self._given and not self.channels:
-            raise SourceError(self.path, f"holds no message that can be read: {losses[-1].problem}")
+            raise SourceError(self.path, f"holds no readable message: {losses[-1].problem}")
 
     def _file_records(self, number: int, found: dict[int, Sequence[Loss]]) -> Iterator[Record]:
         try:

@@ -243,7 +243,7 @@ class Scan:
             frame = self._framing.frame(view)
             if frame:
                 return frame
-            self.resync(self._window.offset, "what stands there is no record")
+            self.resync(self._window.offset, "no valid record here")
 
     def body(self, frame: RecordFrame[int]) -> bytes | None:
         """Take a record. None where it is damaged; the scan then has gone on."""
@@ -375,7 +375,9 @@ def unpack(compression: str, data: memoryview, size: int) -> Unpacked:
     start = bytes(data[:4])
     found = next((name for magic, name in _MAGIC.items() if start.startswith(magic)), compression)
     if found not in _MACHINES:
-        return Unpacked(b"", 0, f"a chunk is compressed by {compression!r}, which is not known")
+        return Unpacked(
+            b"", 0, f"a chunk is compressed with {compression!r}, which is not supported"
+        )
     pieces: list[bytes] = []
     left = size + 1
     machine = _MACHINES[found]()

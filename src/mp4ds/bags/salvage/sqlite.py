@@ -546,7 +546,7 @@ class SqliteSalvage(FileSalvage):
         channel = self._channels.get(found.topic_id)
         try:
             if channel is None:
-                raise Refused(f"messages of topic id {found.topic_id}, of which no row tells")
+                raise Refused(f"messages of topic id {found.topic_id}, which has no row")
             data = self._payload(database, page, row, found, channel.topic)
         except Refused as lost:
             loss = log.lost_of_kind(str(lost), database.pages.offset(number), str(lost))
@@ -566,11 +566,11 @@ class SqliteSalvage(FileSalvage):
             raise Refused(f"messages of {topic} with a time before 1970")
         payload = database.payload(page, row) if row.size <= self._left else None
         if payload is None:
-            raise Refused(f"messages of {topic} of which pages are damaged or missing")
+            raise Refused(f"messages of {topic} with damaged or missing pages")
         self._left -= len(payload)
         data = payload[found.blob :]
         try:
             return self._decompress(data) if self._decompress else data
         except DamageError:
-            problem = f"messages of {topic} of which the compression is damaged"
+            problem = f"messages of {topic} whose compressed data is damaged"
             raise Refused(problem) from None

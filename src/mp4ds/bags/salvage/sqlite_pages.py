@@ -378,7 +378,7 @@ class Pages:
                 place += size + 8
             start = -(-place // sector) * sector
         if found:
-            self.pending = f"a change that was not finished, which {path.name} takes back"
+            self.pending = f"an unfinished change, which {path.name} rolls back"
 
     def close(self) -> None:
         """Close the files."""

@@ -147,7 +147,7 @@ def _of_recording(reader: BagReader) -> tuple[list[EvaluatedCamera], dict[str, s
         if first is None or not len(own):
             left_out[channel.topic] = "has no images"
         elif kind_of(channel) is CodedFields and depends_on_others(channel, first):
-            left_out[channel.topic] = "holds video packets, which mp4ds pack copies"
+            left_out[channel.topic] = "has video packets, which `mp4ds pack` copies"
         else:
             cameras.append(_of_channel(reader, channel, own, _is_jpeg(first)))
     return cameras, left_out
@@ -237,7 +237,7 @@ def _of_images(folder: Path, paths: Sequence[Path], fps: float) -> EvaluatedCame
             yield Shot(encoding, pixels, width, height, time, time)
 
     if len(paths) > 1 and times[1] == times[0]:
-        raise SourceError(folder, f"has no time between its images at {fps:g} frames per second")
+        raise SourceError(folder, f"leaves no time between its images at {fps:g} frames per second")
     return EvaluatedCamera(folder.resolve().name, times, read)
 
 
@@ -339,7 +339,7 @@ def chosen(times: NDArray[np.int64], origin: int, options: EvaluateOptions) -> l
         last = int(np.searchsorted(times, begin + round(options.duration * _SECOND)))
     found = list(range(first, min(count, last)))
     if not found:
-        raise Refused("has no images in the time that was asked for")
+        raise Refused("has no images in the requested time")
     return found
 
 
@@ -400,7 +400,7 @@ def make_clip(camera: EvaluatedCamera, indices: list[int], rate: float | None, p
                 if len(ticks) <= max(1, len(indices) // 2):
                     middle, number = planes, len(ticks) - 1
         if first is None or middle is None:
-            raise Refused("has no images that can be read in the time of its clip")
+            raise Refused("has no readable images in its clip")
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
@@ -434,11 +434,11 @@ def _layout_of(shot: Shot) -> Layout:
     encoding = ENCODINGS[shot.encoding]
     if encoding.lossy is None:
         raise Refused(
-            f"has {encoding.name} images, which are no light of 8 bits: mp4ds pack keeps them "
+            f"has {encoding.name} images, which are not 8-bit images: `mp4ds pack` keeps them "
             "lossless"
         )
     if min(shot.width, shot.height) < _MOST_PIXELS:
-        raise Refused(f"has images of {shot.width}x{shot.height}, too small to be scored")
+        raise Refused(f"has images of {shot.width}x{shot.height}, too small to score")
     return layout_for(encoding, lossless=False)
 
 
@@ -467,7 +467,7 @@ class ClipFile:
         path: The file that `make_clip` made.
 
     Raises:
-        SourceError: It is not whole.
+        SourceError: It is incomplete.
     """
 
     def __init__(self, path: Path) -> None:
@@ -476,7 +476,7 @@ class ClipFile:
         clip = self.clip
         size = clip.width * clip.height * 3 // 2
         if path.stat().st_size != size * clip.frames:
-            raise SourceError(path, "is not whole", "Remove the folder and evaluate again.")
+            raise SourceError(path, "is incomplete", "Remove the folder and evaluate again.")
         self._frames = np.memmap(path, np.uint8, "r", shape=(clip.frames, size))
 
     def fetch(self) -> None:

@@ -180,41 +180,44 @@ class CameraTrial:
         target, options = self._target, self._options
         if self._camera.lossy:
             self._notes.append(
-                f"its images are lossy already ({self._camera.lossy}): scores tell how near to "
-                "these a setting comes, not to what the camera saw"
+                f"its images are already lossy ({self._camera.lossy}): scores measure the "
+                "distance from these, not from what the camera saw"
             )
         if reachable < target.score:
             self._notes.append(
-                f"the clip beside itself has {target.metric} {reachable + CEILING_MARGIN:.2f}: "
-                f"the target is {CEILING_MARGIN} less, {reachable:.2f} instead of {target.score:g}"
+                f"the clip scored against itself has {target.metric} "
+                f"{reachable + CEILING_MARGIN:.2f}, so the target is {CEILING_MARGIN} below that, "
+                f"{reachable:.2f} instead of {target.score:g}"
             )
         if all(score_of(cell, target) < reachable for cell in cells):
             best = max(cells, key=lambda cell: score_of(cell, target))
             self._notes.append(
-                f"no setting reaches {target.metric} {reachable:.2f}; the best one is "
-                f"{best.setting.name} with {score_of(best, target):.2f}: try a smaller --crf"
+                f"no setting reaches {target.metric} {reachable:.2f}; the best is "
+                f"{best.setting.name} with {score_of(best, target):.2f}: try a lower --crf"
             )
         if clip.other_frames:
             self._notes.append(
-                f"{clip.other_frames} images within the clip are of another size or encoding, or "
-                "cannot be read, and are left out of it"
+                f"{clip.other_frames} images in the clip have a different size or encoding, or "
+                "cannot be read, and are left out"
             )
         if self._camera.is_jpeg:
-            self._notes.append("was recorded as JPEG files, which mp4ds pack --transcode encodes")
+            self._notes.append(
+                "was recorded as JPEG files, which `mp4ds pack --transcode` re-encodes"
+            )
         if clip.frames < _SHORT:
-            self._notes.append(f"a clip of {clip.frames} frames tells little: give more --frames")
+            self._notes.append(f"a clip of {clip.frames} frames says little: give more --frames")
         if clip.height > _MODEL_ROWS and "vmaf" in cells[0].scores:
             self._notes.append(
-                f"{VMAF_MODEL} is a model of {_MODEL_ROWS} rows; it is used for {clip.height}, "
-                "too, and not the one for 4K, so that cameras compare"
+                f"{VMAF_MODEL} is made for {_MODEL_ROWS} rows; it is used for {clip.height} rows "
+                "too, instead of the 4K model, so that cameras are comparable"
             )
         if options.jobs > 1 or options.cluster:
-            self._notes.append("times are those of settings that were tried side by side")
+            self._notes.append("times were measured with several settings running at once")
         machines = sorted({cell.machine for cell in cells} - {""})
         if len(machines) > 1:
             self._notes.append(
-                f"times are those of {len(machines)} machines, {', '.join(machines)}, and compare "
-                "as far as these are alike"
+                f"times were measured on {len(machines)} machines, {', '.join(machines)}, and are "
+                "comparable only if these are alike"
             )
 
     # ------------------------------------------------------------ rates
@@ -224,7 +227,9 @@ class CameraTrial:
         for rate in sorted(set(self._options.rates)):
             own = self._camera.rate
             if own is None or rate > own * _NEAR:
-                self._notes.append(f"has no {rate:g} images per second: not tried at this rate")
+                self._notes.append(
+                    f"has fewer than {rate:g} images per second: not tried at this rate"
+                )
                 continue
             self._tell(f"looking for the crf at {rate:g} Hz")
             indices = chosen_at_rate(self._camera.times, rate, self._options.frames)
@@ -276,7 +281,7 @@ class CameraTrial:
     def _data_set(self) -> DataSet | None:
         rate = self._camera.rate
         if rate is None:
-            self._notes.append("has no rate, so that nothing is said of hours of it")
+            self._notes.append("has no frame rate, so no storage estimate is given")
             return None
         return DataSet(self._options.streams or 1, self._options.hours or 1.0, rate)
 
@@ -376,7 +381,7 @@ def _ffmpeg(target: ScoreGoal) -> Ffmpeg | None:
     except ScoringError as error:
         if target.metric == "vmaf":
             raise ScoringError(
-                f"{error} Or give a target of another metric, such as `target` psnr_y=42."
+                f"{error} Or choose another metric, such as `target` psnr_y=42."
             ) from None
         return None
 

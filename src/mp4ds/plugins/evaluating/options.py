@@ -76,7 +76,7 @@ def _rates(text: str) -> tuple[float, ...]:
     try:
         return tuple(float(word) for word in parse_words(text))
     except ValueError:
-        raise OptionError(f"`rates` {text!r} is no list of numbers, such as 2,5,10.") from None
+        raise OptionError(f"`rates` {text!r} is not a list of numbers, such as 2,5,10.") from None
 
 
 @dataclass(frozen=True)
@@ -176,11 +176,11 @@ def grid_of(options: EvaluateOptions) -> Grid:
     """
     codecs = list(dict.fromkeys(map(_codec, options.codecs)))
     if not codecs:
-        raise OptionError("`codecs` names none.")
+        raise OptionError("`codecs` is empty.")
     grid = Grid(_presets(codecs, options.presets), parse_crfs(options.crf), options.gop)
     if not 0 < len(grid.settings()) <= _MOST_CELLS:
         raise OptionError(
-            f"{len(grid.settings())} settings are to be tried; give `codecs`, `presets` and `crf` "
+            f"{len(grid.settings())} settings were asked for; give `codecs`, `presets` and `crf` "
             f"that make 1 to {_MOST_CELLS}."
         )
     return grid
@@ -202,7 +202,7 @@ def _presets(codecs: Sequence[str], asked: Sequence[str]) -> dict[str, tuple[str
         found[codec] = own or _DEFAULT_PRESETS[codec]
     for preset in asked:
         if not any(preset in own for own in found.values()):
-            raise OptionError(f"`presets` {preset!r} is none of {', '.join(codecs)}.")
+            raise OptionError(f"`presets` {preset!r} is not a preset of {', '.join(codecs)}.")
     return found
 
 
@@ -227,11 +227,13 @@ def parse_crfs(texts: Sequence[str]) -> tuple[int, ...]:
             None, None, None
         )  # fmt: skip
         if first is None or step == 0:
-            raise OptionError(f"`crf` {text!r} is none. Give one such as 18, 16:25 or 16:25:3.")
+            raise OptionError(
+                f"`crf` {text!r} is not valid. Use a value such as 18, 16:25 or 16:25:3."
+            )
         found.update(range(first, (first if last is None else last) + 1, step or 1))
     if not found or min(found) < 1 or max(found) > max(MAX_CRF.values()):
         raise OptionError(
-            f"`crf` {', '.join(texts)} has values beyond 1 to {max(MAX_CRF.values())}."
+            f"`crf` {', '.join(texts)} has values outside 1 to {max(MAX_CRF.values())}."
         )
     return tuple(sorted(found))
 
@@ -250,7 +252,7 @@ def parse_target(text: str) -> ScoreGoal:
         value = -1.0
     if metric not in METRICS or not 0 < value <= 100:
         raise OptionError(
-            f"`target` {text!r} is none. Give METRIC=SCORE, such as vmaf=99.5; there are "
+            f"`target` {text!r} is not valid. Use METRIC=SCORE, such as vmaf=99.5; metrics: "
             f"{', '.join(METRICS)}."
         )
     return ScoreGoal(metric, value)
@@ -270,7 +272,7 @@ def check_options(options: EvaluateOptions) -> None:
     if options.start is not None and not 0 <= options.start < float("inf"):
         raise OptionError(f"`start` {options.start:g} is not a number of seconds.")
     if options.cluster and options.jobs != 1:
-        raise OptionError("`jobs` is for this machine; how many a `cluster` tries is up to it.")
+        raise OptionError("`jobs` is for this machine; a `cluster` decides how many run at once.")
     parse_target(options.target)
 
 

@@ -88,9 +88,7 @@ def run_task(job: str) -> None:
         Mp4dsError: It failed; says why.
     """
     if not Path(job).is_file():
-        raise Mp4dsError(
-            f"{job} is not there: all machines must share the folder of the evaluation."
-        )
+        raise Mp4dsError(f"{job} does not exist: all machines must share the evaluation's folder.")
     for outcome in ProcessEngine(command, 1).run([(job,)], lambda *_: None):
         if outcome.error is not None:
             raise Mp4dsError(outcome.error[1])
@@ -166,7 +164,9 @@ def _ffmpeg(versions: dict[str, str]) -> Ffmpeg | None:
         if here.get(name) != version
     ]
     if others:
-        raise Mp4dsError(f"there are other versions: {', '.join(others)}. Install the same.")
+        raise Mp4dsError(
+            f"versions differ between machines: {', '.join(others)}. Install the same."
+        )
     return ffmpeg
 
 
@@ -429,7 +429,9 @@ class Trials:
         sentence = outcome.error[1] if outcome.error else ""
         if not sentence and not self._is_seen(place, setting):
             folder = self._folder / "cells"
-            sentence = f"its result is not seen in {folder}; all machines must share this folder."
+            sentence = (
+                f"its result did not appear in {folder}; all machines must share this folder."
+            )
         result = None if sentence else self._read(place, setting)
         if result is not None:
             self.tried += 1

@@ -50,13 +50,13 @@ def write(job: ExportJob) -> None:
         job.write_png_files(camera, f"images/{place}", [f"images/{file}" for file in files])
         calibration = camera.calibration
         if calibration is None:
-            job.note(f"{camera.topic}: it is not calibrated, and so is not in cameras.txt")
+            job.note(f"{camera.topic}: not calibrated, so it is not in cameras.txt")
             continue
         found = model_of(calibration)
         if found is None:
             job.note(
                 f"{camera.topic}: COLMAP has no model for distortion "
-                f"{calibration.distortion_model!r}, so that it is not in cameras.txt"
+                f"{calibration.distortion_model!r}, so it is not in cameras.txt"
             )
             continue
         hold_calibration(camera, source.ledger)
@@ -155,8 +155,8 @@ def _poses(job: ExportJob) -> Poses | None:
     poses = Poses(job.source.dataset, job.options.poses)
     if not poses.body:
         raise OptionError(
-            f"`poses` {poses.topic} does not say which frame it places, and a camera's pose "
-            "needs it. Give an Odometry or a TransformStamped."
+            f"`poses` {poses.topic} does not say whose pose it gives, which is needed for a "
+            "camera's pose. Use an Odometry or TransformStamped topic."
         )
     return poses
 
@@ -173,8 +173,8 @@ def _write_images(
             place = tree.pose(camera.frame_id, poses.body)
             if place is None:
                 job.note(
-                    f"{camera.topic}: no static transforms tell {camera.frame_id!r} in "
-                    f"{poses.body!r}, so that its images are not in images.txt"
+                    f"{camera.topic}: no static transforms connect {camera.frame_id!r} to "
+                    f"{poses.body!r}, so its images are not in images.txt"
                 )
                 continue
             missing = 0
@@ -191,9 +191,9 @@ def _write_images(
             if missing:
                 job.note(
                     f"{camera.topic}: {missing} of {len(camera)} images are before the first or "
-                    "after the last pose, and so are not in images.txt"
+                    "after the last pose, so they are not in images.txt"
                 )
     (job.path / _MODEL / "points3D.txt").write_text("# no points\n", encoding="utf-8")
     job.source.ledger.hold(poses.topic, len(track.times))
     job.places[f"{_MODEL}/images.txt"] = poses.topic
-    job.note(f"{poses.topic}: poses of images are told, between those that were recorded")
+    job.note(f"{poses.topic}: poses of images are interpolated between the recorded ones")

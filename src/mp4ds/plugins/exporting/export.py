@@ -82,7 +82,7 @@ def export(
     paths = datasets_in(datasets)
     _check(to, paths, chosen)
     if remote(location(output)):
-        raise OptionError(f"{output} is a URL: export to this machine, then upload it.")
+        raise OptionError(f"{output} is a URL: export to a local folder, then upload it.")
     target = Path(os.path.abspath(output))  # noqa: PTH100
     try:
         writer: Callable[[ExportJob], None] = import_module(f"mp4ds.plugins.exporting.{to}").write
@@ -112,7 +112,7 @@ def export(
         summary = _summary(job, to)
         if not any(summary.messages.values()):
             raise OptionError(
-                f"{FORMATS[to]} can hold no topic of {opened[0].path}: "
+                f"{FORMATS[to]} cannot hold any topic of {opened[0].path}: "
                 f"{_first_reason(summary) or 'it has no messages'}."
             )
         if path.is_dir():
@@ -136,16 +136,19 @@ def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
         raise OptionError(f"format {to!r} is not known. Use {', '.join(FORMATS)}.")
     if len(paths) > 1 and to not in _SEVERAL:
         raise OptionError(
-            f"{FORMATS[to]} holds one dataset, and {len(paths)} are given: export each by itself."
+            f"{FORMATS[to]} holds a single dataset, but {len(paths)} were given: export them "
+            "one by one."
         )
     usual = ExportOptions()
     for name, formats in _OPTIONS_OF.items():
         if getattr(options, name) != getattr(usual, name) and to not in formats:
-            raise OptionError(f"`{name}` goes with {', '.join(formats)}, not with {to}.")
+            raise OptionError(f"`{name}` works with {', '.join(formats)}, not with {to}.")
     if to == "lerobot" and options.pixels not in ("seen", "rgb"):
-        raise OptionError(f"LeRobot's videos are of colours: `pixels` {options.pixels} is not.")
+        raise OptionError(
+            f"LeRobot's videos are in colour: `pixels` {options.pixels} does not apply."
+        )
     if options.tolerance_ns is not None and options.tolerance_ns < 0:
-        raise OptionError("`tolerance_ns` is the most time between frames: use 0 or more.")
+        raise OptionError("`tolerance_ns` is the maximum time between frames: use 0 or more.")
     _ = options.reduction  # refuses its own
 
 

@@ -49,7 +49,7 @@ def _nanoseconds(milliseconds: str) -> int:
         return round(float(milliseconds) * _NS_PER_MS)
     except (ValueError, OverflowError):
         raise OptionError(
-            f"`tolerance_ns` {milliseconds!r} is no number of milliseconds."
+            f"`tolerance_ns` {milliseconds!r} is not a number of milliseconds."
         ) from None
 
 
@@ -135,7 +135,7 @@ class ExportSummary:
 # ---------------------------------------------------------------- ledger
 
 AS_RECORDED = "stored as recorded in messages.mcap, not as video"
-NOT_CHOSEN = "not chosen"
+NOT_CHOSEN = "not selected"
 
 
 class Ledger:
@@ -192,7 +192,7 @@ class Ledger:
 # ---------------------------------------------------------------- cameras
 
 _THINNED = "left out on request (--every, --max-rate)"
-_INVERSE = "quantised inverse depths; `mp4ds unpack --images raw` makes depths of them"
+_INVERSE = "quantised inverse depths; `mp4ds unpack --images raw` converts them to depths"
 
 Integers = NDArray[np.int64]
 
@@ -311,7 +311,9 @@ def chosen_cameras(
         ledger.leave(stream.topic, _THINNED, len(stream) - len(kept))
         times = times_of(columns)
         if times is not columns.stamp:
-            notes.append(f"{stream.topic}: its stamps do not increase, log times are told instead")
+            notes.append(
+                f"{stream.topic}: its stamps do not increase, so log times are used instead"
+            )
         kept = kept[np.argsort(times[kept], kind="stable")]
         view = _view(stream, options, notes)
         cameras.append(ExportedCamera(stream, kept, times[kept], view))
@@ -331,7 +333,7 @@ def _view(stream: Stream, options: ExportOptions, notes: list[str]) -> View:
         keeps = (
             ", which --pixels native keeps" if known.mosaic and colours != options.pixels else ""
         )
-        notes.append(f"{stream.topic}: its pixels are made of {kind}{keeps}")
+        notes.append(f"{stream.topic}: its pixels are converted from {kind}{keeps}")
     if encoding_as(known, "rgb") is None:
         colours = "native"  # depths and other numbers have no colours
     return view_of(
@@ -351,7 +353,7 @@ def _matched(
     times = {str(number): camera.times for number, camera in enumerate(cameras)}
     matches = synchronize(times, tolerance_ns=tolerance_ns)
     for number, camera in enumerate(cameras):
-        reason = "not every camera has a frame of this time (--sync)"
+        reason = "not every camera has a frame at this time (--sync)"
         ledger.leave(camera.topic, reason, len(matches.unmatched[str(number)]))
     columns = zip(cameras, matches.indices.T, strict=True)
     return [camera.at(places) for camera, places in columns]
@@ -375,7 +377,9 @@ def of_different_times(camera: ExportedCamera, ledger: Ledger) -> ExportedCamera
     """The camera with one frame of each time, where files are called by it."""
     is_new = np.diff(camera.times, prepend=camera.times[:1] - 1) != 0
     ledger.leave(
-        camera.topic, "another frame has the same time, and so its name", int((~is_new).sum())
+        camera.topic,
+        "another frame has the same time, and therefore the same name",
+        int((~is_new).sum()),
     )
     return camera.at(np.flatnonzero(is_new))
 
@@ -392,9 +396,9 @@ def hold_calibration(camera: ExportedCamera, ledger: Ledger) -> Calibration | No
         same = [number for number, item in enumerate(info.calibrations) if item is used]
         is_same = np.isin(columns.variant, same)
         ledger.hold(topic)
-        ledger.leave(topic, "repeats the calibration that is held", int(is_same.sum()) - 1)
+        ledger.leave(topic, "repeats the exported calibration", int(is_same.sum()) - 1)
         ledger.leave(
-            topic, "another calibration: one of each camera is held", int((~is_same).sum())
+            topic, "a different calibration: only one per camera is exported", int((~is_same).sum())
         )
     return camera.calibration
 

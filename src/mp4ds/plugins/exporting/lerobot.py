@@ -217,9 +217,9 @@ def write(job: ExportJob) -> None:
         found = _features(source, job, episode, fps)
         if features and found != features:
             raise OptionError(
-                f"{source.dataset.path} has other cameras, sizes or numbers than "
-                f"{job.sources[0].dataset.path}, and episodes of LeRobot have the same. Choose "
-                "with `topics`, and `resize` WxH."
+                f"{source.dataset.path} differs in cameras, sizes or vector lengths from "
+                f"{job.sources[0].dataset.path}, but LeRobot episodes must agree. Select with "
+                "`topics`, and `resize` WxH."
             )
         features = found
         write_frames(
@@ -239,10 +239,10 @@ def write(job: ExportJob) -> None:
     _write_json(job.path / "meta/stats.json", statistics)
     _write_json(job.path / "meta/info.json", _info(episodes, features, fps))
     if not task:
-        job.note("no --task is given: the task of every frame is empty")
+        job.note("no --task was given: every frame's task is empty")
     job.note(
-        f"stamps are those of {fps} frames in a second from the first frame on; the recorded "
-        "ones have no place"
+        f"stamps count up at {fps} frames per second from the first frame; recorded stamps are "
+        "not kept"
     )
 
 
@@ -261,16 +261,16 @@ def _shown(source: ExportedDataset) -> list[ExportedCamera]:
     for camera in source.cameras:
         reason = ""
         if camera.view.encoding.name != "rgb8":
-            reason = f"LeRobot's videos show colours of 8 bits, and no {camera.stream.encoding}"
+            reason = f"LeRobot's videos are in 8-bit colour, not {camera.stream.encoding}"
         if reason or not len(camera):
             source.ledger.leave(camera.topic, reason, len(camera))
             continue
         is_later = camera.numbers >= np.maximum.accumulate(camera.numbers)
-        source.ledger.leave(camera.topic, "its stamp goes backward", int((~is_later).sum()))
+        source.ledger.leave(camera.topic, "its stamp goes backwards", int((~is_later).sum()))
         found.append(camera.at(np.flatnonzero(is_later)))
     if not found:
         raise OptionError(
-            f"{source.dataset.path} has no camera for LeRobot: its videos show colours of 8 bits."
+            f"{source.dataset.path} has no camera for LeRobot, whose videos are in 8-bit colour."
         )
     return found
 
@@ -292,7 +292,7 @@ class _Maker:
         end = min(int(camera.times[-1]) for camera in cameras)
         if end < start:
             raise OptionError(
-                f"{source.dataset.path}: its cameras have no time in common. Choose some with "
+                f"{source.dataset.path}: its cameras do not overlap in time. Select some with "
                 "`topics`."
             )
         length = ((end - start) * fps + _NS // 2) // _NS + 1
@@ -329,7 +329,7 @@ class _Maker:
         unused[used] = False
         ledger.leave(
             camera.topic,
-            f"another frame is nearer to each of {self._fps} in a second",
+            f"another frame is nearer at {self._fps} frames per second",
             int((unused & is_within).sum()),
         )
         ledger.leave(
@@ -339,8 +339,8 @@ class _Maker:
         )
         if length > len(used):
             self._source.notes.append(
-                f"{camera.topic}: {length - len(used)} of {length} frames repeat the one before, "
-                f"to be {self._fps} in a second"
+                f"{camera.topic}: {length - len(used)} of {length} frames repeat the previous "
+                f"one, to reach {self._fps} per second"
             )
         path = self._job.path / _video_path(feature, self._number)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -360,7 +360,7 @@ class _Maker:
         ):
             camera.stream.verify_video()
             join_segments([camera.stream.video_path], ticks.tolist(), path)
-            self._source.notes.append(f"{camera.topic}: its video is copied, not encoded anew")
+            self._source.notes.append(f"{camera.topic}: its video is copied, not re-encoded")
             return _video_facts(path, size, sidecar.video.codec)
         return self._encode(camera.at(used), repeats.tolist(), ticks.tolist(), path)
 
@@ -409,8 +409,8 @@ class _Maker:
         for time, values in in_order(vectors.rows()):
             if len(values) != count:
                 raise OptionError(
-                    f"{vectors.topic} has messages of {count} and of {len(values)} numbers, and "
-                    "LeRobot has as many in each frame."
+                    f"{vectors.topic} has messages of {count} and of {len(values)} numbers, but "
+                    "LeRobot needs the same number in each frame."
                 )
             times.append(time)
             rows.append(values)
@@ -419,13 +419,12 @@ class _Maker:
         self._source.ledger.hold(vectors.topic, used)
         self._source.ledger.leave(
             vectors.topic,
-            f"another message is nearer to each of {self._fps} frames in a second",
+            f"another message is nearer at {self._fps} frames per second",
             len(rows) - used,
         )
         away = int(np.abs(np.array(times, np.int64)[places] - self._times).max())
         self._source.notes.append(
-            f"{vectors.topic}: numbers are those nearest to each frame, at most {away / _NS:.3f} s "
-            "from it"
+            f"{vectors.topic}: each frame gets the nearest message, at most {away / _NS:.3f} s away"
         )
         return np.array(rows, np.float32).reshape(-1, count)[places]
 

@@ -204,8 +204,8 @@ class Poses:
         if name not in POSES:
             known = ", ".join(POSES)
             raise OptionError(
-                f"`poses` {topic} is {f'of type {name}' if name else 'no topic of ROS'} in "
-                f"{dataset.path}. Give one of {known}."
+                f"`poses` {topic} is {f'of type {name}' if name else 'not a ROS topic'} in "
+                f"{dataset.path}. Use a topic of type {known}."
             )
         self._parts = POSES[name]
         first = next(dataset.messages([topic]), None)
@@ -246,8 +246,8 @@ class Vectors:
         name = ros_type(dataset, topic)
         if name not in self._TYPES:
             raise OptionError(
-                f"{option} {topic} is {f'of type {name}' if name else 'no topic of ROS'} in "
-                f"{dataset.path}. Give one of {', '.join(self._TYPES)}."
+                f"{option} {topic} is {f'of type {name}' if name else 'not a ROS topic'} in "
+                f"{dataset.path}. Use a topic of type {', '.join(self._TYPES)}."
             )
         self._is_joints = name == self._TYPES[0]
         first = next(dataset.messages([topic]), None)

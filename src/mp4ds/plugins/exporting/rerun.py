@@ -121,12 +121,12 @@ class _Writer:
         for topic in dict.fromkeys(self._static_topics):
             if self._source.chosen(topic):
                 ledger.hold(topic, ledger.total(topic))
-                self._job.note(f"{topic}: of each child frame the last transform is held")
+                self._job.note(f"{topic}: only the last transform of each child frame is kept")
         for message in self._moving():
             if self._write_moving(message):
                 ledger.hold(message.topic)
             else:
-                ledger.leave(message.topic, "a frame has several parents, and in Rerun one", 1)
+                ledger.leave(message.topic, "a frame has several parents; Rerun allows one", 1)
         for topic in self._tf_topics:
             self._job.places[rerun.new_entity_path(["tf"])] = topic
 
@@ -156,7 +156,7 @@ class _Writer:
         encoding = camera.view.encoding
         is_light = encoding_as(encoding, "rgb") is not None
         if not is_light and encoding.name not in _UNITS_IN_METRE:
-            reason = f"Rerun has neither light nor depths of {encoding.name}"
+            reason = f"Rerun cannot hold {encoding.name} as an image or as depths"
             self._source.ledger.leave(camera.topic, reason, len(camera))
             return False
         calibration = hold_calibration(camera, self._source.ledger)
@@ -243,7 +243,7 @@ class _Writer:
             count += 1
         self._source.ledger.hold(topic, count)
         self._job.places[rerun.new_entity_path(parts)] = topic
-        self._job.note(f"{topic}: orientation and covariances are not held")
+        self._job.note(f"{topic}: orientation and covariances are not kept")
 
     # ------------------------------------------------------------ poses and joints
 
@@ -263,7 +263,7 @@ class _Writer:
         if path:
             self._job.places[path] = topic
         if kind not in _POSES_ALONE:
-            self._job.note(f"{topic}: of a message the position and orientation are held")
+            self._job.note(f"{topic}: only position and orientation are kept")
 
     def _write_joints(self, topic: str) -> None:
         """Log positions, velocities and efforts, a series of each joint."""

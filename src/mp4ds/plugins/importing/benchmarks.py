@@ -72,7 +72,7 @@ def find_euroc(folder: Path, options: ImageFolder) -> Scene:
         elif sensor.name.startswith(_POSES):
             _add_poses(scene, sensor)
         else:
-            scene.leave_out(sensor, f"{sensor.name}, which is neither camera, IMU nor pose")
+            scene.leave_out(sensor, f"{sensor.name}, which is not a camera, IMU or pose")
     root = folder / "mav0" if (folder / "mav0").is_dir() else folder
     for path in sorted(root.iterdir()):
         if path.is_file() and path.suffix == ".yaml":
@@ -96,7 +96,7 @@ def _described(scene: Scene, sensor: Path) -> dict[str, Any]:
         try:
             scene.transforms.append(transform(_BODY, sensor.name, pose[:3, :3], pose[:3, 3]))
         except ValueError as error:
-            raise SourceError(path, f"tells no pose: {error}") from None
+            raise SourceError(path, f"holds no valid pose: {error}") from None
     return values
 
 
@@ -131,7 +131,7 @@ def _add_poses(scene: Scene, sensor: Path) -> None:
     scene.tables.append(SensorTable(f"/{sensor.name}", "pose", _WORLD, stamps, poses))
     scene.files.append(path)
     if any(len(split(line)) > 8 for _, line in lines_of(path)):
-        scene.skipped[f"rows of {sensor.name} of which the pose alone was taken"] = len(rows)
+        scene.skipped[f"rows of {sensor.name} of which only the pose was taken"] = len(rows)
 
 
 # ---------------------------------------------------------------- kitti
@@ -200,7 +200,7 @@ def find_kitti(folder: Path, options: ImageFolder) -> Scene:
     used = {path for file in scene.files for path in (file, *file.parents)}
     for path in sorted(folder.iterdir()):
         if path not in used:
-            scene.leave_out(path, f"{path.name}, which is no camera")
+            scene.leave_out(path, f"{path.name}, which is not a camera")
     return scene
 
 
@@ -241,7 +241,7 @@ def _raw_calibration(
         _place(scene, name, np.eye(3), _origin(p))
         return _rectified(size, p)
     if size != values.size(f"S_{number}"):
-        scene.skipped[f"calibrations of {name}, made for images of another size"] = 1
+        scene.skipped[f"calibrations of {name}, made for a different image size"] = 1
         return None
     rotation = values.numbers(f"R_{number}", 9).reshape(3, 3)
     translation = values.numbers(f"T_{number}", 3)
@@ -329,7 +329,7 @@ def _read_stamps(path: Path, files: list[Path], read: Callable[[str], int]) -> N
     if len(stamps) != len(files):
         place = files[0].parent if files else path.parent
         raise SourceError(
-            path, f"has {len(stamps)} times, and there are {len(files)} images in {place}"
+            path, f"has {len(stamps)} times, but there are {len(files)} images in {place}"
         )
     return stamps
 
@@ -384,7 +384,7 @@ def find_tum(folder: Path, options: ImageFolder) -> Scene:
     for place, listed in folders.items():
         scene.files.append(place)
         if place != folder and (unlisted := len(members(place)) - len(listed)):
-            scene.skipped[f"files in {place.name} that no list names"] = unlisted
+            scene.skipped[f"files in {place.name} that are not in any list"] = unlisted
     for name, (kind, frame_id, values) in _TABLES.items():
         path = folder / f"{name}.txt"
         if path.is_file():
@@ -393,5 +393,5 @@ def find_tum(folder: Path, options: ImageFolder) -> Scene:
             scene.files.append(path)
     for path in sorted(folder.iterdir()):
         if path not in scene.files:
-            scene.leave_out(path, f"{path.name}, which is not of the layout")
+            scene.leave_out(path, f"{path.name}, which is not part of the layout")
     return scene

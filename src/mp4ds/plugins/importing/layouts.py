@@ -48,8 +48,8 @@ _NUMBER = re.compile(r"(?<!\d)(?<!cam)(?<!camera)\d+|(?<=cam)\d{2,}|(?<=camera)\
 _HEX = re.compile(r"[0-9a-f]+", re.I)
 _WORD = re.compile(r"[^\W_]+")
 _ADVICE = (
-    "One rate does not tell their times. Give `stamps` FILE with a time and a file name in each "
-    "line, or put those of each camera into a folder of its own."
+    "A single rate cannot give their times. Give `stamps` FILE with a time and a file name per "
+    "line, or put each camera's images into a folder of its own."
 )
 
 
@@ -76,8 +76,8 @@ def by_camera(folder: Path, images: Sequence[Path]) -> Mapping[str, list[Path]]:
             first, second = (paths[0].name for paths in list(kinds.values())[:2])
             raise SourceError(
                 folder,
-                f"holds images of several kinds by their names, such as {first} and {second}, and "
-                "not the same numbers of each",
+                f"holds images of several kinds, judging by names such as {first} and {second}, "
+                "but their numbers differ",
                 _ADVICE,
             )
         cameras = dict(zip(_names(list(kinds)), kinds.values(), strict=True))
@@ -122,7 +122,9 @@ def _check_turns(folder: Path, images: Sequence[Path]) -> None:
             f"{images[place].name} ({kinds[place]})" for place in (changes[0] - 1, changes[0])
         )
         raise SourceError(
-            folder, f"holds images of several kinds in turns, such as {first} and {second}", _ADVICE
+            folder,
+            f"holds images of several kinds interleaved, such as {first} and {second}",
+            _ADVICE,
         )
 
 
@@ -160,7 +162,9 @@ def find_plain(folder: Path, options: ImageFolder) -> Scene:
         OptionError: An option is wrong.
     """
     if options.stamps and options.rate:
-        raise OptionError("`stamps` tells the times that `rate` makes up. Give one of them.")
+        raise OptionError(
+            "`stamps` gives the times that `rate` would make up. Give only one of them."
+        )
     scene = Scene(folder)
     images = images_in(folder)
     if not images:
@@ -180,7 +184,7 @@ def find_plain(folder: Path, options: ImageFolder) -> Scene:
     others = [path for path in members(folder) if path.resolve() not in read]
     others = [path for path in others if path.suffix.lower() not in STILL_SUFFIXES]
     if others:
-        scene.skipped[f"files in {folder.resolve().name} that are no images"] = len(others)
+        scene.skipped[f"files in {folder.resolve().name} that are not images"] = len(others)
     scene.files.append(folder)
     return scene
 
@@ -203,8 +207,8 @@ def _by_rate(folder: Path, images: list[Path], options: ImageFolder) -> list[Sce
     given = [key for key in ("topic", "frame_id", "encoding") if getattr(options, key) is not None]
     if len(found) > 1 and given:
         raise OptionError(
-            f"`{given[0]}` is for the images of one camera, and {folder} holds "
-            f"those of {', '.join(found)}. Put each into a folder of its own."
+            f"`{given[0]}` is for the images of one camera, but {folder} holds those of "
+            f"{', '.join(found)}. Put each into a folder of its own."
         )
     try:
         return [
@@ -219,10 +223,10 @@ def _elsewhere(folder: Path) -> str:
     """Where images are, if not in the folder itself."""
     places = [path for path in sorted(folder.iterdir()) if path.is_dir() and images_in(path)]
     if not places:
-        return ", and no layout that is known"
+        return ", and is not in a known layout"
     listed = ", ".join(path.name for path in places[:_LISTED])
     more = ", ..." if len(places) > _LISTED else ""
-    return f" itself, and no layout that is known; there are some in {listed}{more}"
+    return f" itself, and is not in a known layout; there are some in {listed}{more}"
 
 
 def _by_list(
@@ -245,14 +249,14 @@ def _by_list(
         unit = "ns"
     unit = unit or unit_of([values[0] for _, values in chosen if is_number(values[0])])
     if unit is None:
-        raise OptionError(f"{path}: its times are whole numbers of an unknown unit. Give `unit`.")
+        raise OptionError(f"{path}: its times are integers of an unknown unit. Give `unit`.")
     read = of_unit(unit, scene.skipped)
     if name is not None:
         return listed_images(path, scene.folder, read, chosen)
     stamps = read_times(path, chosen, read)
     if len(stamps) != len(images):
         raise SourceError(
-            path, f"has {len(stamps)} times, and there are {len(images)} images in {scene.folder}"
+            path, f"has {len(stamps)} times, but there are {len(images)} images in {scene.folder}"
         )
     return images, stamps
 
@@ -276,11 +280,13 @@ def _by_name(scene: Scene, images: list[Path], unit: str | None) -> NDArray[np.i
         unit = unit or unit_of(names)
     elif unit is not None:
         wrong = next(path for path in images if not is_number(path.stem))
-        raise SourceError(wrong, "has a name that is no time", "Give `stamps` FILE or `rate` HZ.")
+        raise SourceError(
+            wrong, "has a name that is not a time", "Give `stamps` FILE or `rate` HZ."
+        )
     if unit is None or not all(map(is_number, names)):
         raise SourceError(
             scene.folder,
-            "holds images whose names are no times in nanoseconds or decimal seconds",
+            "holds images whose names are not times in nanoseconds or decimal seconds",
             "Give `stamps` FILE, `rate` HZ, or the `unit` of the names.",
         )
     read = of_unit(unit, scene.skipped)
@@ -289,7 +295,7 @@ def _by_name(scene: Scene, images: list[Path], unit: str | None) -> NDArray[np.i
         try:
             stamps[place] = read(path.stem)
         except Refused as error:
-            raise SourceError(path, f"has a name that is no time: {error}") from None
+            raise SourceError(path, f"has a name that is not a time: {error}") from None
     return stamps
 
 
@@ -334,18 +340,18 @@ def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
         OptionError: The options do not suit its layout.
     """
     if remote(folder):
-        raise SourceError(folder, "is not read where it is", "Download it first.")
+        raise SourceError(folder, "cannot be read remotely", "Download it first.")
     if not folder.exists():
         raise SourceNotFoundError(folder)
     if not folder.is_dir():
-        raise SourceError(folder, "is no folder of images")
+        raise SourceError(folder, "is not a folder of images")
     _check(options)
     try:
         name = options.layout or next(key for key in LAYOUTS if LAYOUTS[key].matches(folder))
         layout = LAYOUTS[name]
         _check_for(name, layout, options)
         if not layout.matches(folder):
-            raise SourceError(folder, f"is not laid out as {name} is", "Leave out `layout`.")
+            raise SourceError(folder, f"does not have the layout {name}", "Omit `layout`.")
         scene = layout.find(folder, options)
     except OSError as error:
         if isinstance(error, SourceError):
@@ -374,11 +380,13 @@ def _check_for(name: str, layout: FolderLayout, options: ImageFolder) -> None:
     given = [key for key in _PLAIN_ONLY if getattr(options, key) is not None]
     if name != "plain" and given:
         raise OptionError(
-            f"`{given[0]}` is for plain folders of images, and this one has the "
-            f"layout {name}, which tells it. Give `layout` plain, or leave it out."
+            f"`{given[0]}` is for plain folders of images, but this one has the layout {name}, "
+            f"which already defines it. Give `layout` plain, or omit `{given[0]}`."
         )
     if layout.is_calibrated and options.calibration:
-        raise OptionError(f"`calibration` is not for the layout {name}, which has its own.")
+        raise OptionError(
+            f"`calibration` cannot be used with the layout {name}, which has its own."
+        )
 
 
 def _calibrate(scene: Scene, path: Path) -> None:
@@ -393,8 +401,8 @@ def _calibrate(scene: Scene, path: Path) -> None:
         if size not in (None, (calibration.width, calibration.height)):
             raise SourceError(
                 path,
-                f"is for images of {calibration.width}x{calibration.height}, and those of "
-                f"{camera.topic} have {size[0]}x{size[1]}",
+                f"is for images of {calibration.width}x{calibration.height}, but those of "
+                f"{camera.topic} are {size[0]}x{size[1]}",
             )
     scene.cameras = [replace(camera, calibration=calibration) for camera in scene.cameras]
     if path.resolve() not in {file.resolve() for file in scene.files}:

@@ -202,8 +202,8 @@ class ImagesReader:
         is_jpeg = np.array([path.suffix.lower() in _JPEG for path in camera.files], bool)
         if camera.encoding and is_jpeg.any():
             raise OptionError(
-                f"{camera.topic} has JPEG files, which are kept as they are: "
-                f"they have no encoding {camera.encoding}."
+                f"{camera.topic} has JPEG files, which are kept as they are: `encoding` "
+                f"{camera.encoding} cannot apply to them."
             )
         for chosen, topic, type_name in (
             (~is_jpeg, camera.topic, IMAGE),
@@ -316,7 +316,7 @@ def _image_message(
     told, pixels = read_image(path)
     encoding = ENCODINGS[camera.encoding or told]
     if not _suits(encoding, pixels):
-        raise SourceError(path, f"holds {told} pixels, which cannot be {encoding.name}")
+        raise SourceError(path, f"has {told} pixels, which cannot be {encoding.name}")
     height, width = pixels.shape[:2]
     step = width * encoding.pixel_bytes
     fields = ImageFields(encoding.name, width, height, step, is_bigendian=0)

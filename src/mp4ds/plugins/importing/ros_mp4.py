@@ -70,15 +70,17 @@ def import_ros_mp4(
     for path in (source, described):
         if not path.is_file():
             raise (
-                SourceNotFoundError(path) if not path.exists() else SourceError(path, "is no file")
+                SourceNotFoundError(path)
+                if not path.exists()
+                else SourceError(path, "is not a file")
             )
     target = Path(os.path.abspath(_local(dataset)))  # noqa: PTH100 - keeps links, unlike resolve()
     states = [SourceState.of(source), SourceState.of(described)]
     old = load_stream(described, video=_ANY)  # users may have named theirs as they like
     if old.stamps != "record-float":
         raise OptionError(
-            f"{described} is no YAML of the tool published with the paper: it is a sidecar of "
-            "mp4ds already."
+            f"{described} is not a YAML file of the tool published with the paper: it is already "
+            "an mp4ds sidecar."
         )
     with (
         staged(target, force=force, owned=dataset_files, sources=[source, described]) as folder,
@@ -113,11 +115,11 @@ def _check(video: Path, described: Path, old: StreamSidecar) -> None:
             raise FormatError(
                 "frame-count",
                 video,
-                f"has {len(reader)} frames, and {described} tells the times of {old.frames}",
+                f"has {len(reader)} frames, but {described} has the times of {old.frames}",
             )
     stamps = old.columns.stamp.decode(old.frames)
     if stamps.min() < 0 or stamps.max() > _MAX_STAMP:
-        raise FormatError("column-invalid", described, "has times that ROS 1 has no bits for")
+        raise FormatError("column-invalid", described, "has times outside the range of ROS 1")
 
 
 def _part_of(video: Path, old: StreamSidecar, folder: Path) -> PartRecord:

@@ -27,7 +27,7 @@ UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 MAX_STAMP = 2**31 * 10**9 - 1
 """The latest time that a message of ROS 2 has bits for, nanoseconds: in 2038."""
 
-ROUNDED = "times finer than a nanosecond, which were rounded to it"
+ROUNDED = "times finer than a nanosecond, which were rounded"
 
 _CERTAIN_DIGITS = 16  # of nanoseconds since 1970; a count of seconds or images has fewer
 _NUMBER = re.compile(r"\+?([0-9]{1,40})(?:(\.[0-9]{0,40})?([eE][-+]?[0-9]{1,2})?)?")
@@ -65,7 +65,7 @@ def of_unit(unit: str, found: Counter[str]) -> Callable[[str], int]:
 
     def read(text: str) -> int:
         if not _NUMBER.fullmatch(text):
-            raise Refused(f"{text!r} is no time in {unit}")
+            raise Refused(f"{text!r} is not a time in {unit}")
         return _checked(Fraction(text) * scale, text, found)
 
     return read
@@ -81,7 +81,7 @@ def of_date(found: Counter[str]) -> Callable[[str], int]:
         except ValueError:
             whole = None
         if match is None or whole is None:
-            raise Refused(f"{text!r} is no date and time")
+            raise Refused(f"{text!r} is not a date and time")
         seconds = timegm(whole.timetuple()) + Fraction(f"0{match[2] or ''}")
         return _checked(seconds * UNITS["s"], text, found)
 
@@ -91,7 +91,7 @@ def of_date(found: Counter[str]) -> Callable[[str], int]:
 def _checked(time: Fraction, text: str, found: Counter[str]) -> int:
     nanoseconds = round(time)
     if not 0 <= nanoseconds <= MAX_STAMP:
-        raise Refused(f"{text!r} is not a time from 1970 to 2038, which is what ROS 2 has")
+        raise Refused(f"{text!r} is not between 1970 and 2038, the range of ROS 2 times")
     if nanoseconds != time:
         found[ROUNDED] += 1
     return nanoseconds
@@ -112,7 +112,7 @@ def at_rate(count: int, rate: str) -> NDArray[np.int64]:
     except (ValueError, ZeroDivisionError):
         found = Fraction(0)
     if not Fraction(1, 10**6) <= found <= 10**6:
-        raise Refused(f"{rate!r} is no rate in Hz")
+        raise Refused(f"{rate!r} is not a rate in Hz")
     times = [round(number * 10**9 / found) for number in range(count)]
     if times and times[-1] > MAX_STAMP:
         raise Refused(f"{rate!r} Hz is too slow for {count} images")
@@ -141,7 +141,7 @@ def quaternion(rotation: Matrix) -> tuple[float, float, float, float]:
     m = rotation
     is_near = np.abs(m @ m.T - np.eye(3)).max(initial=0) < _TOLERANCE
     if not np.isfinite(m).all() or not is_near or np.linalg.det(m) < 0:
-        raise ValueError("its rotation is none")
+        raise ValueError("its rotation is not a rotation")
     symmetric = np.empty((4, 4))
     symmetric[:3, :3] = m + m.T - np.trace(m) * np.eye(3)
     vector = [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]
@@ -206,7 +206,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise SourceError(path, f"is larger than {_MAX_BYTES} bytes, and no calibration")
+            raise SourceError(
+                path, f"is larger than {_MAX_BYTES} bytes, so it cannot be a calibration"
+            )
         return yamlio.load(_without_opencv(path.read_bytes()), str(path))
     except FormatError as error:
         raise SourceError(path, error.problem) from None
@@ -237,8 +239,8 @@ def ros_calibration(path: Path) -> CalibrationFields:
     except ValueError as error:
         raise SourceError(
             path,
-            f"is no calibration: {error}",
-            "Give a YAML file as ROS's camera_calibration saves it.",
+            f"is not a valid calibration: {error}",
+            "Give a YAML file saved by ROS's camera_calibration.",
         ) from None
 
 
@@ -272,7 +274,7 @@ def euroc_calibration(path: Path, values: dict[str, Any]) -> CalibrationFields:
             p=projection(k),
         )
     except ValueError as error:
-        raise SourceError(path, f"is no calibration: {error}") from None
+        raise SourceError(path, f"is not a valid calibration: {error}") from None
 
 
 def euroc_pose(path: Path, values: dict[str, Any]) -> Matrix | None:
@@ -286,7 +288,7 @@ def euroc_pose(path: Path, values: dict[str, Any]) -> Matrix | None:
     try:
         return np.array(_matrix(values, "T_BS", 16)).reshape(4, 4)
     except ValueError as error:
-        raise SourceError(path, f"tells no pose: {error}") from None
+        raise SourceError(path, f"holds no valid pose: {error}") from None
 
 
 def projection(k: Sequence[float]) -> tuple[float, ...]:
@@ -297,13 +299,11 @@ def projection(k: Sequence[float]) -> tuple[float, ...]:
 def _distortion(name: str, values: tuple[float, ...]) -> dict[str, Any]:
     if name not in _MODELS:
         known = ", ".join(_MODELS)
-        raise ValueError(f"distortion_model {name!r} is not known; there are {known}")
+        raise ValueError(f"distortion_model {name!r} is not known; known are {known}")
     model, counts = _MODELS[name]
     if len(values) not in counts:
         listed = " or ".join(map(str, counts))
-        raise ValueError(
-            f"{name} has {listed} distortion_coefficients, and there are {len(values)}"
-        )
+        raise ValueError(f"{name} has {listed} distortion_coefficients, not {len(values)}")
     if model == "plumb_bob":  # ROS's has the third radial one, too
         values = (*values, 0.0)[:5]
     return {"distortion_model": model, "d": values}
@@ -337,7 +337,7 @@ def _matrix(
 def _numbers(values: Any, key: str, count: int | None) -> tuple[float, ...]:
     if not isinstance(values, list) or len(values) != (len(values) if count is None else count):
         listed = "numbers" if count is None else f"{count} numbers"
-        raise ValueError(f"{key} is no list of {listed}")
+        raise ValueError(f"{key} is not a list of {listed}")
     return tuple(_number(value, key) for value in values)
 
 
@@ -442,18 +442,18 @@ def lines_of(path: Path) -> Iterator[tuple[int, str]]:
     """Number, from 1, and text of each line that is neither blank nor a comment.
 
     Raises:
-        SourceError: It is no text, or cannot be read.
+        SourceError: It is not a text file, or cannot be read.
     """
     try:
         if path.stat().st_size > MAX_TEXT:
-            raise SourceError(path, f"is larger than {MAX_TEXT} bytes, and no list")
+            raise SourceError(path, f"is larger than {MAX_TEXT} bytes, so it cannot be a list")
         with path.open(encoding="utf-8-sig") as stream:
             for number, line in enumerate(iter(lambda: stream.readline(_MAX_LINE), ""), start=1):
                 text = line.strip()
                 if text and not text.startswith("#"):
                     yield number, text
     except UnicodeDecodeError:
-        raise SourceError(path, "is no text") from None
+        raise SourceError(path, "is not a text file") from None
     except OSError as error:
         raise SourceError(path, f"cannot be read: {error.strerror}") from None
 
@@ -506,7 +506,7 @@ def read_table(
         try:
             table[place] = [float(text) for text in row[1 : values + 1]]
         except ValueError:
-            raise SourceError(path, f"line {number} holds something else than numbers") from None
+            raise SourceError(path, f"line {number} holds something other than numbers") from None
     return times, table
 
 
@@ -543,5 +543,5 @@ def _listed(path: Path, folder: Path, number: int, values: list[str]) -> Path:
         raise SourceError(path, f"line {number} names a file outside of {folder}: {name}")
     image = folder / name
     if not image.is_file():
-        raise SourceError(path, f"line {number} names {image}, which is not there")
+        raise SourceError(path, f"line {number} names {image}, which does not exist")
     return image

@@ -49,12 +49,12 @@ def read_scores(path: Path) -> dict[str, dict[str, NDArray[np.float32]]]:
     """
     try:
         if path.stat().st_size > _MOST_SCORE_BYTES:
-            raise OptionError(f"`scores` {path} has more than {_MOST_SCORE_BYTES} bytes.")
+            raise OptionError(f"`scores` {path} is larger than {_MOST_SCORE_BYTES} bytes.")
         found = json.loads(path.read_bytes())
     except OSError as error:
         raise OptionError(f"`scores` {path} cannot be read: {error.strerror}.") from None
     except (ValueError, RecursionError):
-        raise OptionError(f"`scores` {path} is no JSON.") from None
+        raise OptionError(f"`scores` {path} is not valid JSON.") from None
     if not isinstance(found, dict):
         raise _unlike(path)
     return {topic: _measures(path, measures) for topic, measures in found.items()}
@@ -80,7 +80,7 @@ def _measures(path: Path, measures: object) -> dict[str, NDArray[np.float32]]:
 def _unlike(path: Path) -> OptionError:
     return OptionError(
         f'`scores` {path} is not of the form {{"/topic": {{"vmaf": [98.7, null, ...]}}}}, with at '
-        f"most {_MOST_MEASURES} measures of a topic."
+        f"most {_MOST_MEASURES} metrics per topic."
     )
 
 
@@ -94,8 +94,8 @@ def scores_of(stream: Stream, scores: Mapping[str, Scores]) -> Scores:
     for name, values in found.items():
         if len(values) != len(stream):
             raise OptionError(
-                f"{stream.topic} has {len(stream)} frames, and {len(values)} scores {name!r}: "
-                "give one for each frame, null where there is none."
+                f"{stream.topic} has {len(stream)} frames but {len(values)} scores {name!r}: give "
+                "one per frame, or null where there is none."
             )
     return found
 
@@ -106,7 +106,7 @@ _MS = 1e6  # nanoseconds
 _WIDER = 2  # times the span of the log times, beyond which stamps are of several clocks
 _SLACK_NS = 10 * 10**9
 _DAY_NS = 86_400 * 10**9
-_NO_STAMPS, _OTHER_CLOCK = "no header stamps", "stamps of another clock"
+_NO_STAMPS, _OTHER_CLOCK = "no header stamps", "stamps from another clock"
 
 
 @dataclass(frozen=True)
@@ -373,9 +373,9 @@ def _problem(
         return ""
     name = _name(calibration.distortion_model)
     if name not in _POLYNOMIAL | _FISHEYE:
-        return f"the distortion model {calibration.distortion_model!r} is not known here"
+        return f"the distortion model {calibration.distortion_model!r} is not supported here"
     if not np.isfinite(d).all() or any(d[_MOST_D:]):
-        return "its sensor is tilted, which is not drawn"
+        return "its sensor is tilted, which is not supported"
     return ""
 
 
@@ -444,7 +444,7 @@ _MOST_CALIBRATIONS = 64
 """Changes of a calibration that the page lists; of a self-calibrating camera there are more."""
 
 _MOST_OVERLAYS = 8
-_NOT_SEEN = Overlay([], [], [], "what is played is not the image")
+_NOT_SEEN = Overlay([], [], [], "the video that is played does not show the image")
 
 
 @dataclass

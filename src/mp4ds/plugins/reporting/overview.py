@@ -72,11 +72,11 @@ def brief(path: Path) -> Brief:
     """What the manifest of a dataset says.
 
     Raises:
-        SourceError: It is no dataset.
+        SourceError: It is not a dataset.
         FormatError: The manifest breaks a rule of the format.
     """
     if not (path / MANIFEST_NAME).is_file():
-        raise SourceError(path, "is no dataset", "Give folders that `mp4ds pack` made.")
+        raise SourceError(path, "is not a dataset", "Give folders made by `mp4ds pack`.")
     manifest = load_manifest(path / MANIFEST_NAME)
     by_topic: dict[str, int] = {}
     for stream in manifest.streams:
@@ -131,14 +131,14 @@ def reports(
         progress: Called with a phrase, and the share that is done.
 
     Raises:
-        SourceError: There is no dataset.
+        SourceError: There is not a dataset.
         OptionError: An option is of one report.
         TargetError: The page may not be written there.
         WriteError: The disk refused.
     """
     chosen = options or ReportOptions()
     if chosen.output is not None or chosen.scores is not None or chosen.slice:
-        raise OptionError("`scores`, `start`, `end` and `duration` go with one dataset.")
+        raise OptionError("`scores`, `start`, `end` and `duration` work with one dataset only.")
     found = datasets_in(datasets)
     for path in found:
         if remote(path):

@@ -274,17 +274,17 @@ def utc_text(time_ns: int) -> str:
 def _notes(dataset: Dataset) -> Iterable[str]:
     manifest = dataset.manifest
     if any(stream.sidecar.stamps == "record-float" for stream in dataset.streams):
-        yield "Times are record times that were stored as float seconds: they are not exact."
+        yield "Times are record times stored as float seconds, so they are not exact."
     if manifest is None:
         return
     if manifest.about:
         yield from manifest.about.lines
     for item in manifest.verbatim:
         yield (
-            f"{item.topic}: {item.messages} messages are in messages.mcap as they were, from "
-            f"number {item.first} on: {item.reason}."
+            f"{item.topic}: {item.messages} messages are stored verbatim in messages.mcap, the "
+            f"first is number {item.first}: {item.reason}."
         )
     for loss in manifest.losses:
-        yield f"Lost when it was packed: {loss.file}: {loss.problem}."
+        yield f"Lost when packing: {loss.file}: {loss.problem}."
     if manifest.topics_left_out:
-        yield f"Left out when it was packed: {', '.join(manifest.topics_left_out)}."
+        yield f"Left out when packing: {', '.join(manifest.topics_left_out)}."

@@ -49,7 +49,7 @@ def why_not_in_browsers(path: Path) -> str:
     if name not in _PLAYED:
         return f"{'few browsers play' if name in _FEW else 'no browser plays'} {name}"
     if pixel_format not in _PLAYED[name]:
-        return f"no browser plays {name} of the pixel format {pixel_format}"
+        return f"no browser plays {name} in the pixel format {pixel_format}"
     return ""
 
 
@@ -95,10 +95,10 @@ class Look:
         if not self._is_light:
             self._low, self._high = _range(_sampled(stream), _LOW, _HIGH)
             first = "the first of its channels, " if encoding.channels > 1 else ""
-            self.caption = f"in colours: {first}{self._low:.4g} to {self._high:.4g}"
+            self.caption = f"in false colour: {first}{self._low:.4g} to {self._high:.4g}"
         elif self._view.dtype != np.uint8:
             self._high = _range(_sampled(stream), _LOW, _WHITE)[1]
-            self.caption = f"of 16 bits: white is {self._high:.0f}"
+            self.caption = f"16 bits: white is {self._high:.0f}"
 
     def picture(self, pixels: Pixels) -> Bytes:
         """A new picture, shape (H, W, 3).
@@ -211,7 +211,7 @@ def presentation_times(stream: Stream) -> NDArray[np.int64]:
     ticks = table.presentation[table.order]
     if len(ticks) != len(stream):
         raise VideoError(
-            "frame-count", path, f"has {len(ticks)} frames where its sidecar says {len(stream)}"
+            "frame-count", path, f"has {len(ticks)} frames, but its sidecar says {len(stream)}"
         )
     whole, part = np.divmod(ticks, table.timescale)
     times: NDArray[np.int64] = whole * _MICROSECONDS + part * _MICROSECONDS // table.timescale
@@ -224,7 +224,7 @@ def why_not_seen(stream: Stream) -> str:
     """Why a stream's video does not look like its images; empty if it does."""
     if stream.sidecar.body == "packet" or stream.sidecar.layout.is_shown:
         return ""
-    return f"its picture is not the image (layout {stream.sidecar.video.layout})"
+    return f"the coded picture does not show the image (layout {stream.sidecar.video.layout})"
 
 
 def proxy_size(image_size: tuple[int, int], width: int) -> tuple[int, int]:

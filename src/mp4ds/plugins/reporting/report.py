@@ -151,7 +151,7 @@ def report(
         if remote(opened.path):
             raise SourceError(opened.path, "is not on this machine", "Copy the dataset first.")
         if opened.manifest is None and chosen.output is None:
-            raise OptionError("A video alone has no folder for a report: give `output`.")
+            raise OptionError("A single video has no folder for a report: give `output`.")
         folder = Path(os.path.abspath(chosen.output or opened.path))  # noqa: PTH100 - as named
         _check_place(folder, force=chosen.force)
         scores = _scores(opened, chosen.scores)
@@ -177,7 +177,7 @@ def _report_slice(
     from mp4ds.packing.pack import pack
 
     if options.output is None:
-        raise OptionError("Give `output`, for a dataset of the slice with its report in it.")
+        raise OptionError("Give `output`: where to write the slice as a dataset with its report.")
     tell("copying the slice")
     span = PackOptions(
         start=options.start, end=options.end, duration=options.duration, force=options.force
@@ -197,7 +197,7 @@ def _scores(dataset: Dataset, path: Path | None) -> Mapping[str, Scores]:
     for topic in scores:
         if topic not in dataset:
             known = ", ".join(dataset.topics) or "none"
-            raise OptionError(f"`scores` {path} has {topic!r}, which is none of {known}.")
+            raise OptionError(f"`scores` {path} has {topic!r}, which is not one of {known}.")
     return scores
 
 
@@ -287,7 +287,7 @@ def _give_video(
     unplayable = why_not_in_browsers(stream.video_path)
     camera.note = unplayable or why_not_seen(stream)
     if options.proxies == "all" or (camera.note and options.proxies == "auto"):
-        camera.note = camera.note or "asked for"
+        camera.note = camera.note or "requested"
         camera.video, camera.caption = proxies.give(stream, camera.times, options.proxy_width, tell)
         camera.is_proxy = True
     elif not unplayable:

@@ -79,13 +79,13 @@ class StillOptions(SliceOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         if (self.at is None) == (self.sheet is None):
-            raise OptionError("Give either `at` TIME or `sheet` 5x4.")
+            raise OptionError("Give either `at` or `sheet`, such as `sheet` 5x4.")
         if self.slice and not self.sheet:
-            raise OptionError("`start`, `end` and `duration` go with `sheet`.")
+            raise OptionError("`start`, `end` and `duration` only work with `sheet`.")
         if self.exact and (self.sheet or self.resize is not None):
-            raise OptionError("`exact` goes neither with `sheet` nor with `resize`.")
+            raise OptionError("`exact` cannot be combined with `sheet` or `resize`.")
         if self.sheet and not 1 <= self.sheet[0] * self.sheet[1] <= _MOST_FRAMES:
-            raise OptionError(f"`sheet` has 1 to {_MOST_FRAMES} frames.")
+            raise OptionError(f"`sheet` can have 1 to {_MOST_FRAMES} frames.")
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> St
     target = Path(output)
     kind = _SUFFIXES.get(target.suffix.lower())
     if kind is None:
-        raise OptionError(f"{target} is neither a .png nor a .jpg: give a name that ends so.")
+        raise OptionError(f"{target} is not a .png or .jpg: give a name with one of these endings.")
     with Dataset(dataset) as opened:
         stream = _chosen(opened, options.topic)
         if options.sheet:
@@ -184,7 +184,9 @@ def _chosen(dataset: Dataset, topic: str) -> Frames:
             raise OptionError(f"{error.args[0]}.") from None
     if len(dataset.topics) != 1:
         known = ", ".join(dataset.topics) or "none"
-        raise OptionError(f"{dataset.path} has several cameras or none: give `topic` of {known}.")
+        raise OptionError(
+            f"{dataset.path} does not have exactly one camera: give a `topic` of {known}."
+        )
     return dataset[dataset.topics[0]]
 
 
@@ -268,7 +270,7 @@ def _sheet(
     whole = columns * cell[0] + _GAP, rows * cell[1] + _GAP + _LABEL
     if max(whole) > _MOST_SIDE:
         raise OptionError(
-            f"A sheet of {whole[0]}x{whole[1]} pixels is larger than {_MOST_SIDE}: give `resize`."
+            f"A sheet of {whole[0]}x{whole[1]} pixels exceeds {_MOST_SIDE} a side: give `resize`."
         )
     look = Look(stream, size)
     page = Page(whole, paper=_PAGE, ink=_INK, text_size=_TEXT)
