@@ -289,7 +289,7 @@ def test_a_summary_that_begins_among_the_data_tells_nothing(tmp_path: Path) -> N
     struct.pack_into("<Q", data, len(data) - 28, place)
     path.write_bytes(data)
     assert McapReader(path).channels == []
-    with pytest.raises(SourceError, match="message 1 is of channel 1, which is not defined"):
+    with pytest.raises(SourceError, match="message 1 belongs to channel 1, which is not defined"):
         messages(McapReader(path).records())
 
 
@@ -508,7 +508,7 @@ DAMAGED: dict[str, tuple[bytes, str]] = {
     "length in a chunk": (file_of(chunk(message_record(1)[:-1])), "ends within a record"),
     "lz4": (file_of(chunk(b"abc", "lz4", crc=0)), "lz4"),
     "zstd": (file_of(chunk(b"abc", "zstd", crc=0)), "zstd"),
-    "bomb": (file_of(chunk(b"abc", "zstd", size=2**60)), "promises"),
+    "bomb": (file_of(chunk(b"abc", "zstd", size=2**60)), "declares"),
     "header": (b"\x89MCAP0\r\n" + file_of()[8:].replace(b"\1", b"\3", 1), "header"),
 }
 

@@ -392,7 +392,10 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
         (b"", "is empty"),
         (b"not a bag at all", "is not a ROS 1 bag"),
         (b"#ROSBAG V2.0\r\n", "is a ROS 1 bag with converted line endings"),
-        (b"#ROSBAG V1.2\n", "version 1.2, and only 2.0 is read. Rewrite it with `rosbag filter"),
+        (
+            b"#ROSBAG V1.2\n",
+            "version 1.2; only version 2.0 is supported. Convert it first, with `rosbag filter",
+        ),
         (b"#ROSRECORD V1.1\n", "version 1.1"),
         (b"version https://git-lfs.github.com/spec/v1\noid", "is a git-lfs pointer"),
         (b"#ROSBAG V2.0\n", "is damaged"),
@@ -465,10 +468,10 @@ def test_damage_has_a_sentence(tmp_path: Path) -> None:
         ({"shift": 1}, "topic /a, chunk at byte 4109: "),
         ({"shift": 500}, "topic /a, chunk at byte 4109: a record is cut short. Copy it again"),
         ({"counted": 1}, "the index of the chunk at byte 4109 contradicts the bag's index"),
-        ({"compression": "zstd"}, "it is compressed by 'zstd', which is not known"),
+        ({"compression": "zstd"}, "it is compressed with 'zstd', which is not supported"),
         ({"size": 3}, "it unpacks to 49 bytes instead of 3"),
         ({"size": 3, "compression": "bz2"}, "its bz2 data does not unpack to 3 bytes"),
-        ({"size": 2**31, "compression": "bz2"}, "it promises 2147483648 bytes and has"),
+        ({"size": 2**31, "compression": "bz2"}, "it declares 2147483648 bytes but has"),
     ):
         refuse(make_bag(path, [plain()], one, **options), problem)
     refuse(make_bag(path, [], one), "contradicts the bag's index")

@@ -481,7 +481,7 @@ def test_a_missing_file_is_named(tmp_path: Path, storage: str) -> None:
     folder = split(tmp_path, storage, [scene()[:25], scene()[25:]])
     (file,) = folder.glob("run_1.*")
     file.unlink()
-    with pytest.raises(SourceError, match=rf"{file.name}, which its metadata.yaml names"):
+    with pytest.raises(SourceError, match=rf"{file.name}, listed in its metadata.yaml"):
         Rosbag2Reader(folder)
 
 
@@ -490,7 +490,7 @@ def test_a_file_that_is_not_named_is_not_left_out(tmp_path: Path) -> None:
     path = folder / "metadata.yaml"
     text = path.read_text()
     edit(folder, lambda info: info["relative_file_paths"].pop())
-    with pytest.raises(SourceError, match=r"which its metadata.yaml does not name"):
+    with pytest.raises(SourceError, match=r"which its metadata.yaml does not list"):
         Rosbag2Reader(folder)
     path.write_text(text)
     compress_files(folder)
@@ -647,7 +647,7 @@ METADATA_FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "no storage": ({"storage_identifier": "", "relative_file_paths": ["a.xyz"]}, "storage ''"),
     "format": ({"compression_mode": "file", "compression_format": "lz4"}, "'lz4'"),
     "mode": ({"compression_mode": "bits", "compression_format": "zstd"}, "'bits'"),
-    "outside": ({"relative_file_paths": [".."]}, r"names '\.\.' as a file"),
+    "outside": ({"relative_file_paths": [".."]}, r"lists '\.\.' as a file"),
     "topics": ({"topics_with_message_count": [{"message_count": 1}]}, "not? as expected|expected"),
     "number": ({"version": "new"}, "expected"),
 }
@@ -742,14 +742,14 @@ DATABASE_FAULTS = {
     ),
     "negative": (
         ["UPDATE messages SET timestamp = -5 WHERE id = 3"],
-        "message 1, topic /image: the time -5",
+        "message 1, topic /image: -5 is not a valid time",
     ),
     "no time": (
         [*REBUILT, "UPDATE messages SET timestamp = 'x' WHERE id = 3"],
-        "message 5, topic /image: the time",
+        "message 5, topic /image: .* is not a valid time",
     ),
-    "orphan": (["UPDATE messages SET topic_id = 7 WHERE id = 3"], "message 3 is of topic id 7"),
-    "column": (["ALTER TABLE messages ADD COLUMN sent INTEGER"], "a column 'sent'"),
+    "orphan": (["UPDATE messages SET topic_id = 7 WHERE id = 3"], "message 3 has topic id 7"),
+    "column": (["ALTER TABLE messages ADD COLUMN sent INTEGER"], "an unknown column 'sent'"),
     "no table": (["DROP TABLE topics"], "not of rosbag2"),
     "no column": (["ALTER TABLE topics DROP COLUMN type"], "not of rosbag2"),
     "not UTF-8": (

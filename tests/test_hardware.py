@@ -100,7 +100,9 @@ def test_what_is_refused() -> None:
         check_codec(name, None, lossless=False, crf=1)
         check_codec(name, None, lossless=False, crf=found.most)
         for crf in (0, found.most + 1):
-            with pytest.raises(OptionError, match=rf"is not one of {name}\. Use 1 to {found.most}"):
+            with pytest.raises(
+                OptionError, match=rf"is out of range for {name}\. Use 1 to {found.most}"
+            ):
                 check_codec(name, None, lossless=False, crf=crf)
         with pytest.raises(OptionError, match=r"lossless packing\. Use ffv1, h264, h265"):
             check_codec(name, None, lossless=True)
@@ -219,7 +221,7 @@ def test_the_sentence_without_a_driver_of_nvidia(name: str) -> None:
         pytest.skip(said or f"{name} is there")
     assert said == (
         f"`codec` {name}: {found.encoder} could not be opened: Cannot load libcuda.so.1. "
-        f"It needs an NVIDIA graphics card that encodes {found.codec}, with its driver; "
+        f"It needs an NVIDIA GPU that encodes {found.codec}, with its driver; "
         f"`codec` {found.codec} needs no device."
     )
 
@@ -234,7 +236,7 @@ def test_the_log_is_left_as_it_was() -> None:
 def test_a_pyav_that_uploads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(av, "codecs_available", {"h264_vaapi"})
     monkeypatch.setattr(av, "__version__", "17.1.0")
-    with pytest.raises(HardwareError, match=r"PyAV 17\.1\.0 cannot bring .* Install PyAV 18"):
+    with pytest.raises(HardwareError, match=r"PyAV 17\.1\.0 cannot upload .* Install PyAV 18"):
         check_hardware("h264-vaapi")
 
 
@@ -270,7 +272,7 @@ def test_other_machines_may_have_it(absent: str) -> None:
 
 def test_a_score_is_not_kept_with_it(tmp_path: Path) -> None:
     options = PackOptions(quality="psnr=40", codec="h264-nvenc")
-    with pytest.raises(OptionError, match="use `codec` h264, or find the crf by mp4ds evaluate"):
+    with pytest.raises(OptionError, match="use `codec` h264, or find a crf with `mp4ds evaluate`"):
         mp4ds.pack(tmp_path / "none.bag", tmp_path / "d", options)
 
 

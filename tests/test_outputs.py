@@ -117,7 +117,7 @@ def test_a_link_is_not_replaced(target: Path) -> None:
     make(target.parent / "precious", "folder", "old")
     target.symlink_to("precious")
     with (
-        pytest.raises(TargetError, match=r"is a symbolic link.*Name .*precious itself"),
+        pytest.raises(TargetError, match=r"is a symbolic link.*Give .*precious itself"),
         staged(target, force=True, owned=anything),
     ):
         pytest.fail("nothing may be made there")

@@ -108,8 +108,8 @@ def test_strangers_in_it_are_kept(stranger: str, bag: Path, work: Path, tmp_path
     (work / stranger).parent.mkdir(exist_ok=True)
     (work / stranger).write_text("mine")
     before = tree(tmp_path)
-    refused(pack(bag, tmp_path), 2, "holds 1 name", "did not make")
-    refused(pack(bag, tmp_path, "--restart"), 2, "holds 1 name", "did not make")
+    refused(pack(bag, tmp_path), 2, "holds 1 item", "did not make")
+    refused(pack(bag, tmp_path, "--restart"), 2, "holds 1 item", "did not make")
     assert tree(tmp_path) == before
 
 

@@ -433,7 +433,7 @@ def test_lies_are_found_and_do_no_harm(name: str, packed: Path, tmp_path: Path) 
     assert mp4ds.validate(path) == []
     (found,) = mp4ds.validate(path, deep=True)
     assert found.code == "references-invalid"
-    assert "group of pictures 0 tell others" in found.message
+    assert "group of pictures 0 show others" in found.message
     codes, right = set(), 0
     with closing(Stream(path)) as stream:
         every = [frame.data for frame in stream]

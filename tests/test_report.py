@@ -607,8 +607,8 @@ def test_scores_are_plotted(copy: Path, tmp_path: Path) -> None:
 @each(
     ("value", "problem"),
     [
-        ({"/nowhere": {"vmaf": []}}, "none of"),
-        ({COLOUR: {"vmaf": [1.0]}}, "one for each frame"),
+        ({"/nowhere": {"vmaf": []}}, "not one of"),
+        ({COLOUR: {"vmaf": [1.0]}}, "give one per frame"),
         ({COLOUR: {"vmaf": ["1"] * FRAMES}}, "not of the form"),
         ({COLOUR: [1.0] * FRAMES}, "not of the form"),
         ([], "not of the form"),

@@ -211,7 +211,7 @@ def test_a_sheet_of_more_than_there_is(drive: Path, tmp_path: Path) -> None:
 
 
 def test_a_sheet_that_is_too_large(drive: Path, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="larger than"):
+    with pytest.raises(OptionError, match="exceeds"):
         frames(drive, tmp_path / "a.png", StillOptions(topic=COLOUR, sheet=(20, 1), resize=20.0))
 
 

@@ -369,7 +369,7 @@ def test_nothing_matches(tmp_path: Path) -> None:
         ({"topics": ["/up"]}, "has no stream '/up'; there are: /"),
         ({"topics": []}, "no topics were selected"),
         ({"topics": LEFT}, "topics is a list"),
-        ({"topics": [LEFT, LEFT]}, "/left/image_raw stands twice"),
+        ({"topics": [LEFT, LEFT]}, "/left/image_raw is given twice"),
         ({"offsets": ()}, "offsets is empty"),
         ({"offsets": (0.5,)}, "in frames must be integers"),
         ({"offsets_in": "minutes"}, "offsets_in is 'minutes'"),
@@ -377,7 +377,7 @@ def test_nothing_matches(tmp_path: Path) -> None:
         ({"tolerance_ns": 5}, 'belongs to offsets_in="seconds"'),
         ({"tolerance_ns": -5, "offsets_in": "seconds"}, "tolerance_ns is -5"),
         ({"sync_tolerance_ns": -1}, "sync_tolerance_ns is -1"),
-        ({"format": "hsv"}, "format is 'hsv', and not one of native, rgb, bgr, gray"),
+        ({"format": "hsv"}, "format is 'hsv', not one of native, rgb, bgr, gray"),
         ({"format": {"/up": "rgb"}}, "format is given for '/up'"),
         ({"dtype": "float16"}, "dtype is 'float16'"),
         ({"backend": "other"}, "backend is 'other'"),
@@ -396,7 +396,7 @@ def test_wrong_options_of_streams(drives: list[Path]) -> None:
     for options, sentence in [
         ({"window": 0}, "window is 0"),
         ({"world_size": 0}, "world_size is 0"),
-        ({"rank": 2, "world_size": 2}, "rank is 2, and must be less"),
+        ({"rank": 2, "world_size": 2}, "rank is 2, but must be less"),
         ({"buffer": -1}, "buffer is -1"),
         ({"cache_files": 1}, "cache_files is 1, and must be at least 2"),
     ]:
@@ -778,7 +778,7 @@ def test_an_epoch_goes_on_where_it_stood(
 
 def test_a_state_of_another_order_is_refused(drives: list[Path]) -> None:
     state = FrameStream(drives[0], topics=[LEFT], seed=1).state_dict()
-    with pytest.raises(mp4ds.OptionError, match="of a stream with seed 1, and this one has 2"):
+    with pytest.raises(mp4ds.OptionError, match="from a stream with seed 1, but this one has 2"):
         FrameStream(drives[0], topics=[LEFT], seed=2).load_state_dict(state)
 
 

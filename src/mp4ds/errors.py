@@ -93,6 +93,7 @@ class SourceError(Mp4dsError, ValueError):
 
     def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
         self.path = _as_path(path)
+        self.problem = problem
         super().__init__(f"{path}: {problem}." + (f" {remedy}" if remedy else ""))
 
 

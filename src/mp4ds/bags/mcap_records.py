@@ -41,8 +41,9 @@ OF_SUMMARY = frozenset(
         Opcode.SUMMARY_OFFSET,
     }
 )
-SALVAGE_REMEDY = "`mp4ds pack --salvage` packs what is still readable."
-CUT_SHORT_REMEDY = f"The recording was cut short: use `mcap recover`, or {SALVAGE_REMEDY}"
+SALVAGE = "use `mp4ds pack --salvage` to pack what is still readable."
+SALVAGE_REMEDY = "U" + SALVAGE[1:]
+CUT_SHORT_REMEDY = f"The recording was cut short: use `mcap recover`, or {SALVAGE}"
 
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 _PIECE_BYTES = 16 * 2**20
@@ -125,8 +126,8 @@ def other_begin(path: Path, kind: str, magic: bytes, start: bytes) -> SourceErro
     """The error for a file that does not begin with the magic bytes of its kind."""
     if start.startswith(magic.rstrip()):
         problem = f"is {kind} with converted line endings, as if copied in text mode"
-        return SourceError(path, problem, f"Copy it again in binary mode, or {SALVAGE_REMEDY}")
-    remedy = f"If it is damaged, {SALVAGE_REMEDY}"
+        return SourceError(path, problem, f"Copy it again in binary mode, or {SALVAGE}")
+    remedy = f"If it is damaged, {SALVAGE}"
     return SourceError(path, f"is not {kind}: it does not start like one", remedy)
 
 

@@ -15,7 +15,7 @@ from typing import BinaryIO
 
 import lz4.frame
 
-from mp4ds.bags.mcap_records import SALVAGE_REMEDY, DamageError, open_source, other_begin
+from mp4ds.bags.mcap_records import SALVAGE, DamageError, open_source, other_begin
 from mp4ds.bags.protocols import most_unpacked
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, Schema
@@ -24,7 +24,7 @@ MAGIC = b"#ROSBAG V2.0\n"
 MAX_TIME = 2**32 * 10**9
 """A ROS 1 time is two uint32, seconds and nanoseconds: from here on there are no times."""
 UINT32 = struct.Struct("<I")
-COPY_AGAIN = f"Copy it again, repair it with `rosbag reindex`, or {SALVAGE_REMEDY}"
+COPY_AGAIN = f"Copy it again, repair it with `rosbag reindex`, or {SALVAGE}"
 DAMAGE = (DamageError, OSError)
 """What reading a damaged bag raises, or one on a damaged disk."""
 
@@ -158,7 +158,7 @@ def check_bag(path: Path) -> int:
         raise SourceError(
             path,
             "is not indexed: the recording was cut short",
-            f"Run `rosbag reindex` on it first, or {SALVAGE_REMEDY}",
+            f"Run `rosbag reindex` on it first, or {SALVAGE}",
         )
     if index > size:
         problem = f"is cut short: its index should begin at byte {index}, and it has {size} bytes"

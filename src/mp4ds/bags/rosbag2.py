@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.mcap import McapReader, is_mcap
-from mp4ds.bags.mcap_records import SALVAGE_REMEDY, unzstd
+from mp4ds.bags.mcap_records import SALVAGE, unzstd
 from mp4ds.bags.protocols import Format, SourcePart, merged
 from mp4ds.bags.rosbag2_files import (
     SharedChannels,
@@ -303,7 +303,7 @@ def _folder_info(path: Path) -> BagInfo:
             path,
             f"has no {METADATA_FILE}",
             "If it is a rosbag2 recording, run `ros2 bag reindex` on it first, or "
-            f"{SALVAGE_REMEDY} If it is a folder of images, use `mp4ds import images`.",
+            f"{SALVAGE} If it is a folder of images, use `mp4ds import images`.",
         )
     info = read_bag_info(path / METADATA_FILE)
     missing = [name for name in info.file_names if not (path / name).exists()]
@@ -312,14 +312,14 @@ def _folder_info(path: Path) -> BagInfo:
         raise SourceError(
             path,
             f"is incomplete: {missing[0]}{more}, listed in its {METADATA_FILE}, is missing",
-            f"Add the missing file, run `ros2 bag reindex` to do without it, or {SALVAGE_REMEDY}",
+            f"Add the missing file, run `ros2 bag reindex` to do without it, or {SALVAGE}",
         )
     unlisted = [] if remote(path) else unlisted_storage(path, info.file_names)
     if unlisted:
         raise SourceError(
             path,
             f"has {unlisted[0]}, which its {METADATA_FILE} does not list",
-            f"Move it away, run `ros2 bag reindex` to add it, or {SALVAGE_REMEDY}",
+            f"Move it away, run `ros2 bag reindex` to add it, or {SALVAGE}",
         )
     return info
 

@@ -14,7 +14,7 @@ from typing import Protocol
 
 import zstandard
 
-from mp4ds.bags.mcap_records import SALVAGE_REMEDY, open_source
+from mp4ds.bags.mcap_records import SALVAGE, open_source
 from mp4ds.bags.protocols import FILE_RATIO, ZSTD_PIECE, HoldBack, most_unpacked
 from mp4ds.bags.rosbag2_metadata import BagInfo
 from mp4ds.errors import SourceError
@@ -114,7 +114,7 @@ class ZstdFile(ZstdStream):
         """
         data = super().read(length)
         if self.problem and len(data) < length:
-            raise SourceError(self._path, self.problem, f"Copy it again, or {SALVAGE_REMEDY}")
+            raise SourceError(self._path, self.problem, f"Copy it again, or {SALVAGE}")
         return data
 
     def tell(self) -> int:

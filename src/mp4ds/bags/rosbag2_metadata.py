@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from mp4ds import yamlio
-from mp4ds.bags.mcap_records import SALVAGE_REMEDY
+from mp4ds.bags.mcap_records import SALVAGE, SALVAGE_REMEDY
 from mp4ds.errors import SourceError
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 
@@ -121,9 +121,7 @@ def read_bag_info(path: Path) -> BagInfo:
     except OSError as error:
         raise SourceError(path, f"cannot be read: {error.strerror}") from None
     if not data.strip():
-        raise SourceError(
-            path, "is empty", f"Recreate it with `ros2 bag reindex`, or {SALVAGE_REMEDY}"
-        )
+        raise SourceError(path, "is empty", f"Recreate it with `ros2 bag reindex`, or {SALVAGE}")
     try:
         return parse_bag_info(data.decode(), path)
     except UnicodeDecodeError:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.mcap_records import SALVAGE_REMEDY, DamageError, open_source
+from mp4ds.bags.mcap_records import SALVAGE, SALVAGE_REMEDY, DamageError, open_source
 from mp4ds.errors import SourceError
 from mp4ds.records import EVERYTHING, HASH_KEY, Channel, ChannelStats, Excerpt, Message, Schema
 
@@ -64,7 +64,7 @@ class Tables:
                 raise SourceError(
                     self._shown,
                     f"has a view or virtual table {shown!r}, which recordings never have",
-                    f"Drop it with the sqlite3 tool, or {SALVAGE_REMEDY}",
+                    f"Drop it with the sqlite3 tool, or {SALVAGE}",
                 )
 
     def columns(self, table: str) -> list[tuple[Any, bool]]:
@@ -132,7 +132,7 @@ def open_tables(path: Path, shown: Path) -> Iterator[Tables]:
             else "If it was cut short, try `.recover` of the sqlite3 tool, or "
         )
         problem = f"cannot be read as sqlite3: {error}"
-        raise SourceError(shown, problem, remedy + SALVAGE_REMEDY) from None
+        raise SourceError(shown, problem, remedy + SALVAGE) from None
     finally:
         if connection:
             connection.set_progress_handler(None, 0)
@@ -358,7 +358,7 @@ class SqliteReader:
         return SourceError(
             self._shown,
             "is damaged: its index of times does not list its messages",
-            f"Rebuild it with `REINDEX` in the sqlite3 tool, or {SALVAGE_REMEDY}",
+            f"Rebuild it with `REINDEX` in the sqlite3 tool, or {SALVAGE}",
         )
 
     def _message(self, tables: Tables, row_id: int, place: str) -> Message:
@@ -372,7 +372,7 @@ class SqliteReader:
             raise SourceError(
                 self._shown,
                 f"{place} has topic id {topic_id}, which is not in its table of topics",
-                f"`ros2 bag convert` leaves such messages out, or {SALVAGE_REMEDY}",
+                f"`ros2 bag convert` leaves such messages out, or {SALVAGE}",
             )
         place = f"{place}, topic {channel.topic}"
         if not isinstance(timestamp, int) or timestamp < 0:

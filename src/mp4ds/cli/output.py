@@ -227,7 +227,7 @@ def print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> None
         say(f"{next(iter(found))}: {problems}; {depth}")
         return
     wrong = sum(map(bool, found.values()))
-    where = f" in {wrong} datasets" if wrong else ""
+    where = f" in {wrong} of them" if wrong else ""
     say(f"{len(found)} datasets: {problems}{where}; {depth}")
 
 

@@ -482,8 +482,8 @@ def _quality_of(paths: Sequence[Path]) -> str:
     if len(found) == 1 and parse_quality(*found).crf is None:
         return found.pop()
     raise OptionError(
-        f"The source datasets have different qualities: {', '.join(sorted(found))}. Give a "
-        "`quality`."
+        f"There is no default `quality` for what was packed as {', '.join(sorted(found))}. Give "
+        "one."
     )
 
 

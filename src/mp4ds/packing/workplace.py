@@ -145,7 +145,8 @@ class Workplace:
             listed = ", ".join(sorted(strange)[:_NAMED]) + ", ..." * (len(strange) > _NAMED)
             raise TargetError(
                 self.folder,
-                f"holds {len(strange)} entries that mp4ds did not make: {listed}",
+                f"holds {len(strange)} item{'s' * (len(strange) != 1)} that mp4ds did not "
+                f"make: {listed}",
                 "Check what they are; if you remove the folder, packing starts over.",
             )
 

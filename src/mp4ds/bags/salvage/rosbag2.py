@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from mp4ds.bags.mcap import is_mcap
-from mp4ds.bags.mcap_records import SALVAGE_REMEDY, unzstd
+from mp4ds.bags.mcap_records import unzstd
 from mp4ds.bags.protocols import Format, SourcePart, merged
 from mp4ds.bags.rosbag2_files import MAGIC as ZSTD_MAGIC
 from mp4ds.bags.rosbag2_files import (
@@ -99,8 +99,7 @@ def _info(folder: Path, losses: list[Loss]) -> BagInfo | None:
 
 def unreadable(name: str, error: SourceError, messages: int | None) -> Loss:
     """A file of which nothing can be read."""
-    problem = str(error).removeprefix(f"{error.path}: ").removesuffix(SALVAGE_REMEDY)
-    return Loss(name, None, None, problem.rstrip(" .;"), messages)
+    return Loss(name, None, None, error.problem, messages)
 
 
 def _names(folder: Path, info: BagInfo | None, losses: list[Loss]) -> Sequence[str]:

@@ -1,4 +1,4 @@
-"""The files that tell what an evaluation found: tables, plots, and one page."""
+"""The files of an evaluation's results: tables, plots, and one page."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ COSTS = {
     "bitrate": ("kbps", "kbit/s", "quality against bitrate"),
     "time": ("encode_cpu_seconds", "CPU seconds per frame", "quality against time"),
 }
-"""Of each plot what a setting costs, how that is called, and its title."""
+"""For each plot: the cost of a setting, its label, and the plot's title."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Axis:
-    """Where figures are drawn.
+    """How values map to pixels.
 
     Attributes:
-        low: The least figure.
-        high: The greatest one.
-        begin: Place of the least one, pixels.
-        end: Place of the greatest one, pixels.
-        is_log: Whether equal quotients are equally far apart.
+        low: The lowest value.
+        high: The highest value.
+        begin: Position of the lowest value, pixels.
+        end: Position of the highest value, pixels.
+        is_log: Whether the scale is logarithmic.
     """
 
     low: float
@@ -53,7 +53,7 @@ class _Axis:
     is_log: bool
 
     def at(self, value: float) -> float:
-        """Place of a figure."""
+        """Position of a value."""
         low, high = self.low, self.high
         if self.is_log:
             low, high, value = math.log(low), math.log(high), math.log(value)
@@ -176,8 +176,8 @@ code { background: #f2f2f2; padding: 1px 4px; }
 """
 _CELL_HEADS = (
     *("codec", "preset", "crf", "kbit/s", "bytes/frame", "frames/s", "CPU s/frame"),
-    *("decoded frames/CPU s", "VMAF", "harmonic", "5 %", "least"),
-    *("PSNR Y", "PSNR Cb", "PSNR Cr", "SSIM", "whole, MB", "whole, min"),
+    *("decoded frames/CPU s", "VMAF", "harmonic", "5 %", "min"),
+    *("PSNR Y", "PSNR Cb", "PSNR Cr", "SSIM", "all, MB", "all, min"),
 )
 _STATISTICS = ("mean", "harmonic_mean", "percentile_5", "minimum")
 
