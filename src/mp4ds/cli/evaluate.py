@@ -165,10 +165,10 @@ def evaluate(
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Try encoder settings on clips of a recording: quality, size and time.
+    """Compare encoder settings on clips of a recording: quality, size and time.
 
-    Makes a folder with tables, plots and a page, and recommends what to pack with. An evaluation
-    that was interrupted goes on when the same command is run again.
+    Writes a folder with tables, plots and a page, and recommends options for `mp4ds pack`. To
+    resume an interrupted evaluation, run the same command again.
     """
     with told_errors(as_json), _interruptible(), _progress(as_json) as report:
         result = run(source, options(), output=output, progress=report)
