@@ -581,7 +581,9 @@ def test_the_query_goes_with_every_request(tmp_path: Path, web: Server) -> None:
 
 def test_salvage_is_done_here(tmp_path: Path, put: Put) -> None:
     write_bag(tmp_path / "drive.bag", scene("mono8"))
-    with pytest.raises(SourceError, match=r"cannot be salvaged from a remote location\. Download it first"):
+    with pytest.raises(
+        SourceError, match=r"cannot be salvaged from a remote location\. Download it first"
+    ):
         mp4ds.pack(put(tmp_path / "drive.bag"), tmp_path / "x", PackOptions(salvage=True))
 
 
