@@ -401,7 +401,7 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
         (b"#ROSBAG V2.0\n", "is damaged"),
         (b"#ROSBAG V2.0\n\x10\0\0\0", "is damaged"),
         (b"#ROSBAG V2.0\n" + joined([(b"op", b"\3")]), "is damaged"),
-        (bag_header(0, 1, 1), "is not indexed: the recording was cut short. Reindex it with"),
+        (bag_header(0, 1, 1), "is not indexed: the recording was cut short. Run"),
         (bag_header(9999, 1, 1), "is cut short: its index should begin at byte 9999"),
         (bag_header(index, 1, 1), "is damaged"),
         (bag_header(index, 0, 0, (b"encryptor", b"rosbag/AesCbcEncryptor")), "is encrypted"),

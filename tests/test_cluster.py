@@ -208,7 +208,7 @@ def test_a_task_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
     assert set(found) == {"deadly"}
     kind, sentence = found["deadly"]
     assert kind == "Killed"
-    assert sentence.startswith("2 workers died over it, perhaps for lack of memory")
+    assert sentence.startswith("2 workers died on it, perhaps for lack of memory")
     assert "300 MiB" in sentence
 
 

@@ -1,7 +1,6 @@
 """The command line: the only place that prints or exits.
 
-Exit codes: 0 the whole job was done; 1 it failed or problems were found; 2 the input or the
-options are wrong; 130 interrupted.
+Exit codes: 0 success; 1 failure, or problems were found; 2 wrong input or options; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from mp4ds.cli.options import Command, spelled
 from mp4ds.cli.output import be_quiet, say
 from mp4ds.cli.process import DEBUG, exit_code_of, prepare_process
 
-_COMPLETE = "_MP4DS_COMPLETE"  # set by the shell that completes
+_COMPLETE = "_MP4DS_COMPLETE"  # set by shells for completion
 
 COMMANDS = {
     "pack": ("packing", "Pack a recording into a dataset of mp4 files, or repack a dataset."),
@@ -69,9 +68,9 @@ def app_for(*names: str, is_completing: bool = False) -> typer.Typer:
     """The command line.
 
     Args:
-        names: Commands that are built, with the modules that they use; the others are only
-            listed. None: all are built.
-        is_completing: Whether a shell asks for what may follow, or is told how to ask.
+        names: Commands to build, with the modules that they use; the others are only listed.
+            None: build all.
+        is_completing: Whether a shell asks for completions, or for the completion script.
     """
     app = typer.Typer(
         name="mp4ds",
@@ -115,7 +114,7 @@ def _top(
 
 
 def _listed() -> None:
-    """Stands for a command in the list of all."""
+    """Placeholder for a command in the list of commands."""
 
 
 def main() -> NoReturn:
@@ -123,7 +122,7 @@ def main() -> NoReturn:
     arguments = spelled(sys.argv[1:])
     prepare_process()
     command = next((word for word in arguments if not word.startswith("-")), "")
-    # what shells complete by is not built for a command that runs
+    # completion is not built for a command that runs
     is_completing = _COMPLETE in os.environ or not command or command not in COMMANDS
     names = () if _COMPLETE in os.environ else (command,)
     app = app_for(*names, is_completing=is_completing)

@@ -135,7 +135,7 @@ def _storage_rows(camera: CameraEvaluation) -> list[list[str]]:
 
 
 def time_text(seconds: float) -> str:
-    """A time in the unit that suits it."""
+    """A duration in a suitable unit."""
     for limit, unit, size in ((120, "s", 1), (7200, "min", 60), (172_800, "h", 3600)):
         if seconds < limit:
             return f"{seconds / size:.1f} {unit}"

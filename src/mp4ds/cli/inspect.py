@@ -125,7 +125,7 @@ def info(
 
 
 def _found(paths: Sequence[str]) -> list[Path]:
-    """What is to be looked into: one recording, or datasets."""
+    """What to show: one recording, or datasets."""
     from mp4ds.dataset.collections import datasets_in
     from mp4ds.errors import SourceError
     from mp4ds.files.urls import location
@@ -139,7 +139,7 @@ def _found(paths: Sequence[str]) -> list[Path]:
 
 
 def _print_checksums(path: Path, as_json: bool) -> None:
-    """The files of a dataset as its manifest tells them, and the manifest itself."""
+    """Print the hashes of a dataset's files from its manifest, and that of the manifest itself."""
     from mp4ds.files.outputs import digest_file
     from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
 

@@ -31,7 +31,7 @@ _quiet = False
 
 
 def be_quiet() -> None:
-    """Print no results for people from now on, and no progress."""
+    """From now on, print neither results for people nor progress."""
     global _quiet
     _quiet = True
 
@@ -49,11 +49,11 @@ def _jsonable(value: Any) -> Any:
 
 @contextmanager
 def printed() -> Iterator[None]:
-    """Tell of standard output what the system says of it: no other file is meant.
+    """Report system errors as errors of standard output: no other file is involved.
 
     Raises:
-        Mp4dsError: It takes nothing more.
-        typer.Exit: Who reads it has enough.
+        Mp4dsError: It cannot be written to.
+        typer.Exit: The reader has closed it.
     """
     try:
         yield
@@ -74,7 +74,7 @@ def print_json(value: Any) -> None:
 
 
 def shown(value: object) -> str:
-    """A text without what would steer a terminal: a topic or file may be named so."""
+    """A text without terminal control characters, which topic and file names may contain."""
     text = str(value)
     if text.isprintable():
         return text
@@ -90,13 +90,13 @@ def say(value: object) -> None:
 
 
 def complain(value: object) -> None:
-    """Print a line beside the result; nothing fails because nobody takes it."""
+    """Print a line to stderr; failing to print it is not an error."""
     with suppress(OSError, ValueError):
         print(f"mp4ds: {shown(value)}", file=sys.stderr, flush=True)
 
 
 def size_text(count: float) -> str:
-    """Bytes in the unit that suits them."""
+    """A size in a suitable unit."""
     for unit in ("B", "kB", "MB", "GB"):
         if count < 1000:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
@@ -105,7 +105,7 @@ def size_text(count: float) -> str:
 
 
 def print_table(columns: list[tuple[str, str]], rows: list[list[str]]) -> None:
-    """Print a table; a column is right-aligned, or folds where the screen is too narrow."""
+    """Print a table; a column is right-aligned, or folds if the screen is too narrow."""
     if _quiet:
         return
     from rich.console import Console
@@ -213,7 +213,7 @@ def print_unpack(summary: UnpackSummary, noun: str) -> None:
 
 
 def print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> None:
-    """Print all problems of datasets, and how deep was looked for them."""
+    """Print all problems of datasets, and how thorough the check was."""
     for problem in chain.from_iterable(found.values()):
         say(problem)
     count = sum(map(len, found.values()))
@@ -232,7 +232,7 @@ def print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> None
 
 
 def print_overview(rows: Sequence[Brief]) -> None:
-    """Print a line for each dataset, and what they are together."""
+    """Print a line for each dataset, and totals."""
     base = os.path.commonpath([str(row.path.parent) for row in rows])
     table = [
         [
@@ -261,7 +261,7 @@ def print_overview(rows: Sequence[Brief]) -> None:
 
 
 def _moment(time_ns: int | None) -> str:
-    """A time, UTC; empty where it is none."""
+    """A time in UTC; empty if there is none."""
     if time_ns is None:
         return ""
     return iso_text(time_ns - time_ns % 10**9)
@@ -282,7 +282,7 @@ def print_info(result: Info) -> None:
 
 
 def print_speeds(speeds: Sequence[ReadingSpeed]) -> None:
-    """Print what frames cost."""
+    """Print how long reading frames takes."""
     rows = [
         [
             item.topic,
