@@ -129,7 +129,7 @@ def left_text(seconds: float | None) -> str:
 
 
 def count_text(done: int, total: int | None) -> str:
-    """ "N of M", if M is known."""
+    """Render N of M, if M is known."""
     return str(done) if total is None else f"{done}/{total}"
 
 

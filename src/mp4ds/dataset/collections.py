@@ -1,4 +1,4 @@
-"""Many datasets: found below a folder or by a pattern, and worked on side by side."""
+"""Many datasets: found below a folder or by a pattern, and processed in parallel."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ Paths = str | Path | Sequence[str | Path]
 
 
 def datasets_in(paths: Paths) -> list[Path]:
-    """The datasets that are meant by paths, in the order of these.
+    """The datasets given by paths, in the same order.
 
     Args:
-        paths: Datasets, sidecars, videos; folders of datasets, however deep; patterns such as
-            ``drives/*``; or URLs, but no patterns of these.
+        paths: Datasets, sidecars, videos; folders of datasets, at any depth; patterns such as
+            ``drives/*``; or URLs, but not URL patterns.
 
     Raises:
-        SourceNotFoundError: There is nothing, or nothing of a pattern.
+        SourceNotFoundError: A path does not exist, or a pattern matches nothing.
         SourceError: A folder has no dataset in it or below it.
     """
     several = [paths] if isinstance(paths, (str, Path, RemotePath)) else paths
@@ -65,7 +65,7 @@ def _below(path: Path) -> list[Path]:
     if not path.is_dir() or (path / MANIFEST_NAME).is_file():
         return [path]
     found = sorted(manifest.parent for manifest in path.rglob(MANIFEST_NAME))
-    # what begins with a dot is being made
+    # names that begin with a dot are being made
     found = [one for one in found if not _is_hidden(one, path)]
     if not found:
         raise SourceError(
@@ -85,18 +85,18 @@ def _is_hidden(dataset: Path, folder: Path) -> bool:
 def each(
     work: Callable[[_Item], _Made], items: Sequence[_Item], jobs: int = 1
 ) -> Iterator[tuple[_Item, _Made]]:
-    """Work on items, several at a time.
+    """Process items in parallel.
 
     Args:
-        work: A function that other processes can import, of arguments that they can be sent.
-        items: What it is given.
-        jobs: Processes at a time; of one, it is this one.
+        work: A function that other processes can import, with picklable arguments.
+        items: Its arguments.
+        jobs: Number of processes; if 1, this one.
 
     Yields:
-        Each item with what became of it, in their order.
+        Each item with its result, in order.
 
     Raises:
-        Mp4dsError: A process died, as where memory is short; else what the work raises.
+        Mp4dsError: A process died, perhaps out of memory; otherwise whatever the work raises.
     """
     if min(jobs, len(items)) < 2:
         for item in items:
@@ -112,7 +112,7 @@ def each(
             raise Mp4dsError(
                 "A worker process died, perhaps out of memory. Try fewer `jobs`."
             ) from None
-        except BaseException:  # nobody waits for what is being worked on
+        except BaseException:  # nobody waits for work in progress
             for process in set(multiprocessing.active_children()) - before:
                 process.terminate()
             pool.shutdown(cancel_futures=True)
@@ -120,13 +120,13 @@ def each(
 
 
 def _leave_to_parent() -> None:
-    """Let the parent decide what Ctrl-C does; on its word, tidy up and end."""
+    """Let the parent handle Ctrl-C; when it says so, clean up and exit."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _end)
 
 
 def _end(number: int, _: object) -> None:
-    signal.signal(number, signal.SIG_IGN)  # the pool sends it, too, when another process ended
+    signal.signal(number, signal.SIG_IGN)  # the pool sends it, too, when another process has died
     sys.exit(128 + number)
 
 
@@ -134,4 +134,4 @@ def _worked(work: Callable[[_Item], _Made], item: _Item) -> _Made:
     try:
         return work(item)
     except SystemExit as ended:
-        os._exit(int(ended.code or 0))  # the pool would go on with the next item
+        os._exit(int(ended.code or 0))  # the pool would continue with the next item

@@ -1,4 +1,4 @@
-"""Decoding by torchcodec, on a processor or a graphics card."""
+"""Decoding by torchcodec, on a CPU or GPU."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class TorchcodecReader:
         device: Such as ``cpu`` or ``cuda``.
 
     Raises:
-        OptionError: torchcodec is missing, mistakes the video's range or beginning, or the
+        OptionError: torchcodec is missing or misinterprets the video's range or beginning, or the
             video's pictures are not the images.
         VideoError: It cannot open the video.
     """
@@ -76,14 +76,14 @@ class TorchcodecReader:
             raise self._refused(error) from None
 
     def _check_range(self, stream: Stream | Video) -> None:
-        """Refuse a video whose range torchcodec mistakes.
+        """Refuse a video whose range torchcodec misinterprets.
 
-        Of AV1, torchcodec 0.13 on a CPU was seen to take the full range for the limited one: the
-        contrast is then 255 / 219 of what it is, and what is dark or bright is lost.
+        On a CPU, torchcodec 0.13 treats full-range AV1 as limited: contrast is then too high by 255
+        / 219, and dark and bright details are clipped.
         """
         if not len(stream):
             return
-        with closing(stream):  # it opens its video again where that is asked of it
+        with closing(stream):  # it reopens its video when needed
             first = stream.read([0], format="rgb")[0]
         ours = first[self._rows, self._columns].astype(np.int16)
         mistaken = ((ours - 16) * (255 / 219)).clip(0, 255)
@@ -100,10 +100,10 @@ class TorchcodecReader:
         return VideoError("decode-failed", self._path, f"torchcodec cannot decode it: {reason}")
 
     def read(self, frames: list[int]) -> Tensor:
-        """Frames in the order asked for, repeated as asked; shape (N, H, W, 3), uint8.
+        """Frames in the requested order, with repetitions; shape (N, H, W, 3), uint8.
 
         Raises:
-            VideoError: One does not decode.
+            VideoError: One cannot be decoded.
         """
         try:
             pixels: Tensor = self._decoder.get_frames_at(frames).data
@@ -112,14 +112,14 @@ class TorchcodecReader:
         return pixels[:, self._rows, self._columns]
 
     def close(self) -> None:
-        """Let the decoder go."""
+        """Release the decoder."""
         self._decoder = None
 
 
 def _check_layout(stream: Stream) -> None:
     """Refuse pictures that are not the images, or that have more than 8 bits.
 
-    Of lossy videos, 10 bits hold images of 8.
+    In lossy videos, 10-bit pictures hold 8-bit images.
     """
     image, video = stream.sidecar.image, stream.sidecar.video
     is_8_bits = video.pixel_format in (None, TEN_BITS) or not video.pixel_format.endswith("le")
