@@ -235,7 +235,7 @@ def fate_of(fates: dict[str, str], name: str, kind: str, to: str = "") -> str:
         return fates[kind]
     if name.startswith("ffmpeg") and to == "mcap":  # the other targets are of the other ROS
         return ALREADY["ffmpeg"]
-    fate = fates["compressed-video"].replace("CompressedVideo has", "FFMPEGPacket has")
+    fate = fates["compressed-video"].replace("CompressedVideo supports", "FFMPEGPacket supports")
     return "given" if fate == ALREADY["compressed-video"] else fate
 
 
@@ -1126,7 +1126,7 @@ def test_the_command_line(packed: Pack, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     now = "/cam/image_raw/compressed_png, sensor_msgs/msg/CompressedImage"
     assert f"/cam/image_raw/compressed: written as {now}" in done.stdout
-    assert "(/cam/image_raw/compressed is taken)" in done.stdout
+    assert "(the name /cam/image_raw/compressed is taken)" in done.stdout
     assert "/cam/image_raw/compressed: 1 messages as recorded: stored verbatim" in done.stdout
     done = command(*arguments, "--json", "-o", tmp_path / "b.mcap")
     told = json.loads(done.stdout)

@@ -398,7 +398,7 @@ def test_wrong_options_of_streams(drives: list[Path]) -> None:
         ({"world_size": 0}, "world_size is 0"),
         ({"rank": 2, "world_size": 2}, "rank is 2, but must be less"),
         ({"buffer": -1}, "buffer is -1"),
-        ({"cache_files": 1}, "cache_files is 1, and must be at least 2"),
+        ({"cache_files": 1}, "cache_files is 1, but must be at least 2"),
     ]:
         with pytest.raises(mp4ds.OptionError, match=sentence):
             FrameStream(drives[0], **options)
@@ -661,7 +661,7 @@ def test_a_wrong_count_is_named(damaged: Path) -> None:
     text = manifest.read_text()
     lines = [line for line in text.splitlines() if not line.startswith("checksum")]
     manifest.write_text("\n".join(lines).replace(f"frames: {FRAMES}", "frames: 9") + "\n")
-    with pytest.raises(SampleError, match=f"topic {LEFT}: .*has {FRAMES} frames where 9 are due"):
+    with pytest.raises(SampleError, match=f"topic {LEFT}: .*has {FRAMES} frames, not 9"):
         FrameDataset(damaged, topics=[LEFT])[0]
 
 

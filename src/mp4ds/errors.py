@@ -58,7 +58,7 @@ def _restored(kind: type[Mp4dsError], args: tuple[Any, ...], fields: dict[str, A
 class Refused(ValueError):  # noqa: N818 - no failure: another way is taken
     """One approach does not work for this input; the text says why, as a phrase.
 
-    Whoever catches it tries the next approach, and reports the reason where it helps the user: a
+    Anyone who catches it tries the next approach, and reports the reason where it helps the user: a
     message is stored verbatim, a video is read in order, a camera is left out.
     """
 

@@ -99,7 +99,7 @@ class _Plan:
         schema: Definition for the target.
         digest: md5sum for ROS 1, type hash for ROS 2.
         times: Where its messages have times.
-        no_message: What is said of a payload that is no message of the type.
+        no_message: What is said of a payload that is not a message of the type.
     """
 
     name: str
@@ -252,7 +252,7 @@ class Converter:
         return converted
 
     def _remembered(self, channel: Channel, plan: _Plan) -> Channel | None:
-        """The ROS 1 channel that this one was made of, if it tells and still fits."""
+        """The ROS 1 channel that this one was made from, if it tells and still fits."""
         known = {
             key[len(_ROS1) :]: value
             for key, value in channel.metadata.items()
@@ -324,7 +324,7 @@ def _end(plan: _Plan, raw: memoryview, *, to_ros1: bool) -> int:
 
 
 def _time_beyond(plan: _Plan, data: bytes | memoryview) -> int | None:
-    """Seconds of a time in a message that only ROS 2 takes for negative; None where there is none.
+    """Seconds of a time in a message that only ROS 2 takes for negative; None if there is none.
 
     Args:
         plan: Of its type.

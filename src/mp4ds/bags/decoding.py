@@ -40,7 +40,7 @@ def decoder_of(channel: Channel) -> Decoder:
     messages; JSON what `json.loads` gives.
 
     Raises:
-        OptionError: They cannot be decoded: for want of a definition, or of a decoder.
+        OptionError: They cannot be decoded: for lack of a definition, or of a decoder.
     """
     make = _DECODERS.get(channel.message_encoding)
     if make is None:

@@ -123,7 +123,7 @@ _NO_STATS = ChannelStats(0, 0, 0)
 class MultiReader:
     """A split recording, or recordings made side by side.
 
-    Parts that follow each other in time are read one after the other, parts that overlap are
+    Parts that follow each other in time are read one after another, parts that overlap are
     merged by log time. Channels equal in all fields are one channel.
 
     Args:
@@ -333,8 +333,8 @@ def format_of(path: Path) -> str:
     """The format of a recording, by its first bytes; by its name where these are damaged.
 
     Raises:
-        SourceNotFoundError: There is nothing.
-        SourceError: It is no recording, or cannot be read.
+        SourceNotFoundError: It does not exist.
+        SourceError: It is not a recording, or cannot be read.
     """
     try:
         if not path.exists():
@@ -474,7 +474,7 @@ def open_writer(
 
     Raises:
         OptionError: The target is unknown.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     if target == "bag":
         from mp4ds.bags.ros1_write import Ros1Writer

@@ -100,7 +100,7 @@ def read_chunks(
         stream: A stream of known size.
         excerpt: What to read.
         summary: The file's summary.
-        between: What stands between its chunks.
+        between: What is between its chunks.
         declared: What the file declares, from its summary on.
 
     Yields:
@@ -135,7 +135,7 @@ def read_chunks(
                     declared.take(kind, part)
         except DamageError as error:
             raise stream.damaged(error) from None
-        # Of messages at the very start of the next chunk, some may stand before this one.
+        # Of messages at the very start of the next chunk, some may be before this one.
         yield from held.release(None if following is None else following - 1)
     for place in others:
         yield _other_at(stream, place, declared)
@@ -174,7 +174,7 @@ class McapReader:
     """Reads an MCAP file. See `BagReader`.
 
     Where the file lists its chunks, messages come in log-time order, ties in file order;
-    else they come in file order. Every pass opens the file anew, so that several may run.
+    else they come in file order. Every pass reopens the file, so that several may run.
 
     Args:
         path: The file.
@@ -264,7 +264,7 @@ class McapReader:
 
     @property
     def start(self) -> int | None:
-        """The earliest log time in nanoseconds as the summary tells; None where it does not."""
+        """The earliest log time in nanoseconds as the summary tells; None if it does not."""
         return self._summary.start if self._summary else None
 
     @property
@@ -279,7 +279,7 @@ class McapReader:
 
     @cached_property
     def _between(self) -> Between | None:
-        """What stands between the chunks, where excerpts can be read from these alone."""
+        """What is between the chunks, where excerpts can be read from these alone."""
         summary = self._summary
         if summary is None:
             return None
@@ -289,7 +289,7 @@ class McapReader:
 
     @cached_property
     def _found_between(self) -> Between | None:
-        """What stands between the chunks, where all fits together; None else."""
+        """What is between the chunks, where all fits together; None else."""
         summary = self._summary
         if summary is None or not summary.is_consistent:
             return None
@@ -385,7 +385,7 @@ class McapReader:
             yield from map(self._unpacked, held.release(None))
 
     def _messages(self, opcode: int, body: bytes) -> Iterator[MessageHead]:
-        """The messages of a top-level record, declaring what stands between them."""
+        """The messages of a top-level record, declaring what is between them."""
         if opcode == Opcode.MESSAGE:
             yield parse_message(body)
         elif opcode == Opcode.CHUNK:

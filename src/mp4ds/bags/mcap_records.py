@@ -72,7 +72,7 @@ class ByteStream(Protocol):
     """What is read: a file, or the decompressed content of one."""
 
     def read(self, length: int, /) -> bytes:
-        """Read so many bytes; fewer at the end only."""
+        """Read that many bytes; fewer at the end only."""
         ...
 
     def tell(self) -> int:
@@ -80,7 +80,7 @@ class ByteStream(Protocol):
         ...
 
     def seek(self, offset: int, /) -> int:
-        """Go on at a byte offset, where the stream has a known size."""
+        """Continue at a byte offset, where the stream has a known size."""
         ...
 
     def close(self) -> None:
@@ -106,7 +106,7 @@ def open_source(path: Path, shown: Path | None = None) -> BinaryIO:
     shown = shown or path
     try:
         if not path.is_file() and not path.is_dir() and path.exists():
-            raise SourceError(shown, "is not a regular file")  # to open a pipe could wait for ever
+            raise SourceError(shown, "is not a regular file")  # to open a pipe could wait forever
         stream = path.open("rb")
     except FileNotFoundError:
         raise SourceNotFoundError(shown) from None
@@ -137,7 +137,7 @@ class RecordStream:
     Args:
         stream: A binary stream at the start of the file.
         path: The file's name, for errors.
-        size: Bytes in the stream; None where it can neither be known nor sought in.
+        size: Bytes in the stream; None if it can neither be known nor sought in.
 
     Attributes:
         start: Byte offset of the record that was read last.
@@ -159,7 +159,7 @@ class RecordStream:
         return self._stream.tell()
 
     def seek(self, offset: int) -> None:
-        """Go on at a byte offset that an index gave."""
+        """Continue at a byte offset that an index gave."""
         if self.size is not None and offset > self.size:
             raise DamageError(f"an index points to byte {offset}, past the end")
         self._stream.seek(offset)
@@ -179,7 +179,7 @@ class RecordStream:
             raise self.cut_short()
 
     def read(self, length: int) -> bytes:
-        """Read exactly so many bytes."""
+        """Read exactly that many bytes."""
         if self.size is not None and length > self.size - self._offset:
             raise self.cut_short()
         try:
@@ -337,7 +337,7 @@ def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
         size: Size of the content where known, else the frame must tell it.
 
     Raises:
-        DamageError: It is no zstd frame, damaged, or of another size.
+        DamageError: It is not a zstd frame, damaged, or of another size.
     """
     try:
         stated = zstandard.frame_content_size(data)
@@ -476,7 +476,7 @@ class Declared:
         return Message(channel, head.log_time, head.publish_time, head.sequence, head.data)
 
     def other(self, opcode: int, body: bytes | memoryview) -> Attachment | MetadataRecord | None:
-        """A record that is no message, to pass on; None where there is nothing to pass on.
+        """A record that is not a message, to pass on; None if there is nothing to pass on.
 
         Raises:
             DamageError: It is damaged, or contradicts what was declared before.

@@ -277,7 +277,7 @@ class _Bag:
             ends[chunk.start] = file.tell()
         if len(ends) < len(listed):
             raise DamageError("its index lists a chunk twice")
-        # messages that the index does not list would be lost without a word
+        # messages that the index does not list would be lost silently
         for chunk_start in sorted(ends):
             check_between(file, first, chunk_start)
             first = ends[chunk_start]

@@ -133,7 +133,7 @@ def _number(data: bytes | memoryview, offset: int) -> int:
 
 
 def check_bag(path: Path) -> int:
-    """Refuse a file that is no readable bag.
+    """Refuse a file that is not a readable bag.
 
     Returns:
         The file's size, bytes.
@@ -167,7 +167,7 @@ def check_bag(path: Path) -> int:
 
 
 def other_format(path: Path, start: bytes) -> SourceError:
-    """The error for a file that is no bag of version 2.0.
+    """The error for a file that is not a bag of version 2.0.
 
     Args:
         path: The file.
@@ -264,7 +264,7 @@ def check_between(file: BagFile, place: int, end: int) -> None:
     """Refuse messages between two bytes of a bag, where the index lists none.
 
     Raises:
-        DamageError: There are some, or something that is no record.
+        DamageError: There are some, or something that is not a record.
     """
     while place < end:
         file.seek(place)
@@ -306,7 +306,7 @@ def unpack_chunk(compression: str, size: int, data: bytes) -> bytes:
 def make_channel(number: int, topic: bytes, header: Mapping[bytes, bytes]) -> Channel:
     """A connection as a channel.
 
-    Its metadata holds ``topic`` only where that is not the record's: empty where the header
+    Its metadata holds ``topic`` only where that is not the record's: empty if the header
     has none, as in bags of RealSense cameras.
 
     Args:

@@ -67,7 +67,7 @@ class Ros1Writer:
     Raises:
         OptionError: The compression is unknown.
         TargetExistsError: The file exists.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
 
     format = "bag"

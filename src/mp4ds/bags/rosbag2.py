@@ -106,7 +106,7 @@ class Rosbag2Reader:
             self._channels.add_listed()
 
     def _storage_reader(self, file: Path) -> StorageReader | None:
-        """The reader of a storage file; None where it must be decompressed or fetched first."""
+        """The reader of a storage file; None if it must be decompressed or fetched first."""
         decompress = unzstd if self._info and self._info.compression == "message" else None
         compressed = is_zstd(file)
         if (self._info and self._info.storage == "mcap") or is_mcap(file, compressed):
@@ -247,7 +247,7 @@ class Rosbag2Reader:
         return MetadataRecord(RECORD, content)
 
     def stats(self) -> Mapping[int, ChannelStats]:
-        """See `BagReader.stats`; empty where one of the files does not tell."""
+        """See `BagReader.stats`; empty if one of the files does not tell."""
         total: dict[int, ChannelStats] = {}
         for number, reader in enumerate(self._readers):
             stats = reader.stats() if reader and _is_complete(reader) else {}

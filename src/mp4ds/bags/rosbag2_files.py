@@ -42,7 +42,7 @@ class ZstdStream:
 
     Attributes:
         consumed: Bytes of the file that were read.
-        problem: Why it ended before the file did, a phrase; empty where it did not.
+        problem: Why it ended before the file did, a phrase; empty if it did not.
 
     Raises:
         SourceError: It cannot be opened, or is empty.
@@ -127,7 +127,7 @@ class ZstdFile(ZstdStream):
 
 
 def copy_file(path: Path, target: Path) -> None:
-    """Bring a remote file here, with what stands beside it of a database that was not closed.
+    """Bring a remote file here, with what is beside it of a database that was not closed.
 
     Raises:
         SourceError: There is no room for it.
@@ -205,7 +205,7 @@ class StorageReader(Protocol):
 
     @property
     def start(self) -> int | None:
-        """The earliest log time, nanoseconds; None where it is not known."""
+        """The earliest log time, nanoseconds; None if unknown."""
 
 
 class SharedChannels:
@@ -256,7 +256,7 @@ class SharedChannels:
         return channel
 
     def add_listed(self) -> None:
-        """Topics without messages may stand in metadata.yaml alone."""
+        """Topics without messages may be in metadata.yaml alone."""
         if not self._info or not self._is_folder:
             return
         known = {(channel.topic, channel.type_name) for channel in self._channels.values()}
@@ -280,7 +280,7 @@ class SharedChannels:
 def consecutive(
     readers: Sequence[StorageReader | None], records: Callable[[int], Iterator[Record]]
 ) -> Iterator[Record]:
-    """Storage files one after the other, with what overlaps in log-time order.
+    """Storage files one after another, with what overlaps in log-time order.
 
     Args:
         readers: Of the files; None for one that is not open yet.

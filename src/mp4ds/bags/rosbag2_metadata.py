@@ -55,8 +55,8 @@ class TopicMetadata:
         name: Topic name.
         type_name: Type name.
         serialization_format: Mostly ``cdr``.
-        qos: Offered QoS profiles as YAML text, None where the version has none.
-        type_hash: Type description hash, None where the version has none.
+        qos: Offered QoS profiles as YAML text, None if the version has none.
+        type_hash: Type description hash, None if the version has none.
         count: Number of messages.
     """
 
@@ -89,10 +89,10 @@ class BagInfo:
         storage: ``sqlite3`` or ``mcap``; empty without files.
         file_names: Names of the storage files within the folder, in reading order.
         compression: ``file``, ``message`` or empty.
-        ros_distro: Name of the ROS distribution, empty where not told.
+        ros_distro: Name of the ROS distribution, empty if not told.
         custom_data: The user's own entries.
         topics: All topics.
-        counts: How many messages each storage file has, by its name; empty where not told.
+        counts: How many messages each storage file has, by its name; empty if not told.
     """
 
     text: str
@@ -198,7 +198,7 @@ def _text(value: Any) -> str:
 
 
 def _base_name(name: Any, path: Path) -> str:
-    # Before version 4 the bag's folder stands before the name; nothing outside of it is read.
+    # Before version 4 the bag's folder is before the name; nothing outside of it is read.
     base = PureWindowsPath(_text(name)).name
     if base in ("", ".", ".."):
         raise SourceError(path, f"lists {name!r} as a file of the recording")
@@ -299,7 +299,7 @@ _POLICIES = {
 
 
 def parse_qos(text: str) -> list[dict[str, Any]] | None:
-    """The QoS profiles of a topic as YAML values, None where the text is no list of them."""
+    """The QoS profiles of a topic as YAML values, None if the text is not a list of them."""
     try:
         profiles = yamlio.build(text, _scalar) if text.strip() else None
     except ValueError:

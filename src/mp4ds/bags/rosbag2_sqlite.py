@@ -30,7 +30,7 @@ class Tables:
 
     Args:
         connection: To the file.
-        size: Its bytes, with what stands beside it.
+        size: Its bytes, with what is beside it.
         shown: Its name in errors.
     """
 
@@ -41,7 +41,7 @@ class Tables:
         self.raised: BaseException | None = None
         looks = self._looks()
         next(looks)
-        # A handler that raises is taken for one that says 1: this one keeps what a signal raises.
+        # A handler that raises is taken as one that says 1: this one keeps what a signal raises.
         connection.set_progress_handler(partial(next, looks, 1), _LOOK_STEPS)
 
     def _looks(self) -> Iterator[int]:
@@ -326,7 +326,7 @@ class SqliteReader:
         with self._opened() as tables:
             self._rows_read = 0
             # Counted without the index, which may lack messages where it is damaged.
-            # COUNT(*) would go on without a look at signals.
+            # COUNT(*) would continue without a look at signals.
             query = "SELECT COUNT(1) FROM messages NOT INDEXED"
             (self._rows,) = tables.select(query).fetchone()
             # Ids first: sorting whole rows would copy the recording where no index helps.

@@ -96,7 +96,7 @@ class SqliteWriter:
         path: The file, which must not exist.
 
     Raises:
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -272,7 +272,7 @@ class Rosbag2Writer:
 
     Raises:
         OptionError: The storage or compression is unknown.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
 
     format = "rosbag2"

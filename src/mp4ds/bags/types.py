@@ -135,7 +135,7 @@ class BoundedStore(Typestore):
     those that have no bytes are counted.
 
     Args:
-        types: Definitions, complete but for time and duration.
+        types: Definitions, complete except for time and duration.
     """
 
     def __init__(self, types: Typesdict) -> None:
@@ -228,7 +228,7 @@ BUILTIN = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 _MAX_TEXT, _MAX_IDL, _MAX_LINES = 2**19, 2**17, 2**14
 _NO_CODE = re.compile(r'"(?:\\.|[^"\\])*"?|//.*|/[*](?:(?s:.*?)[*]/|(?s:.*))|\'\\?.\'')
-# rosbags' parser reads what stands in brackets a hundred times, and multiplies without a bound
+# rosbags' parser reads what is in brackets a hundred times, and multiplies without a bound
 _SLOW_IDL = re.compile(r"[(][^()]*[(]|<[^<>;]*<[^<>;]*<|[*]|<<(?!\s*\d{1,2}\b)")
 _BRACKET = re.compile(r"[^\w\s]\s*[(]")
 _MAX_BRACKETS = 8
@@ -254,7 +254,7 @@ class World:
 
 
 def ros1_world() -> World:
-    """ROS 1 with the types of Noetic, of which rosbags has all but those of tf2."""
+    """ROS 1 with the types of Noetic, of which rosbags has all except those of tf2."""
     tf2 = "tf2_msgs/msg/TFMessage"
     standard = {tf2: get_typestore(Stores.ROS2_HUMBLE).fielddefs[tf2]}
     standard.update(get_typestore(Stores.ROS1_NOETIC).fielddefs)
@@ -306,7 +306,7 @@ def _parse(schema: Schema, name: str, problem: str) -> Typesdict:
     if not schema.encoding:
         return {}
     if schema.encoding in ("ros2idl", "omgidl") or re.match(r"=+\nIDL: ", text):
-        text = re.sub(r"(?m)^[ \t]*#.*$", "", text)  # what it includes stands beside it
+        text = re.sub(r"(?m)^[ \t]*#.*$", "", text)  # what it includes is beside it
         code = _NO_CODE.sub("", text)
         brackets = len(_BRACKET.findall(code))
         if len(text) > _MAX_IDL or brackets > _MAX_BRACKETS or _SLOW_IDL.search(code):

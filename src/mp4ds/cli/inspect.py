@@ -238,7 +238,7 @@ _MODELS = {
 
 
 def print_intrinsics(result: Intrinsics) -> None:
-    """Print the calibrations of all cameras, one after the other, and the static transforms."""
+    """Print the calibrations of all cameras, one after another, and the static transforms."""
     say(f"# {result.path}: {result.kind}, {len(result.cameras)} cameras")
     say("import numpy as np")
     for camera in result.cameras:

@@ -295,7 +295,7 @@ class Dataset:
                 threads.
 
         Raises:
-            FormatError: A frame does not decode, or a message does not match its digest.
+            FormatError: A frame cannot be decoded, or a message does not match its digest.
         """
         is_span = start is not None or end is not None
         span = Excerpt(start, end, None if topics is None else frozenset(topics))

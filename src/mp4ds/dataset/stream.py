@@ -450,7 +450,7 @@ class Stream(DecodedFrames):
                 SHA-256 only if all are.
 
         Raises:
-            FormatError: A frame does not decode, or a message does not match its digest.
+            FormatError: A frame cannot be decoded, or a message does not match its digest.
         """
         columns = self.columns
         if self.sidecar.digests is None and choice is everything:

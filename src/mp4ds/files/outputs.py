@@ -68,7 +68,7 @@ def is_mine(stat: os.stat_result, folder: Path) -> bool:
 
 
 def exchange(one: Path, other: Path) -> bool:
-    """Exchange what stands under two names, in one step.
+    """Exchange what is under two names, in one step.
 
     Returns:
         Whether that was done; False where the system or the file system cannot.
@@ -232,7 +232,7 @@ def write_listing(folder: Path) -> None:
 
 
 def listed_names(folder: Path, listing: str = LISTING_NAME) -> set[str] | None:
-    """The names that a listing in a folder tells, with its own; None where there is none.
+    """The names that a listing in a folder tells, with its own; None if there is none.
 
     Args:
         folder: The folder.
@@ -286,7 +286,7 @@ def staged(
         target: The final name; its parent folder must exist.
         force: Replace an existing target.
         owned: Tells which files of an existing target mp4ds wrote.
-        sources: What the output is made from: neither may stand in the other.
+        sources: What the output is made from: neither may be in the other.
 
     Yields:
         A path that does not exist yet, for the caller to make a file or folder at.
@@ -331,7 +331,7 @@ def work_folder(parent: Path, prefix: str) -> Iterator[Path]:
         prefix: How its name begins.
 
     Raises:
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     for path in _matching(parent, prefix):
         _remove_abandoned(path)
@@ -485,7 +485,7 @@ def write_synced(path: Path, data: bytes, *, replace: bool = True) -> None:
 
     Raises:
         FileExistsError: It is there, and is not to be replaced.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.{socket.gethostname()}.part")
     try:
@@ -522,23 +522,23 @@ def is_seen(is_there: Callable[[], bool], *folders: Path) -> bool:
     end = time.monotonic() + _SEEN_SECONDS
     while not (seen := is_there()) and time.monotonic() < end:
         for folder in folders:
-            list(folder.iterdir())  # which asks the server for its names anew
+            list(folder.iterdir())  # which asks the server for its names again
         time.sleep(_LOOK_SECONDS)
     return seen
 
 
 def move_into_place(path: Path, target: Path, old: Path, *, force: bool, owned: Owned) -> None:
-    """Give an output its final name, in exchange for what stands there.
+    """Give an output its final name, in exchange for what is there.
 
     Args:
         path: The output, whole; afterwards what it replaced, where the system can exchange names.
         target: Its final name.
         old: Where what it replaces is put on other systems; on the same file system.
-        force: Replace what stands there.
+        force: Replace what is there.
         owned: Tells which files of that mp4ds wrote.
 
     Raises:
-        TargetExistsError: Something stands there and ``force`` is not set.
+        TargetExistsError: Something is there and ``force`` is not set.
         TargetError: Meanwhile something else was put there.
     """
     if not os.path.lexists(target):

@@ -231,5 +231,5 @@ def _identities(path: Path) -> list[tuple[int, int, int]]:
 
 def _differ(before: tuple[int, int, int], now: tuple[int, int, int]) -> bool:
     """Whether another file took a name."""
-    # a network file system may number the same one anew, and a new link to it sets its time
+    # a network file system may number the same one again, and a new link to it sets its time
     return before[:2] != now[:2] and before[2] != now[2]

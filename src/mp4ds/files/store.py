@@ -59,8 +59,8 @@ class Facts(NamedTuple):
 
     Attributes:
         is_folder: Whether it is one, or stands for one.
-        size: Bytes; None where it is not told.
-        tag: Changes with the content; empty where nothing does.
+        size: Bytes; None if it is not told.
+        tag: Changes with the content; empty if nothing does.
     """
 
     is_folder: bool

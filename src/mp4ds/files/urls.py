@@ -1,6 +1,6 @@
 """Recordings and datasets at URLs, read by ranges through fsspec.
 
-`location` makes of a URL what reads like a `pathlib.Path`, so that nothing else has to know
+`location` makes of a URL what reads like a `pathlib.Path`, so that nothing else must know
 where a file is. What is local never gets here, and fsspec is imported for URLs alone.
 """
 
@@ -144,7 +144,7 @@ class RemoteFile(io.RawIOBase):
         self._plan = _Plan(missing, self._load)
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read so many bytes, or all that are left."""
+        """Read that many bytes, or all that are left."""
         place = self._place
         wanted = self._size if size is None or size < 0 else place + size
         end = max(place, min(wanted, self._size))
@@ -172,7 +172,7 @@ class RemoteFile(io.RawIOBase):
             self._ahead = _LEAST
         wanted = min(max(end, place + self._ahead), place + _FILL_BYTES, self._size)
         stop = self._segments.next_start(place, wanted)
-        # Who asks for a file's last bytes wants what stands before them next.
+        # Who asks for a file's last bytes wants what is before them next.
         start = max(0, min(place, self._size - _LEAST)) if stop == self._size else place
         self._load([(start, min(stop, wanted))])
 
@@ -197,7 +197,7 @@ class RemoteFile(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Go on elsewhere; costs nothing."""
+        """Continue elsewhere; costs nothing."""
         base = {io.SEEK_SET: 0, io.SEEK_CUR: self._place, io.SEEK_END: self._size}[whence]
         if base + offset < 0:
             raise ValueError(f"seek to {base + offset}, before the file")
@@ -205,7 +205,7 @@ class RemoteFile(io.RawIOBase):
         return self._place
 
     def tell(self) -> int:
-        """Where reading goes on."""
+        """Where reading continues."""
         return self._place
 
     def close(self) -> None:
@@ -222,7 +222,7 @@ class RemoteFile(io.RawIOBase):
 
 
 def _split(ranges: Iterable[Range], most: int) -> Iterator[Range]:
-    """Ranges in pieces of so many bytes at most."""
+    """Ranges in pieces of that many bytes at most."""
     for start, end in ranges:
         for first in range(start, end, most):
             yield first, min(first + most, end)
@@ -309,8 +309,8 @@ class RemoteStat(NamedTuple):
 class RemotePath(Place):
     """A URL with what reading needs of `pathlib.Path`, in the forms that reading asks for.
 
-    What a store tells of it is asked for once and holds as long as the object does; an object
-    made anew sees changes. Its text has no secrets: neither password nor query.
+    What a store tells of it is asked for once and holds as long as the object does; a new object
+    sees changes. Its text has no secrets: neither password nor query.
 
     Args:
         url: With its scheme; of a web address the query is kept, also for files in a folder.
@@ -589,7 +589,7 @@ def location(path: Path | str) -> Path:
 
 
 def remote(path: object) -> RemotePath | None:
-    """What `location` made of a URL; None for a local path."""
+    """The result of `location` for a URL; None for a local path."""
     return path if isinstance(path, RemotePath) else None
 
 

@@ -24,7 +24,7 @@ MAX_CAMERA_INFOS = 10**7
 MAX_VARIANTS = 256
 """Headers or calibrations of a stream: a topic with more is not modelled any further."""
 MAX_PADDING = 4 * 2**20
-"""Characters of all paddings of a stream: its headers stand in the part of a YAML file that is
+"""Characters of all paddings of a stream: its headers are in the part of a YAML file that is
 parsed as a whole."""
 
 Int64 = Annotated[int, Field(ge=INT64_MIN, le=INT64_MAX)]

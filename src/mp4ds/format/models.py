@@ -105,7 +105,7 @@ class Quality(Model):
             scores: Of each frame, in steps of the metric (`SCORE_STEPS`), shape (frames,).
             worst_window: Least mean of a window.
             windows: How many there are.
-            reencoded: How many of them were encoded again.
+            reencoded: How many of them were re-encoded.
             limited: How many have originals that score too little themselves.
         """
         mean, p5, least = _told(scores, target.metric)
@@ -454,7 +454,7 @@ class VideoModel(Model):
 
     @property
     def matrix(self) -> str | None:
-        """Matrix coefficients of the video's colours; None where the video itself tells them."""
+        """Matrix coefficients of the video's colours; None if the video itself tells them."""
         if self.color is None:
             return None if self.pixel_format is None else "bt709"
         return self.color.matrix

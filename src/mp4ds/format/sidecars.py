@@ -27,7 +27,7 @@ _VERSION_0_KEYS = {"bagname", "topic_name", "camera_info", "img_timestamp"}
 
 
 def version_of(document: Document) -> str | None:
-    """The version that a document claims; None where it claims none."""
+    """The version that a document claims; None if it claims none."""
     if "mp4ds" in document:
         version = document["mp4ds"]
         return version if isinstance(version, str) else None

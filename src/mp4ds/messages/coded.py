@@ -72,7 +72,7 @@ REORDERED = "its stream shows pictures in another order than it sends them (B-fr
 
 
 class NoPicture(Refused):
-    """A packet without any picture, which no frame of a video can be made of."""
+    """A packet without any picture, which no frame of a video can be made from."""
 
 
 @dataclass(frozen=True, slots=True)

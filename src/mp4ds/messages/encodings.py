@@ -31,7 +31,7 @@ class Encoding:
         dtype: numpy's kind and bytes of a sample: u1, i1, u2, i2, i4, f4 or f8.
         general: The exact layout without parameters that carries every image.
         exact: Exact layouts worth a try, in order of preference; `general` is among them.
-        lossy: Layout for lossy codecs; None where a lossy codec would harm the meaning.
+        lossy: Layout for lossy codecs; None if a lossy codec would harm the meaning.
         mosaic: For Bayer, the colours of the 2 x 2 block by rows, such as ``rggb``.
         rows: Rows of the array per row of the image: more than 1 for the semi-planar YUV.
         even: Numbers that divide width and height, for chroma of half the resolution.
@@ -77,7 +77,7 @@ class Encoding:
         return int(step * height * self.rows)
 
 
-# general layouts by the number of channels, and what further ones may stand beside them
+# general layouts by the number of channels, and what further ones may be beside them
 _OF_BYTES = {1: "gray8", 2: "stack8", 3: "bgr24", 4: "bgra"}
 _OF_WORDS = {1: "gray16", 2: "stack16", 3: "gbr16", 4: "gbra16"}
 _MORE = {
@@ -189,7 +189,7 @@ def pixel_view(
 def row_padding(
     data: memoryview, encoding: Encoding, *, width: int, height: int, step: int
 ) -> bytes | None:
-    """The bytes after the pixels of each row; None where all rows have them, and all are zero.
+    """The bytes after the pixels of each row; None if all rows have them, and all are zero.
 
     Args:
         data: Of an image for which `why_not` knows no reason.
@@ -212,7 +212,7 @@ def put_padding(data: bytearray | memoryview, padding: bytes, *, row_bytes: int,
 
     Args:
         data: All rows, to be changed.
-        padding: Of all rows, or of all but the last.
+        padding: Of all rows, or of all except the last.
         row_bytes: Of the pixels of a row.
         step: Bytes per row.
     """
@@ -490,7 +490,7 @@ MAX_TABLE = 4096
 """Most values of a table; bounds what a sidecar can hold."""
 
 SCALES = ("product", "quotient")
-"""How metres were made of millimetres: ``k * 0.001f`` or ``k / 1000``."""
+"""How metres were made from millimetres: ``k * 0.001f`` or ``k / 1000``."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -64,7 +64,7 @@ class LayoutKind:
     Attributes:
         name: As the registry spells it.
         is_exact: Whether the pixels return if the picture does.
-        is_shown: Whether the picture looks like the image, so that its colours are to be told.
+        is_shown: Whether the picture looks like the image, so that its colours are tagged.
         parameters: Names of the parameters that it needs, all of them.
         values: What the picture holds for each sample.
         arrangement: Where.
@@ -298,7 +298,7 @@ class Layout:
         encoding: Of the images.
         parameters: Of the layout.
         is_exact: Whether the pixels return if the picture does.
-        is_shown: Whether the picture looks like the image, so that its colours are to be told.
+        is_shown: Whether the picture looks like the image, so that its colours are tagged.
         pixel_format: ffmpeg's name of the picture's format.
     """
 

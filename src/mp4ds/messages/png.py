@@ -54,7 +54,7 @@ RULES = MappingProxyType(
         **{f"1,{kind}": Rule((kind,), first=_SUB) for kind in range(2, 5)},
     }
 )
-"""Name of a rule -> the rule. A number is the filter of all rows; after ``1,`` of all but one."""
+"""Name of a rule -> the rule. A number is the filter of all rows; after ``1,`` of the others."""
 
 
 def unfilter(rows: Bytes, pixel_bytes: int) -> Bytes:
@@ -108,7 +108,7 @@ def _unfilter_front(rows: Bytes, above: Bytes, pixel_bytes: int, out: Bytes) -> 
     steps = height + width - 1
     coded = np.zeros((steps, height, pixel_bytes), np.uint8)
     _slanted(coded, width)[...] = rows[:, 1:].reshape(height, width, pixel_bytes)
-    # fronts[d + 2, y + 1] is the pixel (d - y, y); the row above stands at y = -1
+    # fronts[d + 2, y + 1] is the pixel (d - y, y); the row above is at y = -1
     fronts = np.zeros((steps + 2, height + 1, pixel_bytes), np.int16)
     fronts[1 : width + 1, 0] = above.reshape(width, pixel_bytes)
     kinds = rows[:, 0][:, None]
@@ -272,7 +272,7 @@ PNG_ENCODINGS = {
     (2, 3): "rgb16",
     (2, 4): "rgba16",
 }
-"""Bytes of a sample and samples of a pixel -> the ROS image encoding that a PNG is taken for."""
+"""Bytes of a sample and samples of a pixel -> the ROS image encoding that a PNG is taken as."""
 _MAX_AROUND = 2**16  # bytes of other chunks
 _MAX_CHUNKS = 2**17
 _MIN_CHUNK = 256
@@ -382,7 +382,7 @@ def parse(data: bytes | memoryview) -> PngInfo:
     """Read a PNG's header.
 
     Raises:
-        Refused: It is no PNG, or has a size that no video has.
+        Refused: It is not a PNG, or has a size that no video has.
     """
     head = bytes(data[:33])
     if head[:8] != SIGNATURE or head[8:16] != b"\0\0\0\rIHDR" or len(head) < 33:
@@ -421,7 +421,7 @@ def decode(data: bytes | memoryview, hint: PngRecipe | None = None) -> tuple[Pix
         uint16 in the machine's byte order; and the recipe with which `rebuild` gives the data.
 
     Raises:
-        Refused: It is no whole PNG, of a kind that is not unpacked, or does not rebuild.
+        Refused: It is not a whole PNG, of a kind that is not unpacked, or does not rebuild.
     """
     parts = _split(data)
     info = parts.info
@@ -557,7 +557,7 @@ def _chunks(data: memoryview, offset: int) -> Iterator[tuple[bytes, int, int]]:
 
 
 def _chunk_rule(sizes: list[int]) -> int:
-    """How much goes into an IDAT chunk, 0 where all is in one."""
+    """How much goes into an IDAT chunk, 0 if all is in one."""
     size = sizes[0] if len(sizes) > 1 else 0
     if size and (set(sizes[:-1]) != {size} or not 0 < sizes[-1] <= size or size < _MIN_CHUNK):
         raise Refused(f"{_NO_REBUILD}: its chunks follow no rule")

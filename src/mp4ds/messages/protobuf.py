@@ -352,7 +352,7 @@ def _declaration(type_name: str, schema: bytes) -> Any:
 
 
 def _fields(data: memoryview) -> Iterator[_Field]:
-    """The fields of a message, one after the other."""
+    """The fields of a message, one after another."""
     at = 0
     while at < len(data):
         tag, at = _varint(data, at)

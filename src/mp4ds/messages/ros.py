@@ -100,7 +100,7 @@ class RosWire:
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    """Where a message's slots are, bytes from its start; None where it has no such slot."""
+    """Where a message's slots are, bytes from its start; None if it has no such slot."""
 
     order: str
     sec_code: str

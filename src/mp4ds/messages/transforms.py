@@ -311,7 +311,7 @@ def between(by_child: Mapping[str, Transform], frame_ids: Iterable[str]) -> list
     kept: set[str] = set()
     for frame_id in frame_ids:
         child = _name(frame_id)
-        # stops where another camera's path went on, and in a circle
+        # stops where another camera's path continued, and in a circle
         while child in by_child and child not in kept:
             kept.add(child)
             child = _name(by_child[child].parent)

@@ -30,7 +30,7 @@ class ImageFields:
         width: Columns.
         height: Rows.
         step: Bytes per row.
-        is_bigendian: The byte as it stands; 0 where the type has none.
+        is_bigendian: The byte as it stands; 0 if the type has none.
     """
 
     encoding: str
@@ -46,8 +46,8 @@ class CodedFields:
 
     Attributes:
         format: The format or encoding, to the letter.
-        width: Columns of the image, 0 where the type does not say.
-        height: Rows of the image, 0 where the type does not say.
+        width: Columns of the image, 0 if the type does not say.
+        height: Rows of the image, 0 if the type does not say.
     """
 
     format: str
@@ -95,8 +95,8 @@ class Parts:
 
     Attributes:
         stamp: Header stamp, nanoseconds.
-        seq: Header sequence number; None where the type has none, as in ROS 2.
-        pts: Presentation time of a packet; None where the type has none.
+        seq: Header sequence number; None if the type has none, as in ROS 2.
+        pts: Presentation time of a packet; None if the type has none.
         frame_id: As UTF-8.
         fields: The rest of what it says.
         body: Pixels or coded picture, a view into the payload; empty for a calibration.
@@ -164,12 +164,12 @@ class Form(Protocol):
         """The template of a blank.
 
         Raises:
-            WireError: It is no blank message of this form.
+            WireError: It is not a blank message of this form.
         """
         ...
 
     def plain(self, frame_id: str, fields: Fields) -> bytes | None:
-        """The blank as a plain serializer writes it; None where that is not modelled."""
+        """The blank as a plain serializer writes it; None if that is not modelled."""
         ...
 
 
@@ -223,7 +223,7 @@ class PrimitiveReader:
         data: The payload.
         start: Where the fields begin; alignment counts from here.
         order: ``<`` or ``>``.
-        aligned: Whether primitives stand at multiples of their size.
+        aligned: Whether primitives are at multiples of their size.
     """
 
     def __init__(self, data: memoryview, start: int, order: str, *, aligned: bool) -> None:

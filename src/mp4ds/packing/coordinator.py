@@ -140,7 +140,7 @@ class Coordinator:
     Args:
         runs: The packs.
         engine: Runs the tasks.
-        keep_going: Go on with other tasks where one fails.
+        keep_going: Continue with other tasks where one fails.
         share_of: Number of the share of the tasks to run, and how many shares there are.
         report: Told of progress.
     """
@@ -245,7 +245,7 @@ class Coordinator:
             progress.finished(task.name, topics, before=before)
 
     def finish(self, run: PackRun) -> PackSummary:
-        """Make the dataset of a pack whose tasks are done, and remove what it was made of.
+        """Make the dataset of a pack whose tasks are done, and remove what it was made from.
 
         Raises:
             PartsFailedError: The disk refused; what is finished is kept.

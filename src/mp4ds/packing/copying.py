@@ -1,4 +1,4 @@
-"""A dataset packed again as it is: in part, or with other facts, and nothing encoded anew."""
+"""A dataset repacked as it is: in part, or with other facts, and nothing re-encoded."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ class Outcome:
 
     Attributes:
         task: Its arguments.
-        error: Class name and sentence of what it failed with; None where it was done.
+        error: Class name and sentence of what it failed with; None if it was done.
         facts: What it told at its end.
     """
 

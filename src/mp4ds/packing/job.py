@@ -47,7 +47,7 @@ class Task:
         name: Of the folder of its result.
         start: It takes log times from here on, ns; None: from the first.
         end: To before here; None: to the last.
-        topics: It takes these topics; None: all but `without`.
+        topics: It takes these topics; None: all except `without`.
         without: Topics that others take.
         others: Whether it takes attachments and metadata.
         source: Number of the file whose digest is all it makes; None for others.
@@ -332,14 +332,14 @@ def _open_whole(paths: Sequence[Path], salvage: bool, images: ImageFolder | None
 
 
 def dataset_at(path: Path) -> Path | None:
-    """The folder of a dataset that is to be packed again; None for a recording."""
+    """The folder of a dataset that is to be repacked; None for a recording."""
     folder = path.parent if path.name == MANIFEST_NAME else path
     if folder.suffix in RECORDING_SUFFIXES:  # at a URL, a question less
         return None
     try:
         return folder if (folder / MANIFEST_NAME).is_file() else None
     except OSError:
-        return None  # whoever opens it says why
+        return None  # anyone who opens it says why
 
 
 def _open_one(path: Path) -> BagReader:

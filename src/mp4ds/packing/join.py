@@ -127,7 +127,7 @@ class StreamJoin:
 
         Raises:
             VideoError: A segment is damaged.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         path = folder / f"{stem}.mp4"
         columns = self._columns.to_model()
@@ -202,7 +202,7 @@ def _key(model: object) -> str:
 
 
 class _JoinedColumns:
-    """Columns of segments, one after the other."""
+    """Columns of segments, one after another."""
 
     def __init__(self) -> None:
         self._columns: dict[str, list[NDArray[np.int64]]] = {}
@@ -334,7 +334,7 @@ class Assembler:
 
         Raises:
             SourceError: The parts do not hold what the recording's index tells.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         self._check_counts()
         names = FileNames()

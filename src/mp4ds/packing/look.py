@@ -29,7 +29,7 @@ class StreamKey:
     Attributes:
         wire: Serialization.
         body: What a message's body is to the video (spec/registry.md, "Bodies").
-        codec: Codec of packets; empty where the video is encoded here.
+        codec: Codec of packets; empty if the video is encoded here.
         encoding: ROS image encoding of the frames.
         width: Columns.
         height: Rows.
@@ -55,7 +55,7 @@ class BodyFraming:
         framing: Start codes and delimiters that an mp4 does not keep.
         prefix: Bytes before the coded picture.
         png: How its file was written.
-        padding: What stands between rows of pixels, deflated; None: zeros.
+        padding: The row padding, deflated; None: zeros.
     """
 
     framing: str = ""

@@ -1,4 +1,4 @@
-"""What a part of a pack records of itself, and the manifest made of these records."""
+"""What a part of a pack records of itself, and the manifest made from these records."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class PartStream:
 
 @dataclass
 class PartRecord:
-    """What was packed of a recording into a folder, but for the manifest.
+    """What was packed of a recording into a folder, except for the manifest.
 
     Attributes:
         folder: Where the files are.
@@ -241,7 +241,7 @@ def _damaged(folder: Path) -> FormatError:
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
-    """The record of a part; None where the part is not whole: a file is missing or cut short."""
+    """The record of a part; None if the part is not whole: a file is missing or cut short."""
     try:
         record: dict[str, Any] = load_kept((folder / RECORD_NAME).read_bytes())
         topics = record.setdefault("topics", [])
@@ -286,11 +286,11 @@ class Recorded(Protocol):
 
 @dataclass(frozen=True)
 class Origin:
-    """What a dataset is made of.
+    """What a dataset is made from.
 
     Attributes:
-        sources: The files of the recording, whatever was made of them in between.
-        derived_from: Datasets that were packed again, the oldest first.
+        sources: The files of the recording, whatever was made from them in between.
+        derived_from: Datasets that were repacked, the oldest first.
         losses: What these lost of the recording.
         left_out: Topics that they left out.
         about: What is told of the recording.
@@ -313,7 +313,7 @@ class Origin:
         """The origin of what was read.
 
         Args:
-            files: The files of recordings, and of datasets that are packed again, each of which
+            files: The files of recordings, and of datasets that are repacked, each of which
                 begins with its manifest.
             digests: Name, size in bytes and SHA-256 of each; None of those that were read in part.
             about: What is told of the recording; None for what the datasets tell, if it is one
@@ -463,7 +463,7 @@ def summarize(
     Args:
         part: All that was packed.
         target: The dataset's final name.
-        source_bytes: Bytes of the source files; None where a slice was taken, for the bytes of
+        source_bytes: Bytes of the source files; None if a slice was taken, for the bytes of
             its messages.
         origin: What it was read from.
     """
@@ -526,7 +526,7 @@ def folder_size(folder: Path) -> int:
 
 
 def dataset_files(path: Path) -> set[str] | None:
-    """Names of a dataset's files, by its manifest; None where that is none, or not understood."""
+    """Names of a dataset's files, by its manifest; None if that is none, or not understood."""
     try:
         manifest = load_manifest(path / MANIFEST_NAME)
     except (FormatError, SourceError, OSError):

@@ -167,7 +167,7 @@ class PackProgress:
     Attributes:
         dataset: What is being made.
         phase: ``planning``, ``packing``, ``joining`` or, for a URL, ``uploading``.
-        done: Share of the work of this phase that is done, 0 to 1; None where nothing tells.
+        done: Share of the work of this phase that is done, 0 to 1; None if unknown.
         bytes_read: Payload bytes of the messages packed so far.
         bytes_total: Bytes of the source files.
         bytes_written: Bytes of the dataset so far.
@@ -264,7 +264,7 @@ class PackSummary:
         losses: What could not be read of a damaged recording.
         larger: Why the dataset is larger than its source, where it is by more than 5 %.
         is_copy: Whether the videos of a dataset were copied; `raw_bytes` of topics are not known.
-        not_copied: Why a dataset's videos were encoded anew, where that was not asked for.
+        not_copied: Why a dataset's videos were re-encoded, where that was not asked for.
     """
 
     dataset: Path

@@ -90,7 +90,7 @@ class PackRun:
 
         Args:
             options: Those that decide what comes out.
-            anew: Forget what is there.
+            anew: Discard what is there.
             alone: Nobody else is at work there.
 
         Raises:
@@ -152,7 +152,7 @@ def pack_in_one_pass(
     Raises:
         SourceError: The recording is damaged, or changed while it was read.
         OutOfReachError: A stream cannot have the score that was asked for.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     total = sum(map(source_size, reader.files))
     stats = reader.stats()
@@ -241,7 +241,7 @@ def pack(
         RemoteError: A store or web server fails.
         OptionError: An option is wrong.
         PartsFailedError: Parts of a long recording failed; those finished are kept beside the
-            dataset, and calling again goes on with the others. Else nothing is left behind.
+            dataset, and calling it again resumes with the others. Else nothing is left behind.
     """
     paths = _paths(sources)
     chosen = _checked(options or PackOptions(), paths)
@@ -265,7 +265,7 @@ def _pack(
 def _copied(
     paths: Sequence[Path], target: Path, options: PackOptions, progress: Report | None
 ) -> PackSummary:
-    """Copy a dataset, or encode it anew where it cannot be copied."""
+    """Copy a dataset, or encode it again where it cannot be copied."""
     from mp4ds.packing.copying import copy
 
     try:
@@ -318,7 +318,7 @@ def pack_share(
         progress: Called several times a second.
 
     Raises:
-        Mp4dsError: As `pack`.
+        Mp4dsError: As for `pack`.
     """
     paths = _paths(sources)
     chosen = _checked(options or PackOptions(), paths, may_copy=False)
@@ -352,7 +352,7 @@ def pack_each(
         there already, of the same recordings, are left as they are.
 
     Raises:
-        Mp4dsError: As `pack`.
+        Mp4dsError: As for `pack`.
     """
     paths = _paths(sources)
     asked = options or PackOptions()
@@ -378,7 +378,7 @@ def pack_each(
     made: dict[Path, PackSummary] = {}
     runs = []
     for target, source in missing.items():
-        # what is copied, or goes to a URL, is made one after the other
+        # what is copied, or goes to a URL, is made one after another
         if source in copied or remote(parent):
             own = _checked(asked, [source])
             made[target] = _pack([source], target, own, progress)
@@ -488,7 +488,7 @@ def _quality_of(paths: Sequence[Path]) -> str:
 
 
 def _has_transcoded(paths: Sequence[Path]) -> bool:
-    """Whether JPEG files were encoded anew when something was packed before."""
+    """Whether JPEG files were re-encoded when something was packed before."""
     folders = [folder for path in paths if (folder := dataset_at(path))]
     return any(
         load_stream(folder / entry.sidecar).body == "jpeg"

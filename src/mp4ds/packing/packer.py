@@ -275,7 +275,7 @@ class PartSettings:
         streams: How its streams are encoded.
         selected: Whether a topic is packed.
         excerpt: What of the recording it is made from.
-        survey: What all parts agree on; None where there is but one part.
+        survey: What all parts agree on; None if there is but one part.
         camera_info: Pairs of topics that the user names, ``IMAGE=INFO``.
         workers: Streams that are encoded side by side.
         compression: Of messages.mcap.
@@ -298,7 +298,7 @@ def until_in_reach(make: Callable[[Exact], _Made]) -> _Made:
     """Pack; and again, with other streams lossless, while one cannot have the score asked for.
 
     Args:
-        make: Packs, beginning anew each time; given the streams that are to be lossless.
+        make: Packs, beginning again each time; given the streams that are to be lossless.
     """
     exact: dict[tuple[int, StreamKey], str] = {}
     while True:
@@ -359,7 +359,7 @@ class Packer:
         Raises:
             SourceError: The recording is damaged.
             OutOfReachError: A stream cannot have the score that was asked for.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         part = self._part
         try:

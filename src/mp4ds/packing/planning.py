@@ -151,7 +151,7 @@ class Resources:
             OptionError: Not one fits into the memory.
         """
         busy = max(1, self.cores // max(1, job.threads * job.workers))
-        fitting = (self.memory - TASK_BYTES) // job.task_bytes  # but for what coordinates them
+        fitting = (self.memory - TASK_BYTES) // job.task_bytes  # except for what coordinates them
         if fitting < 1 and self.memory < job.task_bytes:
             needed = -(-job.task_bytes // 2**20)
             raise OptionError(
@@ -413,7 +413,7 @@ def _tasks(
     reader: BagReader,
     asked: Slice,
 ) -> list[Task]:
-    """All tasks, those of one time together; the first group takes what is no camera's, too."""
+    """All tasks, those of one time together; the first group also has those without a camera."""
     apart = [_with_infos(group, topics) for group in groups[1:]]
     solo = [
         _with_infos([topic], topics)

@@ -41,7 +41,7 @@ class Decision:
 
     Attributes:
         key: What they have in common.
-        plans: The best first; none where no video is made of them.
+        plans: The best first; none if no video is made from them.
         refusal: Why there is none.
     """
 

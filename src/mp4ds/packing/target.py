@@ -1,4 +1,4 @@
-"""Streams that are to have a score: their windows encoded, scored, and encoded again."""
+"""Streams that are to have a score: their windows encoded, scored, and re-encoded."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FALLS = {"vmaf": 0.3, "psnr": 0.4, "ssim": 0.001}
 
 _MOST_UP = 8  # crf from one window to the next
 _RANGE = 4  # of how fast scores fall, beside what is assumed
-_LAVISH = 0.5  # of the tolerance: a window with more too much is encoded again, with fewer bits
+_LAVISH = 0.5  # of the tolerance: a window with more too much is re-encoded, with fewer bits
 _MOST_TRIMS = 2  # times
 _NOISE = 1e-9  # of sums of floats
 
@@ -65,7 +65,7 @@ class CrfControl:
         self._surplus = 0.0  # of all frames together
 
     def accepted(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
-        """The largest crf of those tried that is good enough; None where none is.
+        """The largest crf of those tried that is good enough; None if none is.
 
         Args:
             tried: Crf -> the mean score of the window's frames.
@@ -76,7 +76,7 @@ class CrfControl:
         return max((crf for crf, mean in tried.items() if mean >= least), default=None)
 
     def next(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
-        """The crf to encode a window with again; None where no more is to be tried.
+        """The crf to encode a window with again; None if no more is to be tried.
 
         Args:
             tried: Crf -> the mean score of the window, in the order they were tried.
@@ -208,7 +208,7 @@ class WindowCoder:
         Raises:
             EncoderRefusedError: The codec does not take such pictures.
             ScoringError: libvmaf failed.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         width, height = self.coded_size
         encoder = VideoEncoder(
@@ -373,7 +373,7 @@ class TargetTrack:
     """See `Track`.
 
     The frames of a window are kept on disk as planes. When it is full it is encoded, decoded and
-    scored, and encoded again with a lower crf until it is good enough. The windows' videos are
+    scored, and re-encoded with a lower crf until it is good enough. The windows' videos are
     joined at the end.
     """
 

@@ -1,4 +1,4 @@
-"""What a stream's video is made of: pictures encoded here, or packets as they came."""
+"""What a stream's video is made from: pictures encoded here, or packets as they came."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class StreamSettings:
         preset: Preset of the encoder, or None for the default.
         gop: Most frames between key frames.
         threads: Threads of each encoder.
-        transcode: Whether JPEG topics are encoded anew.
+        transcode: Whether JPEG topics are re-encoded.
         purpose: What the dataset is for; None for nothing in particular.
     """
 
@@ -66,7 +66,7 @@ class Track(Protocol):
 
         Raises:
             Refused: The video cannot have the score that was asked for.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         ...
 
@@ -75,7 +75,7 @@ class Track(Protocol):
 
         Raises:
             Refused: The video cannot have the score that was asked for.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         ...
 
@@ -84,7 +84,7 @@ class Track(Protocol):
         ...
 
     def describe(self) -> dict[str, Any]:
-        """What `mp4ds.format.models.Video` says of it, but for the file."""
+        """What `mp4ds.format.models.Video` says of it, except for the file."""
         ...
 
 

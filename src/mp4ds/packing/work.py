@@ -45,14 +45,14 @@ def run_task(folder: str, name: str, progress: Progress | None = None) -> None:
 
     Raises:
         SourceError: The recording is damaged, or not what it was.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     with Tasks() as tasks:
         tasks.run(folder, name, progress)
 
 
 class Tasks:
-    """Runs tasks one after the other; a recording stays open between those of one pack."""
+    """Runs tasks one after another; a recording stays open between those of one pack."""
 
     def __init__(self) -> None:
         self._job: Job | None = None
@@ -192,7 +192,7 @@ def _outcome(tasks: Tasks, folder: str, name: str) -> dict[str, Any]:
 
 
 def _memory(name: str) -> int:
-    """A figure of this process's memory, in bytes; 0 where the system does not tell."""
+    """A figure of this process's memory, in bytes; 0 if the system does not tell."""
     with contextlib.suppress(OSError, ValueError, IndexError):
         # not getrusage, which counts what the process was forked from
         words = Path("/proc/self/status").read_text().split()

@@ -1,6 +1,6 @@
 """The folder in which a divided pack is made: its job, and the results of its tasks.
 
-It stands beside the dataset, on the same file system, under a name that the dataset's tells, so
+It is beside the dataset, on the same file system, under a name that the dataset's tells, so
 that the same command finds it again. A task's result appears in it by one rename, when whole.
 
 Somebody else may have put a folder there: in a folder that users share, or by an archive that was
@@ -202,7 +202,7 @@ class Workplace:
         return job
 
     def check(self, job: Job, options: dict[str, object], paths: list[str]) -> None:
-        """Refuse to go on with a job that is another one.
+        """Refuse to continue with a job that is another one.
 
         Raises:
             OptionError: The options or recordings are others.
@@ -228,10 +228,10 @@ class Workplace:
         """Make the result of a task.
 
         Yields:
-            The folder to fill, with the record last; None where the result is there already.
+            The folder to fill, with the record last; None if the result is there already.
 
         Raises:
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         place = self.parts / task.name
         if self.is_done(task):
@@ -256,7 +256,7 @@ class Workplace:
             shutil.rmtree(folder, ignore_errors=True)
 
     def has_results(self) -> bool:
-        """Whether there is anything to go on from."""
+        """Whether there is anything to continue from."""
         try:
             return any(
                 read_record(place) is not None

@@ -348,7 +348,7 @@ class Watch:
 
 
 def check_address(address: str) -> None:
-    """Refuse what is no way to a cluster, or needs a package that is not there.
+    """Refuse an invalid cluster address, or one that needs a package that is not there.
 
     Raises:
         OptionError: Says what is wrong.
@@ -454,7 +454,7 @@ def _opened(address: str, tasks: int) -> Iterator[tuple[Client, Watch]]:
 
 
 def _check_scheduler(address: str) -> None:
-    """See whether a scheduler answers: a client waits for ever where something else listens.
+    """Check that a scheduler answers: a client waits forever if something else listens.
 
     Raises:
         ClusterError: None does.
@@ -592,7 +592,7 @@ class ClusterEngine:
     ) -> Generator[Outcome, None, None]:
         """See `Engine.run`.
 
-        Closing the generator drops the tasks that wait; on a cluster that goes on, those that
+        Closing the generator drops the tasks that wait; on a cluster that continues, those that
         run come to their end, for nothing stops the thread of a worker from outside.
 
         Raises:
@@ -652,7 +652,7 @@ class ClusterEngine:
                     client.cancel([future for _, future in waiting.values()])
 
     def _outcome(self, task: tuple[str, ...], future: Future) -> Outcome | None:
-        """What became of a task; None where the scheduler has dropped it and nobody knows."""
+        """What became of a task; None if the scheduler has dropped it and nobody knows."""
         if future.status == "finished":
             return Outcome(task)
         if future.status != "error":

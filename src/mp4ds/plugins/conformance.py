@@ -157,7 +157,7 @@ def _columns(columns: DecodedColumns) -> Values:
 
 
 def _decoded(stream: Stream) -> Values:
-    """Hashes of what the video has of each frame, and of what is made of it."""
+    """Hashes of what the video has of each frame, and of what is made from it."""
     sidecar = stream.sidecar
     is_lossless = sidecar.profile == "lossless"
     is_packet = sidecar.body == "packet"
@@ -192,7 +192,7 @@ def _packets(stream: Stream) -> list[str]:
 
 
 def _planes(stream: Stream) -> Values | None:
-    """Of each picture; None where decoders may differ, or not every packet decodes."""
+    """Of each picture; None if decoders may differ, or not every packet decodes."""
     video = stream.sidecar.video
     if video.codec == "mjpeg":
         return None

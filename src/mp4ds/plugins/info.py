@@ -98,7 +98,7 @@ def info(path: Path | str, asked: Slice = WHOLE) -> Info:
         asked: What of it is looked into. Of a slice of a dataset, what would be unpacked.
 
     Raises:
-        SourceError: It is no recording or cannot be read.
+        SourceError: It is not a recording or cannot be read.
         FormatError: The dataset breaks a rule of the format.
         OptionError: There is nothing in the slice.
     """
@@ -147,7 +147,7 @@ def reading_speeds(path: Path | str) -> list[ReadingSpeed]:
         path: A dataset, or a video with its sidecar; or its URL.
 
     Raises:
-        SourceError: It is no dataset, or cannot be read.
+        SourceError: It is not a dataset, or cannot be read.
         FormatError: The dataset breaks a rule of the format.
     """
     with Dataset(path) as dataset:
@@ -315,7 +315,7 @@ class ListedCalibration:
     """A calibration of a camera, and from where on it holds.
 
     Attributes:
-        message: Number of the message that it holds from, among its channel's; None where no
+        message: Number of the message that it holds from, among its channel's; None if no
             messages were recorded.
         log_time: When that was recorded, nanoseconds.
         frame_id: Coordinate frame.
@@ -326,10 +326,10 @@ class ListedCalibration:
         d: Distortion parameters.
         r: Rectification matrix, 3 x 3.
         p: Projection matrix, 3 x 4.
-        binning: Columns and rows binned into one, or None where both are 0.
-        roi: x_offset, y_offset, height, width, do_rectify, or None where all are 0.
-        k_effective: `k` for the images as they are, cut and binned; None where it is `k`.
-        p_effective: `p` for the images as they are; None where it is `p`.
+        binning: Columns and rows binned into one, or None if both are 0.
+        roi: x_offset, y_offset, height, width, do_rectify, or None if all are 0.
+        k_effective: `k` for the images as they are, cut and binned; None if it is `k`.
+        p_effective: `p` for the images as they are; None if it is `p`.
     """
 
     message: int | None
@@ -354,7 +354,7 @@ class CameraCalibrations:
 
     Attributes:
         topic: Of the images; empty for calibrations that belong to no images.
-        info_topic: Of the calibrations; empty where the images have none.
+        info_topic: Of the calibrations; empty if the images have none.
         frame_id: Coordinate frame of the first image.
         sizes: Width and height of the images; several if they change, none if unknown.
         calibrations: Each that differs from the one before, in the order of the recording.
@@ -393,7 +393,7 @@ def intrinsics(path: Path | str) -> Intrinsics:
         path: Where it is, or its URL.
 
     Raises:
-        SourceError: It is no recording or cannot be read.
+        SourceError: It is not a recording or cannot be read.
         FormatError: The dataset breaks a rule of the format.
     """
     return _look(path, _of_dataset, _of_recording)

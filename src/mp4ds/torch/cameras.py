@@ -385,7 +385,7 @@ class StreamReader:
         self._view = view
 
     def read(self, frames: list[int]) -> Tensor:
-        """As `TensorReader.read`."""
+        """Like `TensorReader.read`."""
         view = self._view
         pixels = self._stream.read(frames, format=view.format, resize=view.resize, crop=view.crop)
         return torch.from_numpy(pixels)  # shares the memory
@@ -399,7 +399,7 @@ class StreamReader:
         )
 
     def close(self) -> None:
-        """As `TensorReader.close`."""
+        """Like `TensorReader.close`."""
         self._stream.close()
 
 

@@ -345,7 +345,7 @@ class FrameDataset(Dataset):
 
     Raises:
         OptionError: An option is wrong, a topic is not there, or there is no sample.
-        SourceError: A path is no dataset.
+        SourceError: A path is not a dataset.
         FormatError: A manifest or sidecar breaks a rule of the format.
     """
 

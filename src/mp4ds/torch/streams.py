@@ -129,7 +129,7 @@ class FrameStream(IterableDataset):
 
     Raises:
         OptionError: An option is wrong, a topic is not there, or there is no sample.
-        SourceError: A path is no dataset.
+        SourceError: A path is not a dataset.
         FormatError: A manifest or sidecar breaks a rule of the format.
     """
 

@@ -69,7 +69,7 @@ class Reduction:
             raise OptionError(f"`max_rate` {rate!r} is not a rate: use Hz, such as 10.")
 
     def size_of(self, stream: Stream) -> tuple[int, int] | None:
-        """Width and height that images of a stream get; None where they have them already.
+        """Width and height that images of a stream get; None if they have them already.
 
         Raises:
             OptionError: They are beyond what an image can have.
@@ -129,7 +129,7 @@ def at_most(rate: float, times: NDArray[np.int64]) -> NDArray[np.bool_]:
     is kept that comes less than half of the camera's usual interval before it (and less than half
     of the grid's), or after it. So a camera of 30 Hz loses nothing at 30 Hz, though its frames
     come a little too early or too late, and two of three frames remain of it at 20 Hz. After a
-    gap, or where the time goes backward, the grid begins anew.
+    gap, or where the time goes backward, the grid starts over.
 
     Args:
         rate: Hz.
@@ -172,7 +172,7 @@ class Given:
 
 @dataclass(frozen=True, slots=True)
 class Undecoded:
-    """A message that stays as recorded, since its picture does not decode.
+    """A message that stays as recorded, since its picture cannot be decoded.
 
     Attributes:
         payload: The message.

@@ -90,7 +90,7 @@ class FreeTopics:
         self._taken = set(taken)
 
     def take(self, topic: str, kind: str) -> str:
-        """The topic, or one made of it and its kind, one of `KINDS`, where it is taken."""
+        """The topic, or one made from it and its kind, one of `KINDS`, where it is taken."""
         while topic in self._taken:
             topic += "_" + kind.replace("-", "_")
         self._taken.add(topic)
@@ -137,7 +137,7 @@ def calibration_source(
         is_kept: Which of its images are given; None for all.
 
     Returns:
-        None where they stay as recorded.
+        None if they stay as recorded.
 
     Raises:
         Refused: There are no such messages of another size; says why.

@@ -23,7 +23,7 @@ class VideoFields:
 
     Attributes:
         codec: Name in the registry.
-        encoding: ROS image encoding of the images that the video was made of.
+        encoding: ROS image encoding of the images that the video was made from.
         width: Columns of the images.
         height: Rows of the images.
         pixel_format: Of the video as ffmpeg calls it.
@@ -117,7 +117,7 @@ def _begun(encoding: str, slots: Slots, *, has_seq: bool = False) -> PrimitiveWr
     is_cdr = encoding == "cdr"
     seconds, nanoseconds = divmod(slots.stamp, NS)
     if not (-(2**31) if is_cdr else 0) <= seconds < (2**31 if is_cdr else 2**32):
-        raise WireError("its stamp is outside the range of ROS")
+        raise WireError("its stamp is beyond what ROS has bits for")
     writer = PrimitiveWriter(b"\0\1\0\0" if is_cdr else b"", "<", aligned=is_cdr)
     if has_seq:
         writer.put("I", slots.seq or 0)

@@ -165,7 +165,7 @@ def write_images(
 
 
 def image_names(folder: Path) -> set[str] | None:
-    """Names of the files of image folders, by their stamps.csv; None where there is none."""
+    """Names of the files of image folders, by their stamps.csv; None if there is none."""
     if not folder.is_dir():
         return None
     names: set[str] = set()
@@ -270,7 +270,7 @@ def unpack_each(
 
     Raises:
         OptionError: Two would get one name.
-        Mp4dsError: As `unpack`; those written before stay.
+        Mp4dsError: As for `unpack`; those written before stay.
     """
     outputs: dict[Path, Path | None] = {}
     for dataset in datasets_in(datasets):

@@ -156,7 +156,7 @@ class Group:
     Attributes:
         first: Number of the key frame's packet.
         end: Number of the next group's.
-        parser: Of its packets; None where all is known without.
+        parser: Of its packets; None if all is known without.
         pieces: In the order coded.
         shows: For each packet known the number of the piece that makes its picture come out.
     """
@@ -304,7 +304,7 @@ class FrameAccess:
     Args:
         path: The video.
         codec: Name in the registry.
-        frames: Number of frames that are due; None where only the video tells.
+        frames: Number of frames that are due; None if only the video tells.
         maker: Makes pictures of its frames.
         threads: Of the decoder. One takes the least CPU time; with more, one frame comes sooner.
         references: What the sidecar says of them, so that no packets are read to find out.

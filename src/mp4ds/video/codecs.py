@@ -104,7 +104,7 @@ class HardwareEncoder:
         most: The largest crf; the smallest is 1, since 0 leaves the choice to most of them.
         presets: That it has.
         default_preset: One of them, or empty.
-        device: Kind of device whose memory has to hold the pictures; empty: it takes them as
+        device: Kind of device whose memory must hold the pictures; empty: it takes them as
             they are.
     """
 
@@ -313,7 +313,7 @@ class _Lossy:
 
 
 # with a crf of 1, SVT-AV1's presets from 11 on were seen to make frames that do not look like the
-# pictures, and videos that do not decode
+# pictures, and videos that cannot be decoded
 _AV1_FAST = 11
 _SMALL = "hierarchical-levels=3:enable-qm=1:qm-min=8:ac-bias=1.0"
 _LOSSY: Mapping[str, _Lossy] = {
@@ -373,7 +373,7 @@ def check_codec(
     """Refuse a codec that could make no stream of a profile, or what it does not have.
 
     Args:
-        codec: As ``--codec`` has it, or None for the default.
+        codec: As given to ``--codec``, or None for the default.
         preset: The encoder's preset, or None for the default.
         lossless: Whether every sample must return as it was.
         crf: Constant rate factor, where there is one.

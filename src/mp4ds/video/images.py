@@ -39,7 +39,7 @@ def read_still(path: Path) -> tuple[str, NDArray[np.uint8]]:
         The ROS encoding, ``mono8`` or ``rgb8``, and pixels of shape (H, W) or (H, W, 3).
 
     Raises:
-        SourceError: It is no image, is too large, or has other than 8 bits.
+        SourceError: It is not an image, is too large, or has other than 8 bits.
     """
     from PIL import Image
 
@@ -127,7 +127,7 @@ def read_image(path: Path) -> tuple[str, Pixels]:
         The ROS encoding, and pixels of shape (H, W) or (H, W, C), little-endian.
 
     Raises:
-        SourceError: It is no image, or its values cannot be had as they are.
+        SourceError: It is not an image, or its values cannot be had as they are.
     """
     try:
         with path.open("rb") as file:
@@ -146,7 +146,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file, by its header.
 
     Raises:
-        SourceError: It is no image.
+        SourceError: It is not an image.
     """
     return _header(path)[:2]
 
@@ -155,7 +155,7 @@ def image_kind(path: Path) -> str:
     """Size and kind of pixels of an image file, in words, by its header.
 
     Raises:
-        SourceError: It is no image.
+        SourceError: It is not an image.
     """
     return "{}x{} {}".format(*_header(path))
 
@@ -379,7 +379,7 @@ _ENCODING_OF = {
 
 
 def shown_format(encoding: Encoding) -> str | None:
-    """Name in ffmpeg of what the pixels look like, or None where they are no light.
+    """Name in ffmpeg of what the pixels look like, or None if they cannot be displayed.
 
     Depths, signed numbers, floats, and pairs of channels are data. A Bayer mosaic is its own
     format, and YUV its planes.
@@ -403,7 +403,7 @@ def encoding_as(encoding: Encoding, colours: str) -> str | None:
     """The ROS encoding of pixels made into ``rgb``, ``bgr`` or ``gray``; 16 bits stay 16 bits.
 
     Returns:
-        None where the pixels are no light.
+        None if the pixels cannot be displayed.
     """
     if shown_format(encoding) is None:
         return None

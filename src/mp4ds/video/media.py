@@ -152,7 +152,7 @@ def open_input(source: Any, container: str = "mp4") -> Any:
 
 
 def pixel_format_of(context: Any) -> str:
-    """Ffmpeg's name of the pixel format of a video's codec context; empty where none is told.
+    """Ffmpeg's name of the pixel format of a video's codec context; empty if none is told.
 
     PyAV 17, which Python 3.10 has, crashes where it is asked for `pix_fmt` then.
     """
@@ -170,7 +170,7 @@ class _Source:
         self.close = stream.close
 
     def read(self, size: int = -1) -> bytes:
-        """Read so many bytes; after an error, none."""
+        """Read that many bytes; after an error, none."""
         if self._has_failed:
             return b""
         try:

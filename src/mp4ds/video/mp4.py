@@ -49,7 +49,7 @@ def boxes(file: BinaryIO, start: int, end: int, *, outermost: bool = False) -> I
     Args:
         file: Where they are.
         start: Byte where the first begins.
-        end: Byte after the last. Fewer than 8 bytes before it are no box, as in QuickTime.
+        end: Byte after the last. Fewer than 8 bytes before it are not a box, as in QuickTime.
         outermost: Whether they are in no other box, so that the last may have no size.
 
     Raises:
@@ -522,7 +522,7 @@ def _sizes(movie: _Movie, tables: dict[bytes, Box], file_size: int) -> Integers:
 
 
 def _places(movie: _Movie, tables: dict[bytes, Box], sizes: Integers, file_size: int) -> Integers:
-    """Samples lie in chunks, one after the other; what a chunk holds is told where it changes."""
+    """Samples lie in chunks, one after another; what a chunk holds is told where it changes."""
     if b"co64" in tables:
         chunks = movie.table(tables[b"co64"], _LONG_NUMBER)
     else:
@@ -557,7 +557,7 @@ def _times(movie: _Movie, tables: dict[bytes, Box], count: int) -> tuple[Integer
     delays = _repeated(movie.table(tables[b"ctts"], _DELAYS), count, "ctts")
     if np.any(np.abs(delays) > _LONGEST_DELAY):
         raise Refused("a frame is shown too long after its decoding")
-    # where delays are negative, decoding has to begin earlier
+    # where delays are negative, decoding must begin earlier
     return decoding + min(int(delays.min()), 0), decoding + delays
 
 

@@ -86,7 +86,7 @@ class PacketWriter:
 
         Raises:
             Refused: It is the first, and cannot be decoded or has another size.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         plain = plain_body(self.codec, body)
         if self._container is None:
@@ -135,7 +135,7 @@ class PacketWriter:
 
         Raises:
             VideoError: The file does not hold every packet as it was written.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         if not self._ticks:
             self.abandon()
@@ -233,7 +233,7 @@ class PacketReader:
         sizes: Bytes of each shown packet.
         keyframes: For each shown packet whether decoding can begin there, as 0 or 1.
         extradata: What the track says about the codec: avcC, hvcC or av1C.
-        pixel_format: Of its pictures as ffmpeg calls it; empty where not known.
+        pixel_format: Of its pictures as ffmpeg calls it; empty if unknown.
 
     Raises:
         VideoError: ``file-missing``, ``video-unreadable``, ``codec-mismatch``,
@@ -321,7 +321,7 @@ class PacketReader:
         """All packets in order.
 
         Raises:
-            VideoError: As `packet`.
+            VideoError: As for `packet`.
         """
         return map(self.packet, range(len(self)))
 
@@ -344,7 +344,7 @@ def cut_segment(
 ) -> None:
     """Write consecutive frames of a video into a file of their own.
 
-    What stands between the first of them and the key frame before it comes, too, since they refer
+    What is between the first of them and the key frame before it comes, too, since they refer
     to it; an edit list hides it.
 
     Args:
@@ -356,7 +356,7 @@ def cut_segment(
 
     Raises:
         VideoError: The source cannot be read, or the result does not hold every packet as it was.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     entry = read_sample_entry(source)
     try:
@@ -391,7 +391,7 @@ def cut_segment(
 
 
 def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) -> int:
-    """Write the packets of videos one after the other into one file.
+    """Write the packets of videos one after another into one file.
 
     The file is as one `VideoEncoder` or `PacketWriter` would have made it of the same packets:
     its track describes them in the same words, and its last frame lasts as long as that of the
@@ -414,7 +414,7 @@ def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) 
         VideoError: A segment cannot be read, there are not as many ticks as frames, or the
             result does not hold every packet as it was.
         ValueError: There are no segments, or the ticks do not increase.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     if not segments:
         raise ValueError("there are no segments to join")
@@ -429,7 +429,7 @@ def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) 
 
 
 class _Written:
-    """What the index of the file that is made has to say."""
+    """What the index of the new file must say."""
 
     def __init__(self, codec: str) -> None:
         self.codec = codec
@@ -463,7 +463,7 @@ class _Written:
                 found = (reader.ticks, reader.sizes, reader.keyframes)
                 return found == (self.ticks, self.sizes, self.keyframes)
         except VideoError:
-            return False  # the muxer goes on after some damages, and the index is wrong then
+            return False  # the muxer continues after some damages, and the index is wrong then
 
 
 def _copy(
@@ -575,7 +575,7 @@ def _common_entry(segments: Sequence[Path]) -> SampleEntry:
 
 
 class StandAlonePackets(PacketReader):
-    """The packets of a video as they stand alone, for whoever decodes without the mp4.
+    """The packets of a video as they stand alone, for anyone who decodes without the mp4.
 
     H.264 and H.265 come as Annex B with start codes of four bytes, AV1 as temporal units that
     begin with a delimiter; all with the parameters of the stream before each key frame. VP9
@@ -587,7 +587,7 @@ class StandAlonePackets(PacketReader):
         frames: Number of packets that are due, if known.
 
     Raises:
-        VideoError: As `PacketReader`, or the codec's parameters are damaged.
+        VideoError: As for `PacketReader`, or the codec's parameters are damaged.
     """
 
     def __init__(self, path: Path, *, codec: str, frames: int | None = None) -> None:

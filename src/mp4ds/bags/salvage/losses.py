@@ -117,7 +117,7 @@ class LossLog:
         return self._one_more(draft)
 
     def lost_of_kind(self, kind: Hashable, offset: int | None, problem: str) -> Draft:
-        """As `lost`, for what is found again and again and is one loss.
+        """Like `lost`, for what is found again and again and is one loss.
 
         Returns:
             The loss of that kind, without a size: it may be scattered.
@@ -192,8 +192,8 @@ class Tally:
     messages and be none.
 
     Args:
-        log: Where losses are put down.
-        topic_of: The topic of a channel, None where it is not known.
+        log: Where losses are recorded.
+        topic_of: The topic of a channel, None if unknown.
 
     Attributes:
         is_doubtful: Whether messages are held.
@@ -230,7 +230,7 @@ class Tally:
         Args:
             expected: Messages by channel that an index at the end of the file tells, if any.
             end: Byte where it should end, and its own index begin.
-            span: Least and greatest log time that its messages can have, ns, if known.
+            span: Earliest and latest log time that its messages can have, ns, if known.
         """
         self.close()
         self._begin(expected)
@@ -493,7 +493,7 @@ class FileSalvage(Salvage):
 
     @abstractmethod
     def _pass(self, log: LossLog) -> Iterator[Record]:
-        """Read everything once, putting down what is lost."""
+        """Read everything once, recording what is lost."""
 
     @property
     def _orderly(self) -> Callable[[], BagReader] | None:
@@ -542,7 +542,7 @@ def losses_of(reader: BagReader) -> Sequence[Loss]:
 
 
 class MultiSalvage(MultiReader):
-    """As `MultiReader`, of what can be read of each part. See `SalvageReader`.
+    """Like `MultiReader`, of what can be read of each part. See `SalvageReader`.
 
     Args:
         openers: Each opens one part; a part is open only while it is read.

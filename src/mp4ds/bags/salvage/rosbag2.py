@@ -38,7 +38,7 @@ class StorageFile:
     Attributes:
         path: The file.
         is_compressed: Whether it is compressed as a whole.
-        messages: How many messages it has by metadata.yaml, None where that does not tell.
+        messages: How many messages it has by metadata.yaml, None if unknown.
     """
 
     path: Path
@@ -57,7 +57,7 @@ def find_storage(path: Path) -> tuple[BagInfo | None, list[StorageFile], list[Lo
         of the folder is missing or could not be read.
 
     Raises:
-        SourceError: There is no storage file, or the disk does not give it.
+        SourceError: There is no storage file, or cannot be read.
     """
     if not path.exists():
         raise SourceNotFoundError(path)
@@ -150,7 +150,7 @@ class Rosbag2Salvage(Salvage):
             long as it is read; the system's temporary folder by default.
 
     Raises:
-        SourceError: There is no storage file, or the disk does not give it.
+        SourceError: There is no storage file, or cannot be read.
     """
 
     format: Format = "rosbag2"
@@ -179,7 +179,7 @@ class Rosbag2Salvage(Salvage):
                 self._channels.take_over(number, reader)
         if self._readers and self._readers[0] is None:
             # Its channels are wanted before anything is read: keep it until it was.
-            with contextlib.suppress(SourceError):  # it is told when it is read
+            with contextlib.suppress(SourceError):  # it is reported when it is read
                 self._first_copy = self._unpacked.enter_context(self._decompressed(0))
                 self._first_tables = self._first_copy.tables
                 self._channels.take_over(0, self._first_copy)
@@ -206,7 +206,7 @@ class Rosbag2Salvage(Salvage):
         return readers
 
     def _storage_reader(self, file: StorageFile) -> Storage | None:
-        """The reader of a storage file; None where it must be decompressed first."""
+        """The reader of a storage file; None if it must be decompressed first."""
         is_whole = self._info is not None and self._info.compression == "message"
         is_listed_so = self._info is not None and self._info.storage == "mcap"
         if is_listed_so or ".mcap" in file.path.suffixes or is_mcap(file.path, is_compressed=False):

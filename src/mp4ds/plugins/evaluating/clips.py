@@ -67,7 +67,7 @@ class EvaluatedCamera:
         topic: Its topic, or the name of a video or folder.
         times: Log times of all its images, nanoseconds, sorted.
         read: Images by number, which increase; those that hold none are left out.
-        is_jpeg: Whether its images are recorded as JPEG files, which ``mp4ds pack`` encodes anew
+        is_jpeg: Whether its images are recorded as JPEG files, which ``mp4ds pack`` encodes again
             only if it is told to.
         lossy: What took something from them before, if anything is known to.
     """
@@ -111,7 +111,7 @@ def open_source(path: Path | str, *, fps: float) -> EvaluatedSource:
     """Open a recording, a dataset, a video, or a folder of images.
 
     Args:
-        path: Where it is, or the URL of one that is no folder of images.
+        path: Where it is, or the URL of one that is not a folder of images.
         fps: Frames per second of a folder of images.
 
     Raises:
@@ -298,7 +298,7 @@ class Clip:
 
 
 def clip_to_json(clip: Clip) -> str:
-    """A clip but for its frames, as text."""
+    """A clip except for its frames, as text."""
     return json.dumps(asdict(clip))
 
 
@@ -363,7 +363,7 @@ def chosen_at_rate(times: NDArray[np.int64], rate: float, frames: int) -> list[i
 
 
 def make_clip(camera: EvaluatedCamera, indices: list[int], rate: float | None, path: Path) -> Clip:
-    """Read frames, and write them as planes, one after the other.
+    """Read frames, and write them as planes, one after another.
 
     Args:
         camera: Whose images to take.
@@ -374,7 +374,7 @@ def make_clip(camera: EvaluatedCamera, indices: list[int], rate: float | None, p
     Raises:
         Refused: The camera's images are of no use.
         SourceError: The source is damaged.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     digest = xxhash.xxh3_128()
     clock = PresentationClock()

@@ -2,7 +2,7 @@
 
 Each camera gives a short clip, which is encoded as `mp4ds pack` would encode it with every
 setting of a grid, decoded, and compared with what the encoder was given. What was measured is
-kept in the folder of the evaluation, so that the same call goes on where it was interrupted.
+kept in the folder of the evaluation, so that the same call resumes where it was interrupted.
 """
 
 from __future__ import annotations
@@ -341,7 +341,7 @@ def evaluate(
             tried.
         ClusterError: The cluster does not answer, or was lost; what was measured is kept.
         RemoteError: A store or web server fails.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     chosen = options or EvaluateOptions()
     check_options(chosen)

@@ -33,7 +33,7 @@ class Setting:
     Attributes:
         codec: ``av1``, ``av1-10bit``, ``h264``, ``h265``, or an encoder of the hardware, such as
             ``h264-nvenc``.
-        preset: Of its encoder; empty where it has none.
+        preset: Of its encoder; empty if it has none.
         crf: Constant rate factor.
         gop: Most frames between key frames.
     """
@@ -242,7 +242,7 @@ def parse_target(text: str) -> ScoreGoal:
     """The target of ``vmaf=99.5``, ``psnr_y=42`` or ``ssim=0.98``; a number alone is of VMAF.
 
     Raises:
-        OptionError: It is none.
+        OptionError: It is not valid.
     """
     metric, has_metric, score = text.rpartition("=")
     metric = metric if has_metric else "vmaf"

@@ -378,7 +378,7 @@ def write_files(result: Evaluation, options: EvaluateOptions) -> None:
         options: What was asked for.
 
     Raises:
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     folder = result.output
     write_synced(folder / "evaluation.csv", table(result).encode())

@@ -18,7 +18,7 @@ from mp4ds.video.scores import ScoreSummary
 
 @dataclass(frozen=True)
 class Cell:
-    """What one setting made of one clip.
+    """The results of one setting on one clip.
 
     Attributes:
         setting: How it was encoded.
@@ -33,7 +33,7 @@ class Cell:
         picture: Name of the PNG file of its detail, in the folder of the evaluation.
         whole_bytes: Bytes of the camera's whole recording.
         whole_seconds: Time to encode the camera's whole recording.
-        machine: Name of that which took these times; empty where it was not kept.
+        machine: Name of that which took these times; empty if it was not kept.
     """
 
     setting: Setting
@@ -163,7 +163,7 @@ class CameraEvaluation:
         reachable: The same, or less where the ceiling is too near.
         cells: By setting, in the order of the grid.
         recommended: The smallest and the fastest setting that reach the target; empty if none.
-        rates: By rate and preset; empty where not asked for.
+        rates: By rate and preset; empty if not asked for.
         data_set: Of which `storage` tells the size.
         storage: What storing it takes, in several forms.
         ground_truth: Name of the PNG file of the clip's detail.
@@ -271,7 +271,7 @@ def recommend(cameras: Sequence[Rated], target: ScoreGoal) -> list[Recommendatio
         target: Its metric is compared.
 
     Returns:
-        None where no setting does.
+        None if no setting does.
     """
     able = set.intersection(
         *(
@@ -315,7 +315,7 @@ def pareto(cells: Sequence[Cell], cost: Sequence[float], target: ScoreGoal) -> l
 def storage(clip: Clip, path: Path, chosen: Cell, data_set: DataSet) -> list[StorageRow]:
     """What the frames of a data set take in several forms.
 
-    JPEG files are made of some of the clip's frames.
+    JPEG files are made from some of the clip's frames.
 
     Args:
         clip: Of the camera.

@@ -123,7 +123,7 @@ def run(trial: Trial) -> None:
 
     Raises:
         Mp4dsError: Other versions are installed here, or libvmaf failed.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     ffmpeg = _ffmpeg(trial.versions)
     clip = ClipFile(Path(trial.clip))
@@ -359,7 +359,7 @@ class Trials:
         folder: Where results are kept; in ``cells`` and ``pictures``.
         work: Where files are that are not kept.
         engines: Run them.
-        versions: Of what makes videos and scores: with others, all is measured anew.
+        versions: Of what makes videos and scores: with others, all is measured again.
         threads: Of an encoder.
     """
 
@@ -386,7 +386,7 @@ class Trials:
         settings: Sequence[Setting | None],
         on_done: Callable[[int], None] = lambda _: None,
     ) -> dict[Setting | None, Found]:
-        """Try settings on a clip, but for those whose results are there.
+        """Try settings on a clip, except for those whose results are there.
 
         Args:
             place: The clip.

@@ -75,7 +75,7 @@ def write(job: ExportJob) -> None:
 
 
 def model_of(calibration: Calibration) -> tuple[str, list[float]] | None:
-    """COLMAP's camera model and its parameters; None where it has none.
+    """COLMAP's camera model and its parameters; None if it has none.
 
     A model without the parameters that are all zero is the same, and taken where it is simpler.
     """

@@ -1,4 +1,4 @@
-"""What an export is made of: its cameras, and the account of what is held and left out."""
+"""What an export is made from: its cameras, and the account of what is held and left out."""
 
 from __future__ import annotations
 
@@ -252,7 +252,7 @@ class ExportedCamera:
 
     @property
     def rate(self) -> float:
-        """Usual frames in a second; 0 where there is one frame."""
+        """Usual frames in a second; 0 if there is one frame."""
         usual = usual_interval(intervals(self.times))
         return 1e9 / usual if usual else 0.0
 
@@ -444,7 +444,7 @@ class ExportJob:
         path: Where to make it.
         target: What it will be called.
         options: How.
-        sources: The datasets, one but for formats that hold several.
+        sources: The datasets, one except for formats that hold several.
         tell: Called with a phrase now and then, and the share of the frames that are given.
         places: Part of the output -> the topic that is in it.
     """

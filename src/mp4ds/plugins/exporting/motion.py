@@ -97,7 +97,7 @@ class StaticTree:
         return root, pose
 
     def pose(self, frame: str, within: str) -> Pose | None:
-        """Pose of a frame in another one; None where no static transforms connect them."""
+        """Pose of a frame in another one; None if no static transforms connect them."""
         if not frame or not within:
             return None
         if frame.removeprefix("/") == within.removeprefix("/"):
@@ -157,7 +157,7 @@ def stamp_of(header: Any) -> int:
 
 
 def frame_of(dataset: Dataset, topic: str) -> str:
-    """Coordinate frame of the first message of a topic; empty where there is none."""
+    """Coordinate frame of the first message of a topic; empty if there is none."""
     first = next(dataset.messages([topic]), None)
     return "" if first is None else str(first.decoded.header.frame_id)
 
@@ -191,7 +191,7 @@ class Poses:
 
     Attributes:
         topic: The topic.
-        body: Frame that is placed; empty where messages do not say.
+        body: Frame that is placed; empty if messages do not say.
 
     Raises:
         OptionError: The topic is not there, or of another type.

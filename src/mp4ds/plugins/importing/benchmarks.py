@@ -210,7 +210,7 @@ def find_kitti(folder: Path, options: ImageFolder) -> Scene:
 def _find_raw(folder: Path, cameras: list[Path]) -> Scene:
     scene = Scene(folder)
     values: _Calibrations | None = None
-    # the calibrations of a day stand beside its recordings
+    # the calibrations of a day are beside its recordings
     for place in (folder.absolute().parent, folder):
         for path in sorted(place.glob("calib_*.txt")):
             scene.files.append(path)
@@ -335,7 +335,7 @@ def _read_stamps(path: Path, files: list[Path], read: Callable[[str], int]) -> N
 
 
 def _read_calibrations(path: Path) -> _Calibrations:
-    """Lists of numbers by their names; what is no list of numbers is left out."""
+    """Lists of numbers by their names; what is not a list of numbers is left out."""
     found: dict[str, Matrix] = {}
     for _, line in lines_of(path):
         key, _, text = line.partition(":")

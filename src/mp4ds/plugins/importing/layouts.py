@@ -41,9 +41,9 @@ from mp4ds.plugins.importing.scene import (
 )
 from mp4ds.video.images import STILL_SUFFIXES, image_kind, image_size
 
-_MOST = 8  # cameras; more words are no names of cameras
+_MOST = 8  # cameras; more words are not names of cameras
 _LOOKED_AT = 8
-# a number, but for that of a camera such as cam0
+# a number, except for that of a camera such as cam0
 _NUMBER = re.compile(r"(?<!\d)(?<!cam)(?<!camera)\d+|(?<=cam)\d{2,}|(?<=camera)\d{2,}", re.I)
 _HEX = re.compile(r"[0-9a-f]+", re.I)
 _WORD = re.compile(r"[^\W_]+")
@@ -54,7 +54,7 @@ _ADVICE = (
 
 
 def by_camera(folder: Path, images: Sequence[Path]) -> Mapping[str, list[Path]]:
-    """The images of each camera by its name, which is empty where there is one camera.
+    """The images of each camera by its name, which is empty if there is one camera.
 
     There are several where the names have different words or endings and the same numbers:
     ``color_0001.jpg`` and ``depth_0001.png``.

@@ -118,7 +118,7 @@ def _header(writer: PrimitiveWriter, stamp: int, frame_id: str) -> None:
 # ---------------------------------------------------------------- the reader
 
 FILE_LIST = "images.csv"
-"""Name of the attachment that tells which message was made of which file."""
+"""Name of the attachment that tells which message was made from which file."""
 
 _JPEG = (".jpg", ".jpeg")
 _TF_STATIC = "/tf_static"
@@ -132,7 +132,7 @@ class _Track:
         channel: The channel.
         stamps: Their times, nanoseconds, sorted.
         make: Makes the payload of a message by its number.
-        files: What each is made of; empty where it is not of files.
+        files: What each is made from; empty if it is not of files.
     """
 
     channel: Channel
@@ -325,7 +325,7 @@ def _image_message(
 
 def _suits(encoding: Encoding, pixels: Pixels) -> bool:
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
-    is_whole = encoding.rows == 1  # an image of YUV planes is no picture
+    is_whole = encoding.rows == 1  # an image of YUV planes is not a picture
     return is_whole and channels == encoding.channels and pixels.dtype == np.dtype(encoding.dtype)
 
 

@@ -1,6 +1,6 @@
 """A video and the YAML of the tool published with the paper (version 0), as a whole dataset.
 
-Nothing is coded anew: the packets of the video get the times of the YAML, which the sidecar keeps.
+Nothing is coded again: the packets of the video get the times of the YAML, which the sidecar keeps.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _MAX_STAMP = 2**32 * 10**9 - 1
 
 @dataclass(frozen=True)
 class _Bag:
-    """What is known of the bag that the video was made of."""
+    """What is known of the bag that the video was made from."""
 
     format: Format = "bag"
     profile: str = _PROFILE
@@ -79,7 +79,7 @@ def import_ros_mp4(
     old = load_stream(described, video=_ANY)  # users may have named theirs as they like
     if old.stamps != "record-float":
         raise OptionError(
-            f"{described} is not a YAML file of the tool published with the paper: it is already "
+            f"{described} is not YAML file of the tool published with the paper: it is already "
             "an mp4ds sidecar."
         )
     with (

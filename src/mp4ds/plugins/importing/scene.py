@@ -72,7 +72,7 @@ def of_unit(unit: str, found: Counter[str]) -> Callable[[str], int]:
 
 
 def of_date(found: Counter[str]) -> Callable[[str], int]:
-    """What reads ``2011-09-26 13:02:25.964389445``, which is taken for UTC. See `of_unit`."""
+    """What reads ``2011-09-26 13:02:25.964389445``, which is taken as UTC. See `of_unit`."""
 
     def read(text: str) -> int:
         match = _DATE.fullmatch(text.strip())
@@ -105,7 +105,7 @@ def at_rate(count: int, rate: str) -> NDArray[np.int64]:
         rate: Images per second, such as ``20``, ``29.97`` or ``30000/1001``.
 
     Raises:
-        Refused: It is no rate.
+        Refused: It is not a rate.
     """
     try:
         found = Fraction(rate)
@@ -387,7 +387,7 @@ class SceneCamera:
 
 @dataclass(frozen=True)
 class SensorTable:
-    """Measurements of a sensor that is no camera.
+    """Measurements of a sensor that is not a camera.
 
     Attributes:
         topic: Its topic.

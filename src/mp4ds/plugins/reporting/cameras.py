@@ -111,7 +111,7 @@ _NO_STAMPS, _OTHER_CLOCK = "no header stamps", "stamps from another clock"
 
 @dataclass(frozen=True)
 class Timing:
-    """The times of one camera in figures. Milliseconds, None where there are too few frames.
+    """The times of one camera in figures. Milliseconds, None if there are too few frames.
 
     Attributes:
         frames: Number of frames.
@@ -124,7 +124,7 @@ class Timing:
         gaps: Places where they are missing.
         repeated: Frames with the stamp of the one before.
         backward: Frames with an earlier stamp than the one before.
-        seq_missing: Numbers that the header's `seq` leaves out; None where there is no `seq`.
+        seq_missing: Numbers that the header's `seq` leaves out; None if there is no `seq`.
         delay_median_ms: Median of log time minus stamp.
         delay_least_ms: Least of them.
         delay_most_ms: Most of them.
@@ -454,7 +454,7 @@ class ReportedCamera:
     Attributes:
         stream: The stream.
         name: Its topic, or that with the name of its file where the topic has several.
-        times: Presentation times of its frames, microseconds; None where the video is damaged.
+        times: Presentation times of its frames, microseconds; None if the video is damaged.
         video: URL of what the page plays, from the page; empty: nothing.
         is_proxy: Whether that is a proxy.
         note: Why there is a proxy, or nothing to play.

@@ -125,7 +125,7 @@ def reports(
 
     Args:
         datasets: Datasets, folders of them, or patterns; on this machine.
-        folder: Where the page is made. The report of each stands in its dataset.
+        folder: Where the page is made. The report of each is in its dataset.
         options: How the reports are made.
         jobs: Datasets at a time.
         progress: Called with a phrase, and the share that is done.

@@ -35,8 +35,8 @@ class TopicRow:
         messages: Number of messages.
         rate_hz: Mean rate by log time, or None.
         stored: Names of its files.
-        recorded_bytes: Of its messages' data as recorded; None where it is not known.
-        stored_bytes: Of its videos and sidecars; None where it has none.
+        recorded_bytes: Of its messages' data as recorded; None if unknown.
+        stored_bytes: Of its videos and sidecars; None if it has none.
         is_camera: Whether it has a video.
     """
 
@@ -51,7 +51,7 @@ class TopicRow:
 
     @property
     def ratio(self) -> float | None:
-        """How many times smaller it is stored; None where it is not known."""
+        """How many times smaller it is stored; None if unknown."""
         if not self.recorded_bytes or not self.stored_bytes:
             return None
         return self.recorded_bytes / self.stored_bytes
@@ -106,7 +106,7 @@ def _add_stream(rows: dict[str, TopicRow], stream: Stream) -> None:
 
 
 def recorded_bytes(stream: Stream) -> int | None:
-    """Bytes of a stream's images as recorded; None where files were made into pixels.
+    """Bytes of a stream's images as recorded; None if files were made into pixels.
 
     Packets are counted as large as their video.
     """
@@ -120,7 +120,7 @@ def recorded_bytes(stream: Stream) -> int | None:
 
 
 def _bytes_in_messages(dataset: Dataset) -> Counter[str] | None:
-    """Bytes of each topic's messages in messages.mcap; None where the file is too large to ask."""
+    """Bytes of each topic's messages in messages.mcap; None if the file is too large to ask."""
     sizes: Counter[str] = Counter()
     if dataset.manifest is None:
         return sizes
@@ -165,7 +165,7 @@ def write_folder(
         notes: What else is worth knowing.
 
     Raises:
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     for part in (files("mp4ds.plugins.reporting") / "page").iterdir():
         if part.name.endswith((".js", ".css")):

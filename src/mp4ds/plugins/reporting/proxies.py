@@ -125,7 +125,7 @@ class Look:
 
 
 def pictures_in_order(stream: Stream) -> Iterator[tuple[int, Pixels | None]]:
-    """The pixels of all frames; None for a packet that does not decode by what was recorded.
+    """The pixels of all frames; None for a packet that cannot be decoded by what was recorded.
 
     Raises:
         VideoError: The video is damaged.
@@ -228,7 +228,7 @@ def why_not_seen(stream: Stream) -> str:
 
 
 def proxy_size(image_size: tuple[int, int], width: int) -> tuple[int, int]:
-    """Width and height of a proxy: even, and no larger than the images, but for tiny ones.
+    """Width and height of a proxy: even, and no larger than the images, except for tiny ones.
 
     Args:
         image_size: Of the images.
@@ -269,7 +269,7 @@ def make_proxy(
 
     Raises:
         VideoError: The stream's video cannot be decoded.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     look = Look(stream, size)
     recipe = recipe_for("rgb24", lossless=False, codec="h264", crf=_CRF, preset=_PRESET)

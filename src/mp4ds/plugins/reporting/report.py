@@ -137,7 +137,7 @@ def report(
 
     Raises:
         SourceError: There is no dataset.
-        FormatError: The dataset breaks a rule of the format. A damaged video is no error, but
+        FormatError: The dataset breaks a rule of the format. A damaged video is not an error, but
             one of the summary's problems.
         OptionError: An option is wrong.
         TargetError: The report may not be written there.
@@ -191,7 +191,7 @@ def _scores(dataset: Dataset, path: Path | None) -> Mapping[str, Scores]:
     """The scores of a file.
 
     Raises:
-        OptionError: It has some of a topic that is no stream.
+        OptionError: It has some of a topic that is not a stream.
     """
     scores = read_scores(path) if path else {}
     for topic in scores:
@@ -344,7 +344,7 @@ class _Proxies:
         return True
 
     def write_keys(self) -> None:
-        """Write what the proxies were made of, for the next report."""
+        """Write what the proxies were made from, for the next report."""
         if self._made:
             (self._new / _KEYS_NAME).write_text(json.dumps(self._made))
 

@@ -186,7 +186,7 @@ def byte_range(asked: str, size: int) -> tuple[int, int] | None:
         size: Bytes that there are.
 
     Returns:
-        All of it where the header is of another kind; None where nothing of it is there.
+        All of it where the header is of another kind; None if nothing of it is there.
     """
     match = re.fullmatch(r"bytes=([0-9]*)-([0-9]*)", asked.strip()[:_LONGEST_RANGE])
     if not match or not (match[1] or match[2]):
