@@ -1,4 +1,4 @@
-"""How to pack, what a pack tells while it runs, and what became of each topic."""
+"""Options, progress and results of a pack."""
 
 from __future__ import annotations
 
@@ -131,19 +131,19 @@ class PackOptions(SliceOptions):
 
     @property
     def setting(self) -> QualitySetting:
-        """What `quality` says; lossless where it leaves that to the source.
+        """The parsed `quality`; lossless if it is left to the source.
 
         Raises:
-            OptionError: `quality` is none.
+            OptionError: `quality` is not valid.
         """
         return parse_quality(LOSSLESS if self.quality is None else self.quality)
 
     @property
     def group_frames(self) -> int:
-        """Most frames from one key frame to the next.
+        """Maximum key frame interval, frames.
 
         Raises:
-            OptionError: `quality` or `purpose` is none.
+            OptionError: `quality` or `purpose` is not valid.
         """
         from mp4ds.video.codecs import ARCHIVE_GOP, LOSSLESS_GOP, LOSSY_GOP, LOSSY_TRAINING_GOP
 
@@ -162,21 +162,21 @@ class PackOptions(SliceOptions):
 
 @dataclass(frozen=True)
 class PackProgress:
-    """Where a pack stands.
+    """Progress of a pack.
 
     Attributes:
-        dataset: What is being made.
+        dataset: The dataset being made.
         phase: ``planning``, ``packing``, ``joining`` or, for a URL, ``uploading``.
         done: Share of the work of this phase that is done, 0 to 1; None if unknown.
         bytes_read: Payload bytes of the messages packed so far.
         bytes_total: Bytes of the source files.
         bytes_written: Bytes of the dataset so far.
-        topics: Messages packed so far and in all (None: not known), by topic of a camera.
+        topics: Messages packed so far and in total (None: unknown), by camera topic.
         tasks_done: Parts that are done.
-        tasks_total: Parts that there are; 0 for a recording packed in one go.
-        tasks_before: Of those done, the ones that an earlier run did.
+        tasks_total: Number of parts; 0 for a recording packed in one go.
+        tasks_before: Parts done by an earlier run.
         failed: Parts that failed.
-        note: What is being done now, if it is worth telling.
+        note: Current activity, if worth reporting.
     """
 
     dataset: Path
@@ -200,7 +200,7 @@ class PackProgress:
 
 @dataclass
 class TopicSummary:
-    """What became of a topic.
+    """The result for a topic.
 
     Attributes:
         topic: Its name.
@@ -232,11 +232,11 @@ class TopicSummary:
         self.verbatim[reason] = (count + 1, first)
 
     def extend(self, later: TopicSummary, before: int) -> None:
-        """Add what became of later messages.
+        """Add the result for later messages.
 
         Args:
-            later: Of these messages alone.
-            before: Messages of the topic before them.
+            later: The result for these messages alone.
+            before: Number of the topic's messages before them.
         """
         self.messages += later.messages
         self.frames += later.frames
@@ -251,7 +251,7 @@ class TopicSummary:
 
 @dataclass(frozen=True)
 class PackSummary:
-    """What a pack did.
+    """The result of a pack.
 
     Attributes:
         dataset: The folder made.
@@ -262,9 +262,9 @@ class PackSummary:
         left_out: Topics left out on request.
         skipped: What the source holds and no dataset can: a phrase -> how many.
         losses: What could not be read of a damaged recording.
-        larger: Why the dataset is larger than its source, where it is by more than 5 %.
-        is_copy: Whether the videos of a dataset were copied; `raw_bytes` of topics are not known.
-        not_copied: Why a dataset's videos were re-encoded, where that was not asked for.
+        larger: Why the dataset is larger than its source, if by more than 5 %.
+        is_copy: Whether the videos of a dataset were copied; `raw_bytes` of topics are unknown.
+        not_copied: Why a dataset's videos were re-encoded without being asked to.
     """
 
     dataset: Path

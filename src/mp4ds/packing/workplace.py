@@ -1,14 +1,14 @@
 """The folder in which a divided pack is made: its job, and the results of its tasks.
 
-It is beside the dataset, on the same file system, under a name that the dataset's tells, so
-that the same command finds it again. A task's result appears in it by one rename, when whole.
+It is next to the dataset, on the same file system, under a name derived from the dataset's, so that
+the same command finds it again. A task's result appears in it by one rename, when complete.
 
-Somebody else may have put a folder there: in a folder that users share, or by an archive that was
-unpacked. So nothing is read from it, written to it or removed from it unless all of it belongs to
-this user and has names that are made here, without any link; a job tells the inode of its folder,
-so that a copy is not taken for what was begun here; and how to encode is worked out again
-(`video.codecs.remade`). Trusted are other processes of the same user, and, where machines share the
-folder and see other inodes (--shard, --join, --cluster), whatever that user has put there.
+Somebody else may have put a folder there: in a shared folder, or in an unpacked archive. So nothing
+is read from it, written to it or removed from it unless all of it belongs to this user and has
+expected names, without any links; a job records the inode of its folder, so that a copy is not
+mistaken for the original; and encoder settings are derived again (`video.codecs.remade`). Other
+processes of the same user are trusted, and, where machines share the folder and see other inodes
+(--shard, --join, --cluster), so is whatever that user has put there.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 _NAMED = 3
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 
-_BEGUN = re.compile(rf"\.({TASK_NAME})\.[a-z0-9_]{{8}}")  # a result that is being made
+_BEGUN = re.compile(rf"\.({TASK_NAME})\.[a-z0-9_]{{8}}")  # a result in progress
 _NAMES = re.compile(  # from the folder on; of folders, with a slash at the end
     r"lock|job\.json|\.job\.json\.[^/]+\.part|parts/|(dataset|replaced)/(.*/)?[^/]*"
     rf"|parts/({TASK_NAME}|{_BEGUN.pattern})/(.*/)?[^/]*",
@@ -60,19 +60,19 @@ class Workplace:
 
     @classmethod
     def beside(cls, target: Path) -> Workplace:
-        """That of a dataset, whether it exists or not."""
+        """The work folder of a dataset, whether it exists or not."""
         return cls(target.parent / f".{target.name}{_SUFFIX}")
 
     @contextmanager
     def claimed(self, *, shared: bool) -> Iterator[None]:
-        """Hold the place while working in it.
+        """Lock the folder while working in it.
 
         Args:
             shared: Others may work on other tasks at the same time.
 
         Raises:
-            TargetError: Another pack is at work, the folder cannot be made, or holds what is not
-                made here.
+            TargetError: Another pack is working there, the folder cannot be created, or holds
+                unexpected entries.
             WriteError: The disk is full.
         """
         try:
@@ -92,7 +92,7 @@ class Workplace:
             ) from None
         with os.fdopen(handle, "r+b") as file:
             try:
-                lock(file, shared=shared)  # without locks, results appear whole all the same
+                lock(file, shared=shared)  # even without locks, results appear complete
             except BlockingIOError:
                 raise TargetError(
                     self.folder, "another mp4ds is working there", "Wait for it, or stop it."
