@@ -1,7 +1,6 @@
-"""Outputs for URLs: made whole on this machine, then copied there.
+"""Outputs for URLs: completed on this machine, then copied there.
 
-The file by which an output is recognised comes last, so that what is there without it is visibly
-not whole.
+The file that identifies an output comes last, so that an output without it is visibly incomplete.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from mp4ds.files.urls import RemotePath
 
 Made = TypeVar("Made")
 Report = Callable[[str, int, int], None]
-"""Called with the file that is being uploaded, bytes uploaded, and bytes in all."""
+"""Called with the file being uploaded, bytes uploaded, and total bytes."""
 
 _LOCK = "lock"
 _PROBE = ".mp4ds-upload"
@@ -41,19 +40,19 @@ def uploaded(
 
     Args:
         target: Where it goes.
-        make: Makes it at a path of this machine, in the place of what is there.
+        make: Makes it at a local path, replacing what is there.
         is_folder: Whether it is a folder.
-        last: Of a folder, the file in it that is copied last; without it, it is not whole.
+        last: For a folder, the file to copy last, without which it is incomplete.
         force: Replace what is at the URL.
         owned: Tells which files of that mp4ds wrote.
-        report: Told of the upload.
+        report: Called with the upload's progress.
 
     Returns:
         What `make` returns.
 
     Raises:
-        TargetError: The target may not be written or replaced, or another run is at work on it.
-        RemoteError: It could not be uploaded; what was made is kept here.
+        TargetError: The target cannot be written or replaced, or another run is working on it.
+        RemoteError: It could not be uploaded; the output is kept here.
     """
     local = local_path(target)
     with _claimed(local.parent, target):
@@ -76,7 +75,7 @@ def local_path(target: RemotePath) -> Path:
     """Where the output for a URL is made: the same on all machines that share ``TMPDIR``.
 
     Raises:
-        TargetError: Nothing can be uploaded there, or no folder be made here.
+        TargetError: Nothing can be uploaded there, or no folder can be created here.
     """
     shown = target
     if not target.is_writable:
@@ -91,7 +90,7 @@ def local_path(target: RemotePath) -> Path:
 
 
 def _own_folder() -> Path:
-    """The user's own folder in the system's temporary one, where nobody else can meddle."""
+    """The user's own folder in the system's temporary one, which nobody else can touch."""
     folder = Path(tempfile.gettempdir()) / f"mp4ds-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -107,7 +106,7 @@ def _own_folder() -> Path:
 
 @contextmanager
 def _claimed(folder: Path, target: RemotePath) -> Iterator[None]:
-    """Hold the folder while working in it; it goes when it holds nothing any more."""
+    """Lock the folder while working in it; it is removed once empty."""
     with (folder / _LOCK).open("w") as file:
         try:
             lock(file)
@@ -139,7 +138,7 @@ def _replaced(target: RemotePath, *, is_folder: bool, force: bool, owned: Owned)
 
 
 def _probe(path: RemotePath) -> None:
-    """Learn before the work whether the place can be written to."""
+    """Check before the work whether the place can be written to."""
     with tempfile.NamedTemporaryFile() as file:
         path.upload(Path(file.name))
     path.remove()
@@ -156,7 +155,7 @@ def _send(local: Path, target: RemotePath, old: set[str], last: str, report: Rep
             _place(target, name).upload(local / name)
             done += size
     except BaseException:
-        for name in files if "" not in old else ():  # a file that is not replaced stays
+        for name in files if "" not in old else ():  # files that are not replaced stay
             with suppress(Mp4dsError):
                 _place(target, name).remove()
         raise
