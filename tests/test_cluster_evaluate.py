@@ -228,7 +228,7 @@ def test_workers_of_another_version_are_refused(bag: Path, tmp_path: Path) -> No
 
 
 def test_a_worker_that_does_not_see_the_folder(tmp_path: Path) -> None:
-    with pytest.raises(Mp4dsError, match=r"0\.job is not there: all machines must share"):
+    with pytest.raises(Mp4dsError, match=r"0\.job does not exist: all machines must share"):
         run_task(str(tmp_path / "0.job"))
 
 

@@ -1,8 +1,8 @@
-"""Settings of encoders, tried on clips of a recording: quality, size and time.
+"""Compares encoder settings on clips of a recording: quality, size and time.
 
-Each camera gives a short clip, which is encoded as `mp4ds pack` would encode it with every
-setting of a grid, decoded, and compared with what the encoder was given. What was measured is
-kept in the folder of the evaluation, so that the same call resumes where it was interrupted.
+A short clip of each camera is encoded as `mp4ds pack` would, with every setting of a grid, decoded,
+and compared with the encoder's input. Results are kept in the evaluation's folder, so that the same
+call resumes where it was interrupted.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from mp4ds.video.encoder import check_hardware
 from mp4ds.video.libvmaf import VMAF_MODEL, Ffmpeg, find_ffmpeg
 from mp4ds.video.scores import largest_crf
 
-_NEAR = 1.05  # rates that differ by less are the same
+_NEAR = 1.05  # rates that differ by less count as equal
 _SHORT = 30  # frames
 _MODEL_ROWS = 1080
 
@@ -69,13 +69,13 @@ class CameraTrial:
     """The trial of one camera.
 
     Args:
-        camera: Which.
-        name: Of its files.
+        camera: The camera.
+        name: Name for its files.
         options: How.
         grid: What to try.
         trials: What runs it.
         work: Folder for clips.
-        report: Told when something was done.
+        report: Called when something was done.
     """
 
     def __init__(
@@ -107,8 +107,8 @@ class CameraTrial:
             origin: Log time at which the source begins, nanoseconds.
 
         Raises:
-            Refused: The camera's images are of no use.
-            ScoringError: Nothing could be tried.
+            Refused: The camera's images are not usable.
+            ScoringError: No setting could be tried.
         """
         self._tell("reading")
         place = self._clip(chosen(self._camera.times, origin, self._options), self._camera.rate)
@@ -295,10 +295,10 @@ class CameraTrial:
 
 
 def _measured(found: dict[Setting | None, Found], setting: Setting | None) -> dict[str, Any]:
-    """What was measured with a setting.
+    """The measurements of a setting.
 
     Raises:
-        ScoringError: Nothing was; says why.
+        ScoringError: There are none; says why.
     """
     values = found[setting]
     if isinstance(values, Failure):
@@ -310,7 +310,7 @@ def _measured(found: dict[Setting | None, Found], setting: Setting | None) -> di
 
 _FOLDERS = ("cells", "pictures", "plots")
 _WORK = "work-"
-_NOTE_NAME = "mp4ds_evaluation.json"  # in folders that an evaluation has made
+_NOTE_NAME = "mp4ds_evaluation.json"  # marks folders made by an evaluation
 
 
 def evaluate(
@@ -320,26 +320,26 @@ def evaluate(
     output: Path | str | None = None,
     progress: Callable[[EvaluateProgress], None] | None = None,
 ) -> Evaluation:
-    """Try a grid of encoder settings on clips of a recording's cameras.
+    """Compare a grid of encoder settings on clips of a recording's cameras.
 
     Args:
         source: A bag, rosbag2 folder, MCAP, dataset, video, or folder of images; or a URL.
         options: How.
-        output: Folder of the results; None: ``NAME_evaluation`` in the current folder. Results
-            that are there already are used.
+        output: Folder of the results; None: ``NAME_evaluation`` in the current folder. Existing
+            results are reused.
         progress: Called when something was done.
 
     Returns:
-        What was found; the folder has it as tables, plots and a page.
+        The results; the folder has them as tables, plots and a page.
 
     Raises:
         SourceError: The source cannot be read, or has no camera that could be tried.
         OptionError: An option is wrong.
-        HardwareError: An encoder is asked for that this machine has not.
-        TargetError: The folder may not be used.
-        ScoringError: There is no libvmaf, and the target is one of VMAF; or no setting could be
+        HardwareError: A requested encoder is not available on this machine.
+        TargetError: The folder cannot be used.
+        ScoringError: The target is a VMAF score but libvmaf is missing; or no setting could be
             tried.
-        ClusterError: The cluster does not answer, or was lost; what was measured is kept.
+        ClusterError: The cluster does not respond, or was lost; results so far are kept.
         RemoteError: A store or web server fails.
         OSError: It cannot be written.
     """
@@ -404,10 +404,10 @@ def _is_evaluation(path: Path) -> bool:
 
 @contextmanager
 def _work_in(folder: Path) -> Iterator[Path]:
-    """A folder for what is not kept, within that of the evaluation.
+    """A folder for temporary files, inside that of the evaluation.
 
-    It has a new name each time: workers of a cluster may still be at a trial of a run that was
-    interrupted, and must not take another clip for theirs.
+    It has a new name each time: cluster workers may still be running a trial of an interrupted run,
+    and must not mistake another clip for theirs.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_synced(folder / _NOTE_NAME, json.dumps({"mp4ds": __version__}).encode())
@@ -418,7 +418,7 @@ def _work_in(folder: Path) -> Iterator[Path]:
 
 
 def _origin(source: EvaluatedSource) -> int:
-    """Log time at which the source begins, as far as its cameras tell, nanoseconds."""
+    """Log time at which the source begins, judging by its cameras, nanoseconds."""
     return min((int(camera.times[0]) for camera in source.cameras if len(camera.times)), default=0)
 
 

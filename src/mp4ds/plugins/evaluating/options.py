@@ -1,4 +1,4 @@
-"""What an evaluation is asked for, and the grid of settings that it comes to."""
+"""The options of an evaluation, and the resulting grid of settings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mp4ds.video.codecs import AV1, HARDWARE, LOSSY_GOP, MAX_CRF, check_codec
 from mp4ds.video.scores import METRICS
 
 ENCODER_NAMES = {"svtav1": "av1", "x264": "h264", "x265": "h265"}
-"""Names of the encoders -> of the codecs, as `mp4ds pack` takes them."""
+"""Encoder names -> codec names of `mp4ds pack`."""
 
 _DEFAULT_PRESETS = {
     **dict.fromkeys(AV1, ("6", "8")),
@@ -28,7 +28,7 @@ _CRF = re.compile(r"([0-9]{1,2})(?::([0-9]{1,2})(?::([0-9]{1,2}))?)?")
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """How a clip is encoded, in the words of ``mp4ds pack``.
+    """How to encode a clip, in the terms of ``mp4ds pack``.
 
     Attributes:
         codec: ``av1``, ``av1-10bit``, ``h264``, ``h265``, or an encoder of the hardware, such as
@@ -45,12 +45,12 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """Short, and different for each of a grid."""
+        """A short name, unique within a grid."""
         return " ".join(filter(None, (self.codec, self.preset, f"crf {self.crf}")))
 
     @property
     def pack_options(self) -> str:
-        """The options of ``mp4ds pack`` that encode so."""
+        """The corresponding options of ``mp4ds pack``."""
         preset = f" --preset {self.preset}" if self.preset else ""
         gop = f" --gop {self.gop}" if self.gop != LOSSY_GOP else ""
         return f"--quality crf={self.crf} --codec {self.codec}{preset}{gop}"
@@ -58,11 +58,11 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class ScoreGoal:
-    """The score that a setting is to reach.
+    """The score that a setting has to reach.
 
     Attributes:
         metric: One of `mp4ds.video.scores.METRICS`.
-        score: What its mean over the frames is to be.
+        score: Required mean over the frames.
     """
 
     metric: str = "vmaf"
@@ -130,7 +130,7 @@ class EvaluateOptions(Options):
     def encoder_threads(self) -> int:
         """Threads of an encoder."""
         if self.cluster:
-            return self.threads or 1  # its workers have a core each
+            return self.threads or 1  # its workers have one core each
         return self.threads or max(1, (os.cpu_count() or 1) // self.jobs)
 
     @property
@@ -138,17 +138,17 @@ class EvaluateOptions(Options):
         """The score to reach.
 
         Raises:
-            OptionError: `target` is none.
+            OptionError: `target` is not valid.
         """
         return parse_target(self.target)
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """What is tried.
+    """The settings to try.
 
     Attributes:
-        presets: Of each codec, in the order that was asked for.
+        presets: Of each codec, in the requested order.
         crfs: Increasing.
         gop: Most frames between key frames.
     """
@@ -169,7 +169,7 @@ class Grid:
 
 
 def grid_of(options: EvaluateOptions) -> Grid:
-    """The grid that was asked for.
+    """The requested grid.
 
     Raises:
         OptionError: There is no such codec, preset or crf, or too many of them.
@@ -218,7 +218,7 @@ def parse_crfs(texts: Sequence[str]) -> tuple[int, ...]:
     """The values of ``18``, ``16:25`` and ``16:25:3``.
 
     Raises:
-        OptionError: One is none of these.
+        OptionError: One is not valid.
     """
     found: set[int] = set()
     for text in texts:
@@ -239,7 +239,7 @@ def parse_crfs(texts: Sequence[str]) -> tuple[int, ...]:
 
 
 def parse_target(text: str) -> ScoreGoal:
-    """The target of ``vmaf=99.5``, ``psnr_y=42`` or ``ssim=0.98``; a number alone is of VMAF.
+    """The target of ``vmaf=99.5``, ``psnr_y=42`` or ``ssim=0.98``; a bare number means VMAF.
 
     Raises:
         OptionError: It is not valid.
@@ -277,6 +277,6 @@ def check_options(options: EvaluateOptions) -> None:
 
 
 def first_guess(codec: str, rate: float | None) -> int:
-    """A crf to begin the search for a target with."""
+    """The crf at which to start the search for a target."""
     crf, _ = visual_setting(rate)
     return crf if codec in AV1 else crf - 2
