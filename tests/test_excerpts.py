@@ -694,7 +694,9 @@ def test_what_is_no_time_is_refused_by_some_span(value: str, tmp_path: Path) -> 
     with open_reader(path) as reader:
         assert reader.is_indexed
         spans = consecutive([START + 5 * PERIOD, START + 12 * PERIOD])
-        with pytest.raises(SourceError, match=r"message of id 50, topic .*: .* is not a valid time"):
+        with pytest.raises(
+            SourceError, match=r"message of id 50, topic .*: .* is not a valid time"
+        ):
             read_all(reader, spans)
         assert rows(reader.records(spans[1]))
 

@@ -104,10 +104,9 @@ _MODELS = ("radial-tangential", "equidistant", "none")
 
 
 def distortion(calibration: Calibration) -> tuple[str, list[float]]:
-    """Name and coefficients of a distortion, as EuRoC has them where it knows it.
+    """Name and coefficients of a distortion, in EuRoC's terms if it has them.
 
-    Coefficients that are zero at the end of a longer ROS model are left out: the model is the
-    same.
+    Trailing zero coefficients of a longer ROS model are left out: the model is the same.
     """
     name, values = calibration.distortion_model, list(calibration.d)
     if not any(values) and name in ("", "none", "plumb_bob", "rational_polynomial"):

@@ -54,7 +54,7 @@ def _write_camera(job: ExportJob, number: int, camera: ExportedCamera) -> None:
 def _calibration_lines(
     job: ExportJob, tree: StaticTree, first: ExportedCamera, number: int, camera: ExportedCamera
 ) -> list[str]:
-    """The lines of a camera, in the names and order of calib_cam_to_cam.txt."""
+    """The lines of a camera, with the names and order of calib_cam_to_cam.txt."""
     calibration = hold_calibration(camera, job.source.ledger)
     if calibration is None:
         job.note(f"{camera.topic}: not calibrated")

@@ -24,7 +24,7 @@ from mp4ds.video.codecs import CODECS, recipe_for
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.packets import PacketReader, join_segments
 
-_STEP_FROM = 300  # pixels of a side, from which on fewer are looked at
+_STEP_FROM = 300  # pixels of a side, above which pixels are subsampled
 _SIDE = 150
 
 Floats = NDArray[np.float64]
@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Statistics:
-    """Least, greatest, mean and standard deviation of each number of a feature.
+    """Minimum, maximum, mean and standard deviation of each number of a feature.
 
     Attributes:
         least: Shape of the feature; (3, 1, 1) of pictures.
@@ -50,13 +50,13 @@ class Statistics:
 
     @classmethod
     def of(cls, values: NDArray[Any]) -> Statistics:
-        """Of rows, shape (rows, numbers)."""
+        """Statistics of rows, shape (rows, numbers)."""
         rows = values.astype(np.float64)
         return cls(rows.min(0), rows.max(0), rows.mean(0), rows.std(0), len(rows))
 
     @classmethod
     def of_picture(cls, pixels: Pixels) -> Statistics:
-        """Of a picture's colours from 0 to 1, of a part of its pixels where it is large.
+        """Statistics of a picture's colours from 0 to 1, subsampled if it is large.
 
         Args:
             pixels: uint8, shape (H, W, 3).
@@ -75,7 +75,7 @@ class Statistics:
         )
 
     def as_lists(self) -> dict[str, Any]:
-        """By the names that LeRobot has."""
+        """The statistics under LeRobot's names."""
         return {
             "min": self.least.tolist(),
             "max": self.most.tolist(),
@@ -86,7 +86,7 @@ class Statistics:
 
 
 def merged(parts: Sequence[Statistics]) -> Statistics:
-    """The statistics of all that the parts are of."""
+    """The statistics of all parts combined."""
     counts = np.array([part.count for part in parts], np.float64)
     weights = counts / counts.sum()
     means = np.stack([part.mean for part in parts])
@@ -118,7 +118,7 @@ def write_frames(
         path: The file.
         vectors: Feature -> numbers, shape (frames, numbers).
         length: Frames.
-        fps: Frames in a second.
+        fps: Frames per second.
         episode: Number of the episode.
         first: Number of its first frame among those of all episodes.
     """
@@ -126,7 +126,7 @@ def write_frames(
     for name, values in vectors.items():
         flat = pa.array(values.ravel(), pa.float32())
         count = values.shape[1]
-        # a single number stands by itself
+        # a single number is stored as a scalar
         columns[name] = flat if count == 1 else pa.FixedSizeListArray.from_arrays(flat, count)
     numbers = np.arange(length, dtype=np.int64)
     columns["timestamp"] = pa.array((numbers / fps).astype(np.float32))
@@ -169,25 +169,25 @@ def _write(path: Path, table: Any) -> None:
 
 VERSION = "v3.0"
 CHUNK = 1000
-"""Files in a folder."""
+"""Files per folder."""
 
 Integers = NDArray[np.int64]
 
 _NS = 10**9
-_GOP = 2  # frames between key frames, as LeRobot has them: samples are read one by one
-_SAMPLES = 100  # frames of which the statistics of a camera are made
+_GOP = 2  # frames between key frames, as in LeRobot: samples are read individually
+_SAMPLES = 100  # frames used for a camera's statistics
 _MOST_THREADS = 8
 _TELL_EVERY = 16  # frames
-_PLAYED = ("av1", "h264", "h265", "vp9")  # codecs of videos that are taken as they are
-# whose decoders tell the full range by the pixel format, too: of others, torchcodec, LeRobot's
-# decoder, was seen to take it for the limited one
+_PLAYED = ("av1", "h264", "h265", "vp9")  # codecs of videos that are copied
+# whose decoders also signal full range by the pixel format: for others, torchcodec, LeRobot's
+# decoder, mistakes it for limited range
 _RANGE_TOLD = ("h264", "h265")
 _VECTORS = {"observation.state": "state", "action": "action"}  # feature -> option
 
 
 @dataclass
 class Episode:
-    """What a dataset became.
+    """A dataset as an episode.
 
     Attributes:
         length: Frames.
@@ -296,7 +296,7 @@ class _Maker:
                 "`topics`."
             )
         length = ((end - start) * fps + _NS // 2) // _NS + 1
-        # integers all the way: a float would move late frames
+        # integers throughout: floats would shift late frames
         self._times = start + (np.arange(length, dtype=np.int64) * _NS + fps // 2) // fps
 
     def make(self) -> Episode:
@@ -369,7 +369,7 @@ class _Maker:
     ) -> dict[str, Any]:
         options = self._job.options
         recipe = recipe_for("rgb24", lossless=False, codec=options.codec, crf=options.crf)
-        recipe = replace(recipe, full_range=False)  # for which LeRobot's decoder takes all AV1
+        recipe = replace(recipe, full_range=False)  # which LeRobot's decoder assumes for all AV1
         encoder = VideoEncoder(
             path,
             recipe,
@@ -470,7 +470,7 @@ def _features(
 def _row(
     number: int, episode: Episode, task: str, fps: int, episodes: Sequence[Episode]
 ) -> dict[str, Any]:
-    """What the table of episodes says of one."""
+    """The row of an episode in the table of episodes."""
     first = sum(other.length for other in episodes[:number])
     chunk, file = divmod(number, CHUNK)
     row: dict[str, Any] = {

@@ -24,7 +24,7 @@ _TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 _IMU, _JOINTS = "sensor_msgs/Imu", "sensor_msgs/JointState"
 _POSES_ALONE = ("geometry_msgs/PoseStamped", "geometry_msgs/TransformStamped")
 _STAMP, _RECORDED = "stamp", "recorded"
-_MOST_DEPTH = 64  # frames above each other
+_MOST_DEPTH = 64  # depth of nested frames
 
 
 def write(job: ExportJob) -> None:
@@ -71,11 +71,11 @@ class _Writer:
         return [channel.topic for channel in self._dataset.channels if takes(channel)]
 
     def _moving(self) -> Iterator[RecordedMessage]:
-        """The messages of /tf and its kin."""
+        """The messages of /tf and similar topics."""
         return self._dataset.messages(self._tf_topics) if self._tf_topics else iter(())
 
     def _path(self, frame: str, *more: str) -> str:
-        """Entity of a frame: below its parents."""
+        """Entity path of a frame, below its parents."""
         names = [_name(frame) or "unknown"]
         while len(names) < _MOST_DEPTH and (parent := self._parents.get(names[-1])):
             if parent in names:
@@ -248,7 +248,7 @@ class _Writer:
     # ------------------------------------------------------------ poses and joints
 
     def _write_poses(self, topic: str, kind: str) -> None:
-        """Log poses as transforms of the topic's entity, below the frame that they are in."""
+        """Log poses as transforms of the topic's entity, below their parent frame."""
         names = ["poses", *topic.strip("/").split("/")]
         count, path = 0, ""
         for message in self._dataset.messages([topic]):
@@ -266,7 +266,7 @@ class _Writer:
             self._job.note(f"{topic}: only position and orientation are kept")
 
     def _write_joints(self, topic: str) -> None:
-        """Log positions, velocities and efforts, a series of each joint."""
+        """Log positions, velocities and efforts, one series per joint."""
         parts = ["joints", *topic.strip("/").split("/")]
         count = 0
         for message in self._dataset.messages([topic]):

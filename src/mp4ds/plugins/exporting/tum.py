@@ -19,13 +19,13 @@ _IMU = "sensor_msgs/Imu"
 
 
 def seconds(time: int) -> str:
-    """Nanoseconds as seconds, all digits of them."""
+    """Nanoseconds as seconds, with all digits."""
     sign, (whole, part) = "-" if time < 0 else "", divmod(abs(time), _NS)
     return f"{sign}{whole}.{part:09d}"
 
 
 def is_depth(camera: ExportedCamera) -> bool:
-    """Whether images are depths: by their encoding, or their topic's name where they are mono16."""
+    """Whether images are depths: by their encoding, or by topic name if mono16."""
     encoding = camera.view.encoding
     has_light = encoding_as(encoding, "rgb") is not None
     return not has_light or (encoding.name == "mono16" and "depth" in camera.topic.lower())

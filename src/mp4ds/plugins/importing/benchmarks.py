@@ -84,7 +84,7 @@ def find_euroc(folder: Path, options: ImageFolder) -> Scene:
 
 
 def _described(scene: Scene, sensor: Path) -> dict[str, Any]:
-    """What sensor.yaml says, which is kept; its pose becomes a transform."""
+    """The contents of sensor.yaml, which is kept; its pose becomes a transform."""
     path = sensor / "sensor.yaml"
     if not path.is_file():
         return {}
@@ -124,7 +124,7 @@ def _add_table(scene: Scene, sensor: Path, kind: str, frame_id: str, values: int
 
 
 def _add_poses(scene: Scene, sensor: Path) -> None:
-    """Position and w, x, y, z of the quaternion; velocities and biases have no place in a pose."""
+    """Position and w, x, y, z of the quaternion; a pose cannot hold velocities and biases."""
     path = sensor / LIST
     stamps, rows = read_table(path, of_unit("ns", scene.skipped), 7, more=True)
     poses = rows[:, [0, 1, 2, 4, 5, 6, 3]]
@@ -210,7 +210,7 @@ def find_kitti(folder: Path, options: ImageFolder) -> Scene:
 def _find_raw(folder: Path, cameras: list[Path]) -> Scene:
     scene = Scene(folder)
     values: _Calibrations | None = None
-    # the calibrations of a day are beside its recordings
+    # the calibrations of a day are next to its recordings
     for place in (folder.absolute().parent, folder):
         for path in sorted(place.glob("calib_*.txt")):
             scene.files.append(path)
@@ -232,7 +232,7 @@ def _find_raw(folder: Path, cameras: list[Path]) -> Scene:
 def _raw_calibration(
     scene: Scene, name: str, values: _Calibrations | None, number: str, files: list[Path]
 ) -> CalibrationFields | None:
-    """Of images that are rectified or not, which their size tells; the pose is noted."""
+    """Calibration of rectified or unrectified images, judging by their size; the pose is noted."""
     if not files or values is None or f"P_rect_{number}" not in values:
         return None
     size = image_size(files[0])
@@ -289,7 +289,7 @@ def _find_odometry(folder: Path) -> Scene:
 
 
 def _rectified(size: tuple[int, int], p: Matrix) -> CalibrationFields:
-    """The calibration of images that are rectified: they have the projection alone."""
+    """The calibration of rectified images, which only have a projection."""
     return CalibrationFields(
         width=size[0],
         height=size[1],
@@ -302,7 +302,7 @@ def _rectified(size: tuple[int, int], p: Matrix) -> CalibrationFields:
 
 
 def _origin(p: Matrix) -> Matrix:
-    """Where a rectified camera is in the first one, metres: of P = K [I | t] it is -t."""
+    """Position of a rectified camera in the first one, metres: for P = K [I | t] it is -t."""
     matrix = p.reshape(3, 4)
     try:
         return np.asarray(-np.linalg.solve(matrix[:, :3], matrix[:, 3]), np.float64)

@@ -1,4 +1,4 @@
-"""The table of layouts of folders, and folders without one."""
+"""The table of folder layouts, and plain folders."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ _ADVICE = (
 def by_camera(folder: Path, images: Sequence[Path]) -> Mapping[str, list[Path]]:
     """The images of each camera by its name, which is empty if there is one camera.
 
-    There are several where the names have different words or endings and the same numbers:
+    There are several if the names have different words or extensions and the same numbers:
     ``color_0001.jpg`` and ``depth_0001.png``.
 
     Args:
@@ -64,7 +64,7 @@ def by_camera(folder: Path, images: Sequence[Path]) -> Mapping[str, list[Path]]:
         images: In order.
 
     Raises:
-        SourceError: Nothing tells whether they are of one camera.
+        SourceError: It is unclear whether they are from one camera.
     """
     kinds: dict[str, list[Path]] = {}
     for path in images:
@@ -91,17 +91,17 @@ def _numbers(path: Path) -> tuple[int, ...]:
 
 
 def _may_be_cameras(images: Sequence[Path], numbers: Sequence[list[tuple[int, ...]]]) -> bool:
-    """Whether there are a few kinds, and one number is in several of them."""
+    """Whether there are a few kinds that share numbers."""
     if not 1 < len(numbers) <= _MOST or min(map(len, numbers)) < 2:
         return False
     endings = {path.suffix.lower() for path in images}
     if len(endings) < len(numbers) and all(_HEX.fullmatch(path.stem) for path in images):
-        return False  # letters are digits, too
+        return False  # hexadecimal letters are digits, too
     return len(set().union(*numbers)) < len(images)
 
 
 def _names(kinds: Sequence[str]) -> list[str]:
-    """A name for each camera: the words that not all have; else the ending of its files."""
+    """A name for each camera: the words that differ, else its files' extension."""
     words = [_WORD.findall(Path(kind).stem) for kind in kinds]
     shared = set(words[0]).intersection(*words)
     names = ["_".join(word for word in own if word not in shared) for own in words]
@@ -114,7 +114,7 @@ def _names(kinds: Sequence[str]) -> list[str]:
 
 
 def _check_turns(folder: Path, images: Sequence[Path]) -> None:
-    """Refuse images of two cameras in turns; a camera may well change its size."""
+    """Refuse interleaved images of two cameras; one camera may well change its size."""
     kinds = [_kind(path) for path in images[:_LOOKED_AT]]
     changes = [place for place in range(1, len(kinds)) if kinds[place] != kinds[place - 1]]
     if len(changes) >= len(set(kinds)) > 1:
@@ -131,7 +131,7 @@ def _check_turns(folder: Path, images: Sequence[Path]) -> None:
 def _kind(path: Path) -> str:
     try:
         return image_kind(path)
-    except SourceError:  # JPEG files are kept whatever is in them
+    except SourceError:  # JPEG files are kept whatever they contain
         return path.suffix.lower()
 
 
@@ -149,16 +149,16 @@ def images_in(folder: Path) -> list[Path]:
 
 
 def _in_order(path: Path) -> tuple[list[tuple[int, str]], str]:
-    """Orders 9 before 10, with zeros before it or without."""
+    """Sorts 9 before 10, with or without leading zeros."""
     parts = re.split(r"([0-9]+)", path.name)
     return [(int(part or 0), "") if n % 2 else (0, part) for n, part in enumerate(parts)], path.name
 
 
 def find_plain(folder: Path, options: ImageFolder) -> Scene:
-    """The images of a folder: of one camera, or of several where a rate tells their times.
+    """The images of a folder: of one camera, or of several if a rate gives their times.
 
     Raises:
-        SourceError: There are none, or nothing tells their times.
+        SourceError: There are none, or their times are unknown.
         OptionError: An option is wrong.
     """
     if options.stamps and options.rate:
@@ -202,7 +202,7 @@ def _camera(
 
 
 def _by_rate(folder: Path, images: list[Path], options: ImageFolder) -> list[SceneCamera]:
-    """The cameras whose images are in a folder, all from the same time on."""
+    """The cameras whose images are in a folder, all starting at the same time."""
     found = by_camera(folder, images)
     given = [key for key in ("topic", "frame_id", "encoding") if getattr(options, key) is not None]
     if len(found) > 1 and given:
@@ -232,7 +232,7 @@ def _elsewhere(folder: Path) -> str:
 def _by_list(
     scene: Scene, images: list[Path], path: Path, unit: str | None
 ) -> tuple[list[Path], NDArray[np.int64]]:
-    """The images of a list of times, which may name them."""
+    """The images of a list of times, which may also name them."""
     rows: Rows = [(number, split(line)) for number, line in lines_of(path)]
     header = rows.pop(0)[1] if rows and not any(map(is_number, rows[0][1])) else []
     if not rows:
@@ -262,7 +262,7 @@ def _by_list(
 
 
 def _columns(path: Path, number: int, values: list[str]) -> tuple[int, int | None]:
-    """Where a line has its time, and the name of an image, if it has one."""
+    """Positions of a line's time, and of an image name, if any."""
     time = next((place for place, value in enumerate(values) if is_number(value)), None)
     if time is None:
         raise SourceError(path, f"line {number} has no time")
@@ -311,7 +311,7 @@ class FolderLayout:
     Attributes:
         matches: Whether a folder has it.
         find: Finds what it holds.
-        is_calibrated: Whether it tells calibrations of its own.
+        is_calibrated: Whether it has its own calibrations.
     """
 
     matches: Callable[[Path], bool]
@@ -325,7 +325,7 @@ LAYOUTS: Mapping[str, FolderLayout] = {
     "tum": FolderLayout(is_tum, find_tum, is_calibrated=False),
     "plain": FolderLayout(lambda folder: True, find_plain, is_calibrated=False),
 }
-"""In the order in which they are tried."""
+"""Layouts, in the order in which they are tried."""
 
 
 def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
@@ -333,11 +333,11 @@ def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
 
     Args:
         folder: The folder, on this machine.
-        options: How it is read.
+        options: How to read it.
 
     Raises:
-        SourceError: It cannot be read as asked; says why and what to do.
-        OptionError: The options do not suit its layout.
+        SourceError: It cannot be read; says why and what to do.
+        OptionError: The options do not apply to its layout.
     """
     if remote(folder):
         raise SourceError(folder, "cannot be read remotely", "Download it first.")
@@ -376,7 +376,7 @@ def _check(options: ImageFolder) -> None:
 
 
 def _check_for(name: str, layout: FolderLayout, options: ImageFolder) -> None:
-    """Refuse options that go with other layouts only."""
+    """Refuse options for other layouts."""
     given = [key for key in _PLAIN_ONLY if getattr(options, key) is not None]
     if name != "plain" and given:
         raise OptionError(
@@ -390,10 +390,10 @@ def _check_for(name: str, layout: FolderLayout, options: ImageFolder) -> None:
 
 
 def _calibrate(scene: Scene, path: Path) -> None:
-    """Give all cameras a calibration that is theirs by its size.
+    """Give all cameras a calibration that matches their size.
 
     Raises:
-        SourceError: It is none, or made for images of another size.
+        SourceError: It is not valid, or made for a different image size.
     """
     calibration = ros_calibration(path)
     for camera in scene.cameras:
