@@ -1,4 +1,4 @@
-"""Depth images: ROS' compressedDepth, of PNG or RVL."""
+"""Depth images: ROS's compressedDepth, as PNG or RVL."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def decode_rvl(data: bytes | memoryview) -> Depth:
         uint16 array of shape (rows, cols).
 
     Raises:
-        Refused: It is not RVL, cut short, or promises more pixels than it codes.
+        Refused: It is not RVL, is cut short, or declares more pixels than it codes.
     """
     if len(data) < _HEADER.size or len(data) % _WORD_BYTES:
         raise Refused("it is no RVL: it has no whole number of words")
@@ -130,7 +130,7 @@ def _write_numbers(numbers: _Numbers) -> NDArray[np.uint8]:
 
 
 def _read_runs(numbers: _Numbers, pixels: int) -> tuple[_Numbers, _Numbers, _Numbers]:
-    """Where runs of pixels that are not zero are, and where their counts stand.
+    """Runs of non-zero pixels, and the positions of their counts.
 
     Returns:
         First pixel and length of each run, and the place of its counts among the numbers, with
@@ -173,7 +173,7 @@ _PARAMETERS = slice(4, HEADER_BYTES)  # of quantised inverse depths, in the head
 
 
 def told_encoding(format_: str | None) -> str:
-    """The encoding that the field ``format`` of a message begins with."""
+    """The encoding at the beginning of a message's field ``format``."""
     return (format_ or "").partition(";")[0].strip()
 
 
