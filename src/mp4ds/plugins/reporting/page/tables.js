@@ -116,7 +116,7 @@ var mp4dsTables = (() => {
           element("p", {class: "muted", text: camera.calibration_topic}), element("pre", {text: lines.join("\n")})]));
       }
       const more = camera.calibrations.length - 8 + camera.calibrations_more;
-      if (more > 0) made.push(element("p", {class: "muted", text: `${camera.name}: ${more} more changes; `mp4ds info --intrinsics` lists them`}));
+      if (more > 0) made.push(element("p", {class: "muted", text: `${camera.name}: ${more} more changes; mp4ds info --intrinsics lists them`}));
     }
     place.replaceChildren(...made);
     return made.length > 0;
