@@ -52,7 +52,7 @@ class McapWriter:
 
     Raises:
         OptionError: The compression is unknown.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
 
     format = "mcap"

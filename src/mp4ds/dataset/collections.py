@@ -1,4 +1,4 @@
-"""Many datasets: found below a folder or by a pattern, and worked on side by side."""
+"""Many datasets: found below a folder or by a pattern, and processed in parallel."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ Paths = str | Path | Sequence[str | Path]
 
 
 def datasets_in(paths: Paths) -> list[Path]:
-    """The datasets that are meant by paths, in the order of these.
+    """The datasets given by paths, in the same order.
 
     Args:
-        paths: Datasets, sidecars, videos; folders of datasets, however deep; patterns such as
-            ``drives/*``; or URLs, but no patterns of these.
+        paths: Datasets, sidecars, videos; folders of datasets, at any depth; patterns such as
+            ``drives/*``; or URLs, but not URL patterns.
 
     Raises:
-        SourceNotFoundError: There is nothing, or nothing of a pattern.
+        SourceNotFoundError: A path does not exist, or a pattern matches nothing.
         SourceError: A folder has no dataset in it or below it.
     """
     several = [paths] if isinstance(paths, (str, Path, RemotePath)) else paths
@@ -58,7 +58,7 @@ def _datasets_at(path: Path) -> list[Path]:
         except SourceError:
             continue  # a pattern matches other folders, too
     if not found:
-        raise SourceError(path, "matches no dataset", "Give folders that `mp4ds pack` made.")
+        raise SourceError(path, "matches no dataset", "Give folders made by `mp4ds pack`.")
     return found
 
 
@@ -68,13 +68,13 @@ def _below(path: Path) -> list[Path]:
     if not path.is_dir() or (path / MANIFEST_NAME).is_file():
         return [path]
     found = sorted(manifest.parent for manifest in path.rglob(MANIFEST_NAME))
-    # what begins with a dot is being made
+    # names that begin with a dot are being made
     found = [one for one in found if not _is_hidden(one, path)]
     if not found:
         raise SourceError(
             path,
             f"holds no dataset: there is no {MANIFEST_NAME} in it or below it",
-            "Give the folder that `mp4ds pack` made.",
+            "Give a folder made by `mp4ds pack`.",
         )
     return found
 
@@ -88,18 +88,18 @@ def _is_hidden(dataset: Path, folder: Path) -> bool:
 def each(
     work: Callable[[_Item], _Made], items: Sequence[_Item], jobs: int = 1
 ) -> Iterator[tuple[_Item, _Made]]:
-    """Work on items, several at a time.
+    """Process items in parallel.
 
     Args:
-        work: A function that other processes can import, of arguments that they can be sent.
-        items: What it is given.
-        jobs: Processes at a time; of one, it is this one.
+        work: A function that other processes can import, with picklable arguments.
+        items: Its arguments.
+        jobs: Number of processes; if 1, this one.
 
     Yields:
-        Each item with what became of it, in their order.
+        Each item with its result, in order.
 
     Raises:
-        Mp4dsError: A process died, as where memory is short; else what the work raises.
+        Mp4dsError: A process died, perhaps out of memory; otherwise whatever the work raises.
     """
     if min(jobs, len(items)) < 2:
         for item in items:
@@ -112,8 +112,10 @@ def each(
         try:
             yield from zip(items, pool.map(partial(_worked, work), items), strict=True)
         except BrokenProcessPool:
-            raise Mp4dsError("A process died: memory may be short. Try fewer `jobs`.") from None
-        except BaseException:  # nobody waits for what is being worked on
+            raise Mp4dsError(
+                "A worker process died, perhaps out of memory. Try fewer `jobs`."
+            ) from None
+        except BaseException:  # nobody waits for work in progress
             processes = set(multiprocessing.active_children()) - before
             for process in processes:
                 process.terminate()
@@ -125,7 +127,7 @@ def each(
 
 
 def _leave_to_parent() -> None:
-    """Let the parent decide what Ctrl-C does."""
+    """Let the parent handle Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -146,5 +148,5 @@ def _worked(work: Callable[[_Item], _Made], item: _Item) -> _Made:
 
 
 def _end(number: int, _: object) -> None:
-    signal.signal(number, signal.SIG_IGN)  # the pool sends it, too, when another process ended
+    signal.signal(number, signal.SIG_IGN)  # the pool sends it, too, when another process has died
     sys.exit(128 + number)

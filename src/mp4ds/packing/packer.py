@@ -1,4 +1,4 @@
-"""One recording, or one part of it, into videos, sidecars and verbatim messages."""
+"""Packs one recording, or a part of it, into videos, sidecars and verbatim messages."""
 
 from __future__ import annotations
 
@@ -27,10 +27,12 @@ from mp4ds.plan import FileNames, Selection
 from mp4ds.records import EVERYTHING, Attachment, Channel, Excerpt, Message, Record
 
 Exact = Mapping[tuple[int, StreamKey], str]
-"""Id of a channel and key of streams that no score is asked of any more -> why."""
+"""Channel id and key of streams that no longer need to reach a score -> why."""
 
 TOO_LATE = "recorded faster than it could be encoded"
-NOT_SURVEYED = "images of its size or encoding were not met where the recording was looked into"
+NOT_SURVEYED = (
+    "images of its size or encoding were not in the parts of the recording that were surveyed"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +40,8 @@ class _Item:
     """A message of a camera channel.
 
     Attributes:
-        ordinal: Its place among the channel's messages.
-        number: Its place among the topic's messages.
+        ordinal: Its position among the channel's messages.
+        number: Its position among the topic's messages.
         seen: What it holds.
     """
 
@@ -51,12 +53,12 @@ class _Item:
 
 @dataclass
 class _Route:
-    """Where the messages of one key go: into the first of the streams that takes them.
+    """Where the messages of one key go: into the first stream that accepts them.
 
     Attributes:
-        plans: How further streams for them may be made, the best first.
-        streams: Those that were made, in the order of the plans.
-        refusal: Why there is no stream for what none of these takes.
+        plans: Plans for further streams, the best first.
+        streams: Existing streams, in the order of the plans.
+        refusal: Why there is no stream for what none of these accept.
     """
 
     plans: list[TrackPlan]
@@ -82,11 +84,11 @@ class CameraRouter:
         reader: The recording.
         folder: Where the streams' files are made.
         settings: How to encode.
-        calibrations: Takes notice of new streams.
-        survey: What was decided before; None to decide here.
+        calibrations: Notified of new streams.
+        survey: Earlier decisions; None to decide here.
         topic_of: The summary of a channel's topic.
-        keep: Stores what no stream can carry exactly, for a reason.
-        exact: Streams that are to be lossless although a score is asked for, and why.
+        keep: Stores what no stream can carry exactly, with the reason.
+        exact: Streams that must be lossless although a score is asked for, and why.
         journal: Where to note what is done; None: nowhere.
     """
 
@@ -118,7 +120,7 @@ class CameraRouter:
         self._renamed: set[str] = set()
 
     def take(self, message: Message, workers: Workers) -> None:
-        """Encode an image, hold it back, or keep it with the reason why no stream takes it."""
+        """Encode an image, hold it back, or keep it with the reason why no stream accepts it."""
         channel = message.channel
         state = self._state_of(channel)
         ordinal, number = state.count, self._topic_of(channel).messages - 1
@@ -154,12 +156,12 @@ class CameraRouter:
         return self._channels[channel.identity]
 
     def settle(self, workers: Workers) -> None:
-        """Write everything that is held back: the recording is at its end."""
+        """Write everything held back: the recording has ended."""
         for state in self._channels.values():
             self._settle(state, workers)
 
     def _settle(self, state: _CameraChannel, workers: Workers) -> None:
-        """Decide how the held images are encoded, and write them in their order."""
+        """Decide how to encode the held images, and write them in order."""
         held, state.held = state.held, []
         for key in dict.fromkeys(item.seen.key for item in held):
             if key not in state.routes:
@@ -210,7 +212,7 @@ class CameraRouter:
     def _candidates(
         self, state: _CameraChannel, route: _Route, item: _Item
     ) -> Iterator[StreamWriter]:
-        """The streams that may take a message; the next one is made when the others refuse."""
+        """The streams that may accept a message; the next one is made when the others refuse."""
         yield from route.streams
         while route.plans and not route.refusal:
             made = sum(len(other.streams) for other in state.routes.values())
@@ -285,13 +287,13 @@ class PartSettings:
     Attributes:
         streams: How its streams are encoded.
         selected: Whether a topic is packed.
-        excerpt: What of the recording it is made from.
-        survey: What all parts agree on; None where there is but one part.
-        camera_info: Pairs of topics that the user names, ``IMAGE=INFO``.
-        workers: Streams that are encoded side by side.
+        excerpt: The part of the recording it covers.
+        survey: What all parts agree on; None if there is only one part.
+        camera_info: Pairs of topics given by the user, ``IMAGE=INFO``.
+        workers: Streams to encode in parallel.
         compression: Of messages.mcap.
         is_whole: Whether there are no other parts.
-        exact: Streams that are made lossless, since a score is out of their reach, and why.
+        exact: Streams made lossless because they cannot reach the score, and why.
     """
 
     streams: StreamSettings
@@ -306,10 +308,10 @@ class PartSettings:
 
 
 def until_in_reach(make: Callable[[Exact], _Made]) -> _Made:
-    """Pack; and again, with other streams lossless, while one cannot have the score asked for.
+    """Pack, and repeat with more streams lossless while one cannot reach the score.
 
     Args:
-        make: Packs, beginning anew each time; given the streams that are to be lossless.
+        make: Packs from the beginning, given the streams that must be lossless.
     """
     exact: dict[tuple[int, StreamKey], str] = {}
     while True:
@@ -375,7 +377,7 @@ class Packer:
         Raises:
             SourceError: The recording is damaged.
             OutOfReachError: A stream cannot have the score that was asked for.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         part = self._part
         try:

@@ -157,7 +157,7 @@ class StreamWriter:
 
         Raises:
             OutOfReachError: The video cannot have the score that was asked for.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         try:
             self._track.close()

@@ -150,7 +150,7 @@ class VideoEncoder:
             tick: Presentation time in ticks, greater than the last.
 
         Raises:
-            OSError: The disk refused.
+            OSError: It cannot be written.
             HardwareError: A device failed.
         """
         frame = picture_to_frame(
@@ -189,7 +189,7 @@ class VideoEncoder:
         """Finish the file.
 
         Raises:
-            OSError: The disk refused.
+            OSError: It cannot be written.
             HardwareError: A device failed.
         """
         try:
@@ -291,7 +291,7 @@ def check_hardware(codec: str | None) -> None:
     """Open an encoder for a moment, if it is one of the hardware.
 
     Args:
-        codec: As ``--codec`` has it.
+        codec: As given to ``--codec``.
 
     Raises:
         HardwareError: It cannot be used here; says why, and what to do.
@@ -306,7 +306,7 @@ def refuse_if_unusable(codec: str, width: int, height: int) -> None:
     To be called after an encoder of the hardware could not be opened.
 
     Args:
-        codec: As ``--codec`` has it.
+        codec: As given to ``--codec``.
         width: Columns of the pictures.
         height: Rows of the pictures.
 
@@ -320,8 +320,9 @@ def refuse_if_unusable(codec: str, width: int, height: int) -> None:
         return
     raise hardware_error(
         codec,
-        "the device refused an encoder, and took one a moment later: there were too many at a time",
-        "Give fewer `jobs`",
+        "the device refused an encoder, but accepted one a moment later: too many were open "
+        "at once",
+        "Use fewer `jobs`",
     )
 
 
@@ -329,7 +330,7 @@ def device_for(codec: str) -> HWAccel | None:
     """The device that an encoder's pictures have to be on, for PyAV to bring them there.
 
     Args:
-        codec: As ``--codec`` has it.
+        codec: As given to ``--codec``.
     """
     kind = HARDWARE[codec].device if codec in HARDWARE else ""
     return HWAccel(kind) if kind else None
@@ -339,7 +340,7 @@ def surface_format(codec: str) -> str:
     """The pixel format of pictures on an encoder's device; empty: it takes them as they are.
 
     Args:
-        codec: As ``--codec`` has it.
+        codec: As given to ``--codec``.
     """
     return "nv12" if codec in HARDWARE and HARDWARE[codec].device else ""
 
@@ -350,13 +351,13 @@ def _open_once(codec: str, width: int, height: int) -> None:
         raise hardware_error(
             codec,
             f"PyAV {av.__version__} was built without {found.encoder}",
-            f"It needs {found.needs}, and a PyAV whose ffmpeg has {found.encoder}",
+            f"It needs {found.needs}, and a PyAV whose FFmpeg has {found.encoder}",
         )
     if found.device and int(av.__version__.split(".")[0]) < _UPLOADS_SINCE:
         raise hardware_error(
             codec,
-            f"PyAV {av.__version__} cannot bring pictures to {found.encoder}",
-            f"Install PyAV {_UPLOADS_SINCE}, whose ffmpeg has to have it",
+            f"PyAV {av.__version__} cannot upload pictures to {found.encoder}",
+            f"Install PyAV {_UPLOADS_SINCE} with an FFmpeg that has it",
         )
     with _told() as lines:
         try:

@@ -94,7 +94,9 @@ class Media:
                 "video-unreadable", self._path, f"has {len(tracks)} video tracks, not one"
             )
         if tracks[0].codec_context is None or tracks[0].codec_context.codec is None:
-            raise VideoError("video-unreadable", self._path, "has a video track of no known codec")
+            raise VideoError(
+                "video-unreadable", self._path, "has a video track with an unknown codec"
+            )
         return tracks[0]
 
     @cached_property
@@ -117,13 +119,13 @@ class Media:
         found = context.codec.canonical_name
         if found != (CODECS[codec].ffmpeg if codec in CODECS else codec):
             raise VideoError(
-                "codec-mismatch", self._path, f"is coded as {found} where its sidecar says {codec}"
+                "codec-mismatch", self._path, f"is coded as {found}, but its sidecar says {codec}"
             )
         if coded_size is not None and (context.width, context.height) != coded_size:
             raise VideoError(
                 "geometry-mismatch",
                 self._path,
-                f"has {context.width}x{context.height} pixels where its sidecar says "
+                f"has {context.width}x{context.height} pixels, but its sidecar says "
                 f"{coded_size[0]}x{coded_size[1]}",
             )
 
@@ -151,7 +153,7 @@ def open_input(source: Any, container: str = "mp4") -> Any:
 
 
 def pixel_format_of(context: Any) -> str:
-    """Ffmpeg's name of the pixel format of a video's codec context; empty where none is told.
+    """Ffmpeg's name of the pixel format of a video's codec context; empty if none is told.
 
     PyAV 17, which Python 3.10 has, crashes where it is asked for `pix_fmt` then.
     """
@@ -169,7 +171,7 @@ class _Source:
         self.close = stream.close
 
     def read(self, size: int = -1) -> bytes:
-        """Read so many bytes; after an error, none."""
+        """Read that many bytes; after an error, none."""
         if self._has_failed:
             return b""
         try:

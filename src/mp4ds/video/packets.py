@@ -63,7 +63,7 @@ class PacketWriter:
     ) -> None:
         self._on_packet = on_packet
         if codec not in PACKET_CODECS:
-            raise ValueError(f"codec {codec!r} is none of {', '.join(PACKET_CODECS)}")
+            raise ValueError(f"codec {codec!r} is not one of {', '.join(PACKET_CODECS)}")
         self.codec = codec
         self.width, self.height = width, height
         self._path = path
@@ -91,7 +91,7 @@ class PacketWriter:
 
         Raises:
             Refused: It is the first, and cannot be decoded or has another size.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         plain = plain_body(self.codec, body)
         if self._container is None:
@@ -142,7 +142,7 @@ class PacketWriter:
 
         Raises:
             VideoError: The file does not hold every packet as it was written.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         if not self._ticks:
             self.abandon()
@@ -226,7 +226,7 @@ class PacketReader:
         sizes: Bytes of each shown packet.
         keyframes: For each shown packet whether decoding can begin there, as 0 or 1.
         extradata: What the track says about the codec: avcC, hvcC or av1C.
-        pixel_format: Of its pictures as ffmpeg calls it; empty where not known.
+        pixel_format: Of its pictures as ffmpeg calls it; empty if unknown.
 
     Raises:
         VideoError: ``file-missing``, ``video-unreadable``, ``codec-mismatch``,
@@ -253,7 +253,7 @@ class PacketReader:
             if not count:
                 raise VideoError("frame-count", path, "has no frames")
             if frames is not None and count != frames:
-                raise VideoError("frame-count", path, f"has {count} frames, {frames} are due")
+                raise VideoError("frame-count", path, f"has {count} frames, not {frames}")
             ticks, self._sizes, self._places = array("q"), array("q"), array("q")
             self._keyframes = bytearray()
             for entry in entries:
@@ -291,7 +291,7 @@ class PacketReader:
         """
         key = self._keyframes.rfind(1, 0, self.hidden + index + 1)
         if key < 0:
-            raise VideoError("video-unreadable", self._path, "begins without a key frame")
+            raise VideoError("video-unreadable", self._path, "does not start with a key frame")
         return key - self.hidden
 
     def packet(self, index: int) -> bytes:
@@ -314,7 +314,7 @@ class PacketReader:
         """All packets in order.
 
         Raises:
-            VideoError: As `packet`.
+            VideoError: As for `packet`.
         """
         return map(self.packet, range(len(self)))
 
@@ -337,7 +337,7 @@ def cut_segment(
 ) -> None:
     """Write consecutive frames of a video into a file of their own.
 
-    What stands between the first of them and the key frame before it comes, too, since they refer
+    What is between the first of them and the key frame before it comes, too, since they refer
     to it; an edit list hides it.
 
     Args:
@@ -349,7 +349,7 @@ def cut_segment(
 
     Raises:
         VideoError: The source cannot be read, or the result does not hold every packet as it was.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     entry = read_sample_entry(source)
     try:
@@ -449,7 +449,7 @@ def copy_fragments(
 
 
 def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) -> int:
-    """Write the packets of videos one after the other into one file.
+    """Write the packets of videos one after another into one file.
 
     The file is as one `VideoEncoder` or `PacketWriter` would have made it of the same packets:
     its track describes them in the same words, and its last frame lasts as long as that of the
@@ -472,7 +472,7 @@ def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) 
         VideoError: A segment cannot be read, there are not as many ticks as frames, or the
             result does not hold every packet as it was.
         ValueError: There are no segments, or the ticks do not increase.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     if not segments:
         raise ValueError("there are no segments to join")
@@ -487,7 +487,7 @@ def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) 
 
 
 class _Written:
-    """What the index of the file that is made has to say."""
+    """What the index of the new file must say."""
 
     def __init__(self, codec: str) -> None:
         self.codec = codec
@@ -508,7 +508,7 @@ class _Written:
         """
         if not self._is_in(path):
             raise VideoError(
-                "decode-failed", path, "would not hold the packets as they are: one is damaged"
+                "decode-failed", path, "would not hold the packets unchanged: one is damaged"
             )
         if difference := entry.differences(read_sample_entry(path)):
             raise VideoError(
@@ -521,7 +521,7 @@ class _Written:
                 found = (reader.ticks, reader.sizes, reader.keyframes)
                 return found == (self.ticks, self.sizes, self.keyframes)
         except VideoError:
-            return False  # the muxer goes on after some damages, and the index is wrong then
+            return False  # the muxer continues after some damages, and the index is wrong then
 
 
 def _copy(
@@ -536,7 +536,7 @@ def _copy(
                 _copy_segment(segment, ticks, container, stream, duration, written)
             if next(ticks, None) is not None:
                 raise VideoError(
-                    "frame-count", target, f"would have {len(written.ticks)} frames, more are due"
+                    "frame-count", target, f"would have only {len(written.ticks)} frames"
                 )
         except BaseException:
             # closing completes the file, which may fail, too; the first error tells more
@@ -583,7 +583,7 @@ def _copy_segment(
             tick = next(ticks, None)
             if tick is None:
                 raise VideoError(
-                    "frame-count", path, f"has {len(reader)} frames, {index} of them are due"
+                    "frame-count", path, f"has {len(reader)} frames, but {index} are needed"
                 )
             if written.ticks and tick <= written.ticks[-1]:
                 raise ValueError(f"tick {tick} does not follow {written.ticks[-1]}")
@@ -633,7 +633,7 @@ def _common_entry(segments: Sequence[Path]) -> SampleEntry:
 
 
 class StandAlonePackets(PacketReader):
-    """The packets of a video as they stand alone, for whoever decodes without the mp4.
+    """The packets of a video as they stand alone, for anyone who decodes without the mp4.
 
     H.264 and H.265 come as Annex B with start codes of four bytes, AV1 as temporal units that
     begin with a delimiter; all with the parameters of the stream before each key frame. VP9
@@ -645,7 +645,7 @@ class StandAlonePackets(PacketReader):
         frames: Number of packets that are due, if known.
 
     Raises:
-        VideoError: As `PacketReader`, or the codec's parameters are damaged.
+        VideoError: As for `PacketReader`, or the codec's parameters are damaged.
     """
 
     def __init__(self, path: Path, *, codec: str, frames: int | None = None) -> None:
