@@ -1,7 +1,8 @@
 """What the package uses of rclpy, with its signatures, on a bus within the process.
 
 `install` puts it where `import rclpy` finds it. Publishers and subscriptions meet as in ROS 2:
-by topic, type and quality of service.
+by topic, type and quality of service. As with rmw_cyclonedds, raw messages arrive padded to a
+multiple of 4 bytes, and each publisher keeps as many for late subscribers as its own depth says.
 """
 
 from __future__ import annotations
@@ -98,8 +99,10 @@ class Publisher:
     def publish(self, msg: Any) -> None:
         if not isinstance(msg, bytes):
             raise TypeError(f"Expected {self.kind}, got {type(msg)}")
-        if self.qos.history == HistoryPolicy.KEEP_LAST:
-            self.kept = [*self.kept, msg][-self.qos.depth :]
+        msg = msg.ljust((len(msg) + 3) // 4 * 4, b"\0")
+        self.kept.append(msg)
+        if self.qos.history != HistoryPolicy.KEEP_ALL:
+            self.kept = self.kept[-self.qos.depth :]
         for subscription in self.node.bus.subscriptions:
             if subscription.matches(self):
                 subscription.deliver(msg)

@@ -297,7 +297,7 @@ def test_rclpy_passes_messages_on_as_they_are(bus: fake_rclpy.Bus) -> None:
         publisher.advertise(recorded)
         peer.subscribe("/x", STRING)
         publisher.publish(recorded, payload, 0)
-    assert peer.received("/x", 1) == [payload]
+    assert peer.received("/x", 1) == [padded(payload)]
 
 
 def test_rclpy_may_be_shut_down_from_outside(bus: fake_rclpy.Bus) -> None:
@@ -400,11 +400,11 @@ def test_profiles_that_say_nothing_are_the_default(text: str) -> None:
         ([{"history": "keep_all"}], Qos(reliability="best_effort")),
         (
             [{"history": "keep_last", "depth": 2, "durability": "transient_local"}],
-            Qos(reliability="best_effort", durability="transient_local", depth=2),
+            Qos(reliability="best_effort", durability="transient_local"),
         ),
         (
-            [{"history": "keep_last", "depth": 10**30, "durability": "transient_local"}],
-            Qos(reliability="best_effort", durability="transient_local"),
+            [{"history": "keep_last", "depth": 12, "durability": "transient_local"}] * 2,
+            Qos(reliability="best_effort", durability="transient_local", depth=24),
         ),
     ],
 )

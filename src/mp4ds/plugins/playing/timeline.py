@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -21,6 +22,7 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import DecodedColumns, everything
 from mp4ds.errors import ConversionError, OptionError
 from mp4ds.plan import Selection
+from mp4ds.plugins.publishing.latching import Kept, kept_depth
 from mp4ds.records import Channel, Message
 from mp4ds.unpacking.pictures import Reduction
 from mp4ds.unpacking.republish import Republisher
@@ -393,7 +395,7 @@ class Timeline:
         return Playback(self._parts, start_ns, self._read_ahead, is_late, on_ready)
 
     def latched(self, time_ns: int) -> list[Due]:
-        """The last message before a time of each latched channel."""
+        """What late subscribers get, by a time, of the latched channels."""
         return [due for part in self._parts for due in part.latched(time_ns)]
 
 
@@ -540,8 +542,15 @@ class _Part:
         return Due(message.log_time, channel, payload, source.id in self._frames)
 
     def latched(self, time_ns: int) -> Iterator[Due]:
-        """The last message before a time, of each latched channel."""
+        """What is kept, by a time, of each latched channel."""
         channels = [item for item in self._dataset.channels if item.topic in self._topics]
-        for message in self._dataset.last_before(time_ns, [*filter(is_latched, channels)]):
+        kept = {item.id: Kept[Message](item) for item in filter(is_latched, channels)}
+        topics = {item.topic for item in channels if item.id in kept}
+        most = max((kept_depth(item) for item in channels if item.id in kept), default=1)
+        for message in self._dataset.before(time_ns, topics, most) if topics else ():
+            if message.channel.id in kept:
+                kept[message.channel.id].add(message.data, message)
+        messages = sorted(chain.from_iterable(kept.values()), key=lambda item: item.log_time)
+        for message in messages:
             if due := self._due(message):
                 yield due

@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 
 from mp4ds.bags.convert import Converter
 from mp4ds.errors import ConversionError, OptionError, PublishError
+from mp4ds.plugins.publishing.latching import is_ros1
 from mp4ds.plugins.publishing.publisher import Controls
 from mp4ds.records import Channel
 
@@ -448,7 +449,7 @@ class RospyPublisher:
         self._check_alive()
         topic = self._topic(channel.topic, self._kind(channel), self._queue_size)
         caller = None
-        if channel.metadata.get("latching", "").lower() in ("1", "true"):
+        if is_ros1(channel):
             caller = channel.metadata.get("callerid", "")
             topic.mark_latched()
         self._channels[id(channel)] = channel, topic, caller

@@ -12,6 +12,7 @@ import yaml
 
 from mp4ds.bags.rosbag2_metadata import native_qos
 from mp4ds.errors import ConversionError, OptionError
+from mp4ds.plugins.publishing.latching import PLAYER_DEPTH, kept_depth
 from mp4ds.plugins.publishing.publisher import Controls
 from mp4ds.records import QOS_KEY, Channel
 
@@ -100,9 +101,6 @@ PLAYER_SERVICES = (
 
 
 # ---------------------------------------------------------------- QoS
-
-PLAYER_DEPTH = 10
-"""What rosbag2 keeps of a topic: recordings do not know the depth of their publishers."""
 
 _MAX_BYTES = 2**20
 _MAX_DEPTH = 2**31 - 1
@@ -205,8 +203,8 @@ def offered_qos(channel: Channel, overrides: Mapping[str, Qos]) -> Qos:
     """What a player offers for a channel, chosen as `ros2 bag play` does.
 
     That of the overrides; else the recorded one where all recorded publishers agree on what
-    subscribers can tell; else the default. Of latched topics the depth is kept, up to the
-    player's own, since it is what late subscribers get.
+    subscribers can tell; else the default. Of latched topics the depth is the sum of what all
+    publishers kept, since it is what late subscribers get.
 
     Args:
         channel: The channel, with the recorded profiles in its metadata.
@@ -217,9 +215,8 @@ def offered_qos(channel: Channel, overrides: Mapping[str, Qos]) -> Qos:
     profiles = recorded_qos(channel.metadata.get(QOS_KEY, ""))
     if len({_as_subscribers_see(profile) for profile in profiles}) != 1:
         return Qos()
-    first = profiles[0]
-    depth = min(first.depth, PLAYER_DEPTH) if first.is_latched else PLAYER_DEPTH
-    return replace(first, history="keep_last", depth=depth)
+    depth = kept_depth(channel) if profiles[0].is_latched else PLAYER_DEPTH
+    return replace(profiles[0], history="keep_last", depth=depth)
 
 
 def _as_subscribers_see(qos: Qos) -> Qos:
