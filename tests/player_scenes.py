@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from mp4ds.bags.convert import ros1_channel
 from mp4ds.bags.formats import open_reader, open_writer
+from mp4ds.errors import Refused
 from mp4ds.messages.serializations import form_of
 from mp4ds.messages.wire import ImageFields, Slots
 from mp4ds.records import Channel, Message, Schema
@@ -46,12 +47,15 @@ class RecordingPublisher:
     sent: list[Sent] = field(default_factory=list)
     clocks: list[Sent] = field(default_factory=list)
     on_time: Callable[[int], None] | None = None
-    on_message: Callable[[], None] | None = None
+    on_message: Callable[[int | None], None] | None = None
     controls: Any = None
     subscriber_count: int = 1
     on_sent: Callable[[Sent], None] | None = None
+    not_installed: frozenset[str] = frozenset()
 
     def advertise(self, channel: Channel) -> None:
+        if channel.type_name in self.not_installed:
+            raise Refused("it is not installed")
         self.advertised.append(channel)
 
     def publish(self, channel: Channel, payload: bytes | memoryview, time_ns: int) -> None:
@@ -73,7 +77,7 @@ class RecordingPublisher:
     def follow_clock(self, on_time: Callable[[int], None]) -> None:
         self.on_time = on_time
 
-    def listen(self, _: str, on_message: Callable[[], None]) -> None:
+    def listen(self, _: str, on_message: Callable[[int | None], None]) -> None:
         self.on_message = on_message
 
     def serve(self, controls: Any) -> None:

@@ -97,9 +97,19 @@ class RecordedControls:
     def burst(self, messages: int) -> int:
         raise NotImplementedError
 
-    def seek(self, time_ns: int) -> bool:
+    def seek(self, time_ns: int) -> int:
         self.calls.append(("seek", time_ns))
-        return self._span[0] <= time_ns <= self._span[1]
+        return min(max(time_ns, self._span[0]), self._span[1])
+
+    def play(self, start_ns: int, end_ns: int | None) -> bool:
+        raise NotImplementedError
+
+    def toggle_topic_pauses(self) -> None:
+        raise NotImplementedError
+
+    @property
+    def start_ns(self) -> int:
+        return self._span[0]
 
     def stop(self) -> None:
         raise NotImplementedError
@@ -396,7 +406,7 @@ def test_clients_control_the_player() -> None:
 
         client.request(PAUSE, 1.1, seek=1, name="before the begin")
         state = client.state("before the begin")
-        assert (state.did_seek, state.time, state.is_paused) == (False, 7_000_000_000, True)
+        assert (state.did_seek, state.time, state.is_paused) == (True, span[0], True)
 
         client.request(PLAY, 0.0, name="no rate")
         assert client.state("no rate").speed == pytest.approx(1.1)
@@ -626,7 +636,7 @@ def test_what_foxglove_has_not(publisher: FoxglovePublisher) -> None:
     with pytest.raises(OptionError, match="`foxglove`"):
         publisher.follow_clock(lambda time_ns: None)
     with pytest.raises(OptionError, match=r"/next.*`foxglove`"):
-        publisher.listen("/next", lambda: None)
+        publisher.listen("/next", lambda _: None)
     assert publisher.world is None
     assert not publisher.wants_clock
     assert publisher.is_alive

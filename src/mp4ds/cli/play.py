@@ -41,8 +41,8 @@ class Keyboard:
     """Controls a player by keys, while it is entered; a context manager.
 
     Space: stand still or go on; right or ``s``: one message; left or ``b``: one back; up and
-    down: 10 % faster and slower. Others are ignored. Where standard input is no terminal it
-    does nothing.
+    down: 10 % faster and slower; ``t``: pause for topics or not. Others are ignored.
+    Where standard input is no terminal it does nothing.
 
     The terminal is set to give keys at once and not to show them. It is as it was after the end,
     whatever ends the body or, by a signal, the program; and while the program is stopped
@@ -60,6 +60,7 @@ class Keyboard:
             "s": controls.play_next,
             "left": controls.step_back,
             "b": controls.step_back,
+            "t": controls.toggle_topic_pauses,
             "up": lambda: controls.set_rate(_rounded(controls.rate * _FASTER)),
             "down": lambda: controls.set_rate(_rounded(controls.rate / _FASTER)),
         }
@@ -281,7 +282,7 @@ def play_progress(*, is_quiet: bool) -> Iterator[Callable[[PlayProgress], None]]
     def warn(state: PlayProgress) -> None:
         if state.slowed_s >= _SLOW_S and "slow" not in told:
             told.add("slow")
-            tell("frames are not made in time: the clock waits for them (--drop leaves them out)")
+            tell("messages are not ready in time: the clock waits (--drop leaves out frames)")
         if state.dropped and "dropped" not in told:
             told.add("dropped")
             tell("frames are not made in time: late ones are left out")
@@ -324,17 +325,19 @@ def print_play(summary: PlaySummary) -> None:
     for topic, reasons in summary.as_recorded.items():
         for reason, count in reasons.items():
             say(f"{topic}: {count} as recorded: {reason}")
+    for topic, count in summary.not_installed.items():
+        say(f"{topic}: {count} left out, of a type that is not installed")
     for topic, count in summary.thinned.items():
         say(f"{topic}: {count} frames left out on request")
     total = sum(summary.messages.values())
     text = f"{total} messages in {summary.seconds:.1f} s"
     if summary.loops:
-        text += f", begun again {summary.loops} times"
+        text += f", started over {summary.loops} times"
     if summary.stopped:
         text += ", stopped before the end"
     say(text)
     if summary.slowed_s >= 0.1:
-        say(f"{summary.slowed_s:.1f} s longer than recorded, since frames were not made in time")
+        say(f"{summary.slowed_s:.1f} s longer than recorded: messages were not ready in time")
     if summary.dropped:
         say(f"{summary.dropped} frames left out, since they were late")
 
@@ -365,7 +368,7 @@ def play(
         ),
     ] = False,
     clock_hz: Annotated[
-        float, typer.Option("--hz", help="The rate of --clock, besides with each message.")
+        float, typer.Option("--hz", help="The rate of --clock.")
     ] = _DEFAULT_CLOCK_HZ,
     no_keyboard: Annotated[
         bool, typer.Option("--disable-keyboard-controls", help="Leave the keyboard alone.")

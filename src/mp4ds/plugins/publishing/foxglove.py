@@ -284,10 +284,10 @@ class PlaybackReporter:
         controls = self._controls
         if controls is None:
             return None
-        did_seek = request.seek_time is not None and controls.seek(request.seek_time)
+        did_seek = request.seek_time is not None
         if did_seek:
             # the answer tells of this jump
-            self._time, self._published = request.seek_time, None
+            self._time, self._published = controls.seek(request.seek_time), None
         if request.playback_speed != _as_float32(controls.rate):
             # it comes as a float32: 1.1 is not to become 1.10000002384
             controls.set_rate(round(request.playback_speed, 6))
@@ -565,7 +565,7 @@ class FoxglovePublisher:
             "another clock cannot be followed with `foxglove`: its clients have none."
         )
 
-    def listen(self, topic: str, on_message: Callable[[], None]) -> None:
+    def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
         """See `Publisher`.
 
         Raises:

@@ -18,6 +18,10 @@ from mp4ds.records import QOS_KEY, Channel
 
 _NOTHING = "uint8 structure_needs_at_least_one_member"
 _SUCCESS = "bool success"
+_PLAY = (
+    "builtin_interfaces/Time start_offset\nbuiltin_interfaces/Duration playback_duration\n"
+    "builtin_interfaces/Time playback_until_timestamp"
+)
 _SECOND = 10**9
 
 
@@ -75,9 +79,21 @@ def _burst(controls: Controls, request: Any) -> Mapping[str, Any]:
     return {"actually_burst": controls.burst(request.num_messages)}
 
 
+def _play(controls: Controls, request: Any) -> Mapping[str, Any]:
+    start = controls.start_ns + _nanoseconds(request.start_offset)
+    length, until = map(_nanoseconds, (request.playback_duration, request.playback_until_timestamp))
+    # 0, which nobody plays, is what clients send who leave it out
+    ends = [time for time, is_told in ((start + length, length > 0), (until, until > 0)) if is_told]
+    return {"success": controls.play(start, max(ends, default=None))}
+
+
 def _seek(controls: Controls, request: Any) -> Mapping[str, Any]:
-    time_ns = request.time.sec * _SECOND + request.time.nanosec
-    return {"success": controls.seek(time_ns)}
+    controls.seek(_nanoseconds(request.time))
+    return {"success": True}
+
+
+def _nanoseconds(time: Any) -> int:
+    return int(time.sec * _SECOND + time.nanosec)
 
 
 def _stop(controls: Controls, _: Any) -> Mapping[str, Any]:
@@ -94,10 +110,11 @@ PLAYER_SERVICES = (
     Service("set_rate", "SetRate", "float64 rate", _SUCCESS, _set_rate),
     Service("play_next", "PlayNext", _NOTHING, _SUCCESS, _play_next),
     Service("burst", "Burst", "uint64 num_messages", "uint64 actually_burst", _burst),
+    Service("play", "Play", _PLAY, _SUCCESS, _play),
     Service("seek", "Seek", "builtin_interfaces/Time time", _SUCCESS, _seek),
     Service("stop", "Stop", _NOTHING, _NOTHING, _stop),
 )
-"""All but ``play``, which starts a playback where none is running."""
+"""Those of `ros2 bag play`, which are answered when what they ask for is done."""
 
 
 # ---------------------------------------------------------------- QoS
