@@ -32,8 +32,8 @@ RECORD = "/usr/lib/rosbag/record"
 PLAY = "/usr/lib/rosbag/play"
 
 _PACKAGES = "/usr/lib/python3/dist-packages"
-# What pip installed goes before what Debian did, numpy and yaml above all; and what the tests import
-# goes before what is installed.
+# What pip installed goes before what Debian did, numpy and yaml above all; what the tests import,
+# before both.
 _PYTHON = f"""
 import runpy, sys
 sys.path.insert(0, {str(Path(mp4ds.__file__).parents[1])!r})

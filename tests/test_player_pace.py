@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +13,15 @@ import pytest
 
 import mp4ds
 from each import each
+from mp4ds.bags.formats import open_writer
 from mp4ds.errors import PublishError
 from mp4ds.plugins.playing import pace, timeline
 from mp4ds.plugins.playing.pace import Lateness, Ticks
 from mp4ds.plugins.playing.play import PlayOptions, open_player
 from mp4ds.plugins.playing.player import Player, PlaySummary
-from player_scenes import MS, STEP, RecordingPublisher, make_ros2
+from mp4ds.records import Message
+from player_scenes import MS, START, STEP, RecordingPublisher, make_ros2, ros2_channel, text
+from waiting import WATCHDOG_S, until
 
 NS = 10**9
 CHATTER = "/chatter"
@@ -200,6 +206,97 @@ def test_the_clock_waits_for_what_is_not_read_in_time(drive: Path, slow_reading:
     assert summary.slowed_s > 0.3
     times = [one.time_ns for one in publisher.clocks]
     assert times == sorted(times)
+
+
+# ---------------------------------------------------------------- pausing, skipping, the end
+
+
+@pytest.fixture
+def gap(tmp_path: Path) -> Path:
+    """Two strings, an hour apart."""
+    channel = ros2_channel(0, CHATTER, "std_msgs/msg/String")
+    with open_writer(
+        tmp_path / "gap.mcap", "mcap", name="gap", profile="ros2", library="", storage="mcap"
+    ) as writer:
+        writer.add_channel(channel)
+        for n in range(2):
+            time_ns = START + n * 3600 * NS
+            writer.write(Message(channel, time_ns, time_ns, 0, text(f"{n}")))
+    mp4ds.pack(tmp_path / "gap.mcap", tmp_path / "gap")
+    return tmp_path / "gap"
+
+
+def test_empty_times_are_skipped(gap: Path) -> None:
+    publisher, summary = run(gap, skip_empty=60.0, clock=20.0)
+    assert len(publisher.sent) == 2
+    assert summary.seconds < 3000
+    assert summary.slowed_s == 0
+
+
+@each(
+    ("options", "last"),
+    [
+        ({"until_nsec": START + 100 * MS}, 100),
+        ({"until_sec": (START + 125 * MS) / NS}, 100),
+        ({"until_nsec": START + 200 * MS, "duration": 0.1}, 200),
+        ({"until_nsec": START, "duration": 0.1}, 100),
+        ({"until_nsec": -1, "until_sec": -1.0}, 950),
+    ],
+)
+def test_the_last_time_that_is_played(drive: Path, options: dict[str, Any], last: int) -> None:
+    publisher, _ = run(drive, immediate=True, topics=[CHATTER], **options)
+    assert publisher.sent[-1].time_ns == START + last * MS
+
+
+@contextmanager
+def running(
+    drive: Path, publisher: RecordingPublisher, **options: Any
+) -> Iterator[tuple[Player, threading.Thread]]:
+    with open_player(drive, PlayOptions(**options), publisher=publisher) as player:
+        thread = threading.Thread(target=player.run)
+        thread.start()
+        try:
+            yield player, thread
+        finally:
+            player.stop()
+            thread.join(WATCHDOG_S)
+
+
+def test_it_pauses_before_messages_of_a_topic(drive: Path) -> None:
+    publisher = RecordingPublisher(world="ros2")
+    with running(drive, publisher, rate=10.0, pause_topics=["/map"]) as (player, thread):
+        until(lambda: player.is_paused)
+        assert "/map" not in {sent.topic for sent in publisher.sent}
+        assert player.play_next()
+        assert publisher.sent[-1].payload == text("map 0")
+        player.resume()  # as with rosbag play, also for the next one, which it stands before
+        until(lambda: not thread.is_alive())
+    assert len(publisher.sent) == 26
+    publisher = RecordingPublisher(world="ros2")
+    options = PlayOptions(rate=10.0, pause_topics=["/map"])
+    with open_player(drive, options, publisher=publisher) as player:
+        player.toggle_topic_pauses()
+        assert not player.run().stopped
+    assert len(publisher.sent) == 26
+
+
+def test_it_waits_for_the_stamps_that_control_its_rate(drive: Path) -> None:
+    publisher = RecordingPublisher(world="ros2")
+    options = {"rate_control_topic": "/odom", "rate_control_max_delay": 0.1}
+    with running(drive, publisher, topics=[CHATTER], rate=5.0, **options) as (player, thread):
+        until(lambda: len(publisher.sent) == 3)  # of 0, 50 and 100 ms
+        time.sleep(0.3)
+        assert len(publisher.sent) <= 3
+        assert publisher.on_message is not None
+        publisher.on_message(None)  # without a stamp
+        publisher.on_message(START + 500 * MS)
+        until(lambda: len(publisher.sent) >= 12)
+        time.sleep(0.3)
+        assert len(publisher.sent) <= 13
+        publisher.on_message(START + NS)
+        until(lambda: not thread.is_alive())
+        assert not player.is_paused
+    assert len(publisher.sent) == 20
 
 
 # ---------------------------------------------------------------- types that are not installed

@@ -7,6 +7,7 @@ import select
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -15,11 +16,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mp4ds.cli.options import JsonFlag, takes
-from mp4ds.cli.output import complain, print_json, say, shown
-from mp4ds.cli.process import ending_signals, told_errors
+from mp4ds.cli.options import Command, JsonFlag, takes
+from mp4ds.cli.output import be_quiet, complain, is_quiet, print_json, say, shown
+from mp4ds.cli.play_words import STORAGES, spelled
+from mp4ds.cli.process import DEBUG, ending_signals, told_errors
 from mp4ds.errors import OptionError
 from mp4ds.plugins.playing.play import PlayOptions, open_player
+from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import Controls
 
 if TYPE_CHECKING:
@@ -301,7 +304,8 @@ def play_progress(*, is_quiet: bool) -> Iterator[Callable[[PlayProgress], None]]
 
 def tell(text: str) -> None:
     """Say something beside the result."""
-    complain(text)
+    if not is_quiet():
+        complain(text)
 
 
 def _standing(state: PlayProgress) -> str:
@@ -344,12 +348,34 @@ def print_play(summary: PlaySummary) -> None:
 
 # ---------------------------------------------------------------- play
 
-_DEFAULT_CLOCK_HZ = 100.0
+_NAMES = "mp4ds.names"  # what ROS told, in click's context
+
+
+class PlayCommand(Command):
+    """The command, which understands how the options of other players are typed."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse arguments, in the words of `rosbag play` and `ros2 bag play`."""
+        valued = {
+            name
+            for option in self.get_params(ctx)
+            if option.param_type_name == "option" and not getattr(option, "is_flag", False)
+            for name in option.opts
+        }
+        with told_errors("--json" in args):
+            words, ctx.meta[_NAMES] = spelled(args, valued.__contains__)
+        parsed: list[str] = super().parse_args(ctx, words)
+        return parsed
+
+
+COMMAND = PlayCommand
+_QUIET = {"error", "fatal"}
 
 
 @takes(PlayOptions, without=("to", "clock"))
 def play(
     options: Callable[[], PlayOptions],
+    context: typer.Context,
     datasets: Annotated[
         list[str], typer.Argument(metavar="DATASET...", help="Datasets; several are merged.")
     ],
@@ -368,8 +394,16 @@ def play(
         ),
     ] = False,
     clock_hz: Annotated[
-        float, typer.Option("--hz", help="The rate of --clock.")
-    ] = _DEFAULT_CLOCK_HZ,
+        float, typer.Option("--hz", help="The rate of --clock; 40 with --ros2.")
+    ] = 100.0,
+    storage: Annotated[
+        str, typer.Option("--storage", help="sqlite3 or mcap: of no meaning for datasets.")
+    ] = "",
+    log_level: Annotated[
+        str,
+        typer.Option("--log-level", help="debug, info, warn, error or fatal: what is told."),
+    ] = "",
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
     no_keyboard: Annotated[
         bool, typer.Option("--disable-keyboard-controls", help="Leave the keyboard alone.")
     ] = False,
@@ -381,16 +415,30 @@ def play(
     """Publish datasets as if they were the recording: into ROS 1, ROS 2 or Foxglove.
 
     Keys: space pauses; right: one message; left: one back; up and down: faster and slower.
+
+    With --ros2, -x is --exclude-regex, -s is --storage and -i a dataset, as in `ros2 bag play`;
+    with --ros1, -p is --prefix, as in `rosbag play`. Lists such as --topics /a /b are understood.
     """
     with told_errors(as_json), ExitStack() as stack:
+        names: NodeNames = context.meta.get(_NAMES, PLAIN)
+        _say_as_much(log_level or names.log_level, quiet)
+        if storage not in ("", *STORAGES):
+            raise OptionError(
+                f"`storage` {storage!r} is none of {', '.join(STORAGES)}. With --ros2, -s is "
+                "--storage; seconds to leave out are --start-offset."
+            )
         kinds = {"ros1": ros1, "ros2": ros2, "foxglove": foxglove}
         chosen = [name for name, on in kinds.items() if on]
         if len(chosen) > 1:
             raise OptionError(f"--{chosen[0]} contradicts --{chosen[1]}.")
         told = replace(
-            options(), to=chosen[0] if chosen else None, clock=clock_hz if clock else None
+            options(),
+            to=chosen[0] if chosen else None,
+            clock=clock_hz if clock else None,
+            names=names,
         )
-        report = stack.enter_context(play_progress(is_quiet=as_json or not progress))
+        is_silent = as_json or not progress or is_quiet()
+        report = stack.enter_context(play_progress(is_quiet=is_silent))
         player = stack.enter_context(open_player(datasets, told, progress=report))
         tell(f"publishing to {player.address}")
         if player.follows_clock:
@@ -405,6 +453,18 @@ def play(
         print_play(summary)
     if caught:
         raise typer.Exit(128 + caught[0])
+
+
+def _say_as_much(level: str, quiet: bool) -> None:
+    """Tell as much as was asked for."""
+    if level not in ("", "debug", "info", "warn", *_QUIET):
+        raise OptionError(f"`log_level` {level!r} is not debug, info, warn, error or fatal.")
+    if level == "debug":
+        os.environ[DEBUG] = "1"
+    if quiet or level in ("warn", *_QUIET):
+        be_quiet()
+    if level in _QUIET:
+        warnings.simplefilter("ignore")
 
 
 @contextmanager
