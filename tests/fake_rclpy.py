@@ -152,7 +152,7 @@ class Subscription:
 class Node:
     def __init__(self, name: str, context: Context, bus: Bus, namespace: str = "") -> None:
         self.name, self.context, self.bus = name, context, bus
-        self.namespace = "/".join(filter(None, ("", namespace.strip("/"))))
+        self.namespace = f"/{namespace.strip('/')}" if namespace else ""
         self.inbox: queue.Queue[Callable[[], None]] = queue.Queue()
 
     def get_name(self) -> str:

@@ -18,6 +18,7 @@ import pytest
 import fake_rclpy
 from mp4ds.bags.convert import LATCHED_QOS
 from mp4ds.errors import ConversionError, OptionError, PublishError, Refused
+from mp4ds.plugins.publishing.names import NodeNames
 from mp4ds.plugins.publishing.ros2 import RclpyPublisher
 from mp4ds.plugins.publishing.ros2_writers import Qos, load_overrides, offered_qos, recorded_qos
 from mp4ds.records import Channel, Schema
@@ -216,6 +217,25 @@ def test_services_belong_to_the_node(side: Side) -> None:
     with side.open(node="other") as publisher:
         publisher.serve(Player())
         assert side.peer.call("/other/get_rate", "GetRate", {}) == {"rate": 2.5}
+
+
+def test_ros_names_the_node_and_its_clock(side: Side) -> None:
+    names = NodeNames("player", "/robot", (("/clock", "/sim"),))
+    with side.open(names=names) as publisher:
+        publisher.serve(Player())
+        publisher.clock(0)
+        assert side.peer.call("/robot/player/get_rate", "GetRate", {}) == {"rate": 2.5}
+        side.peer.subscribe("/sim", "rosgraph_msgs/msg/Clock", reliable=False)
+        assert side.peer.connected("/sim", 1) == 1
+
+
+@pytest.mark.parametrize("seconds", [0.5, float("inf")])
+def test_subscribers_have_as_long_as_they_are_given(side: Side, seconds: float) -> None:
+    recorded = channel("/robot/topic", STRING)
+    with side.open(parting_s=seconds) as publisher:
+        connect(side, publisher, recorded)
+        publisher.publish(recorded, message(STRING, 1), 0)
+    assert len(side.peer.received("/robot/topic", 1)) == 1
 
 
 def test_who_is_closed_is_gone(side: Side) -> None:
