@@ -160,7 +160,7 @@ def test_signals(drive: Path, number: signal.Signals) -> None:
         (["{}", "--foxglove", "--rate", "0"], 2, "--rate 0 is not above 0"),
         (["{}", "--foxglove", "--topics", "/none"], 2, "matches no topic"),
         (["{}", "--foxglove", "--qos-profile-overrides-path", "x"], 2, "goes with --ros2"),
-        (["{}", "--foxglove", "--resize", "big"], 2, "--resize 'big' is no size"),
+        (["{}", "--foxglove", "--resize", "big"], 2, "--resize 'big' is not a size"),
         (["{}/none", "--foxglove"], 2, "none"),
         (["{}", "--foxglove", "--lock-step", "/odom"], 2, "--foxglove"),
         (["{}", "--foxglove", "--follow-clock"], 2, "--foxglove"),

@@ -106,9 +106,9 @@ class RclpyPublisher:
         """
         from rclpy.exceptions import InvalidTopicNameException
 
-        kind = _message_class(topic, type_name)
+        kind = _installed_class(topic, type_name)
         try:
-            return self._node.create_publisher(kind, topic, _profile(qos))
+            return self._node.create_publisher(kind, topic, qos_profile(qos))
         except InvalidTopicNameException:
             remedy = "Play it under another name."
             raise ConversionError(topic, "ROS 2 has no topics of such names", remedy) from None
@@ -160,15 +160,15 @@ class RclpyPublisher:
                 qos = Qos(reliability="reliable" if reliable else "best_effort")
                 try:
                     self._subscribe(topic, others[0].topic_type, qos, lambda _: on_message(None))
-                except (ConversionError, Refused) as error:
+                except ConversionError as error:
                     self._node.get_logger().error(str(error))
                 return
 
     def _subscribe(
         self, topic: str, type_name: str, qos: Qos, on_raw: Callable[[bytes], None]
     ) -> None:
-        kind = _message_class(topic, type_name)
-        self._node.create_subscription(kind, topic, on_raw, _profile(qos), raw=True)
+        kind = message_class(topic, type_name)
+        self._node.create_subscription(kind, topic, on_raw, qos_profile(qos), raw=True)
 
     def serve(self, controls: Controls) -> None:
         """Offer the services of `ros2 bag play`, where rosbag2_interfaces is installed."""
@@ -227,13 +227,19 @@ class RclpyPublisher:
         self.close()
 
 
-def _message_class(topic: str, type_name: str) -> Any:
-    """The class of a type.
+def message_class(topic: str, type_name: str) -> Any:
+    """The class of a topic's messages.
 
     Raises:
-        Refused: It is not installed.
-        ConversionError: ROS 2 has no types of such names.
+        ConversionError: The type is not installed, or ROS 2 has no types of such names.
     """
+    try:
+        return _installed_class(topic, type_name)
+    except Refused as reason:
+        raise ConversionError(topic, str(reason), "Install and source its package.") from None
+
+
+def _installed_class(topic: str, type_name: str) -> Any:
     from rosidl_runtime_py.utilities import get_message
 
     try:
@@ -275,7 +281,8 @@ def _installed_hash(type_name: str) -> str:
         return ""
 
 
-def _profile(qos: Qos) -> Any:
+def qos_profile(qos: Qos) -> Any:
+    """A quality of service as rclpy has it."""
     from rclpy.duration import Duration
     from rclpy.qos import (
         DurabilityPolicy,
