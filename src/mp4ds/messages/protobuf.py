@@ -430,6 +430,6 @@ def _timestamp(stamp: int) -> bytes:
     """A google.protobuf.Timestamp as serializers write it."""
     sec, nanos = divmod(stamp, NS)
     if not -(1 << 63) <= sec < 1 << 63:
-        raise WireError("a time is outside the range of its field")
+        raise WireError("a time is beyond what its message has bits for")
     out = b"\x08" + _varint_bytes(sec & _UINT64) if sec else b""
     return out + (b"\x10" + _varint_bytes(nanos) if nanos else b"")

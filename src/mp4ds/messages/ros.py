@@ -121,7 +121,7 @@ class _Places:
             if self.body is not None:
                 struct.pack_into(f"{self.order}I", message, self.body - 4, body_size)
         except struct.error:
-            raise WireError("a time or number is outside the range of its field") from None
+            raise WireError("a time or number is beyond what its message has bits for") from None
 
 
 class RosForm:
