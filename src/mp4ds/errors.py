@@ -202,6 +202,16 @@ class WriteError(Mp4dsError, OSError):
         )
 
 
+class RecordError(Mp4dsError, OSError):
+    """The disk refused while a recording was made; what came before is kept."""
+
+    def __init__(self, folder: Path, target: Path, cause: BaseException) -> None:
+        super().__init__(
+            f"{folder}: could not be written: {reason_of(cause)}. What was recorded before is in "
+            f"it: make room, then run mp4ds pack --salvage {folder} -o {target}"
+        )
+
+
 class PartsFailedError(Mp4dsError):
     """Parts of a pack failed; finished parts are kept, so that the same command resumes.
 

@@ -35,6 +35,10 @@ COMMANDS = {
         "play",
         "Publish datasets as if they were the recording: into ROS 1, ROS 2 or Foxglove.",
     ),
+    "record": (
+        "record",
+        "Record topics of a live robot, ROS 1 or ROS 2, into a dataset.",
+    ),
     "report": (
         "report",
         "Make an HTML report: synchronised cameras, timing, topics, calibrations.",

@@ -50,6 +50,7 @@ _PANELS = {
     "What": (
         *("topics", "exclude", "regex", "start", "end", "duration", "start_offset", "topic", "at"),
         *("sheet", "every", "max_rate", "sync", "tolerance_ns", "camera_info", "salvage", "poses"),
+        *("all", "exclude_regex", "hidden", "max_duration", "max_size", "start_paused"),
         *("state", "action", "task", "cameras", "frames", "clips"),
     ),
     "How": (
@@ -58,7 +59,15 @@ _PANELS = {
         *("publish_as", "storage", "exact", "about", "skip_unconvertible", "rate", "loop"),
         *("delay", "paused", "immediate", "drop", "restamp", "lock_step", "clock", "hz"),
         *("follow_clock", "wait_for_subscribers", "qos_overrides", "read_ahead", "deep"),
-        *("intrinsics", "speed", "seconds"),
+        *(
+            "intrinsics",
+            "speed",
+            "seconds",
+            "buffer",
+            "use_sim_time",
+            "discover",
+            "polling_interval",
+        ),
     ),
     "Where": (
         *(

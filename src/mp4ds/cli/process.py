@@ -141,6 +141,32 @@ def ending_signals() -> list[signal.Signals]:
     return [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
 
 
+@contextmanager
+def caught_signals(stop: Callable[[], None]) -> Iterator[list[int]]:
+    """Let a command end in its own time at Ctrl-C and the like; at the second one, at once.
+
+    Args:
+        stop: Ends it.
+
+    Yields:
+        The numbers of the signals that came.
+    """
+    caught: list[int] = []
+
+    def end(number: int, _: Any) -> None:
+        if caught:  # asked again: whatever holds it up is not waited for
+            raise KeyboardInterrupt
+        caught.append(number)
+        stop()
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, *ending_signals())}
+    try:
+        yield caught
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def _end(number: int, _: object) -> None:
     if number != signal.SIGTERM:  # a lost terminal sends it more than once, even during cleanup
         signal.signal(number, signal.SIG_IGN)

@@ -21,6 +21,9 @@ from mp4ds.format.sidecars import MANIFEST_NAME
 _Item = TypeVar("_Item")
 _Made = TypeVar("_Made")
 
+_TIDY_S = 20.0
+"""Seconds that a process has to end, on its parent's word."""
+
 Paths = str | Path | Sequence[str | Path]
 """A path or several."""
 
@@ -113,25 +116,37 @@ def each(
                 "A worker process died, perhaps out of memory. Try fewer `jobs`."
             ) from None
         except BaseException:  # nobody waits for work in progress
-            for process in set(multiprocessing.active_children()) - before:
+            processes = set(multiprocessing.active_children()) - before
+            for process in processes:
                 process.terminate()
+            for process in processes:
+                process.join(_TIDY_S)
+                process.kill()  # one that has not ended would be waited for without end
             pool.shutdown(cancel_futures=True)
             raise
 
 
 def _leave_to_parent() -> None:
-    """Let the parent handle Ctrl-C; when it says so, clean up and exit."""
+    """Let the parent handle Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _end)
+
+
+def _worked(work: Callable[[_Item], _Made], item: _Item) -> _Made:
+    """Work, and tidy up if the parent's word to end comes meanwhile.
+
+    Where the pool itself is at work, ending is left to the system: the pool would take what a
+    handler raises for a result that cannot be sent, and go on.
+    """
+    try:
+        signal.signal(signal.SIGTERM, _end)
+        try:
+            return work(item)
+        finally:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    except SystemExit as ended:
+        os._exit(int(ended.code or 0))
 
 
 def _end(number: int, _: object) -> None:
     signal.signal(number, signal.SIG_IGN)  # the pool sends it, too, when another process has died
     sys.exit(128 + number)
-
-
-def _worked(work: Callable[[_Item], _Made], item: _Item) -> _Made:
-    try:
-        return work(item)
-    except SystemExit as ended:
-        os._exit(int(ended.code or 0))  # the pool would continue with the next item

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 from mp4ds.dataset.rebuild import CameraInfoWriter, MessageSplitter
 from mp4ds.errors import OptionError, Refused
+from mp4ds.format.models import CameraInfo
 from mp4ds.messages.serializations import is_calibration, is_camera, kind_of
 from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, Parts
+from mp4ds.packing.journal import Journal
 from mp4ds.packing.look import CameraMessage
 from mp4ds.packing.options import TopicSummary
-from mp4ds.packing.writer import StreamWriter
 from mp4ds.records import Channel, Message
 
 INFO_WINDOW = 50
@@ -360,12 +362,24 @@ _MAX_PENDING = 1000
 """Calibrations of a topic that may wait for their stream; with more, all are kept verbatim."""
 
 
+class CalibratedStream(Protocol):
+    """A stream that takes the calibrations of its camera.
+
+    Attributes:
+        channel: Of its messages.
+        camera_info: The calibrations, when all are there.
+    """
+
+    channel: Channel
+    camera_info: CameraInfo | None
+
+
 @dataclass
 class _InfoChannel:
     """A calibration channel whose stream exists, or may still come."""
 
     writer: CameraInfoWriter
-    owner: StreamWriter | None = None
+    owner: CalibratedStream | None = None
     pending: list[tuple[Message, int]] = field(default_factory=list)
 
 
@@ -385,6 +399,7 @@ class Calibrations:
         surveyed: Pairs already found by stamps, by id; None to compare stamps here.
         topic_of: The summary of a channel's topic.
         keep: Stores messages that belong to no stream.
+        journal: Where calibrations are noted; None: nowhere. Channels may appear later then.
 
     Raises:
         OptionError: A chosen pair is not possible.
@@ -398,24 +413,29 @@ class Calibrations:
         *,
         topic_of: Callable[[Channel], TopicSummary],
         keep: Callable[[Message], None],
+        journal: Journal | None = None,
     ) -> None:
         self._topic_of = topic_of
         self._keep = keep
+        self._journal = journal
         self._channels = {channel.id: channel for channel in channels}
         self._pairs = pair_camera_infos(channels, chosen=choose_pairs(chosen, channels))
         self._by_stamp = None
         if surveyed is not None:
             self._pairs.update(surveyed)
-        elif unpaired_infos(channels, self._pairs):
+        elif journal or unpaired_infos(channels, self._pairs):
             self._by_stamp = StampPairing()
         self._forms: dict[int, MessageSplitter] = {}
         self._infos: dict[int, _InfoChannel | None] = {}
         self._counts: Counter[tuple[object, ...]] = Counter()
-        self._streams: dict[tuple[object, ...], StreamWriter] = {}
+        self._streams: dict[tuple[object, ...], CalibratedStream] = {}
 
     def take(self, message: Message) -> None:
         """Add a calibration to its stream, or keep it if it belongs to none."""
         channel = message.channel
+        if self._journal is not None:
+            self._journal.calibration(message)
+        self._meet(channel)
         # its position among those of all channels with the same identity
         ordinal = self._counts[channel.identity]
         self._counts[channel.identity] += 1
@@ -436,11 +456,18 @@ class Calibrations:
 
     def saw(self, channel: Channel, seen: CameraMessage) -> None:
         """Note an image's stamp, for calibrations that names leave unpaired."""
+        self._meet(channel)
         if self._by_stamp is not None:
             size = seen.key.width, seen.key.height
             self._by_stamp.add(channel, seen.parts, size=size)
 
-    def adopt(self, stream: StreamWriter) -> None:
+    def _meet(self, channel: Channel) -> None:
+        """Pair a channel by its name if it was not known at the beginning."""
+        if channel.id not in self._channels:
+            self._channels[channel.id] = channel
+            self._pairs = pair_camera_infos(list(self._channels.values()), chosen=self._pairs)
+
+    def adopt(self, stream: CalibratedStream) -> None:
         """Give a channel's first stream the calibrations that waited for it."""
         self._streams.setdefault(stream.channel.identity, stream)
         self._settle()
@@ -463,7 +490,7 @@ class Calibrations:
             return None
         return _InfoChannel(CameraInfoWriter(channel), self._owner_of(channel.id))
 
-    def _owner_of(self, info_id: int) -> StreamWriter | None:
+    def _owner_of(self, info_id: int) -> CalibratedStream | None:
         image_id = self._pairs.get(info_id)
         if image_id is None:
             return None
@@ -482,7 +509,10 @@ class Calibrations:
         except Refused:
             return  # it is kept verbatim when it is taken or given up
         if len(state.pending) % INFO_WINDOW == 0:
-            self._pairs.update(self._by_stamp.decide(self._pairs, final=False))
+            found = self._by_stamp.decide(self._pairs, final=False)
+            if found and self._journal is not None:
+                self._journal.pairs(found)
+            self._pairs.update(found)
             self._settle()
 
     def _settle(self) -> None:

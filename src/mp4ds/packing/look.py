@@ -93,15 +93,17 @@ class Looker:
     Args:
         channel: The channel.
         transcode: Decode JPEG files instead of taking them as packets.
+        is_live: Leave what takes long to be taken apart.
     """
 
-    def __init__(self, channel: Channel, *, transcode: bool = False) -> None:
+    def __init__(self, channel: Channel, *, transcode: bool = False, is_live: bool = False) -> None:
         self._is_packets = _holds_packets(channel)
         self._forms = MessageSplitter(channel)
         self._parsers: dict[str, PictureParser] = {}
         self._png: png.PngRecipe | None = None
         self._png_refusals = 0
         self._transcode = transcode
+        self._is_live = is_live
 
     def look(self, message: Message) -> CameraMessage:
         """What a message holds.
@@ -171,6 +173,8 @@ class Looker:
     @contextmanager
     def _png_trial(self) -> Iterator[None]:
         """Give up on a topic whose files cannot be rebuilt: trying is costly."""
+        if self._is_live:
+            raise Refused("PNG and RVL files are stored as they are while recording")
         if self._png_refusals == _MAX_PNG_REFUSALS:
             raise Refused("PNG files of its topic do not rebuild")
         try:

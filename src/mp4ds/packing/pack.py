@@ -40,6 +40,7 @@ from mp4ds.packing.job import (
     outcome_options,
     span_of,
 )
+from mp4ds.packing.journal import is_unfinished
 from mp4ds.packing.manifest import (
     Origin,
     PartRecord,
@@ -213,6 +214,7 @@ def _digest(reader: BagReader, number: int) -> tuple[int, str]:
 
 
 Report = Callable[[PackProgress], None]
+_USUAL = PackOptions()
 
 
 def pack(
@@ -254,12 +256,28 @@ def _pack(
     store = remote(target)
     if store:
         return _pack_to_store(paths, store, options, progress)
+    if any(map(is_unfinished, paths)):
+        return _recovered(paths, target, options)
     if options.quality is None:
         return _copied(paths, target, options, progress)
     run = _plan(paths, target, options)
     if run.is_new and run.job.is_single and not options.cluster:
         return until_in_reach(partial(_pack_in_one_pass, run, progress))
     return _pack_runs([run], options, progress)[0]
+
+
+def _recovered(paths: Sequence[Path], target: Path, options: PackOptions) -> PackSummary:
+    """The dataset of a recording that was cut off while `mp4ds record` made it."""
+    from mp4ds.packing.recovery import recover
+
+    usual = replace(_USUAL, salvage=True, force=options.force, about=options.about)
+    if len(paths) > 1 or replace(options, quality=None) != usual:
+        raise OptionError(
+            f"{paths[0]} was being recorded when it was cut off. Make a dataset of it first: mp4ds "
+            f"pack --salvage {paths[0]} -o DATASET, and pack that."
+        )
+    about = load_about(options.about) if options.about is not None else None
+    return recover(paths[0], target, force=options.force, about=about)
 
 
 def _copied(

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import TypeVar
 
 from mp4ds.bags.mcap_write import McapWriter
-from mp4ds.bags.protocols import BagReader, BagWriter
+from mp4ds.bags.protocols import BagReader
 from mp4ds.bags.salvage.losses import losses_of
 from mp4ds.errors import OutOfReachError, Refused
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.messages.transforms import TransformCollector
 from mp4ds.packing.calibrations import Calibrations
 from mp4ds.packing.engine import Workers
+from mp4ds.packing.journal import Journal
 from mp4ds.packing.look import CameraMessage, Looker, StreamKey
 from mp4ds.packing.manifest import PartRecord, PartStream, declare_rest
 from mp4ds.packing.options import TopicSummary
@@ -28,6 +29,7 @@ from mp4ds.records import EVERYTHING, Attachment, Channel, Excerpt, Message, Rec
 Exact = Mapping[tuple[int, StreamKey], str]
 """Channel id and key of streams that no longer need to reach a score -> why."""
 
+TOO_LATE = "recorded faster than it could be encoded"
 NOT_SURVEYED = (
     "images of its size or encoding were not in the parts of the recording that were surveyed"
 )
@@ -85,8 +87,9 @@ class CameraRouter:
         calibrations: Notified of new streams.
         survey: Earlier decisions; None to decide here.
         topic_of: The summary of a channel's topic.
-        keep: Stores what no stream can carry exactly.
+        keep: Stores what no stream can carry exactly, with the reason.
         exact: Streams that must be lossless although a score is asked for, and why.
+        journal: Where to note what is done; None: nowhere.
     """
 
     def __init__(
@@ -98,12 +101,14 @@ class CameraRouter:
         survey: Survey | None,
         *,
         topic_of: Callable[[Channel], TopicSummary],
-        keep: Callable[[Message], None],
+        keep: Callable[[Message, str], None],
         exact: Exact,
+        journal: Journal | None = None,
     ) -> None:
         self._reader = reader
         self._folder = folder
         self._settings = settings
+        self._journal = journal
         self._calibrations = calibrations
         self._survey = survey
         self._topic_of = topic_of
@@ -124,7 +129,7 @@ class CameraRouter:
             seen = state.looker.look(message)
         except Refused as reason:
             self._settle(state, workers)
-            self._keep_verbatim(message, number, str(reason))
+            self._keep_verbatim(message, ordinal, number, str(reason))
             return
         self._calibrations.saw(channel, seen)
         item = _Item(message, ordinal, number, seen)
@@ -141,7 +146,8 @@ class CameraRouter:
 
     def _state_of(self, channel: Channel) -> _CameraChannel:
         if channel.identity not in self._channels:
-            looker = Looker(channel, transcode=self._settings.transcode)
+            settings = self._settings
+            looker = Looker(channel, transcode=settings.transcode, is_live=settings.is_live)
             state = self._channels[channel.identity] = _CameraChannel(looker)
             decisions = self._survey.decisions.get(channel.id) if self._survey else None
             if decisions is not None:
@@ -186,6 +192,10 @@ class CameraRouter:
         route = state.routes[item.seen.key]
         reason = route.refusal
         for stream in self._candidates(state, route, item):
+            number = self._streams.index(stream)
+            if workers.is_late(number):
+                reason = TOO_LATE
+                break
             try:
                 job = stream.accept(item.message, item.seen, item.ordinal)
             except Refused as refusal:
@@ -194,10 +204,10 @@ class CameraRouter:
             self._topic_of(item.message.channel).frames += 1
             if stream.frames == 1:
                 self._calibrations.adopt(stream)
-            workers.submit(self._streams.index(stream), job)
+            workers.submit(number, job)
             return
         state.looker.leave_out(item.seen)
-        self._keep_verbatim(item.message, item.number, route.refusal or reason)
+        self._keep_verbatim(item.message, item.ordinal, item.number, route.refusal or reason)
 
     def _candidates(
         self, state: _CameraChannel, route: _Route, item: _Item
@@ -232,6 +242,7 @@ class CameraRouter:
             plan=plan,
             settings=self._settings,
             rate=self._rate(channel),
+            journal=self._journal,
         )
         self._streams.append(stream)
         if renamed:
@@ -240,9 +251,11 @@ class CameraRouter:
             self._topic_of(channel).notes.append(stream.note)
         return stream
 
-    def _keep_verbatim(self, message: Message, number: int, reason: str) -> None:
+    def _keep_verbatim(self, message: Message, ordinal: int, number: int, reason: str) -> None:
+        if self._journal is not None:
+            self._journal.verbatim(message.channel, ordinal, number, reason)
         self._topic_of(message.channel).count_verbatim(reason, number)
-        self._keep(message)
+        self._keep(message, reason)
 
     def finish(self) -> list[PartStream]:
         """Complete all videos and write their sidecars; all jobs must have run."""
@@ -318,9 +331,10 @@ class Packer:
         folder: The folder to fill, empty.
         settings: How.
         progress: Called after each record with what was packed so far.
+        journal: Where to note what is done; None: nowhere.
     """
 
-    _verbatim: BagWriter  # messages.mcap, open while `run` reads
+    _verbatim: McapWriter  # messages.mcap, open while `run` reads
 
     def __init__(
         self,
@@ -328,9 +342,11 @@ class Packer:
         folder: Path,
         settings: PartSettings,
         progress: Callable[[PartRecord], None] | None = None,
+        journal: Journal | None = None,
     ) -> None:
         self._reader = reader
         self._settings = settings
+        self._journal = journal
         self._progress = progress
         self._transforms = TransformCollector()
         self._part = PartRecord(folder)
@@ -341,6 +357,7 @@ class Packer:
             survey.pairs if survey else None,
             topic_of=self._part.topic,
             keep=self._keep,
+            journal=journal,
         )
         self._cameras = CameraRouter(
             reader,
@@ -351,6 +368,7 @@ class Packer:
             topic_of=self._part.topic,
             keep=self._keep,
             exact=settings.exact,
+            journal=journal,
         )
 
     def run(self) -> PartRecord:
@@ -403,6 +421,8 @@ class Packer:
         if not self._settings.selected(channel.topic):
             part.left_out[channel.topic] = None
             return
+        if self._journal is not None and channel.id not in part.counts:
+            self._journal.channel(channel)
         part.counts[channel.id] = part.counts.get(channel.id, 0) + 1
         topic = part.topic(channel)
         topic.messages += 1
@@ -416,6 +436,7 @@ class Packer:
         else:
             self._keep(record)
 
-    def _keep(self, message: Message) -> None:
+    def _keep(self, message: Message, reason: str = "") -> None:
+        del reason
         self._verbatim.add_channel(message.channel)
         self._verbatim.write(message)

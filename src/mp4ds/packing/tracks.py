@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -33,6 +33,8 @@ class StreamSettings:
         threads: Threads of each encoder.
         transcode: Whether JPEG topics are re-encoded.
         purpose: What the dataset is for; None for nothing in particular.
+        is_live: Whether it is encoded while it is recorded: with the fastest settings, untried,
+            into files of which a power cut leaves all but the end.
     """
 
     quality: QualitySetting
@@ -42,6 +44,11 @@ class StreamSettings:
     threads: int
     transcode: bool = False
     purpose: Purpose | None = None
+    is_live: bool = False
+
+
+OnPacket = Callable[[str, bytes], None]
+"""Told of a codec and a packet."""
 
 
 class Track(Protocol):
@@ -107,7 +114,12 @@ class TrackPlan(Protocol):
         ...
 
     def open(
-        self, path: Path, seen: CameraMessage, settings: StreamSettings, rate: float | None
+        self,
+        path: Path,
+        seen: CameraMessage,
+        settings: StreamSettings,
+        rate: float | None,
+        on_packet: OnPacket | None = None,
     ) -> Track:
         """Begin the file.
 
@@ -116,6 +128,7 @@ class TrackPlan(Protocol):
             seen: The first message.
             settings: How to encode.
             rate: Frames per second, where known.
+            on_packet: Called with the codec and each packet, of live streams.
 
         Raises:
             Refused: The encoder does not support such pictures.
@@ -141,10 +154,15 @@ class PicturePlan:
     gop: int = 0
 
     def open(
-        self, path: Path, seen: CameraMessage, settings: StreamSettings, rate: float | None
+        self,
+        path: Path,
+        seen: CameraMessage,
+        settings: StreamSettings,
+        rate: float | None,
+        on_packet: OnPacket | None = None,
     ) -> Track:
         """See `TrackPlan.open`."""
-        return _PictureTrack(self, path, seen.key, settings, rate)
+        return _PictureTrack(self, path, seen.key, settings, rate, on_packet)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,7 +172,12 @@ class TargetPlan(PicturePlan):
     target: QualityTarget
 
     def open(
-        self, path: Path, seen: CameraMessage, settings: StreamSettings, rate: float | None
+        self,
+        path: Path,
+        seen: CameraMessage,
+        settings: StreamSettings,
+        rate: float | None,
+        on_packet: OnPacket | None = None,
     ) -> Track:
         """See `TrackPlan.open`."""
         from mp4ds.packing.target import TargetTrack
@@ -181,6 +204,7 @@ class _PictureTrack:
         key: StreamKey,
         settings: StreamSettings,
         rate: float | None,
+        on_packet: OnPacket | None,
     ) -> None:
         self._layout = layout = plan.layout
         self.note = plan.note
@@ -197,6 +221,7 @@ class _PictureTrack:
                     gop=plan.gop or settings.gop,
                     threads=settings.threads,
                     rate=rate,
+                    on_packet=on_packet and partial(on_packet, recipe.codec),
                 )
             except EncoderRefusedError as error:
                 path.unlink(missing_ok=True)
@@ -268,16 +293,28 @@ class PacketPlan:
     note: str = ""
 
     def open(
-        self, path: Path, seen: CameraMessage, settings: StreamSettings, rate: float | None
+        self,
+        path: Path,
+        seen: CameraMessage,
+        settings: StreamSettings,
+        rate: float | None,
+        on_packet: OnPacket | None = None,
     ) -> Track:
         """See `TrackPlan.open`."""
-        return _PacketTrack(path, seen, rate, self.note)
+        return _PacketTrack(path, seen, rate, self.note, on_packet)
 
 
 class _PacketTrack:
     """See `Track`."""
 
-    def __init__(self, path: Path, seen: CameraMessage, rate: float | None, note: str) -> None:
+    def __init__(
+        self,
+        path: Path,
+        seen: CameraMessage,
+        rate: float | None,
+        note: str,
+        on_packet: OnPacket | None,
+    ) -> None:
         self.note = note
         self._key = seen.key
         self._begun = False
@@ -288,6 +325,7 @@ class _PacketTrack:
             height=seen.key.height,
             parameters=seen.parameters,
             rate=rate,
+            on_packet=on_packet and partial(on_packet, seen.key.codec),
         )
 
     def refuses(self, seen: CameraMessage) -> str | None:
@@ -343,7 +381,7 @@ _NEGLIGIBLE = 1 / 50
 
 def needs_trial(seen: CameraMessage, settings: StreamSettings) -> bool:
     """Whether `plan_tracks` benefits from having several messages."""
-    if seen.pixels is None:
+    if seen.pixels is None or settings.is_live:
         return False
     if settings.quality.target is not None:
         return True
@@ -387,6 +425,8 @@ def plan_tracks(
         if target is None:
             return [plan]
         return _target_plans(plan, target, samples, runs, settings, rate)
+    if settings.is_live:
+        return _live_plans(samples[0], settings)
     return _lossless_plans(samples, settings)
 
 
@@ -401,7 +441,7 @@ def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) ->
     crf, preset = quality.crf, settings.preset
     if crf is None:  # the search for a score starts there
         crf, table_preset = visual_setting(rate)
-        if settings.codec in (None, *AV1):
+        if settings.codec in (None, *AV1) and not settings.is_live:
             usual = PURPOSE_PRESET if settings.purpose else str(table_preset)
             preset = preset or (_SCORE_PRESET if quality.target else usual)
     recipe = recipe_for(
@@ -411,6 +451,7 @@ def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) ->
         crf=crf,
         preset=preset,
         varied=quality.target is not None,
+        live=settings.is_live,
     )
     return PicturePlan(layout, recipe, str(quality), exact=False)
 
@@ -480,6 +521,17 @@ def _lossless_plans(
         return [plan]
     recipe = recipe_for(general.pixel_format, lossless=True)
     return [plan, PicturePlan(general, recipe, "lossless", exact=True)]
+
+
+def _live_plans(seen: CameraMessage, settings: StreamSettings) -> list[TrackPlan]:
+    """Without loss, by what encodes in the least time (spec/notes.md)."""
+    layout = layout_for(ENCODINGS[seen.key.encoding], lossless=True)
+    able = lossless_codecs(layout.pixel_format)
+    codec, preset = settings.codec, settings.preset
+    if codec not in able:  # of those that are, H.264 has the fastest presets
+        codec, preset = ("h264" if "h264" in able else able[0]), None
+    recipe = recipe_for(layout.pixel_format, lossless=True, codec=codec, preset=preset, live=True)
+    return [PicturePlan(layout, recipe, "lossless", exact=True)]
 
 
 def _refuse_noise(samples: Sequence[CameraMessage], video_size: float) -> None:

@@ -287,6 +287,16 @@ _LOSSLESS: dict[str, dict[str, _Coding]] = {
     },
     **{planar: {"h264": _x264_lossless(planar), "ffv1": _ffv1_8bit(planar)} for planar in _YUV},
 }
+# encodes 640x480 at more than 100 MB/s, five times as fast as what pack uses and 15 % larger
+_LIVE_PRESETS = MappingProxyType(
+    {
+        **dict.fromkeys(("libx264", "libx264rgb", "libx265"), "ultrafast"),
+        "libsvtav1": "11",
+    }
+)
+_LOW_DELAY = (
+    "hierarchical-levels=2:lookahead=0"  # 12 frames; without any, videos were three times as large
+)
 _X26X_PRESETS = (
     *("ultrafast", "superfast", "veryfast", "faster", "fast"),
     *("medium", "slow", "slower", "veryslow"),
@@ -427,6 +437,7 @@ def recipe_for(
     preset: str | None = None,
     varied: bool = False,
     fast: bool = False,
+    live: bool = False,
 ) -> Recipe:
     """The recipe for pictures of a pixel format.
 
@@ -439,6 +450,7 @@ def recipe_for(
         preset: The encoder's preset, or None for the default; encoders without ignore it.
         varied: Whether videos with several crf will be joined into one.
         fast: For a lossless recipe, the variant that decodes faster and is larger.
+        live: By default, the fastest preset; few frames wait for later ones.
 
     Raises:
         OptionError: The codec is unknown or cannot do it; names those that can.
@@ -462,9 +474,13 @@ def recipe_for(
             parameters = options.get("x264-params")
             options["x264-params"] = ":".join(filter(None, (parameters, _SAME_HEADERS)))
     if coding.default_preset:
-        options["preset"] = preset or coding.default_preset
-    if coding.tuning and preset is None:
+        usual = _LIVE_PRESETS.get(coding.encoder) if live else None
+        options["preset"] = preset or usual or coding.default_preset
+    if coding.tuning and preset is None and not live:
         options["x264-params"] = coding.tuning
+    if live and coding.encoder == "libsvtav1":
+        given = options.get("svtav1-params")
+        options["svtav1-params"] = f"{given}:{_LOW_DELAY}" if given else _LOW_DELAY
     if fast:
         if coding.fast is None or not lossless:
             raise OptionError(f"codec {name} has no faster form for {pixel_format} pictures")

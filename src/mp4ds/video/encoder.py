@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
@@ -18,7 +18,7 @@ from mp4ds.errors import EncoderRefusedError, HardwareError
 from mp4ds.messages.arrangements import Picture
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import HARDWARE, Recipe
-from mp4ds.video.media import raise_if_scarce
+from mp4ds.video.media import new_mp4, raise_if_scarce
 from mp4ds.video.pixels import PictureConverter, picture_to_frame
 
 _THREADS = Path("/proc/self/task")
@@ -80,6 +80,8 @@ class VideoEncoder:
         gop: Maximum distance of key frames, in frames.
         threads: Threads of the encoder.
         rate: Frames per second, if known; a hint for the encoder's look-ahead.
+        on_packet: Called with each packet before it is written. What was written can then be read
+            at any time; see `new_mp4`.
 
     Raises:
         EncoderRefusedError: The codec does not take such pictures.
@@ -97,9 +99,11 @@ class VideoEncoder:
         gop: int,
         threads: int,
         rate: float | None,
+        on_packet: Callable[[bytes], None] | None = None,
     ) -> None:
         self.recipe = recipe
         self.frames = 0
+        self._on_packet = on_packet
         self._picture_format = picture_format
         # a camera's own YUV keeps its range
         self._converter = PictureConverter(
@@ -107,15 +111,7 @@ class VideoEncoder:
         )
         self.width, self.height = coded_size(recipe, width, height)
         self.options = {**_options(recipe, self.width, self.height), "g": str(gop)}
-        self._container = av.open(
-            str(path.absolute()),  # ffmpeg takes a relative name with a colon for an address
-            "w",
-            format="mp4",
-            options={
-                "video_track_timescale": str(TIMESCALE),
-                "movie_timescale": str(TIMESCALE),
-            },
-        )
+        self._container = new_mp4(path, is_durable=on_packet is not None)
         try:
             self._open_stream(threads, rate)
         except MemoryError:  # which FFmpegError may be, too: no fault of the pictures
@@ -167,9 +163,14 @@ class VideoEncoder:
         frame.pts = tick
         frame.time_base = _TIME_BASE
         frame.color_range = color_range(self.recipe)
-        for packet in self._encoded(frame):
-            self._container.mux(packet)
+        self._mux(self._encoded(frame))
         self.frames += 1
+
+    def _mux(self, packets: Sequence[Any]) -> None:
+        for packet in packets:
+            if self._on_packet is not None:
+                self._on_packet(bytes(packet))
+            self._container.mux(packet)
 
     def _encoded(self, frame: av.VideoFrame | None) -> Sequence[Any]:
         try:
@@ -192,8 +193,7 @@ class VideoEncoder:
             HardwareError: A device failed.
         """
         try:
-            for packet in self._encoded(None):
-                self._container.mux(packet)
+            self._mux(self._encoded(None))
         finally:
             self._container.close()
 
