@@ -7,8 +7,9 @@ node that publishes, and ROS's own recorder. Sections:
 
 - steady: two Bayer cameras of 640x480 at 30 Hz and an IMU of 200 Hz: whether all messages are
   there, with the bytes, stamps and connection headers of ``rosbag record``; what both cost.
-- overload: four cameras of 2448x2048 at 15 Hz, which no two cores can encode: what of that which
-  ``rosbag record`` kept is not there, and how much memory it took.
+- overload: four cameras of 2448x2048 at 15 Hz, which no two cores can encode, from a publisher
+  that waits for its subscribers: what of that which ``rosbag record`` kept is not there, and how
+  much memory it took.
 - kills: N times ``kill -9`` at a random moment: seconds between the last message that is there and
   the end, and whether all before are those that ``rosbag record`` has.
 """
@@ -42,6 +43,8 @@ from roscore import RECORD, Core, missing, python, wait_until
 
 PUBLISHER = str(Path(__file__).with_name("recording_publisher.py"))
 OTHERS = "/rosout.*|/clock"
+STEADY = (2, "640x480", 30, 200, 30)
+OVERLOAD = (4, "2448x2048", 15, 0, 0)
 NS = 10**9
 _TICKS = os.sysconf("SC_CLK_TCK")
 
@@ -107,10 +110,9 @@ def theirs(bag: Path) -> list[str]:
     return [RECORD, "-a", "-O", str(bag), "-x", OTHERS]
 
 
-def publisher(core: Core, cameras: int, size: str, hertz: int, imu: int, *rest: float) -> Any:
+def publisher(core: Core, *robot: object) -> Any:
     """A robot; see recording_publisher.py."""
-    arguments = [str(one) for one in (cameras, size, hertz, imu, *rest)]
-    command = [*core._prefix, *python(PUBLISHER, *arguments)]
+    command = [*core._prefix, *python(PUBLISHER, *map(str, robot))]
     path = {"PYTHONPATH": str(Path(PUBLISHER).parent)}
     return subprocess.Popen(
         command, env={**core.environment, **path}, stdout=subprocess.PIPE, text=True
@@ -156,6 +158,11 @@ def beside(core: Core, folder: Path, seconds: float, *robot: Any) -> None:
     elapsed = time.monotonic() - begun
     after = {name: Cost.of(one.pid) for name, one in recorders.items()}
     codes = {name: end(one) for name, one in recorders.items()}
+    print(f"- published for {elapsed:.1f} s")
+    for line in (core.folder / "python.log").read_text().splitlines():
+        if "dropped" in line:
+            print(f"- {line}")
+    print()
     (found, heads), (due, their_heads) = messages(unpacked(dataset, folder)), messages(bag)
     rows = [
         (
@@ -207,7 +214,7 @@ def kills(core: Core, folder: Path, count: int) -> None:
     bag = folder / "rosbag.bag"
     bag.unlink(missing_ok=True)
     reference = core.start(*theirs(bag))
-    source = publisher(core, 2, "640x480", 30, 200, 0, 1)
+    source = publisher(core, *STEADY, 0, 1)
     assert said(source) == "begun"
     made: list[tuple[Path, int]] = []
     for number in range(count):
@@ -272,9 +279,9 @@ def main() -> None:
             print(f"\n### {name}\n\n- load before: {os.getloadavg()[0]:.2f}\n", flush=True)
             with Core(logs) as core:
                 if name == "steady":
-                    beside(core, folder, arguments.seconds, 2, "640x480", 30, 200)
+                    beside(core, folder, arguments.seconds, *STEADY)
                 elif name == "overload":
-                    beside(core, folder, 10.0, 4, "2448x2048", 15, 0)
+                    beside(core, folder, 10.0, *OVERLOAD)
                 else:
                     kills(core, folder, arguments.kills)
 

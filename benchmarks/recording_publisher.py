@@ -1,10 +1,11 @@
 """Cameras and an IMU of a robot, by rospy. Knows nothing of mp4ds.
 
-    recording_publisher.py CAMERAS WIDTHxHEIGHT HZ IMU_HZ SECONDS SUBSCRIBERS
+    recording_publisher.py CAMERAS WIDTHxHEIGHT HZ IMU_HZ QUEUE SECONDS SUBSCRIBERS
 
 Publishes Bayer images with the noise of a camera (see clips.py) as /camN/image_raw, their
 CameraInfo, and /imu, when each topic has so many subscribers; says then that it begins, and at its
-end how many messages of each topic it published. Without an end where SECONDS is 0.
+end how many messages of each topic it published. Without an end where SECONDS is 0. So many
+messages wait for a subscriber that is slow; where QUEUE is 0, the publisher waits for it instead.
 """
 
 from __future__ import annotations
@@ -24,8 +25,6 @@ import clips
 
 KEPT_BYTES = 64 << 20
 """Of frames that are published again and again."""
-
-QUEUE = 30
 
 
 class RawImage(Image):  # type: ignore[misc]
@@ -74,14 +73,14 @@ def run(hertz: float, seconds: float, publish: Any, counts: dict[str, int], topi
 
 def main() -> None:
     """Publish."""
-    cameras, dimensions, hertz, imu_hertz, seconds, subscribers = sys.argv[1:]
+    cameras, dimensions, hertz, imu_hertz, queue, seconds, subscribers = sys.argv[1:]
     width, height = map(int, dimensions.split("x"))
     frames = frames_of((width, height), float(hertz))
     rospy.init_node("robot", disable_rostime=True)
     tasks, counts, publishers = [], {}, []
 
     def advertise(topic: str, kind: Any) -> Any:
-        publishers.append(rospy.Publisher(topic, kind, queue_size=QUEUE, tcp_nodelay=True))
+        publishers.append(rospy.Publisher(topic, kind, queue_size=int(queue) or None, tcp_nodelay=True))
         return publishers[-1]
 
     def camera(name: str) -> Any:
