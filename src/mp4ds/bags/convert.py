@@ -1,4 +1,4 @@
-"""Converts channels and messages between ROS 1 and ROS 2; standard definitions of either."""
+"""Converts channels and messages between ROS 1 and ROS 2; standard definitions of both."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def where_times_are(types: Typesdict, name: str) -> Where:
 
 
 def _parts(types: Typesdict, name: str) -> list[tuple[int, str, bool]]:
-    """Of the fields that are messages: place, type, and whether they are several."""
+    """The fields that are messages: place, type, and whether there are several."""
     shapes = [field_shape(desc) for _, desc in fields_of(types, name)]
     return [
         (place, shape.message, shape.length is not None or shape.bound is not None)
@@ -85,7 +85,7 @@ LATCHED_QOS = """\
   avoid_ros_namespace_conventions: false"""
 """Keep the last one, reliable, transient local: what ROS 1 calls latching."""
 
-_ROS1 = "ros1:"  # begins the keys that keep a ROS 1 connection header in ROS 2 metadata
+_ROS1 = "ros1:"  # prefix of the keys that keep a ROS 1 connection header in ROS 2 metadata
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 _REMEDY = "Exclude the topic with `exclude`, or unpack to mcap, which keeps it as it is."
 
@@ -96,12 +96,12 @@ class _Plan:
 
     Attributes:
         name: The type as rosbags spells it.
-        types: Its own definition, and those that it refers to.
-        store: The same with the header of ROS 2, which is what rosbags converts bytes by.
+        types: Its own definition and those it refers to.
+        store: The same with the header of ROS 2, which rosbags uses to convert bytes.
         schema: Definition for the target.
         digest: md5sum for ROS 1, type hash for ROS 2.
         times: Where its messages have times.
-        no_message: What is said of a payload that is not a message of the type.
+        no_message: The error for a payload that is not a message of the type.
     """
 
     name: str
@@ -147,14 +147,14 @@ class Converter:
 
     @property
     def omitted(self) -> Mapping[str, int]:
-        """What the target has no place for and was left out: a phrase -> how many."""
+        """What was left out because the target cannot hold it: a phrase -> how many."""
         return dict(self._omitted)
 
     def channel(self, channel: Channel) -> Channel:
-        """The channel as it is in the target; the same object if it is there already.
+        """The channel for the target; the same object if nothing changes.
 
         Raises:
-            ConversionError: It is not of ROS, or its definition is missing or damaged.
+            ConversionError: It is not a ROS channel, or its definition is missing or damaged.
         """
         if self._is_done(channel):
             return self._completed(channel) if self._to == "ros1" else channel
@@ -164,7 +164,7 @@ class Converter:
         return _ros2_channel(channel, plan)
 
     def payload(self, channel: Channel, data: bytes | memoryview) -> bytes | memoryview:
-        """A message of a source channel as it is in the target.
+        """A message of a source channel, converted for the target.
 
         Raises:
             ConversionError: It does not parse as the channel's type.
@@ -178,10 +178,10 @@ class Converter:
             raise ConversionError(channel.topic, str(reason), _REMEDY) from None
 
     def _completed(self, channel: Channel) -> Channel:
-        """A ROS 1 channel with the md5sum without which ROS 1 opens no bag.
+        """A ROS 1 channel with its md5sum, without which ROS 1 cannot open a bag.
 
-        Only where the source tells none (an MCAP file may not); a known standard type then
-        gets its definition too, if it has none.
+        Only if the source has none (as in some MCAP files); a known standard type then also gets
+        its definition, if it has none.
         """
         schema = channel.schema
         if schema is None or not schema.name or "md5sum" in channel.metadata:
@@ -242,7 +242,7 @@ class Converter:
         store, name = plan.store, plan.name
         problem = plan.no_message
         if to_ros1 and bytes(raw[:2]) == b"\0\0":
-            # rosbags converts bytes of little-endian CDR only.
+            # rosbags only converts little-endian CDR.
             message = by_library(problem, store.deserialize_cdr, raw, name)
             little_endian = partial(store.serialize_cdr, little_endian=True)
             raw = by_library(problem, little_endian, message, name)
@@ -250,7 +250,7 @@ class Converter:
         try:
             converted = by_library(problem, convert, raw, name)
         except Refused:
-            # ROS itself overlooks bytes after a message, such as RealSense cameras' bags hold.
+            # ROS itself ignores bytes after a message, which bags of RealSense cameras have.
             end = _end(plan, raw, to_ros1=to_ros1)
             if not (0 < len(raw) - end <= MAX_TAIL and fields_of(plan.types, name)):
                 raise
@@ -268,7 +268,7 @@ class Converter:
         return converted
 
     def _remembered(self, channel: Channel, plan: _Plan) -> Channel | None:
-        """The ROS 1 channel that this one was made from, if it tells and still fits."""
+        """The ROS 1 channel that this one was made from, if recorded and still valid."""
         known = {
             key[len(_ROS1) :]: value
             for key, value in channel.metadata.items()
@@ -317,7 +317,7 @@ def _ros2_channel(channel: Channel, plan: _Plan) -> Channel:
 
 
 def is_latched(channel: Channel) -> bool:
-    """Whether those that subscribe late get the last message: latching, or transient local."""
+    """Whether late subscribers get the last message: latching, or transient local."""
     if channel.metadata.get("latching", "").lower() in ("1", "true"):
         return True
     qos = channel.metadata.get(QOS_KEY, "")
@@ -340,7 +340,7 @@ def _end(plan: _Plan, raw: memoryview, *, to_ros1: bool) -> int:
 
 
 def _time_beyond(plan: _Plan, data: bytes | memoryview) -> int | None:
-    """Seconds of a time in a message that only ROS 2 takes for negative; None if there is none.
+    """Seconds of a time in a message that is negative in ROS 2 only, or None.
 
     Args:
         plan: Of its type.
@@ -412,7 +412,7 @@ def ros2_channel(channel_id: int, topic: str, type_name: str) -> Channel:
 
 
 def latched(channel: Channel) -> Channel:
-    """The same ROS 2 channel, which gives those that subscribe late its last message."""
+    """The same ROS 2 channel, latched: late subscribers get the last message."""
     return replace(channel, metadata={**channel.metadata, QOS_KEY: LATCHED_QOS})
 
 

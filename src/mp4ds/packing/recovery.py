@@ -41,7 +41,7 @@ from mp4ds.records import Channel, Loss, Message
 from mp4ds.video.packets import copy_fragments
 
 CUT_OFF = "the recording was cut off; what came in its last two seconds may be missing"
-_UNKNOWN = "kept as it was when the recording was cut off"
+_UNKNOWN = "stored as it was when the recording was cut off"
 
 
 def recover(
