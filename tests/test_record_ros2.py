@@ -14,6 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mp4ds
 from mp4ds.bags.formats import open_reader
+from mp4ds.plugins.publishing.names import NodeNames
 from mp4ds.plugins.publishing.ros2_writers import Qos, recorded_qos
 from mp4ds.plugins.recording.record import RecordOptions, open_recorder
 from mp4ds.plugins.recording.ros2_channels import (
@@ -119,6 +120,29 @@ def test_a_recording_is_a_rosbag2(side: Side, tmp_path: Path) -> None:
         assert reader.format == "rosbag2"
         found = [bytes(one.data) for one in reader.records() if isinstance(one, Message)]
     assert [*map(padded, found)] == [*map(padded, images)]
+
+
+def test_ros_renames_topics(side: Side) -> None:
+    """And /clock; the recording has the names that were asked for."""
+    names = NodeNames("bag", "/robot", (("name", "/front/name"), ("/clock", "/sim")))
+    found, clock = channel("/front/name", STRING), 1_700_000_000 * 10**9
+    heard = Heard()
+    options = SourceOptions("recorder", use_sim_time=True, names=names)
+    with side.open(names=names) as publisher:
+        publisher.advertise(found)
+        publisher.clock(clock)
+        source = open_source("ros2", options)
+        source.start(Wanted(("name",), names=names), heard.take)
+
+        def arrives() -> bool:
+            publisher.clock(clock)
+            publisher.publish(found, message(STRING, 1), 0)
+            return any(log == clock for _, log in heard.times)
+
+        assert until(arrives)
+        source.close()
+    assert {*heard.payloads} == {*source.state.topics} == {"/robot/name"}
+    assert source.address.endswith(("rclpy as bag", "Cyclone DDS"))
 
 
 def test_hidden_topics_are_left_out(side: Side) -> None:

@@ -168,6 +168,7 @@ def open_player(
     _check(chosen)
     kind = chosen.to or ("" if publisher else sourced())
     world = publisher.world if publisher else WORLDS.get(kind)
+    chosen = replace(chosen, names=chosen.names.in_world(world))
     places = datasets_in(datasets)
     with ExitStack() as stack:
         opened = [

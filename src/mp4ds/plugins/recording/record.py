@@ -34,6 +34,7 @@ from mp4ds.packing.planning import available_cores
 from mp4ds.packing.recovery import recover
 from mp4ds.packing.tracks import StreamSettings
 from mp4ds.plan import LOSSLESS, MAX_GOP, Selection, parse_quality
+from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import sourced
 from mp4ds.plugins.recording.source import Source, SourceOptions, Wanted, open_source
 from mp4ds.records import Message
@@ -103,6 +104,8 @@ class RecordOptions(Options):
         "YAML with title, description, authors, license, doi, links or keywords.", metavar="FILE"
     )
     force: bool = force()
+    names: NodeNames = PLAIN
+    """What ROS calls the node and its topics; without a counterpart among the options."""
 
 
 @dataclass(frozen=True)
@@ -218,6 +221,8 @@ def open_recorder(
         progress: See `record`.
     """
     chosen = options or RecordOptions()
+    world = source.profile if source else chosen.to or sourced()
+    names = chosen.names.in_world(world)
     if not (topics or chosen.all or chosen.regex):
         raise OptionError("Name topics, or give `all` or `regex`.")
     wanted = Wanted(
@@ -225,18 +230,20 @@ def open_recorder(
         regex="" if chosen.all else chosen.regex,
         exclude=chosen.exclude,
         exclude_regex=chosen.exclude_regex,
+        names=names,
     )
     settings = _settings(chosen)
     about = load_about(chosen.about) if chosen.about is not None else None
     if source is None:
         source = open_source(
-            chosen.to or sourced(),
+            world,
             SourceOptions(
                 chosen.node,
-                use_sim_time=chosen.use_sim_time,
+                use_sim_time=chosen.use_sim_time or bool(names.use_sim_time),
                 poll_s=chosen.polling_interval / 1000 if chosen.discover else None,
                 hidden=chosen.hidden,
                 qos_overrides=chosen.qos_overrides,
+                names=names,
             ),
         )
     with ExitStack() as stack:
@@ -312,6 +319,11 @@ class Recorder:
     def received(self) -> int:
         """Messages that came so far."""
         return sum(self._intake.received.values())
+
+    @property
+    def unfinished(self) -> list[Path]:
+        """Folders of which no dataset was made yet."""
+        return [split.folder for split in self._splits if split.folder.is_dir()]
 
     # ------------------------------------------------------------ controls
 
