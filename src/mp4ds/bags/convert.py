@@ -8,7 +8,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, is_dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -20,12 +20,14 @@ from mp4ds.bags.types import (
     BUILTIN,
     HEADER,
     MAX_TAIL,
+    World,
     by_library,
     field_shape,
     fields_of,
     incomprehensible,
     make_store,
     ros1_world,
+    ros2_store,
     ros2_world,
     same_wire,
     translate,
@@ -125,11 +127,23 @@ class Converter:
     def __init__(self, target: str | None, *, distribution: str = "humble") -> None:
         if target not in ("ros1", "ros2", None):
             raise OptionError(f"Messages cannot be converted to {target!r}. Use ros1 or ros2.")
-        self._ros1, self._ros2 = ros1_world(), ros2_world(distribution)
-        self._target = {"ros1": self._ros1, "ros2": self._ros2}.get(target or "")
-        self._source = self._ros1 if self._target is self._ros2 else self._ros2
+        ros2_store(distribution)  # is known
+        self._to, self._distribution = target, distribution
         self._plans: dict[Schema, _Plan] = {}
         self._omitted: Counter[str] = Counter()
+
+    # standard types take a while to load, and most recordings are in their target already
+    @cached_property
+    def _ros1(self) -> World:
+        return ros1_world()
+
+    @cached_property
+    def _ros2(self) -> World:
+        return ros2_world(self._distribution)
+
+    @property
+    def _source(self) -> World:
+        return self._ros1 if self._to == "ros2" else self._ros2
 
     @property
     def omitted(self) -> Mapping[str, int]:
@@ -143,9 +157,9 @@ class Converter:
             ConversionError: It is not a ROS channel, or its definition is missing or damaged.
         """
         if self._is_done(channel):
-            return self._completed(channel) if self._target is self._ros1 else channel
+            return self._completed(channel) if self._to == "ros1" else channel
         plan = self._plan(channel)
-        if self._target is self._ros1:
+        if self._to == "ros1":
             return self._remembered(channel, plan) or self._ros1_channel(channel, plan)
         return _ros2_channel(channel, plan)
 
@@ -184,7 +198,9 @@ class Converter:
         return replace(channel, schema=schema, metadata={"md5sum": digest, **channel.metadata})
 
     def _is_done(self, channel: Channel) -> bool:
-        return self._target is None or channel.message_encoding == self._target.encoding
+        return channel.message_encoding == {"ros1": "ros1", "ros2": "cdr"}.get(
+            self._to or "", channel.message_encoding
+        )
 
     def _plan(self, channel: Channel) -> _Plan:
         schema = channel.schema
@@ -202,7 +218,7 @@ class Converter:
         return self._plans[schema]
 
     def _make_plan(self, schema: Schema) -> _Plan:
-        target = self._target or self._source
+        target = self._ros2 if self._to == "ros2" else self._ros1
         problem = incomprehensible(schema.name)
         types = types_of(schema, self._source)
         name = normalize_msgtype(schema.name)
@@ -222,7 +238,7 @@ class Converter:
         return _Plan(name, types, store, made_schema, digest, times, no_message)
 
     def _convert(self, plan: _Plan, raw: memoryview) -> memoryview:
-        to_ros1 = self._target is self._ros1
+        to_ros1 = self._to == "ros1"
         store, name = plan.store, plan.name
         problem = plan.no_message
         if to_ros1 and bytes(raw[:2]) == b"\0\0":

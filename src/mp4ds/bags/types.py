@@ -267,14 +267,24 @@ def ros2_world(distribution: str) -> World:
     Raises:
         OptionError: The distribution is not known.
     """
+    store = ros2_store(distribution)
+    # including later types: a recording without definitions may have them
+    latest = get_typestore(Stores.LATEST).fielddefs
+    standard = {**latest, **get_typestore(store).fielddefs}
+    return World("ROS 2", "cdr", "ros2msg", standard)
+
+
+def ros2_store(distribution: str) -> Stores:
+    """What rosbags calls a distribution of ROS 2.
+
+    Raises:
+        OptionError: It is not known.
+    """
     known = {store.value[5:]: store for store in Stores if store.value.startswith("ros2_")}
     if distribution not in known:
         names = ", ".join(known)
         raise OptionError(f"ROS 2 distribution {distribution!r} is not known. Use {names}.")
-    # including later types: a recording without definitions may have them
-    latest = get_typestore(Stores.LATEST).fielddefs
-    standard = {**latest, **get_typestore(known[distribution]).fielddefs}
-    return World("ROS 2", "cdr", "ros2msg", standard)
+    return known[distribution]
 
 
 def types_of(schema: Schema, world: World) -> Typesdict:
