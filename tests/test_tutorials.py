@@ -196,15 +196,3 @@ def test_every_option_that_a_page_names_is_there(page: Path) -> None:
         known = options_of(command)
         unknown = [option for option in given if option not in known]
         assert not unknown, f"mp4ds {command} has no {', '.join(unknown)}"
-
-
-def test_every_option_is_told_on_some_page() -> None:
-    pages = [ROOT / "README.md", *DOCS.rglob("*.md")]
-    text = "\n".join(page.read_text() for page in pages)
-    group = typer.main.get_command(app_for())
-    assert hasattr(group, "commands")
-    for name, command in group.commands.items():
-        for option in command.params:
-            names = [word for word in (*option.opts, *option.secondary_opts) if word[:2] == "--"]
-            is_told = any(re.search(rf"{word}(?![\w-])", text) for word in names)
-            assert is_told or not names, f"mp4ds {name} {names}"
