@@ -1,4 +1,4 @@
-"""The tutorials and exporting.md: each command and snippet in order, in one folder, and its output.
+"""Tutorials, exporting.md and hub.md: each command and snippet in order, and what it prints.
 
 A page has blocks. ``sh`` and ``python`` are run; a command that is to fail says so behind it
 (``# exit code 2``). ``text`` right after a block is what this prints, of which numbers may differ
@@ -33,6 +33,7 @@ from waiting import WATCHDOG_S
 
 DOCS = ROOT / "docs"
 PAGES = sorted((DOCS / "tutorials").glob("*.md"))
+OTHERS = [DOCS / "exporting.md", DOCS / "hub.md"]
 NEEDS = {"--foxglove": "foxglove", "mp4ds.torch": "torch"}
 """What a line needs beside the package -> the module of it; the page is skipped without."""
 
@@ -124,7 +125,7 @@ def assert_printed(said: str, printed: str) -> None:
         assert any(due in found for found in lines), f"{line}\n\n{printed}"
 
 
-@each("page", [*PAGES, DOCS / "exporting.md"], ids=lambda page: page.stem, one_in=3)
+@each("page", [*PAGES, *OTHERS], ids=lambda page: page.stem, one_in=3)
 def test_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     blocks = blocks_of(page)

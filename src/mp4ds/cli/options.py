@@ -51,7 +51,7 @@ _PANELS = {
         *("publish_as", "storage", "exact", "about", "skip_unconvertible", "rate", "loop"),
         *("delay", "paused", "immediate", "drop", "restamp", "lock_step", "clock", "hz"),
         *("follow_clock", "wait_for_subscribers", "qos_overrides", "read_ahead", "deep"),
-        *("intrinsics", "speed", "seconds"),
+        *("intrinsics", "speed", "seconds", "checksums", "card"),
     ),
     "Where": (
         *(
