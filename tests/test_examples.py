@@ -63,6 +63,33 @@ def test_other_topics(tmp_path: Path) -> None:
     assert "/cam/image_raw" not in out
 
 
+@each("kind", ["euroc", "kitti", "tum", "images", "mcap"], one_in=3)
+def test_public_data(kind: str, demo_dataset: Path, tmp_path: Path) -> None:
+    """The demonstration in the layout of each public data set."""
+    source = tmp_path / "source"
+    camera = {"topics": ["/right/image_raw"]}
+    if kind == "mcap":
+        source = source.with_suffix(".mcap")
+        mp4ds.unpack(demo_dataset, "mcap", source)
+    elif kind == "images":
+        mp4ds.unpack(demo_dataset, "images", source, mp4ds.UnpackOptions(**camera))
+        source = source / "right_image_raw"
+        (source / "stamps.csv").unlink()
+    else:
+        mp4ds.export(demo_dataset, kind, source, mp4ds.ExportOptions(**camera))
+    script = str(ROOT / "examples/public_data.py")
+    words = [kind, str(source), "out", "--frames", "4", "--crf", "30"]
+    words += ["--rate", "15"] if kind == "images" else []
+    out = run(sys.executable, script, *words, cwd=tmp_path)
+    told = dict(line.strip("| ").split(" | ") for line in out.splitlines())
+    assert told["validate lossless --deep"] == "0 problems"
+    assert any("rgb8 480x360" in result for result in told.values())
+    assert re.search(r"[1-9]\.\d times smaller", told["lossless"])
+    assert any(step.startswith("evaluate /") for step in told)
+    assert (tmp_path / told["report"].split(",")[0]).is_file()
+    assert any(re.match(r"[1-9]\d* messages held", result) for result in told.values())
+
+
 def test_quickstart(tmp_path: Path) -> None:
     """The README's first command, but for the installation, which CI does in a fresh clone."""
     script = (ROOT / "examples/quickstart.sh").read_text()
