@@ -18,8 +18,10 @@ from sources import SOURCES, load_tool, scene
 NETWORKS = {
     "test_play_ros1": "ros1",
     "test_publish_ros1": "ros1",
+    "test_record_ros1": "ros1",
     "test_publish_dds": "dds",
     "test_publish_ros2": "dds",
+    "test_record_ros2": "dds",
 }
 """Files of tests that need a network of ROS, and which; tools/test.sh collects them alone."""
 

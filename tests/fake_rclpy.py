@@ -7,16 +7,19 @@ by topic, type and quality of service.
 from __future__ import annotations
 
 import enum
+import inspect
 import queue
 import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib.machinery import ModuleSpec
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
+from rosbags.typesys import Stores, get_typestore
 
 from waiting import WATCHDOG_S
 
@@ -130,7 +133,12 @@ class Subscription:
     def deliver(self, msg: bytes) -> None:
         if not self.raw:
             raise TypeError("only raw subscriptions are part of this")
-        self.node.inbox.put(lambda: self.callback(msg))
+        try:  # as rclpy finds out what a callback takes
+            inspect.signature(self.callback).bind(object())
+            self.node.inbox.put(lambda: self.callback(msg))
+        except TypeError:
+            info = {"source_timestamp": time.time_ns(), "received_timestamp": time.time_ns()}
+            self.node.inbox.put(lambda: self.callback(msg, info))
 
 
 class Node:
@@ -175,11 +183,20 @@ class Node:
     def get_publishers_info_by_topic(self, topic_name: str) -> list[Any]:
         return [
             SimpleNamespace(
-                node_name=one.node.name, topic_type=one.kind.type_name, qos_profile=one.qos
+                node_name=one.node.name,
+                topic_type=one.kind.type_name,
+                topic_type_hash=getattr(one.kind, "type_hash", None),
+                qos_profile=one.qos,
             )
             for one in self.bus.publishers
             if one.topic == topic_name
         ]
+
+    def get_topic_names_and_types(self, no_demangle: bool = False) -> list[tuple[str, list[str]]]:
+        found: dict[str, dict[str, None]] = {}
+        for one in (*self.bus.publishers, *self.bus.subscriptions):
+            found.setdefault(one.topic, {})[one.kind.type_name] = None
+        return [(topic, [*kinds]) for topic, kinds in found.items()]
 
     def destroy_node(self) -> None:
         bus = self.bus
@@ -244,7 +261,9 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Bus:
     def create_node(node_name: str, *, context: Context) -> Node:
         return Node(node_name, context, bus)
 
-    bus.kinds = {name: SimpleNamespace(type_name=name) for name in INSTALLED}
+    bus.kinds = {
+        name: SimpleNamespace(type_name=name, type_hash=_type_hash(name)) for name in INSTALLED
+    }
     services = ("Pause", "Resume", "TogglePaused", "IsPaused", "GetRate", "SetRate")
     services += ("PlayNext", "Burst", "Seek", "Stop")
     modules: dict[str, dict[str, Any]] = {
@@ -271,11 +290,18 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Bus:
     for name, content in modules.items():
         module = ModuleType(name)
         vars(module).update(content)
+        module.__spec__ = ModuleSpec(name, None)  # by which others see that it is there
         monkeypatch.setitem(sys.modules, name, module)
         if "." in name:
             parent, _, child = name.rpartition(".")
             monkeypatch.setattr(sys.modules[parent], child, module, raising=False)
     return bus
+
+
+def _type_hash(name: str) -> Any:
+    """As Jazzy's rclpy tells it."""
+    text = get_typestore(Stores.ROS2_JAZZY).hash_rihs01(name)
+    return SimpleNamespace(version=1, value=bytes.fromhex(text.removeprefix("RIHS01_")))
 
 
 class FakePeer:

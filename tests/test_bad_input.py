@@ -236,8 +236,8 @@ BAD_SOURCES: dict[str, tuple[Callable[[Path], Path], str]] = {
     },
     **{f"empty.{s}": (written(f"drive.{s}", b""), "is empty") for s in SUFFIXES},
     **{f"git-lfs.{s}": (written(f"drive.{s}", LFS_POINTER), "git lfs pull") for s in SUFFIXES},
-    "text": (written("notes.txt", b"hello\n"), "is not a recording"),
-    "no-suffix": (written("notes", b""), "is not a recording"),
+    "text": (written("notes.txt", b"hello\n"), "is not in a recording format"),
+    "no-suffix": (written("notes", b""), "is not in a recording format"),
     "bag-1.2": (written("drive.bag", b"#ROSBAG V1.2\n" + bytes(99)), "1.2"),
     **{f"half.{s}": (cut(s, 0.5), "drive." + s) for s in SUFFIXES},
     **{f"start.{s}": (cut(s, 0.01), "drive." + s) for s in SUFFIXES},
@@ -247,7 +247,7 @@ BAD_SOURCES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "damaged-bz2.bag": (damaged("bag", "bz2"), "is damaged"),
     "damaged-lz4.bag": (damaged("bag", "lz4"), "is damaged"),
     "damaged-zstd.mcap": (damaged("mcap", "zstd"), "is damaged"),
-    "other-database": (database, "not one of rosbag2"),
+    "other-database": (database, "but not of rosbag2"),
     "empty-folder": (empty_folder, "has no metadata.yaml"),
     "no-metadata": (
         folder_of(lambda folder: (folder / "metadata.yaml").unlink()),
@@ -552,7 +552,7 @@ def test_pack_replaces_a_dataset_with_force_only(
     small_bag: Path, small_dataset: Path, tmp_path: Path
 ) -> None:
     with unchanged(tmp_path):
-        refused(call("pack", small_bag, "-o", small_dataset), 2, "exists already", "--force")
+        refused(call("pack", small_bag, "-o", small_dataset), 2, "already exists", "--force")
     assert call("pack", small_bag, "-o", small_dataset, "--force").code == 0
     assert mp4ds.validate(small_dataset, deep=True) == []
     with mp4ds.open(small_dataset) as dataset:
@@ -563,7 +563,7 @@ def test_pack_replaces_a_dataset_with_force_only(
 def test_pack_replaces_an_empty_folder_with_force_only(small_bag: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with unchanged(tmp_path):
-        refused(call("pack", small_bag, "-o", tmp_path / "empty"), 2, "exists already")
+        refused(call("pack", small_bag, "-o", tmp_path / "empty"), 2, "already exists")
     assert call("pack", small_bag, "-o", tmp_path / "empty", "--force").code == 0
     assert mp4ds.validate(tmp_path / "empty") == []
 
@@ -597,7 +597,7 @@ def test_unpack_replaces_its_own_output_with_force_only(
     assert call(*arguments).code == 0
     first = tree(target) if target.is_dir() else target.stat().st_ino
     with unchanged(tmp_path):
-        refused(call(*arguments), 2, "exists already", "--force")
+        refused(call(*arguments), 2, "already exists", "--force")
     assert call(*arguments, "--force").code == 0
     assert target.is_dir() or target.stat().st_ino != first
     if to == "images":
@@ -835,7 +835,7 @@ def test_a_lost_terminal_leaves_nothing(
     with unchanged(tmp_path):
         arguments = ("pack", long_demo, "-o", tmp_path / "x", *SLOW)
         options = {"numbers": numbers, "preexec_fn": ignore if is_ignored else None}
-        refused(interrupted(tmp_path, *arguments, **options), code, "ended")
+        refused(interrupted(tmp_path, *arguments, **options), code, "terminated")
 
 
 def test_interrupting_an_unpack(long_demo: Path, tmp_path: Path) -> None:

@@ -23,8 +23,8 @@ from mp4ds.records import Channel, Schema
 from sources import INFO, image_cdr, image_ros1, scene, typestore
 
 HEADER = "std_msgs/msg/Header"
-NO_SEQ = "messages with a header's sequence number, which ROS 2 has not"
-TAILS = "messages with bytes after their end, which were left out"
+NO_SEQ = "messages with a header sequence number, which ROS 2 does not have"
+TAILS = "messages with trailing bytes, which were dropped"
 REAL_BAGS = (
     "bag_reader_java/Int64MultiArray",
     "ecto_ros_camera_info",
@@ -333,7 +333,7 @@ def test_an_empty_definition_of_a_type_that_is_not_empty() -> None:
     channel = Channel(0, "/a", "ros1", Schema("my/Type", "ros1msg", b""), {})
     converter = Converter("ros2")
     assert bytes(converter.payload(channel, b"")) == b"\0\1\0\0\0"
-    with pytest.raises(ConversionError, match="does not parse as my/Type"):
+    with pytest.raises(ConversionError, match="cannot be parsed as my/Type"):
         converter.payload(channel, b"four")
 
 
@@ -356,18 +356,18 @@ def test_large_payloads_are_not_deserialised() -> None:
     [
         ("protobuf", Schema("foxglove.RawImage", "protobuf", b""), "ros1", "messages are protobuf"),
         ("json", None, "ros2", "messages are json"),
-        ("", None, "ros2", "of no known encoding"),
-        ("ros1", None, "ros2", "the type of its messages is not known"),
+        ("", None, "ros2", "in an unknown encoding"),
+        ("ros1", None, "ros2", "its message type is not known"),
         ("ros1", Schema("my/Type", "", b""), "ros2", "no definition of type my/Type is known"),
         ("ros1", Schema("my/Type", "ros1msg", b"Other x"), "ros2", "type my/msg/Other is known"),
-        ("ros1", Schema("my/Type", "ros1msg", b"int8 x\n?!"), "ros2", "cannot be understood"),
-        ("ros1", Schema("", "ros1msg", b"int8 x"), "ros2", "type of its messages is not known"),
-        ("ros1", Schema("my/1 Type", "ros1msg", b"int8 x"), "ros2", "cannot be understood"),
-        ("ros1", Schema("my/Type", "ros1msg", b"Type x"), "ros2", "holds itself"),
+        ("ros1", Schema("my/Type", "ros1msg", b"int8 x\n?!"), "ros2", "cannot be parsed"),
+        ("ros1", Schema("", "ros1msg", b"int8 x"), "ros2", "message type is not known"),
+        ("ros1", Schema("my/1 Type", "ros1msg", b"int8 x"), "ros2", "cannot be parsed"),
+        ("ros1", Schema("my/Type", "ros1msg", b"Type x"), "ros2", "contains itself"),
         ("cdr", Schema("my/msg/Type", "ros2msg", b"wstring x"), "ros1", "no definition of type"),
-        ("cdr", Schema("my/srv/Type", "ros2msg", b"int8 x\n---\n"), "ros1", "cannot be understood"),
-        ("cdr", Schema("my/msg/Type", "ros2idl", b"module {"), "ros1", "cannot be understood"),
-        ("cdr", Schema("x", "ros2msg", b"bool data\n"), "ros1", "cannot be understood"),
+        ("cdr", Schema("my/srv/Type", "ros2msg", b"int8 x\n---\n"), "ros1", "cannot be parsed"),
+        ("cdr", Schema("my/msg/Type", "ros2idl", b"module {"), "ros1", "cannot be parsed"),
+        ("cdr", Schema("x", "ros2msg", b"bool data\n"), "ros1", "cannot be parsed"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_converted(
@@ -391,7 +391,7 @@ def test_payloads_that_do_not_parse(target: str) -> None:
     converter = Converter(target)
     huge = data.replace(b"\6\0\0\0abcdef", b"\xff\xff\xff\xffabcdef")
     for damaged in [huge, b"\xff" * 80, *(data[:length] for length in range(len(data)))]:
-        with pytest.raises(ConversionError, match="a message does not parse as sensor_msgs/"):
+        with pytest.raises(ConversionError, match="a message cannot be parsed as sensor_msgs/"):
             converter.payload(channel, damaged)
     assert not converter.omitted
 

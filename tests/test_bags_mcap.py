@@ -289,7 +289,7 @@ def test_a_summary_that_begins_among_the_data_tells_nothing(tmp_path: Path) -> N
     struct.pack_into("<Q", data, len(data) - 28, place)
     path.write_bytes(data)
     assert McapReader(path).channels == []
-    with pytest.raises(SourceError, match="message 1 is of channel 1, which is not defined"):
+    with pytest.raises(SourceError, match="message 1 belongs to channel 1, which is not defined"):
         messages(McapReader(path).records())
 
 
@@ -343,7 +343,7 @@ def test_a_decompressed_stream(tmp_path: Path) -> None:
     assert reader.position == packed.stat().st_size
     assert sum(map(len, reader.times().values())) == len(written)
     packed.write_bytes(packed.read_bytes()[:-50])
-    with pytest.raises(SourceError, match="compression is cut short"):
+    with pytest.raises(SourceError, match="zstd data is cut short"):
         list(McapReader(packed, open_stream=lambda: ZstdFile(packed)).records())
 
 
@@ -405,7 +405,7 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
     refuse(path, "is not an MCAP file")
     for magic in (b"\x89MCAP0\n", b"\x89MCAP0\r\r\n"):
         path.write_bytes(magic + bytes(5000))
-        refuse(path, "line ends were converted.* --salvage")
+        refuse(path, "with converted line endings.* --salvage")
     refuse(tmp_path, "cannot be read")
 
 
@@ -486,7 +486,10 @@ def file_of(*records: bytes) -> bytes:
 
 DAMAGED: dict[str, tuple[bytes, str]] = {
     "unknown compression": (file_of(chunk(b"", "brotli")), "'brotli'"),
-    "no channel": (file_of(message_record(3)), "message 1 is of channel 3, which is not defined"),
+    "no channel": (
+        file_of(message_record(3)),
+        "message 1 belongs to channel 3, which is not defined",
+    ),
     "two channels": (
         file_of(channel_record(1, "/a"), channel_record(1, "/b")),
         "defined twice and differently",
@@ -505,7 +508,7 @@ DAMAGED: dict[str, tuple[bytes, str]] = {
     "length in a chunk": (file_of(chunk(message_record(1)[:-1])), "ends within a record"),
     "lz4": (file_of(chunk(b"abc", "lz4", crc=0)), "lz4"),
     "zstd": (file_of(chunk(b"abc", "zstd", crc=0)), "zstd"),
-    "bomb": (file_of(chunk(b"abc", "zstd", size=2**60)), "promises"),
+    "bomb": (file_of(chunk(b"abc", "zstd", size=2**60)), "declares"),
     "header": (b"\x89MCAP0\r\n" + file_of()[8:].replace(b"\1", b"\3", 1), "header"),
 }
 

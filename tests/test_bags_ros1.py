@@ -391,14 +391,17 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
     for data, problem in (
         (b"", "is empty"),
         (b"not a bag at all", "is not a ROS 1 bag"),
-        (b"#ROSBAG V2.0\r\n", "is a ROS 1 bag whose line ends were converted"),
-        (b"#ROSBAG V1.2\n", "version 1.2, and only 2.0 is read. Rewrite it with `rosbag filter"),
+        (b"#ROSBAG V2.0\r\n", "is a ROS 1 bag with converted line endings"),
+        (
+            b"#ROSBAG V1.2\n",
+            "version 1.2; only version 2.0 is supported. Convert it first, with `rosbag filter",
+        ),
         (b"#ROSRECORD V1.1\n", "version 1.1"),
         (b"version https://git-lfs.github.com/spec/v1\noid", "is a git-lfs pointer"),
         (b"#ROSBAG V2.0\n", "is damaged"),
         (b"#ROSBAG V2.0\n\x10\0\0\0", "is damaged"),
         (b"#ROSBAG V2.0\n" + joined([(b"op", b"\3")]), "is damaged"),
-        (bag_header(0, 1, 1), "is not indexed: the recording was cut short. Reindex it with"),
+        (bag_header(0, 1, 1), "is not indexed: the recording was cut short. Run"),
         (bag_header(9999, 1, 1), "is cut short: its index should begin at byte 9999"),
         (bag_header(index, 1, 1), "is damaged"),
         (bag_header(index, 0, 0, (b"encryptor", b"rosbag/AesCbcEncryptor")), "is encrypted"),
@@ -464,17 +467,17 @@ def test_damage_has_a_sentence(tmp_path: Path) -> None:
     for options, problem in (
         ({"shift": 1}, "topic /a, chunk at byte 4109: "),
         ({"shift": 500}, "topic /a, chunk at byte 4109: a record is cut short. Copy it again"),
-        ({"counted": 1}, "the index of the chunk at byte 4109 contradicts that of the bag"),
-        ({"compression": "zstd"}, "it is compressed by 'zstd', which is not known"),
+        ({"counted": 1}, "the index of the chunk at byte 4109 contradicts the bag's index"),
+        ({"compression": "zstd"}, "it is compressed with 'zstd', which is not supported"),
         ({"size": 3}, "it unpacks to 49 bytes instead of 3"),
         ({"size": 3, "compression": "bz2"}, "its bz2 data does not unpack to 3 bytes"),
-        ({"size": 2**31, "compression": "bz2"}, "it promises 2147483648 bytes and has"),
+        ({"size": 2**31, "compression": "bz2"}, "it declares 2147483648 bytes but has"),
     ):
         refuse(make_bag(path, [plain()], one, **options), problem)
-    refuse(make_bag(path, [], one), "contradicts that of the bag")
+    refuse(make_bag(path, [], one), "contradicts the bag's index")
     two = make_bag(path, [plain()], [[(0, 1, b"one")], [(0, 2, b"two")]]).read_bytes()
     path.write_bytes(two.replace(b"chunk_count=\2", b"chunk_count=\1"))
-    refuse(path, "its header counts fewer chunks than its index lists")
+    refuse(path, "its header declares fewer chunks than its index lists")
     good = make_bag(path, [plain("/a"), plain("/b")], [[(0, 1, b"one"), (1, 2, b"two")]])
     data = good.read_bytes()
     path.write_bytes(data.replace(b"chunk_count=\1", b"chunk_count=\0"))

@@ -110,7 +110,7 @@ def test_a_source_that_changes_while_it_is_packed(
     images = mp4ds.ImageFolder() if kind == "images" else None
     options = mp4ds.PackOptions(images=images, codec="ffv1", salvage=salvage)
     progress = changes_once(CHANGES[change], file)
-    with pytest.raises(SourceError, match="changed while it was read"):
+    with pytest.raises(SourceError, match="changed while it was being read"):
         mp4ds.pack(path, tmp_path / "dataset", options, progress=progress)
     assert not (tmp_path / "dataset").exists()
     assert leftovers(tmp_path) == []
@@ -129,7 +129,7 @@ def test_a_source_that_changes_while_it_is_packed_in_parts(
 
     monkeypatch.setattr(work.Tasks, "_pack", changing)
     options = mp4ds.PackOptions(codec="ffv1", gop=2, window=2)
-    with pytest.raises(mp4ds.PartsFailedError, match="changed while it was read"):
+    with pytest.raises(mp4ds.PartsFailedError, match="changed while it was being read"):
         mp4ds.pack(path, tmp_path / "dataset", options)
     assert not (tmp_path / "dataset").exists()
 
@@ -155,7 +155,7 @@ def test_a_pair_that_changes_while_it_is_imported(
         return make(*arguments)
 
     monkeypatch.setattr(ros_mp4, "_part_of", changing)
-    with pytest.raises(SourceError, match="changed while it was read"):
+    with pytest.raises(SourceError, match="changed while it was being read"):
         import_ros_mp4(source / "drive.mp4", source / "drive.yaml", tmp_path / "dataset")
     assert not (tmp_path / "dataset").exists()
     assert leftovers(tmp_path) == []

@@ -201,7 +201,7 @@ def test_one_that_is_interrupted_leaves_the_cluster_idle(
         _, stderr = process.communicate(timeout=WATCHDOG_S)
     assert process.returncode == 130
     assert not re.search("distributed|dask|Traceback|Warning", stderr)
-    assert "run the same command again to go on" in " ".join(stderr.split())
+    assert "run the same command again to resume" in " ".join(stderr.split())
     assert not list((tmp_path / "out").glob("work*"))
     until(cluster.is_idle)
     idle = measured(tmp_path)
@@ -228,7 +228,7 @@ def test_workers_of_another_version_are_refused(bag: Path, tmp_path: Path) -> No
 
 
 def test_a_worker_that_does_not_see_the_folder(tmp_path: Path) -> None:
-    with pytest.raises(Mp4dsError, match=r"0\.job is not there: all machines must share"):
+    with pytest.raises(Mp4dsError, match=r"0\.job does not exist: all machines must share"):
         run_task(str(tmp_path / "0.job"))
 
 
@@ -245,13 +245,13 @@ def test_results_that_are_not_seen(
     monkeypatch.setattr("mp4ds.files.outputs._SEEN_SECONDS", 0.1)
     monkeypatch.setattr("mp4ds.files.outputs._LOOK_SECONDS", 0.01)
     monkeypatch.setattr(Engines, "engine", lambda *_: Elsewhere())
-    with pytest.raises(ScoringError, match=r"not seen in .*cells; all machines must share"):
+    with pytest.raises(ScoringError, match=r"did not appear in .*cells; all machines must share"):
         mp4ds.evaluate(bag, QUICK, output=tmp_path / "out")
 
 
 def test_nobody_at_the_address(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mp4ds.plugins.cluster._CONNECT_SECONDS", 1.0)
-    with pytest.raises(ClusterError, match="no Dask scheduler could be reached"):
+    with pytest.raises(ClusterError, match="no Dask scheduler can be reached"):
         mp4ds.evaluate(bag, replace(QUICK, cluster=NOBODY), output=tmp_path / "out")
     assert not list((tmp_path / "out").glob("work*"))
 

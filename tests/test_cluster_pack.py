@@ -123,7 +123,7 @@ def test_a_lost_scheduler_is_told_and_another_goes_on(
     assert "Traceback" not in stderr
     said = " ".join(stderr.split())  # as it is folded to the terminal's width
     assert f"{lost.address}: the connection to the Dask scheduler was lost" in said
-    assert "run the same command again to go on" in said
+    assert "run the same command again to resume" in said
     assert not (tmp_path / "dataset").exists()
     kept = finished(tmp_path)
     assert 2 <= len(kept) < PARTS
@@ -150,7 +150,7 @@ def test_a_command_that_ended_leaves_the_cluster_idle(
     assert process.returncode == code
     assert "Traceback" not in stderr
     if sign == signal.SIGINT:
-        assert "run the same command again to go on" in " ".join(stderr.split())
+        assert "run the same command again to resume" in " ".join(stderr.split())
     until(cluster.is_idle)
     idle = finished(tmp_path)
     time.sleep(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import re
 import shutil
@@ -17,6 +18,7 @@ import pytest
 
 import mp4ds
 from each import each as each_case
+from mp4ds.dataset import collections
 from mp4ds.dataset.collections import datasets_in, each
 from mp4ds.errors import (
     Mp4dsError,
@@ -28,7 +30,7 @@ from mp4ds.errors import (
 from mp4ds.plugins.reporting.overview import brief, reports
 from mp4ds.plugins.reporting.report import ReportOptions
 from mp4ds.unpacking.unpack import unpack_each
-from waiting import WATCHDOG_S
+from waiting import WATCHDOG_S, until
 
 
 @pytest.fixture
@@ -117,8 +119,27 @@ def test_items_in_their_order(jobs: int) -> None:
 
 
 def test_a_process_that_dies() -> None:
-    with pytest.raises(Mp4dsError, match="memory may be short"):
+    with pytest.raises(Mp4dsError, match="perhaps out of memory"):
         list(each(dying, range(5), 2))
+
+
+def stubborn(place: Path, number: int) -> int:
+    """Work that one process does not leave for its parent's word."""
+    if number == 0:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        (place / "begun").write_text("")
+        time.sleep(WATCHDOG_S)
+        return number
+    until(lambda: (place / "begun").exists())
+    raise OptionError("two")
+
+
+def test_a_process_that_does_not_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collections, "_TIDY_S", 0.1)
+    with pytest.raises(OptionError, match="two"):
+        for _ in each(partial(stubborn, tmp_path), [1, 0], 2):
+            pass
+    assert not multiprocessing.active_children()
 
 
 def held(place: Path, number: int) -> int:
@@ -198,7 +219,7 @@ def test_all_are_validated(drives: Path, tmp_path: Path) -> None:
     done = run("validate", "drives", folder=tmp_path)
     assert (done.returncode, done.stdout) == (
         0,
-        "3 datasets: no problem; frames were not decoded (--deep does)\n",
+        "3 datasets: no problems; frames were not decoded (--deep does)\n",
     )
     (drives / "a" / "messages.mcap").unlink()
     done = run("validate", "drives/a", "drives/b", "-j", "2", folder=tmp_path)

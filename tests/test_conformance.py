@@ -236,7 +236,7 @@ def test_the_command_prints_problems() -> None:
 def test_the_command_refuses_what_is_no_dataset(tmp_path: Path) -> None:
     done = run(sys.executable, "-m", "mp4ds", "conformance-dump", tmp_path)
     assert done.returncode == 2
-    assert "is no dataset" in done.stderr
+    assert "is not a dataset" in done.stderr
     assert "Traceback" not in done.stderr
 
 

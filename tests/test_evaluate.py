@@ -172,7 +172,7 @@ def test_clips_of_a_time() -> None:
     assert abs(np.mean(middle) - 49.5) < 1
     assert chosen(times, origin, replace(given, start=0.0)) == [0, 1, 2]
     for start in (11.0, 1e9):
-        with pytest.raises(Refused, match="no images in the time"):
+        with pytest.raises(Refused, match="no images in the requested time"):
             chosen(times, origin, replace(given, start=start))
 
 
@@ -392,7 +392,7 @@ def test_images_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"0\.png"):
         evaluate(images, QUICK, output=tmp_path / "out")
     Image.fromarray(np.zeros((64, 64), np.uint16)).save(images / "0.png")
-    with pytest.raises(SourceError, match="8 bits"):
+    with pytest.raises(SourceError, match="8-bit samples"):
         evaluate(images, QUICK, output=tmp_path / "out")
     shutil.rmtree(images)
     with pytest.raises(SourceError, match="no such file"):
@@ -452,7 +452,7 @@ def test_every_oddity_is_tried_or_told(trait: str, tmp_path: Path) -> None:
         assert found.frames + found.other_frames == 8
         assert list(found.ticks) == sorted(set(found.ticks))
     else:
-        assert found.startswith("has no images") or "too small" in found
+        assert found.startswith(("has no images", "has no readable images")) or "too small" in found
 
 
 def test_jpeg_files_are_packed_anew(tmp_path: Path) -> None:

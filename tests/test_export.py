@@ -141,7 +141,7 @@ def test_euroc_imu_and_poses(dataset: Path, tmp_path: Path) -> None:
     _, *poses = rows_of(tmp_path / "out/mav0/pose0/data.csv")
     assert [int(row[0]) for row in poses] == [pose_at(n)[0] for n in range(FRAMES + 1)]
     assert [float(value) for value in poses[3][1:]] == [pose_at(3)[1], 0, 0, 1, 0, 0, 0]
-    assert summary.left_out[COLOUR] == {"not chosen": FRAMES}
+    assert summary.left_out[COLOUR] == {"not selected": FRAMES}
 
 
 # ---------------------------------------------------------------- TUM
@@ -405,7 +405,7 @@ def test_frames_of_one_time(tmp_path: Path) -> None:
     changed = Scene([_stamped(message, {third: second}) for message in made.messages])
     summary = mp4ds.export(pack_drive(tmp_path, changed), "euroc", tmp_path / "out")
     assert summary.messages["/cam/image_raw"] == 5
-    reason = "another frame has the same time, and so its name"
+    reason = "another frame has the same time, and therefore the same name"
     assert summary.left_out["/cam/image_raw"] == {reason: 1}
     rows = (tmp_path / "out/mav0/cam0/data.csv").read_text().splitlines()[1:]
     assert [int(row.split(",")[0]) for row in rows] == [first, second, *others]
@@ -643,7 +643,7 @@ def test_the_command(dataset: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
     assert told["messages"] == {COLOUR: FRAMES}
-    assert told["left_out"][GREY] == {"not chosen": FRAMES}
+    assert told["left_out"][GREY] == {"not selected": FRAMES}
     note = json.loads((out / "mp4ds_export.json").read_text())
     assert note["left_out"] == told["left_out"]
     with pytest.raises(mp4ds.TargetExistsError):
@@ -658,18 +658,18 @@ def test_the_command(dataset: Path, tmp_path: Path) -> None:
     ("to", "options", "words"),
     [
         ("nuscenes", {}, "format 'nuscenes' is not known"),
-        ("kitti", {"poses": ODOMETRY}, "`poses` goes with"),
-        ("euroc", {"fps": 30}, "`fps` goes with lerobot"),
+        ("kitti", {"poses": ODOMETRY}, "`poses` works with"),
+        ("euroc", {"fps": 30}, "`fps` works with lerobot"),
         ("euroc", {"poses": IMU}, "`poses` /imu is of type sensor_msgs/Imu"),
-        ("euroc", {"poses": "/none"}, "no topic of ROS"),
+        ("euroc", {"poses": "/none"}, "not a ROS topic"),
         ("euroc", {"topics": ["/nothing*"]}, "matches no topic"),
-        ("tum", {"topics": ["/chatter"]}, "TUM can hold no topic"),
-        ("kitti", {"crf": 20}, "`crf` goes with lerobot"),
+        ("tum", {"topics": ["/chatter"]}, "TUM cannot hold any topic"),
+        ("kitti", {"crf": 20}, "`crf` works with lerobot"),
         ("lerobot", {"codec": "ffv1"}, "`codec` 'ffv1' is not known"),
         ("lerobot", {"codec": "h264", "crf": 60}, "not from 0 to 51"),
-        ("lerobot", {"pixels": "gray"}, "`pixels` gray is not"),
+        ("lerobot", {"pixels": "gray"}, "`pixels` gray does not apply"),
         ("euroc", {"pixels": "pink"}, "`pixels` 'pink' is not known"),
-        ("euroc", {"tolerance_ns": -1}, "`tolerance_ns` is the most time"),
+        ("euroc", {"tolerance_ns": -1}, "`tolerance_ns` is the maximum time"),
         ("euroc", {"every": 0}, "`every` 0"),
     ],
 )
@@ -684,10 +684,10 @@ def test_bad_options(
 def test_what_is_not_ours_is_kept(dataset: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out/thesis.txt").write_text("mine")
-    with pytest.raises(mp4ds.TargetError, match="not something that mp4ds wrote"):
+    with pytest.raises(mp4ds.TargetError, match="was not written by mp4ds"):
         mp4ds.export(dataset, "euroc", tmp_path / "out", mp4ds.ExportOptions(force=True))
     assert (tmp_path / "out/thesis.txt").read_text() == "mine"
-    with pytest.raises(mp4ds.OptionError, match="holds one dataset"):
+    with pytest.raises(mp4ds.OptionError, match="holds a single dataset"):
         mp4ds.export([dataset, dataset], "euroc", tmp_path / "two")
 
 

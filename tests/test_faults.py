@@ -41,7 +41,7 @@ PARTS = ["00000-0", "00001-0"]
 WORK = ".dataset.mp4ds-part"
 PAGE = 4096
 KINDS = ["bag-none", "mcap-ros2-zstd", "rosbag2-sqlite3-v9", "rosbag2-mcap-v9"]
-AGAIN = "run the same command again to go on"
+AGAIN = "run the same command again to resume"
 
 
 def instead_of_open(patch: pytest.MonkeyPatch, opened: Callable[..., Any]) -> None:
@@ -420,7 +420,7 @@ def test_a_process_that_is_killed_again_and_again(
     kill = "os.kill(os.getpid(), signal.SIGKILL)"
     use_harmed(monkeypatch, PARTS[0], f"open({str(log)!r}, 'a').write('x'); {kill}")
     options = replace(IN_PARTS, keep_going=True, jobs=jobs)
-    with pytest.raises(PartsFailedError, match=r"SIGKILL, perhaps for want of memory") as caught:
+    with pytest.raises(PartsFailedError, match=r"SIGKILL, perhaps for lack of memory") as caught:
         mp4ds.pack(source, tmp_path / "dataset", options)
     assert [name for name, _ in caught.value.failures] == [PARTS[0]]
     assert caught.value.exit_code == 1
@@ -445,9 +445,9 @@ def test_a_process_that_finds_its_source_gone(
     [
         ("raise MemoryError", "out of memory; try fewer `jobs`"),
         ("bytearray(2**60)", "out of memory; try fewer `jobs`"),
-        ("sys.exit(3)", "its process ended with code 3"),
-        ("os.abort()", "its process was ended by SIGABRT"),
-        ("raise ArithmeticError('odd')", "its process ended with code 1: ArithmeticError: odd"),
+        ("sys.exit(3)", "its process exited with code 3"),
+        ("os.abort()", "its process was killed by SIGABRT"),
+        ("raise ArithmeticError('odd')", "its process exited with code 1: ArithmeticError: odd"),
     ],
     one_in=2,
 )
@@ -478,7 +478,7 @@ def test_processes_that_cannot_begin_for_want_of_memory(
 ) -> None:
     limit = ["prlimit", f"--as={megabytes * 2**20}"]
     monkeypatch.setattr("mp4ds.packing.work.command", lambda task: [*limit, *command(task)])
-    with pytest.raises(PartsFailedError, match=r"Part source-0: its process ended") as caught:
+    with pytest.raises(PartsFailedError, match=r"Part source-0: its process exited") as caught:
         mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, jobs=1))
     assert "\n" not in str(caught.value)
     assert leftovers(tmp_path) == []
@@ -492,7 +492,7 @@ def test_a_work_folder_that_is_removed_meanwhile(
     tmp_path: Path, source: Path, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     use(monkeypatch, before_task(PARTS[1], lambda: shutil.rmtree(tmp_path / WORK)))
-    with pytest.raises(PartsFailedError, match="holds no pack that was begun"):
+    with pytest.raises(PartsFailedError, match="holds no pack in progress"):
         mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
     ran = goes_on(source, tmp_path / "dataset", expected, monkeypatch)
     assert ran == ["source-0", *PARTS]
@@ -572,7 +572,7 @@ def test_a_target_folder_that_is_read_only(
     (tmp_path / "out").mkdir()
     with (
         read_only(tmp_path / "out"),
-        pytest.raises(TargetError, match="cannot be made: Read-only file system"),
+        pytest.raises(TargetError, match="cannot be created: Read-only file system"),
     ):
         mp4ds.pack(source, tmp_path / "out" / "dataset", IN_PARTS)
     goes_on(source, tmp_path / "out" / "dataset", expected, monkeypatch)

@@ -63,9 +63,7 @@ def test_a_folder_with_something_else_in_it_is_kept(kind: str, made: Path, tmp_p
         stranger.write_text("years of work")
         with unchanged(tmp_path):
             told = stranger.relative_to(target).as_posix().replace("labels/0.txt", "labels/")
-            refused(
-                call(*command, "--force"), 2, f"holds 1 thing that mp4ds did not write ({told})"
-            )
+            refused(call(*command, "--force"), 2, f"holds 1 item that mp4ds did not write ({told})")
         stranger.unlink()
         if stranger.parent.name == "labels":
             stranger.parent.rmdir()
@@ -82,7 +80,7 @@ def test_a_file_of_another_kind_is_kept(kind: str, made: Path, tmp_path: Path) -
     assert len(list(tmp_path.iterdir())) == 1
     (tmp_path / name).write_text("years of work")
     with unchanged(tmp_path):
-        refused(call(*line, "--force"), 2, "not something that mp4ds wrote")
+        refused(call(*line, "--force"), 2, "was not written by mp4ds")
 
 
 def yolo(folder: Path) -> None:
@@ -130,7 +128,9 @@ def test_an_evaluation_goes_into_its_own_folder_only(
     (tmp_path / "out").mkdir()
     folder(tmp_path / "out")
     with unchanged(tmp_path):
-        refused(call("evaluate", made / "drive", "-o", tmp_path / "out"), 2, "exists and is not")
+        refused(
+            call("evaluate", made / "drive", "-o", tmp_path / "out"), 2, "was not written by mp4ds"
+        )
 
 
 @pytest.mark.parametrize("kind", [*FOLDERS, *FILES])

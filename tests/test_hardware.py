@@ -100,11 +100,13 @@ def test_what_is_refused() -> None:
         check_codec(name, None, lossless=False, crf=1)
         check_codec(name, None, lossless=False, crf=found.most)
         for crf in (0, found.most + 1):
-            with pytest.raises(OptionError, match=rf"is not one of {name}\. Use 1 to {found.most}"):
+            with pytest.raises(
+                OptionError, match=rf"is out of range for {name}\. Use 1 to {found.most}"
+            ):
                 check_codec(name, None, lossless=False, crf=crf)
         with pytest.raises(OptionError, match=r"lossless packing\. Use ffv1, h264, h265"):
             check_codec(name, None, lossless=True)
-        with pytest.raises(OptionError, match="goes with `quality` visual or crf=N"):
+        with pytest.raises(OptionError, match="works with `quality` visual or crf=N"):
             check_codec(name, None, lossless=False, varied=True)
     check_codec("h265-nvenc", "p7", lossless=False)
     with pytest.raises(OptionError, match="Use one of p1, p2, p3, p4, p5, p6, p7"):
@@ -205,7 +207,7 @@ def test_one_sentence_says_what_is_missing(name: str) -> None:
     if found.encoder not in av.codecs_available:
         assert said == (
             f"`codec` {name}: PyAV {av.__version__} was built without {found.encoder}. It needs "
-            f"{found.needs}, and a PyAV whose ffmpeg has {found.encoder}{end}"
+            f"{found.needs}, and a PyAV whose FFmpeg has {found.encoder}{end}"
         )
     else:
         assert said.startswith(f"`codec` {name}: {found.encoder} could not be opened: ")
@@ -219,7 +221,7 @@ def test_the_sentence_without_a_driver_of_nvidia(name: str) -> None:
         pytest.skip(said or f"{name} is there")
     assert said == (
         f"`codec` {name}: {found.encoder} could not be opened: Cannot load libcuda.so.1. "
-        f"It needs an NVIDIA graphics card that encodes {found.codec}, with its driver; "
+        f"It needs an NVIDIA GPU that encodes {found.codec}, with its driver; "
         f"`codec` {found.codec} needs no device."
     )
 
@@ -234,7 +236,7 @@ def test_the_log_is_left_as_it_was() -> None:
 def test_a_pyav_that_uploads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(av, "codecs_available", {"h264_vaapi"})
     monkeypatch.setattr(av, "__version__", "17.1.0")
-    with pytest.raises(HardwareError, match=r"PyAV 17\.1\.0 cannot bring .* Install PyAV 18"):
+    with pytest.raises(HardwareError, match=r"PyAV 17\.1\.0 cannot upload .* Install PyAV 18"):
         check_hardware("h264-vaapi")
 
 
@@ -270,7 +272,7 @@ def test_other_machines_may_have_it(absent: str) -> None:
 
 def test_a_score_is_not_kept_with_it(tmp_path: Path) -> None:
     options = PackOptions(quality="psnr=40", codec="h264-nvenc")
-    with pytest.raises(OptionError, match="use `codec` h264, or find the crf by mp4ds evaluate"):
+    with pytest.raises(OptionError, match="use `codec` h264, or find a crf with `mp4ds evaluate`"):
         mp4ds.pack(tmp_path / "none.bag", tmp_path / "d", options)
 
 
@@ -298,7 +300,11 @@ def refusing(sizes: list[tuple[int, int]], tried: list[Any]) -> Callable[..., No
     [
         ([(64, 48)], EncoderRefusedError, "does not take pictures of 64x48"),
         ([(64, 48), (640, 480)], HardwareError, "refused"),
-        ([], HardwareError, "too many at a time. Give fewer `jobs`; `codec` h264 needs no device"),
+        (
+            [],
+            HardwareError,
+            "too many were open at once. Use fewer `jobs`; `codec` h264 needs no device",
+        ),
     ],
 )
 def test_pictures_and_devices_are_told_apart(

@@ -347,7 +347,7 @@ def test_a_rate_is_that_of_one_camera(names: list[str], tmp_path: Path) -> None:
 @each(
     ("names", "options", "words"),
     [
-        (["color_1.png", "color_2.png", "depth_1.png", "depth_3.png"], [], "not the same numbers"),
+        (["color_1.png", "color_2.png", "depth_1.png", "depth_3.png"], [], "their numbers differ"),
         (["1.png", "2_deep.png", "3.png", "4_deep.png"], [], "--stamps FILE"),
         (["1.png", "deep1.png", "2.png", "deep2.png"], ["--encoding", "16UC1"], "camera, deep"),
     ],
@@ -388,7 +388,7 @@ def test_a_plain_folder_round_trip(tmp_path: Path) -> None:
     summary = mp4ds.pack(
         tmp_path / "in", tmp_path / "ds2", folder(stamps=str(tmp_path / "times.csv"))
     )
-    assert summary.skipped == {"images without a time": 1, "files in in that are no images": 1}
+    assert summary.skipped == {"images without a time": 1, "files in in that are not images": 1}
     kept = attachments(tmp_path / "ds" / "messages.mcap")
     assert kept["cam.yaml"].decode() == ROS_CALIBRATION
     assert kept["images.csv"].decode().splitlines() == [
@@ -469,7 +469,7 @@ def test_an_import_goes_on_unless_the_images_have_changed(
     with pytest.raises(mp4ds.PartsFailedError):
         mp4ds.pack(place, tmp_path / "ds", options)
     other = replace(options, images=mp4ds.ImageFolder(layout="euroc"))
-    with pytest.raises(mp4ds.OptionError, match="another `images`"):
+    with pytest.raises(mp4ds.OptionError, match="different `images`"):
         mp4ds.pack(place, tmp_path / "ds", other)
     shown = sorted((place / CAM0 / "data").iterdir())[3]
     before, times_of = shown.read_bytes(), shown.stat()
@@ -661,8 +661,8 @@ def test_euroc_tells_what_it_leaves_out(tmp_path: Path) -> None:
     summary = mp4ds.pack(root / "mav0", tmp_path / "ds", folder())
     assert summary.skipped == {
         "files in data of cam0 that data.csv does not list": 1,
-        "files of leica0, which is neither camera, IMU nor pose": 1,
-        "rows of state_groundtruth_estimate0 of which the pose alone was taken": 1,
+        "files of leica0, which is not a camera, IMU or pose": 1,
+        "rows of state_groundtruth_estimate0 of which only the pose was taken": 1,
     }
 
 
@@ -754,7 +754,7 @@ def test_kitti_raw(rectified: bool, tmp_path: Path) -> None:
     half = 0.5**0.5
     assert [turn.z, turn.w] == pytest.approx([0, 1] if rectified else [-half, half])
     summary = mp4ds.pack(drive, tmp_path / "ds2", folder())
-    assert summary.skipped == {"files of oxts, which is no camera": 1}
+    assert summary.skipped == {"files of oxts, which is not a camera": 1}
 
 
 # ---------------------------------------------------------------- TUM
@@ -817,9 +817,9 @@ BAD: dict[str, tuple[Callable[[Path], Any], list[str], str]] = {
     "missing-image": (
         lambda root: next((root / CAM0 / "data").iterdir()).unlink(),
         [],
-        "not there",
+        "does not exist",
     ),
-    "bad-stamp": (spoil(CAM0 / "data.csv", "#t\n12x,1.png\n"), [], "line 2: '12x' is no time"),
+    "bad-stamp": (spoil(CAM0 / "data.csv", "#t\n12x,1.png\n"), [], "line 2: '12x' is not a time"),
     "outside": (spoil(CAM0 / "data.csv", "1,../../x.png\n"), [], "outside"),
     "no-name": (spoil(CAM0 / "data.csv", "123456\n"), [], "line 1 is not a time and a file name"),
     "late": (spoil(CAM0 / "data.csv", "9999999999999999999,x.png\n"), [], "2038"),
@@ -834,7 +834,11 @@ BAD: dict[str, tuple[Callable[[Path], Any], list[str], str]] = {
         [],
         "pinhole",
     ),
-    "no-rotation": (spoil(CAM0 / "sensor.yaml", f"T_BS: {[2] * 16}\n"), [], "rotation is none"),
+    "no-rotation": (
+        spoil(CAM0 / "sensor.yaml", f"T_BS: {[2] * 16}\n"),
+        [],
+        "rotation is not valid",
+    ),
     "short-imu": (
         spoil(Path("mav0/imu0/data.csv"), "1403636579758555392,1,2\n"),
         [],
@@ -852,7 +856,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], list[str], str]] = {
         [],
         "cannot identify image file",
     ),
-    "other-layout": (lambda root: None, ["--layout", "tum"], "is not laid out as tum is"),
+    "other-layout": (lambda root: None, ["--layout", "tum"], "does not have the layout tum"),
     "no-layout": (lambda root: None, ["--layout", "x"], "euroc, kitti, tum, plain"),
     "stamps": (lambda root: None, ["--stamps", "x"], "--stamps is for plain folders"),
     "frame-id": (lambda root: None, ["--frame-id", "x"], "--frame-id is for plain folders"),
@@ -883,21 +887,21 @@ WITH_CALIBRATION = ["--rate", "2", "--calibration", "c"]
 PLAIN_BAD: dict[str, tuple[list[str], dict[str, str], list[str], str]] = {
     "no-times": (["a.png"], {}, [], "--rate HZ"),
     "frame-numbers": (["0.png", "1.png"], {}, [], "--rate HZ"),
-    "names-of-no-unit": (["a.png"], {}, ["--unit", "ns"], "name that is no time"),
+    "names-of-no-unit": (["a.png"], {}, ["--unit", "ns"], "name that is not a time"),
     "unknown-unit": (["a.png"], {"t": "17\n"}, ["--stamps", "t"], "Give --unit"),
     "no-unit": (["a.png"], {}, ["--unit", "h"], "s, ms, us, ns"),
     "fewer-times": (
         ["a.png", "b.png"],
         {"t": "1.5\n"},
         ["--stamps", "t"],
-        "1 times, and there are 2",
+        "1 times, but there are 2",
     ),
     "empty-list": (["a.png"], {"t": "# none\n"}, ["--stamps", "t"], "holds no times"),
-    "binary-list": (["a.png"], {}, ["--stamps", "in/a.png"], "is no text"),
+    "binary-list": (["a.png"], {}, ["--stamps", "in/a.png"], "is not a text file"),
     "no-list": (["a.png"], {}, ["--stamps", "none"], "cannot be read"),
-    "unlisted": (["a.png"], {"t": "1.5 b.png\n"}, ["--stamps", "t"], "not there"),
-    "both": (["a.png"], {}, ["--stamps", "t", "--rate", "2"], "Give one of them"),
-    "bad-rate": (["a.png"], {}, ["--rate", "fast"], "'fast' is no rate"),
+    "unlisted": (["a.png"], {"t": "1.5 b.png\n"}, ["--stamps", "t"], "does not exist"),
+    "both": (["a.png"], {}, ["--stamps", "t", "--rate", "2"], "Give only one of them"),
+    "bad-rate": (["a.png"], {}, ["--rate", "fast"], "'fast' is not a rate"),
     "bad-encoding": (["a.png"], {}, ["--rate", "2", "--encoding", "x"], "--encoding 'x'"),
     "other-encoding": (["a.png"], {}, ["--rate", "2", "--encoding", "rgb8"], "cannot be rgb8"),
     "jpeg-encoding": (["a.jpg"], {}, ["--rate", "2", "--encoding", "mono8"], "JPEG"),
@@ -912,7 +916,7 @@ PLAIN_BAD: dict[str, tuple[list[str], dict[str, str], list[str], str]] = {
         ["a.png"],
         {"c": ROS_CALIBRATION.replace("plumb_bob", "fov")},
         WITH_CALIBRATION,
-        "there are plumb_bob",
+        "known are plumb_bob",
     ),
     "no-matrix": (
         ["a.png"],
@@ -948,11 +952,13 @@ def test_targets_are_kept(tmp_path: Path) -> None:
     refused(run(*arguments, tmp_path / "ds"), "--force")
     assert run(*arguments, tmp_path / "ds", "--force").exit_code == 0
     refused(run("import", "images", tmp_path / "none", "-o", tmp_path / "x"), "no such file")
-    refused(run("import", "images", tmp_path / "in" / "a.png", "-o", tmp_path / "x"), "no folder")
+    refused(
+        run("import", "images", tmp_path / "in" / "a.png", "-o", tmp_path / "x"), "not a folder"
+    )
     options = replace(folder(rate="1"), salvage=True)
     with pytest.raises(mp4ds.OptionError, match="salvage"):
         mp4ds.pack(tmp_path / "in", tmp_path / "x", options)
-    with pytest.raises(mp4ds.OptionError, match="One folder"):
+    with pytest.raises(mp4ds.OptionError, match="Only one folder"):
         mp4ds.pack([tmp_path / "in", tmp_path / "ds"], tmp_path / "x", folder(rate="1"))
 
 
@@ -1011,9 +1017,9 @@ def test_bad_pairs_are_refused(tmp_path: Path) -> None:
         assert not [path for path in tmp_path.iterdir() if path not in (video, text)]
 
     write_text(text, document(STAMPS[:-1]))
-    fails(1, "tells the times of 11")
+    fails(1, "has the times of 11")
     write_text(text, document([-1.5, *STAMPS[1:]]))
-    fails(1, "no bits for")
+    fails(1, "outside the range")
     content = document()
     content["camera_info"]["width"] = 66
     write_text(text, content)
@@ -1031,4 +1037,4 @@ def test_bad_pairs_are_refused(tmp_path: Path) -> None:
     mp4ds.pack(tmp_path / "in", tmp_path / "own", folder(rate="2"))
     own = tmp_path / "own" / "camera_image_raw.yaml"
     done = run("import", "ros-mp4", own.with_suffix(".mp4"), own, "-o", tmp_path / "x")
-    refused(done, "a sidecar of mp4ds already")
+    refused(done, "already an mp4ds sidecar")

@@ -493,7 +493,7 @@ def test_messages_that_lost_their_index(dataset: Path) -> None:
     agreed(dataset)
     for deep in (False, True):
         assert codes(dataset, deep=deep) == ["messages-unreadable"]
-    assert "has no index" in refused(dataset, "bag")
+    assert "has no complete index" in refused(dataset, "bag")
 
 
 @pytest.mark.parametrize(

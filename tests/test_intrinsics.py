@@ -439,7 +439,7 @@ def test_a_camera_without_calibration_and_one_that_is_not_calibrated(tmp_path: P
     write_bag(path, Scene([*made.messages, Record("/lens", INFO, START, blank)]))
     text, names = command(path)
     assert "# /cam/image_raw: 64x48, frame 'cam'\n# no calibration\n" in text
-    assert "# /lens: calibrations that belong to no images\n" in text
+    assert "# /lens: calibrations without an image topic\n" in text
     assert "no distortion model" in text
     assert "# not calibrated: K is zero\n" in text
     assert names["D"].shape == (0,)

@@ -509,8 +509,8 @@ def test_other_sequences_between_segments(codec: str, tmp_path: Path) -> None:
         join_segments([tmp_path / "a.mp4", tmp_path / "b.mp4"], range(24), tmp_path / "j.mp4")
 
 
-@pytest.mark.parametrize(("count", "match"), [(9, "5 frames, 4 of them are due"), (11, "10 frames"),
-                                              (0, "5 frames, 0 of them")])  # fmt: skip
+@pytest.mark.parametrize(("count", "match"), [(9, "5 frames, but 4 are needed"), (11, "10 frames"),
+                                              (0, "5 frames, but 0 are needed")])  # fmt: skip
 def test_ticks_for_other_frames(count: int, match: str, tmp_path: Path) -> None:
     segment = small(tmp_path / "a.mp4")
     with pytest.raises(VideoError, match=match) as caught:

@@ -17,7 +17,8 @@ from typing import Any
 import pytest
 
 from each import each, fresh
-from mp4ds.cli.play import Keyboard, Keys
+from mp4ds.cli.keyboard import Keyboard, Keys
+from mp4ds.cli.play import player_keys
 from waiting import until
 
 ESC = b"\x1b"
@@ -120,7 +121,7 @@ IGNORED = {
 def test_each_key(name: str, terminal: Terminal) -> None:
     typed, call, rate = KEYS[name]
     controls = RecordedControls()
-    with Keyboard(controls, fd=terminal.fd):
+    with Keyboard(player_keys(controls), fd=terminal.fd):
         terminal.type(typed)
         until(lambda: bool(controls.calls))
     assert controls.calls == [call]
@@ -131,7 +132,7 @@ def test_each_key(name: str, terminal: Terminal) -> None:
 def test_a_key_that_comes_byte_by_byte(name: str, terminal: Terminal) -> None:
     typed, call, _ = KEYS[name]
     controls = RecordedControls()
-    with Keyboard(controls, fd=terminal.fd):
+    with Keyboard(player_keys(controls), fd=terminal.fd):
         for n in range(len(typed)):
             assert not controls.calls
             terminal.type(typed[n : n + 1])
@@ -143,7 +144,7 @@ def test_a_key_that_comes_byte_by_byte(name: str, terminal: Terminal) -> None:
 @each("name", IGNORED)
 def test_other_keys_are_ignored(name: str, terminal: Terminal) -> None:
     controls = RecordedControls()
-    with Keyboard(controls, fd=terminal.fd):
+    with Keyboard(player_keys(controls), fd=terminal.fd):
         for n in range(0, len(IGNORED[name]), 1000):
             terminal.type(IGNORED[name][n : n + 1000])
             time.sleep(0.02)
@@ -156,7 +157,7 @@ def test_many_keys_at_once(terminal: Terminal) -> None:
     controls = RecordedControls()
     typed = b"".join(keys for keys, _, _ in KEYS.values()) * 100
     expected = [call for _, call, _ in KEYS.values()] * 100
-    with Keyboard(controls, fd=terminal.fd):
+    with Keyboard(player_keys(controls), fd=terminal.fd):
         terminal.type(typed)
         until(lambda: len(controls.calls) >= len(expected))
     assert controls.calls == expected
@@ -164,7 +165,7 @@ def test_many_keys_at_once(terminal: Terminal) -> None:
 
 def test_faster_and_slower_cancel(terminal: Terminal) -> None:
     controls = RecordedControls()
-    with Keyboard(controls, fd=terminal.fd):
+    with Keyboard(player_keys(controls), fd=terminal.fd):
         terminal.type((ESC + b"[A") * 5)
         until(lambda: len(controls.calls) == 5)
         assert controls.rate == pytest.approx(1.1**5)
@@ -187,7 +188,7 @@ def test_keys_wherever_they_are_cut(size: int) -> None:
 def test_the_terminal_is_as_it_was_after_the_end(terminal: Terminal) -> None:
     before = terminal.attributes
     handlers = {n: signal.getsignal(n) for n in signal.valid_signals()}
-    with Keyboard(RecordedControls(), fd=terminal.fd):
+    with Keyboard(player_keys(RecordedControls()), fd=terminal.fd):
         assert terminal.gives_keys
         assert terminal.attributes[3] & termios.ISIG
     assert terminal.attributes == before
@@ -199,7 +200,7 @@ def test_the_terminal_is_as_it_was_after_an_exception(terminal: Terminal) -> Non
     before = terminal.attributes
 
     def fail() -> None:
-        with Keyboard(RecordedControls(), fd=terminal.fd):
+        with Keyboard(player_keys(RecordedControls()), fd=terminal.fd):
             assert terminal.gives_keys
             raise KeyboardInterrupt
 
@@ -212,7 +213,7 @@ def test_it_works_outside_of_the_main_thread(terminal: Terminal) -> None:
     before, controls = terminal.attributes, RecordedControls()
 
     def use() -> None:
-        with Keyboard(controls, fd=terminal.fd):
+        with Keyboard(player_keys(controls), fd=terminal.fd):
             terminal.type(b" ")
             until(lambda: bool(controls.calls))
 
@@ -225,7 +226,7 @@ def test_it_works_outside_of_the_main_thread(terminal: Terminal) -> None:
 
 def test_the_terminal_goes_away() -> None:
     hand, fd = os.openpty()
-    with Keyboard(RecordedControls(), fd=fd):
+    with Keyboard(player_keys(RecordedControls()), fd=fd):
         os.close(hand)
         until(lambda: "keys" not in [thread.name for thread in threading.enumerate()])
     os.close(fd)
@@ -235,7 +236,7 @@ def test_what_is_no_terminal_is_left_alone(tmp_path: Path) -> None:
     controls = RecordedControls()
     reading, writing = os.pipe()
     os.write(writing, b"  ")
-    with Keyboard(controls, fd=reading):
+    with Keyboard(player_keys(controls), fd=reading):
         assert "keys" not in [thread.name for thread in threading.enumerate()]
         time.sleep(0.05)
     assert os.read(reading, 10) == b"  "
@@ -251,7 +252,7 @@ def test_no_standard_input(
     file = (tmp_path / "stdin").open("w+")
     file.close()
     monkeypatch.setattr(sys, "stdin", file if stdin else None)
-    with Keyboard(RecordedControls()):
+    with Keyboard(player_keys(RecordedControls())):
         assert "keys" not in [thread.name for thread in threading.enumerate()]
 
 
@@ -260,14 +261,15 @@ def test_no_standard_input(
 
 PLAYER = """
 import sys, time
-from mp4ds.cli.play import Keyboard
+from mp4ds.cli.keyboard import Keyboard
+from mp4ds.cli.play import player_keys
 class Player:
     rate = 1.0
     def toggle_paused(self): print("toggled", flush=True)
     def play_next(self): return True
     def step_back(self): return True
     def set_rate(self, rate): return True
-with Keyboard(Player()):
+with Keyboard(player_keys(Player())):
     print("entered", flush=True)
     while True:
         time.sleep(0.05)

@@ -101,7 +101,7 @@ def test_nothing_is_replaced_unasked(target: Path) -> None:
         check_target(target, force=False, owned=anything)
     assert isinstance(caught.value, FileExistsError)
     assert caught.value.path == target
-    with pytest.raises(TargetError, match="not something that mp4ds wrote") as refused:
+    with pytest.raises(TargetError, match="was not written by mp4ds") as refused:
         check_target(target, force=True, owned=nothing)
     assert not isinstance(refused.value, TargetExistsError)
     assert read(target) == "old"
@@ -117,7 +117,7 @@ def test_a_link_is_not_replaced(target: Path) -> None:
     make(target.parent / "precious", "folder", "old")
     target.symlink_to("precious")
     with (
-        pytest.raises(TargetError, match=r"is a symbolic link.*Name .*precious itself"),
+        pytest.raises(TargetError, match=r"is a symbolic link.*Give .*precious itself"),
         staged(target, force=True, owned=anything),
     ):
         pytest.fail("nothing may be made there")
@@ -128,13 +128,13 @@ def test_a_link_is_not_replaced(target: Path) -> None:
 @pytest.mark.parametrize(
     ("stranger", "told"),
     [
-        ("notes.txt", "1 thing .*(notes.txt)"),
-        ("deep/notes.txt", "1 thing .*(deep/notes.txt)"),
-        ("labels/1.txt", r"1 thing .*\(labels/\)"),
-        ("empty/", r"1 thing .*\(empty/\)"),
-        ("link ->", r"1 thing .*\(link\)"),
-        ("deep/part ->", r"1 thing .*\(deep/part\)"),
-        ("a b c d e", r"5 things .*\(a, b, c, \.\.\.\)"),
+        ("notes.txt", "1 item .*(notes.txt)"),
+        ("deep/notes.txt", "1 item .*(deep/notes.txt)"),
+        ("labels/1.txt", r"1 item .*\(labels/\)"),
+        ("empty/", r"1 item .*\(empty/\)"),
+        ("link ->", r"1 item .*\(link\)"),
+        ("deep/part ->", r"1 item .*\(deep/part\)"),
+        ("a b c d e", r"5 items .*\(a, b, c, \.\.\.\)"),
     ],
 )
 def test_what_mp4ds_did_not_write_keeps_the_rest_from_being_replaced(
@@ -164,7 +164,7 @@ def test_what_mp4ds_did_not_write_keeps_the_rest_from_being_replaced(
 def test_what_appears_in_it_meanwhile_is_kept(target: Path) -> None:
     make(target, "folder", "old")
     with (  # noqa: PT012 - the body is what is tested
-        pytest.raises(TargetError, match=r"1 thing .*notes\.txt"),
+        pytest.raises(TargetError, match=r"1 item .*notes\.txt"),
         staged(target, force=True, owned=lambda _: {"deep/part"}) as path,
     ):
         make(path, "folder")
@@ -186,10 +186,10 @@ def test_a_report_within_is_replaced_with_it(target: Path) -> None:
 
 
 def test_the_folder_must_exist(target: Path) -> None:
-    with pytest.raises(TargetError, match="is no folder"):
+    with pytest.raises(TargetError, match="is not a folder"):
         check_target(target / "deep", force=False, owned=anything)
     make(target, "file")
-    with pytest.raises(TargetError, match="is no folder"):
+    with pytest.raises(TargetError, match="is not a folder"):
         check_target(target / "deep", force=False, owned=anything)
 
 
@@ -240,7 +240,7 @@ def test_any_name_that_the_disk_takes(name: str, tmp_path: Path) -> None:
 @each("code", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.EROFS])
 def test_a_disk_that_refuses(code: int, target: Path) -> None:
     with (  # noqa: PT012 - the body is what is tested
-        pytest.raises(WriteError, match="the unfinished output was removed") as caught,
+        pytest.raises(WriteError, match="the partial output was removed") as caught,
         staged(target, force=False, owned=nothing) as path,
     ):
         make(path, "folder")

@@ -102,7 +102,7 @@ def test_a_pattern_that_matches_nothing_is_an_error() -> None:
     topics = ["/b", "/a"]
     Selection(["/a"], ["/b"]).check(topics)
     Selection().check([])
-    with pytest.raises(OptionError, match=r"`topics` '/x' matches no topic. There are: /a, /b\."):
+    with pytest.raises(OptionError, match=r"`topics` '/x' matches no topic. Topics: /a, /b\."):
         Selection(["/a", "/x"]).check(topics)
     with pytest.raises(OptionError, match="`exclude` '/x' matches no topic"):
         Selection([], ["/x"]).check(topics)

@@ -108,8 +108,8 @@ def test_strangers_in_it_are_kept(stranger: str, bag: Path, work: Path, tmp_path
     (work / stranger).parent.mkdir(exist_ok=True)
     (work / stranger).write_text("mine")
     before = tree(tmp_path)
-    refused(pack(bag, tmp_path), 2, "holds 1 name", "did not make")
-    refused(pack(bag, tmp_path, "--restart"), 2, "holds 1 name", "did not make")
+    refused(pack(bag, tmp_path), 2, "holds 1 item", "did not make")
+    refused(pack(bag, tmp_path, "--restart"), 2, "holds 1 item", "did not make")
     assert tree(tmp_path) == before
 
 
@@ -120,14 +120,14 @@ def test_what_is_no_file_is_refused(kind: str, bag: Path, work: Path, tmp_path: 
         os.mkfifo(work / "job.json")
     else:
         (work / "job.json").mkdir()
-    refused(pack(bag, tmp_path), 2, "job.json", "is no file")
+    refused(pack(bag, tmp_path), 2, "job.json", "is not a file")
 
 
 def test_a_copy_is_not_taken_for_what_was_begun_here(bag: Path, work: Path, tmp_path: Path) -> None:
     """Its parts may hold other messages; --restart begins anew, on the same machine."""
     work.rename(tmp_path / "moved")
     shutil.copytree(tmp_path / "moved", work)
-    refused(pack(bag, tmp_path), 2, "was not begun there", "--restart")
+    refused(pack(bag, tmp_path), 2, "was started elsewhere", "--restart")
     assert pack(bag, tmp_path, "--restart").code == 0
     shutil.rmtree(tmp_path / "moved")
     assert mp4ds.validate(tmp_path / "out", deep=True) == []
@@ -213,7 +213,7 @@ def test_another_recording_in_a_planted_job_is_refused(
     path.write_bytes(replace(job, sources=[other]).to_json())
     shutil.rmtree(work / "parts" / "source-0")
     result = pack(bag, tmp_path)
-    refused(result, result.code, "consists of other files")
+    refused(result, result.code, "consists of different files")
     assert not (tmp_path / "out").exists()
 
 

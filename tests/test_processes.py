@@ -30,9 +30,9 @@ EXPECTED: dict[str, tuple[str, str] | None] = {
     "talkative": None,
     "noisy": None,
     "error": ("SourceError", "drive.bag: is damaged."),
-    "crash": ("Failed", "its process ended with code 3: last words"),
-    "quiet": ("Failed", "its process ended with code 0"),
-    "killed": ("Killed", "its process was ended by SIGKILL, perhaps for want of memory"),
+    "crash": ("Failed", "its process exited with code 3: last words"),
+    "quiet": ("Failed", "its process exited with code 0"),
+    "killed": ("Killed", "its process was killed by SIGKILL, perhaps for lack of memory"),
 }
 
 

@@ -282,7 +282,7 @@ def test_a_resumed_pack_tells_what_was_done_before() -> None:
     for n in range(100):
         clock.seconds = 1000.0 + n
         log.take(told(0.8 + n / 10_000, before=192))
-    assert "192 parts were done before" in stream.getvalue().splitlines()[0]
+    assert "192 parts were already done" in stream.getvalue().splitlines()[0]
 
 
 def test_silence_is_logged_too() -> None:

@@ -435,7 +435,7 @@ def test_the_command_tells_what_it_came_to(tmp_path: Path) -> None:
     done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert f"{TOPIC}: psnr " in done.stdout
-    assert "(asked for: 40)" in done.stdout
+    assert "(target: 40)" in done.stdout
     wrong = [*command, "--quality", "psnr=99"]
     done = subprocess.run(wrong, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
@@ -455,4 +455,4 @@ def test_vmaf_of_a_noisy_camera_is_measured_against_its_ceiling(
     assert (found.windows, found.limited) == (1, 1)
     assert 98.5 < found.mean < 99.5
     (topic,) = (topic for topic in summary.topics if topic.frames)
-    assert "were to have 0.5 less than the originals beside themselves" in topic.notes[0]
+    assert "limited to 0.5 below the score of the originals against themselves" in topic.notes[0]

@@ -128,7 +128,9 @@ def test_any_sequence_of_integers(colour: mp4ds.Stream) -> None:
 @pytest.mark.parametrize("index", [12, -13, 2**70])
 def test_numbers_out_of_range(index: int, colour: mp4ds.Stream) -> None:
     for ask in (colour.get, colour.read):
-        with pytest.raises(IndexError, match=rf"{TOPIC} has 12 frames, and no frame {index}: .*11"):
+        with pytest.raises(
+            IndexError, match=rf"{TOPIC} has no frame {index}: its 12 frames are 0 to 11"
+        ):
             ask([0, index])
 
 
@@ -176,12 +178,15 @@ def test_into_an_array_of_ones_own(colour: mp4ds.Stream) -> None:
 @each(
     ("out", "problem"),
     [
-        (np.zeros((3, 48, 64, 3), np.uint8), r"uint8 \(3, 48, 64, 3\) where .* \(2, 48, 64, 3\)"),
-        (np.zeros((2, 48, 64), np.uint8), r"\(2, 48, 64\) where"),
+        (
+            np.zeros((3, 48, 64, 3), np.uint8),
+            r"uint8 \(3, 48, 64, 3\), not an array of uint8 \(2, 48, 64, 3\)",
+        ),
+        (np.zeros((2, 48, 64), np.uint8), r"\(2, 48, 64\), not an array"),
         (np.zeros((2, 48, 64, 3), np.float32), "float32"),
         (np.zeros((2, 48, 64, 3), np.int8), "int8"),
         ([[0]], "out is list"),
-        (np.broadcast_to(np.zeros(3, np.uint8), (2, 48, 64, 3)), "cannot be written"),
+        (np.broadcast_to(np.zeros(3, np.uint8), (2, 48, 64, 3)), "not writeable"),
     ],
 )
 def test_an_array_that_does_not_suit(out: Any, problem: str, colour: mp4ds.Stream) -> None:
@@ -289,7 +294,7 @@ def test_depths_in_metres(encoding: str, tmp_path: Path) -> None:
 
 
 def test_colours_are_no_depths(colour: mp4ds.Stream) -> None:
-    with pytest.raises(mp4ds.OptionError, match=r"rgb8 images, which are no depths.*16UC1"):
+    with pytest.raises(mp4ds.OptionError, match=r"rgb8 images, which are not depths.*16UC1"):
         colour.read([0], format="depth_m")
 
 
@@ -385,7 +390,9 @@ def test_a_part_of_a_mosaic_is_a_mosaic(encoding: str, tmp_path: Path) -> None:
             assert frame.encoding == f"bayer_{''.join(rolled)}{encoding[10:]}"
             (rgb,) = stream.read([0], crop=(x, y, 20, 11))
             assert np.array_equal(rgb, stream.read([0])[0][y : y + 11, x : x + 20])
-        with pytest.raises(mp4ds.OptionError, match="as rgb, bgr or gray only"):
+        with pytest.raises(
+            mp4ds.OptionError, match="only be cropped and resized as rgb, bgr or gray"
+        ):
             stream.get([0], resize=0.5)
         assert stream.read([0], resize=0.5).shape == (1, 24, 32, 3)
 
@@ -395,7 +402,9 @@ def test_camera_yuv_is_not_cut(encoding: str, tmp_path: Path) -> None:
     with mp4ds.open(packed(tmp_path, scene(encoding, frames=4))) as dataset:
         stream = dataset[TOPIC]
         for options in ({"crop": (0, 0, 2, 2)}, {"resize": 0.5}):
-            with pytest.raises(mp4ds.OptionError, match="as rgb, bgr or gray only"):
+            with pytest.raises(
+                mp4ds.OptionError, match="only be cropped and resized as rgb, bgr or gray"
+            ):
                 stream.get([0], **options)
         (part,) = stream.read([0], crop=(1, 3, 9, 7))
         assert np.array_equal(part, stream.read([0])[0][3:10, 1:10])

@@ -222,11 +222,11 @@ def channel(encoding: str, name: str = "", schema: bytes = b"", kind: str = "") 
 @each(
     ("odd", "problem"),
     [
-        (channel("flatbuffer", "foxglove.Log", b"", "flatbuffer"), "they are flatbuffer encoding"),
-        (channel(""), "of no known encoding"),
-        (channel("ros1"), "the type of its messages is not known"),
+        (channel("flatbuffer", "foxglove.Log", b"", "flatbuffer"), "their encoding is flatbuffer"),
+        (channel(""), "their encoding is unknown"),
+        (channel("ros1"), "its message type is not known"),
         (channel("cdr", "my_msgs/msg/Odd"), "no definition of type my_msgs/msg/Odd"),
-        (channel("ros1", "my_msgs/Odd", b"int32[ x", "ros1msg"), "cannot be understood"),
+        (channel("ros1", "my_msgs/Odd", b"int32[ x", "ros1msg"), "cannot be parsed"),
         (channel("ros1", "my_msgs/Odd", b"other_msgs/X x", "ros1msg"), "no definition of type"),
         (channel("ros1", "my_msgs/Odd", b"std_msgs/Empty[] x", "ros1msg"), "without fields"),
         (
@@ -235,7 +235,7 @@ def channel(encoding: str, name: str = "", schema: bytes = b"", kind: str = "") 
             ),
             "without fields",
         ),
-        (channel("protobuf", "foxglove.Log"), "definition is not known"),
+        (channel("protobuf", "foxglove.Log"), "definition is unknown"),
         (channel("protobuf", "foxglove.Log", b"\xff", "protobuf"), "does not declare foxglove.Log"),
         (channel("protobuf", "foxglove.Log", b"", "protobuf"), "does not declare foxglove.Log"),
     ],
@@ -283,7 +283,7 @@ def test_bytes_after_a_message() -> None:
     image = image_ros1(width=2, height=1, encoding="mono8", data=b"ab", tail=b"four")
     decode = decoder_of(channel("ros1", "sensor_msgs/Image"))
     assert decode(memoryview(image)).data.tolist() == [97, 98]
-    with pytest.raises(WireError, match="it is no sensor_msgs/Image"):
+    with pytest.raises(WireError, match="it is not a sensor_msgs/Image"):
         decode(memoryview(image + bytes(9)))
 
 

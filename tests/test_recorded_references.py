@@ -402,7 +402,7 @@ def test_distances_that_contradict_themselves(change: Change, packed: Path, tmp_
     path = edited(packed, tmp_path, change)
     assert [problem.code for problem in mp4ds.validate(path)] == ["references-invalid"]
     with closing(Stream(path)) as stream:
-        with pytest.raises(FormatError, match="does not fit the references") as raised:
+        with pytest.raises(FormatError, match="does not match the references") as raised:
             stream.get([3])
         assert raised.value.code == "references-invalid"
         assert stream.get([49])[0].index == 49  # of another group
@@ -433,7 +433,7 @@ def test_lies_are_found_and_do_no_harm(name: str, packed: Path, tmp_path: Path) 
     assert mp4ds.validate(path) == []
     (found,) = mp4ds.validate(path, deep=True)
     assert found.code == "references-invalid"
-    assert "group of pictures 0 tell others" in found.message
+    assert "group of pictures 0 show others" in found.message
     codes, right = set(), 0
     with closing(Stream(path)) as stream:
         every = [frame.data for frame in stream]

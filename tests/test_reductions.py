@@ -251,7 +251,7 @@ def test_what_no_video_holds_is_told(tmp_path: Path) -> None:
     with mp4ds.open(made.folder / "dataset") as dataset:
         assert dataset.manifest is not None
         verbatim = {entry.reason: entry.messages for entry in dataset.manifest.verbatim}
-    expected = {f"stored as it was: {reason}": count for reason, count in verbatim.items()}
+    expected = {f"stored verbatim: {reason}": count for reason, count in verbatim.items()}
     assert summary.as_recorded == {"/odd/image": expected}
     (count,) = expected.values()
     sizes = Counter(m.value.width for m in messages if m.type_name == IMAGE)
@@ -298,9 +298,7 @@ def test_packets_that_refer_to_others_stay(packed: Callable[..., Packed], name: 
     made = packed(name)
     summary, messages = made.unpack("mcap", None, every=2)
     assert rows(messages) == rows(made.unpack("mcap", None)[1])
-    reason = (
-        "packets of a video refer to each other, so that none can be left out; give another form"
-    )
+    reason = "video packets depend on each other, so none can be left out; use another form"
     assert summary.as_recorded == {made.topic: {reason: len(made.cameras)}}
     assert summary.thinned == {}
     summary, messages = made.unpack("mcap", "raw", every=2)

@@ -119,16 +119,16 @@ def test_a_lossy_one_stays_as_it_was_asked_for(recording: Path, tmp_path: Path) 
         numbers = range(len(eye[topic]))
         assert (eye[topic].read(numbers) == fast[topic].read(numbers)).all()
     found = info(tmp_path / "fast")
-    assert "packed again from eye (visual), kept (lossless)" in found.notes
+    assert "repacked from eye (visual), kept (lossless)" in found.notes
 
 
 def test_a_quality_that_says_nothing_of_another_codec(recording: Path, tmp_path: Path) -> None:
     mp4ds.pack(recording, tmp_path / "small", PackOptions(quality="crf=30", codec="h264"))
     mp4ds.pack(tmp_path / "small", tmp_path / "copy")
     assert manifest(tmp_path / "copy").streams == manifest(tmp_path / "small").streams
-    with pytest.raises(OptionError, match=r"has crf=30\. Give a `quality`"):
+    with pytest.raises(OptionError, match=r"packed as crf=30\. Give one"):
         mp4ds.pack(tmp_path / "small", tmp_path / "again", PackOptions(codec="av1"))
-    with pytest.raises(OptionError, match="has crf=30, lossless"):
+    with pytest.raises(OptionError, match="packed as crf=30, lossless"):
         mp4ds.pack([tmp_path / "small", recording], tmp_path / "again")
     assert not (tmp_path / "again").exists()
 
@@ -191,7 +191,7 @@ def test_one_dataset_each(recording: Path, tmp_path: Path) -> None:
 
 def test_no_dataset_is_salvaged(recording: Path, tmp_path: Path) -> None:
     mp4ds.pack(recording, tmp_path / "whole")
-    with pytest.raises(OptionError, match="`salvage` goes with recordings"):
+    with pytest.raises(OptionError, match="`salvage` works with recordings"):
         mp4ds.pack(tmp_path / "whole", tmp_path / "again", PackOptions(salvage=True))
 
 
@@ -215,7 +215,7 @@ def test_who_made_it(recording: Path, tmp_path: Path) -> None:
     ("text", "problem"),
     [
         ("author: me", "at author"),
-        ("title: [", "is no YAML"),
+        ("title: [", "is not valid YAML"),
         ("doi: https://doi.org/10.5281/zenodo.1", "at doi"),
         ("- title", "at the top"),
         ("title:", "at title"),

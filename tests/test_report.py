@@ -360,7 +360,7 @@ def test_a_second_report_takes_the_proxies_of_the_first(copy: Path) -> None:
     again = report(copy)
     assert (proxy.stat().st_ino, proxy.stat().st_mtime_ns) == (first.st_ino, first.st_mtime_ns)
     assert again.cameras[0].plays == "proxy"
-    assert "in colours" in data_of(copy)["cameras"][0]["caption"]
+    assert "in false colour" in data_of(copy)["cameras"][0]["caption"]
     report(copy, ReportOptions(proxy_width=64))
     with mp4ds.open(proxy) as opened:
         assert opened.videos[0].image_size == (64, 44)
@@ -403,9 +403,15 @@ def test_tiles_are_played_where_no_proxies_are_wanted(packed_bag: Path, tmp_path
     output = tmp_path / "page"
     summary = report(packed_bag, ReportOptions(output=output, proxies="none"))
     (camera,) = summary.cameras
-    assert (camera.plays, camera.note) == ("video", "its picture is not the image (layout mosaic8)")
+    assert (camera.plays, camera.note) == (
+        "video",
+        "the coded picture does not show the image (layout mosaic8)",
+    )
     (facts,) = data_of(output)["cameras"]
-    assert facts["calibrations"][0]["overlay"]["problem"] == "what is played is not the image"
+    assert (
+        facts["calibrations"][0]["overlay"]["problem"]
+        == "the video that is played does not show the image"
+    )
     assert facts["shown"] == [1, 1]
 
 
@@ -426,7 +432,7 @@ def test_what_is_no_report_stays(copy: Path) -> None:
     shutil.rmtree(copy / "report")
     (copy / "report").mkdir()
     (copy / "report" / "thesis.tex").write_text("mine")
-    with pytest.raises(TargetError, match="not something that mp4ds wrote"):
+    with pytest.raises(TargetError, match="was not written by mp4ds"):
         report(copy, ReportOptions(force=True))
     assert (copy / "report" / "thesis.tex").read_text() == "mine"
 
@@ -601,8 +607,8 @@ def test_scores_are_plotted(copy: Path, tmp_path: Path) -> None:
 @each(
     ("value", "problem"),
     [
-        ({"/nowhere": {"vmaf": []}}, "none of"),
-        ({COLOUR: {"vmaf": [1.0]}}, "one for each frame"),
+        ({"/nowhere": {"vmaf": []}}, "not one of"),
+        ({COLOUR: {"vmaf": [1.0]}}, "give one per frame"),
         ({COLOUR: {"vmaf": ["1"] * FRAMES}}, "not of the form"),
         ({COLOUR: [1.0] * FRAMES}, "not of the form"),
         ([], "not of the form"),

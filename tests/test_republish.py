@@ -58,13 +58,13 @@ TYPES = {
     "ffmpeg": PACKET,
 }
 ALREADY = {
-    "raw": "they are raw images already",
-    "jpeg": "they are JPEG files already",
-    "png": "they are PNG files already",
-    "compressed-video": "they are CompressedVideo already",
-    "ffmpeg": "they are FFMPEGPackets already",
+    "raw": "they are already raw images",
+    "jpeg": "they are already JPEG files",
+    "png": "they are already PNG files",
+    "compressed-video": "they are already CompressedVideo",
+    "ffmpeg": "they are already FFMPEGPackets",
 }
-NO_CODEC = "CompressedVideo has the codecs h264, h265, av1, vp9, and this video is {}"
+NO_CODEC = "CompressedVideo supports the codecs h264, h265, av1, vp9, but this video is {}"
 
 
 H264 = PackOptions(codec="h264")
@@ -179,9 +179,7 @@ METRES = {
 VIDEO = FILE | {"compressed-video": "given"}
 FFV1, MJPEG = ({"compressed-video": NO_CODEC.format(codec)} for codec in ("ffv1", "mjpeg"))
 SHOWN = {"compressed-video": "given"}
-MOSAIC = {
-    "compressed-video": "its video does not show the images as they are seen (layout mosaic8)"
-}
+MOSAIC = {"compressed-video": "its video does not show the images as they look (layout mosaic8)"}
 DONE = {kind: {kind: reason} for kind, reason in ALREADY.items()}
 FATES: dict[str, dict[str, str]] = {
     "raw-mono8": RAW | SHOWN,
@@ -237,7 +235,7 @@ def fate_of(fates: dict[str, str], name: str, kind: str, to: str = "") -> str:
         return fates[kind]
     if name.startswith("ffmpeg") and to == "mcap":  # the other targets are of the other ROS
         return ALREADY["ffmpeg"]
-    fate = fates["compressed-video"].replace("CompressedVideo has", "FFMPEGPacket has")
+    fate = fates["compressed-video"].replace("CompressedVideo supports", "FFMPEGPacket supports")
     return "given" if fate == ALREADY["compressed-video"] else fate
 
 
@@ -724,7 +722,7 @@ def test_verbatim_messages_stay_and_are_counted(packed: Pack) -> None:
     summary, messages = made.unpack("mcap", "raw")
     assert summary.republished == {made.topic: Republished("/cam/image_raw", IMAGE)}
     (reason,) = summary.as_recorded[made.topic]
-    assert reason.startswith("stored as it was: its JPEG is cut short")
+    assert reason.startswith("stored verbatim: its JPEG is cut short")
     assert summary.as_recorded == {made.topic: {reason: 1}}
     assert summary.messages[made.topic] == 1
     assert summary.messages["/cam/image_raw"] == len(made.cameras) - 1
@@ -760,7 +758,7 @@ def test_packets_that_do_not_decode_stay(packed: Pack) -> None:
     """Those that refer to a lost one."""
     made = packed("video-h265-lost", "mcap-ros2-zstd")
     summary, messages = made.unpack("mcap", "raw")
-    reason = "its picture does not decode"
+    reason = "its picture cannot be decoded"
     count = summary.as_recorded[made.topic][reason]
     assert 0 < count < len(made.cameras)
     stayed = kept(made, messages)
@@ -805,7 +803,7 @@ def test_depths_of_unknown_unit_stay(tmp_path: Path) -> None:
     made = Packed(tmp_path, Scene(records), "mcap-ros2-none")
     for kind in ("raw", "png"):
         summary, _ = made.unpack("mcap", kind)
-        reason = "its format 'compressedDepth' does not tell the unit of its depths"
+        reason = "its format 'compressedDepth' does not give the unit of its depths"
         assert summary.as_recorded == {made.topic: {reason: 4}}
 
 
@@ -905,7 +903,7 @@ def test_channels_of_ros2(packed: Pack, name: str, kind: str, source: str) -> No
         old = [(m.log_time, m.publish_time, m.sequence) for m in plain if m.topic == made.topic]
         assert times == old
     else:
-        lost = "messages with a header's sequence number, which ROS 2 has not"
+        lost = "messages with a header sequence number, which ROS 2 does not have"
         # of all cameras, and what else has a header
         assert summary.omitted[lost] >= len(made.cameras)
 
@@ -973,7 +971,7 @@ def test_a_profile_of_neither_ros(packed: Pack) -> None:
 
 def test_other_protobuf_topics_have_no_place_in_a_bag(packed: Pack) -> None:
     made = packed("foxglove-raw-mono8", "mcap-protobuf")
-    with pytest.raises(ConversionError, match="protobuf, which has no counterpart in ROS"):
+    with pytest.raises(ConversionError, match="protobuf, which has no equivalent in ROS"):
         made.unpack("bag", "raw")
 
 
@@ -986,7 +984,9 @@ def test_stamps_beyond_32_bits_have_no_place_in_ros(tmp_path: Path) -> None:
     ]
     packed_ = Packed(tmp_path, Scene(late), "mcap-protobuf")
     for kind in ("raw", "compressed-video"):
-        with pytest.raises(ConversionError, match=r"/camera/image: message 0: .* bits for"):
+        with pytest.raises(
+            ConversionError, match=r"/camera/image: message 0: .* outside the range"
+        ):
             packed_.unpack("mcap", kind)
     assert not (tmp_path / "again.mcap").exists()
 
@@ -1047,7 +1047,7 @@ def test_no_topic_is_taken_twice() -> None:
     ("to", "options", "problem"),
     [
         ("mcap", {"images": "bmp"}, "`images` 'bmp' is not known. Use raw, jpeg, png, compressed"),
-        ("images", {"images": "raw"}, "`images` goes with a recording"),
+        ("images", {"images": "raw"}, "`images` is for recordings"),
         ("mcap", {"jpeg_quality": 0}, "`jpeg_quality` 0 is not from 1 to 100"),
         ("mcap", {"jpeg_quality": 101}, "`jpeg_quality` 101 is not from 1 to 100"),
     ],
@@ -1125,9 +1125,9 @@ def test_the_command_line(packed: Pack, tmp_path: Path) -> None:
     done = command(*arguments, "--jpeg-quality", "80", "-o", tmp_path / "a.mcap")
     assert done.returncode == 0, done.stderr
     now = "/cam/image_raw/compressed_png, sensor_msgs/msg/CompressedImage"
-    assert f"/cam/image_raw/compressed: given as {now}" in done.stdout
-    assert "(/cam/image_raw/compressed is taken)" in done.stdout
-    assert "/cam/image_raw/compressed: 1 messages as recorded: stored as it was" in done.stdout
+    assert f"/cam/image_raw/compressed: written as {now}" in done.stdout
+    assert "(the name /cam/image_raw/compressed is taken)" in done.stdout
+    assert "/cam/image_raw/compressed: 1 messages as recorded: stored verbatim" in done.stdout
     done = command(*arguments, "--json", "-o", tmp_path / "b.mcap")
     told = json.loads(done.stdout)
     assert told["republished"]["/cam/image_raw/compressed"]["topic"].endswith("compressed_png")

@@ -57,7 +57,7 @@ def use(monkeypatch: pytest.MonkeyPatch, engine: InlineEngine) -> InlineEngine:
 
 def fail_at(tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     use(monkeypatch, InlineEngine(lambda task: task == name))
-    with pytest.raises(PartsFailedError, match=r"run the same command again to go on"):
+    with pytest.raises(PartsFailedError, match=r"run the same command again to resume"):
         mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
 
 
@@ -126,12 +126,12 @@ def test_where_nothing_was_finished_nothing_is_left(
 @each(
     ("options", "sentence"),
     [
-        ({"codec": "ffv1"}, r"another `codec`: 'h264', and now it is 'ffv1'.*`restart`"),
-        ({"codec": None}, r"another `codec`: 'h264', and now it is None.*`restart`"),
-        ({"window": 4}, r"another `window`: 3, and now it is 4"),
-        ({"quality": "crf=20"}, r"another `quality`: 'lossless', and now it is 'crf=20'"),
-        ({"exclude": ["/imu"]}, r"another `exclude`: \[\], and now it is \['/imu'\]"),
-        ({"camera_info": ["a=b"]}, r"another `camera_info`"),
+        ({"codec": "ffv1"}, r"different `codec`: 'h264', and now it is 'ffv1'.*`restart`"),
+        ({"codec": None}, r"different `codec`: 'h264', and now it is None.*`restart`"),
+        ({"window": 4}, r"different `window`: 3, and now it is 4"),
+        ({"quality": "crf=20"}, r"different `quality`: 'lossless', and now it is 'crf=20'"),
+        ({"exclude": ["/imu"]}, r"different `exclude`: \[\], and now it is \['/imu'\]"),
+        ({"camera_info": ["a=b"]}, r"different `camera_info`"),
     ],
 )
 def test_other_options_are_refused(
@@ -215,7 +215,7 @@ def test_a_video_that_rotted_is_not_joined(
     data[len(data) // 2] ^= 1
     video.write_bytes(data)
     use(monkeypatch, InlineEngine())
-    with pytest.raises(FormatError, match=r"cam_image_raw.mp4.*was damaged since"):
+    with pytest.raises(FormatError, match=r"cam_image_raw.mp4.*was damaged after"):
         mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
     assert not (tmp_path / "dataset").exists()
 
@@ -226,7 +226,7 @@ def test_two_at_a_time_are_refused(
     refusals = []
 
     def meanwhile(_: str) -> bool:
-        with pytest.raises(TargetError, match=r"another mp4ds is at work there"):
+        with pytest.raises(TargetError, match=r"another mp4ds is working there"):
             mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
         refusals.append(1)
         return False
@@ -245,7 +245,7 @@ def test_an_interrupt_keeps_what_is_finished(
         return False
 
     use(monkeypatch, InlineEngine(interrupt))
-    with pytest.raises(KeyboardInterrupt, match=r"run the same command again to go on"):
+    with pytest.raises(KeyboardInterrupt, match=r"run the same command again to resume"):
         mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
     engine = use(monkeypatch, InlineEngine())
     mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
@@ -374,7 +374,7 @@ def test_killed_at_random_moments_it_ends_as_if_it_had_not_been(
     if not (tmp_path / "dataset").exists():
         for _ in range(100):  # workers end by themselves
             last = subprocess.run(command, capture_output=True, check=False, text=True)
-            if "at work there" not in last.stderr:
+            if "working there" not in last.stderr:
                 break
             time.sleep(0.1)
         assert last.returncode == 0, last.stderr

@@ -431,7 +431,7 @@ def test_the_usual_error_names_the_option(name: str, tmp_path: Path) -> None:
     if last.is_dir():
         last = sorted(last.glob("*_0.*"))[0]
     os.truncate(last, last.stat().st_size * 2 // 3)
-    with pytest.raises(SourceError, match=r"`mp4ds pack --salvage` packs what can be read"):
+    with pytest.raises(SourceError, match=r"`mp4ds pack --salvage` to pack what is still readable"):
         usual(*paths)
     if "zstd-file" in name:
         return  # a single block: nothing of it comes out
@@ -473,7 +473,7 @@ def test_the_damaged_files_of_others() -> None:
 def test_what_is_no_recording_is_refused(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"drive.{suffix}"
     path.write_bytes(random.Random(suffix).randbytes(10**6))
-    with pytest.raises(SourceError, match="holds no record"):
+    with pytest.raises(SourceError, match=r"holds no .* records"):
         salvaged(path)
     path.write_bytes(b"")
     with pytest.raises(SourceError, match="is empty"):

@@ -497,7 +497,7 @@ UNINDEXED: dict[str, tuple[Change, str]] = {
     "only a pause": (edits((500, -1)), "several edits"),
     "before the start": (edits((500, -2)), "several edits"),
     "many edits": (edits(*[(1, -1)] * 16, (500, 0)), "several edits"),
-    "standing still": (edits((500, 0), speed=0), "stands still"),
+    "standing still": (edits((500, 0), speed=0), "freezes a frame"),
     "no end": (edits((0, 0)), "no end"),
     "nothing": (edits((500, 2**30)), "shows no frames"),
     "edits that are not counted": (

@@ -331,7 +331,7 @@ def test_broken_files_are_refused_in_a_sentence(
         mp4ds.open(path)
     assert caught.value.code == "migration-failed"
     sentence = str(caught.value)
-    assert sentence.startswith(f"{path}: is not a whole file of version 0")
+    assert sentence.startswith(f"{path}: is not a complete file of version 0")
     assert word in sentence
     assert "\n" not in sentence
     problems = mp4ds.validate(path)

@@ -163,7 +163,7 @@ def test_memory_for_less_than_one_encoder_is_refused(
 ) -> None:
     monkeypatch.undo()  # the engine is to be the usual one
     demo(tmp_path / "drive.bag", seconds=3)
-    with pytest.raises(OptionError, match=r"`memory` of 50 MiB is too little: one encoder"):
+    with pytest.raises(OptionError, match=r"`memory` of 50 MiB is too little: encoding"):
         mp4ds.pack(
             tmp_path / "drive.bag", tmp_path / "d", PackOptions(window=15, memory=50 * 2**20)
         )

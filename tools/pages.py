@@ -28,16 +28,6 @@ from mp4ds.options import Options, shown_of
 ROOT = Path(__file__).resolve().parents[1]
 OTHERS = ("*.md", "spec/*.md", "conformance/README.md", "benchmarks/RESULTS.md", "benchmarks/*.svg")
 """Files of the site that are not in docs/."""
-KINDS = {
-    "pack": ("PackOptions",),
-    "unpack": ("UnpackOptions",),
-    "import images": ("ImageFolder", "PackOptions"),
-    "export": ("ExportOptions",),
-    "play": ("PlayOptions",),
-    "evaluate": ("EvaluateOptions",),
-    "report": ("ReportOptions",),
-}
-"""Command -> the classes that have its options in Python."""
 API = {
     "pack-unpack": ("Packing and unpacking", ("packing.", "unpacking.", "plugins.importing")),
     "reading": ("Reading", ("dataset.", "times")),
@@ -171,7 +161,7 @@ def command_page(name: str) -> str:
 def command_text(name: str, command: Any, examples: list[tuple[str, str, Page | str]]) -> str:
     """The page of a command."""
     context = typer.Context(command, info_name=f"mp4ds {name}")
-    kinds = [option_class(kind) for kind in KINDS.get(name, ())]
+    kinds = [kind for kind in getattr(command.callback, "kinds", ()) if is_public(kind)]
     parts = [f"# mp4ds {name}\n", _paragraphs(command.help)]
     usage = " ".join(["mp4ds", name, *command.collect_usage_pieces(context)])
     parts.append(f"```text\n{usage}\n```\n")
@@ -271,10 +261,9 @@ def names_of(page: str) -> list[str]:
     return sorted(found, key=lambda name: (name[0].isupper(), name))
 
 
-def option_class(name: str) -> type[Options]:
-    """A class of options."""
-    found: type[Options] = getattr(mp4ds, name)
-    return found
+def is_public(kind: type[Options]) -> bool:
+    """Whether a class of options is one of the package's names."""
+    return getattr(mp4ds, kind.__name__, None) is kind
 
 
 def _options_table(kind: type[Options]) -> str:

@@ -1,14 +1,14 @@
 """Robot camera recordings as mp4 files with YAML sidecars, and back again exactly.
 
-The public surface, and nothing else::
+The public API, and nothing else::
 
-    mp4ds.pack("drive.bag", "drive")            a recording into a dataset
-    mp4ds.unpack("drive", "bag", "again.bag")   and back
-    mp4ds.import_ros_mp4("a.mp4", "a.yaml", "a")   a dataset of the paper's tool as it is
+    mp4ds.pack("drive.bag", "drive")            recording -> dataset
+    mp4ds.unpack("drive", "bag", "again.bag")   dataset -> recording
+    mp4ds.import_ros_mp4("a.mp4", "a.yaml", "a")   converts a pair made by the paper's tool
     mp4ds.export("drive", "euroc", "for_slam")  EuRoC, TUM, KITTI, COLMAP, Rerun, LeRobot
-    mp4ds.evaluate("drive.bag").recommended     encoder settings, tried on clips of its cameras
-    mp4ds.report("drive")                       a page of its cameras, times and calibrations
-    mp4ds.play("drive")                         as if it were the recording: ROS 1, ROS 2, Foxglove
+    mp4ds.evaluate("drive.bag").recommended     encoder settings, tried on clips
+    mp4ds.report("drive")                       a page with its cameras, timing and calibrations
+    mp4ds.play("drive")                         publishes to ROS 1, ROS 2 or Foxglove
     mp4ds.validate("drive", deep=True)          every problem, or an empty list
     mp4ds.open("drive")["/camera/image_raw"][7].data
     mp4ds.open("drive")["/camera/image_raw"].read([7, 3, 9], format="rgb", resize=0.5)

@@ -3,31 +3,30 @@
 ::
 
     Mp4dsError                         exit code 1
-    ├── SourceError (ValueError)       2  a recording that cannot be read as asked
+    ├── SourceError (ValueError)       2  a recording that cannot be read
     │   └── SourceNotFoundError (FileNotFoundError)
-    ├── TargetError (OSError)          2  an output that may not be written there
+    ├── TargetError (OSError)          2  an output that cannot be written there
     │   └── TargetExistsError (FileExistsError)
-    ├── OptionError (ValueError)       2  options that contradict or are unknown
-    ├── FrameNotFoundError (LookupError) 2  no frame has the time that was asked for
+    ├── OptionError (ValueError)       2  options that are unknown or contradict each other
+    ├── FrameNotFoundError (LookupError) 2  no frame has the requested time
     ├── FormatError (ValueError)       1  a dataset that breaks a rule of the format
     │   ├── VersionError               1  written by a newer major version
     │   └── VideoError                 1  a video that cannot be decoded as its sidecar says
     ├── ConversionError (ValueError)   1  a message that the target cannot hold
-    ├── WriteError (OSError)           1  the disk refused while writing
+    ├── WriteError (OSError)           1  an output could not be written
     ├── PartsFailedError               1  parts of a pack failed, the others are kept
-    ├── EncoderRefusedError            1  pictures that an encoder does not take
-    ├── HardwareError                  1  an encoder of the hardware that is not there, or failed
-    ├── OutOfReachError                1  a score that a stream cannot have
+    ├── EncoderRefusedError            1  pictures that an encoder does not support
+    ├── HardwareError                  1  a hardware encoder that is missing or failed
+    ├── OutOfReachError                1  a score that a stream cannot reach
     ├── SegmentsDifferError            1  videos that cannot be joined
-    ├── ScoringError                   1  an ffmpeg with libvmaf that is not there, or failed
+    ├── ScoringError                   1  an ffmpeg with libvmaf that is missing or failed
     ├── SampleError (RuntimeError)     1  a sample of a data loader that cannot be read
-    ├── ClusterError (ConnectionError) 1  a cluster that does not answer, or was lost
+    ├── ClusterError (ConnectionError) 1  a cluster that does not respond, or was lost
     ├── RemoteError                    1  a store or web server that fails
-    └── PublishError (OSError)         1  ROS or another receiver that is not there, or was lost
+    └── PublishError (OSError)         1  ROS or another receiver that is missing or was lost
 
 The classes build their sentence from their fields: what, where, and what to do.
-The exit code is the one that the command line ends with. `Refused` is not one of them: no user
-meets it.
+The exit code is that of the command line. `Refused` is not one of them: users never see it.
 """
 
 from __future__ import annotations
@@ -44,12 +43,12 @@ class Mp4dsError(Exception):
     exit_code = 1
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # as it is: the classes cannot be made again from their sentence alone
+        # pickled like this because the classes cannot be rebuilt from their sentence alone
         return _restored, (type(self), self.args, vars(self))
 
 
 def _restored(kind: type[Mp4dsError], args: tuple[Any, ...], fields: dict[str, Any]) -> Mp4dsError:
-    """An error that comes from another process."""
+    """An error from another process."""
     error: Mp4dsError = (OSError if issubclass(kind, OSError) else Exception).__new__(kind)
     error.args = args
     vars(error).update(fields)
@@ -57,9 +56,9 @@ def _restored(kind: type[Mp4dsError], args: tuple[Any, ...], fields: dict[str, A
 
 
 class Refused(ValueError):  # noqa: N818 - no failure: another way is taken
-    """One way cannot be taken with what is there; the text says why, as a phrase.
+    """One approach does not work for this input; the text says why, as a phrase.
 
-    Whoever catches it takes the next way, and tells the reason where the user gains by it: a
+    Anyone who catches it tries the next approach, and reports the reason where it helps the user: a
     message is stored verbatim, a video is read in order, a camera is left out.
     """
 
@@ -69,19 +68,19 @@ def _as_path(path: Path | str) -> Path:
 
 
 def reason_of(error: BaseException) -> str:
-    """What the system says of an error, and what helps; without a full stop."""
+    """The system's description of an error, and what helps; without a full stop."""
     if getattr(error, "errno", None) in (errno.EMFILE, errno.ENFILE):
         return "too many files are open at once; `ulimit -n` allows more"
     return getattr(error, "strerror", None) or str(error)
 
 
 def sentence_of(error: OSError) -> str:
-    """An error of the system: where, and what; without a full stop."""
+    """A system error: where, and what; without a full stop."""
     return f"{error.filename or 'a file'}: {reason_of(error)}"
 
 
 class SourceError(Mp4dsError, ValueError):
-    """A recording cannot be read as asked.
+    """A recording cannot be read.
 
     Args:
         path: The recording.
@@ -93,6 +92,7 @@ class SourceError(Mp4dsError, ValueError):
 
     def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
         self.path = _as_path(path)
+        self.problem = problem
         super().__init__(f"{path}: {problem}." + (f" {remedy}" if remedy else ""))
 
 
@@ -104,7 +104,7 @@ class SourceNotFoundError(SourceError, FileNotFoundError):
 
 
 class TargetError(Mp4dsError, OSError):
-    """An output may not be written where it was asked for."""
+    """An output cannot be written to the requested place."""
 
     exit_code = 2
 
@@ -117,7 +117,9 @@ class TargetExistsError(TargetError, FileExistsError):
     """The output exists and ``force`` was not given."""
 
     def __init__(self, path: Path | str) -> None:
-        super().__init__(path, "exists already", "Choose another name, or replace it with `force`.")
+        super().__init__(
+            path, "already exists", "Choose another name, or use `force` to replace it."
+        )
 
 
 class OptionError(Mp4dsError, ValueError):
@@ -127,13 +129,13 @@ class OptionError(Mp4dsError, ValueError):
 
 
 class FrameNotFoundError(Mp4dsError, LookupError):
-    """No frame of a topic has the time that was asked for.
+    """No frame of a topic has the requested time.
 
     Args:
         topic: Topic of the frames.
-        stamp_ns: What was asked for, nanoseconds.
+        stamp_ns: The requested time, nanoseconds.
         wanted: Which frame, such as "at or before"; a phrase.
-        nearest_ns: Stamp of the nearest frame there is, nanoseconds.
+        nearest_ns: Stamp of the nearest frame, nanoseconds.
     """
 
     exit_code = 2
@@ -143,7 +145,7 @@ class FrameNotFoundError(Mp4dsError, LookupError):
         self.stamp_ns = stamp_ns
         self.nearest_ns = nearest_ns
         super().__init__(
-            f"{topic} has no frame {wanted} {stamp_ns} ns; the nearest one is of {nearest_ns} ns, "
+            f"{topic} has no frame {wanted} {stamp_ns} ns; the nearest is at {nearest_ns} ns, "
             f"{abs(nearest_ns - stamp_ns)} ns {'later' if nearest_ns > stamp_ns else 'earlier'}."
         )
 
@@ -171,7 +173,7 @@ class VersionError(FormatError):
         super().__init__(
             "version-unsupported",
             place,
-            f"is of format version {found!r}, and this mp4ds reads up to {supported!r}; "
+            f"has format version {found!r}; this mp4ds reads versions up to {supported!r}: "
             "install a newer mp4ds",
         )
 
@@ -190,23 +192,33 @@ class ConversionError(Mp4dsError, ValueError):
 
 
 class WriteError(Mp4dsError, OSError):
-    """The disk refused while an output was written; nothing stays under its final name."""
+    """An output could not be written; nothing remains under its final name."""
 
     def __init__(self, path: Path | str, cause: BaseException) -> None:
         self.path = _as_path(path)
         super().__init__(
-            f"{path}: could not be written: {reason_of(cause)}. "
-            "The source is untouched and the unfinished output was removed."
+            f"{path}: could not be written: {reason_of(cause)}. The source is untouched, and the "
+            "partial output was removed."
+        )
+
+
+class RecordError(Mp4dsError, OSError):
+    """The disk refused while a recording was made; what came before is kept."""
+
+    def __init__(self, folder: Path, target: Path, cause: BaseException) -> None:
+        super().__init__(
+            f"{folder}: could not be written: {reason_of(cause)}. What was recorded before is in "
+            f"it: make room, then run mp4ds pack --salvage {folder} -o {target}"
         )
 
 
 class PartsFailedError(Mp4dsError):
-    """Parts of a pack failed; what was finished is kept, so that the same command goes on.
+    """Parts of a pack failed; finished parts are kept, so that the same command resumes.
 
     Args:
         dataset: What was being made.
         failures: Name and sentence of each part that failed.
-        total: Parts that there are.
+        total: Number of parts.
         exit_code: That of the first failure.
     """
 
@@ -222,7 +234,7 @@ class PartsFailedError(Mp4dsError):
         more = f" And {len(failures) - 5} more." if len(failures) > 5 else ""
         super().__init__(
             f"{dataset}: {len(failures)} of {total} parts could not be packed. {listed}{more} "
-            "What is finished is kept: run the same command again to go on."
+            "Finished parts are kept: run the same command again to resume."
         )
 
 
@@ -230,7 +242,7 @@ class ClusterError(Mp4dsError, ConnectionError):
     """A cluster does not answer, refuses, or was lost.
 
     Args:
-        address: What the user called it.
+        address: The address as the user gave it.
         problem: What is wrong, without a full stop.
         remedy: What the user can do.
     """
@@ -243,8 +255,8 @@ class ClusterError(Mp4dsError, ConnectionError):
 class RemoteError(Mp4dsError):
     """A store or web server did not answer, or the network failed, while reading or uploading.
 
-    It is neither a `ValueError` nor an `OSError` on purpose: what handles a damaged recording or a
-    full disk must not take it for that.
+    It is neither a `ValueError` nor an `OSError` on purpose: handlers of a damaged recording or a
+    full disk must not catch it.
 
     Args:
         path: What was read or uploaded.
@@ -261,7 +273,7 @@ class PublishError(Mp4dsError, OSError):
     """Messages cannot be published: a master or client library is missing, or was lost.
 
     Args:
-        where: A topic, or the address of what does not answer.
+        where: A topic, or the address that does not respond.
         problem: What is wrong and what to do, without a full stop.
     """
 
@@ -275,29 +287,31 @@ class ScoringError(Mp4dsError):
 
 
 class SampleError(Mp4dsError, RuntimeError):
-    """Frames of a sample cannot be read; says of which dataset and topic, and which frame.
+    """Frames of a sample cannot be read; names the dataset, topic and frame.
 
-    A DataLoader makes an error of a worker again in the main process, from its text alone. So
-    this one has nothing but its text, and is the same with and without workers.
+    A DataLoader re-creates a worker's error in the main process from its text alone. So this error
+    has only a text, and is the same with and without workers.
     """
 
 
 class OutOfReachError(Mp4dsError):
-    """A stream that was begun cannot have the score that was asked for.
+    """A stream that was started cannot reach the requested score.
 
     Args:
         topic: Of its messages.
-        stream: What tells it from the others of a pack.
+        stream: Identifies it among the streams of a pack.
         reason: What was tried.
     """
 
     def __init__(self, topic: str, stream: Any, reason: str) -> None:
         self.stream, self.reason = stream, reason
-        super().__init__(f"{topic}: {reason}. Ask for less, or pack it with `quality` lossless.")
+        super().__init__(
+            f"{topic}: {reason}. Lower the target, or pack it with `quality` lossless."
+        )
 
 
 class SegmentsDifferError(Mp4dsError):
-    """Videos that cannot be one: their track could not describe the packets of both.
+    """Videos that cannot be joined: one track could not describe the packets of both.
 
     Args:
         first: The segment that the others are compared with.
@@ -308,16 +322,16 @@ class SegmentsDifferError(Mp4dsError):
     def __init__(self, first: Path, other: Path, differences: str) -> None:
         self.first, self.other = first, other
         super().__init__(
-            f"{other}: cannot be joined to {first}, since they differ in {differences}. "
-            "Encode both with the same options, or keep them as two streams."
+            f"{other}: cannot be joined to {first}: they differ in {differences}. Encode both "
+            "with the same options, or keep them as two streams."
         )
 
 
 class HardwareError(Mp4dsError):
-    """An encoder of the hardware cannot be used here.
+    """A hardware encoder cannot be used here.
 
     Args:
-        name: As ``--codec`` has it.
+        name: As given to ``--codec``.
         problem: What was tried, and why it failed, without a full stop.
         remedy: What the user can do, without a full stop.
         instead: The codec that needs no hardware.
@@ -329,4 +343,4 @@ class HardwareError(Mp4dsError):
 
 
 class EncoderRefusedError(Mp4dsError):
-    """The encoder does not take pictures of this kind or size; the message says why."""
+    """The encoder does not support pictures of this kind or size; the message says why."""

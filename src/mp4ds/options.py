@@ -1,6 +1,6 @@
-"""Options, declared once: as fields of dataclasses, with all that the command line shows of them.
+"""Options, declared once: as fields of dataclasses, with everything the command line shows.
 
-Errors name an option by its field, in backticks; the command line makes its flag of that.
+Errors name an option by its field, in backticks; the command line turns it into the flag.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """What is shown of an option.
+    """How an option is shown.
 
     Attributes:
         help: A phrase.
         flags: Of the command line; without a long one it is named like the field.
-        metavar: What stands for its value.
-        least: The least value; None for any.
-        most: The greatest value; None for any.
-        parse: Makes the value of text, where the command line cannot by itself.
-        default: What text stands for the default, where there is `parse`.
+        metavar: Placeholder for its value.
+        least: The minimum; None for any value.
+        most: The maximum; None for any value.
+        parse: Converts text to the value, if the command line cannot do so itself.
+        default: The default as text, if there is `parse`.
     """
 
     help: str
@@ -95,12 +95,12 @@ def parse_size(text: str) -> int:
     """Bytes of ``8G``, ``500M`` or ``1.5GB``; units of 1024.
 
     Raises:
-        OptionError: It is no size.
+        OptionError: It is not a size.
     """
     match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) *([kmgt]?)(?:i?b)?", text.strip().lower())
     size = int(float(match[1]) * _UNITS[match[2]]) if match else 0
     if not size:
-        raise OptionError(f"`memory` {text!r} is no size. Give one such as 8G or 500M.")
+        raise OptionError(f"`memory` {text!r} is not a size. Use a value such as 8G or 500M.")
     return size
 
 
@@ -117,12 +117,12 @@ def parse_resize(text: str) -> float | tuple[int, int]:
         return float(text)
     except ValueError:
         raise OptionError(
-            f"`resize` {text!r} is no size. Give a factor such as 0.5, or WxH such as 640x480."
+            f"`resize` {text!r} is not a size. Use a factor such as 0.5, or WxH such as 640x480."
         ) from None
 
 
 def parse_words(text: str) -> tuple[str, ...]:
-    """The words of a list with commas."""
+    """The words of a comma-separated list."""
     return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
@@ -132,7 +132,7 @@ _NS = 10**9
 _LATEST = 2**63 - 1
 _NUMBER = re.compile(r"\+?([0-9]{1,19})(?:\.([0-9]{0,9}))?")
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?Z?")
-_SINCE_1970, _IN_NS = 10**8, 10**11  # smaller numbers are seconds from the beginning, or of 1970
+_SINCE_1970, _IN_NS = 10**8, 10**11  # smaller numbers are seconds from the beginning, or since 1970
 
 
 def time_of(text: str, start_ns: int, option: str) -> int:
@@ -140,10 +140,10 @@ def time_of(text: str, start_ns: int, option: str) -> int:
 
     Args:
         text: ``2.5`` or ``+2.5``: seconds from the beginning; from 1e8 on, ``1700000000.5``:
-            seconds since 1970, all nine digits counting; from 1e11 on, ``1700000000123456789``:
+            seconds since 1970, with nanosecond precision; from 1e11 on, ``1700000000123456789``:
             nanoseconds; ``2023-11-14T22:13:20.5``: UTC.
         start_ns: The beginning.
-        option: What is told, for errors.
+        option: The option's name, for errors.
 
     Raises:
         OptionError: It is none of these.
@@ -161,10 +161,10 @@ def time_of(text: str, start_ns: int, option: str) -> int:
         try:
             moment = datetime.fromisoformat(match[1]).replace(tzinfo=timezone.utc)
         except ValueError as error:
-            raise OptionError(f"`{option}` {text!r} is no date: {error}.") from None
+            raise OptionError(f"`{option}` {text!r} is not a valid date: {error}.") from None
         return _nanoseconds(int(moment.timestamp()), match[2])
     raise OptionError(
-        f"`{option}` {text!r} is no time. Give seconds from the beginning or since 1970, "
+        f"`{option}` {text!r} is not a valid time. Use seconds from the beginning or since 1970, "
         "nanoseconds since 1970, or a date such as 2023-11-14T22:13:20.5."
     )
 
@@ -174,7 +174,7 @@ def _nanoseconds(seconds: int, fraction: str | None) -> int:
 
 
 def iso_text(time_ns: int) -> str:
-    """A time as an ISO date, UTC, without the digits that say nothing; outside of them a number."""
+    """A time as an ISO date in UTC, without trailing zeros; as a number if out of range."""
     seconds, rest = divmod(time_ns, _NS)
     try:
         moment = datetime.fromtimestamp(seconds, timezone.utc)
@@ -186,12 +186,12 @@ def iso_text(time_ns: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Slice:
-    """A slice of time, as users write it. False where none is asked for.
+    """A time slice, as users write it. False if empty.
 
     Attributes:
-        start: The first time that is taken; None for the beginning.
-        end: The time before which all is taken; None for no end.
-        duration: Seconds from `start`, or before `end`; None where the others tell.
+        start: The first time included; None for the beginning.
+        end: The time before which everything is included; None for no end.
+        duration: Seconds from `start`, or before `end`; None if the others define the slice.
     """
 
     start: str | float | None = None
@@ -202,7 +202,7 @@ class Slice:
         return (self.start, self.end, self.duration) != (None, None, None)
 
     def times(self, first: int, last: int, place: object) -> tuple[int | None, int | None]:
-        """The first log time that is taken, and the first one after; None for open.
+        """The first log time included, and the first one after; None for open.
 
         Args:
             first: Of the recording, nanoseconds.
@@ -210,14 +210,14 @@ class Slice:
             place: The recording, for errors.
 
         Raises:
-            OptionError: A time is none, or nothing of the recording is taken.
+            OptionError: A time is not valid, or the slice contains nothing.
         """
         start = None if self.start is None else time_of(str(self.start), first, "start")
         end = None if self.end is None else time_of(str(self.end), first, "end")
         if self.duration is not None:
             length = time_of(f"+{self.duration}", 0, "duration")
             if start is not None and end is not None:
-                raise OptionError("Give two of `start`, `end` and `duration`.")
+                raise OptionError("Give at most two of `start`, `end` and `duration`.")
             if end is not None:
                 start = max(end - length, -_LATEST)
             else:
@@ -225,19 +225,19 @@ class Slice:
         begin, stop = first if start is None else start, last + 1 if end is None else end
         if begin >= stop or begin > last or stop <= first:
             raise OptionError(
-                f"{place}: nothing was recorded from {iso_text(begin)} to before "
-                f"{iso_text(stop)}. It has messages from {iso_text(first)} to {iso_text(last)}, "
+                f"{place}: nothing was recorded from {iso_text(begin)} until {iso_text(stop)}. It "
+                f"has messages from {iso_text(first)} to {iso_text(last)}, "
                 f"{(last - first) / _NS:.9g} seconds."
             )
         return start, end
 
 
 WHOLE = Slice()
-"""No slice: all that was recorded."""
+"""No slice: the whole recording."""
 
 
 class SliceOptions(Options):
-    """Base of options that have these three."""
+    """Base of options that have these three fields."""
 
     start: str | float | None
     end: str | float | None
@@ -245,7 +245,7 @@ class SliceOptions(Options):
 
     @property
     def slice(self) -> Slice:
-        """What is taken of the recording; false for all."""
+        """The slice of the recording; false for all of it."""
         return Slice(self.start, self.end, self.duration)
 
 
@@ -253,63 +253,63 @@ class SliceOptions(Options):
 
 
 def topics() -> Any:
-    """The option of topics to take."""
-    return option("Only topics that match; may be repeated.", (), "-t", metavar="GLOB")
+    """The option for topics to include."""
+    return option("Only matching topics; repeatable.", (), "-t", metavar="GLOB")
 
 
 def exclude(*flags: str) -> Any:
-    """The option of topics to leave out."""
-    return option("Leave out topics that match.", (), *flags, "-x", metavar="GLOB")
+    """The option for topics to leave out."""
+    return option("Leave out matching topics.", (), *flags, "-x", metavar="GLOB")
 
 
-def resize(help: str = "Smaller images, calibrations to match.") -> Any:  # noqa: A002
-    """The option of another size of images: a factor, or width and height in pixels."""
+def resize(help: str = "Scale images down, calibrations to match.") -> Any:  # noqa: A002
+    """The option for resizing images: a factor, or width and height in pixels."""
     return option(help, None, metavar="0.5|WxH", parse=parse_resize)
 
 
 def every() -> Any:
-    """The option of fewer frames, by number."""
-    return option("Every Nth frame only, from the first one on.", 1, metavar="N", least=1)
+    """The option for fewer frames, by number."""
+    return option("Keep only every Nth frame, starting with the first.", 1, metavar="N", least=1)
 
 
 def max_rate() -> Any:
-    """The option of fewer frames, by time."""
-    return option("So many frames a second at most.", None, metavar="HZ")
+    """The option for fewer frames, by time."""
+    return option("Maximum frames per second.", None, metavar="HZ")
 
 
 def jpeg_quality() -> Any:
-    """The option of the quality of JPEG files."""
-    return option("Of JPEG files that are made.", 95, least=1, most=100)
+    """The option for the quality of JPEG files."""
+    return option("Quality of the JPEG files that are made.", 95, least=1, most=100)
 
 
 def start() -> Any:
-    """The option of the first time that is taken."""
+    """The option for the first time included."""
     return option(
-        "Take what was recorded from here on: seconds from the beginning, or since 1970; "
-        "nanoseconds since 1970; or an ISO date.",
+        "Begin at this time: seconds from the beginning or since 1970, nanoseconds since 1970, "
+        "or an ISO date.",
         metavar="TIME",
     )
 
 
 def end() -> Any:
-    """The option of the time before which all is taken."""
-    return option("Take what was recorded before this time.", metavar="TIME")
+    """The option for the time before which everything is included."""
+    return option("Stop before this time.", metavar="TIME")
 
 
 def duration() -> Any:
-    """The option of how much is taken."""
-    return option("Take that many seconds from `start` on, or before `end`.", metavar="SECONDS")
+    """The option for the length of a slice."""
+    return option("Seconds from `start` on, or up to `end`.", metavar="SECONDS")
 
 
 def cluster() -> Any:
-    """The option of what runs tasks."""
+    """The option for what runs the tasks."""
     return option(
-        "Dask scheduler, tcp://HOST:PORT, or slurm; this machine by default.",
+        "Dask scheduler at tcp://HOST:PORT, or slurm; default: this machine.",
         None,
         metavar="ADDRESS",
     )
 
 
 def force(help: str = "Replace an existing output.") -> Any:  # noqa: A002
-    """The option of replacing what is there."""
+    """The option to replace existing output."""
     return option(help, False, "-f")

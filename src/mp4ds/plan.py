@@ -16,10 +16,10 @@ import xxhash
 from mp4ds.errors import OptionError
 
 LOSSLESS = "lossless"
-"""The quality by which nothing is lost."""
+"""The quality at which nothing is lost."""
 
 MAX_GOP = 100_000
-"""Most frames from one key frame to the next that may be asked for."""
+"""Maximum key frame interval that may be asked for, frames."""
 
 _MAX_NAME = 100
 _RESERVED = {"dataset", "messages", "con", "prn", "aux", "nul"} | {
@@ -46,11 +46,11 @@ _BOUNDS = {"vmaf": 100.0, "psnr": 60.0, "ssim": 1.0}  # of PSNR, dB: identical p
 
 @dataclass(frozen=True, slots=True)
 class QualityTarget:
-    """The score that packed frames are to have.
+    """The score that packed frames have to reach.
 
     Attributes:
         metric: ``vmaf`` (0 to 100), or of the luma ``psnr`` (dB) or ``ssim`` (0 to 1).
-        score: What the mean over the frames is to be.
+        score: Required mean over the frames.
     """
 
     metric: str
@@ -81,7 +81,7 @@ class QualitySetting:
 
     @property
     def lossless(self) -> bool:
-        """Whether every pixel must return as it was."""
+        """Whether every pixel must be restored exactly."""
         return self.name == LOSSLESS
 
     def __str__(self) -> str:
@@ -113,7 +113,7 @@ def parse_quality(text: str) -> QualitySetting:
 
 
 TRAINING, ARCHIVE = "training", "archive"
-_LARGER = 15  # per cent that faster reading may cost
+_LARGER = 15  # percent that faster reading may cost
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +130,7 @@ class Purpose:
 
     @property
     def is_training(self) -> bool:
-        """Whether frames are to be read fast."""
+        """Whether fast reading matters."""
         return self.name == TRAINING
 
 
@@ -157,7 +157,7 @@ def visual_setting(rate: float | None) -> tuple[int, int]:
     """The crf and preset of the table row nearest to a frame rate.
 
     Args:
-        rate: Frames per second, or None where no index tells; then 30 is assumed.
+        rate: Frames per second, or None if no index gives it; then 30 is assumed.
     """
     wanted = rate or _UNKNOWN_RATE
     _, crf, preset = min(VISUAL_TABLE, key=lambda row: abs(row[0] - wanted))
@@ -168,8 +168,8 @@ class Selection:
     """Topics chosen by globs.
 
     Args:
-        topics: Globs of which one must match; empty for all topics.
-        exclude: Globs of which none may match.
+        topics: Globs, at least one of which must match; empty for all topics.
+        exclude: Globs, none of which may match.
     """
 
     def __init__(self, topics: Sequence[str] = (), exclude: Sequence[str] = ()) -> None:
@@ -194,7 +194,7 @@ class Selection:
                 if not any(_matches(topic, (pattern,)) for topic in known):
                     listed = ", ".join(known[:20]) + (", ..." if len(known) > 20 else "")
                     raise OptionError(
-                        f"`{option}` {pattern!r} matches no topic. There are: {listed or 'none'}."
+                        f"`{option}` {pattern!r} matches no topic. Topics: {listed or 'none'}."
                     )
 
 

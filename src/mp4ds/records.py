@@ -37,10 +37,10 @@ class Channel:
     """One topic of one publisher; several channels may share a topic.
 
     Attributes:
-        id: Unique within one reader, and without meaning outside of it.
+        id: Unique within one reader, meaningless outside it.
         topic: Topic name, as the source spells it.
         message_encoding: ``ros1``, ``cdr``, ``protobuf``, ``json`` ...
-        schema: The definition, or None where the source has none at all.
+        schema: The definition, or None if the source has none.
         metadata: For ROS 1 the connection header (callerid, latching, md5sum ...);
             for ROS 2 ``offered_qos_profiles`` and ``topic_type_hash``; all verbatim.
     """
@@ -58,7 +58,7 @@ class Channel:
 
     @property
     def identity(self) -> tuple[object, ...]:
-        """All fields but the id: channels of the same identity cannot be told apart."""
+        """All fields except the id: channels with the same identity are indistinguishable."""
         metadata = tuple(sorted(self.metadata.items()))
         return (self.topic, self.message_encoding, self.schema, metadata)
 
@@ -70,8 +70,8 @@ class Message:
     Attributes:
         channel: The channel it was recorded on.
         log_time: When it was recorded, nanoseconds.
-        publish_time: When it was published, nanoseconds; the log time where not known.
-        sequence: The MCAP sequence number; 0 where the source has none.
+        publish_time: When it was published, nanoseconds; the log time if unknown.
+        sequence: The MCAP sequence number; 0 if the source has none.
         data: The payload, byte for byte.
     """
 
@@ -113,11 +113,11 @@ class Excerpt:
     """A part of a recording: a span of log time, and some of the topics.
 
     Attributes:
-        start: The first log time that it may have, nanoseconds; None for open.
+        start: The first log time included, nanoseconds; None for open.
         end: The first log time after it, nanoseconds; None for open.
         topics: Only these; None for all.
-        without: All but these.
-        others: Attachments and metadata records too, all of them whatever the span.
+        without: All except these.
+        others: Also all attachments and metadata records, whatever the span.
     """
 
     start: int | None = None
@@ -128,31 +128,31 @@ class Excerpt:
 
     @property
     def has_messages(self) -> bool:
-        """Whether there may be any message in it."""
+        """Whether it may contain any messages."""
         if self.start is not None and self.end is not None and self.start >= self.end:
             return False
         return self.topics is None or not self.topics <= self.without
 
     def has_topic(self, topic: str) -> bool:
-        """Whether messages of a topic are part of it."""
+        """Whether it includes messages of a topic."""
         return topic not in self.without and (self.topics is None or topic in self.topics)
 
     def has_time(self, time: int) -> bool:
-        """Whether messages of a log time, nanoseconds, are part of it."""
+        """Whether it includes messages of a log time, nanoseconds."""
         return (self.start is None or self.start <= time) and (self.end is None or time < self.end)
 
     def within(self, other: Excerpt) -> Excerpt:
-        """It, as far as it lies in the span of another."""
+        """The part of it within the span of another."""
         starts = [time for time in (self.start, other.start) if time is not None]
         ends = [time for time in (self.end, other.end) if time is not None]
         return replace(self, start=max(starts, default=None), end=min(ends, default=None))
 
     def touches(self, first: int, last: int) -> bool:
-        """Whether some log time from `first` to `last`, both included, is part of it."""
+        """Whether it includes any log time from `first` to `last`, inclusive."""
         return (self.start is None or self.start <= last) and (self.end is None or first < self.end)
 
     def has(self, record: Record) -> bool:
-        """Whether a record is part of it."""
+        """Whether it includes a record."""
         if isinstance(record, Message):
             return self.has_time(record.log_time) and self.has_topic(record.channel.topic)
         return self.others
@@ -163,26 +163,25 @@ EVERYTHING = Excerpt()
 
 
 MAX_LOSSES = 1000
-"""Losses of a recording that are told one by one; the last one then sums up the rest."""
+"""Losses of a recording that are listed individually; the last one then summarises the rest."""
 
 MAX_LOST_TOPICS = 64
-"""Topics that one loss names; the last name then tells how many more there are."""
+"""Topics that one loss names; the last name then says how many more there are."""
 
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """Something of a recording that could not be read.
+    """A part of a recording that could not be read.
 
     Attributes:
         file: Name of the file.
-        offset: Byte where it begins, None where it has no place in the file.
-        size: Bytes of it, of which some may have been read all the same; None where not known.
+        offset: Byte where it begins, None if it has no place in the file.
+        size: Its bytes, some of which may have been read anyway; None if unknown.
         problem: What is wrong, a phrase.
-        messages: How many are lost, None where nothing tells. Where all that tells is what
-            several places lost together, the largest of them has it.
-        topics: Of what is known to be lost.
-        start: Log time of the last message read before it, ns; None where not known.
-        end: Log time of the first message read after it, ns; None where not known.
+        messages: How many are lost, None if unknown. If only the total of several places is known,
+        the largest of them has it. topics: Topics known to have lost messages. start: Log time of
+        the last message read before it, ns; None if unknown. end: Log time of the first
+        message read after it, ns; None if unknown.
     """
 
     file: str
@@ -197,7 +196,7 @@ class Loss:
 
 @dataclass(frozen=True, slots=True)
 class ChannelStats:
-    """What an index tells of a channel without reading its messages.
+    """What an index says about a channel without reading its messages.
 
     Attributes:
         count: Number of messages.
@@ -217,7 +216,7 @@ class ChannelStats:
         return (self.count - 1) * 1e9 / (self.end - self.start)
 
     def plus(self, other: ChannelStats) -> ChannelStats:
-        """What both tell together; without messages there is no span."""
+        """Both combined; without messages there is no span."""
         if not self.count or not other.count:
             return self if self.count else other
         return ChannelStats(

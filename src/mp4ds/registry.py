@@ -1,4 +1,4 @@
-"""The table by which the core finds its plugins, none of which it imports."""
+"""The table by which the core finds its plugins without importing them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Integer nanoseconds: columns of them as text, presentation times, intervals, and cameras matched.
+"""Integer nanoseconds: columns as text, presentation times, intervals, and matching cameras.
 
 numpy only (spec/index.md, "Columns" and "Presentation times").
 """
@@ -21,7 +21,7 @@ TIMESCALE = 1_000_000
 """Ticks per second of every video track: microseconds."""
 
 MAX_GAP_NS = 1_000 * 10**9
-"""A longer gap is shown as this long: past 2,147 s the container breaks."""
+"""Longer gaps are shown with this length: past 2,147 s the container breaks."""
 
 NS_PER_TICK = 10**9 // TIMESCALE
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
@@ -40,7 +40,7 @@ def encode_column(values: Sequence[int] | NDArray[np.int64]) -> dict[str, int | 
         values: At least one 64-bit integer.
 
     Returns:
-        ``start``, ``step`` and ``values``: residuals as text, 32 a line, where ``r*n``
+        ``start``, ``step`` and ``values``: residuals as text, 32 per line, where ``r*n``
         stands for n times r.
     """
     column = np.asarray(values, dtype=np.int64)
@@ -78,7 +78,7 @@ def decode_column(start: int, step: int, text: str, count: int) -> NDArray[np.in
         start: First value.
         step: Common difference.
         text: Residuals.
-        count: Number of values that the column must have, at least one.
+        count: Required number of values, at least one.
 
     Returns:
         int64 array of shape (count,).
@@ -99,7 +99,7 @@ def decode_column(start: int, step: int, text: str, count: int) -> NDArray[np.in
 def _decode_residuals(text: str, count: int) -> NDArray[np.int64]:
     raw = text.encode("ascii", "replace")
     if raw.translate(None, _COLUMN_BYTES):
-        raise ValueError("holds something else than integers")
+        raise ValueError("holds something other than integers")
     codes = np.frombuffer(raw, np.uint8)
     signs = codes[:-1] == _MINUS
     signs &= codes[1:] < _ZERO
@@ -112,12 +112,12 @@ def _decode_residuals(text: str, count: int) -> NDArray[np.int64]:
         try:
             values = np.fromstring(text, dtype=np.int64, sep=" ")
         except (DeprecationWarning, ValueError):
-            raise ValueError("holds something else than integers") from None
+            raise ValueError("holds something other than integers") from None
     if not raw.strip():
         values = values[:0]
     if len(values) != count:
-        raise ValueError(f"holds {len(values) + 1} values where {count + 1} are due")
-    # numpy saturates what does not fit, without a word
+        raise ValueError(f"holds {len(values) + 1} values, not {count + 1}")
+    # numpy silently saturates what does not fit
     if len(values) and (values.max() == INT64_MAX or values.min() == INT64_MIN):
         raise ValueError("holds an integer beyond 64 bits")
     return values
@@ -125,7 +125,7 @@ def _decode_residuals(text: str, count: int) -> NDArray[np.int64]:
 
 def _decode_runs(text: str, count: int) -> NDArray[np.int64]:
     if not _TOKENS.fullmatch(text):
-        raise ValueError("holds something else than integers and runs")
+        raise ValueError("holds something other than integers and runs")
     values: list[int] = []
     lengths: list[int] = []
     total = 0
@@ -139,14 +139,14 @@ def _decode_runs(text: str, count: int) -> NDArray[np.int64]:
         if total > count:
             break
     if total != count:
-        raise ValueError(f"does not hold the {count + 1} values that are due")
+        raise ValueError(f"does not hold {count + 1} values")
     if any(not INT64_MIN <= value <= INT64_MAX for value in values):
         raise ValueError("holds an integer beyond 64 bits")
     return np.repeat(np.array(values, dtype=np.int64), lengths)
 
 
 class PresentationClock:
-    """Turns stamps into the strictly increasing ticks that a player shows.
+    """Turns stamps into strictly increasing ticks for players.
 
     The first frame is shown at 0. The time between two frames is that of their header stamps
     where these advance by at most `MAX_GAP_NS`, else that of their log times, else one tick.
@@ -167,13 +167,13 @@ class PresentationClock:
             self._elapsed += gap
         self._stamp, self._log_time = stamp, log_time
         self._tick = max(self._elapsed // NS_PER_TICK, self._tick + 1)
-        # clamping up counts as elapsed, so that a burst does not make later frames late twice
+        # clamping up counts as elapsed, so that a burst does not delay later frames twice
         self._elapsed = max(self._elapsed, self._tick * NS_PER_TICK)
         return self._tick
 
 
 class Int64Column:
-    """A growing column that takes eight bytes a value."""
+    """A growing column that uses eight bytes per value."""
 
     def __init__(self) -> None:
         self._values = array("q")
@@ -213,13 +213,13 @@ def differences(later: Integers, earlier: Integers) -> Floats:
 
 
 def nearest(times: Integers, wanted: Integers) -> Integers:
-    """Places of the times that are nearest to others.
+    """Indices of the nearest times.
 
     Of two equally near ones it is the earlier, of several equal ones the first.
 
     Args:
-        times: Increasing or equal, at least one.
-        wanted: What is looked for, of any shape.
+        times: Sorted, at least one.
+        wanted: The times to look for, of any shape.
     """
     after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
     before = np.maximum(after - 1, 0)
@@ -235,17 +235,17 @@ def intervals(times: Integers) -> Floats:
 
 
 def usual_interval(steps: Floats) -> float | None:
-    """Median of the intervals that advance, nanoseconds; None where none does."""
+    """Median of the positive intervals, nanoseconds; None if there are none."""
     advancing = steps[steps > 0]
     return float(np.median(advancing)) if len(advancing) else None
 
 
 def lost_frames(steps: Floats) -> Integers:
-    """How many frames seem to be missing in each interval.
+    """Estimated number of lost frames in each interval.
 
-    An interval of more than 1.5 times the median is taken for as many as fit into it, rounded.
-    Of it is taken off first what the intervals right before and after are shorter than the
-    median: a frame that came late, or early, is not a lost one.
+    An interval of more than 1.5 times the median counts as the number of medians that fit into it,
+    rounded. Before that it is reduced by the amounts by which the intervals just before and after
+    fall short of the median: a late or early frame is not a lost one.
     """
     usual = usual_interval(steps)
     if usual is None:
@@ -261,25 +261,25 @@ def lost_frames(steps: Floats) -> Integers:
 # ---------------------------------------------------------------- sync
 
 
-_MOST = 2**64 - 1  # no two stamps are farther apart, nanoseconds
+_MOST = 2**64 - 1  # no two stamps can be farther apart, nanoseconds
 
 
 @dataclass(frozen=True, eq=False)
 class Sync:
     """Matches of the frames of several topics. ``len()`` is the number of matches.
 
-    A match has one frame of each topic, and no frame is in two matches. Each topic is matched
-    with the reference by itself: a frame of the one and a frame of the other may go together
-    where no frame of these two topics has a stamp between theirs. The pair that is nearest in
-    time is taken first, of equally near ones the earlier, and neither of them again.
+    A match has one frame of each topic, and no frame is in two matches. Each topic is matched with
+    the reference separately: a frame of one and a frame of the other can be matched if no frame of
+    these two topics has a stamp between theirs. The pair nearest in time is taken first, the
+    earlier of equally near ones, and neither frame is used again.
 
     Attributes:
         topics: Names of the topics, in the order of the columns.
         reference: The topic that the others were matched with.
-        tolerance_ns: Most nanoseconds between a frame and that of the reference.
+        tolerance_ns: Maximum nanoseconds between a frame and the reference frame.
         indices: Frame numbers, int64, shape (matches, topics), by stamp of the reference.
         stamps: Stamps of these frames, nanoseconds, int64, shape (matches, topics).
-        unmatched: Numbers of the frames that are in no match, int64, increasing, by topic.
+        unmatched: Numbers of the unmatched frames, int64, increasing, by topic.
     """
 
     topics: tuple[str, ...]
@@ -299,16 +299,16 @@ def synchronize(
     """Match frames by their stamps; see `Sync`.
 
     Args:
-        stamps: Of each topic's frames, nanoseconds; unsorted and repeated as they may be.
-        tolerance_ns: Most nanoseconds between a frame and that of the reference.
-        reference: One of the topics; None: the one with the fewest frames, of several the first.
+        stamps: Stamps of each topic's frames, nanoseconds; may be unsorted and repeated.
+        tolerance_ns: Maximum nanoseconds between a frame and the reference frame.
+        reference: One of the topics; None: the one with the fewest frames, or the first of several.
 
     Raises:
         OptionError: There is no topic, no such reference, or the tolerance is negative.
     """
     tolerance = as_integer(tolerance_ns)
     if tolerance < 0:
-        raise OptionError(f"a tolerance of {tolerance} ns: use 0 or more")
+        raise OptionError(f"tolerance is {tolerance} ns: use 0 or more")
     if not stamps:
         raise OptionError("there are no topics to match")
     if reference is None:
@@ -336,18 +336,18 @@ def synchronize(
 
 
 def match(reference: Integers, other: Integers, *, tolerance_ns: int) -> Integers:
-    """The frame of the other topic that goes with each of the reference; see `Sync`.
+    """The frame of the other topic matched with each reference frame; see `Sync`.
 
     Args:
         reference: Stamps, nanoseconds.
         other: Stamps, nanoseconds.
-        tolerance_ns: Most nanoseconds between both.
+        tolerance_ns: Maximum nanoseconds between the two.
 
     Returns:
         Frame numbers, int64, shape of `reference`; -1 where there is none.
     """
     times, numbers, is_other = _merged(reference, other)
-    # numbers without a sign, since times may be more than 2^63 apart
+    # unsigned numbers, since times may be more than 2^63 apart
     unsigned: NDArray[np.uint64] = times.view(np.uint64)
     gaps = unsigned[1:] - unsigned[:-1]
     may_go = (is_other[1:] != is_other[:-1]) & (gaps <= np.uint64(min(tolerance_ns, _MOST)))
@@ -363,7 +363,7 @@ def match(reference: Integers, other: Integers, *, tolerance_ns: int) -> Integer
 def _merged(reference: Integers, other: Integers) -> tuple[Integers, Integers, NDArray[np.bool_]]:
     """Both topics by stamp: stamps, frame numbers, and which are of the other topic.
 
-    Of frames with equal stamps, one of the reference is followed by one of the other.
+    Among frames with equal stamps, reference frames and other frames alternate.
     """
     parts = [_ranked(reference), _ranked(other)]
     times, numbers, ranks = (np.concatenate(same) for same in zip(*parts, strict=True))
@@ -384,15 +384,15 @@ def _ranked(stamps: Integers) -> tuple[Integers, Integers, Integers]:
 
 
 def _nearest_first(gaps: NDArray[np.uint64], may_go: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which pairs of neighbours are taken, if the nearest is taken first and then its two are not.
+    """Which pairs of neighbours are taken, nearest first, using each frame once.
 
-    A pair waits for the neighbouring pairs that are nearer. So from each pair that waits for
-    none, along pairs that each wait for the one before, every other one is taken; where two
-    such runs meet, the last pair if it is due in both.
+    A pair waits for neighbouring pairs that are nearer. So from each pair that waits for none,
+    along pairs that each wait for the previous one, every other pair is taken; where two such runs
+    meet, the last pair is taken if both runs would take it.
 
     Args:
         gaps: Time between each frame and the next one.
-        may_go: Whether the two may go together.
+        may_go: Whether the two can be matched.
     """
     both = may_go[1:] & may_go[:-1]
     is_later_nearer = gaps[1:] < gaps[:-1]
@@ -405,6 +405,6 @@ def _nearest_first(gaps: NDArray[np.uint64], may_go: NDArray[np.bool_]) -> NDArr
 
 
 def _run_lengths(waits: NDArray[np.bool_]) -> Integers:
-    """How many places each is after the last one that does not wait."""
+    """Distance of each from the last one before it that does not wait."""
     places = np.arange(len(waits))
     return places - np.maximum.accumulate(np.where(waits, 0, places))

@@ -2,9 +2,8 @@
 
 A file is the JSON-compatible core of YAML 1.2: maps, lists, strings, integers, floats, true,
 false and null; no anchors, tags, dates, duplicate keys or other spellings of booleans.
-Long columns stand at the end as block scalars and are sliced out before parsing, so that
-loading costs the size of the structure and not that of the columns. The last line is a
-checksum of all bytes before it.
+Long columns are block scalars at the end and are cut out before parsing, so that parsing costs as
+much as the structure, not the columns. The last line is a checksum of all bytes before it.
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ import yaml
 
 from mp4ds.errors import FormatError
 
-MAX_BYTES = 512 * 2**20  # a sidecar of a day at 60 Hz has about 100 MB
+MAX_BYTES = 512 * 2**20  # the sidecar of a day at 60 Hz has about 100 MB
 MAX_STRUCTURE_BYTES = 16 * 2**20
 MAX_DEPTH = 32
 MAX_EVENTS = 10**6
 MAX_ALIASED = 10**4
-_MAX_DIGITS = 4300  # where Python stops converting
-_TEXT_OF_A_VALUE = 32  # characters that count as a value where an alias repeats them
+_MAX_DIGITS = 4300  # Python's limit for converting integers
+_TEXT_OF_A_VALUE = 32  # characters that count as a value when an alias repeats them
 _PLAIN_TAGS = ("tag:yaml.org,2002:str", "!")
 
 _CHECKSUM = re.compile(rb'(?:\A|\n)checksum: "xxh64:([0-9a-f]{16})"\n\Z')
@@ -39,7 +38,7 @@ _WORDS = {"": None, "null": None, "~": None, "true": True, "false": False}
 
 
 class _Dumper(_BaseDumper):  # type: ignore[misc]
-    """Writes the subset: lists indented, texts of several lines as literal blocks."""
+    """Writes the subset: lists indented, multi-line texts as literal blocks."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -57,7 +56,8 @@ class _Dumper(_BaseDumper):  # type: ignore[misc]
 
 def _represent_str(dumper: _Dumper, text: str) -> Any:
     plain_block = bool(re.fullmatch(r"[^\s][\n\x20-\x7e\xa0-\u2027\u2030-\ud7ff]*", text))
-    # a text that ends open, or shows the first line of a column, is quoted: readers may slice
+    # a text without a final newline, or that looks like a column's first line, is quoted: readers
+    # may cut it out
     plain_block &= "\n" in text and not text.endswith("\n\n") and not _COLUMN_LINE.search(text)
     style = "|" if plain_block else None
     if not plain_block and _needs_quotes(text):
@@ -123,7 +123,7 @@ def load(data: bytes, place: str) -> dict[str, Any]:
     """
     if len(data) > MAX_BYTES:
         raise FormatError("yaml-invalid", place, f"is larger than {MAX_BYTES} bytes")
-    end = len(data)  # of the document; nothing large is copied on the way to its columns
+    end = len(data)  # of the document; nothing large is copied to get at its columns
     match = _CHECKSUM.search(data, max(0, end - 64))
     if match:
         end = match.start() + 1 if match.start() or data[:1] == b"\n" else 0
@@ -131,16 +131,16 @@ def load(data: bytes, place: str) -> dict[str, Any]:
             raise FormatError(
                 "checksum-mismatch",
                 place,
-                "does not match the checksum in its last line: it was damaged or edited; "
-                "after an intended edit, remove that line",
+                "does not match the checksum in its last line: it was damaged or edited; if the "
+                "edit was intended, remove that line",
             )
     structure, columns = _slice_columns(data, end)
     if len(structure) > MAX_STRUCTURE_BYTES:
-        raise FormatError("yaml-invalid", place, "has too much structure outside of its columns")
+        raise FormatError("yaml-invalid", place, "has too many values outside its columns")
     document = _parse(structure, place)
     marks = structure.count(_MARK.encode())
     if columns and not marks == _restore_columns(document, columns) == len(columns):
-        document = _parse(data[:end], place)  # what looked like a column stood inside of a text
+        document = _parse(data[:end], place)  # what looked like a column was inside a text
     return document
 
 
@@ -153,22 +153,22 @@ def _parse(data: bytes, place: str) -> dict[str, Any]:
             "yaml-invalid", place, f"is not valid YAML of the subset: {reason}"
         ) from None
     if not isinstance(document, dict):
-        raise FormatError("yaml-invalid", place, "is not a map of keys and values")
+        raise FormatError("yaml-invalid", place, "is not a mapping")
     return document
 
 
 def build(text: str, scalar: Callable[[Any], Any]) -> Any:
-    """Read a document of somebody else's YAML, in bounded time and memory.
+    """Read a third-party YAML document, in bounded time and memory.
 
-    Keys are texts, as they stand there. An alias counts as much as what it stands for.
+    Keys are strings, as written. An alias counts as much as its value.
 
     Args:
         text: One document.
-        scalar: Makes the value of a scalar's event.
+        scalar: Converts a scalar event to a value.
 
     Raises:
-        ValueError: It is no YAML, has tags but ``!!str``, keys that are no texts or stand twice,
-            or is too large or nested too deep.
+        ValueError: It is not YAML, has tags other than ``!!str``, keys that are not strings or are
+            repeated, or is too large or too deeply nested.
     """
     try:
         return _build(yaml.parse(text, Loader=_Parser), scalar, is_subset=False)
@@ -177,13 +177,13 @@ def build(text: str, scalar: Callable[[Any], Any]) -> Any:
 
 
 class _Node:
-    """A map or list that is being read.
+    """A map or list being read.
 
     Attributes:
-        value: What was read of it.
-        key: Of a map, that of the next value; None where a key comes next.
+        value: What has been read so far.
+        key: In a map, the key of the next value; None if a key comes next.
         anchor: Its name for aliases, if it has one.
-        before: Size of what stands before it.
+        before: Size of everything before it.
         height: Levels below it.
     """
 
@@ -242,7 +242,7 @@ def _build(events: Iterable[Any], scalar: Callable[[Any], Any], *, is_subset: bo
         if isinstance(event, yaml.CollectionStartEvent):
             open_nodes.append(_Node(value, event.anchor, size))
             height = 0
-        if len(open_nodes) + height > MAX_DEPTH + 1:  # the first is around the document
+        if len(open_nodes) + height > MAX_DEPTH + 1:  # the first encloses the document
             raise ValueError(f"line {line}: is nested deeper than {MAX_DEPTH} levels")
     if len(root) != 1:
         raise ValueError("holds no document, or several")
@@ -266,7 +266,7 @@ def _attach(parent: _Node, value: Any, line: int) -> None:
     elif not isinstance(value, str):
         raise ValueError(f"line {line}: key {value!r} is not a string")
     elif value in parent.value:
-        raise ValueError(f"line {line}: key {value!r} stands twice")
+        raise ValueError(f"line {line}: key {value!r} is repeated")
     else:
         parent.key = value
 
@@ -286,7 +286,7 @@ def _scalar(event: Any) -> Any:
         return int(text)
     value = float(text)
     if value - value != 0:
-        raise ValueError(f"line {_line(event)}: {text} is no finite number")
+        raise ValueError(f"line {_line(event)}: {text} is not a finite number")
     return value
 
 
@@ -294,8 +294,8 @@ def _slice_columns(data: bytes, end: int) -> tuple[bytes, list[str]]:
     """Cut the literal blocks of columns out, leaving a numbered placeholder for each.
 
     Returns:
-        The document's structure, and the columns without their indentation; where a block is
-        not as we write it, the whole document and no columns, for the parser to judge.
+        The document's structure, and the columns without their indentation; if a block is not in
+        the form that we write, the whole document and no columns, for the parser to judge.
     """
     pieces: list[bytes] = []
     columns: list[str] = []

@@ -99,7 +99,7 @@ class _Plan:
         schema: Definition for the target.
         digest: md5sum for ROS 1, type hash for ROS 2.
         times: Where its messages have times.
-        no_message: What is said of a payload that is no message of the type.
+        no_message: What is said of a payload that is not a message of the type.
     """
 
     name: str
@@ -124,7 +124,7 @@ class Converter:
 
     def __init__(self, target: str | None, *, distribution: str = "humble") -> None:
         if target not in ("ros1", "ros2", None):
-            raise OptionError(f"{target!r} cannot be converted to. Use ros1 or ros2.")
+            raise OptionError(f"Messages cannot be converted to {target!r}. Use ros1 or ros2.")
         self._ros1, self._ros2 = ros1_world(), ros2_world(distribution)
         self._target = {"ros1": self._ros1, "ros2": self._ros2}.get(target or "")
         self._source = self._ros1 if self._target is self._ros2 else self._ros2
@@ -189,11 +189,11 @@ class Converter:
     def _plan(self, channel: Channel) -> _Plan:
         schema = channel.schema
         if channel.message_encoding != self._source.encoding:
-            encoding = channel.message_encoding or "of no known encoding"
-            problem = f"its messages are {encoding}, which has no counterpart in ROS"
+            encoding = channel.message_encoding or "in an unknown encoding"
+            problem = f"its messages are {encoding}, which has no equivalent in ROS"
             raise ConversionError(channel.topic, problem, _REMEDY)
         if schema is None or not schema.name:
-            raise ConversionError(channel.topic, "the type of its messages is not known", _REMEDY)
+            raise ConversionError(channel.topic, "its message type is not known", _REMEDY)
         if schema not in self._plans:
             try:
                 self._plans[schema] = self._make_plan(schema)
@@ -218,7 +218,7 @@ class Converter:
         store.get_msgdef(name)  # compiled now, to fail before any message
         made_schema = Schema(new_name, target.schema_encoding, definition.encode())
         times = where_times_are(types, name)
-        no_message = f"a message does not parse as {schema.name}"
+        no_message = f"a message cannot be parsed as {schema.name}"
         return _Plan(name, types, store, made_schema, digest, times, no_message)
 
     def _convert(self, plan: _Plan, raw: memoryview) -> memoryview:
@@ -240,7 +240,7 @@ class Converter:
                 raise
             raw = raw[:end]
             converted = by_library(problem, convert, raw, name)
-            self._omitted["messages with bytes after their end, which were left out"] += 1
+            self._omitted["messages with trailing bytes, which were dropped"] += 1
         seconds = _time_beyond(plan, raw if to_ros1 else converted)
         if seconds is not None:
             has = f"{seconds} s, and ROS 1 can hold 0 to 2^32 seconds"
@@ -248,11 +248,11 @@ class Converter:
                 has = f"{seconds + 2**32} s, and ROS 2 can hold -2^31 to 2^31 seconds"
             raise Refused(f"a message has a time of {has}")
         if not to_ros1 and HEADER in plan.types:
-            self._omitted["messages with a header's sequence number, which ROS 2 has not"] += 1
+            self._omitted["messages with a header sequence number, which ROS 2 does not have"] += 1
         return converted
 
     def _remembered(self, channel: Channel, plan: _Plan) -> Channel | None:
-        """The ROS 1 channel that this one was made of, if it tells and still fits."""
+        """The ROS 1 channel that this one was made from, if it tells and still fits."""
         known = {
             key[len(_ROS1) :]: value
             for key, value in channel.metadata.items()
@@ -280,7 +280,7 @@ class Converter:
         if is_latched(channel):
             metadata["latching"] = "1"
         elif qos:
-            self._omitted["QoS profiles of topics, which ROS 1 has not"] += 1
+            self._omitted["QoS profiles of topics, which ROS 1 does not have"] += 1
         return replace(channel, message_encoding="ros1", schema=plan.schema, metadata=metadata)
 
 
@@ -324,7 +324,7 @@ def _end(plan: _Plan, raw: memoryview, *, to_ros1: bool) -> int:
 
 
 def _time_beyond(plan: _Plan, data: bytes | memoryview) -> int | None:
-    """Seconds of a time in a message that only ROS 2 takes for negative; None where there is none.
+    """Seconds of a time in a message that only ROS 2 takes for negative; None if there is none.
 
     Args:
         plan: Of its type.

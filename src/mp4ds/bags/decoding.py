@@ -30,7 +30,7 @@ Raises:
 """
 
 _DISTRIBUTION = "humble"  # whose standard types stand in for definitions that were not recorded
-_ADVICE = "take its bytes instead, `RecordedMessage.raw`"
+_ADVICE = "use its raw bytes instead, `RecordedMessage.raw`"
 
 
 def decoder_of(channel: Channel) -> Decoder:
@@ -40,13 +40,13 @@ def decoder_of(channel: Channel) -> Decoder:
     messages; JSON what `json.loads` gives.
 
     Raises:
-        OptionError: They cannot be decoded: for want of a definition, or of a decoder.
+        OptionError: They cannot be decoded: for lack of a definition, or of a decoder.
     """
     make = _DECODERS.get(channel.message_encoding)
     if make is None:
         known = ", ".join(_DECODERS)
         raise _undecodable(
-            channel, f"they are {channel.message_encoding or 'of no known'} encoding, not {known}"
+            channel, f"their encoding is {channel.message_encoding or 'unknown'}, not {known}"
         )
     return make(channel)
 
@@ -58,7 +58,7 @@ def _undecodable(channel: Channel, problem: str) -> OptionError:
 def _ros(channel: Channel) -> Decoder:
     schema = channel.schema
     if schema is None or not schema.name:
-        raise _undecodable(channel, "the type of its messages is not known")
+        raise _undecodable(channel, "its message type is not known")
     is_ros1 = channel.message_encoding == "ros1"
     world = ros1_world() if is_ros1 else ros2_world(_DISTRIBUTION)
     try:
@@ -75,16 +75,16 @@ def _ros(channel: Channel) -> Decoder:
         start, read = 0, definition.deserialize_ros1
         if not is_ros1:
             if len(payload) < 4 or payload[0] != 0 or payload[1] > 1:
-                raise WireError(f"it is no {schema.name}")
+                raise WireError(f"it is not a {schema.name}")
             start = 4
             read = definition.deserialize_cdr_le if payload[1] else definition.deserialize_cdr_be
         try:
             args = (payload[start:], 0, definition.cls, store)
-            message, end = by_library(f"it is no {schema.name}", read, *args)
+            message, end = by_library(f"it is not a {schema.name}", read, *args)
         except Refused as reason:
             raise WireError(str(reason)) from None
         if len(payload) - start - end > MAX_TAIL:
-            raise WireError(f"it is no {schema.name}")
+            raise WireError(f"it is not a {schema.name}")
         return message
 
     return decode
@@ -95,7 +95,7 @@ def _json(channel: Channel) -> Decoder:
         try:
             return json.loads(bytes(payload))
         except (ValueError, RecursionError):
-            raise WireError("it is no JSON") from None
+            raise WireError("it is not JSON") from None
 
     return decode
 
@@ -103,7 +103,7 @@ def _json(channel: Channel) -> Decoder:
 def _protobuf(channel: Channel) -> Decoder:
     schema = channel.schema
     if schema is None or schema.encoding != "protobuf":
-        raise _undecodable(channel, "they are protobuf, and their definition is not known")
+        raise _undecodable(channel, "they are protobuf, and their definition is unknown")
     try:
         decoder = protobuf_decoder(schema.name, schema.data)
     except WireError as error:
@@ -142,7 +142,7 @@ def protobuf_decoder(type_name: str, schema: bytes) -> Callable[[bytes], Any]:
         try:
             return message_class.FromString(data)
         except (DecodeError, ValueError):  # the latter by protobuf's pure Python
-            raise WireError(f"it is no {type_name}") from None
+            raise WireError(f"it is not a {type_name}") from None
 
     return decode
 

@@ -123,7 +123,7 @@ _NO_STATS = ChannelStats(0, 0, 0)
 class MultiReader:
     """A split recording, or recordings made side by side.
 
-    Parts that follow each other in time are read one after the other, parts that overlap are
+    Parts that follow each other in time are read one after another, parts that overlap are
     merged by log time. Channels equal in all fields are one channel.
 
     Args:
@@ -333,8 +333,8 @@ def format_of(path: Path) -> str:
     """The format of a recording, by its first bytes; by its name where these are damaged.
 
     Raises:
-        SourceNotFoundError: There is nothing.
-        SourceError: It is no recording, or cannot be read.
+        SourceNotFoundError: It does not exist.
+        SourceError: It is not a recording, or cannot be read.
     """
     try:
         if not path.exists():
@@ -356,8 +356,8 @@ def format_of(path: Path) -> str:
         return RECORDING_SUFFIXES[path.suffix]
     remedy = "Give a ROS 1 .bag, a rosbag2 folder or an .mcap file."
     if video := video_at(path):
-        raise SourceError(path, f"is {video}, and no recording", f"{remedy} {HOW_TO_OPEN}")
-    raise SourceError(path, "is not a recording that mp4ds knows", remedy)
+        raise SourceError(path, f"is {video}, not a recording", f"{remedy} {HOW_TO_OPEN}")
+    raise SourceError(path, "is not in a recording format that mp4ds supports", remedy)
 
 
 def recording_names(path: Path) -> set[str] | None:
@@ -428,7 +428,7 @@ def open_sources(
 
 def _open_salvaged(paths: Sequence[Path]) -> SalvageReader:
     for path in filter(remote, paths):
-        raise SourceError(path, "is not salvaged where it is", "Download it first.")
+        raise SourceError(path, "cannot be salvaged from a remote location", "Download it first.")
     openers = [partial(_SALVAGERS[format_of(path)], path) for path in paths]
     if len(paths) == 1:
         return openers[0]()
@@ -474,7 +474,7 @@ def open_writer(
 
     Raises:
         OptionError: The target is unknown.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     if target == "bag":
         from mp4ds.bags.ros1_write import Ros1Writer

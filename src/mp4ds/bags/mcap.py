@@ -83,7 +83,7 @@ def _other_at(stream: RecordStream, place: int, declared: Declared) -> Attachmen
     except DamageError as error:
         raise stream.damaged(error) from None
     if record is None:
-        raise stream.damaged("it was another one before")
+        raise stream.damaged("it differs from the one read before")
     return record
 
 
@@ -100,7 +100,7 @@ def read_chunks(
         stream: A stream of known size.
         excerpt: What to read.
         summary: The file's summary.
-        between: What stands between its chunks.
+        between: What is between its chunks.
         declared: What the file declares, from its summary on.
 
     Yields:
@@ -135,7 +135,7 @@ def read_chunks(
                     declared.take(kind, part)
         except DamageError as error:
             raise stream.damaged(error) from None
-        # Of messages at the very start of the next chunk, some may stand before this one.
+        # Of messages at the very start of the next chunk, some may be before this one.
         yield from held.release(None if following is None else following - 1)
     for place in others:
         yield _other_at(stream, place, declared)
@@ -149,7 +149,7 @@ def _records(stream: RecordStream, chunk: ChunkEntry) -> Iterator[tuple[int, mem
         raise DamageError("it is not the chunk that the index lists there")
     content = unpack_chunk(body)
     if len(content) > chunk.size:
-        raise DamageError(f"it unpacks to {len(content)} bytes, and its index tells of less")
+        raise DamageError(f"it unpacks to {len(content)} bytes, more than its index says")
     for _, kind, part in chunk_records(content):
         yield kind, part
 
@@ -164,7 +164,7 @@ def _check(head: MessageHead, chunk: ChunkEntry, summary: McapSummary) -> None:
         problem = f"of channel {head.channel_id}"
     else:
         return
-    raise DamageError(f"it holds a message {problem}, of which its index does not tell")
+    raise DamageError(f"it holds a message {problem} that its index does not list")
 
 
 # ---------------------------------------------------------------- the reader
@@ -174,7 +174,7 @@ class McapReader:
     """Reads an MCAP file. See `BagReader`.
 
     Where the file lists its chunks, messages come in log-time order, ties in file order;
-    else they come in file order. Every pass opens the file anew, so that several may run.
+    else they come in file order. Every pass reopens the file, so that several may run.
 
     Args:
         path: The file.
@@ -214,7 +214,7 @@ class McapReader:
     def _read_ends(self, stream: RecordStream) -> None:
         opcode, body = stream.next()
         if opcode != Opcode.HEADER:
-            raise DamageError("it stands where the header should")
+            raise DamageError("it is in the place of the header")
         header = parse(mcap_records.Header, body)
         self.profile: str = header.profile
         self.library: str = header.library
@@ -264,7 +264,7 @@ class McapReader:
 
     @property
     def start(self) -> int | None:
-        """The earliest log time in nanoseconds as the summary tells; None where it does not."""
+        """The earliest log time in nanoseconds as the summary tells; None if it does not."""
         return self._summary.start if self._summary else None
 
     @property
@@ -279,7 +279,7 @@ class McapReader:
 
     @cached_property
     def _between(self) -> Between | None:
-        """What stands between the chunks, where excerpts can be read from these alone."""
+        """What is between the chunks, where excerpts can be read from these alone."""
         summary = self._summary
         if summary is None:
             return None
@@ -289,7 +289,7 @@ class McapReader:
 
     @cached_property
     def _found_between(self) -> Between | None:
-        """What stands between the chunks, where all fits together; None else."""
+        """What is between the chunks, where all fits together; None else."""
         summary = self._summary
         if summary is None or not summary.is_consistent:
             return None
@@ -347,7 +347,7 @@ class McapReader:
         if excerpt == EVERYTHING and not summary.covers(count):
             raise SourceError(
                 self.path,
-                f"is damaged: its chunks hold {count} messages, its statistics others",
+                f"is damaged: its chunks hold {count} messages, which its statistics contradict",
                 SALVAGE_REMEDY,
             )
 
@@ -385,7 +385,7 @@ class McapReader:
             yield from map(self._unpacked, held.release(None))
 
     def _messages(self, opcode: int, body: bytes) -> Iterator[MessageHead]:
-        """The messages of a top-level record, declaring what stands between them."""
+        """The messages of a top-level record, declaring what is between them."""
         if opcode == Opcode.MESSAGE:
             yield parse_message(body)
         elif opcode == Opcode.CHUNK:
@@ -468,12 +468,12 @@ class McapReader:
                 stream.seek(chunk)
                 opcode, body = stream.next()
                 if opcode != Opcode.CHUNK:
-                    raise DamageError("it stands where a chunk should")
+                    raise DamageError("it is in the place of a chunk")
                 content, at = unpack_chunk(body), chunk
             kind, part, _ = chunk_record(memoryview(content), offset)
             head = parse_message(part) if kind == Opcode.MESSAGE else None
             if head is None or head.channel_id != channel_id:
-                raise DamageError("its message index points beside the messages")
+                raise DamageError("its message index does not point to messages")
             message = self._declared.message(head, "the first message")
             yield channel_id, with_own_payload(self._unpacked(message))
 

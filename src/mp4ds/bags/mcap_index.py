@@ -43,7 +43,7 @@ class ChunkEntry(NamedTuple):
         start: Earliest log time of its messages, nanoseconds; 0 without messages.
         end: Latest log time of its messages, nanoseconds; 0 without messages.
         size: Bytes of its content, decompressed.
-        channels: Ids of the channels that it holds messages of; empty where the file does
+        channels: Ids of the channels that it holds messages of; empty if the file does
             not tell, or without messages.
     """
 
@@ -134,13 +134,13 @@ class ChunkTable:
         return self._later_starts[place] if place < len(self._later_starts) else None
 
     def span(self) -> tuple[int, int] | None:
-        """Least and greatest log time of all chunks; None without messages."""
+        """Earliest and latest log time of all chunks; None without messages."""
         return (self._later_starts[0], int(self._ends.max())) if self.has_messages else None
 
     def spans(self) -> dict[int, tuple[int, int]]:
-        """Least and greatest log time of the chunks that hold a channel, by its id.
+        """Earliest and latest log time of the chunks that hold a channel, by its id.
 
-        It is empty where a chunk does not tell which channels it holds.
+        It is empty if a chunk does not tell which channels it holds.
         """
         if ((self._held == 0) & ~self._empty).any():
             return {}
@@ -278,7 +278,7 @@ class McapSummary:
         return span[0] if span else None
 
     def _span(self) -> tuple[int, int] | None:
-        """The least and the greatest log time that anything tells of."""
+        """The earliest and latest log time that anything tells of."""
         statistics, listed = self.statistics, self.chunks.span()
         if not statistics or not statistics.message_count:
             return listed
@@ -304,7 +304,7 @@ class McapSummary:
         )
 
     def stats(self) -> dict[int, ChannelStats]:
-        """Counts and spans by channel id; empty where the counts do not add up."""
+        """Counts and spans by channel id; empty if the counts do not add up."""
         statistics = self.statistics
         if not statistics:
             return {}
@@ -331,7 +331,7 @@ class McapSummary:
             while stream.tell() < end:
                 opcode, body = stream.next()
                 if opcode != Opcode.MESSAGE_INDEX:
-                    raise DamageError("it stands where a message index should")
+                    raise DamageError("it is in the place of a message index")
                 yield _parse_entries(chunk, body)
 
     def covers(self, count: int) -> bool:
@@ -343,7 +343,7 @@ class McapSummary:
 
         Returns:
             Log time, byte offset of the chunk, and offset in its content, by the channel's id;
-            None where the indexes do not have all messages.
+            None if the indexes do not have all messages.
 
         Raises:
             DamageError: An index record is damaged.
@@ -372,7 +372,7 @@ def read_summary(stream: RecordStream) -> McapSummary | None:
     """Read the summary section of a file, leaving the stream anywhere.
 
     Returns:
-        The summary, or None where the file has none, or it does not begin where the footer says.
+        The summary, or None if the file has none, or it does not begin where the footer says.
 
     Raises:
         SourceError: The file does not end as an MCAP file does.
@@ -384,7 +384,7 @@ def read_summary(stream: RecordStream) -> McapSummary | None:
     if size < 2 * len(MAGIC) + FOOTER_BYTES - len(MAGIC):
         raise stream.cut_short()
     stream.seek(size - FOOTER_BYTES)
-    # Read apart from its record: what stands there in a file cut short is no length.
+    # Read apart from its record: what is there in a file cut short is not a length.
     tail = stream.read(FOOTER_BYTES)
     if tail[-len(MAGIC) :] != MAGIC or tail[0] != Opcode.FOOTER:
         raise stream.cut_short()
@@ -398,7 +398,7 @@ def read_summary(stream: RecordStream) -> McapSummary | None:
         if opcode == Opcode.FOOTER:
             break
         if opcode not in OF_SUMMARY and opcode < PRIVATE_OPCODE:
-            return None  # what stands between records of the data tells of no whole file
+            return None  # what is between records of the data tells of no whole file
         _add(summary, opcode, body)
     summary.chunks.finish()
     return summary
@@ -427,7 +427,7 @@ _OTHERS = (Opcode.ATTACHMENT, Opcode.METADATA)
 
 @dataclass
 class Between:
-    """What stands between the chunks that a summary lists.
+    """What is between the chunks that a summary lists.
 
     Attributes:
         is_sound: Whether the chunks are where the summary says, and no messages beside them.
@@ -486,7 +486,7 @@ def read_frame(stream: RecordStream, place: int) -> tuple[int, int]:
     stream.start = place
     opcode, length = _FRAME.unpack(stream.read(_FRAME.size))
     if length > MAX_RECORD_BYTES:
-        raise DamageError(f"it tells of {length} bytes")
+        raise DamageError(f"it says it has {length} bytes")
     return opcode, place + _FRAME.size + length
 
 

@@ -41,8 +41,9 @@ OF_SUMMARY = frozenset(
         Opcode.SUMMARY_OFFSET,
     }
 )
-SALVAGE_REMEDY = "`mp4ds pack --salvage` packs what can be read."
-CUT_SHORT_REMEDY = f"The recording was cut short: use `mcap recover`; without it, {SALVAGE_REMEDY}"
+SALVAGE = "use `mp4ds pack --salvage` to pack what is still readable."
+SALVAGE_REMEDY = "U" + SALVAGE[1:]
+CUT_SHORT_REMEDY = f"The recording was cut short: use `mcap recover`, or {SALVAGE}"
 
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 _PIECE_BYTES = 16 * 2**20
@@ -71,7 +72,7 @@ class ByteStream(Protocol):
     """What is read: a file, or the decompressed content of one."""
 
     def read(self, length: int, /) -> bytes:
-        """Read so many bytes; fewer at the end only."""
+        """Read that many bytes; fewer at the end only."""
         ...
 
     def tell(self) -> int:
@@ -79,7 +80,7 @@ class ByteStream(Protocol):
         ...
 
     def seek(self, offset: int, /) -> int:
-        """Go on at a byte offset, where the stream has a known size."""
+        """Continue at a byte offset, where the stream has a known size."""
         ...
 
     def close(self) -> None:
@@ -105,7 +106,7 @@ def open_source(path: Path, shown: Path | None = None) -> BinaryIO:
     shown = shown or path
     try:
         if not path.is_file() and not path.is_dir() and path.exists():
-            raise SourceError(shown, "is no regular file")  # to open a pipe could wait for ever
+            raise SourceError(shown, "is not a regular file")  # to open a pipe could wait forever
         stream = path.open("rb")
     except FileNotFoundError:
         raise SourceNotFoundError(shown) from None
@@ -124,10 +125,10 @@ def open_source(path: Path, shown: Path | None = None) -> BinaryIO:
 def other_begin(path: Path, kind: str, magic: bytes, start: bytes) -> SourceError:
     """The error for a file that does not begin with the magic bytes of its kind."""
     if start.startswith(magic.rstrip()):
-        problem = f"is {kind} whose line ends were converted, as copying it as text does"
-        return SourceError(path, problem, f"Copy it again as binary; {SALVAGE_REMEDY}")
-    remedy = f"If it is a damaged one, {SALVAGE_REMEDY}"
-    return SourceError(path, f"is not {kind}: it does not begin like one", remedy)
+        problem = f"is {kind} with converted line endings, as if copied in text mode"
+        return SourceError(path, problem, f"Copy it again in binary mode, or {SALVAGE}")
+    remedy = f"If it is damaged, {SALVAGE}"
+    return SourceError(path, f"is not {kind}: it does not start like one", remedy)
 
 
 class RecordStream:
@@ -136,7 +137,7 @@ class RecordStream:
     Args:
         stream: A binary stream at the start of the file.
         path: The file's name, for errors.
-        size: Bytes in the stream; None where it can neither be known nor sought in.
+        size: Bytes in the stream; None if it can neither be known nor sought in.
 
     Attributes:
         start: Byte offset of the record that was read last.
@@ -158,7 +159,7 @@ class RecordStream:
         return self._stream.tell()
 
     def seek(self, offset: int) -> None:
-        """Go on at a byte offset that an index gave."""
+        """Continue at a byte offset that an index gave."""
         if self.size is not None and offset > self.size:
             raise DamageError(f"an index points to byte {offset}, past the end")
         self._stream.seek(offset)
@@ -178,7 +179,7 @@ class RecordStream:
             raise self.cut_short()
 
     def read(self, length: int) -> bytes:
-        """Read exactly so many bytes."""
+        """Read exactly that many bytes."""
         if self.size is not None and length > self.size - self._offset:
             raise self.cut_short()
         try:
@@ -311,7 +312,7 @@ def _decompress(compression: str, data: memoryview, size: int) -> bytes | memory
     if compression == "":
         return data
     if size > most_unpacked(len(data)):
-        raise DamageError(f"a chunk promises {size} bytes and has {len(data)}")
+        raise DamageError(f"a chunk declares {size} bytes but has {len(data)}")
     if compression == "zstd":
         return unzstd(data, size)
     if compression == "lz4":
@@ -319,11 +320,13 @@ def _decompress(compression: str, data: memoryview, size: int) -> bytes | memory
         try:
             content: bytes = machine.decompress(data, max_length=size + 1)
         except RuntimeError as error:
-            raise DamageError(f"the lz4 compression of a chunk is damaged: {error}") from None
+            raise DamageError(f"the lz4 data of a chunk is damaged: {error}") from None
         if not machine.eof:
-            raise DamageError(f"the lz4 compression of a chunk does not end after {size} bytes")
+            raise DamageError(f"the lz4 data of a chunk does not end after {size} bytes")
         return content
-    raise DamageError(f"a chunk is compressed by {compression!r}, and only zstd and lz4 are known")
+    raise DamageError(
+        f"a chunk is compressed with {compression!r}; only zstd and lz4 are supported"
+    )
 
 
 def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
@@ -334,7 +337,7 @@ def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
         size: Size of the content where known, else the frame must tell it.
 
     Raises:
-        DamageError: It is no zstd frame, damaged, or of another size.
+        DamageError: It is not a zstd frame, damaged, or of another size.
     """
     try:
         stated = zstandard.frame_content_size(data)
@@ -343,7 +346,7 @@ def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
         if size is not None and stated not in (-1, size):
             raise DamageError(f"zstd data holds {stated} bytes instead of {size}")
         if stated > most_unpacked(len(data)):
-            raise DamageError(f"zstd data promises {stated} bytes and has {len(data)}")
+            raise DamageError(f"zstd data declares {stated} bytes but has {len(data)}")
         return zstandard.ZstdDecompressor().decompress(
             data, max_output_size=size or 0, allow_extra_data=False
         )
@@ -469,11 +472,11 @@ class Declared:
         """
         channel = self.channels.get(head.channel_id)
         if channel is None:
-            raise DamageError(f"{place} is of channel {head.channel_id}, which is not defined")
+            raise DamageError(f"{place} belongs to channel {head.channel_id}, which is not defined")
         return Message(channel, head.log_time, head.publish_time, head.sequence, head.data)
 
     def other(self, opcode: int, body: bytes | memoryview) -> Attachment | MetadataRecord | None:
-        """A record that is no message, to pass on; None where there is nothing to pass on.
+        """A record that is not a message, to pass on; None if there is nothing to pass on.
 
         Raises:
             DamageError: It is damaged, or contradicts what was declared before.

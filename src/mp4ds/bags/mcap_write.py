@@ -52,7 +52,7 @@ class McapWriter:
 
     Raises:
         OptionError: The compression is unknown.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
 
     format = "mcap"
@@ -112,10 +112,16 @@ class McapWriter:
             channel.topic, channel.message_encoding, schema_id, dict(channel.metadata)
         )
 
-    def write(self, message: Message) -> None:
-        """Append a message, payload verbatim."""
+    def write(self, message: Message, *, compress: bool = True) -> None:
+        """Append a message, payload verbatim.
+
+        Args:
+            message: The message.
+            compress: Whether there is time to compress the chunk that it ends, if it is large.
+        """
         check_message(message)
-        if 2 * len(message.data) > most_unpacked(0) and self._compresses_too_well(message.data):
+        is_large = 2 * len(message.data) > most_unpacked(0)
+        if not compress or (is_large and self._compresses_too_well(message.data)):
             with self._uncompressed():
                 self._add(message)
         else:
@@ -145,6 +151,11 @@ class McapWriter:
             message.publish_time,
             message.sequence,
         )
+
+    def flush(self) -> None:
+        """Give the system all that was written, so that a reader of damaged files has it."""
+        self._writer._Writer__finalize_chunk()
+        self._file.flush()
 
     def add_attachment(self, attachment: Attachment) -> None:
         """Append an attachment."""

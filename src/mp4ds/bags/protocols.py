@@ -64,7 +64,7 @@ class BagReader(Protocol):
 
     @property
     def skipped(self) -> Mapping[str, int]:
-        """What the source holds and no dataset can: a phrase -> how many; to be told.
+        """What the source holds and no dataset can: a phrase -> how many; to be reported.
 
         Of what the last `records` came across.
         """
@@ -89,7 +89,7 @@ class BagReader(Protocol):
 
         An excerpt has what is part of it, in the order of the whole. Where the recording
         `is_indexed`, the messages of consecutive spans are, for each channel, those of the whole
-        one after the other. What a damaged index hides is told by the counts of `stats` alone:
+        one after another. What a damaged index hides is told by the counts of `stats` alone:
         let the spans be open at both ends, and count their messages.
 
         Args:
@@ -197,7 +197,7 @@ class HoldBack:
 
         Args:
             message: The message.
-            place: Where it stands in the source, if messages are not added in source order;
+            place: Where it is in the source, if messages are not added in source order;
                 ties of one place come in the order in which they were added.
         """
         self._added += 1

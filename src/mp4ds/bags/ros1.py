@@ -267,7 +267,7 @@ class _Bag:
         start = file.tell()
         listed = [self._read_chunk_info() for _ in range(header.number(b"chunk_count"))]
         if self._goes_on():
-            raise DamageError("its header counts fewer chunks than its index lists")
+            raise DamageError("its header declares fewer chunks than its index lists")
         expect(file.stream, self._index_ranges(listed, start))
         ends = {}
         for chunk in listed:
@@ -277,7 +277,7 @@ class _Bag:
             ends[chunk.start] = file.tell()
         if len(ends) < len(listed):
             raise DamageError("its index lists a chunk twice")
-        # messages that the index does not list would be lost without a word
+        # messages that the index does not list would be lost silently
         for chunk_start in sorted(ends):
             check_between(file, first, chunk_start)
             first = ends[chunk_start]
@@ -328,7 +328,7 @@ class _Bag:
             or len(entries) != count * _INDEX_ENTRY.itemsize
             or number not in self.channels
         ):
-            problem = f"the index of the chunk at byte {chunk.start} contradicts that of the bag"
+            problem = f"the index of the chunk at byte {chunk.start} contradicts the bag's index"
             raise DamageError(problem)
         self._index_entries[number] += entries
         self._index_runs[number].extend((len(self.chunks) - 1, count))
@@ -374,7 +374,9 @@ class _Bag:
         chunks = np.repeat(runs[:, 0].astype(np.int32), runs[:, 1])
         times = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
         if times.max(initial=0) >= MAX_TIME:
-            raise DamageError("it has a message of a time past 2^32 seconds, which is none of ROS")
+            raise DamageError(
+                "it has a message with a time past 2^32 seconds, which ROS cannot represent"
+            )
         places = chunks.astype(np.int64) << 32 | entries["offset"]
         if len(np.unique(places)) < len(places):
             raise DamageError("its index lists a message twice")

@@ -15,7 +15,7 @@ from typing import BinaryIO
 
 import lz4.frame
 
-from mp4ds.bags.mcap_records import SALVAGE_REMEDY, DamageError, open_source, other_begin
+from mp4ds.bags.mcap_records import SALVAGE, DamageError, open_source, other_begin
 from mp4ds.bags.protocols import most_unpacked
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, Schema
@@ -24,7 +24,7 @@ MAGIC = b"#ROSBAG V2.0\n"
 MAX_TIME = 2**32 * 10**9
 """A ROS 1 time is two uint32, seconds and nanoseconds: from here on there are no times."""
 UINT32 = struct.Struct("<I")
-COPY_AGAIN = f"Copy it again, or repair it with `rosbag reindex`; {SALVAGE_REMEDY}"
+COPY_AGAIN = f"Copy it again, repair it with `rosbag reindex`, or {SALVAGE}"
 DAMAGE = (DamageError, OSError)
 """What reading a damaged bag raises, or one on a damaged disk."""
 
@@ -117,7 +117,7 @@ class BagFile:
         """
         fields = Fields(split_header(self.take(self.length())))
         if op is not None and fields.op != op:
-            raise DamageError(f"a record of kind {fields.op} stands where {op.name} should")
+            raise DamageError(f"a record of kind {fields.op} is where {op.name} should be")
         return fields
 
     def close(self) -> None:
@@ -133,7 +133,7 @@ def _number(data: bytes | memoryview, offset: int) -> int:
 
 
 def check_bag(path: Path) -> int:
-    """Refuse a file that is no readable bag.
+    """Refuse a file that is not a readable bag.
 
     Returns:
         The file's size, bytes.
@@ -158,7 +158,7 @@ def check_bag(path: Path) -> int:
         raise SourceError(
             path,
             "is not indexed: the recording was cut short",
-            f"Reindex it with `rosbag reindex` first; without that, {SALVAGE_REMEDY}",
+            f"Run `rosbag reindex` on it first, or {SALVAGE}",
         )
     if index > size:
         problem = f"is cut short: its index should begin at byte {index}, and it has {size} bytes"
@@ -167,7 +167,7 @@ def check_bag(path: Path) -> int:
 
 
 def other_format(path: Path, start: bytes) -> SourceError:
-    """The error for a file that is no bag of version 2.0.
+    """The error for a file that is not a bag of version 2.0.
 
     Args:
         path: The file.
@@ -177,8 +177,8 @@ def other_format(path: Path, start: bytes) -> SourceError:
     if version and version[1] != b"2.0":
         return SourceError(
             path,
-            f"is a ROS 1 bag of version {version[1].decode()}, and only 2.0 is read",
-            "Rewrite it with `rosbag filter OLD NEW True` of ROS 1 first.",
+            f"is a ROS 1 bag of version {version[1].decode()}; only version 2.0 is supported",
+            "Convert it first, with `rosbag filter OLD NEW True` of ROS 1.",
         )
     return other_begin(path, "a ROS 1 bag", MAGIC, start)
 
@@ -264,7 +264,7 @@ def check_between(file: BagFile, place: int, end: int) -> None:
     """Refuse messages between two bytes of a bag, where the index lists none.
 
     Raises:
-        DamageError: There are some, or something that is no record.
+        DamageError: There are some, or something that is not a record.
     """
     while place < end:
         file.seek(place)
@@ -288,7 +288,7 @@ def unpack_chunk(compression: str, size: int, data: bytes) -> bytes:
         unpacked = data
     elif compression in ("bz2", "lz4"):
         if size > most_unpacked(len(data)):
-            raise DamageError(f"it promises {size} bytes and has {len(data)}")
+            raise DamageError(f"it declares {size} bytes but has {len(data)}")
         machine = BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
         try:
             unpacked = machine.decompress(data, max_length=size + 1)
@@ -297,7 +297,7 @@ def unpack_chunk(compression: str, size: int, data: bytes) -> bytes:
         if not machine.eof:
             raise DamageError(f"its {compression} data does not unpack to {size} bytes")
     else:
-        raise DamageError(f"it is compressed by {compression!r}, which is not known")
+        raise DamageError(f"it is compressed with {compression!r}, which is not supported")
     if len(unpacked) != size:
         raise DamageError(f"it unpacks to {len(unpacked)} bytes instead of {size}")
     return unpacked
@@ -306,7 +306,7 @@ def unpack_chunk(compression: str, size: int, data: bytes) -> bytes:
 def make_channel(number: int, topic: bytes, header: Mapping[bytes, bytes]) -> Channel:
     """A connection as a channel.
 
-    Its metadata holds ``topic`` only where that is not the record's: empty where the header
+    Its metadata holds ``topic`` only where that is not the record's: empty if the header
     has none, as in bags of RealSense cameras.
 
     Args:

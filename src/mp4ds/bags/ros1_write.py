@@ -34,8 +34,8 @@ def check_channel(channel: Channel) -> None:
     if channel.message_encoding != "ros1":
         raise ConversionError(
             channel.topic,
-            f"its messages are {channel.message_encoding or 'of no known encoding'}, "
-            "and a ROS 1 bag holds only those of ROS 1",
+            f"its messages are {channel.message_encoding or 'in an unknown encoding'}, and a ROS "
+            "1 bag can only hold ROS 1 messages",
             "Exclude the topic with `exclude`, or unpack to mcap, which keeps it as it is.",
         )
 
@@ -54,7 +54,7 @@ def check_message(message: Message) -> None:
             "Unpack to mcap, which keeps it as it is.",
         )
     if len(message.data) > _MAX_PAYLOAD:
-        raise ConversionError(topic, "has a message of more bytes than a ROS 1 bag can hold")
+        raise ConversionError(topic, "has a message too large for a ROS 1 bag")
 
 
 class Ros1Writer:
@@ -67,7 +67,7 @@ class Ros1Writer:
     Raises:
         OptionError: The compression is unknown.
         TargetExistsError: The file exists.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
 
     format = "bag"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.mcap import McapReader, is_mcap
-from mp4ds.bags.mcap_records import SALVAGE_REMEDY, unzstd
+from mp4ds.bags.mcap_records import SALVAGE, unzstd
 from mp4ds.bags.protocols import Format, SourcePart, merged
 from mp4ds.bags.rosbag2_files import (
     SharedChannels,
@@ -48,7 +48,6 @@ from mp4ds.records import (
 
 StorageReader = McapReader | SqliteReader
 _NO_STATS = ChannelStats(0, 0, 0)
-_GO_ON = "go without: " + SALVAGE_REMEDY
 
 
 class Rosbag2Reader:
@@ -107,7 +106,7 @@ class Rosbag2Reader:
             self._channels.add_listed()
 
     def _storage_reader(self, file: Path) -> StorageReader | None:
-        """The reader of a storage file; None where it must be decompressed or fetched first."""
+        """The reader of a storage file; None if it must be decompressed or fetched first."""
         decompress = unzstd if self._info and self._info.compression == "message" else None
         compressed = is_zstd(file)
         if (self._info and self._info.storage == "mcap") or is_mcap(file, compressed):
@@ -248,7 +247,7 @@ class Rosbag2Reader:
         return MetadataRecord(RECORD, content)
 
     def stats(self) -> Mapping[int, ChannelStats]:
-        """See `BagReader.stats`; empty where one of the files does not tell."""
+        """See `BagReader.stats`; empty if one of the files does not tell."""
         total: dict[int, ChannelStats] = {}
         for number, reader in enumerate(self._readers):
             stats = reader.stats() if reader and _is_complete(reader) else {}
@@ -303,8 +302,8 @@ def _folder_info(path: Path) -> BagInfo:
         raise SourceError(
             path,
             f"has no {METADATA_FILE}",
-            f"If it is a rosbag2 recording, run `ros2 bag reindex` on it first, or {_GO_ON} "
-            "A folder of images is for `mp4ds import images`.",
+            "If it is a rosbag2 recording, run `ros2 bag reindex` on it first, or "
+            f"{SALVAGE} If it is a folder of images, use `mp4ds import images`.",
         )
     info = read_bag_info(path / METADATA_FILE)
     missing = [name for name in info.file_names if not (path / name).exists()]
@@ -312,15 +311,15 @@ def _folder_info(path: Path) -> BagInfo:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise SourceError(
             path,
-            f"is incomplete: {missing[0]}{more}, which its {METADATA_FILE} names, is missing",
-            f"Add what is missing, or run `ros2 bag reindex` to go without it, or {_GO_ON}",
+            f"is incomplete: {missing[0]}{more}, listed in its {METADATA_FILE}, is missing",
+            f"Add the missing file, run `ros2 bag reindex` to do without it, or {SALVAGE}",
         )
     unlisted = [] if remote(path) else unlisted_storage(path, info.file_names)
     if unlisted:
         raise SourceError(
             path,
-            f"has {unlisted[0]}, which its {METADATA_FILE} does not name",
-            f"Move it away, or run `ros2 bag reindex` to add it; {SALVAGE_REMEDY}",
+            f"has {unlisted[0]}, which its {METADATA_FILE} does not list",
+            f"Move it away, run `ros2 bag reindex` to add it, or {SALVAGE}",
         )
     return info
 

@@ -14,7 +14,7 @@ from typing import Protocol
 
 import zstandard
 
-from mp4ds.bags.mcap_records import SALVAGE_REMEDY, open_source
+from mp4ds.bags.mcap_records import SALVAGE, open_source
 from mp4ds.bags.protocols import FILE_RATIO, ZSTD_PIECE, HoldBack, most_unpacked
 from mp4ds.bags.rosbag2_metadata import BagInfo
 from mp4ds.errors import SourceError
@@ -42,7 +42,7 @@ class ZstdStream:
 
     Attributes:
         consumed: Bytes of the file that were read.
-        problem: Why it ended before the file did, a phrase; empty where it did not.
+        problem: Why it ended before the file did, a phrase; empty if it did not.
 
     Raises:
         SourceError: It cannot be opened, or is empty.
@@ -64,7 +64,7 @@ class ZstdStream:
         while len(self._left) < length and not self._ended:
             piece = self._file.read(ZSTD_PIECE)
             if not piece:
-                self._end("its zstd compression is cut short" if self._is_within else "")
+                self._end("its zstd data is cut short" if self._is_within else "")
             self._take(piece)
             self.consumed += len(piece)
         data = bytes(self._left[:length])
@@ -77,7 +77,7 @@ class ZstdStream:
             try:
                 self._left += self._frame.decompress(piece)
             except zstandard.ZstdError as error:
-                self._end(f"its zstd compression is damaged near byte {self.consumed}: {error}")
+                self._end(f"its zstd data is damaged near byte {self.consumed}: {error}")
                 return
             if self._given + len(self._left) > self._most:
                 self._end(f"it unpacks to more than {self._most} bytes, too many for its size")
@@ -114,7 +114,7 @@ class ZstdFile(ZstdStream):
         """
         data = super().read(length)
         if self.problem and len(data) < length:
-            raise SourceError(self._path, self.problem, f"Copy it again; {SALVAGE_REMEDY}")
+            raise SourceError(self._path, self.problem, f"Copy it again, or {SALVAGE}")
         return data
 
     def tell(self) -> int:
@@ -127,7 +127,7 @@ class ZstdFile(ZstdStream):
 
 
 def copy_file(path: Path, target: Path) -> None:
-    """Bring a remote file here, with what stands beside it of a database that was not closed.
+    """Bring a remote file here, with what is beside it of a database that was not closed.
 
     Raises:
         SourceError: There is no room for it.
@@ -140,9 +140,9 @@ def copy_file(path: Path, target: Path) -> None:
     if size > shutil.disk_usage(target.parent).free:
         raise SourceError(
             path,
-            f"is an sqlite3 database of {size} bytes, which is copied to {target.parent} to be "
-            "read, and there is no room for it",
-            "Name another folder by TMPDIR.",
+            f"is an sqlite3 database of {size} bytes, which must be copied to {target.parent} to "
+            "be read, and there is not enough space",
+            "Set TMPDIR to another folder.",
         )
     for side in found:
         ending = side.name.removeprefix(path.name)
@@ -205,7 +205,7 @@ class StorageReader(Protocol):
 
     @property
     def start(self) -> int | None:
-        """The earliest log time, nanoseconds; None where it is not known."""
+        """The earliest log time, nanoseconds; None if unknown."""
 
 
 class SharedChannels:
@@ -256,7 +256,7 @@ class SharedChannels:
         return channel
 
     def add_listed(self) -> None:
-        """Topics without messages may stand in metadata.yaml alone."""
+        """Topics without messages may be in metadata.yaml alone."""
         if not self._info or not self._is_folder:
             return
         known = {(channel.topic, channel.type_name) for channel in self._channels.values()}
@@ -280,7 +280,7 @@ class SharedChannels:
 def consecutive(
     readers: Sequence[StorageReader | None], records: Callable[[int], Iterator[Record]]
 ) -> Iterator[Record]:
-    """Storage files one after the other, with what overlaps in log-time order.
+    """Storage files one after another, with what overlaps in log-time order.
 
     Args:
         readers: Of the files; None for one that is not open yet.

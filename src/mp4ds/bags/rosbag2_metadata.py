@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from mp4ds import yamlio
-from mp4ds.bags.mcap_records import SALVAGE_REMEDY
+from mp4ds.bags.mcap_records import SALVAGE, SALVAGE_REMEDY
 from mp4ds.errors import SourceError
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 
@@ -55,8 +55,8 @@ class TopicMetadata:
         name: Topic name.
         type_name: Type name.
         serialization_format: Mostly ``cdr``.
-        qos: Offered QoS profiles as YAML text, None where the version has none.
-        type_hash: Type description hash, None where the version has none.
+        qos: Offered QoS profiles as YAML text, None if the version has none.
+        type_hash: Type description hash, None if the version has none.
         count: Number of messages.
     """
 
@@ -89,10 +89,10 @@ class BagInfo:
         storage: ``sqlite3`` or ``mcap``; empty without files.
         file_names: Names of the storage files within the folder, in reading order.
         compression: ``file``, ``message`` or empty.
-        ros_distro: Name of the ROS distribution, empty where not told.
+        ros_distro: Name of the ROS distribution, empty if not told.
         custom_data: The user's own entries.
         topics: All topics.
-        counts: How many messages each storage file has, by its name; empty where not told.
+        counts: How many messages each storage file has, by its name; empty if not told.
     """
 
     text: str
@@ -114,16 +114,14 @@ def read_bag_info(path: Path) -> BagInfo:
     """
     try:
         if not path.is_file():
-            raise SourceError(path, "is no regular file")
+            raise SourceError(path, "is not a regular file")
         if path.stat().st_size > _MAX_BYTES:
             raise SourceError(path, f"is larger than {_MAX_BYTES} bytes")
         data = path.read_bytes()
     except OSError as error:
         raise SourceError(path, f"cannot be read: {error.strerror}") from None
     if not data.strip():
-        raise SourceError(
-            path, "is empty", f"Make it anew with `ros2 bag reindex`; {SALVAGE_REMEDY}"
-        )
+        raise SourceError(path, "is empty", f"Recreate it with `ros2 bag reindex`, or {SALVAGE}")
     try:
         return parse_bag_info(data.decode(), path)
     except UnicodeDecodeError:
@@ -143,15 +141,15 @@ def parse_bag_info(text: str, path: Path) -> BagInfo:
     document = _load(text, path)
     info = document.get(_TOP_KEY, document) if isinstance(document, dict) else None
     if not isinstance(info, dict) or "version" not in info:
-        problem = f"is no metadata of rosbag2: it has no {_TOP_KEY}"
+        problem = f"is not rosbag2 metadata: it has no {_TOP_KEY}"
         raise SourceError(path, problem, SALVAGE_REMEDY)
     try:
         version = int(info["version"])
         if version > NEWEST_VERSION:
             raise SourceError(
                 path,
-                f"is of rosbag2 metadata version {version}, "
-                f"and this mp4ds reads up to {NEWEST_VERSION}",
+                f"has rosbag2 metadata version {version}; this mp4ds reads versions up to "
+                f"{NEWEST_VERSION}",
                 "Install a newer mp4ds.",
             )
         names = tuple(_base_name(name, path) for name in info.get("relative_file_paths") or [])
@@ -172,7 +170,7 @@ def parse_bag_info(text: str, path: Path) -> BagInfo:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         if isinstance(error, SourceError):
             raise
-        problem = f"is no metadata of rosbag2 as expected: {error!r}"
+        problem = f"is not rosbag2 metadata as expected: {error!r}"
         raise SourceError(path, problem, SALVAGE_REMEDY) from None
 
 
@@ -200,10 +198,10 @@ def _text(value: Any) -> str:
 
 
 def _base_name(name: Any, path: Path) -> str:
-    # Before version 4 the bag's folder stands before the name; nothing outside of it is read.
+    # Before version 4 the bag's folder is before the name; nothing outside of it is read.
     base = PureWindowsPath(_text(name)).name
     if base in ("", ".", ".."):
-        raise SourceError(path, f"names {name!r} as a file of the recording")
+        raise SourceError(path, f"lists {name!r} as a file of the recording")
     return base
 
 
@@ -225,7 +223,7 @@ def _storage(identifier: str, names: tuple[str, ...], path: Path) -> str:
     if identifier == "" and len(suffixes) <= 1 and "" not in suffixes:
         return suffixes.pop() if suffixes else ""
     raise SourceError(
-        path, f"names the storage {identifier!r}, and only sqlite3 and mcap are known"
+        path, f"names the storage {identifier!r}; only sqlite3 and mcap are supported"
     )
 
 
@@ -237,8 +235,8 @@ def _compression(info: Mapping[str, Any], path: Path) -> str:
     if mode not in ("file", "message") or scheme != "zstd":
         raise SourceError(
             path,
-            f"names the compression {scheme!r} of mode {mode!r}, "
-            "and only zstd of files or messages is known",
+            f"names the compression {scheme!r} of mode {mode!r}; only zstd of files or messages "
+            "is supported",
         )
     return mode
 
@@ -301,7 +299,7 @@ _POLICIES = {
 
 
 def parse_qos(text: str) -> list[dict[str, Any]] | None:
-    """The QoS profiles of a topic as YAML values, None where the text is no list of them."""
+    """The QoS profiles of a topic as YAML values, None if the text is not a list of them."""
     try:
         profiles = yamlio.build(text, _scalar) if text.strip() else None
     except ValueError:

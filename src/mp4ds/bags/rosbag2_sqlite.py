@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.mcap_records import SALVAGE_REMEDY, DamageError, open_source
+from mp4ds.bags.mcap_records import SALVAGE, SALVAGE_REMEDY, DamageError, open_source
 from mp4ds.errors import SourceError
 from mp4ds.records import EVERYTHING, HASH_KEY, Channel, ChannelStats, Excerpt, Message, Schema
 
@@ -30,7 +30,7 @@ class Tables:
 
     Args:
         connection: To the file.
-        size: Its bytes, with what stands beside it.
+        size: Its bytes, with what is beside it.
         shown: Its name in errors.
     """
 
@@ -41,7 +41,7 @@ class Tables:
         self.raised: BaseException | None = None
         looks = self._looks()
         next(looks)
-        # A handler that raises is taken for one that says 1: this one keeps what a signal raises.
+        # A handler that raises is taken as one that says 1: this one keeps what a signal raises.
         connection.set_progress_handler(partial(next, looks, 1), _LOOK_STEPS)
 
     def _looks(self) -> Iterator[int]:
@@ -63,8 +63,8 @@ class Tables:
                 shown = bytes(name).decode(errors="replace") if isinstance(name, bytes) else name
                 raise SourceError(
                     self._shown,
-                    f"has a view or virtual table {shown!r}, which no recording has",
-                    f"Drop it with the sqlite3 tool, or go without: {SALVAGE_REMEDY}",
+                    f"has a view or virtual table {shown!r}, which recordings never have",
+                    f"Drop it with the sqlite3 tool, or {SALVAGE}",
                 )
 
     def columns(self, table: str) -> list[tuple[Any, bool]]:
@@ -90,7 +90,7 @@ class Tables:
 
     def too_much(self) -> SourceError:
         """The error for tables that hold more than the file."""
-        problem = "is damaged: its tables list more than a file of its size can hold"
+        problem = "is damaged: its tables list more data than a file of its size can hold"
         return SourceError(self._shown, problem, SALVAGE_REMEDY)
 
 
@@ -127,12 +127,12 @@ def open_tables(path: Path, shown: Path) -> Iterator[Tables]:
         if tables and tables.raised:
             raise tables.raised from None
         remedy = (
-            "It was not closed properly: open and close it once with the sqlite3 tool; "
+            "It was not closed properly: open and close it once with the sqlite3 tool, or "
             if beside
-            else "If it was cut short, try `.recover` of the sqlite3 tool; without that, "
+            else "If it was cut short, try `.recover` of the sqlite3 tool, or "
         )
         problem = f"cannot be read as sqlite3: {error}"
-        raise SourceError(shown, problem, remedy + SALVAGE_REMEDY) from None
+        raise SourceError(shown, problem, remedy + SALVAGE) from None
     finally:
         if connection:
             connection.set_progress_handler(None, 0)
@@ -205,7 +205,7 @@ class SqliteReader:
     def _columns(self, tables: Tables, table: str) -> list[str]:
         columns = tables.columns(table)
         if any(is_computed for _, is_computed in columns):
-            problem = f"computes a column of its table {table}, which no recording does"
+            problem = f"has a computed column in its table {table}, which recordings never have"
             raise SourceError(self._shown, problem, SALVAGE_REMEDY)
         return [self._text(name, table) for name, _ in columns]
 
@@ -225,12 +225,12 @@ class SqliteReader:
             self._columns(tables, "messages"),
         )
         if not {*topics}.issuperset(_TOPIC_COLUMNS) or not {*messages} >= _MESSAGE_COLUMNS:
-            raise SourceError(self._shown, "is a database, but not one of rosbag2")
+            raise SourceError(self._shown, "is an sqlite3 database, but not of rosbag2")
         unknown = [name for name in messages if name not in _MESSAGE_COLUMNS]
         if unknown:
             raise SourceError(
                 self._shown,
-                f"has a column {unknown[0]!r} with its messages that this mp4ds does not know",
+                f"has an unknown column {unknown[0]!r} in its table of messages",
                 "Install a newer mp4ds.",
             )
 
@@ -326,7 +326,7 @@ class SqliteReader:
         with self._opened() as tables:
             self._rows_read = 0
             # Counted without the index, which may lack messages where it is damaged.
-            # COUNT(*) would go on without a look at signals.
+            # COUNT(*) would continue without a look at signals.
             query = "SELECT COUNT(1) FROM messages NOT INDEXED"
             (self._rows,) = tables.select(query).fetchone()
             # Ids first: sorting whole rows would copy the recording where no index helps.
@@ -358,7 +358,7 @@ class SqliteReader:
         return SourceError(
             self._shown,
             "is damaged: its index of times does not list its messages",
-            f"Make it anew with `REINDEX` in the sqlite3 tool; {SALVAGE_REMEDY}",
+            f"Rebuild it with `REINDEX` in the sqlite3 tool, or {SALVAGE}",
         )
 
     def _message(self, tables: Tables, row_id: int, place: str) -> Message:
@@ -371,15 +371,15 @@ class SqliteReader:
         if channel is None:
             raise SourceError(
                 self._shown,
-                f"{place} is of topic id {topic_id}, which its table of topics does not have",
-                f"`ros2 bag convert` leaves such messages out; {SALVAGE_REMEDY}",
+                f"{place} has topic id {topic_id}, which is not in its table of topics",
+                f"`ros2 bag convert` leaves such messages out, or {SALVAGE}",
             )
         place = f"{place}, topic {channel.topic}"
         if not isinstance(timestamp, int) or timestamp < 0:
-            problem = f"{place}: the time {timestamp!r} is no time"
+            problem = f"{place}: {timestamp!r} is not a valid time"
             raise SourceError(self._shown, problem, SALVAGE_REMEDY)
         if kind != b"blob":
-            problem = f"{place}: the payload is {kind.decode()} and no blob"
+            problem = f"{place}: the payload is {kind.decode()}, not a blob"
             raise SourceError(self._shown, problem, SALVAGE_REMEDY)
         if self._decompress:
             try:

@@ -69,7 +69,7 @@ def _schema_of(channel: Channel) -> Schema:
     if channel.schema is None:
         raise ConversionError(
             channel.topic,
-            "has no schema, and rosbag2 wants the type of every topic",
+            "has no schema, and rosbag2 needs the type of every topic",
             "Unpack to mcap instead.",
         )
     return channel.schema
@@ -84,7 +84,7 @@ def check_message(message: Message) -> None:
     if not 0 <= message.log_time <= _MAX_TIME:
         raise ConversionError(
             message.channel.topic,
-            f"has the log time {message.log_time}, which rosbag2 cannot hold",
+            f"has the log time {message.log_time}, which rosbag2 cannot store",
             "Unpack to mcap instead.",
         )
 
@@ -96,7 +96,7 @@ class SqliteWriter:
         path: The file, which must not exist.
 
     Raises:
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -157,13 +157,13 @@ class SqliteWriter:
         if not schema.encoding and not schema.data:
             return
         if self._definitions.setdefault((schema.name, type_hash), schema) != schema:
-            self._left_out["message definitions (sqlite3 storage keeps one for a type)"] += 1
+            self._left_out["message definitions (sqlite3 storage keeps one per type)"] += 1
 
     def write(self, message: Message) -> None:
         """Append a message, payload verbatim."""
         check_message(message)
         if message.publish_time != message.log_time:
-            self._left_out["publish times (sqlite3 storage keeps one time)"] += 1
+            self._left_out["publish times (sqlite3 storage keeps only one time)"] += 1
         if message.sequence:
             self._left_out["sequence numbers (sqlite3 storage keeps none)"] += 1
         row = self._row_of[message.channel.id], message.log_time, message.data
@@ -175,7 +175,7 @@ class SqliteWriter:
         except (OverflowError, sqlite3.DataError):
             raise ConversionError(
                 message.channel.topic,
-                f"has a message of {len(message.data)} bytes, more than sqlite3 can hold",
+                f"has a message of {len(message.data)} bytes, more than sqlite3 can store",
                 "Unpack to mcap instead.",
             ) from None
 
@@ -272,7 +272,7 @@ class Rosbag2Writer:
 
     Raises:
         OptionError: The storage or compression is unknown.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
 
     format = "rosbag2"
@@ -344,7 +344,7 @@ class Rosbag2Writer:
         if isinstance(self._writer, McapWriter):
             self._writer.add_attachment(attachment)
         else:
-            self._left_out["attachments (sqlite3 storage holds none)"] += 1
+            self._left_out["attachments (sqlite3 storage cannot hold any)"] += 1
 
     def add_metadata(self, record: MetadataRecord) -> None:
         """Take in what is known of the source, or append a metadata record."""
@@ -362,7 +362,7 @@ class Rosbag2Writer:
             self._source_has_record |= record.name == _MCAP_RECORD
             self._writer.add_metadata(record)
         elif record.name != _MCAP_RECORD:  # sqlite3 keeps its like in a table of its own
-            self._left_out["metadata records (sqlite3 storage holds none)"] += 1
+            self._left_out["metadata records (sqlite3 storage cannot hold any)"] += 1
 
     def _take_source(self, content: Mapping[str, str]) -> None:
         self._take_distro(content)

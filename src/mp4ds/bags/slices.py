@@ -41,7 +41,7 @@ class SliceReader:
             arrays = [times for times in reader.times().values() if len(times)]
             known = [ChannelStats(len(one), int(one[0]), int(one[-1])) for one in arrays]
         if not known:
-            raise SourceError(reader.path, "has no messages, of which a slice could be taken")
+            raise SourceError(reader.path, "has no messages to take a slice of")
         first, last = min(item.start for item in known), max(item.end for item in known)
         self.span = Excerpt(*asked.times(first, last, reader.path))
 

@@ -72,7 +72,7 @@ def by_library(problem: str, call: Callable[..., _Made], *args: Any) -> _Made:
 
 def incomprehensible(name: str) -> str:
     """What is said of a type whose definition a library cannot use."""
-    return f"the definition of type {name} cannot be understood"
+    return f"the definition of type {name} cannot be parsed"
 
 
 class Size(NamedTuple):
@@ -108,7 +108,7 @@ def sizes_of(types: Typesdict) -> dict[str, Size]:
                 sizes[todo[-1]] = _size(types, todo[-1], sizes)
                 todo.pop()
             elif len(todo) > _MAX_DEPTH:
-                raise Refused(f"{name} holds itself, or too many levels of messages")
+                raise Refused(f"{name} contains itself, or is nested too deeply")
             else:
                 todo.append(missing[0])
         parts += sum(_spelled_out(desc) for _, desc in types[name][1])
@@ -135,13 +135,13 @@ class BoundedStore(Typestore):
     those that have no bytes are counted.
 
     Args:
-        types: Definitions, complete but for time and duration.
+        types: Definitions, complete except for time and duration.
     """
 
     def __init__(self, types: Typesdict) -> None:
         super().__init__(empty)
         self._sizes = sizes_of({**self.fielddefs, **types})
-        by_library("its definition cannot be understood", self.register, types)
+        by_library("its definition cannot be parsed", self.register, types)
         self._data: object = None
         self._empty_left = 0
 
@@ -162,7 +162,7 @@ class BoundedStore(Typestore):
                 self._data, self._empty_left = data, _MAX_EMPTY + 2 * len(data)
             self._empty_left -= 1
             if self._empty_left < 0:
-                raise SerdeError("a message in it claims too many without any byte")
+                raise SerdeError("an array in it declares too many elements of no bytes")
             return read(data, *rest)
 
         return counted
@@ -214,7 +214,7 @@ def _size(types: Typesdict, name: str, sizes: dict[str, Size]) -> Size:
         least += length * part.least
         steps += 1 + length * part.steps
     if steps > _MAX_STEPS or depth > _MAX_DEPTH:
-        raise Refused(f"{name} holds more than any message has")
+        raise Refused(f"{name} has more fields than any real message")
     return Size(least, steps, depth)
 
 
@@ -228,7 +228,7 @@ BUILTIN = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 _MAX_TEXT, _MAX_IDL, _MAX_LINES = 2**19, 2**17, 2**14
 _NO_CODE = re.compile(r'"(?:\\.|[^"\\])*"?|//.*|/[*](?:(?s:.*?)[*]/|(?s:.*))|\'\\?.\'')
-# rosbags' parser reads what stands in brackets a hundred times, and multiplies without a bound
+# rosbags' parser reads what is in brackets a hundred times, and multiplies without a bound
 _SLOW_IDL = re.compile(r"[(][^()]*[(]|<[^<>;]*<[^<>;]*<|[*]|<<(?!\s*\d{1,2}\b)")
 _BRACKET = re.compile(r"[^\w\s]\s*[(]")
 _MAX_BRACKETS = 8
@@ -254,7 +254,7 @@ class World:
 
 
 def ros1_world() -> World:
-    """ROS 1 with the types of Noetic, of which rosbags has all but those of tf2."""
+    """ROS 1 with the types of Noetic, of which rosbags has all except those of tf2."""
     tf2 = "tf2_msgs/msg/TFMessage"
     standard = {tf2: get_typestore(Stores.ROS2_HUMBLE).fielddefs[tf2]}
     standard.update(get_typestore(Stores.ROS1_NOETIC).fielddefs)
@@ -301,12 +301,12 @@ def types_of(schema: Schema, world: World) -> Typesdict:
 
 def _parse(schema: Schema, name: str, problem: str) -> Typesdict:
     if len(schema.data) > _MAX_TEXT or schema.data.count(b"\n") > _MAX_LINES:
-        raise Refused(f"the definition of type {schema.name} is longer than those of messages")
+        raise Refused(f"the definition of type {schema.name} is longer than any real one")
     text = schema.data.decode(errors="replace").replace("\r\n", "\n")
     if not schema.encoding:
         return {}
     if schema.encoding in ("ros2idl", "omgidl") or re.match(r"=+\nIDL: ", text):
-        text = re.sub(r"(?m)^[ \t]*#.*$", "", text)  # what it includes stands beside it
+        text = re.sub(r"(?m)^[ \t]*#.*$", "", text)  # what it includes is beside it
         code = _NO_CODE.sub("", text)
         brackets = len(_BRACKET.findall(code))
         if len(text) > _MAX_IDL or brackets > _MAX_BRACKETS or _SLOW_IDL.search(code):

@@ -1,7 +1,6 @@
 """The command line: the only place that prints or exits.
 
-Exit codes: 0 the whole job was done; 1 it failed or problems were found; 2 the input or the
-options are wrong; 130 interrupted.
+Exit codes: 0 success; 1 failure, or problems were found; 2 wrong input or options; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -18,45 +17,52 @@ from mp4ds.cli.options import Command, spelled
 from mp4ds.cli.output import be_quiet, say
 from mp4ds.cli.process import DEBUG, exit_code_of, prepare_process
 
-_COMPLETE = "_MP4DS_COMPLETE"  # set by the shell that completes
+_COMPLETE = "_MP4DS_COMPLETE"  # set by shells for completion
 
 COMMANDS = {
-    "pack": ("packing", "Pack a recording, or a dataset again, into a dataset of mp4 files."),
-    "repack": ("packing", "Pack a recording, or a dataset again, into a dataset of mp4 files."),
+    "pack": ("packing", "Pack a recording into a dataset of mp4 files, or repack a dataset."),
+    "repack": ("packing", "Pack a recording into a dataset of mp4 files, or repack a dataset."),
     "unpack": (
         "unpacking",
-        "Write a dataset's recording again: as a bag, rosbag2, MCAP, or images.",
+        "Turn a dataset back into a recording: a bag, rosbag2, MCAP or images.",
     ),
-    "import": ("packing", "Make a dataset of images, or of a video of the paper's tool."),
+    "import": ("packing", "Make a dataset from images, or from a video made by the paper's tool."),
     "export": (
         "unpacking",
-        "Write a dataset in the format of another tool, as far as that can hold it.",
+        "Export a dataset to another tool's format, keeping what that format supports.",
     ),
     "play": (
         "play",
         "Publish datasets as if they were the recording: into ROS 1, ROS 2 or Foxglove.",
     ),
+    "record": (
+        "record",
+        "Record topics of a live robot, ROS 1 or ROS 2, into a dataset.",
+    ),
     "report": (
         "report",
-        "Make a page of a dataset: all cameras in step, timing, topics, calibrations.",
+        "Make an HTML report: synchronised cameras, timing, topics, calibrations.",
     ),
     "frames": (
         "report",
-        "Save the frame of a time as an image, or many frames as a contact sheet.",
+        "Save one frame as an image, or many frames as a contact sheet.",
     ),
     "evaluate": (
         "evaluate",
-        "Try encoder settings on clips of a recording: quality, size and time.",
+        "Compare encoder settings on clips of a recording: quality, size and time.",
     ),
-    "validate": ("inspect", "List every problem of datasets; exit code 1 if there is one."),
+    "validate": (
+        "inspect",
+        "Check datasets and list every problem; exits with 1 if there are any.",
+    ),
     "info": ("inspect", "Show what is in a recording or a dataset."),
     "demo": (
         "inspect",
-        "Make a small recording: two cameras (Bayer and rgb), calibrations, imu and tf.",
+        "Make a small test recording: two cameras (Bayer and RGB), calibrations, IMU, tf.",
     ),
     "conformance-dump": (
         "inspect",
-        "Print what a file holds as JSON, to compare other readers with (conformance/README.md).",
+        "Dump a file's contents as JSON, to check other readers against (conformance/README.md).",
     ),
 }
 """Commands -> their module, and what they do."""
@@ -66,13 +72,13 @@ def app_for(*names: str, is_completing: bool = False) -> typer.Typer:
     """The command line.
 
     Args:
-        names: Commands that are built, with the modules that they use; the others are only
-            listed. None: all are built.
-        is_completing: Whether a shell asks for what may follow, or is told how to ask.
+        names: Commands to build, with the modules that they use; the others are only listed.
+            None: build all.
+        is_completing: Whether a shell asks for completions, or for the completion script.
     """
     app = typer.Typer(
         name="mp4ds",
-        help="Robot camera recordings as ordinary mp4 files, and back again exactly.",
+        help="Turn robot camera recordings into ordinary mp4 files, and back again exactly.",
         no_args_is_help=True,
         add_completion=is_completing,
         pretty_exceptions_enable=False,
@@ -96,10 +102,10 @@ def app_for(*names: str, is_completing: bool = False) -> typer.Typer:
 def _top(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
     quiet: Annotated[
-        bool, typer.Option("--quiet", "-q", help="Print errors only, and what --json prints.")
+        bool, typer.Option("--quiet", "-q", help="Print nothing but errors and --json output.")
     ] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Show where errors come from.")
+        bool, typer.Option("--verbose", "-v", help="Show tracebacks of errors.")
     ] = False,
 ) -> None:
     if quiet:
@@ -112,7 +118,7 @@ def _top(
 
 
 def _listed() -> None:
-    """Stands for a command in the list of all."""
+    """Placeholder for a command in the list of commands."""
 
 
 def main() -> NoReturn:
@@ -120,7 +126,7 @@ def main() -> NoReturn:
     arguments = spelled(sys.argv[1:])
     prepare_process()
     command = next((word for word in arguments if not word.startswith("-")), "")
-    # what shells complete by is not built for a command that runs
+    # completion is not built for a command that runs
     is_completing = _COMPLETE in os.environ or not command or command not in COMMANDS
     names = () if _COMPLETE in os.environ else (command,)
     app = app_for(*names, is_completing=is_completing)

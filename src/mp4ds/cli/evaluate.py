@@ -48,10 +48,10 @@ def print_evaluation(result: Evaluation) -> None:
         say(f"{topic}: left out: {reason}")
     if len(result.cameras) > 1:
         for item in result.recommended:
-            say(f"{item.why} for all cameras: {item.options} (at least {item.score:.2f})")
+            say(f"{item.why} for all cameras: {item.options} (score at least {item.score:.2f})")
         if not result.recommended:
-            say("no setting reaches the targets of all cameras")
-    known = f", {result.known} known from before" if result.known else ""
+            say("no setting reaches every camera's target")
+    known = f", {result.known} reused from an earlier run" if result.known else ""
     say(f"{result.output}/index.html: {result.tried} settings tried{known}")
 
 
@@ -59,11 +59,11 @@ def _print_camera(camera: CameraEvaluation) -> None:
     rate = f" at {camera.rate:.2f} Hz" if camera.rate else ""
     say(
         f"{camera.topic}: {camera.encoding} {camera.size[0]}x{camera.size[1]}{rate}; clip of "
-        f"{camera.frames} frames from {camera.start:.2f} s on, of {camera.source_frames}"
+        f"{camera.frames} of {camera.source_frames} frames, starting at {camera.start:.2f} s"
     )
     print_table(_CELLS, [_cell_row(cell) for cell in camera.cells])
     ceiling = ", ".join(f"{name} {value.mean:.2f}" for name, value in camera.ceiling.items())
-    say(f"ceiling, the clip beside itself: {ceiling}")
+    say(f"ceiling, the clip scored against itself: {ceiling}")
     if camera.rates:
         print_table(_RATES, _rate_rows(camera))
     if camera.storage and camera.data_set:
@@ -135,7 +135,7 @@ def _storage_rows(camera: CameraEvaluation) -> list[list[str]]:
 
 
 def time_text(seconds: float) -> str:
-    """A time in the unit that suits it."""
+    """A duration in a suitable unit."""
     for limit, unit, size in ((120, "s", 1), (7200, "min", 60), (172_800, "h", 3600)):
         if seconds < limit:
             return f"{seconds / size:.1f} {unit}"
@@ -144,7 +144,7 @@ def time_text(seconds: float) -> str:
 
 # ---------------------------------------------------------------- evaluate
 
-_AGAIN = "what was measured is kept: run the same command again to go on"
+_AGAIN = "results so far are kept: run the same command again to resume"
 
 
 @takes(EvaluateOptions)
@@ -157,15 +157,18 @@ def evaluate(
     output: Annotated[
         Optional[str],  # noqa: UP045 - read at run time by typer
         typer.Option(
-            "--output", "-o", metavar="DIR", help="For the results; NAME_evaluation by default."
+            "--output",
+            "-o",
+            metavar="DIR",
+            help="Folder for the results; default: NAME_evaluation.",
         ),
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Try encoder settings on clips of a recording: quality, size and time.
+    """Compare encoder settings on clips of a recording: quality, size and time.
 
-    Makes a folder with tables, plots and a page, and recommends what to pack with. An evaluation
-    that was interrupted goes on when the same command is run again.
+    Writes a folder with tables, plots and a page, and recommends options for `mp4ds pack`. To
+    resume an interrupted evaluation, run the same command again.
     """
     with told_errors(as_json), _interruptible(), _progress(as_json) as report:
         result = run(source, options(), output=output, progress=report)

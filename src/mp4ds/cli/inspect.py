@@ -32,12 +32,15 @@ if TYPE_CHECKING:
 def validate(
     paths: DatasetsArgument,
     deep: Annotated[
-        bool, typer.Option("--deep", help="Also hash and decode all, and compare every message.")
+        bool,
+        typer.Option(
+            "--deep", help="Also hash and decode every file and check every message's digest."
+        ),
     ] = False,
     jobs: JobsOption = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """List every problem of datasets; exit code 1 if there is one."""
+    """Check datasets and list every problem; exits with 1 if there are any."""
     from mp4ds.dataset.checks import validate as run
     from mp4ds.dataset.collections import datasets_in, each
 
@@ -64,23 +67,22 @@ def info(
         list[str],
         typer.Argument(
             metavar="PATH...",
-            help="A bag, rosbag2 folder, MCAP, dataset or sidecar; datasets, or a folder of them.",
+            help="A .bag, rosbag2 folder, .mcap, dataset or sidecar; or datasets, or a folder of "
+            "them.",
         ),
     ],
     intrinsics: Annotated[
         bool,
-        typer.Option(
-            "--intrinsics", help="Show the cameras' calibrations, to be pasted into Python."
-        ),
+        typer.Option("--intrinsics", help="Print the cameras' calibrations as Python code."),
     ] = False,
     speed: Annotated[
         bool,
-        typer.Option("--speed", help="Read some frames of a dataset, and show what one costs."),
+        typer.Option("--speed", help="Read some frames of a dataset and show how long one takes."),
     ] = False,
     checksums: Annotated[
         bool,
         typer.Option(
-            "--checksums", help="Print the SHA-256 of a dataset's files, as sha256sum does."
+            "--checksums", help="Print the SHA-256 of a dataset's files in the format of sha256sum."
         ),
     ] = False,
     card: Annotated[
@@ -89,7 +91,7 @@ def info(
     ] = False,
     start: Annotated[
         Optional[str],  # noqa: UP045 - read at run time by typer
-        typer.Option("--start", metavar="TIME", help="Look into a slice, as `pack` takes it."),
+        typer.Option("--start", metavar="TIME", help="Show a slice only; times as for `pack`."),
     ] = None,
     end: Annotated[Optional[str], typer.Option("--end", metavar="TIME")] = None,  # noqa: UP045
     duration: Annotated[
@@ -101,12 +103,12 @@ def info(
     """Show what is in a recording or a dataset."""
     if intrinsics and speed:
         with told_errors(as_json):
-            raise OptionError("--intrinsics and --speed are shown one at a time.")
+            raise OptionError("Give --intrinsics or --speed, not both.")
     with told_errors(as_json):
         found = _found(paths)
         asked = Slice(start, end, duration)
         if len(found) > 1 and (intrinsics or speed or asked or checksums):
-            raise OptionError("These options go with one recording or dataset.")
+            raise OptionError("These options work with one recording or dataset only.")
     if intrinsics:
         _print_intrinsics(paths[0], as_json)
     elif speed:
@@ -129,7 +131,7 @@ def info(
 
 
 def _found(paths: Sequence[str]) -> list[Path]:
-    """What is to be looked into: one recording, or datasets."""
+    """What to show: one recording, or datasets."""
     from mp4ds.dataset.collections import datasets_in
     from mp4ds.errors import SourceError
     from mp4ds.files.urls import location
@@ -143,13 +145,13 @@ def _found(paths: Sequence[str]) -> list[Path]:
 
 
 def _print_checksums(path: Path, as_json: bool) -> None:
-    """The files of a dataset as its manifest tells them, and the manifest itself."""
+    """Print the hashes of a dataset's files from its manifest, and that of the manifest itself."""
     from mp4ds.files.outputs import digest_file
     from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
 
     with told_errors(as_json):
         if not (path / MANIFEST_NAME).is_file():
-            raise OptionError(f"{path} is no dataset: checksums are those of a dataset.")
+            raise OptionError(f"{path} is not a dataset; only datasets have checksums.")
         told = {item.name: item.sha256 for item in load_manifest(path / MANIFEST_NAME).files}
         told[MANIFEST_NAME] = digest_file(path / MANIFEST_NAME)[1]
     if as_json:
@@ -209,14 +211,14 @@ def _print_speeds(path: str, as_json: bool) -> None:
 
 
 def demo(
-    output: Annotated[Path, typer.Argument(help="The .bag file to make.")] = Path("demo.bag"),
+    output: Annotated[Path, typer.Argument(help="The .bag file to write.")] = Path("demo.bag"),
     seconds: Annotated[
-        float, typer.Option("--seconds", min=0.1, max=3600.0, help="Its length.")
+        float, typer.Option("--seconds", min=0.1, max=3600.0, help="Length of the recording.")
     ] = 3.0,
     force: ForceFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Make a small recording: two cameras (Bayer and rgb), calibrations, imu and tf."""
+    """Make a small test recording: two cameras (Bayer and RGB), calibrations, IMU, tf."""
     from mp4ds.plugins.demo import demo as run
 
     with told_errors(as_json):
@@ -230,9 +232,9 @@ def demo(
 def conformance_dump(
     path: Annotated[str, typer.Argument(metavar="FILE", help="A sidecar or a dataset.")],
 ) -> None:
-    """Print what a file holds as JSON, to compare other readers with (conformance/README.md).
+    """Dump a file's contents as JSON, to check other readers against (conformance/README.md).
 
-    Exit code 1 if it has problems, which are then all that is printed.
+    If the file has problems, prints only those and exits with 1.
     """
     from mp4ds.plugins.conformance import as_json
     from mp4ds.plugins.conformance import conformance_dump as run
@@ -254,7 +256,7 @@ _MODELS = {
 
 
 def print_intrinsics(result: Intrinsics) -> None:
-    """Print the calibrations of all cameras, one after the other, and the static transforms."""
+    """Print the calibrations of all cameras, one after another, and the static transforms."""
     say(f"# {result.path}: {result.kind}, {len(result.cameras)} cameras")
     say("import numpy as np")
     for camera in result.cameras:
@@ -269,13 +271,13 @@ def _print_camera(camera: CameraCalibrations) -> None:
     if camera.topic:
         say(f"# {camera.topic}: {sizes}, frame {camera.frame_id!r}")
     else:
-        say(f"# {camera.info_topic}: calibrations that belong to no images")
+        say(f"# {camera.info_topic}: calibrations without an image topic")
     if not camera.calibrations:
         say("# no calibration")
     for calibration in camera.calibrations:
         _print_calibration(camera, calibration)
     if camera.more:
-        say(f"# ... and {camera.more} more changes of the calibration")
+        say(f"# ... and {camera.more} more calibration changes")
 
 
 def _print_calibration(camera: CameraCalibrations, calibration: ListedCalibration) -> None:
@@ -301,7 +303,7 @@ def _print_calibration(camera: CameraCalibrations, calibration: ListedCalibratio
     if calibration.roi:
         say(f"roi = {calibration.roi}")
     if calibration.k_effective or calibration.p_effective:
-        say("# of the images as they are, cut to the ROI and binned (REP 104):")
+        say("# for the recorded images, cropped to the ROI and binned (REP 104):")
         _print_matrix("K_effective", calibration.k_effective or calibration.k)
         _print_matrix("P_effective", calibration.p_effective or calibration.p)
 

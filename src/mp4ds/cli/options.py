@@ -1,4 +1,4 @@
-"""Options of dataclasses as those of commands, and values as users write them."""
+"""Options of dataclasses as command-line options, and values as users write them."""
 
 from __future__ import annotations
 
@@ -15,25 +15,32 @@ from typer.models import OptionInfo
 from mp4ds.errors import OptionError
 from mp4ds.options import Options, Shown, shown_of
 
-DatasetArgument = Annotated[str, typer.Argument(help="A dataset, or a sidecar beside its video.")]
+DatasetArgument = Annotated[str, typer.Argument(help="A dataset, or a sidecar next to its video.")]
 DatasetsArgument = Annotated[
     list[str],
     typer.Argument(
-        metavar="DATASET...", help="Datasets, or folders of them; or a sidecar beside its video."
+        metavar="DATASET...",
+        help="Datasets or folders of datasets; or a sidecar next to its video.",
     ),
 ]
 JobsOption = Annotated[
     Optional[int],  # noqa: UP045 - read at run time by typer
-    typer.Option("--jobs", "-j", min=1, max=1024, help="Datasets at a time; all cores by default."),
+    typer.Option(
+        "--jobs",
+        "-j",
+        min=1,
+        max=1024,
+        help="Datasets to process in parallel; default: one per core.",
+    ),
 ]
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 ForceFlag = Annotated[bool, typer.Option("--force", "-f", help="Replace an existing output.")]
 
-_FLAGS: dict[str, str] = {}  # what the options of the commands that were made are called
+_FLAGS: dict[str, str] = {}  # flags of the options of all commands built so far
 
 
 def in_flags(text: str) -> str:
-    """A sentence of the library, with the flags of the command line for the names of options."""
+    """A sentence of the library, with option names replaced by command-line flags."""
     return re.sub("`([a-z_0-9]+)`", lambda match: _FLAGS.get(match[1], match[0]), text)
 
 
@@ -43,6 +50,7 @@ _PANELS = {
     "What": (
         *("topics", "exclude", "regex", "start", "end", "duration", "start_offset", "topic", "at"),
         *("sheet", "every", "max_rate", "sync", "tolerance_ns", "camera_info", "salvage", "poses"),
+        *("all", "exclude_regex", "hidden", "max_duration", "max_size", "start_paused"),
         *("state", "action", "task", "cameras", "frames", "clips"),
     ),
     "How": (
@@ -51,7 +59,17 @@ _PANELS = {
         *("publish_as", "storage", "exact", "about", "skip_unconvertible", "rate", "loop"),
         *("delay", "paused", "immediate", "drop", "restamp", "lock_step", "clock", "hz"),
         *("follow_clock", "wait_for_subscribers", "qos_overrides", "read_ahead", "deep"),
-        *("intrinsics", "speed", "seconds", "checksums", "card"),
+        *(
+            "intrinsics",
+            "speed",
+            "seconds",
+            "checksums",
+            "card",
+            "buffer",
+            "use_sim_time",
+            "discover",
+            "polling_interval",
+        ),
     ),
     "Where": (
         *(
@@ -80,10 +98,10 @@ _EXTRAS = re.compile(r"(?:^|  )\[([^\]]*)\]$")
 
 
 class Command(typer.core.TyperCommand):
-    """A command whose help has its options by what they are about."""
+    """A command whose help groups its options by topic."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """The usage line, arguments by the names that its help gives them."""
+        """The usage line, with arguments named as in the help."""
         del ctx
         names = [
             name if parameter.required else f"[{name}]"
@@ -118,7 +136,7 @@ class Command(typer.core.TyperCommand):
 
 
 def _without_bounds(extras: re.Match[str]) -> str:
-    """What stands in brackets behind a help text, but for bounds of numbers."""
+    """The bracketed part after a help text, without the bounds of numbers."""
     kept = [part for part in extras[1].split("; ") if not re.search(r"\bx[<>]=?", part)]
     return f"  [{'; '.join(kept)}]" if kept else ""
 
@@ -137,10 +155,10 @@ def _argument(parameter: Any) -> str:
 def takes(
     *kinds: type[Options], without: Sequence[str] = ()
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of dataclasses, behind its own that are required.
+    """Give a command the options of dataclasses, after its own required ones.
 
-    The command gets, for each dataclass, a function that makes it of what the user gave, and
-    raises `OptionError` for values that are none.
+    For each dataclass the command gets a function that builds it from the user's values and raises
+    `OptionError` for invalid ones.
 
     Args:
         kinds: The dataclasses; no two have an option of the same name.
@@ -174,7 +192,8 @@ def takes(
             )
 
         update_wrapper(call, command)
-        del call.__dict__["__wrapped__"]  # typer would look there
+        del call.__dict__["__wrapped__"]  # typer would follow it
+        call.__dict__["kinds"] = kinds  # for the documentation
         call.__dict__["__signature__"] = inspect.Signature(
             [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in parameters]
         )
@@ -217,18 +236,18 @@ def _parameter(name: str, hint: Any, default: Any, shown: Shown) -> inspect.Para
 
 
 def flags_of(name: str, shown: Shown) -> Sequence[str]:
-    """What an option is called on the command line, the long names before the short ones."""
+    """The flags of an option, long ones before short ones."""
     has_long = any(flag.startswith("--") for flag in shown.flags)
     return shown.flags if has_long else ("--" + name.replace("_", "-"), *shown.flags)
 
 
 def _plain(hint: Any, shown: Shown) -> Any:
-    """A type that typer makes of text."""
+    """A type that typer can parse."""
     if shown.parse:
         return Optional[str]  # noqa: UP045
     if get_origin(hint) not in (None, Union) and type(None) not in get_args(hint):
         return Optional[list[str]]  # noqa: UP045 - of a sequence
-    if type(None) in get_args(hint):  # written with a bar, which older typers do not read
+    if type(None) in get_args(hint):  # with a bar, which old typers cannot read
         return Optional[get_args(hint)[0]]  # noqa: UP045
     return hint
 
@@ -244,7 +263,7 @@ def _made(kind: type[Options], given: Mapping[str, Any]) -> Options:
 
 
 def cores(jobs: int | None) -> int:
-    """Processes at a time: as many as were asked for, or as there are processors."""
+    """Number of processes: as requested, or one per core."""
     if jobs is not None:
         return jobs
     from mp4ds.packing.planning import available_cores
@@ -256,16 +275,16 @@ def parse_share(text: str) -> tuple[int, int]:
     """Number and count of ``I/N``.
 
     Raises:
-        OptionError: It is none.
+        OptionError: It is not valid.
     """
     match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
     if not match or not 1 <= int(match[1]) <= int(match[2]):
-        raise OptionError(f"`shard` {text!r} is not I/N, such as 3/16, with I from 1 to N.")
+        raise OptionError(f"`shard` {text!r} is not I/N with I from 1 to N, such as 3/16.")
     return int(match[1]), int(match[2])
 
 
 def spelled(arguments: Sequence[str]) -> list[str]:
-    """Arguments of the command line, ``play --clock 50`` with its rate as an option of its own.
+    """Command-line arguments, with the rate of ``play --clock 50`` turned into a separate option.
 
     ``--clock`` is a flag of `rosbag play` and takes a number, if there is one, from users of
     ``ros2 bag play``.

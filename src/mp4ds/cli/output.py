@@ -31,7 +31,7 @@ _quiet = False
 
 
 def be_quiet() -> None:
-    """Print no results for people from now on, and no progress."""
+    """From now on, print neither results for people nor progress."""
     global _quiet
     _quiet = True
 
@@ -49,11 +49,11 @@ def _jsonable(value: Any) -> Any:
 
 @contextmanager
 def printed() -> Iterator[None]:
-    """Tell of standard output what the system says of it: no other file is meant.
+    """Report system errors as errors of standard output: no other file is involved.
 
     Raises:
-        Mp4dsError: It takes nothing more.
-        typer.Exit: Who reads it has enough.
+        Mp4dsError: It cannot be written to.
+        typer.Exit: The reader has closed it.
     """
     try:
         yield
@@ -61,8 +61,8 @@ def printed() -> Iterator[None]:
         raise typer.Exit(1) from None
     except OSError as error:
         raise Mp4dsError(
-            f"standard output: {error.strerror or error}. What the command was to print is lost, "
-            "what it made is whole."
+            f"standard output: {error.strerror or error}. The command's output text is lost; the "
+            "files it wrote are complete."
         ) from None
 
 
@@ -74,7 +74,7 @@ def print_json(value: Any) -> None:
 
 
 def shown(value: object) -> str:
-    """A text without what would steer a terminal: a topic or file may be named so."""
+    """A text without terminal control characters, which topic and file names may contain."""
     text = str(value)
     if text.isprintable():
         return text
@@ -90,13 +90,13 @@ def say(value: object) -> None:
 
 
 def complain(value: object) -> None:
-    """Print a line beside the result; nothing fails because nobody takes it."""
+    """Print a line to stderr; failing to print it is not an error."""
     with suppress(OSError, ValueError):
         print(f"mp4ds: {shown(value)}", file=sys.stderr, flush=True)
 
 
 def size_text(count: float) -> str:
-    """Bytes in the unit that suits them."""
+    """A size in a suitable unit."""
     for unit in ("B", "kB", "MB", "GB"):
         if count < 1000:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
@@ -105,7 +105,7 @@ def size_text(count: float) -> str:
 
 
 def print_table(columns: list[tuple[str, str]], rows: list[list[str]]) -> None:
-    """Print a table; a column is right-aligned, or folds where the screen is too narrow."""
+    """Print a table; a column is right-aligned, or folds if the screen is too narrow."""
     if _quiet:
         return
     from rich.console import Console
@@ -138,17 +138,17 @@ def print_pack(summary: PackSummary) -> None:
         for note in topic.notes:
             say(f"{topic.topic}: {note}")
     for what, count in summary.skipped.items():
-        say(f"not packed as it was: {count} {what}")
+        say(f"not packed exactly: {count} {what}")
     if summary.left_out:
         say(f"left out: {', '.join(summary.left_out)}")
     for loss in summary.losses[:_LOSSES_SHOWN]:
         say(f"lost: {_loss_text(loss)}")
     if len(summary.losses) > _LOSSES_SHOWN:
-        say(f"lost: {len(summary.losses) - _LOSSES_SHOWN} places more; dataset.yaml lists them")
+        say(f"lost: {len(summary.losses) - _LOSSES_SHOWN} more places, listed in dataset.yaml")
     if not any(topic.files for topic in summary.topics):
-        say("no topic became a video: all messages are in messages.mcap as they were")
+        say("no topic became a video: all messages are stored unchanged in messages.mcap")
     if summary.not_copied:
-        say(f"encoded again, as it cannot be copied: {summary.not_copied}")
+        say(f"re-encoded, because it cannot be copied: {summary.not_copied}")
     if summary.is_copy:
         say(f"{summary.dataset}: {size_text(summary.dataset_bytes)}, copied")
         return
@@ -194,8 +194,8 @@ def print_unpack(summary: UnpackSummary, noun: str) -> None:
     total = sum(summary.messages.values())
     say(f"{summary.output}: {total} {noun} of {len(summary.messages)} topics")
     for topic, now in summary.republished.items():
-        taken = f" ({now.instead_of} is taken)" if now.instead_of else ""
-        say(f"{topic}: given as {now.topic}, {now.type_name}{taken}")
+        taken = f" (the name {now.instead_of} is taken)" if now.instead_of else ""
+        say(f"{topic}: written as {now.topic}, {now.type_name}{taken}")
     for topic, reasons in summary.as_recorded.items():
         for reason, count in reasons.items():
             say(f"{topic}: {count} messages as recorded: {reason}")
@@ -207,19 +207,19 @@ def print_unpack(summary: UnpackSummary, noun: str) -> None:
     if summary.converted:
         say(f"converted between ROS 1 and ROS 2: {', '.join(summary.converted)}")
     for what, count in summary.omitted.items():
-        say(f"not held by this format: {count} {what}")
+        say(f"not supported by this format: {count} {what}")
     if summary.left_out:
         say(f"left out: {', '.join(summary.left_out)}")
 
 
 def print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> None:
-    """Print all problems of datasets, and how deep was looked for them."""
+    """Print all problems of datasets, and how thorough the check was."""
     for problem in chain.from_iterable(found.values()):
         say(problem)
     count = sum(map(len, found.values()))
-    problems = f"{count} problem{'s' * (count > 1)}" if count else "no problem"
+    problems = f"{count} problem{'s' * (count > 1)}" if count else "no problems"
     depth = (
-        "every video was read to its end, every message with a digest compared"
+        "every video was decoded, every message with a digest checked"
         if deep
         else "frames were not decoded (--deep does)"
     )
@@ -232,7 +232,7 @@ def print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> None
 
 
 def print_overview(rows: Sequence[Brief]) -> None:
-    """Print a line for each dataset, and what they are together."""
+    """Print a line for each dataset, and totals."""
     base = os.path.commonpath([str(row.path.parent) for row in rows])
     table = [
         [
@@ -261,7 +261,7 @@ def print_overview(rows: Sequence[Brief]) -> None:
 
 
 def _moment(time_ns: int | None) -> str:
-    """A time, UTC; empty where it is none."""
+    """A time in UTC; empty if there is none."""
     if time_ns is None:
         return ""
     return iso_text(time_ns - time_ns % 10**9)
@@ -282,7 +282,7 @@ def print_info(result: Info) -> None:
 
 
 def print_speeds(speeds: Sequence[ReadingSpeed]) -> None:
-    """Print what frames cost."""
+    """Print how long reading frames takes."""
     rows = [
         [
             item.topic,
@@ -318,9 +318,9 @@ def _number(value: float | None, digits: int) -> str:
 _PIPE_WIDTH = 160
 _SPEED_COLUMNS = [
     ("topic", "fold"),
-    ("a frame", "right"),
-    ("ms at random", "right"),
-    ("ms in order", "right"),
+    ("per frame", "right"),
+    ("ms, random access", "right"),
+    ("ms, in order", "right"),
 ]
 _PACK_COLUMNS = [
     ("topic", "fold"),

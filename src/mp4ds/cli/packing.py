@@ -1,4 +1,4 @@
-"""``mp4ds pack`` and ``mp4ds import``: what makes datasets."""
+"""``mp4ds pack`` and ``mp4ds import``: commands that make datasets."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def pack(
         list[str],
         typer.Argument(
             metavar="SOURCE...",
-            help="A .bag, a rosbag2 folder, an .mcap or a dataset; or several parts.",
+            help="A .bag, rosbag2 folder, .mcap or dataset; or the parts of a split recording.",
         ),
     ],
     output: Annotated[
@@ -37,19 +37,20 @@ def pack(
             "--output",
             "-o",
             metavar="DATASET",
-            help="The folder to make; with a slash at its end, one dataset per SOURCE in it.",
+            help="Folder to create; if it ends in a slash, one dataset per SOURCE is made inside "
+            "it.",
         ),
     ],
     shard: Annotated[
         Optional[str],  # noqa: UP045 - read at run time by typer
-        typer.Option("--shard", metavar="I/N", help="Pack one share of the parts only."),
+        typer.Option("--shard", metavar="I/N", help="Pack only the Ith of N shares of the parts."),
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Pack a recording, or a dataset again, into a dataset of mp4 files.
+    """Pack a recording into a dataset of mp4 files, or repack a dataset.
 
-    Lossless by default: `mp4ds unpack` gives every message back as it was. A pack that was
-    interrupted goes on when the same command is run again. Of a dataset, what was exact stays so.
+    Lossless by default: `mp4ds unpack` restores every message exactly. To resume an interrupted
+    pack, run the same command again. Repacking a dataset keeps exact what was exact.
     """
     from mp4ds.packing.pack import pack as run
     from mp4ds.packing.pack import pack_each, pack_share
@@ -58,7 +59,7 @@ def pack(
     with told_errors(as_json), pack_progress(as_json, whole=not shard) as progress:
         chosen = options()
         if shard and (chosen.join or output.endswith("/")):
-            raise OptionError("`shard` goes neither with `join` nor with several datasets.")
+            raise OptionError("`shard` cannot be combined with `join` or with several datasets.")
         if shard:
             pack_share(sources, output, parse_share(shard), chosen, progress=progress)
         elif output.endswith("/"):
@@ -76,7 +77,7 @@ def pack(
             with told_errors(as_json):
                 print_speeds(reading_speeds(summary.dataset))
     if shard:
-        say(f"share {shard} is packed; when all are, --join makes the dataset")
+        say(f"share {shard} is packed; once all shares are, run --join to make the dataset")
 
 
 repack = pack
@@ -85,13 +86,13 @@ repack = pack
 
 imports = typer.Typer(
     name="import",
-    help="Make a dataset of images, or of a video of the paper's tool.",
+    help="Make a dataset from images, or from a video made by the paper's tool.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
 
 _Output = Annotated[
-    str, typer.Option("--output", "-o", metavar="DATASET", help="The folder to make.")
+    str, typer.Option("--output", "-o", metavar="DATASET", help="Folder to create.")
 ]
 
 
@@ -101,15 +102,15 @@ def images(
     images_as: Callable[[], ImageFolder],
     options: Callable[[], PackOptions],
     folder: Annotated[
-        str, typer.Argument(metavar="FOLDER", help="Of images, or of a layout that is known.")
+        str, typer.Argument(metavar="FOLDER", help="Folder of images, plain or in a known layout.")
     ],
     output: _Output,
     as_json: JsonFlag = False,
 ) -> None:
-    """Make a dataset of a folder of images with times.
+    """Make a dataset from a folder of timestamped images.
 
-    EuRoC, KITTI and TUM RGB-D folders give all their cameras at once. Lossless by default. A run
-    that was interrupted goes on when the same command is run again.
+    EuRoC, KITTI and TUM RGB-D folders are imported with all their cameras. Lossless by default. To
+    resume an interrupted import, run the same command again.
     """
     from mp4ds.packing.pack import pack as run
 
@@ -124,15 +125,17 @@ def images(
 
 @imports.command("ros-mp4", cls=Command)
 def ros_mp4(
-    video: Annotated[str, typer.Argument(metavar="VIDEO", help="The mp4.")],
-    sidecar: Annotated[str, typer.Argument(metavar="YAML", help="The YAML that came with it.")],
+    video: Annotated[str, typer.Argument(metavar="VIDEO", help="The mp4 file.")],
+    sidecar: Annotated[
+        str, typer.Argument(metavar="YAML", help="The YAML file that belongs to it.")
+    ],
     output: _Output,
     force: ForceFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Make a dataset of a video and YAML of the tool published with the paper.
+    """Convert an mp4 and YAML made by the tool published with the paper.
 
-    The video is not encoded anew: its packets are copied.
+    The video is not re-encoded: its packets are copied.
     """
     from mp4ds.plugins.importing.ros_mp4 import import_ros_mp4
 

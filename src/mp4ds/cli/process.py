@@ -1,4 +1,4 @@
-"""The process of the command line: its streams, signals, limits and end; errors as one sentence."""
+"""The command line's process: its streams, signals, limits and exit; errors as one sentence."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mp4ds.cli.options import in_flags
 from mp4ds.cli.output import complain, print_json, printed
 from mp4ds.errors import Mp4dsError, sentence_of
 
-_AGAIN = "run the same command again to go on"
+_AGAIN = "run the same command again to resume"
 _BAD_PATH = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EACCES, errno.EINVAL)
 DEBUG = "MP4DS_DEBUG"
 _NO_MEMORY = "out of memory; try fewer --jobs"
@@ -41,19 +41,19 @@ def told_errors(as_json: bool) -> Iterator[None]:
     except (typer.Exit, typer.Abort, typer.BadParameter):
         raise
     except KeyboardInterrupt as interrupt:
-        _fail(str(interrupt) or "interrupted; nothing unfinished was left behind", 130, as_json)
+        _fail(str(interrupt) or "interrupted; no partial output was left behind", 130, as_json)
     except SystemExit as ended:  # by SIGTERM
-        _fail("ended; what is finished of a pack in parts is kept: " + _AGAIN, ended.code, as_json)
+        _fail("terminated; finished parts of a pack are kept: " + _AGAIN, ended.code, as_json)
     except Mp4dsError as error:
         _fail(in_flags(str(error)), error.exit_code, as_json)
     except OSError as error:
-        # a path that the system itself refuses, wherever it was met
+        # a path that the system itself refuses, wherever it occurs
         code = 2 if error.errno in _BAD_PATH else 1
         _fail(sentence_of(error), code, as_json)
     except MemoryError:
         _fail(_NO_MEMORY, 1, as_json)
     except Exception as error:
-        # what a system without memory says where it is not asked for memory itself
+        # errors of other calls on a system that is out of memory
         if any(words in str(error) for words in _MEMORY_REFUSED):
             _fail(_NO_MEMORY, 1, as_json)
         _fail(_unexpected(error), 1, as_json, versions=_versions())
@@ -66,7 +66,7 @@ def _fail(
         for line in traceback.format_exc().splitlines():
             complain(line)
     if as_json:
-        with suppress(Mp4dsError):  # nobody takes it
+        with suppress(Mp4dsError):  # nobody reads it
             print_json(
                 {"error": message, "exit_code": code} | ({"versions": versions} if versions else {})
             )
@@ -77,21 +77,21 @@ def _fail(
 
 
 def _unexpected(error: Exception) -> str:
-    """A sentence about an error that nobody thought of."""
-    said = " ".join(str(error).split())[:_LONGEST].rstrip(".") or "no more is told"
+    """A sentence about an unexpected error."""
+    said = " ".join(str(error).split())[:_LONGEST].rstrip(".") or "no details"
     place = ""
     for frame in traceback.extract_tb(error.__traceback__):
         path = Path(frame.filename)
         if _PACKAGE in path.parents:
             place = f" in {path.relative_to(_PACKAGE).as_posix()}:{frame.lineno}"
     return (
-        f"{type(error).__name__}{place}: {said}. This is not meant to happen: please report it, "
-        f"with the versions told here and what {DEBUG}=1 shows."
+        f"{type(error).__name__}{place}: {said}. This is a bug: please report it, with the "
+        f"versions listed here and the output with {DEBUG}=1."
     )
 
 
 def _versions() -> dict[str, str]:
-    """What is at work, and the version of each."""
+    """The software involved, with versions."""
     from importlib import metadata
 
     found = {"mp4ds": __version__, "Python": platform.python_version()}
@@ -106,7 +106,7 @@ def _versions() -> dict[str, str]:
             except metadata.PackageNotFoundError:
                 if "extra ==" not in condition:
                     found[name] = "missing"
-    with suppress(Exception):  # it may be what is at fault
+    with suppress(Exception):  # it may itself be the culprit
         from mp4ds.video.encoder import tool_versions
 
         found.update(tool_versions())
@@ -120,37 +120,63 @@ _MOST_FILES = 65_536
 
 def prepare_process() -> None:
     """Make the process ready, before numpy is imported."""
-    # no matrix is multiplied here, and idle threads cost time
+    # no matrices are multiplied here, and idle threads cost time
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    gc.set_threshold(20_000)  # imports make many objects and no garbage
+    gc.set_threshold(20_000)  # imports create many objects but no garbage
     warnings.showwarning = lambda message, *_, **__: complain(message)
-    # a batch system's way to interrupt, and a terminal's that is lost: leave as after Ctrl-C
+    # sent by batch systems, and when a terminal is lost: exit as after Ctrl-C
     for number in ending_signals():
         signal.signal(number, _end)
     _fill_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a terminal may lack a topic's letters
+            stream.reconfigure(errors="backslashreplace")  # for names in other scripts
     _allow_files()
 
 
 def ending_signals() -> list[signal.Signals]:
-    """The signals that end a command, besides Ctrl-C's; not those that nohup keeps away."""
+    """The signals that end a command, besides Ctrl-C's; except those that nohup ignores."""
     names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # or Windows
     numbers = [signal.Signals[name] for name in names]
     return [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
 
 
+@contextmanager
+def caught_signals(stop: Callable[[], None]) -> Iterator[list[int]]:
+    """Let a command end in its own time at Ctrl-C and the like; at the second one, at once.
+
+    Args:
+        stop: Ends it.
+
+    Yields:
+        The numbers of the signals that came.
+    """
+    caught: list[int] = []
+
+    def end(number: int, _: Any) -> None:
+        if caught:  # asked again: whatever holds it up is not waited for
+            raise KeyboardInterrupt
+        caught.append(number)
+        stop()
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, *ending_signals())}
+    try:
+        yield caught
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def _end(number: int, _: object) -> None:
-    if number != signal.SIGTERM:  # a lost terminal tells so more than once, also while tidying up
+    if number != signal.SIGTERM:  # a lost terminal sends it more than once, even during cleanup
         signal.signal(number, signal.SIG_IGN)
     sys.exit(128 + number)
 
 
 def _fill_streams() -> None:
-    """Put /dev/null where a standard stream is closed.
+    """Open /dev/null for closed standard streams.
 
-    Else the next file that is opened gets its number, and what libraries say of errors.
+    Otherwise the next opened file gets its number, and the error messages of libraries.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
@@ -161,7 +187,7 @@ def _fill_streams() -> None:
 
 
 def _allow_files() -> None:
-    """Raise the limit of open files as far as may be: every camera has some."""
+    """Raise the limit of open files as far as allowed: every camera has some."""
     try:
         import resource
     except ImportError:  # Windows
@@ -169,20 +195,20 @@ def _allow_files() -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = _MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, _MOST_FILES)
     if soft != resource.RLIM_INFINITY and soft < most:
-        with suppress(OSError, ValueError):  # macOS takes less than it tells
+        with suppress(OSError, ValueError):  # macOS accepts less than it reports
             resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 def exit_code_of(command: Callable[[], object], *, as_json: bool) -> int:
-    """Run the command line to its end, also where nobody takes what it prints.
+    """Run the command line to its end, even if nobody reads its output.
 
     Args:
         command: Runs it; raises `SystemExit` with its exit code.
-        as_json: How errors are told.
+        as_json: Whether errors are printed as JSON.
     """
     code = 0
     try:
-        with told_errors(as_json), printed():  # all else is told by the commands themselves
+        with told_errors(as_json), printed():  # the commands report everything else themselves
             try:
                 command()
             except SystemExit as ended:
@@ -196,7 +222,7 @@ def exit_code_of(command: Callable[[], object], *, as_json: bool) -> int:
 
 
 def _let_go(stream: object) -> None:
-    """Drop what a stream did not take: Python would try again at its end, and complain."""
+    """Drop what a stream did not accept: Python would try again at exit, and complain."""
     if isinstance(stream, TextIOWrapper):
         try:
             stream.flush()

@@ -1,4 +1,4 @@
-"""What commands tell of their progress, always on stderr: live, in lines, of packs as events."""
+"""Progress of commands, always on stderr: live, as lines, or as events for packs."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ if TYPE_CHECKING:
     from mp4ds.packing.options import PackProgress
 
 PACE_SECONDS = 60.0
-"""Over which a pace is taken."""
+"""Period over which the pace is measured."""
 
 _LEFT_SECONDS = 3.0
 _NAME_WIDTH = 60
 _ROUNDING = 1e-6
-_DIGITS = 9  # of a share: with all of a float, the time left may be more than a number
+_DIGITS = 9  # digits of a share: with a float's full precision, the time left may overflow
 
 
 class PackStanding:
-    """Where one or several packs stand.
+    """Progress of one or several packs.
 
     Args:
         whole: As for `pack_progress`.
         clock: Seconds; does not go back.
 
     Attributes:
-        states: What was told last of each dataset, in the order in which they began.
+        states: Last reported state of each dataset, in the order in which they began.
     """
 
     def __init__(self, *, whole: bool = True, clock: Callable[[], float] = time.monotonic) -> None:
@@ -50,12 +50,12 @@ class PackStanding:
 
     @property
     def seconds(self) -> float | None:
-        """Since it began; None before."""
+        """Seconds since it began; None before."""
         return None if self._began is None else self.clock() - self._began
 
     @property
     def share(self) -> float | None:
-        """Share of it that is packed, by bytes of the sources; None where nothing tells."""
+        """Share that is packed, by bytes of the sources; None if unknown."""
         total = packed = 0.0
         for state in self.states.values():
             share, weight = packed_share(state), max(1.0, state.bytes_total)
@@ -65,7 +65,7 @@ class PackStanding:
         return packed / total if total else None
 
     def take(self, state: PackProgress) -> None:
-        """Take what is told."""
+        """Take a reported state."""
         if self._began is None:
             self._began = self.clock()
         self.states[state.dataset] = state
@@ -76,20 +76,20 @@ class PackStanding:
         if self._pace is None:
             from rich.progress import Progress
 
-            # never shown: it is here for what it knows of time
+            # never shown: used only to estimate time
             self._pace = Progress(get_time=self.clock, speed_estimate_period=PACE_SECONDS)
             self._pace.add_task("", total=1.0, completed=share)  # type: ignore[arg-type]
         self._pace.update(self._pace.task_ids[0], completed=share)
 
     @property
     def seconds_left(self) -> int | None:
-        """Until all is packed, by the pace of the last minute; None while too little is known."""
+        """Seconds until all is packed, at the pace of the last minute; None if unknown."""
         left = self._pace.tasks[0].time_remaining if self._pace else None
         return None if left is None else int(left)
 
 
 def packed_share(state: PackProgress) -> float | None:
-    """Share of a dataset that is packed, 0 to 1; None where nothing tells."""
+    """Share of a dataset that is packed, 0 to 1; None if unknown."""
     if state.phase == "planning":
         return 0.0
     if state.phase != "packing":
@@ -100,18 +100,18 @@ def packed_share(state: PackProgress) -> float | None:
 
 
 def plain(value: object) -> str:
-    """A name in ASCII that fits into a line and steers no terminal."""
+    """A name in ASCII that fits into a line and cannot control a terminal."""
     text = shown(value).encode("ascii", "backslashreplace").decode()
     return text if len(text) <= _NAME_WIDTH else "..." + text[3 - _NAME_WIDTH :]
 
 
 def percent_text(share: float | None) -> str:
-    """A share in percent, never 100 before all is done; empty where it is not known."""
+    """A share in percent, never 100 before all is done; empty if unknown."""
     return "" if share is None else f"{int(100 * share + _ROUNDING)} %"
 
 
 def duration_text(seconds: float) -> str:
-    """A duration in the largest two units that say something."""
+    """A duration in its two largest units."""
     if seconds < 99.5:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -124,17 +124,17 @@ def duration_text(seconds: float) -> str:
 
 
 def left_text(seconds: float | None) -> str:
-    """The time left; empty where it is not known, or no time."""
+    """The time left; empty if unknown or zero."""
     return f"{duration_text(seconds)} left" if seconds else ""
 
 
 def count_text(done: int, total: int | None) -> str:
-    """So many of so many, if that is known."""
+    """Render N of M, if M is known."""
     return str(done) if total is None else f"{done}/{total}"
 
 
 def amounts(states: list[PackProgress]) -> list[str]:
-    """Parts done and in all, if there are any, and bytes read and written."""
+    """Parts done and total, if there are any, and bytes read and written."""
     total, failed = sum(s.tasks_total for s in states), sum(s.failed for s in states)
     parts = f"parts {sum(s.tasks_done for s in states)}/{total}" if total else ""
     read, written = sum(s.bytes_read for s in states), sum(s.bytes_written for s in states)
@@ -147,7 +147,7 @@ def amounts(states: list[PackProgress]) -> list[str]:
 
 
 def phase_text(state: PackProgress) -> str:
-    """What is being done with a dataset, where it is not just packed."""
+    """The phase of a dataset, unless it is just being packed."""
     return "" if state.phase == "packing" else f"{state.phase} {plain(state.note)}".strip()
 
 
@@ -160,7 +160,7 @@ _LISTED = 20
 
 
 class Lines:
-    """Writes lines, as long as anybody takes them: a pack does not fail for want of a log.
+    """Writes lines as long as anyone reads them: a pack does not fail for lack of a log.
 
     Args:
         stream: Where to.
@@ -182,10 +182,10 @@ class Lines:
 
 
 class Events:
-    """Tells of a job by events in JSON.
+    """Reports a job as JSON events.
 
     Args:
-        job: Where it stands.
+        job: Its progress.
         lines: Take the events.
         now: The time of day, with its zone.
     """
@@ -239,7 +239,7 @@ class Events:
             dataset=str(state.dataset),
             phase=state.phase,
             note=state.note,
-            # joining that does not tell how far it is keeps the whole share of packing
+            # while joining does not report progress, the share stays that of packing
             done=None if done == 1 and state.phase != "packing" else _rounded(done),
             job_done=_rounded(self._job.share),
             tasks_done=state.tasks_done,
@@ -266,13 +266,13 @@ def _rounded(share: float | None) -> float | None:
 
 
 class Log:
-    """Tells of a long job by plain lines: of its beginning, its end, and now and then.
+    """Reports a long job by plain lines: at its beginning, its end, and now and then.
 
     The first comes after 10 s. Others follow when a minute went by, later a twentieth of the
     time since the beginning, at most ten minutes.
 
     Args:
-        job: Where it stands.
+        job: Its progress.
         lines: Take the lines.
         now: The local time of day.
     """
@@ -302,7 +302,7 @@ class Log:
             self._line(
                 f"started {began:%Y-%m-%d}",
                 f"{size_text(sum(state.bytes_total for state in states))} to pack",
-                f"{before} parts were done before" if before else "",
+                f"{before} parts were already done" if before else "",
                 at=began,
             )
         elif seconds - self._told < min(

@@ -1,4 +1,4 @@
-"""``mp4ds report`` and ``mp4ds frames``: datasets to look at."""
+"""``mp4ds report`` and ``mp4ds frames``: commands for looking at datasets."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ def report(
     options: Callable[[], ReportOptions],
     datasets: DatasetsArgument,
     serve: Annotated[
-        bool, typer.Option("--serve", help="Then show it to this machine's browsers.")
+        bool, typer.Option("--serve", help="Then serve it to browsers on this machine.")
     ] = False,
     port: Annotated[
-        int, typer.Option("--port", min=0, max=65535, help="Of --serve; a free one by default.")
+        int, typer.Option("--port", min=0, max=65535, help="Port for --serve; 0 picks a free one.")
     ] = 0,
     jobs: JobsOption = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Make a page of a dataset: all cameras in step, timing, topics, calibrations.
+    """Make an HTML report: synchronised cameras, timing, topics, calibrations.
 
-    Open its index.html in a browser, from the disk or by --serve; it needs no network. Of several
-    datasets, or a folder of them, a page with a picture of each leads to their reports.
+    Open its index.html in a browser, from disk or with --serve; it works offline. Several datasets,
+    or a folder of them, get an overview page with a picture of each and links to their reports.
     """
     with told_errors(as_json):
         found, chosen = datasets_in(datasets), options()
         if len(found) > 1:
             if serve:
-                raise OptionError("--serve goes with one dataset.")
+                raise OptionError("--serve works with one dataset only.")
             _reports(datasets, found, chosen, cores(jobs), as_json)
             return
         with progress_of("reporting", as_json) as tell:
@@ -87,7 +87,7 @@ def _reports(
     if folder is None and len(datasets) == 1 and Path(datasets[0]).is_dir():
         folder = Path(datasets[0])
     if folder is None:
-        raise OptionError("Give `output`, for the page of several datasets.")
+        raise OptionError("Give `output`: where to write the overview page of several datasets.")
     with progress_of("reporting", as_json) as tell:
         summary = reports(found, folder, replace(options, output=None), jobs=jobs, progress=tell)
     if as_json:
@@ -127,11 +127,11 @@ def frames(
     options: Callable[[], StillOptions],
     dataset: DatasetArgument,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="IMAGE", help="A .png or .jpg to make.")
+        Path, typer.Option("--output", "-o", metavar="IMAGE", help="The .png or .jpg to write.")
     ],
     as_json: JsonFlag = False,
 ) -> None:
-    """Save the frame of a time as an image, or many frames as a contact sheet."""
+    """Save one frame as an image, or many frames as a contact sheet."""
     with told_errors(as_json):
         summary = run_frames(dataset, output, options())
     if as_json:

@@ -1,4 +1,4 @@
-"""``mp4ds unpack`` and ``mp4ds export``: what is made of datasets."""
+"""``mp4ds unpack`` and ``mp4ds export``: commands that convert datasets."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def unpack(
     datasets: DatasetsArgument,
     to: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option("--to", help="bag, rosbag2, mcap or images; by default as it was recorded."),
+        typer.Option("--to", help="bag, rosbag2, mcap or images; default: the recorded format."),
     ] = None,
     output: Annotated[
         Optional[str],  # noqa: UP045
@@ -33,15 +33,15 @@ def unpack(
             "--output",
             "-o",
             metavar="OUT",
-            help="What to make, of several the folder to make them in; NAME_unpacked by default.",
+            help="Output, or a folder for the outputs of several datasets; default: NAME_unpacked.",
         ),
     ] = None,
     jobs: JobsOption = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Write a dataset's recording again: as a bag, rosbag2, MCAP, or images.
+    """Turn a dataset back into a recording: a bag, rosbag2, MCAP or images.
 
-    Messages are converted between ROS 1 and ROS 2 where the target asks for it.
+    Messages are converted between ROS 1 and ROS 2 if the output format requires it.
     """
     with told_errors(as_json), progress_of("unpacking", as_json) as tell:
         noun = "images" if to == "images" else "messages"
@@ -75,20 +75,20 @@ def export(
     datasets: Annotated[
         list[str],
         typer.Argument(
-            metavar="DATASET...", help="A dataset; for lerobot also several, each an episode."
+            metavar="DATASET...", help="A dataset; for lerobot one or more, each an episode."
         ),
     ],
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", metavar="OUT", help="The folder to make; for rerun an .rrd file."
+            "--output", "-o", metavar="OUT", help="Folder to create; for rerun an .rrd file."
         ),
     ],
     as_json: JsonFlag = False,
 ) -> None:
-    """Write a dataset in the format of another tool, as far as that can hold it.
+    """Export a dataset to another tool's format, keeping what that format supports.
 
-    What it cannot hold is counted by topic and told, here and in mp4ds_export.json.
+    What is left out is counted by topic and listed, here and in mp4ds_export.json.
     """
     with told_errors(as_json), progress_of("exporting", as_json) as tell:
         summary = run_export(datasets, to, output, options(), progress=tell)

@@ -1,1 +1,1 @@
-"""A dataset, opened: its streams, their frames, its messages, and whether it is whole."""
+"""An open dataset: its streams, their frames, its messages, and validation."""

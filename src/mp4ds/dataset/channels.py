@@ -1,4 +1,4 @@
-"""The channels of a recording that have messages in videos, put together again."""
+"""Reassembles the channels that have messages in videos."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from mp4ds.errors import FormatError
 from mp4ds.records import Channel, Message, Record
 
 MessageSource = Callable[[Channel, Choice], Iterator[tuple[int, Message]]]
-"""Gives those messages of a channel that are wanted, each with its place among the channel's."""
+"""Yields the wanted messages of a channel, each with its ordinal."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class PartKey:
-    """Which messages of a dataset are meant.
+    """Identifies some messages of a dataset.
 
     Attributes:
         sidecar: Path of the sidecar that has them.
@@ -37,23 +37,23 @@ class PartKey:
 
 
 class Ahead(Protocol):
-    """Has the items of an iterator made before they are asked for, such as by a thread."""
+    """Prefetches the items of an iterator, for example in a thread."""
 
     def __call__(self, items: Iterator[T], /) -> Iterator[T]:
         """The same items."""
 
 
 def when_asked(items: Iterator[T], /) -> Iterator[T]:
-    """Has nothing made before it is asked for."""
+    """Prefetches nothing."""
     return items
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How the messages are read that belong to videos.
+    """How messages in videos are read.
 
     Attributes:
-        sources: What gives the messages of a part instead.
+        sources: Replacement sources for the messages of a part.
         choice: Which are wanted.
         ahead: Wraps the messages of each part of a channel.
     """
@@ -80,12 +80,12 @@ class ImageChannel:
 
 @dataclass(frozen=True)
 class ChannelPart:
-    """Messages of a channel that belong to one video.
+    """Messages of a channel in one video.
 
     Attributes:
         key: Which they are.
         source: Makes them.
-        decode_columns: Gives their columns.
+        decode_columns: Decodes their columns.
         stream: Whose images they are; None for calibrations.
     """
 
@@ -106,8 +106,8 @@ class ChannelGroup:
 
     Attributes:
         channel: The channel as a whole.
-        parts: Its messages that belong to videos.
-        recorded_ids: Channels of messages.mcap that have the others.
+        parts: Its messages in videos.
+        recorded_ids: Channels of messages.mcap with the other messages.
     """
 
     channel: Channel
@@ -120,17 +120,17 @@ class ChannelGroup:
         return [part.stream for part in self.parts if part.stream is not None]
 
     def found_in(self, records: Iterable[Record]) -> Iterator[Message]:
-        """Its messages among the records of messages.mcap, which are read only if there are any."""
+        """Its messages among the records of messages.mcap, read only if there are any."""
         for record in records if self.recorded_ids else ():
             if isinstance(record, Message) and record.channel.id in self.recorded_ids:
                 yield replace(record, channel=self.channel)
 
     def messages(self, reading: Reading) -> Iterator[Message]:
-        """Its messages that belong to videos, in the channel's order."""
+        """Its messages in videos, in the channel's order."""
         return (message for _, message in self._placed(reading))
 
     def parts_of(self, reading: Reading) -> list[Iterator[Message]]:
-        """Its messages that belong to videos, those of each part by themselves."""
+        """Its messages in videos, separately for each part."""
         return [(message for _, message in part) for part in self._read(reading)]
 
     def merged(
@@ -139,8 +139,8 @@ class ChannelGroup:
         """All its messages, in the channel's order.
 
         Args:
-            reading: How those are read that belong to videos.
-            recorded: Those of messages.mcap, which have the places that are left.
+            reading: How those in videos are read.
+            recorded: Those of messages.mcap, which fill the remaining ordinals.
             place: The dataset, for errors.
 
         Raises:
@@ -156,7 +156,8 @@ class ChannelGroup:
                     raise FormatError(
                         "messages-missing",
                         place,
-                        f"message {self._free(given)} of topic {self.channel.topic} is in no file",
+                        f"message {self._free(given)} of topic {self.channel.topic} is not in "
+                        "any file",
                     )
                 yield verbatim
                 given += 1
@@ -165,19 +166,19 @@ class ChannelGroup:
 
     @property
     def places(self) -> NDArray[np.int64]:
-        """Places of the messages that belong to videos, among the channel's messages; sorted."""
+        """Ordinals of the messages in videos; sorted."""
         return np.sort(np.concatenate([part.columns.ordinal for part in self.parts]))
 
     def _free(self, number: int) -> int:
-        """The place that a message of messages.mcap has, by its number among these."""
+        """The ordinal of a message of messages.mcap, by its index there."""
         for place in self.places.tolist():
             number += place <= number
         return number
 
     def is_in_time(self, recorded: Sequence[NDArray[np.int64]]) -> bool:
-        """Whether log times tell the order of its messages.
+        """Whether its messages are ordered by log time.
 
-        They do not where an earlier time comes later, or where messages of equal times are in
+        They are not if an earlier time comes later, or if messages with equal times are in
         different files.
 
         Args:
@@ -186,7 +187,7 @@ class ChannelGroup:
         columns = [part.columns for part in self.parts]
         count = sum(len(one.ordinal) for one in columns) + sum(map(len, recorded))
         if max(int(one.ordinal[-1]) for one in columns) >= count:
-            return False  # there is a gap, which reading the whole tells
+            return False  # there is a gap, which reading everything reports
         times = np.empty(count, np.int64)
         owner = np.zeros(count, np.int64)  # 0: messages.mcap
         for number, one in enumerate(columns, start=1):
@@ -196,10 +197,10 @@ class ChannelGroup:
         return bool((steps >= 0).all() and not ((steps == 0) & (np.diff(owner) != 0)).any())
 
     def gap(self, recorded: int) -> str:
-        """What the columns say is missing, empty if nothing.
+        """What is missing according to the columns; empty if nothing.
 
-        The places that they leave free are those of the channel's messages in messages.mcap, so
-        these must be as many.
+        The ordinals that they leave free belong to the channel's messages in messages.mcap, so the
+        counts must agree.
 
         Args:
             recorded: Messages in messages.mcap.
@@ -207,9 +208,9 @@ class ChannelGroup:
         places = self.places
         total = len(places) + recorded
         if len(np.unique(places)) < len(places):
-            return "two messages have the same place"
+            return "two messages have the same number"
         if places[-1] >= total:
-            return f"has {total} messages and one of number {places[-1]}"
+            return f"has {total} messages, and one with number {places[-1]}"
         return ""
 
     def _placed(self, reading: Reading) -> Iterator[tuple[int, Message]]:

@@ -41,7 +41,7 @@ _Model = TypeVar("_Model", StreamSidecar, Manifest)
 
 @dataclass(frozen=True)
 class Problem:
-    """One problem found.
+    """A problem found by validation.
 
     Attributes:
         code: Stable code, see spec/registry.md.
@@ -65,15 +65,14 @@ def validate(
     Args:
         path: What to validate, or its URL.
         deep: Also hash every file, decode every frame, rebuild every message, and compare.
-        progress: Called with a phrase, and the share of the work that is done, 0 to 1, where
-            that is known.
+        progress: Called with a phrase and the share of the work done, 0 to 1, if known.
 
     Returns:
-        All problems; empty if there is none.
+        All problems; empty if there are none.
 
     Raises:
-        SourceNotFoundError: There is nothing at the path.
-        SourceError: It is nothing that can be validated.
+        SourceNotFoundError: The path does not exist.
+        SourceError: It is not something that can be validated.
     """
     return list(dict.fromkeys(_problems(location(path), deep, progress or (lambda *_: None))))
 
@@ -94,8 +93,8 @@ def _problems(path: Path, deep: bool, report: _Report) -> list[Problem]:
     if sidecar.suffix not in (".yaml", ".yml"):
         raise SourceError(
             path,
-            "is neither a dataset, a sidecar nor a video of one",
-            "Give a dataset folder, a .yaml sidecar, or an .mp4 beside its sidecar.",
+            "is not a dataset, a sidecar or a dataset's video",
+            "Give a dataset folder, a .yaml sidecar, or an .mp4 next to its sidecar.",
         )
     model, problems = _read(sidecar, "stream", StreamSidecar)
     if model is None:
@@ -106,11 +105,11 @@ def _problems(path: Path, deep: bool, report: _Report) -> list[Problem]:
 
 
 def _scaled(report: _Report, before: int, total: int, size: int = 1) -> _Report:
-    """What takes the progress of a part of the work.
+    """A progress callback for a part of the work.
 
     Args:
-        report: Takes that of the whole.
-        before: What is done before the part, in any unit.
+        report: Callback for the whole.
+        before: Work done before the part, in any unit.
         total: The whole.
         size: The part.
     """
@@ -122,13 +121,13 @@ def _scaled(report: _Report, before: int, total: int, size: int = 1) -> _Report:
 
 
 def _read(path: Path, kind: str, model: type[_Model]) -> tuple[_Model | None, list[Problem]]:
-    """Tiers schema and model of one YAML file; there is no model where there is a problem."""
+    """Check schema and model of one YAML file; the model is None if there is a problem."""
     try:
         document = load_document(path)
     except FormatError as error:
         return None, [Problem(error.code, error.place, error.problem)]
     if document["kind"] != kind:
-        return None, [Problem("kind-unknown", str(path), f"is no {kind}")]
+        return None, [Problem("kind-unknown", str(path), f"is not a {kind}")]
     problems = [
         Problem("schema-invalid", f"{path} at {'.'.join(map(str, error.absolute_path))}", reason)
         for error in _schema_validator(kind).iter_errors(document)
@@ -157,7 +156,7 @@ def _schema_validator(kind: str) -> Any:
 
 
 def _validate_dataset(folder: Path, deep: bool, report: _Report) -> list[Problem]:
-    """All that costs little, then, if deep, the rest."""
+    """Check everything cheap, then, if deep, the rest."""
     manifest, problems = _read(folder / MANIFEST_NAME, "dataset", Manifest)
     if manifest is None:
         return problems
@@ -186,23 +185,23 @@ def _validate_dataset(folder: Path, deep: bool, report: _Report) -> list[Problem
 
 
 def _check_files(folder: Path, manifest: Manifest, report: _Report) -> Iterator[Problem]:
-    """Each file of the manifest is there and has its size; small ones have their hash."""
+    """Check that each listed file exists with its size; small ones also with their hash."""
     for entry in manifest.files:
         path = folder / entry.name
         if not path.is_file():
-            yield Problem("file-missing", str(path), "is listed in the manifest and not there")
+            yield Problem("file-missing", str(path), "is listed in the manifest but missing")
             continue
         size = path.stat().st_size
         if size != entry.size:
             yield Problem(
-                "size-mismatch", str(path), f"has {size} bytes where the manifest says {entry.size}"
+                "size-mismatch", str(path), f"has {size} bytes, but the manifest says {entry.size}"
             )
         elif path.suffix == ".yaml":
             yield from _check_hash(path, entry, report)
 
 
 def _check_hashes(folder: Path, manifest: Manifest, report: _Report) -> Iterator[Problem]:
-    """Each file that has the size that the manifest says has its hash."""
+    """Check the hash of each file whose size is right."""
     for entry in manifest.files:
         path = folder / entry.name
         if path.suffix != ".yaml" and path.is_file() and path.stat().st_size == entry.size:
@@ -212,13 +211,11 @@ def _check_hashes(folder: Path, manifest: Manifest, report: _Report) -> Iterator
 def _check_hash(path: Path, entry: FileEntry, report: _Report) -> Iterator[Problem]:
     report(f"hashing {path.name}", None)
     if digest_file(path)[1] != entry.sha256:
-        yield Problem(
-            "hash-mismatch", str(path), "does not have the SHA-256 that the manifest says"
-        )
+        yield Problem("hash-mismatch", str(path), "does not match the SHA-256 in the manifest")
 
 
 def _check_listed(folder: Path, manifest: Manifest) -> Iterator[Problem]:
-    """Each file of the folder is in the manifest, and each stream's files too."""
+    """Check that each file of the folder, and each stream's files, are in the manifest."""
     listed = {entry.name for entry in manifest.files}
     for entry in manifest.streams:
         for name in (entry.sidecar, entry.video):
@@ -237,7 +234,7 @@ def _check_listed(folder: Path, manifest: Manifest) -> Iterator[Problem]:
 
 
 def _check_entry(folder: Path, entry: StreamEntry, sidecar: StreamSidecar) -> Iterator[Problem]:
-    """A sidecar says the same as the manifest."""
+    """Check that a sidecar agrees with the manifest."""
     for what, own, listed in (
         ("topic", sidecar.channel.topic, entry.topic),
         ("video", sidecar.video.file, entry.video),
@@ -247,12 +244,12 @@ def _check_entry(folder: Path, entry: StreamEntry, sidecar: StreamSidecar) -> It
             yield Problem(
                 "manifest-inconsistent",
                 str(folder / MANIFEST_NAME),
-                f"says {what} {listed} for {entry.sidecar}, which says {own}",
+                f"gives {what} {listed} for {entry.sidecar}, which gives {own}",
             )
 
 
 def _check_stream(stream: Stream) -> list[Problem]:
-    """A valid sidecar's columns and its video."""
+    """Check a valid sidecar's columns and its video."""
     problems: list[Problem] = []
     try:
         problems += _check_video_file(stream, deep=False)
@@ -271,12 +268,12 @@ def _check_count(stream: Stream, coded: int) -> Iterator[Problem]:
         yield Problem(
             "frame-count",
             str(stream.video_path),
-            f"has {coded} frames where its sidecar says {len(stream)}",
+            f"has {coded} frames, but its sidecar says {len(stream)}",
         )
 
 
 def _check_deep(stream: Stream, report: _Report) -> list[Problem]:
-    """A video has its hash, and every frame decodes to the message that was recorded."""
+    """Check a video's hash, and that every frame decodes to the recorded message."""
     problems: list[Problem] = []
     try:
         report(f"hashing {stream.video_path.name}", None)
@@ -291,10 +288,10 @@ def _check_deep(stream: Stream, report: _Report) -> list[Problem]:
 
 
 def _check_quality(stream: Stream) -> None:
-    """The scores are one for each frame, and come to what is told of them.
+    """Check that there is a score for each frame, and that the statistics match.
 
     Raises:
-        FormatError: They are not, or do not.
+        FormatError: They do not.
     """
     quality = stream.sidecar.video.quality
     if quality is not None:
@@ -313,7 +310,7 @@ def _check_video_file(stream: Stream, *, deep: bool) -> Iterator[Problem]:
 
 
 def _check_frames(stream: Stream, report: _Report) -> Iterator[Problem]:
-    """Every frame decodes and, where there is a digest, its message is the original one."""
+    """Check that every frame decodes and that its message matches its digest, if any."""
     for number, make in enumerate(stream.makers()):
         if number % _TELL_EVERY == 0:
             report(f"decoding {stream.video_path.name}", number / len(stream))
@@ -324,7 +321,7 @@ def _check_frames(stream: Stream, report: _Report) -> Iterator[Problem]:
 
 
 def _check_messages(dataset: Dataset, manifest: Manifest) -> list[Problem]:
-    """All messages together are as many as were packed, and can be unpacked again."""
+    """Check that the number of messages is as packed, and that they can be unpacked."""
     place = str(dataset.path / MESSAGES_NAME)
     try:
         gaps = [Problem("messages-missing", topic, what) for topic, what in dataset.gaps()]
@@ -332,7 +329,7 @@ def _check_messages(dataset: Dataset, manifest: Manifest) -> list[Problem]:
             return gaps
         total = sum(map(_modelled, dataset.streams)) + sum(dataset.recorded_counts.values())
         if total != manifest.messages:
-            problem = f"and the videos hold {total} messages where the manifest says "
+            problem = f"and the videos hold {total} messages, but the manifest says "
             return [Problem("message-count", place, f"{problem}{manifest.messages}")]
         return list(_check_limits(dataset, manifest, (), place))
     except FormatError as error:
@@ -342,7 +339,7 @@ def _check_messages(dataset: Dataset, manifest: Manifest) -> list[Problem]:
 
 
 def _check_recorded(dataset: Dataset, manifest: Manifest, report: _Report) -> list[Problem]:
-    """All of messages.mcap can be read, and unpacked again."""
+    """Check that all of messages.mcap can be read and unpacked."""
     report(f"reading {MESSAGES_NAME}", 1.0)
     place = str(dataset.path / MESSAGES_NAME)
     try:
@@ -354,10 +351,10 @@ def _check_recorded(dataset: Dataset, manifest: Manifest, report: _Report) -> li
 
 
 def _counted(dataset: Dataset, place: str) -> Iterator[Record]:
-    """All of messages.mcap, of which the index must have told just that.
+    """All of messages.mcap, which must agree with its index.
 
     Raises:
-        FormatError: ``messages-unreadable``: another number of messages of a channel.
+        FormatError: ``messages-unreadable``: a channel's number of messages differs.
     """
     counts = Counter[int]()
     for record in dataset.recorded_records():
@@ -367,19 +364,19 @@ def _counted(dataset: Dataset, place: str) -> Iterator[Record]:
     told = dataset.recorded_counts
     for key in counts.keys() | told.keys():
         if counts[key] != told.get(key, 0):
-            problem = f"holds {counts[key]} messages of channel {key}, its index tells of "
+            problem = f"holds {counts[key]} messages of channel {key}, but its index lists "
             raise FormatError("messages-unreadable", place, f"{problem}{told.get(key, 0)}")
 
 
 def _check_limits(
     dataset: Dataset, manifest: Manifest, records: Iterable[Record], place: str
 ) -> Iterator[Problem]:
-    """The format that the recording had can hold each channel and message, as unpacking wants.
+    """Check that the recording's format can hold each channel and message, as unpacking requires.
 
     Args:
         dataset: The dataset.
         manifest: Its manifest.
-        records: What is looked at of messages.mcap.
+        records: The records of messages.mcap.
         place: Its name.
     """
     storage = ""
@@ -407,7 +404,7 @@ def _check_limits(
 
 
 def _extremes(stream: Stream) -> Iterator[Message]:
-    """Messages of the least and of the greatest times and numbers that a sidecar has."""
+    """Messages with the smallest and largest times and numbers of a sidecar."""
     parts = [(stream.sidecar.channel, stream.columns)]
     info, columns = stream.sidecar.camera_info, stream.camera_info_columns
     if info and columns:
@@ -428,11 +425,11 @@ def _modelled(stream: Stream) -> int:
 
 
 def wrong_facts(path: Path, video: VideoModel, *, deep: bool) -> Iterator[FormatError]:
-    """What a sidecar says of its video's file and is not so.
+    """What a sidecar gets wrong about its video file.
 
     Args:
-        path: The video, which is there.
-        video: What its sidecar says.
+        path: The video, which exists.
+        video: Its sidecar's description.
         deep: Also read the whole file.
 
     Raises:
@@ -441,7 +438,7 @@ def wrong_facts(path: Path, video: VideoModel, *, deep: bool) -> Iterator[Format
     size = path.stat().st_size
     if video.size is not None and size != video.size:
         yield VideoError(
-            "size-mismatch", path, f"has {size} bytes where its sidecar says {video.size}"
+            "size-mismatch", path, f"has {size} bytes, but its sidecar says {video.size}"
         )
         return
     references = video.references
@@ -449,7 +446,7 @@ def wrong_facts(path: Path, video: VideoModel, *, deep: bool) -> Iterator[Format
     try:
         due = _structures(path, references) if references else None
     except VideoError:
-        pass  # told when it is opened, if others cannot read it either
+        pass  # reported when it is opened, if it cannot be read there either
     except FormatError as error:
         yield error
         return
@@ -457,17 +454,17 @@ def wrong_facts(path: Path, video: VideoModel, *, deep: bool) -> Iterator[Format
         return
     found = digest_video(path, video.codec)
     if video.sha256 not in (None, found.sha256):
-        yield VideoError("hash-mismatch", path, "does not have the SHA-256 that its sidecar says")
+        yield VideoError("hash-mismatch", path, "does not match the SHA-256 in its sidecar")
     elif due is not None and (problem := _difference(due, found.structures)):
         yield _unfit(path, problem)
 
 
 def _structures(path: Path, references: References) -> Structures:
-    """What references say of a video.
+    """The structures of a video by its references.
 
     Raises:
         VideoError: Its index is damaged.
-        FormatError: They are not of that video.
+        FormatError: They do not belong to that video.
     """
     try:
         structures = references.decode(packets_in_groups(path))
@@ -481,14 +478,14 @@ def _structures(path: Path, references: References) -> Structures:
 
 def _difference(told: Structures, found: Structures | None) -> str:
     if found is None or len(found.groups) != len(told.groups):
-        return "its packets do not tell any"
+        return "its packets do not show any"
     numbers = {text: number for number, text in enumerate(found.texts)}
     as_found = np.array([numbers.get(text, -1) for text in told.texts])
     wrong = np.flatnonzero(as_found[told.groups] != found.groups)
-    return f"the packets of its group of pictures {wrong[0]} tell others" if len(wrong) else ""
+    return f"the packets of its group of pictures {wrong[0]} show others" if len(wrong) else ""
 
 
 def _unfit(path: Path, problem: str) -> FormatError:
     return FormatError(
-        "references-invalid", path, f"does not fit the references in its sidecar: {problem}"
+        "references-invalid", path, f"does not match the references in its sidecar: {problem}"
     )

@@ -1,4 +1,4 @@
-"""Many datasets: found below a folder or by a pattern, and worked on side by side."""
+"""Many datasets: found below a folder or by a pattern, and processed in parallel."""
 
 from __future__ import annotations
 
@@ -21,19 +21,22 @@ from mp4ds.format.sidecars import MANIFEST_NAME
 _Item = TypeVar("_Item")
 _Made = TypeVar("_Made")
 
+_TIDY_S = 20.0
+"""Seconds that a process has to end, on its parent's word."""
+
 Paths = str | Path | Sequence[str | Path]
 """A path or several."""
 
 
 def datasets_in(paths: Paths) -> list[Path]:
-    """The datasets that are meant by paths, in the order of these.
+    """The datasets given by paths, in the same order.
 
     Args:
-        paths: Datasets, sidecars, videos; folders of datasets, however deep; patterns such as
-            ``drives/*``; or URLs, but no patterns of these.
+        paths: Datasets, sidecars, videos; folders of datasets, at any depth; patterns such as
+            ``drives/*``; or URLs, but not URL patterns.
 
     Raises:
-        SourceNotFoundError: There is nothing, or nothing of a pattern.
+        SourceNotFoundError: A path does not exist, or a pattern matches nothing.
         SourceError: A folder has no dataset in it or below it.
     """
     several = [paths] if isinstance(paths, (str, Path, RemotePath)) else paths
@@ -55,7 +58,7 @@ def _datasets_at(path: Path) -> list[Path]:
         except SourceError:
             continue  # a pattern matches other folders, too
     if not found:
-        raise SourceError(path, "matches no dataset", "Give folders that `mp4ds pack` made.")
+        raise SourceError(path, "matches no dataset", "Give folders made by `mp4ds pack`.")
     return found
 
 
@@ -65,13 +68,13 @@ def _below(path: Path) -> list[Path]:
     if not path.is_dir() or (path / MANIFEST_NAME).is_file():
         return [path]
     found = sorted(manifest.parent for manifest in path.rglob(MANIFEST_NAME))
-    # what begins with a dot is being made
+    # names that begin with a dot are being made
     found = [one for one in found if not _is_hidden(one, path)]
     if not found:
         raise SourceError(
             path,
             f"holds no dataset: there is no {MANIFEST_NAME} in it or below it",
-            "Give the folder that `mp4ds pack` made.",
+            "Give a folder made by `mp4ds pack`.",
         )
     return found
 
@@ -85,18 +88,18 @@ def _is_hidden(dataset: Path, folder: Path) -> bool:
 def each(
     work: Callable[[_Item], _Made], items: Sequence[_Item], jobs: int = 1
 ) -> Iterator[tuple[_Item, _Made]]:
-    """Work on items, several at a time.
+    """Process items in parallel.
 
     Args:
-        work: A function that other processes can import, of arguments that they can be sent.
-        items: What it is given.
-        jobs: Processes at a time; of one, it is this one.
+        work: A function that other processes can import, with picklable arguments.
+        items: Its arguments.
+        jobs: Number of processes; if 1, this one.
 
     Yields:
-        Each item with what became of it, in their order.
+        Each item with its result, in order.
 
     Raises:
-        Mp4dsError: A process died, as where memory is short; else what the work raises.
+        Mp4dsError: A process died, perhaps out of memory; otherwise whatever the work raises.
     """
     if min(jobs, len(items)) < 2:
         for item in items:
@@ -109,27 +112,41 @@ def each(
         try:
             yield from zip(items, pool.map(partial(_worked, work), items), strict=True)
         except BrokenProcessPool:
-            raise Mp4dsError("A process died: memory may be short. Try fewer `jobs`.") from None
-        except BaseException:  # nobody waits for what is being worked on
-            for process in set(multiprocessing.active_children()) - before:
+            raise Mp4dsError(
+                "A worker process died, perhaps out of memory. Try fewer `jobs`."
+            ) from None
+        except BaseException:  # nobody waits for work in progress
+            processes = set(multiprocessing.active_children()) - before
+            for process in processes:
                 process.terminate()
+            for process in processes:
+                process.join(_TIDY_S)
+                process.kill()  # one that has not ended would be waited for without end
             pool.shutdown(cancel_futures=True)
             raise
 
 
 def _leave_to_parent() -> None:
-    """Let the parent decide what Ctrl-C does; on its word, tidy up and end."""
+    """Let the parent handle Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _end)
-
-
-def _end(number: int, _: object) -> None:
-    signal.signal(number, signal.SIG_IGN)  # the pool sends it, too, when another process ended
-    sys.exit(128 + number)
 
 
 def _worked(work: Callable[[_Item], _Made], item: _Item) -> _Made:
+    """Work, and tidy up if the parent's word to end comes meanwhile.
+
+    Where the pool itself is at work, ending is left to the system: the pool would take what a
+    handler raises for a result that cannot be sent, and go on.
+    """
     try:
-        return work(item)
+        signal.signal(signal.SIGTERM, _end)
+        try:
+            return work(item)
+        finally:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
     except SystemExit as ended:
-        os._exit(int(ended.code or 0))  # the pool would go on with the next item
+        os._exit(int(ended.code or 0))
+
+
+def _end(number: int, _: object) -> None:
+    signal.signal(number, signal.SIG_IGN)  # the pool sends it, too, when another process has died
+    sys.exit(128 + number)

@@ -1,4 +1,4 @@
-"""A dataset, opened: its streams, and every message of the recording again."""
+"""An open dataset: its streams, and every message of the recording."""
 
 from __future__ import annotations
 
@@ -43,27 +43,27 @@ _JPEG_QUALITY = 95
 
 
 class Dataset:
-    """A folder that `mp4ds pack` made, or one video with its sidecar.
+    """A folder made by `mp4ds pack`, or one video with its sidecar.
 
-    ``dataset["/topic"]`` has a topic's frames, ``"/topic" in dataset`` tells whether it has any,
-    and iteration gives all streams. Where a topic changes its size or encoding and so has several
-    streams, ``dataset["/topic"]`` is a `TopicFrames`: the frames of all of them in the order of
-    recording. Each stream is also found by its file's name without ending.
+    ``dataset["/topic"]`` returns a topic's frames, ``"/topic" in dataset`` tells whether it has
+    any, and iteration yields all streams. If a topic changes its size or encoding and so has
+    several streams, ``dataset["/topic"]`` is a `TopicFrames`: the frames of all of them in recorded
+    order. Each stream can also be looked up by its file name without extension.
 
     Attributes:
         path: The folder, or the video or sidecar.
         manifest: Of the folder; None for one video.
         streams: Its streams.
-        videos: Videos of others, which have no sidecar; see `mp4ds.open`.
-        jpeg_quality: Of the JPEG files that messages of transcoded streams get.
+        videos: Third-party videos without a sidecar; see `mp4ds.open`.
+        jpeg_quality: Quality of the JPEG files in messages of transcoded streams.
 
     Args:
-        path: The folder, a manifest, a sidecar, or a video beside its sidecar; or its URL.
-        jpeg_quality: Of the JPEG files that messages of transcoded streams get, 1 to 100.
+        path: The folder, a manifest, a sidecar, or a video next to its sidecar; or its URL.
+        jpeg_quality: Quality of the JPEG files in messages of transcoded streams, 1 to 100.
 
     Raises:
-        SourceNotFoundError: There is nothing.
-        SourceError: What is there is no dataset.
+        SourceNotFoundError: The path does not exist.
+        SourceError: It is not a dataset.
         FormatError: A file breaks a rule of the format.
     """
 
@@ -77,10 +77,10 @@ class Dataset:
         self.manifest: Manifest | None = None
         holds_one = (self.path / MANIFEST_NAME).exists()
         if not holds_one and self.path.suffix not in (".yaml", ".yml", ".mp4"):
-            problem = "is no dataset"
-            remedy = "Give a folder that `mp4ds pack` made, or a sidecar beside its video."
+            problem = "is not a dataset"
+            remedy = "Give a folder made by `mp4ds pack`, or a sidecar next to its video."
             if video := video_at(self.path):
-                problem, remedy = f"is {video}, and no dataset", HOW_TO_OPEN
+                problem, remedy = f"is {video}, not a dataset", HOW_TO_OPEN
             raise SourceError(self.path, problem, remedy)
         if self.path.is_dir():
             self.manifest = load_manifest(self.path / MANIFEST_NAME)
@@ -94,7 +94,7 @@ class Dataset:
 
     @classmethod
     def of(cls, folder: Path, manifest: Manifest, streams: Sequence[Stream]) -> Dataset:
-        """A folder of which all sidecars were read already."""
+        """A folder whose sidecars have already been read."""
         dataset = cls.__new__(cls)
         dataset.path, dataset.manifest, dataset.jpeg_quality = folder, manifest, _JPEG_QUALITY
         dataset.streams, dataset.videos = list(streams), []
@@ -106,12 +106,12 @@ class Dataset:
 
     @property
     def topics(self) -> list[str]:
-        """Topics that have frames."""
+        """Topics with frames."""
         return list(dict.fromkeys(stream.topic for stream in self._all))
 
     @cached_property
     def _by_name(self) -> dict[str, Frames]:
-        """The frames of each topic, and the streams by the names of their files."""
+        """The frames of each topic, and the streams by file name."""
         found: dict[str, Frames] = {one.path.stem: one for one in self._all}
         found |= {video.topic: video for video in self.videos}
         for topic in dict.fromkeys(stream.topic for stream in self.streams):
@@ -157,11 +157,11 @@ class Dataset:
 
     @property
     def recorded_counts(self) -> Mapping[int, int]:
-        """Messages in messages.mcap by channel id, as its index tells."""
+        """Number of messages in messages.mcap by channel id, from its index."""
         return self._file.counts
 
     def verify_messages(self) -> None:
-        """Compare messages.mcap with its SHA-256: not all that it holds has a checksum of its own.
+        """Check messages.mcap against its SHA-256: not all of its contents have their own checksum.
 
         Raises:
             FormatError: ``file-missing`` or ``hash-mismatch``.
@@ -187,7 +187,7 @@ class Dataset:
         return [channel for channel in self._file.channels if channel.id not in split]
 
     def image_channels(self) -> list[ImageChannel]:
-        """The channels that have images in videos."""
+        """The channels with images in videos."""
         recorded = self._file.counts
         found = []
         for group in self._groups:
@@ -197,10 +197,10 @@ class Dataset:
         return found
 
     def messages(self, topics: Sequence[str] | None = None) -> Iterator[RecordedMessage]:
-        """The messages that are no frames, by log time, each decoded when asked for.
+        """The messages that are not frames, by log time, decoded on request.
 
-        Calibrations are among them. Images that no video could hold are, too, if their topic is
-        asked for.
+        This includes calibrations, and, if their topic is requested, images that no video could
+        hold.
 
         Args:
             topics: Only these topics; None for all.
@@ -241,14 +241,14 @@ class Dataset:
         tolerance_ns: int,
         reference: str | None = None,
     ) -> Sync:
-        """Frames of several topics that were taken at the same time, by their header stamps.
+        """Match frames of several topics taken at the same time, by header stamp.
 
         Args:
-            topics: Topics, or names of streams; None: all topics. Numbers of frames are those of
+            topics: Topics, or names of streams; None: all topics. Frame numbers are those of
                 ``dataset[topic]``.
-            tolerance_ns: Most nanoseconds between a frame and that of the reference.
-            reference: One of the topics, with whose frames those of the others are matched;
-                None: the one with the fewest frames, of several the first.
+            tolerance_ns: Maximum nanoseconds between a frame and the reference frame.
+            reference: One of the topics, to whose frames the others are matched;
+                None: the one with the fewest frames, or the first of several.
 
         Raises:
             OptionError: There is no such topic, or the tolerance is negative.
@@ -262,7 +262,7 @@ class Dataset:
         except KeyError as error:
             raise OptionError(str(error.args[0])) from None
         if len(stamps) < len(topics):
-            raise OptionError(f"a topic stands twice among {', '.join(topics)}")
+            raise OptionError(f"a topic is given twice: {', '.join(topics)}")
         return synchronize(stamps, tolerance_ns=tolerance_ns, reference=reference)
 
     def records(
@@ -275,27 +275,27 @@ class Dataset:
         topics: Collection[str] | None = None,
         ahead: Ahead = when_asked,
     ) -> Iterator[Record]:
-        """Everything that was recorded, merged by log time; each channel in its own order.
+        """Everything recorded, merged by log time; each channel in its own order.
 
-        Of a span of time, a channel's messages that are in messages.mcap are merged with those of
-        its videos by log time. There are only messages then, and what lies before the key frame
-        of the first one of a video is not decoded. Where some messages are left out, videos are
-        not compared with their SHA-256, while messages still are with their digests.
+        For a time span, a channel's messages in messages.mcap are merged with those of its videos
+        by log time. Only messages are yielded then, and nothing before the key frame of a video's
+        first message is decoded. If some messages are left out, videos are not checked against
+        their SHA-256, but messages still are against their digests.
 
         Args:
-            sources: What gives the messages of a video or its calibrations; all others are as
-                recorded.
-            start: The first log time, nanoseconds; None for the first that there is.
-            end: The log time before which all are, nanoseconds; None for no end.
-            choose: Which messages of videos, and of their calibrations, are wanted. Packets
-                that refer to others come with those between two that are wanted.
+            sources: Replacement sources for the messages of a video or its calibrations; all others
+                are as recorded.
+            start: The first log time, nanoseconds; None for the beginning.
+            end: The log time before which all messages are, nanoseconds; None for no end.
+            choose: Which messages of videos, and of their calibrations, are wanted. Packets between
+                wanted ones are included if others refer to them.
             topics: Only these topics; None for all.
-            ahead: Wraps what gives the messages of each video and calibration, and of
-                messages.mcap, so that each may be read by a thread of its own. A dataset is not
-                to be read twice at a time by such threads.
+            ahead: Wraps the iterators over each video, calibration and messages.mcap, so that each
+                can be read in its own thread. A dataset must not be read twice at once by such
+                threads.
 
         Raises:
-            FormatError: A frame does not decode, or a message does not match its digest.
+            FormatError: A frame cannot be decoded, or a message does not match its digest.
         """
         is_span = start is not None or end is not None
         span = Excerpt(start, end, None if topics is None else frozenset(topics))
@@ -309,7 +309,7 @@ class Dataset:
         return heapq.merge(ahead(self._verbatim_records(topics)), *channels, key=_time_of)
 
     def last_before(self, time_ns: int, channels: Collection[Channel]) -> list[Message]:
-        """The last message of some channels before a log time, of those that have one.
+        """The last message before a log time of each channel that has one.
 
         Args:
             time_ns: Nanoseconds.
@@ -339,7 +339,7 @@ class Dataset:
 
     @property
     def is_in_time(self) -> bool:
-        """Whether a span of time has, of each channel, what follows each other in the whole."""
+        """Whether the messages of a time span are consecutive in each channel."""
         recorded = self._file.times()
         return all(
             group.is_in_time([recorded[key] for key in group.recorded_ids if key in recorded])
@@ -347,7 +347,7 @@ class Dataset:
         )
 
     def gaps(self) -> Iterator[tuple[str, str]]:
-        """Topics of which the columns say that messages are missing, and what is missing."""
+        """Topics with missing messages according to the columns, and what is missing."""
         if self.manifest is None:
             return
         recorded = self._file.counts
@@ -364,16 +364,16 @@ class Dataset:
                 yield record
 
     def recorded_messages(self, excerpt: Excerpt) -> Iterator[Message]:
-        """Messages in messages.mcap, by log time, on the channels that they belong to."""
+        """Messages in messages.mcap, by log time, on their channels."""
         owners = {key: group.channel for group in self._groups for key in group.recorded_ids}
         for message in self._file.in_time(excerpt):
             owner = owners.get(message.channel.id)
             yield replace(message, channel=owner) if owner else message
 
     def _group_messages(self, group: ChannelGroup, reading: Reading) -> Iterator[Message]:
-        """One channel's messages from all its places, in the channel's order."""
+        """One channel's messages from all its files, in the channel's order."""
         recorded = reading.ahead(group.found_in(self.recorded_records()))
-        if self.manifest is None:  # a pair alone has only its own messages
+        if self.manifest is None:  # a pair on its own has only its own messages
             return chain(group.messages(reading), recorded)
         return group.merged(reading, recorded, str(self.path))
 
@@ -394,7 +394,7 @@ def _time_of(record: Record) -> int:
 
 
 class _VideoDataset(Dataset):
-    """One video of others."""
+    """A third-party video."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -411,8 +411,8 @@ class _VideoDataset(Dataset):
 def open_dataset(path: Path | str) -> Dataset:
     """Open a dataset, or one video with its sidecar. See `Dataset`.
 
-    A video that has no sidecar and is in no dataset is opened, too: `Dataset.videos` then has
-    it, and its topic is the file's name without ending.
+    A video without a sidecar or dataset can be opened, too: it is then in `Dataset.videos`, and its
+    topic is the file name without extension.
 
     Args:
         path: See `Dataset`.

@@ -1,4 +1,4 @@
-"""Frames by number and by stamp: what streams, videos of others and whole topics have in common."""
+"""Frames by number and by stamp: the common interface of streams, third-party videos and topics."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _INT64 = np.iinfo(np.int64)
 
 
 class StampIndex:
-    """Finds frames by stamp; of several with the same stamp, the first in order.
+    """Finds frames by stamp; the first of several with the same stamp.
 
     Args:
         topic: For errors.
@@ -44,24 +44,24 @@ class StampIndex:
         self._sorted = stamps[self._order]
 
     def find(self, stamp_ns: int, *, mode: str, tolerance_ns: int | None) -> int:
-        """Number of the frame that belongs to a time.
+        """Number of the frame for a time.
 
         Args:
             stamp_ns: Nanoseconds.
-            mode: ``nearest``, and of two that are equally near the earlier one; ``before``: the
+            mode: ``nearest``, the earlier of two equally near; ``before``: the
                 last at or before the time; ``after``: the first at or after it; ``exact``.
-            tolerance_ns: Most nanoseconds between them, or None for any number.
+            tolerance_ns: Maximum nanoseconds between them, or None for no limit.
 
         Raises:
             FrameNotFoundError: There is none.
             OptionError: There is no such mode or tolerance.
         """
         if mode not in _WANTED:
-            raise OptionError(f"there is no mode {mode!r}: use {', '.join(_WANTED)}")
+            raise OptionError(f"mode {mode!r} is not known: use {', '.join(_WANTED)}")
         stamp = as_integer(stamp_ns)
         tolerance = None if tolerance_ns is None else as_integer(tolerance_ns)
         if tolerance is not None and tolerance < 0:
-            raise OptionError(f"a tolerance of {tolerance} ns: use 0 or more")
+            raise OptionError(f"tolerance is {tolerance} ns: use 0 or more")
         earlier, later = self._around(stamp)
         near = [place for place in (earlier, later) if place is not None]
         nearest = min(near, key=lambda place: abs(self._stamp(place) - stamp))
@@ -88,7 +88,7 @@ class StampIndex:
         return int(np.searchsorted(self._sorted, value, side="left"))
 
     def _around(self, stamp: int) -> tuple[int | None, int | None]:
-        """Places of the last one at or before a time, and of the first one at or after it."""
+        """Indices of the last stamp at or before a time, and of the first at or after it."""
         place = self._place(stamp)
         later = place if place < len(self._sorted) else None
         if later is not None and self._stamp(later) == stamp:
@@ -101,27 +101,27 @@ class StampIndex:
 
 
 def numbers_of(topic: str, count: int, indices: Sequence[int] | NDArray[np.int64]) -> list[int]:
-    """Frame numbers, negative ones counted from the end.
+    """Frame numbers; negative ones count from the end.
 
     Args:
         topic: For errors.
-        count: Frames that there are.
+        count: Number of frames.
         indices: Any integers.
 
     Raises:
         IndexError: There is no such frame.
-        TypeError: One is no integer.
+        TypeError: One is not an integer.
     """
     numbers = []
     for index in indices.tolist() if isinstance(indices, np.ndarray) else indices:
         if isinstance(index, bool):
-            raise TypeError("frames are chosen by number: give np.flatnonzero(mask) of a mask")
+            raise TypeError("frames are selected by number: for a mask, give np.flatnonzero(mask)")
         asked = as_integer(index)
         number = asked + count if asked < 0 else asked
         if not 0 <= number < count:
             raise IndexError(
-                f"{topic} has {count} frames, and no frame {asked}: they are 0 to {count - 1}, "
-                f"or {-count} to -1 from the end"
+                f"{topic} has no frame {asked}: its {count} frames are 0 to {count - 1}, or "
+                f"{-count} to -1 from the end"
             )
         numbers.append(number)
     return numbers
@@ -135,13 +135,13 @@ class Frame:
     """One image of a stream.
 
     Attributes:
-        data: Pixels in the encoding, shape as `Encoding.shape`, native byte order.
+        data: Pixels in the encoding, shape as in `Encoding.shape`, native byte order.
         index: Number of the frame in its stream.
         stamp_ns: Header stamp, nanoseconds.
         log_time_ns: When it was recorded, nanoseconds.
         frame_id: Coordinate frame.
         encoding: ROS image encoding of `data`.
-        intrinsics: The calibration of `data`, or None where the recording has none.
+        intrinsics: The calibration of `data`, or None if the recording has none.
     """
 
     data: Pixels
@@ -157,21 +157,21 @@ Indices = Sequence[int] | NDArray[np.int64]
 
 
 class Frames(ABC):
-    """A sequence of frames, decoded when asked for.
+    """A sequence of frames, decoded on demand.
 
-    ``len(frames)``, ``frames[i]``, ``frames[-1]``, ``frames[a:b]`` and iteration work as on a
-    list. Not to be shared between threads or over a fork.
+    ``len(frames)``, ``frames[i]``, ``frames[-1]``, ``frames[a:b]`` and iteration work as on a list.
+    Do not share it between threads or across a fork.
 
-    Where frames can be given otherwise than recorded:
+    Options for returning frames other than as recorded:
 
     * ``format``: ``"native"`` in their ROS encoding; ``"rgb"`` and ``"bgr"``, shape (H, W, 3);
       ``"gray"``, shape (H, W). 16 bits stay 16 bits, a Bayer mosaic is interpolated, alpha is
-      left out. Depths and other numbers are given as ``"native"``; depths also as ``"depth_m"``,
-      float32 in metres, shape (H, W). Where there is none it is 0 or NaN, as recorded.
-    * ``crop``: x, y, width and height in pixels of the image, cut out first.
-    * ``resize``: a factor, or width and height. Sizes are reduced by area and enlarged by bicubic
-      interpolation; depths and other numbers take the nearest pixel. The frame's `intrinsics`
-      are those of the picture given.
+      dropped. Depths and other measurements are available as ``"native"``; depths also as
+      ``"depth_m"``, float32 in metres, shape (H, W). Missing depths are 0 or NaN, as recorded.
+    * ``crop``: x, y, width and height in pixels of the image, applied first.
+    * ``resize``: a factor, or width and height. Images are shrunk by area averaging and enlarged by
+      bicubic interpolation; depths and other measurements use the nearest pixel. The frame's
+      `intrinsics` are adjusted to match.
     """
 
     # ------------------------------------------------------------ what they are
@@ -217,12 +217,12 @@ class Frames(ABC):
 
     @property
     def calibrations(self) -> Sequence[Calibration]:
-        """All calibrations, in the order in which they were first seen; none where not known."""
+        """All calibrations, in the order in which they were first seen; none if unknown."""
         return []
 
     @abstractmethod
     def intrinsics_at(self, index: int) -> Calibration | None:
-        """The calibration that held when a frame was recorded.
+        """The calibration that applied when a frame was recorded.
 
         Args:
             index: 0 <= index < frames.
@@ -233,7 +233,7 @@ class Frames(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Close what is open of videos."""
+        """Close any open videos."""
 
     # ------------------------------------------------------------ by number
 
@@ -260,20 +260,20 @@ class Frames(ABC):
         resize: Resize = None,
         crop: Crop = None,
     ) -> list[Frame]:
-        """Frames by number, decoded in the order that costs least.
+        """Frames by number, decoded in the cheapest order.
 
         Args:
-            indices: In any order, also several times; negative ones count from the end.
+            indices: In any order, with repetitions; negative ones count from the end.
             format: See `Frames`.
             resize: See `Frames`.
             crop: See `Frames`.
 
         Returns:
-            One frame for each index, whose pixels are its own.
+            One frame for each index, each with its own pixels.
 
         Raises:
             IndexError: There is no such frame.
-            OptionError: There is no such format, part or size, or not of these frames.
+            OptionError: The format, crop or size is invalid, or not available for these frames.
             VideoError: A frame cannot be decoded.
         """
 
@@ -301,7 +301,7 @@ class Frames(ABC):
 
         Raises:
             IndexError: There is no such frame.
-            OptionError: As for `get`; or `out` has another shape or type.
+            OptionError: As for `get`; or `out` has the wrong shape or type.
             VideoError: A frame cannot be decoded.
         """
 
@@ -315,11 +315,11 @@ class Frames(ABC):
         resize: Resize = None,
         crop: Crop = None,
     ) -> None:
-        """As `read`, each frame into an array of its own.
+        """Like `read`, but each frame into its own array.
 
         Args:
             indices: As for `get`.
-            outs: An array for each, of the shape and type of a row of what `read` returns.
+            outs: An array for each, with the shape and type of a row returned by `read`.
             format: See `Frames`.
             resize: See `Frames`.
             crop: See `Frames`.
@@ -339,16 +339,16 @@ class Frames(ABC):
     def index_at(
         self, stamp_ns: int, *, mode: str = "nearest", tolerance_ns: int | None = None
     ) -> int:
-        """Number of the frame that belongs to a time.
+        """Number of the frame for a time.
 
-        Stamps need not be sorted. Of several frames with the same stamp it is the first in
-        order, and of two that are equally near the earlier one.
+        Stamps need not be sorted. Of several frames with the same stamp it is the first, and of two
+        equally near it is the earlier.
 
         Args:
             stamp_ns: Nanoseconds.
             mode: ``nearest``; ``before``: the last at or before the time; ``after``: the first
                 at or after it; ``exact``.
-            tolerance_ns: Most nanoseconds between the frame and the time; None for any number.
+            tolerance_ns: Maximum nanoseconds between the frame and the time; None for no limit.
 
         Raises:
             FrameNotFoundError: There is no such frame.
@@ -366,7 +366,7 @@ class Frames(ABC):
         resize: Resize = None,
         crop: Crop = None,
     ) -> Frame:
-        """The frame that belongs to a time.
+        """The frame for a time.
 
         Args:
             stamp_ns: See `index_at`.
@@ -429,11 +429,11 @@ class DecodedFrames(Frames):
 
     @abstractmethod
     def _open_reader(self) -> FrameReader:
-        """A decoder of its own for frames by number."""
+        """A separate decoder for frames by number."""
 
     @abstractmethod
     def _pictures(self, scale: Scale | None) -> Iterator[Picture]:
-        """All pictures in order, read by a decoder of their own."""
+        """All pictures in order, from a separate decoder."""
 
     @property
     @abstractmethod
@@ -445,7 +445,7 @@ class DecodedFrames(Frames):
         """Write the pixels of a picture, as recorded."""
 
     def _metres(self, index: int, pixels: Pixels) -> NDArray[np.float32]:
-        """The depths of a frame in metres, of its pixels as recorded."""
+        """The depths of a frame in metres, from its pixels as recorded."""
         return metres_of(pixels)
 
     @abstractmethod
@@ -462,10 +462,11 @@ class DecodedFrames(Frames):
         Args:
             indices: 0 <= index < frames, increasing.
             scale: See `PictureMaker.make`.
-            outs: Its `out`, by frame, which may be left unused.
+            outs: Its `out`, by frame; may be left unused.
 
         Yields:
-            Views that hold until the next one is asked for. Nothing else may be read meanwhile.
+            Views that are valid until the next one is requested. Nothing else may be read
+            meanwhile.
 
         Raises:
             VideoError: One cannot be decoded.
@@ -540,8 +541,8 @@ class DecodedFrames(Frames):
         """Write the pixels of frames.
 
         Args:
-            numbers: 0 <= number < frames, in any order, also several times.
-            view: Of these frames.
+            numbers: 0 <= number < frames, in any order, with repetitions.
+            view: The view of these frames.
             out: An array for each.
 
         Raises:
@@ -574,10 +575,10 @@ class DecodedFrames(Frames):
         )
 
     def _in_order(self, indices: NDArray[np.int64], view: View) -> Iterator[Frame]:
-        """Frames in an order, of which what increases is decoded in one go."""
+        """Frames in a given order; increasing runs are decoded in one go."""
         falls = np.flatnonzero(np.diff(indices) < 0) + 1
         runs = (run.tolist() for run in np.split(indices, falls) if len(run))
-        with self._open_reader() as reader:  # of its own: more may be read meanwhile
+        with self._open_reader() as reader:  # a separate one: more may be read meanwhile
             for run in runs:
                 for index, picture in reader.pictures_of(run, view.scale):
                     yield self._frame(index, picture, view)
@@ -585,10 +586,10 @@ class DecodedFrames(Frames):
     # ------------------------------------------------------------ how they are given
 
     def _view(self, format: str, resize: Resize, crop: Crop) -> View:  # noqa: A002
-        """One way of giving the frames.
+        """The view for a format, size and crop.
 
         Raises:
-            OptionError: There is no such format, part or size, or not of these frames.
+            OptionError: The format, crop or size is invalid, or not available for these frames.
         """
         key = repr((format, resize, crop))
         view = self._views.get(key)
@@ -602,7 +603,7 @@ class DecodedFrames(Frames):
                 crop=crop,
                 shows_colours=self._shows_colours,
             )
-            self._views = {key: view}  # the last one alone: it holds tables of its own
+            self._views = {key: view}  # only the last one: each holds its own tables
         return view
 
     def _give(self, number: int, picture: Picture, view: View, out: Pixels) -> None:

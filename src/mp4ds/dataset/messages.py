@@ -1,4 +1,4 @@
-"""messages.mcap of a dataset, and messages of a recording to be looked at."""
+"""messages.mcap of a dataset, and recorded messages for users."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from mp4ds.records import Channel, Excerpt, Message, MetadataRecord, Record, Sch
 
 
 class MessagesFile:
-    """messages.mcap of a dataset; of one video with its sidecar, which has none, empty.
+    """messages.mcap of a dataset; empty for a single video with its sidecar, which has none.
 
     Args:
-        path: The file; None where there is none.
+        path: The file; None if there is none.
     """
 
     def __init__(self, path: Path | None) -> None:
         self.path = path
 
     def verify(self, manifest: Manifest) -> None:
-        """Compare it with its SHA-256: not all that it holds has a checksum of its own.
+        """Check it against its SHA-256: not all of its contents have their own checksum.
 
         Raises:
             FormatError: ``file-missing`` or ``hash-mismatch``.
@@ -42,7 +42,7 @@ class MessagesFile:
         entry = next((item for item in manifest.files if item.name == MESSAGES_NAME), None)
         if entry is None or digest_file(self.path)[1] != entry.sha256:
             raise FormatError(
-                "hash-mismatch", self.path, "does not have the SHA-256 that the manifest says"
+                "hash-mismatch", self.path, "does not match the SHA-256 in the manifest"
             )
 
     @staticmethod
@@ -52,11 +52,11 @@ class MessagesFile:
 
     @cached_property
     def _reader(self) -> McapReader | None:
-        """Reads it; holds no file open between its passes.
+        """The reader; keeps no file open between passes.
 
         Raises:
-            FormatError: ``file-missing``; ``messages-unreadable`` where it does not list them all.
-            SourceError: It is damaged, or no MCAP file.
+            FormatError: ``file-missing``; ``messages-unreadable`` if it does not list them all.
+            SourceError: It is damaged, or not an MCAP file.
         """
         if self.path is None:
             return None
@@ -66,7 +66,7 @@ class MessagesFile:
             raise FormatError(
                 "messages-unreadable",
                 self.path,
-                "has no index of all that it holds; copy it again, or see `mcap recover`",
+                "has no complete index; copy it again, or run `mcap recover`",
             )
         return reader
 
@@ -82,7 +82,7 @@ class MessagesFile:
 
     @cached_property
     def counts(self) -> Mapping[int, int]:
-        """Messages by channel id, as its index tells."""
+        """Number of messages by channel id, from its index."""
         stats = self._reader.stats() if self._reader else {}
         return {key: item.count for key, item in stats.items()}
 
@@ -91,7 +91,7 @@ class MessagesFile:
         return self._reader.times() if self._reader else {}
 
     def in_file_order(self) -> Iterator[Record]:
-        """All that is in it, as it stands there."""
+        """All its records, in file order."""
         return self._reader.as_it_stands() if self._reader else iter(())
 
     def others(self) -> Iterator[Record]:
@@ -105,10 +105,10 @@ class MessagesFile:
 
 
 def recorded_storage(records: Iterable[Record]) -> str:
-    """The storage that a rosbag2 source had; mcap, the default of ROS 2, where none is told.
+    """The storage of a rosbag2 source; mcap, the default of ROS 2, if unknown.
 
     Args:
-        records: All that is in messages.mcap; the folder's own record stands before its messages.
+        records: All records of messages.mcap; the folder's own record precedes its messages.
     """
     for record in records:
         if isinstance(record, Message):
@@ -124,11 +124,11 @@ class RecordedMessage:
 
     Attributes:
         topic: Its topic.
-        type_name: Its type as the recording spells it; empty where that is not known.
+        type_name: Its type as the recording spells it; empty if unknown.
         log_time_ns: When it was recorded, nanoseconds.
-        publish_time_ns: When it was published, nanoseconds; the log time where not known.
-        raw: Its bytes, which cannot be written to.
-        decode: What `decoded` calls.
+        publish_time_ns: When it was published, nanoseconds; the log time if unknown.
+        raw: Its bytes, read-only.
+        decode: Called by `decoded`.
     """
 
     topic: str
@@ -140,20 +140,20 @@ class RecordedMessage:
 
     @cached_property
     def decoded(self) -> Any:
-        """The message as an object, decoded when first asked for.
+        """The message as an object, decoded on first access.
 
-        ROS 1 and ROS 2 give an object whose attributes are the message's fields, arrays of
-        numbers as numpy's; protobuf a message of its own; JSON dicts and lists.
+        ROS 1 and ROS 2 messages become objects with the message's fields as attributes and numeric
+        arrays as numpy arrays; protobuf gives a protobuf message; JSON gives dicts and lists.
 
         Raises:
             OptionError: No message of the topic can be decoded.
-            SourceError: This one is not of the type that its topic tells.
+            SourceError: This one does not match its topic's type.
         """
         return self.decode(self.raw)
 
 
 def as_recorded(messages: Iterable[Message], path: Path) -> Iterator[RecordedMessage]:
-    """Messages to be looked at.
+    """Messages for users.
 
     Args:
         messages: Of any channels.
@@ -174,7 +174,7 @@ def as_recorded(messages: Iterable[Message], path: Path) -> Iterator[RecordedMes
 
 
 class _Topic:
-    """Decodes the messages of a channel; the first one makes the decoder."""
+    """Decodes the messages of a channel; creates the decoder for the first one."""
 
     def __init__(self, channel: Channel, path: Path) -> None:
         self._channel = channel
@@ -182,7 +182,7 @@ class _Topic:
 
     @cached_property
     def _decoder(self) -> Callable[[memoryview], Any]:
-        # rosbags takes long to import, and not everybody decodes messages
+        # rosbags is slow to import, and not everyone decodes messages
         from mp4ds.bags.decoding import decoder_of
 
         return decoder_of(self._channel)

@@ -1,4 +1,4 @@
-"""What stands around the bodies of messages: collected, rebuilt, and chosen."""
+"""Everything around the bodies of messages: collected, rebuilt, and selected."""
 
 from __future__ import annotations
 
@@ -60,14 +60,14 @@ class ColumnsWriter:
         """Refuse times that a column cannot hold.
 
         Raises:
-            Refused: A time is beyond 64 bits with sign.
+            Refused: A time does not fit into a signed 64-bit integer.
         """
         for value in (message.log_time, message.publish_time, parts.pts or 0):
             if not INT64_MIN <= value <= INT64_MAX:
                 raise Refused(f"time {value} ns does not fit into 64 bits with sign")
 
     def append(self, message: Message, parts: Parts, *, variant: int, ordinal: int) -> None:
-        """Append one message's values, checked before."""
+        """Append one message's values, already checked."""
         self._log_time.append(message.log_time)
         self._publish_time.append(message.publish_time)
         self._sequence.append(message.sequence)
@@ -95,11 +95,11 @@ class ColumnsWriter:
 
 
 def columns_model(values: Mapping[str, NDArray[np.int64]]) -> Columns:
-    """Columns as the sidecar holds them; what follows from the rest is left out.
+    """Columns as the sidecar stores them, without those that follow from others.
 
     Args:
-        values: All that `Columns` has by name, shape (messages,); ``seq`` and ``pts`` where
-            the messages have them.
+        values: All that `Columns` has by name, shape (messages,); ``seq`` and ``pts`` if the
+            messages have them.
     """
     log_time, publish_time, ordinal = (
         values[name] for name in ("log_time", "publish_time", "ordinal")
@@ -144,7 +144,7 @@ _ModelT = TypeVar("_ModelT")
 
 
 class MessageSplitter:
-    """Takes the messages of one channel apart; its serialization may change between messages."""
+    """Splits the messages of one channel; its serialization may change between messages."""
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
@@ -190,13 +190,13 @@ class HeaderTable(Generic[_ModelT]):
         describe: Callable[[str | None], _ModelT],
         extra: object = None,
     ) -> int:
-        """The number of a message's header, after rebuilding the message and comparing.
+        """The number of a message's header, after rebuilding and comparing the message.
 
         Args:
             parts: Of the message.
             data: The message.
-            describe: Makes the model of a new header, given its template or None for a plain one.
-            extra: What else makes a header another one.
+            describe: Makes the model of a new header, from its template or None for a plain one.
+            extra: What else distinguishes headers.
 
         Raises:
             Refused: It does not rebuild, or there are too many.
@@ -234,11 +234,11 @@ class CameraInfoWriter:
         self._heads: HeaderTable[Calibration] | None = None
 
     def accept(self, message: Message, ordinal: int) -> None:
-        """Take a message.
+        """Accept a message.
 
         Args:
             message: The message.
-            ordinal: Its place among the channel's messages.
+            ordinal: Its position among the channel's messages.
 
         Raises:
             Refused: It cannot be modelled exactly; nothing was changed.
@@ -262,7 +262,7 @@ class CameraInfoWriter:
         self._columns.append(message, parts, variant=variant, ordinal=ordinal)
 
     def to_model(self) -> CameraInfo | None:
-        """The model, or None if no message was taken."""
+        """The model, or None if no message was accepted."""
         if self._heads is None:
             return None
         return CameraInfo(
@@ -300,7 +300,7 @@ def _calibration(frame_id: str, fields: CalibrationFields, template: str | None)
 
 
 def fields_of(calibration: Calibration) -> CalibrationFields:
-    """The fields of a calibration, as a wire takes them."""
+    """The fields of a calibration, for serialization."""
     roi = calibration.roi
     return CalibrationFields(
         height=calibration.height,
@@ -334,7 +334,7 @@ class DecodedColumns:
     ordinal: NDArray[np.int64]
 
     def slots(self, index: int) -> Slots:
-        """What fills the blank of a message."""
+        """The values that fill a message's blank."""
         return Slots(
             stamp=int(self.stamp[index]),
             seq=None if self.seq is None else int(self.seq[index]),
@@ -377,7 +377,7 @@ def decode_columns(columns: Columns, count: int, variants: int, place: str) -> D
 
 
 def check_slots(columns: DecodedColumns, templates: list[Template], place: str) -> None:
-    """Refuse stamps and numbers that the serialization has no bits for.
+    """Refuse stamps and numbers that the serialization cannot represent.
 
     Raises:
         FormatError: ``column-invalid``.
@@ -417,8 +417,8 @@ def template_of(
     Args:
         form: Of the messages.
         encoded: The blank in base64, or None for a plain one.
-        frame_id: What the sidecar says beside it.
-        fields: What it says besides; the size of coded images does not count.
+        frame_id: The sidecar's value.
+        fields: The sidecar's other values; the size of coded images is ignored.
         place: Of the template, for errors.
 
     Raises:
@@ -440,7 +440,7 @@ def template_of(
 
 
 def camera_info_columns(camera_info: CameraInfo, place: str) -> DecodedColumns:
-    """The columns of a stream's CameraInfo messages, of which there are some.
+    """The columns of a stream's CameraInfo messages, of which there is at least one.
 
     Raises:
         FormatError: ``column-invalid``.
@@ -481,7 +481,7 @@ class CameraInfoRebuilder:
         check_slots(self.columns, self._templates, place)
 
     def messages(self, channel: Channel, indices: Iterable[int]) -> Iterator[tuple[int, Message]]:
-        """Ordinal and message of each one that is wanted.
+        """Ordinal and message of each wanted one.
 
         Args:
             channel: The channel to make them on.
@@ -510,10 +510,10 @@ def message_at(
 # ---------------------------------------------------------------- choices
 
 Choice = Callable[[DecodedColumns], Iterator[int]]
-"""Gives the numbers of the messages that are wanted, increasing.
+"""Yields the numbers of the wanted messages, increasing.
 
-It is asked for the next number only when the message before was made, so that it may leave out
-those for which it is too late by then.
+The next number is requested only when the previous message has been made, so that it can skip those
+for which it is too late by then.
 """
 
 
@@ -523,7 +523,7 @@ def everything(columns: DecodedColumns) -> Iterator[int]:
 
 
 def within(excerpt: Excerpt, choice: Choice = everything) -> Choice:
-    """Of the messages that are wanted those of a span of log time."""
+    """Restrict the wanted messages to a span of log time."""
 
     def choose(columns: DecodedColumns) -> Iterator[int]:
         times = columns.log_time
@@ -542,7 +542,7 @@ def last_of(end: int) -> Choice:
 
 
 def marked(is_wanted: NDArray[np.bool_], choice: Choice = everything) -> Choice:
-    """Of the messages that are wanted those that are marked.
+    """Restrict the wanted messages to marked ones.
 
     Args:
         is_wanted: For each message, shape (messages,).
@@ -558,12 +558,12 @@ def marked(is_wanted: NDArray[np.bool_], choice: Choice = everything) -> Choice:
 def unbroken(
     indices: Iterable[int], keys: Sequence[int], *, from_key: bool = False
 ) -> Iterator[int]:
-    """Packets of a video, and those between that must be decoded before them.
+    """Packets of a video, including those between that must be decoded first.
 
     Args:
-        indices: Numbers of the packets that are wanted, increasing.
+        indices: Numbers of the wanted packets, increasing.
         keys: Numbers of the key frames, increasing.
-        from_key: Begin with the key frame before the first one.
+        from_key: Start with the key frame before the first one.
     """
     due: int | None = None
     for index in indices:

@@ -1,4 +1,4 @@
-"""A dataset as a recording: what was packed may be packed again."""
+"""A dataset as a recording, so that it can be repacked."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _BEST_JPEG = 100
 
 
 class DatasetReader:
-    """The recording that a dataset gives back. See `BagReader`.
+    """The recording held by a dataset. See `BagReader`.
 
-    Of lossy streams the messages have the pixels that the videos have; JPEG files that were
-    encoded anew are made with the best quality.
+    Messages of lossy streams have the pixels of the videos; re-encoded JPEG files are made with the
+    best quality.
 
     Args:
         path: The folder, or its manifest; or its URL.
@@ -32,7 +32,7 @@ class DatasetReader:
 
     Raises:
         FormatError: A file breaks a rule of the format.
-        SourceError: It is no dataset.
+        SourceError: It is not a dataset.
     """
 
     def __init__(self, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A dataset of a part of another: packets are copied, nothing is encoded."""
+"""Cuts a dataset out of another: packets are copied, nothing is encoded."""
 
 from __future__ import annotations
 
@@ -45,33 +45,33 @@ _NO_TIMES = np.empty(0, np.int64)
 
 
 def span_in(dataset: Dataset, asked: Slice) -> Excerpt:
-    """A slice, as times of a dataset.
+    """A slice as a span of a dataset's times.
 
     Raises:
-        OptionError: There is nothing in it, or a time is none.
+        OptionError: It is empty, or a time is not valid.
     """
     if not asked:
         return EVERYTHING
     times = [one for one in dataset.times().values() if len(one)]
     if not times:
-        raise OptionError(f"{dataset.path} has no messages, of which a slice could be taken.")
+        raise OptionError(f"{dataset.path} has no messages to take a slice of.")
     first, last = min(int(one[0]) for one in times), max(int(one[-1]) for one in times)
     return Excerpt(*asked.times(first, last, dataset.path))
 
 
 @contextmanager
 def sliced(dataset: Dataset, asked: Slice, folder: Path) -> Iterator[Dataset]:
-    """A dataset of a slice, which is gone afterwards; the dataset itself where none is asked for.
+    """A temporary dataset of a slice; the dataset itself if no slice is given.
 
     Args:
-        dataset: A folder that `mp4ds pack` made.
+        dataset: A folder made by `mp4ds pack`.
         asked: The slice.
-        folder: Where there is room for it.
+        folder: Where to make it.
 
     Raises:
-        OptionError: There is nothing in it, or it cannot be taken.
+        OptionError: It is empty, or cannot be cut out.
         FormatError: The dataset is damaged.
-        OSError: The disk refused.
+        OSError: The disk could not be written.
     """
     if not asked:
         yield dataset
@@ -81,7 +81,7 @@ def sliced(dataset: Dataset, asked: Slice, folder: Path) -> Iterator[Dataset]:
     try:
         copy_part(dataset, path, span=span_in(dataset, asked))
     except Refused as reason:
-        raise OptionError(f"{dataset.path}: no slice can be taken: {reason}.") from None
+        raise OptionError(f"{dataset.path} cannot be sliced: {reason}.") from None
     try:
         with Dataset(path, jpeg_quality=dataset.jpeg_quality) as opened:
             yield opened
@@ -97,25 +97,25 @@ def copy_part(
     selected: Callable[[str], bool] = lambda _: True,
     about: About | None = None,
 ) -> Manifest:
-    """Copy what was recorded in a span of log time, and of some topics.
+    """Copy what was recorded in a span of log time, on some topics.
 
-    Frames that come before the span, but belong to the group of pictures in which it begins, are
-    in the new video, too, hidden by its edit list (spec, "The video").
+    Frames before the span that belong to the group of pictures in which it begins are also in the
+    new video, hidden by its edit list (spec, "The video").
 
     Args:
-        dataset: A folder that `mp4ds pack` made.
+        dataset: A folder made by `mp4ds pack`.
         folder: The folder to fill, empty.
-        span: What to copy; topics that it names are not looked at.
+        span: What to copy; its topics are ignored.
         selected: Whether a topic is to be copied.
-        about: What is told of the recording; None for what the dataset tells.
+        about: Description of the recording; None to keep the dataset's.
 
     Returns:
-        The new manifest, which is written.
+        The new manifest, already written.
 
     Raises:
         Refused: It cannot be copied; says why. Nothing was written.
-        FormatError: A file is not what its dataset says.
-        OSError: The disk refused.
+        FormatError: A file does not match its dataset.
+        OSError: The disk could not be written.
     """
     part = _Part(dataset, folder, span, selected)
     part.check()
@@ -124,12 +124,12 @@ def copy_part(
 
 @dataclass(frozen=True)
 class _Cut:
-    """A stream of the part.
+    """A stream of the slice.
 
     Attributes:
         stream: Of the dataset.
-        images: Numbers of the frames that are copied.
-        infos: Numbers of the calibrations that are copied.
+        images: Numbers of the frames to copy.
+        infos: Numbers of the calibrations to copy.
     """
 
     stream: Stream
@@ -147,7 +147,7 @@ class _Part:
         self, dataset: Dataset, folder: Path, span: Excerpt, selected: Callable[[str], bool]
     ) -> None:
         if dataset.manifest is None:
-            raise Refused("it is one video, and no dataset")
+            raise Refused("it is a single video, not a dataset")
         self._old = dataset.manifest
         self._dataset = dataset
         self._folder = folder
@@ -182,7 +182,7 @@ class _Part:
             Refused: Says why.
         """
         if self._is_slice and not self._dataset.is_in_time:
-            raise Refused("log times do not tell the order of its messages")
+            raise Refused("its messages are not ordered by log time")
         for cut in self._cuts:
             info = cut.stream.sidecar.camera_info
             if (
@@ -190,12 +190,12 @@ class _Part:
                 and info.messages
                 and self._selected(info.channel.topic) != self._selected(cut.stream.topic)
             ):
-                raise Refused(f"{cut.stream.topic} and {info.channel.topic} are one stream")
+                raise Refused(f"{cut.stream.topic} and {info.channel.topic} share one stream")
             if np.any(np.diff(cut.images) != 1):
-                raise Refused(f"frames of {cut.stream.topic} are not in the order of their times")
+                raise Refused(f"frames of {cut.stream.topic} are not ordered by time")
 
     def write(self, about: About | None) -> Manifest:
-        """Write all files, and the manifest at last."""
+        """Write all files, the manifest last."""
         dataset, folder, old = self._dataset, self._folder, self._old
         made = self._write_streams()
         self._write_messages(folder / MESSAGES_NAME)
@@ -249,7 +249,7 @@ class _Part:
         return manifest
 
     def _verbatim(self) -> list[Verbatim]:
-        """Camera messages that are in messages.mcap, by topic, with the reasons that are known."""
+        """Camera messages in messages.mcap, by topic, with the known reasons."""
         old = self._old
         if not self._is_slice:
             return [item for item in old.verbatim if self._selected(item.topic)]
@@ -298,7 +298,7 @@ class _Part:
             raise VideoError(
                 "hash-mismatch",
                 stream.video_path,
-                "does not have the SHA-256 that its sidecar says",
+                "does not match the SHA-256 in its sidecar",
             )
         if video.quality is not None:
             changes["quality"] = video.quality.of(numbers, len(stream))
@@ -340,7 +340,7 @@ class _Part:
     def _columns(
         self, columns: DecodedColumns, numbers: Integers, channel: ChannelModel
     ) -> tuple[Columns, list[int]]:
-        """Columns of some messages, and the numbers of the variants that they are of."""
+        """Columns of some messages, and the numbers of their variants."""
         values = {
             name: getattr(columns, name)[numbers]
             for name in Columns.model_fields
@@ -354,10 +354,10 @@ class _Part:
 
     @cached_property
     def _times(self) -> dict[tuple[object, ...], Integers]:
-        """Sorted log times of the messages of what is copied, by the identity of channels."""
+        """Sorted log times of the copied messages, by channel identity."""
         times = self._dataset.times()
         found: dict[tuple[object, ...], list[Integers]] = {}
-        for channel in self._dataset.channels:  # several may be alike
+        for channel in self._dataset.channels:  # several may be equal
             if self._selected(channel.topic):
                 found.setdefault(channel.identity, []).append(times.get(channel.id, _NO_TIMES))
         return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items()}
@@ -391,9 +391,9 @@ class _Part:
                 writer.add_schema(schema)
 
     def _verbatim_messages(self) -> Iterator[Message]:
-        """What goes into messages.mcap, by log time.
+        """The messages for messages.mcap, by log time.
 
-        Also the calibrations of streams that have no frames in the span.
+        Includes the calibrations of streams without frames in the span.
         """
         recorded = (
             message

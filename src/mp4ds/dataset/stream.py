@@ -1,4 +1,4 @@
-"""One stream of a dataset, opened: its frames by number, and its messages again."""
+"""An open stream of a dataset: its frames by number, and its messages."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ from mp4ds.video.reader import FrameReader, open_frames
 
 
 class MessageRebuilder:
-    """Makes the camera messages of a stream.
+    """Rebuilds the camera messages of a stream.
 
     Args:
         sidecar: The stream's.
         columns: The stream's.
         place: Name of the sidecar, for errors.
-        jpeg_quality: Of the JPEG files that transcoded messages get, 1 to 100.
+        jpeg_quality: Quality of the JPEG files in transcoded messages, 1 to 100.
 
     Raises:
         FormatError: The sidecar contradicts itself.
@@ -77,7 +77,7 @@ class MessageRebuilder:
         rows = self._encoding.shape(image.width, image.height)[0]
         self._padding_size = rows * (image.step - self._row_bytes)
         self._paddings: dict[int, bytes | None] = {}
-        for variant in range(len(sidecar.headers)):  # so that a wrong one is told at once
+        for variant in range(len(sidecar.headers)):  # so that a wrong one is reported at once
             self._padding(variant)
         self._jpeg = (
             ImageFile(self._encoding.name, "jpeg", quality=jpeg_quality)
@@ -88,12 +88,12 @@ class MessageRebuilder:
 
     @property
     def picture_format(self) -> str:
-        """Pixel format of the pictures that `pixels` takes."""
+        """Pixel format of the pictures for `pixels`."""
         return self._layout.pixel_format
 
     @property
     def picture_size(self) -> tuple[int, int]:
-        """Width and height of the pictures that `pixels` takes."""
+        """Width and height of the pictures for `pixels`."""
         return self._layout.picture_size(self._sidecar.image.width, self._sidecar.image.height)
 
     def pixels(self, picture: Picture) -> Pixels:
@@ -105,11 +105,11 @@ class MessageRebuilder:
         return out
 
     def write_pixels(self, picture: Picture, out: Pixels) -> None:
-        """Write the image's pixels into an array of the shape and type that `pixels` gives."""
+        """Write the image's pixels into an array with the shape and type returned by `pixels`."""
         self._layout.to_pixels(picture, out)
 
     def payload(self, index: int, picture: Picture) -> bytes | bytearray:
-        """The message of a frame, verified against its digest where there is one.
+        """The message of a frame, verified against its digest if there is one.
 
         Args:
             index: Of the frame.
@@ -131,8 +131,8 @@ class MessageRebuilder:
             else:
                 body = prefix + depth.encode_rvl(pixels)
         except Refused as error:
-            raise self._failure("header-mismatch", index, f"cannot be made: {error}") from None
-        if self._digests is None:  # its length may be another than the recorded one's
+            raise self._failure("header-mismatch", index, f"cannot be rebuilt: {error}") from None
+        if self._digests is None:  # its length may differ from the recorded one
             body += bytes(self._templates[variant].padding(len(body)))
         return self._verified(index, self._around(index, body))
 
@@ -141,7 +141,7 @@ class MessageRebuilder:
 
         Args:
             index: Of the frame.
-            packet: As the video has it.
+            packet: As stored in the video.
 
         Raises:
             FormatError: ``digest-mismatch`` or ``decode-failed``, naming topic and frame.
@@ -150,7 +150,7 @@ class MessageRebuilder:
         try:
             body = body_of(self._sidecar.video.codec, packet, framing)
         except Refused as error:
-            raise self._failure("decode-failed", index, f"cannot be made: {error}") from None
+            raise self._failure("decode-failed", index, f"cannot be rebuilt: {error}") from None
         return self._verified(index, self._around(index, body))
 
     def _with_pixels(self, index: int, picture: Picture) -> bytes | bytearray:
@@ -191,13 +191,11 @@ class MessageRebuilder:
         remark = ""
         if header.png and header.png.deflate != zlib_fingerprint():
             remark = (
-                f": its PNG file is made again by zlib, and this Python has {zlib_build()}, which "
-                "makes other bytes. Use a Python that is linked with zlib itself, or unpack with "
-                "`images` raw"
+                f": its PNG file is rebuilt with zlib, and this Python has {zlib_build()}, which "
+                "compresses to different bytes. Use a Python linked with plain zlib, or unpack "
+                "with `images` raw"
             )
-        raise self._failure(
-            "digest-mismatch", index, f"does not come back as it was recorded{remark}"
-        )
+        raise self._failure("digest-mismatch", index, f"differs from what was recorded{remark}")
 
     def _failure(self, code: str, index: int, problem: str) -> FormatError:
         topic = self._sidecar.channel.topic
@@ -212,10 +210,10 @@ class MessageRebuilder:
             raise FormatError("column-invalid", f"{self._place} at digests", str(error)) from None
 
     def _padding(self, variant: int) -> bytes | None:
-        """What follows the rows of pixels in messages of a header; None: zeros.
+        """The row padding in messages of a header; None: zeros.
 
         Raises:
-            FormatError: ``header-mismatch``: there are not as many bytes as the rows leave.
+            FormatError: ``header-mismatch``: it does not have as many bytes as the rows leave.
         """
         if variant not in self._paddings:
             text = self._sidecar.headers[variant].padding
@@ -228,9 +226,9 @@ class MessageRebuilder:
             dues = (self._padding_size, self._padding_size - per_row)
             if padding is not None and (not per_row or len(padding) not in dues):
                 raise FormatError(
-                    "header-mismatch", place, f"has not the {dues[0]} bytes that rows leave"
+                    "header-mismatch", place, f"does not have the {dues[0]} bytes that rows leave"
                 )
-            self._paddings = {variant: padding}  # one of them: they may be large
+            self._paddings = {variant: padding}  # only one of them: they may be large
         return self._paddings[variant]
 
     def _make_templates(self) -> list[Template]:
@@ -252,10 +250,10 @@ class MessageRebuilder:
 
 
 def _inflated(text: str, most: int) -> bytes:
-    """The bytes of base64 of a zlib stream, at most so many and one more.
+    """The contents of a base64 zlib stream, up to one byte more than allowed.
 
     Raises:
-        ValueError: It is none.
+        ValueError: It is not valid.
     """
     inflater = zlib.decompressobj()
     try:
@@ -263,7 +261,7 @@ def _inflated(text: str, most: int) -> bytes:
     except zlib.error as error:
         raise ValueError(f"cannot be inflated: {error}") from None
     if len(data) <= most and (not inflater.eof or inflater.unused_data):
-        raise ValueError("is not one whole stream of zlib")
+        raise ValueError("is not a single complete zlib stream")
     return data
 
 
@@ -274,9 +272,9 @@ class Stream(DecodedFrames):
     """One camera topic (of one geometry), as a sequence of frames. See `Frames`.
 
     Args:
-        path: The sidecar; the video is beside it.
-        sidecar: What it holds, if it was read already.
-        jpeg_quality: Of the JPEG files that messages of a transcoded stream get, 1 to 100.
+        path: The sidecar; the video is next to it.
+        sidecar: Its contents, if already read.
+        jpeg_quality: Quality of the JPEG files in messages of a transcoded stream, 1 to 100.
 
     Raises:
         FormatError: The sidecar or its video breaks a rule of the format.
@@ -306,16 +304,16 @@ class Stream(DecodedFrames):
 
     @cached_property
     def columns(self) -> DecodedColumns:
-        """One value a frame: its times, and what fills its message; checked when first used."""
+        """One value per frame: its times, and what fills its message; checked on first use."""
         try:
             size = self.video_path.stat().st_size
         except OSError as error:
             raise FormatError(
                 "file-missing", self.video_path, f"cannot be read: {error.strerror}"
             ) from None
-        if self.sidecar.frames > size:  # a coded frame takes a byte at least
+        if self.sidecar.frames > size:  # a coded frame takes at least a byte
             raise FormatError(
-                "frame-count", self.path, f"claims {self.sidecar.frames} frames in {size} bytes"
+                "frame-count", self.path, f"declares {self.sidecar.frames} frames in {size} bytes"
             )
         count, variants = self.sidecar.frames, len(self.sidecar.headers)
         return decode_columns(self.sidecar.columns, count, variants, str(self.path))
@@ -367,7 +365,7 @@ class Stream(DecodedFrames):
         return CameraInfoRebuilder(info, columns, str(self.path))
 
     def intrinsics_at(self, index: int) -> Calibration | None:
-        """The calibration that held when a frame was recorded: the last before it, else the first.
+        """The calibration that applied to a frame: the last recorded before it, else the first.
 
         Args:
             index: 0 <= index < frames.
@@ -381,19 +379,19 @@ class Stream(DecodedFrames):
         return self.calibrations[int(columns.variant[max(int(place) - 1, 0)])]
 
     def open_video(self, *, sequential: bool) -> VideoDecoder:
-        """A decoder of its own for the stream's pictures.
+        """A separate decoder for the stream's pictures.
 
         Args:
             sequential: Decode with all cores, for reading in order.
 
         Raises:
-            VideoError: The video cannot be read, or is not what the sidecar says.
+            VideoError: The video cannot be read, or does not match the sidecar.
         """
         return VideoDecoder(self.video_path, **self._promises, sequential=sequential)
 
     @property
     def _promises(self) -> dict[str, Any]:
-        """What the sidecar says of the video, as those that decode it ask for it."""
+        """The sidecar's description of the video, as arguments for decoders."""
         video = self.sidecar.video
         return {
             "codec": video.codec,
@@ -434,7 +432,7 @@ class Stream(DecodedFrames):
         if len(prefix) != depth.HEADER_BYTES:
             raise OptionError(
                 f"frame {index} of {self.topic} holds quantised depths without their parameters: "
-                "it is given as format='native' alone"
+                "only format='native' is available"
             )
         return depth.metres_of(pixels, prefix)
 
@@ -444,15 +442,15 @@ class Stream(DecodedFrames):
     def messages(
         self, channel: Channel, choice: Choice = everything
     ) -> Iterator[tuple[int, Message]]:
-        """The image messages, each with its place among the channel's messages.
+        """The image messages, each with its ordinal.
 
         Args:
             channel: The channel to make them on.
-            choice: Which are wanted; see `numbered_makers`. The video is compared with its
-                SHA-256 only where all are.
+            choice: Which are wanted; see `numbered_makers`. The video is checked against its
+                SHA-256 only if all are.
 
         Raises:
-            FormatError: A frame does not decode, or a message does not match its digest.
+            FormatError: A frame cannot be decoded, or a message does not match its digest.
         """
         columns = self.columns
         if self.sidecar.digests is None and choice is everything:
@@ -465,7 +463,7 @@ class Stream(DecodedFrames):
         return (make() for make in self.makers(choice))
 
     def makers(self, choice: Choice = everything) -> Iterator[Callable[[], bytes | bytearray]]:
-        """As `numbered_makers`, without the numbers."""
+        """Like `numbered_makers`, without the numbers."""
         return (make for _, make in self.numbered_makers(choice))
 
     @property
@@ -477,14 +475,14 @@ class Stream(DecodedFrames):
     def numbered_makers(
         self, choice: Choice = everything
     ) -> Iterator[tuple[int, Callable[[], bytes | bytearray]]]:
-        """For each message its number, and what makes its payload before the next one is taken.
+        """Number of each message, and what makes its payload before the next one is taken.
 
         Args:
-            choice: Which are wanted. Packets of a video that refer to others are of no use
-                without them: those between two that are wanted come, too.
+            choice: Which are wanted. Packets that others refer to are included between two wanted
+                ones.
 
         Raises:
-            FormatError: A frame cannot be read; the makers raise what else is wrong with one.
+            FormatError: A frame cannot be read; the functions raise any other error of a message.
         """
         rebuilder = self.rebuilder
         if self.sidecar.body == "packet":
@@ -505,15 +503,15 @@ class Stream(DecodedFrames):
     def pictures_in_order(
         self, decoder: VideoDecoder, choice: Choice = everything, scale: Scale | None = None
     ) -> Iterator[tuple[int, Picture]]:
-        """Pictures that are wanted, each with its number.
+        """The wanted pictures, each with its number.
 
         Args:
-            decoder: Of `open_video`.
-            choice: Which are wanted. Where all are, the video must not go on after them.
+            decoder: From `open_video`.
+            choice: Which are wanted. If all are, the video must end after them.
             scale: See `PictureMaker.make`.
 
         Yields:
-            Views that hold until the next one is asked for.
+            Views that are valid until the next one is requested.
 
         Raises:
             VideoError: See `VideoDecoder.pictures`.
@@ -524,7 +522,7 @@ class Stream(DecodedFrames):
             yield from decoder.pictures_at(choice(self.columns), scale)
 
     def verify_video(self) -> None:
-        """Compare the video with its SHA-256, for where no digest of a message tells damage.
+        """Check the video against its SHA-256, for when no message digest would reveal damage.
 
         Raises:
             FormatError: ``file-missing`` or ``hash-mismatch``.
@@ -536,13 +534,13 @@ class Stream(DecodedFrames):
             raise FormatError(
                 "hash-mismatch",
                 self.video_path,
-                "does not have the SHA-256 that its sidecar says",
+                "does not match the SHA-256 in its sidecar",
             )
 
     def camera_info_messages(
         self, channel: Channel, choice: Choice = everything
     ) -> Iterator[tuple[int, Message]]:
-        """The CameraInfo messages, each with its place among the channel's messages.
+        """The CameraInfo messages, each with its ordinal.
 
         Args:
             channel: The channel to make them on.

@@ -1,4 +1,4 @@
-"""All frames of a topic that has several streams."""
+"""All frames of a topic with several streams."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ Integers = NDArray[np.int64]
 class TopicFrames(Frames):
     """All frames of a topic that changes its size or encoding. See `Frames`.
 
-    They are in the order in which they were recorded, each with its own size, encoding and
-    intrinsics; a `crop` or a factor is that of each frame. What holds for all frames (`shape`,
-    `dtype`, `encoding`, `image_size`, and the array of `read`) is there where they have it in
-    common: `read` needs a `resize` to width and height, and a `format`, that make them equal.
+    They are in recorded order, each with its own size, encoding and intrinsics; a `crop` or a
+    factor applies to each frame. Properties of all frames (`shape`, `dtype`, `encoding`,
+    `image_size`, and the array of `read`) are available only if they are common to all: `read`
+    needs a `resize` to width and height, and a `format`, that make them equal.
 
     Attributes:
-        streams: The streams that have them.
+        streams: Their streams.
 
     Args:
-        streams: Of one topic, at least one.
+        streams: The streams of one topic, at least one.
     """
 
     def __init__(self, streams: Sequence[Stream]) -> None:
@@ -59,7 +59,7 @@ class TopicFrames(Frames):
         """ROS image encoding of the frames as recorded.
 
         Raises:
-            OptionError: They have several.
+            OptionError: They differ.
         """
         self._check_alike([stream.encoding for stream in self.streams])
         return self.streams[0].encoding
@@ -69,7 +69,7 @@ class TopicFrames(Frames):
         """Width and height of the images, pixels.
 
         Raises:
-            OptionError: They have several.
+            OptionError: They differ.
         """
         self._check_alike([stream.image_size for stream in self.streams])
         return self.streams[0].image_size
@@ -92,7 +92,7 @@ class TopicFrames(Frames):
         return owner.intrinsics_at(number)
 
     def place_of(self, index: int) -> tuple[Stream, int]:
-        """The stream that has a frame, and the frame's number there.
+        """The stream of a frame, and the frame's number there.
 
         Args:
             index: 0 <= index < frames.
@@ -111,7 +111,7 @@ class TopicFrames(Frames):
 
     @cached_property
     def _owners(self) -> Integers:
-        """For each frame the number of its stream.
+        """For each frame, the number of its stream.
 
         Messages of a channel are in the order of their ordinals. Several channels of the topic
         are merged by log time, as `Dataset.records` merges them.
@@ -133,18 +133,18 @@ class TopicFrames(Frames):
 
     @cached_property
     def _numbers(self) -> Integers:
-        """For each frame its number in its stream."""
+        """For each frame, its number in its stream."""
         return self._gathered([np.arange(len(stream)) for stream in self.streams])
 
     def _gathered(self, columns: Sequence[Integers]) -> Integers:
-        """What all frames have, from what those of each stream have."""
+        """Values for all frames, from those of each stream."""
         found = np.empty(len(self), np.int64)
         for owner, column in enumerate(columns):
             found[self._owners == owner] = column
         return found
 
     def _by_stream(self, numbers: Sequence[int]) -> Iterator[tuple[Stream, Integers, Integers]]:
-        """For each stream: which places of a list of frames it has, and their numbers there."""
+        """For each stream: which positions of a list of frames it has, and their numbers there."""
         chosen = np.array(numbers, np.int64)
         owners = self._owners[chosen]
         for owner in np.unique(owners).tolist():
@@ -157,7 +157,7 @@ class TopicFrames(Frames):
         kinds = ["{}x{} {}".format(*stream.image_size, stream.encoding) for stream in self.streams]
         names = ", ".join(stream.path.stem for stream in self.streams)
         raise OptionError(
-            f"{self.topic} changes its size or encoding: {', '.join(dict.fromkeys(kinds))}. Ask "
+            f"{self.topic} changes its size or encoding: {', '.join(dict.fromkeys(kinds))}. Check "
             "each frame, read them with resize=(width, height) and format='rgb' or 'gray', or "
             f"choose one of the streams {names}"
         )
@@ -197,8 +197,8 @@ class TopicFrames(Frames):
         """See `Frames.read`.
 
         Raises:
-            OptionError: As of `Frames.read`; or the topic's frames would differ, also those that
-                are not asked for.
+            OptionError: As for `Frames.read`; or the topic's frames would differ, including those
+                not requested.
         """
         numbers = numbers_of(self.topic, len(self), indices)
         views = self._views_alike(format, resize, crop)
@@ -253,9 +253,9 @@ class TopicFrames(Frames):
         return self._merged(indices, parts)
 
     def _merged(self, indices: Integers, parts: Mapping[int, Iterator[Frame]]) -> Iterator[Frame]:
-        """Frames in an order, those of each stream from an iterator.
+        """Frames in a given order, with an iterator for each stream.
 
-        An iterator is run to its end after its last frame, so that its decoder is closed.
+        Each iterator is exhausted after its last frame, so that its decoder is closed.
         """
         owners: list[int] = self._owners[indices].tolist()
         last = {owner: place for place, owner in enumerate(owners)}

@@ -1,4 +1,4 @@
-"""Videos of others, which have no sidecar."""
+"""Third-party videos, without a sidecar."""
 
 from __future__ import annotations
 
@@ -17,17 +17,16 @@ from mp4ds.video.reader import FrameReader, VideoFile, open_file_frames
 
 
 class Video(DecodedFrames):
-    """The frames of an mp4 that has no sidecar. See `Frames`.
+    """The frames of an mp4 without a sidecar. See `Frames`.
 
-    Its topic is the file's name without ending. Frames are ``rgb8``, as the video's colours are
-    tagged, in the orientation in which they are coded; stamps are the presentation times, the
-    first one's usually 0.
+    Its topic is the file name without extension. Frames are ``rgb8``, converted by the video's
+    colour tags, in coded orientation; stamps are presentation times, the first usually 0.
 
     Args:
         path: The video.
 
     Raises:
-        VideoError: It cannot be read, or has not one video track.
+        VideoError: It cannot be read, or does not have exactly one video track.
     """
 
     def __init__(self, path: Path) -> None:
@@ -38,7 +37,7 @@ class Video(DecodedFrames):
 
     @property
     def topic(self) -> str:
-        """The file's name without ending."""
+        """The file name without extension."""
         return self.path.stem
 
     @property

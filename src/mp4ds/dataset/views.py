@@ -1,4 +1,4 @@
-"""How frames are to be given: their format, which part of them, its size, and its calibration."""
+"""How frames are returned: their format, crop, size, and calibration."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ Matrix = list[list[float]]
 
 
 def effective(calibration: CalibrationFields) -> tuple[Matrix, Matrix]:
-    """K and P for the images as they are, rather than for the full resolution.
+    """K and P for the recorded images, rather than for the full resolution.
 
-    The principal point moves by the offset of the region of interest, then all that is in pixels
-    is divided by the binning, as REP 104 has it and image_geometry's PinholeCameraModel does.
+    The principal point moves by the offset of the region of interest, then everything in pixels is
+    divided by the binning, as in REP 104 and image_geometry's PinholeCameraModel.
 
     Args:
-        calibration: K and P of the full resolution, with ROI and binning.
+        calibration: K and P for the full resolution, with ROI and binning.
 
     Returns:
         K, 3 x 3, and P, 3 x 4.
@@ -47,7 +47,7 @@ def effective(calibration: CalibrationFields) -> tuple[Matrix, Matrix]:
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Where a picture was cut out of an image, and its size after that.
+    """The crop of an image, and its size after resizing.
 
     Attributes:
         crop: x, y, width and height in pixels of the image.
@@ -60,8 +60,8 @@ class Placement:
     def calibration(self, image: Calibration) -> Calibration:
         """The calibration of the picture; without binning, and without a region of interest.
 
-        The middle of a pixel has whole coordinates, so that a picture scaled by s has its
-        principal point at ``(cx + 0.5) * s - 0.5``.
+        Pixel centres have integer coordinates, so a picture scaled by s has its principal point at
+        ``(cx + 0.5) * s - 0.5``.
 
         Args:
             image: The calibration of the image, as recorded.
@@ -73,7 +73,7 @@ class Placement:
             (1, y, self.size[1] / height),
         ):
             for matrix in (k, p):
-                # by the third row, which is 0 in the matrices of a camera that is not calibrated
+                # by the third row, which is 0 in the matrices of an uncalibrated camera
                 matrix[row] = scale * (matrix[row] - offset * matrix[2])
                 matrix[row] += (0.5 * scale - 0.5) * matrix[2]
         rectify = image.roi.do_rectify if image.roi else 0
@@ -86,7 +86,7 @@ class Placement:
                 "binning_x": 0,
                 "binning_y": 0,
                 "roi": _whole(rectify) if rectify else None,
-                "template": None,  # the recorded message is another
+                "template": None,  # the recorded message differs
             }
         )
 
@@ -101,13 +101,13 @@ Resize = float | tuple[int, int] | None
 """A factor, or width and height in pixels."""
 
 Crop = tuple[int, int, int, int] | None
-"""x, y, width and height in pixels of the image, cut out before anything else."""
+"""x, y, width and height in pixels of the image, applied first."""
 
 FORMATS = ("native", "rgb", "bgr", "gray", "depth_m")
 """As recorded; (H, W, 3); (H, W, 3); (H, W); (H, W) of float32, metres."""
 
 _OF_VIDEOS = ("rgb8", "bgr8", "rgba8", "bgra8")
-"""Encodings that are in videos as pictures in colour; alpha is left out where they are shown."""
+"""Encodings stored in videos as colour pictures; alpha is dropped when they are shown."""
 
 _Part = tuple[int, int, int, int]
 _Size = tuple[int, int]
@@ -115,15 +115,15 @@ _Size = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One way of giving the frames of a stream; not to be shared between threads.
+    """One way of returning the frames of a stream; not to be shared between threads.
 
     Attributes:
-        encoding: ROS image encoding of what is given.
+        encoding: ROS image encoding of the result.
         shape: Of one frame.
         dtype: Of its pixels.
-        is_plain: Whether the pixels are given as they were recorded.
-        in_metres: Whether they are made depths in metres first.
-        scale: What the video makes in place of pictures as recorded, which is the view.
+        is_plain: Whether the pixels are returned as recorded.
+        in_metres: Whether they are converted to depths in metres first.
+        scale: What the decoder makes directly, instead of pictures as recorded.
     """
 
     encoding: Encoding
@@ -136,10 +136,10 @@ class View:
     _renderer: Renderer | None = None
 
     def give(self, pixels: Pixels, out: Pixels) -> None:
-        """Write what the pixels of an image become.
+        """Write the view of an image's pixels.
 
         Args:
-            pixels: As recorded, native byte order; depths in metres where the view is in these.
+            pixels: As recorded, native byte order; depths in metres if `in_metres`.
             out: Of the view's shape and type.
         """
         if self._renderer is not None:
@@ -150,7 +150,7 @@ class View:
             np.copyto(out, pixels)
 
     def calibration(self, image: Calibration | None) -> Calibration | None:
-        """The calibration of what is given, from that of the image."""
+        """The calibration of the result, from that of the image."""
         if image is None or self._placement is None:
             return image
         return self._placement.calibration(image)
@@ -166,7 +166,7 @@ def view_of(
     crop: Crop,
     shows_colours: bool = False,
 ) -> View:
-    """The view that was asked for.
+    """The requested view.
 
     Args:
         topic: For errors.
@@ -178,10 +178,10 @@ def view_of(
         shows_colours: See `mp4ds.video.pixels.shows_colours`.
 
     Raises:
-        OptionError: There is no such format, part or size, or not of these images.
+        OptionError: The format, crop or size is invalid, or not available for these images.
     """
     if format not in FORMATS:
-        raise OptionError(f"there is no format {format!r} of frames: use {', '.join(FORMATS)}")
+        raise OptionError(f"format {format!r} is not known: use {', '.join(FORMATS)}")
     width, height = image_size
     part = _part(topic, image_size, crop) if crop is not None else (0, 0, width, height)
     cut = part[2:]
@@ -191,8 +191,8 @@ def view_of(
     if format == "depth_m":
         if encoding.name not in DEPTHS:
             raise OptionError(
-                f"{topic} has {encoding.name} images, which are no depths: format='depth_m' is for "
-                f"those of {', '.join(DEPTHS)}"
+                f"{topic} has {encoding.name} images, which are not depths: format='depth_m' is "
+                f"for {', '.join(DEPTHS)}"
             )
         given = ENCODINGS["32FC1"]
     elif format != "native" or not is_whole:
@@ -221,14 +221,16 @@ def _part(topic: str, image_size: _Size, crop: Sequence[int]) -> _Part:
     try:
         x, y, columns, rows = (as_integer(value) for value in crop)
     except (TypeError, ValueError):
-        raise OptionError(f"a crop is (x, y, width, height) in pixels, not {crop!r}") from None
+        raise OptionError(f"crop must be (x, y, width, height) in pixels, not {crop!r}") from None
     if min(x, y) < 0 or min(columns, rows) < 1 or x + columns > width or y + rows > height:
-        raise OptionError(f"a crop of {tuple(crop)} is not within the {width}x{height} of {topic}")
+        raise OptionError(
+            f"crop {tuple(crop)} is not inside the {width}x{height} images of {topic}"
+        )
     return x, y, columns, rows
 
 
 def size_after(topic: str, cut: _Size, resize: float | Sequence[int]) -> _Size:
-    """Width and height of frames that are resized.
+    """Width and height of resized frames.
 
     Args:
         topic: For errors.
@@ -260,36 +262,36 @@ def size_after(topic: str, cut: _Size, resize: float | Sequence[int]) -> _Size:
 def _given(
     topic: str, encoding: Encoding, colours: str, part: _Part, *, is_resized: bool
 ) -> Encoding:
-    """The encoding of what is given."""
+    """The encoding of the result."""
     if colours != "native":
         name = encoding_as(encoding, colours)
         if name is None:
             raise OptionError(
-                f"{topic} has {encoding.name} images, which are numbers and no light: they are "
-                f"given as format='native', not {colours!r}"
+                f"{topic} has {encoding.name} images, which are measurements, not colour: use "
+                f"format='native', not {colours!r}"
             )
         return ENCODINGS[name]
     is_yuv = encoding.even != (1, 1) or encoding.rows != 1
     if is_yuv or (encoding.mosaic and is_resized):
         raise OptionError(
-            f"{topic} has {encoding.name} images, which can be cut and resized as rgb, bgr or "
-            "gray only: give format="
+            f"{topic} has {encoding.name} images, which can only be cropped and resized as rgb, "
+            "bgr or gray: give format="
         )
     if not encoding.mosaic:
         return encoding
-    x, y = part[0] % 2, part[1] % 2  # the pattern begins at another colour
+    x, y = part[0] % 2, part[1] % 2  # the pattern begins at a different colour
     rows = encoding.mosaic[:2], encoding.mosaic[2:]
     mosaic = "".join(rows[(row + y) % 2][(column + x) % 2] for row in (0, 1) for column in (0, 1))
     return ENCODINGS[f"bayer_{mosaic}{8 * encoding.bytes_per_sample}"]
 
 
 def _is_interpolated(encoding: Encoding) -> bool:
-    """Whether values between two others make sense: not of depths, labels and other numbers."""
+    """Whether interpolating values makes sense: not for depths, labels and other measurements."""
     return shown_format(encoding) is not None and not encoding.name[0].isdigit()
 
 
 def _nearest(pixels: Pixels, placement: Placement) -> Pixels:
-    """The part of an image, each pixel that of its nearest one."""
+    """The crop of an image, resized by nearest neighbour."""
     x, y, width, height = placement.crop
     part = pixels[y : y + height, x : x + width]
     if placement.size == (width, height):
@@ -306,20 +308,20 @@ def output(out: Pixels | None, shape: tuple[int, ...], dtype: np.dtype[np.generi
     """The array to write into.
 
     Raises:
-        OptionError: It cannot take what is to be written.
+        OptionError: It has the wrong shape or type.
     """
     if out is None:
         return np.empty(shape, dtype)
     if not isinstance(out, np.ndarray) or (out.shape, out.dtype) != (shape, dtype):
         found = f"{out.dtype} {out.shape}" if isinstance(out, np.ndarray) else type(out).__name__
-        raise OptionError(f"out is {found} where an array of {dtype} {shape} is needed")
+        raise OptionError(f"out is {found}, not an array of {dtype} {shape}")
     if not out.flags.writeable:
-        raise OptionError("out cannot be written to")
+        raise OptionError("out is not writeable")
     return out
 
 
 def check_outputs(outs: Sequence[Pixels], count: int, view: View) -> None:
-    """Refuse arrays that cannot take so many frames, each its own.
+    """Refuse arrays that cannot take the frames, one each.
 
     Raises:
         OptionError: Says why.

@@ -1,1 +1,1 @@
-"""Where recordings and datasets are: outputs, sources, and what is at URLs."""
+"""Where recordings and datasets are: outputs, sources, and URLs."""

@@ -1,4 +1,4 @@
-"""Outputs appear under their final name only when whole, and replace only what mp4ds wrote."""
+"""Outputs get their final name only when complete, and replace only what mp4ds wrote."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ _UNABLE = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EX
 
 
 def lock(file: IO[Any], *, shared: bool = False) -> bool:
-    """Lock a file for as long as it is open, or its process lives.
+    """Lock a file while it is open and its process lives.
 
     Args:
-        file: Open for writing, as NFS wants it.
-        shared: Others may hold it, too, if they share it.
+        file: Open for writing, as NFS requires.
+        shared: Whether other shared locks are allowed.
 
     Returns:
-        Whether it is locked; False where the system or the file system has no locks.
+        Whether it is locked; False if the system or file system has no locks.
 
     Raises:
-        BlockingIOError: Another holds it.
+        BlockingIOError: Another process holds it.
     """
     if fcntl is None:
         return False
@@ -54,11 +54,11 @@ def lock(file: IO[Any], *, shared: bool = False) -> bool:
 
 
 def is_mine(stat: os.stat_result, folder: Path) -> bool:
-    """Whether something belongs to the user whom this process works for.
+    """Whether something belongs to the user of this process.
 
     Args:
-        stat: What is told of it.
-        folder: One beside it: a server may have another name for the user.
+        stat: Its status.
+        folder: A folder next to it: a server may map the user differently.
     """
     if not hasattr(os, "geteuid") or stat.st_uid == os.geteuid():
         return True
@@ -68,13 +68,13 @@ def is_mine(stat: os.stat_result, folder: Path) -> bool:
 
 
 def exchange(one: Path, other: Path) -> bool:
-    """Exchange what stands under two names, in one step.
+    """Swap two names atomically.
 
     Returns:
-        Whether that was done; False where the system or the file system cannot.
+        Whether that was done; False if the system or file system cannot.
 
     Raises:
-        OSError: It can, and failed.
+        OSError: It can, but failed.
     """
     return _renamed(one, other, linux=2, macos=2)  # RENAME_EXCHANGE, RENAME_SWAP
 
@@ -83,10 +83,10 @@ def rename_to_new(old: Path, new: Path) -> bool:
     """Rename, unless there is something under the new name.
 
     Returns:
-        Whether that was done; False where the system or the file system cannot.
+        Whether that was done; False if the system or file system cannot.
 
     Raises:
-        FileExistsError: There is something.
+        FileExistsError: It exists.
         OSError: It failed.
     """
     return _renamed(old, new, linux=1, macos=4)  # RENAME_NOREPLACE, RENAME_EXCL
@@ -100,7 +100,7 @@ def _renamed(old: Path, new: Path, *, linux: int, macos: int) -> bool:
             failed = libc.renamex_np(*names, macos)
         else:
             failed = libc.renameat2(_AT_FDCWD, names[0], _AT_FDCWD, names[1], linux)
-    except (AttributeError, OSError, TypeError):  # it has no such function, or no such library
+    except (AttributeError, OSError, TypeError):  # the system lacks the function or library
         return False
     if not failed:
         return True
@@ -113,13 +113,13 @@ def _renamed(old: Path, new: Path, *, linux: int, macos: int) -> bool:
 # ---------------------------------------------------------------- owned
 
 Owned = Callable[[Path], Iterable[str] | None]
-"""Tells the names of an output's files, from its folder on; None: it is none that mp4ds writes.
+"""Returns the names of an output's files, relative to its folder; None if it is not of mp4ds.
 
-Of an output that is a file, the one name is empty.
+For an output that is a file, the only name is empty.
 """
 
 LISTING_NAME = "mp4ds_files.json"
-"""File of a folder that lists the files in it, where nothing else does."""
+"""File that lists the files of a folder, if nothing else does."""
 
 PAGE_SIGN = b'<meta name="generator" content="mp4ds'
 """Within the first bytes of each page that mp4ds makes."""
@@ -134,17 +134,17 @@ def check_replaceable(target: Path, owned: Owned) -> None:
     """Refuse to replace what mp4ds did not write.
 
     Args:
-        target: What is there.
-        owned: Tells its names.
+        target: The existing output.
+        owned: Returns its names.
 
     Raises:
-        TargetError: It is something else, or there is something else in it.
+        TargetError: It is something else, or holds something else.
     """
     if target.is_symlink():
         raise TargetError(
             target,
             "is a symbolic link, which `force` does not replace",
-            f"Name {os.path.realpath(target)} itself, or remove the link.",
+            f"Give {os.path.realpath(target)} itself, or remove the link.",
         )
     is_folder = target.is_dir()
     if is_folder and not any(target.iterdir()):
@@ -158,12 +158,12 @@ def refuse_not_ours(target: Path, names: Iterable[str] | None) -> set[str]:
     """The names of an output's files.
 
     Raises:
-        TargetError: There are none: it is not of the kind.
+        TargetError: There are none: it is not of that kind.
     """
     if names is None:
         raise TargetError(
             target,
-            "exists and is not something that mp4ds wrote, so `force` does not replace it",
+            "exists and was not written by mp4ds, so `force` does not replace it",
             "Choose another name, or remove it yourself.",
         )
     return set(names)
@@ -178,23 +178,23 @@ def refuse_strangers(target: Path, others: Collection[str]) -> None:
     if not others:
         return
     listed = ", ".join(sorted(others)[:_NAMED]) + (", ..." if len(others) > _NAMED else "")
-    what = "1 thing" if len(others) == 1 else f"{len(others)} things"
+    what = "1 item" if len(others) == 1 else f"{len(others)} items"
     raise TargetError(
         target,
         f"holds {what} that mp4ds did not write ({listed}), so `force` does not replace it",
-        "Move that elsewhere, or choose another name.",
+        "Move them elsewhere, or choose another name.",
     )
 
 
 def strangers(folder: Path, names: Collection[str]) -> list[str]:
-    """What is in a folder besides files of some names, those of a report in it, and their folders.
+    """What a folder holds besides the named files, those of a report in it, and their folders.
 
     Args:
         folder: The folder.
-        names: From it on, with slashes.
+        names: Relative to it, with slashes.
 
     Returns:
-        Names; that of a folder, in which nothing is known, ends with a slash.
+        Names; that of a folder without known files ends with a slash.
     """
     known = set(names)
     folders = {str(above) for name in known for above in PurePosixPath(name).parents}
@@ -225,14 +225,14 @@ def strangers(folder: Path, names: Collection[str]) -> list[str]:
 
 
 def write_listing(folder: Path) -> None:
-    """List all files of a folder in it."""
+    """Write a listing of all files of a folder into it."""
     names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
     text = json.dumps({"files": names}, indent=1) + "\n"
     (folder / LISTING_NAME).write_text(text, encoding="utf-8")
 
 
 def listed_names(folder: Path, listing: str = LISTING_NAME) -> set[str] | None:
-    """The names that a listing in a folder tells, with its own; None where there is none.
+    """The names in a folder's listing, including its own; None if there is none.
 
     Args:
         folder: The folder.
@@ -272,7 +272,7 @@ def is_page(path: Path) -> bool:
 
 # ---------------------------------------------------------------- outputs
 
-_LOCK, _NEW, _OLD = "lock", "new", "old"  # all there is in a folder where an output is made
+_LOCK, _NEW, _OLD = "lock", "new", "old"  # the contents of a folder where an output is made
 _SUFFIX = ".part"
 
 
@@ -285,16 +285,16 @@ def staged(
     Args:
         target: The final name; its parent folder must exist.
         force: Replace an existing target.
-        owned: Tells which files of an existing target mp4ds wrote.
-        sources: What the output is made from: neither may stand in the other.
+        owned: Returns which files of an existing target mp4ds wrote.
+        sources: What the output is made from: neither may be in the other.
 
     Yields:
         A path that does not exist yet, for the caller to make a file or folder at.
 
     Raises:
         TargetExistsError: The target exists and ``force`` is not set.
-        TargetError: It may not be written or replaced.
-        WriteError: The disk refused.
+        TargetError: It cannot be written or replaced.
+        WriteError: It could not be written.
     """
     _clear_leftovers(target)
     check_target(target, force=force, owned=owned, sources=sources)
@@ -322,16 +322,16 @@ def staged(
 
 @contextmanager
 def work_folder(parent: Path, prefix: str) -> Iterator[Path]:
-    """A folder of this run alone, which is removed at the end.
+    """A private folder for this run, removed at the end.
 
-    Those of killed runs are removed first.
+    Those left by killed runs are removed first.
 
     Args:
         parent: Where it is made.
-        prefix: How its name begins.
+        prefix: Prefix of its name.
 
     Raises:
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     for path in _matching(parent, prefix):
         _remove_abandoned(path)
@@ -344,7 +344,7 @@ def work_folder(parent: Path, prefix: str) -> Iterator[Path]:
 
 
 def _begun(parent: Path, prefix: str, suffix: str = "") -> tuple[Path, IO[bytes]]:
-    """A new folder, and its lock, so that no other run takes it for abandoned."""
+    """A new folder and its lock, so that no other run considers it abandoned."""
     while True:
         folder = Path(tempfile.mkdtemp(prefix=prefix, suffix=suffix, dir=parent))
         try:
@@ -355,14 +355,14 @@ def _begun(parent: Path, prefix: str, suffix: str = "") -> tuple[Path, IO[bytes]
                     return folder, file
             file.close()
         except FileNotFoundError:
-            continue  # another run has removed it before it was locked, as it may above
+            continue  # another run removed it before it was locked, as may happen above
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
 
 
 def _matching(parent: Path, prefix: str, suffix: str = "") -> Iterator[Path]:
-    """The folders in which runs work, or did."""
+    """The folders in which runs work, or have worked."""
     name = re.compile(re.escape(prefix) + "[a-z0-9_]{8}" + re.escape(suffix))
     with suppress(OSError):
         for path in list(parent.iterdir()):
@@ -371,7 +371,7 @@ def _matching(parent: Path, prefix: str, suffix: str = "") -> Iterator[Path]:
 
 
 def _remove_abandoned(folder: Path, before: Callable[[], None] = lambda: None) -> None:
-    """Remove what a killed run has left; not where another is at work, or nobody knows.
+    """Remove what a killed run left behind; not if another run is active, or that is unknown.
 
     Args:
         folder: Its folder.
@@ -390,7 +390,7 @@ def _prefix(target: Path) -> str:
 
 
 def _clear_leftovers(target: Path) -> None:
-    """Remove what killed runs for a target have left, as far as it can be told to be that."""
+    """Remove what killed runs for a target left behind, if it is recognisable."""
 
     def give_back() -> None:
         if os.path.lexists(old) and not os.path.lexists(target):
@@ -401,7 +401,7 @@ def _clear_leftovers(target: Path) -> None:
         with suppress(OSError):
             parts = list(folder.iterdir())
             inner = [path.name for part in parts if part.name != _LOCK for path in part.iterdir()]
-            # another target's long name may begin alike
+            # another target's long name may start the same
             if {part.name for part in parts} <= {_LOCK, _NEW, _OLD} and (
                 {*inner} <= {target.name} and not any(part.is_symlink() for part in parts)
             ):
@@ -425,19 +425,21 @@ def check_target(
 
 
 def check_place(target: Path, sources: Sequence[Path]) -> None:
-    """Keep a source from being written into, or replaced together with what is around it.
+    """Protect a source from being written into, or replaced with its surroundings.
 
     Raises:
-        TargetError: It would be, or there is no folder to write in.
+        TargetError: It would be, or there is no folder to write to.
     """
     place = target.resolve()
     for source in (path.resolve() for path in sources):
         if place == source or source in place.parents or place in source.parents:
             raise TargetError(
-                target, f"overlaps with the source {source}", "Choose a place beside the source."
+                target,
+                f"overlaps with the source {source}",
+                "Choose a location outside the source.",
             )
     if not target.parent.is_dir():
-        raise TargetError(target, f"{target.parent} is no folder", "Make the folder first.")
+        raise TargetError(target, f"{target.parent} is not a folder", "Create the folder first.")
 
 
 def as_write_error(error: OSError, target: Path) -> OSError:
@@ -464,7 +466,7 @@ _WRITE_ERRNOS = {
 
 
 def sync(path: Path) -> None:
-    """Bring an output's bytes, and the names in its folders, to the disk before its own name is."""
+    """Sync an output's bytes, and the names in its folders, to disk before its own name."""
     for place in [*sorted(path.rglob("*"), reverse=True), path]:
         if place.is_dir():
             sync_folder(place)
@@ -474,16 +476,16 @@ def sync(path: Path) -> None:
 
 
 def write_synced(path: Path, data: bytes, *, replace: bool = True) -> None:
-    """Write a small file whole or not at all, whatever happens meanwhile.
+    """Write a small file completely or not at all, whatever happens meanwhile.
 
     Args:
         path: The file.
         data: Its content.
-        replace: Replace the file if it is there.
+        replace: Replace the file if it exists.
 
     Raises:
-        FileExistsError: It is there, and is not to be replaced.
-        OSError: The disk refused.
+        FileExistsError: It exists and `replace` is false.
+        OSError: It cannot be written.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.{socket.gethostname()}.part")
     try:
@@ -501,7 +503,7 @@ def write_synced(path: Path, data: bytes, *, replace: bool = True) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring the names in a folder to the disk, where the system can."""
+    """Sync the names in a folder to disk, if the system can."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -511,33 +513,33 @@ def sync_folder(folder: Path) -> None:
 
 
 def is_seen(is_there: Callable[[], bool], *folders: Path) -> bool:
-    """Whether what another machine has made is there; a file system may show it after a while only.
+    """Whether another machine's result exists; a file system may only show it after a while.
 
     Args:
-        is_there: Looks for it.
-        folders: In which it is.
+        is_there: Checks for it.
+        folders: The folders it is in.
     """
     end = time.monotonic() + _SEEN_SECONDS
     while not (seen := is_there()) and time.monotonic() < end:
         for folder in folders:
-            list(folder.iterdir())  # which asks the server for its names anew
+            list(folder.iterdir())  # which asks the server for its names again
         time.sleep(_LOOK_SECONDS)
     return seen
 
 
 def move_into_place(path: Path, target: Path, old: Path, *, force: bool, owned: Owned) -> None:
-    """Give an output its final name, in exchange for what stands there.
+    """Give an output its final name, replacing what is there.
 
     Args:
-        path: The output, whole; afterwards what it replaced, where the system can exchange names.
+        path: The complete output; afterwards what it replaced, if the system can swap names.
         target: Its final name.
-        old: Where what it replaces is put on other systems; on the same file system.
-        force: Replace what stands there.
-        owned: Tells which files of that mp4ds wrote.
+        old: Where to move what it replaces on other systems; on the same file system.
+        force: Replace what is there.
+        owned: Returns which files of that mp4ds wrote.
 
     Raises:
-        TargetExistsError: Something stands there and ``force`` is not set.
-        TargetError: Meanwhile something else was put there.
+        TargetExistsError: Something is there and ``force`` is not set.
+        TargetError: Something else has been put there meanwhile.
     """
     if not os.path.lexists(target):
         try:

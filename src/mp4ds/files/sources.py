@@ -1,8 +1,7 @@
 """The files that a recording consists of; one of them may be a folder of images.
 
-Such a folder counts as one file, since a manifest cannot list a hundred thousand: what is in it,
-without the folders, in the order of the names. Its digest is that of a listing as sha256sum
-writes it.
+Such a folder counts as one file, since a manifest cannot list a hundred thousand: its files,
+without subfolders, sorted by name. Its digest is that of a listing in the format of sha256sum.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from mp4ds.files.urls import location, remote, spelled
 
 _SAMPLE = 2**16
 _SIDES = ("-wal", "-journal")
-"""What sqlite puts beside a database that is being written to: its latest changes."""
+"""Files that sqlite keeps next to a database in use: its latest changes."""
 
 
 _CONTAINERS = [
@@ -38,10 +37,10 @@ _CONTAINERS = [
     )
 ]
 HOW_TO_OPEN = (
-    "`mp4ds.open` reads the frames of an .mp4 or .mov, without packing; "
-    "`ffmpeg -i VIDEO -c copy VIDEO.mp4` makes one of others."
+    "`mp4ds.open` reads frames of an .mp4 or .mov without packing; to convert other videos, run "
+    "`ffmpeg -i VIDEO -c copy VIDEO.mp4`."
 )
-"""What to do with a video that is given instead of a recording or dataset."""
+"""Advice for a video given instead of a recording or dataset."""
 
 
 def video_at(path: Path) -> str:
@@ -86,7 +85,7 @@ def source_size(path: Path) -> int:
 def source_digest(path: Path) -> tuple[int, str]:
     """Size in bytes and SHA-256 of a file of a recording.
 
-    Of a folder it is the SHA-256 of a line for each member: its own SHA-256, two spaces and its
+    For a folder it is the SHA-256 of a line for each member: its own SHA-256, two spaces and its
     name.
 
     Raises:
@@ -103,7 +102,7 @@ def source_digest(path: Path) -> tuple[int, str]:
 
 
 def source_name(path: Path, folder: Path | None) -> str:
-    """Name of a recording's file in a manifest: with its folder's, where that was given."""
+    """Name of a recording's file in a manifest: with its folder's, if that was given."""
     if folder is None or path == folder:
         return path.name
     if path.parent == folder:
@@ -115,15 +114,15 @@ def source_name(path: Path, folder: Path | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class SourceState:
-    """A file of a recording, as far as a change would show, on whatever machine.
+    """The state of a recording's file, by which changes are detected on any machine.
 
     Attributes:
         path: Absolute, or a URL.
         size: Bytes.
-        modified_ns: When it was written, as the file system tells; 0 at a URL.
-        sample: XXH64 of its first and last bytes and of what sqlite keeps beside it, or of the
-            names, sizes and times in a folder; at a URL, what the store says of its content, such
-            as an ETag, where it says anything.
+        modified_ns: Modification time; 0 at a URL.
+        sample: XXH64 of its first and last bytes and of what sqlite keeps next to it, or of the
+            names, sizes and times in a folder; at a URL, the store's tag for its content, such as
+            an ETag, if any.
     """
 
     path: str
@@ -164,7 +163,7 @@ class SourceState:
         return cls(spelled(folder), size, latest, digest.hexdigest())
 
     def check(self) -> None:
-        """Refuse the file if it is not what it was.
+        """Refuse the file if it has changed.
 
         Raises:
             SourceError: It has changed, or cannot be read.
@@ -173,8 +172,8 @@ class SourceState:
         if SourceState.of(path) != self:
             raise SourceError(
                 path,
-                "has changed since its packing began",
-                "Start over with `restart`, or give the file back as it was.",
+                "has changed since packing began",
+                "Start over with `restart`, or restore the file as it was.",
             )
 
 
@@ -191,13 +190,13 @@ def _add_listing(digest: xxhash.xxh64, files: Sequence[Path]) -> tuple[int, int]
 
 @contextmanager
 def unchanged(states: Sequence[SourceState]) -> Iterator[None]:
-    """Refuse what is read of a recording while the context lasts, if it changes meanwhile.
+    """Refuse a recording that changes while it is read within the context.
 
     Args:
-        states: Of its files, as they are to be from beginning to end.
+        states: The states its files must keep throughout.
 
     Raises:
-        SourceError: Names a file that is not what it was, or that another one took the place of.
+        SourceError: Names a file that has changed or been replaced.
     """
     for state in states:
         state.check()
@@ -209,8 +208,8 @@ def unchanged(states: Sequence[SourceState]) -> Iterator[None]:
             if SourceState.of(path) != state or any(map(_differ, identities, _identities(path))):
                 raise SourceError(
                     path,
-                    "changed while it was read",
-                    "Pack it again when nothing writes to it any more.",
+                    "changed while it was being read",
+                    "Pack it again when nothing is writing to it.",
                 )
 
     try:
@@ -230,6 +229,6 @@ def _identities(path: Path) -> list[tuple[int, int, int]]:
 
 
 def _differ(before: tuple[int, int, int], now: tuple[int, int, int]) -> bool:
-    """Whether another file took a name."""
-    # a network file system may number the same one anew, and a new link to it sets its time
+    """Whether a name now belongs to a different file."""
+    # a network file system may renumber the same file, and a new link changes its time
     return before[:2] != now[:2] and before[2] != now[2]

@@ -1,4 +1,4 @@
-"""What is asked of fsspec, and its errors as sentences."""
+"""Access to fsspec, with its errors as sentences."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _TAGS = ("ETag", "etag", "blob_id", "md5Hash", "Content-MD5")
 _TIMES = ("LastModified", "Last-Modified", "mtime")
 _REFUSED = (401, 403)
 _MISSING = (404, 410)
-_NO_CREDENTIALS = "Credentials"  # in the names of what the libraries of stores raise
+_NO_CREDENTIALS = "Credentials"  # in the names of errors of store libraries
 _NETWORK = "Check the network, and try again."
 _ACCESS = "Check the address and your credentials for it."
 _MAX_TEXT, _MAX_CAUSES = 300, 8
-# Many small ranges are asked for at once, on so many connections; botocore has 10 by itself.
+# Many small ranges are requested at once, on that many connections; botocore's default is 10.
 _AT_ONCE, _HUB_AT_ONCE = 32, 8
-# s3fs keeps ten parts of 50 MiB in memory unless told otherwise.
+# By default s3fs keeps ten parts of 50 MiB in memory.
 _S3_UPLOAD = {"chunksize": 2**24, "max_concurrency": 4}
 
 Range = tuple[int, int]
@@ -60,12 +60,12 @@ class Place(_Path):
 
 
 class Facts(NamedTuple):
-    """What a store tells of a file or folder.
+    """A store's information about a file or folder.
 
     Attributes:
-        is_folder: Whether it is one, or stands for one.
-        size: Bytes; None where it is not told.
-        tag: Changes with the content; empty where nothing does.
+        is_folder: Whether it is a folder, or represents one.
+        size: Bytes; None if unknown.
+        tag: Changes with the content; empty if there is none.
     """
 
     is_folder: bool
@@ -74,7 +74,7 @@ class Facts(NamedTuple):
 
 
 class NoRangesError(Exception):
-    """A web server sends the whole file where a part of it is asked for."""
+    """A web server sends the whole file when asked for a part."""
 
 
 class Store:
@@ -84,7 +84,7 @@ class Store:
         path: Anything in it.
 
     Raises:
-        OptionError: The scheme is not known, or what it needs is not installed.
+        OptionError: The scheme is unknown, or its dependency is not installed.
     """
 
     def __init__(self, path: Place) -> None:
@@ -94,11 +94,11 @@ class Store:
             from fsspec.config import conf
             from fsspec.core import url_to_fs
         except ImportError:
-            raise OptionError(f"{path}: URLs need more than is installed. Run: {INSTALL}") from None
+            raise OptionError(f"{path}: URLs need an optional dependency. Run: {INSTALL}") from None
         if self.scheme not in fsspec.available_protocols():
             raise OptionError(
-                f"{path}: {self.scheme}:// is not known. Use s3, gs, hf, https, http, file, or "
-                "another scheme of fsspec."
+                f"{path}: {self.scheme}:// is not supported. Use s3, gs, hf, https, http, file, or "
+                "another fsspec scheme."
             )
         options: dict[str, Any] = {}
         if self.scheme in _S3 and "config_kwargs" not in conf.get("s3", {}):
@@ -110,7 +110,7 @@ class Store:
 
                 self._fs = RangeFileSystem(**self._fs.storage_options)
         except ImportError as error:
-            problem = f"{path}: URLs of {self.scheme}:// need more than is installed"
+            problem = f"{path}: {self.scheme}:// URLs need an optional dependency"
             remedy = f"Run: {INSTALL}." if self.scheme in _INSTALLED else f"{_text(error)}."
             raise OptionError(f"{problem}. {remedy}") from None
         except Exception as error:
@@ -123,11 +123,11 @@ class Store:
         return key
 
     def look(self, path: Place) -> Facts | None:
-        """What is there now; None for nothing.
+        """What exists there now; None for nothing.
 
         Raises:
-            SourceError: The store refuses to tell.
-            RemoteError: It does not answer.
+            SourceError: The store denies access.
+            RemoteError: It does not respond.
         """
         try:
             with _sentences(path):
@@ -142,7 +142,7 @@ class Store:
         """Ranges of a file, all at once.
 
         Raises:
-            RemoteError: The store does not give them, or the file is another one now.
+            RemoteError: The store does not return them, or the file has changed.
         """
         key = self._key(path)
         starts, ends = [start for start, _ in ranges], [end for _, end in ranges]
@@ -161,19 +161,19 @@ class Store:
                     if isinstance(error, BaseException):
                         raise error
         except FileNotFoundError:
-            raise _remote_error(path, "could not be read: it is gone") from None
+            raise _remote_error(path, "could not be read: it no longer exists") from None
         for (start, end), data in zip(ranges, found, strict=True):
             if len(data) != end - start:
-                problem = f"{len(data)} bytes came of {end - start} from byte {start} on"
+                problem = f"got {len(data)} of {end - start} bytes from byte {start} on"
                 raise _remote_error(path, f"could not be read: {problem}", _NETWORK)
         return found
 
     def check_ranges(self, path: Place, size: int) -> None:
-        """Refuse a web server that sends the whole file where a part of it is asked for.
+        """Refuse a web server that sends the whole file when asked for a part.
 
         Raises:
             SourceError: It is one.
-            RemoteError: It does not answer.
+            RemoteError: It does not respond.
         """
         if self.scheme not in HTTP or size < 2:
             return
@@ -181,10 +181,10 @@ class Store:
             with _sentences(path):
                 self._fs.cat_file(self._key(path), start=size - 1, end=size)
         except FileNotFoundError:
-            raise _remote_error(path, "could not be read: it is gone") from None
+            raise _remote_error(path, "could not be read: it no longer exists") from None
 
     def names(self, path: Place) -> list[str]:
-        """Names of what is directly in a folder; none where the store does not list."""
+        """Names of a folder's direct entries; none if the store does not list."""
         if self.scheme in HTTP:
             return []
         key = self._key(path).rstrip("/")
@@ -198,11 +198,11 @@ class Store:
         return sorted(path.rpartition("/")[2] for path in paths if path != key)
 
     def files(self, path: Place) -> list[str]:
-        """All files in a folder and below it, relative to it; none where the store does not list.
+        """All files in and below a folder, relative to it; none if the store does not list.
 
         Raises:
-            SourceError: The store refuses to tell.
-            RemoteError: It does not answer.
+            SourceError: The store denies access.
+            RemoteError: It does not respond.
         """
         if self.scheme in HTTP:
             return []
@@ -216,7 +216,7 @@ class Store:
 
         Raises:
             TargetError: The store refuses.
-            RemoteError: It does not answer.
+            RemoteError: It does not respond.
         """
         key = self._key(path)
         with _sentences(path, "uploaded"):
@@ -227,7 +227,7 @@ class Store:
 
         Raises:
             TargetError: The store refuses.
-            RemoteError: It does not answer.
+            RemoteError: It does not respond.
         """
         with suppress(FileNotFoundError), _sentences(path, "removed"):
             self._fs.rm_file(self._key(path))
@@ -243,26 +243,24 @@ def _refusal(path: Place, problem: str, remedy: str = "") -> SourceError:
 
 @contextmanager
 def _sentences(path: Place, done: str = "read") -> Iterator[None]:
-    """Errors of fsspec as ours; of a missing file, a FileNotFoundError.
+    """Translate fsspec's errors; a missing file becomes a FileNotFoundError.
 
     Args:
-        path: What is asked for.
-        done: What is being done with it.
+        path: What is being accessed.
+        done: The operation, as a participle.
     """
     try:
         yield
     except Mp4dsError:
         raise
     except NoRangesError:
-        problem = "its web server does not serve parts of files (byte ranges)"
-        raise _refusal(
-            path, f"cannot be read where it is: {problem}", "Download it first."
-        ) from None
+        problem = "its web server does not support range requests"
+        raise _refusal(path, f"cannot be read remotely: {problem}", "Download it first.") from None
     except Exception as error:
         verdict, reason = explained(error)
         if verdict == "missing" and done != "uploaded":
             raise FileNotFoundError(str(path)) from None
-        what = "access is refused: " if verdict == "refused" else ""
+        what = "access denied: " if verdict == "refused" else ""
         if verdict == "failed" or done == "fetched":  # the latter was allowed before
             done = "read" if done == "fetched" else done
             raise _remote_error(path, f"could not be {done}: {what}{reason}", _NETWORK) from None
@@ -271,7 +269,7 @@ def _sentences(path: Place, done: str = "read") -> Iterator[None]:
 
 
 def explained(error: BaseException) -> tuple[str, str]:
-    """What an error of fsspec, or of what it uses, comes down to.
+    """Classify an error of fsspec or its dependencies.
 
     Returns:
         ``missing``, ``refused`` or ``failed``; and why, as the end of a sentence.
@@ -285,7 +283,7 @@ def explained(error: BaseException) -> tuple[str, str]:
         return "refused", reason
     if any(status in _MISSING for status in statuses):
         return "missing", reason
-    # For fsspec, what a web server did not answer to does not exist.
+    # For fsspec, a URL to which a web server does not respond does not exist.
     if isinstance(error, FileNotFoundError) and not any(map(_is_of_network, causes)):
         return "missing", reason
     return "failed", reason
@@ -301,7 +299,7 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
 
 
 def _status(error: BaseException) -> int | None:
-    """The HTTP status that an error tells of."""
+    """The HTTP status of an error."""
     response = getattr(error, "response", None)
     if isinstance(response, Mapping):
         return _number(response.get("ResponseMetadata", {}).get("HTTPStatusCode"))
@@ -326,6 +324,6 @@ def _text(error: BaseException) -> str:
         return "it took too long to answer"
     message = getattr(error, "message", None)
     if isinstance(message, str) and _status(error):
-        return f"{_status(error)} {message}"  # without the address, which may hold a secret
+        return f"{_status(error)} {message}"  # without the URL, which may hold a secret
     text = " ".join(str(error).split()).rstrip(".")
     return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]} ..."

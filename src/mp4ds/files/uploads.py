@@ -1,7 +1,6 @@
-"""Outputs for URLs: made whole on this machine, then copied there.
+"""Outputs for URLs: completed on this machine, then copied there.
 
-The file by which an output is recognised comes last, so that what is there without it is visibly
-not whole.
+The file that identifies an output comes last, so that an output without it is visibly incomplete.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from mp4ds.files.urls import RemotePath
 
 Made = TypeVar("Made")
 Report = Callable[[str, int, int], None]
-"""Called with the file that is being uploaded, bytes uploaded, and bytes in all."""
+"""Called with the file being uploaded, bytes uploaded, and total bytes."""
 
 _LOCK = "lock"
 _PROBE = ".mp4ds-upload"
@@ -41,27 +40,27 @@ def uploaded(
 
     Args:
         target: Where it goes.
-        make: Makes it at a path of this machine, in the place of what is there.
+        make: Makes it at a local path, replacing what is there.
         is_folder: Whether it is a folder.
-        last: Of a folder, the file in it that is copied last; without it, it is not whole.
+        last: For a folder, the file to copy last, without which it is incomplete.
         force: Replace what is at the URL.
         owned: Tells which files of that mp4ds wrote.
-        report: Told of the upload.
+        report: Called with the upload's progress.
 
     Returns:
         What `make` returns.
 
     Raises:
-        TargetError: The target may not be written or replaced, or another run is at work on it.
-        RemoteError: It could not be uploaded; what was made is kept here.
+        TargetError: The target cannot be written or replaced, or another run is working on it.
+        RemoteError: It could not be uploaded; the output is kept here.
     """
     local = local_path(target)
     with _claimed(local.parent, target):
         old = _replaced(target, is_folder=is_folder, force=force, owned=owned)
         _probe(target / _PROBE if is_folder else target.with_name(f"{target.name}{_PROBE}"))
         made = make(local)
-        kept = f"What was made is kept in {local}: copy it there with a tool of your own"
-        kept += f", {last} last, or run the command again." if last else ", or run again."
+        kept = f"The output is kept in {local}: copy it with a tool of your choice"
+        kept += f"({last} last), or run the command again." if last else ", or run again."
         try:
             _send(local, target, old, last, report)
         except (TargetError, RemoteError) as error:
@@ -76,14 +75,14 @@ def local_path(target: RemotePath) -> Path:
     """Where the output for a URL is made: the same on all machines that share ``TMPDIR``.
 
     Raises:
-        TargetError: Nothing can be uploaded there, or no folder be made here.
+        TargetError: Nothing can be uploaded there, or no folder can be created here.
     """
     shown = target
     if not target.is_writable:
-        problem = "is on a web server, which takes no uploads"
-        raise TargetError(shown, problem, "Name a place in a store, such as s3://.")
+        problem = "is on a web server, which does not accept uploads"
+        raise TargetError(shown, problem, "Give a location in a store, such as s3://.")
     if target.parent == target:
-        raise TargetError(shown, "is a whole bucket", "Name a folder in it.")
+        raise TargetError(shown, "is an entire bucket", "Give a folder in it.")
     digest = hashlib.sha256(str(target).encode()).hexdigest()
     folder = _own_folder() / f"{target.name[:60]}-{digest[:16]}"
     folder.mkdir(exist_ok=True)
@@ -91,29 +90,29 @@ def local_path(target: RemotePath) -> Path:
 
 
 def _own_folder() -> Path:
-    """The user's own folder in the system's temporary one, where nobody else can meddle."""
+    """The user's own folder in the system's temporary one, which nobody else can touch."""
     folder = Path(tempfile.gettempdir()) / f"mp4ds-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         stat = folder.lstat()
     except OSError as error:
         raise TargetError(
-            folder, f"cannot be made: {error.strerror}", "Name another folder by TMPDIR."
+            folder, f"cannot be created: {error.strerror}", "Set TMPDIR to another folder."
         ) from None
     if not folder.is_dir() or folder.is_symlink() or stat.st_uid != os.getuid():
-        raise TargetError(folder, "belongs to somebody else", "Name another folder by TMPDIR.")
+        raise TargetError(folder, "belongs to another user", "Set TMPDIR to another folder.")
     return folder
 
 
 @contextmanager
 def _claimed(folder: Path, target: RemotePath) -> Iterator[None]:
-    """Hold the folder while working in it; it goes when it holds nothing any more."""
+    """Lock the folder while working in it; it is removed once empty."""
     with (folder / _LOCK).open("w") as file:
         try:
             lock(file)
         except BlockingIOError:
             raise TargetError(
-                target, "another mp4ds is making it here", "Wait for it, or end it."
+                target, "another mp4ds is already making it here", "Wait for it, or stop it."
             ) from None
         try:
             yield
@@ -139,7 +138,7 @@ def _replaced(target: RemotePath, *, is_folder: bool, force: bool, owned: Owned)
 
 
 def _probe(path: RemotePath) -> None:
-    """Learn before the work whether the place can be written to."""
+    """Check before the work whether the place can be written to."""
     with tempfile.NamedTemporaryFile() as file:
         path.upload(Path(file.name))
     path.remove()
@@ -156,7 +155,7 @@ def _send(local: Path, target: RemotePath, old: set[str], last: str, report: Rep
             _place(target, name).upload(local / name)
             done += size
     except BaseException:
-        for name in files if "" not in old else ():  # a file that is not replaced stays
+        for name in files if "" not in old else ():  # files that are not replaced stay
             with suppress(Mp4dsError):
                 _place(target, name).remove()
         raise

@@ -1,7 +1,7 @@
 """Recordings and datasets at URLs, read by ranges through fsspec.
 
-`location` makes of a URL what reads like a `pathlib.Path`, so that nothing else has to know
-where a file is. What is local never gets here, and fsspec is imported for URLs alone.
+`location` turns a URL into an object that reads like a `pathlib.Path`, so that nothing else needs
+to know where a file is. Local paths never get here, and fsspec is imported for URLs only.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ Fetch = Callable[[Sequence[Range]], list[bytes]]
 """Fetches ranges, all at once."""
 
 KEPT_BYTES = 32 * 2**20
-"""Of each file, as long as it is open: what comes after the reader finds its bytes here."""
+"""Kept per open file, for other readers of the same bytes."""
 
 _IDLE_BYTES = 2**20
-_LEAST, _MOST = 2**17, 2**22  # read ahead: at first, and after a while of reading in order
+_LEAST, _MOST = 2**17, 2**22  # read-ahead: at first, and after a while of reading in order
 _FILL_BYTES = 2 * _MOST
 _FIRST_BATCH_BYTES, _BATCH_BYTES, _BATCH_RANGES = 2**19, 2**23, 256
-_GAP = 2**16  # less costs less to fetch than to ask twice
+_GAP = 2**16  # smaller gaps cost less to fetch than a second request
 
 
 class Segments:
-    """The bytes of a file that were fetched last, for all who read it at the time.
+    """The most recently fetched bytes of a file, shared by all its current readers.
 
     Threads may share it.
     """
@@ -53,14 +53,14 @@ class Segments:
             self._users += 1
 
     def release(self) -> None:
-        """Drop what nobody may want any more."""
+        """Drop what is no longer needed."""
         with self._lock:
             self._users -= 1
             if not self._users:
                 self._shrink(_IDLE_BYTES)
 
     def add(self, start: int, data: bytes) -> None:
-        """Keep bytes that were fetched; none are kept within others."""
+        """Keep fetched bytes; segments are never nested."""
         end = start + len(data)
         with self._lock:
             number = bisect_right(self._starts, start) - 1
@@ -115,15 +115,15 @@ class Segments:
 
 
 class RemoteFile(io.RawIOBase):
-    """A remote file, open for reading; `read` gives less than was asked for at the end only.
+    """A remote file, open for reading; `read` returns less than requested only at the end.
 
-    Reading in order fetches more and more ahead, reading elsewhere little more than is asked
-    for. What was announced by `expect` is fetched while what comes before it is being used.
+    Sequential reading fetches more and more ahead, random reading little more than requested.
+    Ranges announced by `expect` are fetched while earlier ones are being used.
 
     Args:
         size: Bytes of the file.
-        fetch: Fetches ranges; what it raises, reading raises.
-        segments: What is kept of the file.
+        fetch: Fetches ranges; reading raises its errors.
+        segments: The kept bytes of the file.
     """
 
     def __init__(self, size: int, fetch: Fetch, segments: Segments) -> None:
@@ -138,13 +138,13 @@ class RemoteFile(io.RawIOBase):
         segments.claim()
 
     def expect(self, ranges: Iterable[Range]) -> None:
-        """See `mp4ds.files.urls.expect`; replaces what was announced before."""
+        """See `mp4ds.files.urls.expect`; replaces earlier announcements."""
         self._drop_plan()
         missing = (span for span in ranges if not self._segments.hold(*span))
         self._plan = _Plan(missing, self._load)
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read so many bytes, or all that are left."""
+        """Read that many bytes, or all that are left."""
         place = self._place
         wanted = self._size if size is None or size < 0 else place + size
         end = max(place, min(wanted, self._size))
@@ -165,14 +165,14 @@ class RemoteFile(io.RawIOBase):
         return b"".join(pieces)
 
     def _fill(self, place: int, end: int) -> None:
-        """Fetch what is missing from a place on, and something after it."""
+        """Fetch what is missing from a position on, and something after it."""
         if 0 <= place - self._read_to <= _GAP:
             self._ahead = min(max(2 * self._ahead, _LEAST), _MOST)
         else:
             self._ahead = _LEAST
         wanted = min(max(end, place + self._ahead), place + _FILL_BYTES, self._size)
         stop = self._segments.next_start(place, wanted)
-        # Who asks for a file's last bytes wants what stands before them next.
+        # After a file's last bytes, readers usually want those before them.
         start = max(0, min(place, self._size - _LEAST)) if stop == self._size else place
         self._load([(start, min(stop, wanted))])
 
@@ -197,7 +197,7 @@ class RemoteFile(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Go on elsewhere; costs nothing."""
+        """Change the position; costs nothing."""
         base = {io.SEEK_SET: 0, io.SEEK_CUR: self._place, io.SEEK_END: self._size}[whence]
         if base + offset < 0:
             raise ValueError(f"seek to {base + offset}, before the file")
@@ -205,11 +205,11 @@ class RemoteFile(io.RawIOBase):
         return self._place
 
     def tell(self) -> int:
-        """Where reading goes on."""
+        """The position."""
         return self._place
 
     def close(self) -> None:
-        """Stop fetching, and let go of what was fetched."""
+        """Stop fetching, and drop what was fetched."""
         if not self.closed:
             self._drop_plan()
             self._segments.release()
@@ -222,14 +222,14 @@ class RemoteFile(io.RawIOBase):
 
 
 def _split(ranges: Iterable[Range], most: int) -> Iterator[Range]:
-    """Ranges in pieces of so many bytes at most."""
+    """Ranges in pieces of that many bytes at most."""
     for start, end in ranges:
         for first in range(start, end, most):
             yield first, min(first + most, end)
 
 
 class _Plan:
-    """Fetches announced ranges in batches, each while the one before it is being used.
+    """Fetches announced ranges in batches, each while the previous one is being used.
 
     Args:
         ranges: In the order of reading.
@@ -246,7 +246,7 @@ class _Plan:
         self._begin_next()
 
     def reach(self, place: int) -> None:
-        """Wait for the bytes at a place, where they are the next that were announced."""
+        """Wait for the bytes at a position, if they are the next announced ones."""
         while _holds(self._next, place) and not _holds(self._current, place):
             if self._coming is None:
                 self._coming = self._worker.submit(self._load, self._next)
@@ -261,7 +261,7 @@ class _Plan:
         self._next = next(self._batches, [])
 
     def close(self) -> None:
-        """Fetch no more."""
+        """Stop fetching."""
         self._worker.shutdown(wait=False, cancel_futures=True)
 
 
@@ -270,9 +270,9 @@ def _holds(ranges: Sequence[Range], place: int) -> bool:
 
 
 def _batches(ranges: Iterable[Range]) -> Iterator[list[Range]]:
-    """Ranges to be fetched at once; those that lie close to each other as one.
+    """Ranges to fetch at once, merging those close to each other.
 
-    The batches grow, since who reads a little may stop.
+    The batches grow, since readers may stop early.
     """
     batch: list[Range] = []
     size, most = 0, _FIRST_BATCH_BYTES
@@ -294,27 +294,27 @@ def _batches(ranges: Iterable[Range]) -> Iterator[list[Range]]:
 # ---------------------------------------------------------------- path
 
 _SIGNS = ("dataset.yaml", "metadata.yaml")
-"""What a web server has of a folder that holds a recording or a dataset; it lists nothing."""
+"""Files that identify a recording's or dataset's folder on a web server, which lists nothing."""
 
 _FILE_SUFFIXES = (".bag", ".mcap", ".db3", ".zstd", ".mp4", ".yaml", ".yml")
 
 
 class RemoteStat(NamedTuple):
-    """As much of a stat result as a store tells; sizes in bytes, times in nanoseconds."""
+    """The part of a stat result that stores provide; sizes in bytes, times in nanoseconds."""
 
     st_size: int
     st_mtime_ns: int = 0
 
 
 class RemotePath(Place):
-    """A URL with what reading needs of `pathlib.Path`, in the forms that reading asks for.
+    """A URL with the parts of `pathlib.Path` that reading needs.
 
-    What a store tells of it is asked for once and holds as long as the object does; an object
-    made anew sees changes. Its text has no secrets: neither password nor query.
+    A store's information is requested once and cached for the object's life; a new object sees
+    changes. Its text has no secrets: neither password nor query.
 
     Args:
-        url: With its scheme; of a web address the query is kept, also for files in a folder.
-        store: Of its file system; None to find it.
+        url: With its scheme; a web address keeps its query, also for files in a folder.
+        store: Its file system's store; None to find it.
     """
 
     def __init__(self, url: str, store: Store | None = None) -> None:
@@ -373,27 +373,27 @@ class RemotePath(Place):
 
     @property
     def suffix(self) -> str:
-        """Its ending, with the dot."""
+        """Its extension, with the dot."""
         return PurePosixPath(self.name).suffix
 
     @property
     def suffixes(self) -> list[str]:
-        """All its endings."""
+        """All its extensions."""
         return PurePosixPath(self.name).suffixes
 
     @property
     def stem(self) -> str:
-        """The name without its ending."""
+        """The name without its extension."""
         return PurePosixPath(self.name).stem
 
     @property
     def parent(self) -> RemotePath:
-        """The folder that it is in; of a bucket or host, itself."""
+        """Its parent folder; for a bucket or host, itself."""
         return self._at(self._rest.rpartition("/")[0] or self._rest)
 
     @property
     def parents(self) -> Sequence[RemotePath]:
-        """All folders that it is in, the nearest first."""
+        """All its parent folders, the nearest first."""
         found = []
         path = self
         while path.parent != path:
@@ -409,11 +409,11 @@ class RemotePath(Place):
         return self._at(f"{self._rest}/{quote(tail) if self.scheme in HTTP else tail}")
 
     def with_name(self, name: str) -> RemotePath:
-        """Another one in the same folder."""
+        """A sibling with another name."""
         return self.parent / name
 
     def with_suffix(self, suffix: str) -> RemotePath:
-        """The same with another ending."""
+        """The same with another extension."""
         return self.with_name(PurePosixPath(self.name).with_suffix(suffix).name)
 
     def absolute(self) -> RemotePath:
@@ -435,11 +435,11 @@ class RemotePath(Place):
 
     @property
     def tag(self) -> str:
-        """What the store says of the content, and would say otherwise of another; may be empty."""
+        """The store's tag of the content, which changes with it; may be empty."""
         return self._facts.tag if self._facts else ""
 
     def exists(self) -> bool:
-        """Whether there is anything.
+        """Whether anything exists.
 
         Raises:
             SourceError: The store refuses to tell.
@@ -448,7 +448,7 @@ class RemotePath(Place):
         return self._facts is not None
 
     def is_dir(self) -> bool:
-        """Whether it is a folder; of a web server, one of a recording or dataset."""
+        """Whether it is a folder; on a web server, one of a recording or dataset."""
         return self._facts is not None and self._facts.is_folder
 
     def is_file(self) -> bool:
@@ -459,8 +459,8 @@ class RemotePath(Place):
         """Its size.
 
         Raises:
-            FileNotFoundError: There is nothing.
-            SourceError: The size is not told.
+            FileNotFoundError: It does not exist.
+            SourceError: The size is unknown.
         """
         return RemoteStat(0 if self.is_dir() else self._size())
 
@@ -471,21 +471,21 @@ class RemotePath(Place):
         if facts.size is None:
             raise SourceError(
                 self,
-                "cannot be read where it is: its size is not told",
+                "cannot be read remotely: the server does not report its size",
                 "Download it first.",
             )
         return facts.size
 
     def iterdir(self) -> Iterator[RemotePath]:  # type: ignore[override]
-        """What is directly in it; nothing of a web server, which does not list."""
+        """Its direct entries; none on a web server, which does not list."""
         return (self / name for name in self._store.names(self))
 
     def rglob(self, name: str) -> Iterator[RemotePath]:  # type: ignore[override]
-        """The files of a name (no pattern) in it and below; nothing of a web server."""
+        """The files with a name (not a pattern) in and below it; none on a web server."""
         return (path for path in self.files() if path.name == name)
 
     def files(self) -> list[RemotePath]:
-        """All files in it and below; none of a web server, which does not list."""
+        """All files in and below it; none on a web server, which does not list."""
         return [self / path for path in self._store.files(self)]
 
     # ---------------------------------------------------------------- content
@@ -507,8 +507,8 @@ class RemotePath(Place):
         """Open it for reading by ranges.
 
         Raises:
-            FileNotFoundError: There is nothing.
-            SourceError: The store refuses, or serves no ranges.
+            FileNotFoundError: It does not exist.
+            SourceError: The store denies access, or does not support ranges.
             RemoteError: It does not answer.
         """
         if mode != "rb":
@@ -526,24 +526,24 @@ class RemotePath(Place):
 
     @property
     def is_writable(self) -> bool:
-        """Whether its kind of store takes uploads."""
+        """Whether its kind of store accepts uploads."""
         return self.scheme not in HTTP
 
     def upload(self, local: Path) -> RemotePath:
-        """Put a file here, in the place of what is there.
+        """Upload a file here, replacing what is there.
 
         Returns:
-            The path, which tells what is there now.
+            A path with the new state.
 
         Raises:
-            TargetError: The store refuses.
-            RemoteError: It does not answer, or has kept less.
+            TargetError: The store denies access.
+            RemoteError: It does not respond, or has stored less.
         """
         self._store.put(local, self)
         now = RemotePath(self.url, self._store)
         sizes = now.stat().st_size if now.exists() else 0, local.stat().st_size
         if sizes[0] != sizes[1]:
-            problem = f"could not be uploaded: {sizes[0]} of {sizes[1]} bytes are there"
+            problem = f"could not be uploaded: only {sizes[0]} of {sizes[1]} bytes arrived"
             raise RemoteError(self, problem)
         return now
 
@@ -551,7 +551,7 @@ class RemotePath(Place):
         """Remove the file here, if there is one.
 
         Raises:
-            TargetError: The store refuses.
+            TargetError: The store denies access.
             RemoteError: It does not answer.
         """
         self._store.remove(self)
@@ -571,7 +571,7 @@ def location(path: Path | str) -> Path:
             ``https`` or ``file``.
 
     Returns:
-        The local path; of a URL a `RemotePath`, which has of a path what reading needs.
+        The local path; for a URL a `RemotePath`, which has what reading needs of a path.
 
     Raises:
         OptionError: The scheme is not known, or what it needs is not installed.
@@ -589,21 +589,21 @@ def location(path: Path | str) -> Path:
 
 
 def remote(path: object) -> RemotePath | None:
-    """What `location` made of a URL; None for a local path."""
+    """The result of `location` for a URL; None for a local path."""
     return path if isinstance(path, RemotePath) else None
 
 
 def spelled(path: Path) -> str:
-    """A path or URL in full, from which `location` makes it again anywhere on this machine."""
+    """A full path or URL, from which `location` rebuilds it anywhere on this machine."""
     found = remote(path)
     return found.url if found else str(path.absolute())
 
 
 def expect(stream: object, ranges: Iterable[tuple[int, int]]) -> None:
-    """Tell a file which of its bytes will be read, so that a remote one fetches them in time.
+    """Announce which bytes of a file will be read, so that a remote one fetches them in time.
 
     Args:
-        stream: What ``open("rb")`` gave, of a local path or a `RemotePath`.
+        stream: From ``open("rb")`` of a local path or a `RemotePath`.
         ranges: First byte and end of each, in the order of reading; other bytes may be read
             between.
     """

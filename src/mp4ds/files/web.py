@@ -1,4 +1,4 @@
-"""Ranges of files on web servers: no more than was asked for, whatever these send."""
+"""Ranges of files on web servers: no more than requested, whatever these send."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from mp4ds.files.store import NoRangesError
 
 
 class RangeFileSystem(HTTPFileSystem):  # type: ignore[misc]
-    """fsspec's, which reads whatever comes, with reading by ranges alone."""
+    """fsspec's file system, which reads whatever comes, limited to ranges."""
 
     async def _cat_file(self, url: str, start: int = 0, end: int = 0, **kwargs: Any) -> bytes:
-        """A range; one byte more where the server sends more.
+        """A range; one byte more if the server sends more.
 
         Raises:
-            NoRangesError: The server does not know ranges.
+            NoRangesError: The server does not support ranges.
         """
         options = {**self.kwargs, **kwargs}
         headers = {

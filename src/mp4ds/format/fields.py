@@ -24,7 +24,7 @@ MAX_CAMERA_INFOS = 10**7
 MAX_VARIANTS = 256
 """Headers or calibrations of a stream: a topic with more is not modelled any further."""
 MAX_PADDING = 4 * 2**20
-"""Characters of all paddings of a stream: its headers stand in the part of a YAML file that is
+"""Characters of all paddings of a stream: its headers are in the part of a YAML file that is
 parsed as a whole."""
 
 Int64 = Annotated[int, Field(ge=INT64_MIN, le=INT64_MAX)]
@@ -67,7 +67,7 @@ def decode_base64(text: str) -> bytes:
     except binascii.Error as error:
         raise ValueError(f"{text[:20]!r} is not base64: {error}") from None
     if base64.b64encode(data).decode() != text:
-        raise ValueError(f"{text[:20]!r} is not base64: it does not encode what it decodes to")
+        raise ValueError(f"{text[:20]!r} is not canonical base64")
     return data
 
 
@@ -160,7 +160,7 @@ class Digests(Model):
         try:
             raw = bytes.fromhex(self.values)
         except ValueError:
-            raise ValueError("holds something else than hexadecimal digits") from None
+            raise ValueError("holds something other than hexadecimal digits") from None
         if len(raw) != 8 * count:
-            raise ValueError(f"holds {len(raw) / 8:g} digests where {count} are due")
+            raise ValueError(f"holds {len(raw) / 8:g} digests, not {count}")
         return np.frombuffer(raw, dtype=">u8").astype(np.uint64)

@@ -84,7 +84,7 @@ class Quality(Model):
     @model_validator(mode="after")
     def _counted(self) -> Quality:
         if max(self.reencoded, self.limited) > self.windows:
-            raise ValueError("more windows are told of than there are")
+            raise ValueError("more windows are listed than there are")
         return self
 
     @classmethod
@@ -105,7 +105,7 @@ class Quality(Model):
             scores: Of each frame, in steps of the metric (`SCORE_STEPS`), shape (frames,).
             worst_window: Least mean of a window.
             windows: How many there are.
-            reencoded: How many of them were encoded again.
+            reencoded: How many of them were re-encoded.
             limited: How many have originals that score too little themselves.
         """
         mean, p5, least = _told(scores, target.metric)
@@ -171,21 +171,23 @@ class Quality(Model):
         steps = self.scores.decode(frames)
         for name, due in zip(("mean", "p5", "min"), _told(steps, self.metric), strict=True):
             if abs(due - getattr(self, name)) > _ROUNDED:
-                raise ValueError(f"has scores whose {name} is {due:g}, not {getattr(self, name):g}")
+                raise ValueError(
+                    f"its scores have a {name} of {due:g}, not {getattr(self, name):g}"
+                )
         return steps / SCORE_STEPS[self.metric]
 
     def __str__(self) -> str:
         text = (
-            f"{self.metric} {self.mean:g} (asked for: {self.target:g}), 5 % of the frames below "
-            f"{self.p5:g}, least {self.min:g}; worst of {self.windows} windows "
+            f"{self.metric} {self.mean:g} (target: {self.target:g}), 5 % of frames below "
+            f"{self.p5:g}, minimum {self.min:g}; worst of {self.windows} windows "
             f"{self.worst_window:g}"
         )
         if self.reencoded:
-            text += f"; {self.reencoded} encoded again"
+            text += f"; {self.reencoded} re-encoded"
         if self.limited:
             text += (
-                f"; {self.limited} that were to have {TOLERANCES[self.metric]:g} less than the "
-                "originals beside themselves, which is less than was asked for"
+                f"; {self.limited} limited to {TOLERANCES[self.metric]:g} below the score of the "
+                "originals against themselves, which is below the target"
             )
         return text
 
@@ -213,7 +215,7 @@ class References(Model):
     @model_validator(mode="after")
     def _bounded(self) -> References:
         if sum(map(len, self.structures)) > MAX_CHARS:
-            raise ValueError(f"the structures have more than {MAX_CHARS} characters together")
+            raise ValueError(f"the structures have more than {MAX_CHARS} characters in total")
         return self
 
     @property
@@ -452,7 +454,7 @@ class VideoModel(Model):
 
     @property
     def matrix(self) -> str | None:
-        """Matrix coefficients of the video's colours; None where the video itself tells them."""
+        """Matrix coefficients of the video's colours; None if the video itself tells them."""
         if self.color is None:
             return None if self.pixel_format is None else "bt709"
         return self.color.matrix
@@ -554,10 +556,10 @@ class StreamSidecar(Model):
             if wire not in WIRES:
                 raise ValueError(f"wire {wire!r} is not one of {', '.join(WIRES)}")
         if self.profile == "lossless" and self.digests is None:
-            raise ValueError("a lossless stream has digests")
+            raise ValueError("a lossless stream must have digests")
         quality = self.video.quality
         if quality and self.profile != str(QualityTarget(quality.metric, quality.target)):
-            raise ValueError(f"video.quality is of another profile than {self.profile}")
+            raise ValueError(f"video.quality does not match the profile {self.profile}")
         width, height = self.layout.picture_size(self.image.width, self.image.height)
         if self.video.width < width or self.video.height < height:
             raise ValueError(f"the video is smaller than its pictures of {width}x{height}")
@@ -570,18 +572,22 @@ class StreamSidecar(Model):
         if allowed is not None and encoding not in allowed:
             raise ValueError(f"a stream with the body {body} has no {encoding} images")
         if (self.video.pixel_format is None) != (body == "packet"):
-            raise ValueError("video.pixel_format is absent for the body packet, and only there")
+            raise ValueError(
+                "video.pixel_format must be absent for the body packet, and only there"
+            )
         if body == "packet" and self.video.codec not in PACKET_CODECS:
-            raise ValueError(f"no packets of codec {self.video.codec} are carried")
+            raise ValueError(f"packets of codec {self.video.codec} are not supported")
         if body == "jpeg" and self.profile == "lossless":
             raise ValueError("a stream with the body jpeg is not lossless")
         if exceeds_padding(header.padding for header in self.headers):
-            raise ValueError("the headers have too much padding")
+            raise ValueError("the headers have too much padding in total")
         for number, header in enumerate(self.headers):
             if (header.png is not None) != (body == "png"):
-                raise ValueError(f"headers.{number}.png is there for the body png, and only there")
+                raise ValueError(
+                    f"headers.{number}.png must be present for the body png, and only there"
+                )
             if header.padding is not None and body != "pixels":
-                raise ValueError(f"headers.{number}.padding is there for the body pixels only")
+                raise ValueError(f"headers.{number}.padding is allowed for the body pixels only")
 
     @property
     def shows_colours(self) -> bool:

@@ -27,7 +27,7 @@ _VERSION_0_KEYS = {"bagname", "topic_name", "camera_info", "img_timestamp"}
 
 
 def version_of(document: Document) -> str | None:
-    """The version that a document claims; None where it claims none."""
+    """The version that a document claims; None if it claims none."""
     if "mp4ds" in document:
         version = document["mp4ds"]
         return version if isinstance(version, str) else None
@@ -46,7 +46,7 @@ def migrate(document: Document, place: str) -> Document:
         except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             reason = f"{type(error).__name__}: {error}"
             raise FormatError(
-                "migration-failed", place, f"is not a whole file of version {version} ({reason})"
+                "migration-failed", place, f"is not a complete file of version {version} ({reason})"
             ) from None
     return document
 
@@ -57,7 +57,7 @@ def _from_0(old: Document, place: str) -> Document:
     if unknown:
         raise ValueError(f"unknown keys {sorted(unknown)}")
     if not isinstance(old["topic_name"], list):
-        raise ValueError("topic_name is no list")
+        raise ValueError("topic_name is not a list")
     info_topic, image_topic = map(_text, old["topic_name"])
     info = old["camera_info"]
     # round half even of the exact product: the nearest nanosecond to the stored float
@@ -130,21 +130,21 @@ def _calibration_0(info: Document) -> Document:
 
 def _number(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"{value!r} is no number")
+        raise ValueError(f"{value!r} is not a number")
     if value - value != 0:
-        raise ValueError(f"{value} is no finite number")
+        raise ValueError(f"{value} is not a finite number")
     return float(value)
 
 
 def _integer(value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
-        raise ValueError(f"{value!r} is no whole number")
+        raise ValueError(f"{value!r} is not an integer")
     return value
 
 
 def _text(value: Any) -> str:
     if not isinstance(value, str):
-        raise ValueError(f"{value!r} is no text")
+        raise ValueError(f"{value!r} is not a string")
     return value
 
 
@@ -152,7 +152,7 @@ def _from_1_0(old: Document, place: str) -> Document:
     """Version 1.0: no header has padding."""
     headers = old.get("headers")
     if isinstance(headers, list) and any(isinstance(h, dict) and "padding" in h for h in headers):
-        raise ValueError("headers with padding are of version 1.1")
+        raise ValueError("headers with padding need version 1.1")
     return {**old, "mp4ds": "1.1"}
 
 
@@ -197,7 +197,7 @@ def load_document(path: Path) -> dict[str, Any]:
     """
     try:
         if not path.is_file() and path.exists():
-            raise FormatError("file-missing", path, "is no regular file")
+            raise FormatError("file-missing", path, "is not a regular file")
         if path.stat().st_size > yamlio.MAX_BYTES:
             raise FormatError("yaml-invalid", path, f"is larger than {yamlio.MAX_BYTES} bytes")
         data = path.read_bytes()
@@ -220,10 +220,10 @@ def load_document(path: Path) -> dict[str, Any]:
         raise VersionError(path, version, FORMAT_VERSION)
     if found < supported:
         raise FormatError(
-            "version-unsupported", path, f"is of version {version!r}, which never was"
+            "version-unsupported", path, f"has version {version!r}, which does not exist"
         )
     if document.get("kind") not in list(_MODELS):
-        raise FormatError("kind-unknown", path, "is neither a stream nor a dataset")
+        raise FormatError("kind-unknown", path, "is not a stream or a dataset")
     return document if found == supported else _without_news(document, path)
 
 
@@ -243,8 +243,8 @@ def _without_news(document: dict[str, Any], path: Path) -> dict[str, Any]:
             _remove(document, place)
             dropped.append(".".join(map(str, place)))
     warnings.warn(
-        f"{path} is of format version {document['mp4ds']}, newer than {FORMAT_VERSION}; "
-        f"ignored: {', '.join(dropped[:_NEWS_LISTED]) or 'nothing'}"
+        f"{path} has format version {document['mp4ds']}, newer than {FORMAT_VERSION}; ignored: "
+        f"{', '.join(dropped[:_NEWS_LISTED]) or 'nothing'}"
         + (f" and {len(dropped) - _NEWS_LISTED} more" if len(dropped) > _NEWS_LISTED else ""),
         stacklevel=2,
     )
@@ -309,7 +309,7 @@ def load_about(path: Path | str) -> About:
         key, problem = model_problems(error)[0]
         raise SourceError(place, f"at {key}: {problem}", remedy) from None
     except ValueError as error:
-        raise SourceError(place, f"is no YAML: {error}", remedy) from None
+        raise SourceError(place, f"is not valid YAML: {error}", remedy) from None
 
 
 def model_problems(error: ValidationError) -> list[tuple[str, str]]:

@@ -1,1 +1,1 @@
-"""What camera messages hold: serializations, image encodings and layouts, files of images."""
+"""The contents of camera messages: serializations, image encodings and layouts, image files."""

@@ -1,4 +1,4 @@
-"""Where the values of pixels go in the planes of a picture; numpy only."""
+"""Placement of pixel values in the planes of a picture; numpy only."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Arrangement(Protocol):
     """A bijection between an array of samples and a picture."""
 
     def pixel_format(self, bits: int) -> str:
-        """Name in ffmpeg of the picture's format, for samples of so many bits."""
+        """FFmpeg's name of the picture's format, for samples of that many bits."""
 
     def picture_size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height of the image -> of the picture."""
@@ -63,7 +63,7 @@ class Packed:
 
 @dataclass(frozen=True, slots=True)
 class Mosaic:
-    """Four half-size pictures, one per place in the 2 x 2 block, in a 2 x 2 grid.
+    """Four half-size pictures, one per position in the 2 x 2 block, in a 2 x 2 grid.
 
     Neighbours then hold the same colour, which is what predictors expect. An odd last row or
     column of a tile repeats its neighbour.
@@ -111,10 +111,10 @@ class Mosaic:
 
 @dataclass(frozen=True, slots=True)
 class Stack:
-    """The channels of an image, one under the other.
+    """The channels of an image, stacked vertically.
 
     Attributes:
-        channels: How many.
+        channels: Number of channels.
     """
 
     channels: int
@@ -124,7 +124,7 @@ class Stack:
         return _gray(bits)
 
     def picture_size(self, width: int, height: int) -> tuple[int, int]:
-        """As many times as high."""
+        """Height times the number of channels."""
         return width, self.channels * height
 
     def arrange(self, samples: Samples) -> Picture:
@@ -171,15 +171,15 @@ class PlanarRgb:
 
 @dataclass(frozen=True, slots=True)
 class Fold:
-    """High bits over low bits, these folded: all of them inverted where the high ones are odd.
+    """High bits over folded low bits, which are inverted where the high bits are odd.
 
-    So a slope that carries into the high bits does not tear the low ones from end to end, and
-    the noise of the low bits does not hide what the high ones predict.
+    So the low bits stay continuous where a slope carries into the high bits, and their noise does
+    not hide the high bits from prediction.
 
     Attributes:
         bits: Of a sample, at most 16.
-        low: How many of them are low, at most 8.
-        first: What is done to the samples before, into one array.
+        low: Number of low bits, at most 8.
+        first: Arrangement applied to the samples first, into one array.
     """
 
     bits: int
@@ -191,7 +191,7 @@ class Fold:
         return (1 << self.low) - 1
 
     def pixel_format(self, bits: int) -> str:
-        """Grey, of as many bits as the high ones need."""
+        """Grey, with as many bits as the high bits need."""
         return _gray(8 if self.bits - self.low <= 8 else 10)
 
     def picture_size(self, width: int, height: int) -> tuple[int, int]:
@@ -219,17 +219,17 @@ class Fold:
         self.first.restore((wide | (folded ^ self._folds(high)),), samples)
 
     def _folds(self, high: Samples) -> Samples:
-        """All low bits where the high ones are odd, else 0."""
+        """All low bits set where the high bits are odd, else 0."""
         folds: Samples = (high & 1) * high.dtype.type(self._mask)
         return folds
 
 
 @dataclass(frozen=True, slots=True)
 class Bytes:
-    """A picture for each byte of 32 or 64 bits, the highest first: two or four side by side.
+    """A picture for each byte of 32- or 64-bit samples, highest first: two or four side by side.
 
-    In two rows; the channels one under the other. So each slice of the codec has bytes of one
-    kind, and the high ones, which are smooth, do not share its statistics with the low ones.
+    In two rows, with channels stacked. So each slice of the codec has bytes of one kind, and the
+    smooth high bytes do not share statistics with the low ones.
 
     Attributes:
         size: Bytes of a sample, 4 or 8.
@@ -293,7 +293,7 @@ CHROMA_SHIFTS = {"yuv420p": (1, 1), "yuv422p": (1, 0), "yuv444p": (0, 0)}
 
 @dataclass(frozen=True, slots=True)
 class Packed422:
-    """Planes of Y, U and V, from pixels of two bytes that share U and V with a neighbour.
+    """Planes Y, U and V, from two-byte pixels that share U and V with a neighbour.
 
     Attributes:
         luma: Which of the two bytes is Y; in the other, U and V alternate.
@@ -326,10 +326,10 @@ class Packed422:
 
 @dataclass(frozen=True, slots=True)
 class SemiPlanar:
-    """Planes of Y, U and V, from a plane of Y over one of U and V in turn.
+    """Planes Y, U and V, from a Y plane above a plane of alternating U and V.
 
     Attributes:
-        halved: Whether chroma has half the width and height (nv12, nv21), or all (nv24).
+        halved: Whether chroma has half the width and height (nv12, nv21), or the full size (nv24).
         first: Which comes first, ``u`` or ``v``.
     """
 
@@ -345,7 +345,7 @@ class SemiPlanar:
         return width, height
 
     def arrange(self, samples: Samples) -> Picture:
-        """Views where rows follow each other."""
+        """Views if rows are contiguous."""
         height = self.luma_rows(samples)
         both = samples[height:].reshape(height >> self.halved, -1, 2)
         u = 0 if self.first == "u" else 1
@@ -369,7 +369,7 @@ class SemiPlanar:
 class Halved:
     """Chroma averaged to half the width and height; not exact.
 
-    The picture's sides are even; what is odd repeats its last row and column.
+    The picture's sides are even; odd images repeat their last row and column.
 
     Attributes:
         full: The exact arrangement of the same encoding.
@@ -378,7 +378,7 @@ class Halved:
     full: Packed422 | SemiPlanar
 
     def pixel_format(self, bits: int) -> str:
-        """What every lossy encoder takes."""
+        """The format that every lossy encoder supports."""
         return "yuv420p"
 
     def picture_size(self, width: int, height: int) -> tuple[int, int]:
@@ -413,7 +413,7 @@ class Halved:
 
 
 def _mean(plane: Samples, *, down: bool, across: bool) -> Samples:
-    """The rounded mean of two rows, two columns or both; what is odd repeats its neighbour."""
+    """The rounded mean of two rows, two columns or both; odd sizes repeat the last one."""
     pad = ((0, down and plane.shape[0] % 2), (0, across and plane.shape[1] % 2))
     total = np.pad(plane, pad, mode="edge").astype(np.uint16)
     if down:
@@ -427,9 +427,9 @@ def _mean(plane: Samples, *, down: bool, across: bool) -> Samples:
 # ---------------------------------------------------------------- palette
 
 FEWEST_ENTRIES, MOST_ENTRIES = 256, 4096
-"""Bounds of the length of a list, which is a power of two."""
+"""Bounds of a list's length, which is a power of two."""
 
-_ROOM = 3 / 2  # entries for each value of an image of the samples
+_ROOM = 3 / 2  # entries per value of a sample image
 
 
 def _values(samples: Samples) -> Samples:
@@ -443,11 +443,11 @@ def _values(samples: Samples) -> Samples:
 
 @dataclass(frozen=True, slots=True)
 class Few:
-    """Samples as `Whole` has them, of no more than so many values.
+    """Samples like those of `Whole`, with a limited number of different values.
 
     Attributes:
-        whole: What becomes of each.
-        entries: Most values of an image.
+        whole: Maps each sample.
+        entries: Maximum number of values of an image.
     """
 
     whole: Whole
@@ -484,14 +484,14 @@ class Few:
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
-        """Room for half as many values again, where they are sparse if they are integers."""
+        """Allow for half as many values again; integers must be sparse."""
         most = 0
         for pixels in samples:
             if len(_values(native(pixels)[::8, ::8])) > MOST_ENTRIES / _ROOM:
                 return None
             values = _values(Whole(encoding).encode(pixels))
             if not encoding.is_float and int(values[-1]) - int(values[0]) + 1 < 2 * len(values):
-                return None  # a plain picture has hardly more
+                return None  # a plain picture hardly has more
             most = max(most, len(values))
         entries = FEWEST_ENTRIES
         while entries < most * _ROOM:
@@ -501,7 +501,7 @@ class Few:
 
 @dataclass(frozen=True, slots=True)
 class Palette:
-    """The number of each sample in a list, and below the list itself.
+    """The index of each sample in a list, and the list itself below.
 
     Numbers of more than 8 bits are folded. The list is increasing, its last entry repeated;
     first come the highest bytes of all entries, then the next ones, by rows of the picture.
@@ -523,7 +523,7 @@ class Palette:
         return "gray"
 
     def picture_size(self, width: int, height: int) -> tuple[int, int]:
-        """Higher by the list."""
+        """Taller by the list."""
         _, rows = self._numbers.picture_size(width, height)
         return width, rows + -(-self.entries * self.size // width)
 
@@ -550,7 +550,7 @@ class Palette:
         return (picture,)
 
     def restore(self, picture: Picture, samples: Samples) -> None:
-        """Copy; numbers beyond the list, of a damaged video, are its last entry."""
+        """Copy; indices beyond the list, from a damaged video, mean its last entry."""
         height, width = samples.shape
         _, upper = self._numbers.picture_size(width, height)
         numbers = np.empty((height, width), np.uint8 if self.entries <= 256 else np.uint16)

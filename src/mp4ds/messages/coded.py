@@ -1,4 +1,4 @@
-"""What the parsers of coded pictures share: refusals, bounds, bits, and what they tell."""
+"""Shared by the parsers of coded pictures: refusals, bounds, bit reading, and their results."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from mp4ds.errors import Refused
 
 MAX_SIDE = 16384
-"""Largest width and height of a coded picture: what video decoders take."""
+"""Maximum width and height of a coded picture, a limit of video decoders."""
 
 MAX_IMAGE_BYTES = 2**28
-"""Most bytes of pixels that are unpacked from one coded picture."""
+"""Maximum bytes of pixels unpacked from one coded picture."""
 
 _MAX_UE_BITS = 32
 
 
 def check_size(width: int, height: int) -> None:
-    """Refuse a size that no video has.
+    """Refuse a size that no video can have.
 
     Raises:
         Refused: A side is zero or beyond `MAX_SIDE`.
@@ -29,7 +29,7 @@ class BitReader:
     """Reads fields of bits, most significant first.
 
     Args:
-        data: The bytes; a header's worth, since each read costs their length.
+        data: The bytes; only a header's worth, since each read costs their length.
     """
 
     def __init__(self, data: bytes) -> None:
@@ -72,7 +72,7 @@ REORDERED = "its stream shows pictures in another order than it sends them (B-fr
 
 
 class NoPicture(Refused):
-    """A packet without any picture, which no frame of a video can be made of."""
+    """A packet without any picture, which cannot be a video frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,23 +94,22 @@ class Picture:
 
 
 class UnknownStructure(Refused):
-    """What frames refer to cannot be told: they are decoded from the key frame on."""
+    """It is unknown what frames refer to: they are decoded from the key frame on."""
 
 
 @dataclass(frozen=True, slots=True)
 class CodedFrame:
-    """One coded frame in a packet, and which frames a decoder must have had before it.
+    """One coded frame in a packet, and the frames a decoder needs before it.
 
-    Frames are counted as they are coded, those among them that are not shown, or only show
-    another one.
+    Frames are counted as coded, including those that are not shown or only show another one.
 
     Attributes:
         start: Offset of its first byte in the packet.
         end: Offset after its last byte.
-        references: How many coded frames back each frame is that it needs, 1 being the one just
-            before; nearest first, none twice. Empty for a key frame.
+        references: How many coded frames back each frame it needs is, 1 being the previous one;
+            nearest first, without repetition. Empty for a key frame.
         shown: Whether a picture comes out.
-        existing: Whether it holds no picture and only shows the one that it refers to.
+        existing: Whether it has no picture of its own and only shows the one it refers to.
     """
 
     start: int

@@ -1,4 +1,4 @@
-"""Depth images: ROS' compressedDepth, of PNG or RVL."""
+"""Depth images: ROS's compressedDepth, as PNG or RVL."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def decode_rvl(data: bytes | memoryview) -> Depth:
         uint16 array of shape (rows, cols).
 
     Raises:
-        Refused: It is no RVL, cut short, or promises more pixels than it codes.
+        Refused: It is not RVL, is cut short, or declares more pixels than it codes.
     """
     if len(data) < _HEADER.size or len(data) % _WORD_BYTES:
         raise Refused("it is no RVL: it has no whole number of words")
@@ -42,7 +42,7 @@ def decode_rvl(data: bytes | memoryview) -> Depth:
     words = np.frombuffer(data, "<u4", offset=_HEADER.size)
     numbers = _read_numbers(_nibbles_of(words))
     starts, lengths, first = _read_runs(numbers, columns * rows)
-    # every number that is no count is a difference
+    # every number that is not a count is a difference
     is_difference = np.ones(first[-1] if len(first) else 0, bool)
     is_difference[first[:-1]] = False
     is_difference[first[:-1] + 1] = False
@@ -69,7 +69,7 @@ def encode_rvl(depth: Depth) -> bytes:
     zeros, nonzeros = np.diff(bounds)[0::2], np.diff(bounds)[1::2]
     values = flat[filled].astype(np.int64)
     differences = np.diff(values, prepend=0)
-    # each run's two counts stand before its differences
+    # each run's two counts are before its differences
     numbers = np.empty(len(values) + 2 * len(zeros), np.int64)
     first = np.cumsum(nonzeros) - nonzeros + 2 * np.arange(len(zeros))
     is_difference = np.ones(len(numbers), bool)
@@ -130,7 +130,7 @@ def _write_numbers(numbers: _Numbers) -> NDArray[np.uint8]:
 
 
 def _read_runs(numbers: _Numbers, pixels: int) -> tuple[_Numbers, _Numbers, _Numbers]:
-    """Where runs of pixels that are not zero are, and where their counts stand.
+    """Runs of non-zero pixels, and the positions of their counts.
 
     Returns:
         First pixel and length of each run, and the place of its counts among the numbers, with
@@ -173,7 +173,7 @@ _PARAMETERS = slice(4, HEADER_BYTES)  # of quantised inverse depths, in the head
 
 
 def told_encoding(format_: str | None) -> str:
-    """The encoding that the field ``format`` of a message begins with."""
+    """The encoding at the beginning of a message's field ``format``."""
     return (format_ or "").partition(";")[0].strip()
 
 
@@ -182,7 +182,7 @@ def is_depth(format_: str | None, header: bytes) -> bool:
 
     Args:
         format_: Field ``format`` of its message.
-        header: What stands before the file in its data.
+        header: What is before the file in its data.
     """
     return bool(header) or "compressedDepth" in (format_ or "")
 

@@ -31,7 +31,7 @@ class Encoding:
         dtype: numpy's kind and bytes of a sample: u1, i1, u2, i2, i4, f4 or f8.
         general: The exact layout without parameters that carries every image.
         exact: Exact layouts worth a try, in order of preference; `general` is among them.
-        lossy: Layout for lossy codecs; None where a lossy codec would harm the meaning.
+        lossy: Layout for lossy codecs; None if a lossy codec would harm the meaning.
         mosaic: For Bayer, the colours of the 2 x 2 block by rows, such as ``rggb``.
         rows: Rows of the array per row of the image: more than 1 for the semi-planar YUV.
         even: Numbers that divide width and height, for chroma of half the resolution.
@@ -77,7 +77,7 @@ class Encoding:
         return int(step * height * self.rows)
 
 
-# general layouts by the number of channels, and what further ones may stand beside them
+# general layouts by the number of channels, and what further ones may be beside them
 _OF_BYTES = {1: "gray8", 2: "stack8", 3: "bgr24", 4: "bgra"}
 _OF_WORDS = {1: "gray16", 2: "stack16", 3: "gbr16", 4: "gbra16"}
 _MORE = {
@@ -89,7 +89,7 @@ _METRES = ("metres16", "metres_fold", "table", "palette")
 
 
 def _of_samples(name: str, channels: int, dtype: str, lossy: str | None = None) -> Encoding:
-    """One to four channels without a meaning of their own, as OpenCV's matrices have them."""
+    """One to four channels without a defined meaning, as in OpenCV's matrices."""
     general = {"1": _OF_BYTES, "2": _OF_WORDS}.get(dtype[1], {}).get(channels, "bytes")
     more = _METRES if name == "32FC1" else _MORE.get(general, ())
     if name == "8UC4":
@@ -174,7 +174,7 @@ def pixel_view(
 
     Returns:
         Array of `Encoding.shape`, of the encoding's type in the message's byte order; writable
-        where the data is. ``yuv422`` and its like give (height, width, 2); ``nv12`` and ``nv21``
+        where the data is. ``yuv422`` and the like give (height, width, 2); ``nv12`` and ``nv21``
         (height * 3 / 2, width), luma over interleaved chroma; ``nv24`` (height * 3, width), where
         two rows hold the chroma of one.
     """
@@ -189,10 +189,10 @@ def pixel_view(
 def row_padding(
     data: memoryview, encoding: Encoding, *, width: int, height: int, step: int
 ) -> bytes | None:
-    """The bytes after the pixels of each row; None where all rows have them, and all are zero.
+    """The bytes after the pixels of each row; None if all rows have them, and all are zero.
 
     Args:
-        data: Of an image for which `why_not` knows no reason.
+        data: Of an image that `why_not` accepts.
         encoding: The image's encoding.
         width: Columns.
         height: Rows of the image.
@@ -212,7 +212,7 @@ def put_padding(data: bytearray | memoryview, padding: bytes, *, row_bytes: int,
 
     Args:
         data: All rows, to be changed.
-        padding: Of all rows, or of all but the last.
+        padding: Of all rows, or of all except the last.
         row_bytes: Of the pixels of a row.
         step: Bytes per row.
     """
@@ -232,12 +232,12 @@ DEPTHS = (8, 10, 12, 14)
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """What a layout needs to know of a stream; a layout has all of its own and no other.
+    """Parameters of a layout for a stream; a layout has exactly the ones it needs.
 
     Attributes:
         bits: Bits per sample of the picture.
         shift: Zero bits below them in each sample of the image.
-        low: How many of the bits are low ones, folded and stored apart.
+        low: Number of low bits, folded and stored separately.
         table: The bit patterns that occur, in increasing order.
         entries: Length of the list of values in each picture.
         hole: Bit pattern of the float that stands for no measurement.
@@ -256,17 +256,17 @@ class Parameters:
 
     @property
     def names(self) -> frozenset[str]:
-        """Names of those that are there."""
+        """Names of those that are set."""
         return frozenset(f.name for f in fields(self) if getattr(self, f.name) is not None)
 
     def to_values(self) -> dict[str, Any]:
-        """As JSON has it, without those that are not there."""
+        """As JSON values, without those that are not set."""
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name in self.names}
         return values | ({"table": list(self.table)} if self.table is not None else {})
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> Parameters:
-        """The parameters of `to_values`; `mp4ds.messages.layouts.bind` checks what they say.
+        """The inverse of `to_values`; `mp4ds.messages.layouts.bind` checks the values.
 
         Raises:
             ValueError: A name is unknown.
@@ -284,7 +284,7 @@ NO_PARAMETERS = Parameters()
 
 
 class Values(Protocol):
-    """A bijection between samples of an image and those of its picture."""
+    """A bijection between the samples of an image and those of its picture."""
 
     @property
     def bits(self) -> int:
@@ -298,13 +298,13 @@ class Values(Protocol):
         """Shape of the samples of pixels."""
 
     def encode(self, pixels: Pixels) -> Samples:
-        """Samples of pixels that are not refused; may be a view."""
+        """Samples of accepted pixels; may be a view."""
 
     def decode(self, samples: Samples, out: Pixels) -> None:
         """Write the pixels of samples into ``out``, in its byte order."""
 
     def refuses(self, pixels: Pixels) -> str | None:
-        """Why these pixels would not come back, or None if they do."""
+        """Why these pixels would not be restored, or None if they would."""
 
 
 def patterns(pixels: Pixels) -> Samples:
@@ -320,7 +320,7 @@ def native(pixels: Pixels) -> Samples:
 
 @dataclass(frozen=True, slots=True)
 class Whole:
-    """Samples as they are; of signed integers the top bit is inverted, which keeps their order.
+    """Samples as they are; signed integers have their top bit inverted, which keeps their order.
 
     Attributes:
         encoding: The image's.
@@ -359,12 +359,12 @@ class Whole:
 
 @dataclass(frozen=True, slots=True)
 class Narrow:
-    """The bits of 16 that are in use.
+    """The bits in use of 16-bit samples.
 
     Attributes:
         bits: Bits per sample, one of `DEPTHS` or 16.
         shift: Zero bits below them.
-        signed: Half of the range is added first.
+        signed: Whether half of the range is added first.
     """
 
     bits: int
@@ -373,7 +373,7 @@ class Narrow:
 
     @property
     def is_identity(self) -> bool:
-        """Where only the picture's format differs."""
+        """If only the picture's format differs."""
         return self.bits > 8 and not self.shift and not self.signed
 
     @property
@@ -382,7 +382,8 @@ class Narrow:
 
     def _shifted(self, pixels: Pixels) -> Samples:
         samples = native(pixels)
-        return samples + np.uint16(self._half) if self.signed else samples  # wraps, as it must
+        # wraps around, as intended
+        return samples + np.uint16(self._half) if self.signed else samples
 
     def shape(self, pixels: Pixels) -> tuple[int, ...]:
         """That of the pixels."""
@@ -403,7 +404,7 @@ class Narrow:
         patterns(out)[...] = wide - np.uint16(self._half) if self.signed else wide
 
     def refuses(self, pixels: Pixels) -> str | None:
-        """A bit outside of those that are kept."""
+        """A bit outside the kept ones."""
         used = int(np.bitwise_or.reduce(self._shifted(pixels), axis=None))
         kept = ((1 << self.bits) - 1) << self.shift
         if used & ~kept:
@@ -413,10 +414,10 @@ class Narrow:
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
-        """The least bits for values that end at the highest bit, or at the twelfth.
+        """The fewest bits for values that end at the highest bit, or at the twelfth.
 
-        At the highest bit, the zeros below tell the sensor's depth. Elsewhere a scene may just
-        be dark, so that fewer than 12 bits are taken for granted only where a value has them all.
+        At the highest bit, the zeros below show the sensor's depth. Elsewhere a scene may just be
+        dark, so fewer than 12 bits are assumed only if a value uses them all.
         """
         used = most = 0
         for pixels in samples:
@@ -428,7 +429,8 @@ class Narrow:
         bits = (used >> zeros).bit_length()
         if not encoding.is_signed and bits in DEPTHS and most >> zeros == (1 << bits) - 1:
             return Parameters(bits=bits, shift=zeros)
-        for top, least in ((16, 4), (12, 0), (16, 2)):  # where the values end, by the zeros below
+        # top bit of the values, and minimum zero bits below
+        for top, least in ((16, 4), (12, 0), (16, 2)):
             bits = next((depth for depth in DEPTHS if depth >= top - zeros), 16)
             narrow = cls(bits, top - bits, encoding.is_signed)
             if zeros >= least and bits < 16 and not any(map(narrow.refuses, samples)):
@@ -438,7 +440,7 @@ class Narrow:
 
 @dataclass(frozen=True, slots=True)
 class Opaque:
-    """The colours of pixels that all have the same alpha, of 8 bits.
+    """The colours of 8-bit pixels that all have the same alpha.
 
     Attributes:
         alpha: Of every pixel.
@@ -470,14 +472,14 @@ class Opaque:
         out[..., 3] = self.alpha
 
     def refuses(self, pixels: Pixels) -> str | None:
-        """Another alpha."""
+        """A different alpha."""
         if (pixels[..., 3] != self.alpha).any():
             return f"an alpha that is not the stream's, {self.alpha}"
         return None
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
-        """The alpha of the first pixel, if it is that of all."""
+        """The alpha of the first pixel, if all have it."""
         alpha = int(samples[0][0, 0, 3])
         if any(cls(alpha).refuses(pixels) for pixels in samples):
             return None
@@ -487,15 +489,15 @@ class Opaque:
 # ---------------------------------------------------------------- numbers
 
 MAX_TABLE = 4096
-"""Most values of a table; bounds what a sidecar can hold."""
+"""Maximum number of values in a table; bounds a sidecar's size."""
 
 SCALES = ("product", "quotient")
-"""How metres were made of millimetres: ``k * 0.001f`` or ``k / 1000``."""
+"""How metres were made from millimetres: ``k * 0.001f`` or ``k / 1000``."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatternTable:
-    """The number of each bit pattern in a list of those that occur.
+    """The index of each bit pattern in a list of those that occur.
 
     Attributes:
         table: The patterns, increasing, uint16 or uint32.
@@ -505,7 +507,7 @@ class PatternTable:
 
     @property
     def bits(self) -> int:
-        """What its numbers need, in whole bytes."""
+        """As many as its indices need, in whole bytes."""
         return 8 if len(self.table) <= 256 else 16
 
     @property
@@ -514,7 +516,7 @@ class PatternTable:
         return False
 
     def _numbers(self, samples: Samples) -> Samples:
-        """For each sample the number of the last pattern that is not greater, or 0."""
+        """For each sample the index of the last pattern that is not greater, or 0."""
         if samples.dtype.itemsize == 2:
             every = np.arange(65536, dtype=np.uint16)
             numbers = np.searchsorted(self.table, every, side="right")
@@ -532,7 +534,7 @@ class PatternTable:
         return numbers.astype(np.uint8) if self.bits == 8 else numbers
 
     def decode(self, samples: Samples, out: Pixels) -> None:
-        """Write the pixels; numbers beyond the table, of a damaged video, are the last."""
+        """Write the pixels; indices beyond the table, from a damaged video, mean the last entry."""
         patterns(out)[...] = np.take(self.table, samples, mode="clip")
 
     def refuses(self, pixels: Pixels) -> str | None:
@@ -546,16 +548,16 @@ class PatternTable:
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
-        """The patterns of the samples, where they are few, and sparse if they are integers.
+        """The patterns of the samples, if they are few; integers must also be sparse.
 
-        Where the second half of the samples has patterns that the first has not, later images
-        would have others again.
+        If the second half of the samples has patterns missing in the first, later images would have
+        yet others.
         """
         half = (len(samples) + 1) // 2
         found: Samples = np.empty(0, f"u{encoding.bytes_per_sample}")
         for number, pixels in enumerate(samples):
             patterns_here, before = native(pixels), len(found)
-            for part in (patterns_here[::16, ::16], patterns_here):  # most refusals are cheap
+            for part in (patterns_here[::16, ::16], patterns_here):  # makes most refusals cheap
                 found = np.union1d(found, part)
                 if len(found) > MAX_TABLE or (number >= half and len(found) > before):
                     return None
@@ -570,7 +572,7 @@ _EXPONENT = 0x7F800000  # all ones in NaN and infinity
 
 @cache
 def _metres(scale: str) -> Samples:
-    """Bit patterns of 0 to 65535 millimetres in metres, as float32; not to be written to."""
+    """Bit patterns of 0 to 65535 millimetres in metres, as float32; read-only."""
     counts = np.arange(65536, dtype=np.float32)
     thousand = np.float32(1000)
     metres = counts * np.float32(0.001) if scale == "product" else counts / thousand
@@ -581,7 +583,7 @@ def _metres(scale: str) -> Samples:
 
 @dataclass(frozen=True, slots=True)
 class Metres:
-    """Whole millimetres, of floats that hold them in metres; 0 is the hole.
+    """Whole millimetres, from floats in metres; 0 is the hole.
 
     Attributes:
         hole: Bit pattern of a float32: 0, a NaN or an infinity.

@@ -1,4 +1,4 @@
-"""JPEG: what its markers say, and whether it is whole (ITU-T T.81, annex B)."""
+"""Parses JPEG markers and checks completeness (ITU-T T.81, annex B)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _OTHER_FRAMES = {
     **dict.fromkeys((0xC5, 0xC6, 0xC7), "hierarchical"),
     **dict.fromkeys((0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF, _DAC), "arithmetic-coded"),
 }
-# a marker inside of coded data: neither a stuffed 0xFF, nor a restart, nor a fill byte
+# a marker inside coded data: not a stuffed 0xFF, a restart, or a fill byte
 _FILL = re.compile(rb"\xff*")
 _MAX_SEGMENTS = 2**16
 _MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
@@ -36,7 +36,7 @@ _OTHER_IMAGES = [
     )
 ]
 
-# sampling factors of Y, Cb and Cr, horizontal then vertical, that decoders know -> its name
+# sampling factors of Y, Cb and Cr, horizontal then vertical, that decoders support -> name
 _SAMPLINGS = {
     (0x11, 0x11, 0x11): "444",
     (0x12, 0x12, 0x12): "444",
@@ -54,7 +54,7 @@ _SAMPLINGS = {
 
 @dataclass(frozen=True, slots=True)
 class JpegInfo:
-    """What a JPEG says about itself.
+    """A JPEG's properties.
 
     Attributes:
         width: Columns.
@@ -78,14 +78,14 @@ class JpegInfo:
 def parse(data: bytes | memoryview) -> JpegInfo:
     """Walk a JPEG's markers up to its end.
 
-    Huffman tables may be absent, as in what many USB cameras send: decoders of motion JPEG
-    know the usual ones.
+    Huffman tables may be absent, as with many USB cameras: motion JPEG decoders know the usual
+    ones.
 
     Args:
         data: The whole JPEG, with whatever follows it.
 
     Raises:
-        Refused: It is none, it is cut short, or of a kind that video decoders do not take.
+        Refused: It is not a JPEG, is cut short, or is of a kind that video decoders do not support.
     """
     data = memoryview(data)
     if bytes(data[:2]) != b"\xff\xd8":
@@ -131,7 +131,7 @@ def parse(data: bytes | memoryview) -> JpegInfo:
 
 
 def _next_marker(data: memoryview, offset: int) -> tuple[int, int]:
-    """The marker at an offset, past fill bytes, and where what it marks begins."""
+    """The marker at an offset, past fill bytes, and where its content begins."""
     if offset >= len(data):
         raise Refused("its JPEG is cut short: it has no end-of-image marker")
     if data[offset] != 0xFF:
@@ -144,7 +144,7 @@ def _next_marker(data: memoryview, offset: int) -> tuple[int, int]:
 
 
 def _segment(data: memoryview, offset: int) -> memoryview:
-    """What a marker segment holds after its length."""
+    """The content of a marker segment after its length."""
     length = int.from_bytes(data[offset : offset + 2], "big")
     if length < 2 or offset + length > len(data):
         raise Refused("its JPEG is cut short, or a length in it is wrong")

@@ -1,7 +1,7 @@
-"""How the pixels of a ROS image become the picture that a video holds, and return.
+"""How the pixels of a ROS image become the picture in a video, and back.
 
-A picture is what the encoder is given, in one of ffmpeg's pixel formats; the codec is not chosen
-here. A layout is a step on the values (`mp4ds.messages.encodings`) and one on their places
+A picture is the encoder's input, in one of FFmpeg's pixel formats; the codec is not chosen here. A
+layout is a step on the values (`mp4ds.messages.encodings`) and one on their places
 (`mp4ds.messages.arrangements`).
 """
 
@@ -53,22 +53,22 @@ from mp4ds.messages.encodings import (
 )
 
 _MOST_LOW, _MOST_HIGH = 8, 10  # bits that a plane of `Fold` may have
-_LOW_BITS = {12: 3, 14: 5, 16: 8}  # by measurement: what is mostly noise
+_LOW_BITS = {12: 3, 14: 5, 16: 8}  # by measurement: the bits that are mostly noise
 _OF_COLOURS = {"rgba": "rgb24", "bgra": "bgr24"}
 
 
 @dataclass(frozen=True, slots=True)
 class LayoutKind:
-    """A layout as the registry has it.
+    """A layout of the registry.
 
     Attributes:
-        name: As the registry spells it.
-        is_exact: Whether the pixels return if the picture does.
-        is_shown: Whether the picture looks like the image, so that its colours are to be told.
-        parameters: Names of the parameters that it needs, all of them.
-        values: What the picture holds for each sample.
-        arrangement: Where.
-        fit: The parameters that suit samples of a stream, where there are any.
+        name: Its name in the registry.
+        is_exact: Whether the pixels are restored if the picture is.
+        is_shown: Whether the picture looks like the image, so that its colours are tagged.
+        parameters: Names of all the parameters it needs.
+        values: Makes the values of the picture.
+        arrangement: Makes their placement.
+        fit: Finds parameters that suit samples of a stream, if any.
     """
 
     name: str
@@ -102,7 +102,7 @@ def _narrow(encoding: Encoding, parameters: Parameters) -> Narrow:
 
 
 def _narrow_planes(encoding: Encoding, parameters: Parameters) -> Narrow:
-    """Planes of colours have more than 8 bits, by ffmpeg's formats."""
+    """Colour planes have more than 8 bits in FFmpeg's formats."""
     if parameters.bits == 8:
         raise ValueError("no layout has colour planes of 8 bits")
     return _narrow(encoding, parameters)
@@ -123,7 +123,7 @@ def _folded(encoding: Encoding, parameters: Parameters) -> Narrow:
 
 
 def _fit_folded(encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
-    """All bits, or those in use if there are enough of them to tell noise from the rest."""
+    """All bits, or those in use if there are enough of them to separate noise from the rest."""
     found = Narrow.fit(encoding, samples) or Parameters(bits=16, shift=0)
     low = _LOW_BITS.get(found.bits or 0)
     return None if low is None else replace(found, low=low)
@@ -173,7 +173,7 @@ def _is_integer(value: Any, top: int) -> bool:
 
 
 def _rgb_order(encoding: Encoding) -> str:
-    """Channels without a name are blue, green, red and alpha, as OpenCV has them."""
+    """Unnamed channels are blue, green, red and alpha, as in OpenCV."""
     return encoding.name.rstrip("1680") if encoding.name[0] in "rb" else "bgra"[: encoding.channels]
 
 
@@ -267,7 +267,7 @@ LAYOUTS: dict[str, LayoutKind] = {
         _kind("mosaic16", _WHOLE, _mosaic),
         _kind("mosaic_bits", _BITS, _mosaic),
         _kind("mosaic_fold", _FOLDED, _fold_mosaic),
-        # demosaicing is done by the video's converter; sampling it again gives the mosaic
+        # demosaicing is done by the video's converter; resampling restores the mosaic
         _kind(
             "demosaic8", _WHOLE, lambda e, _: Packed(f"bayer_{e.mosaic}8"), exact=False, shown=True
         ),
@@ -291,14 +291,14 @@ LAYOUTS: dict[str, LayoutKind] = {
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """One way of laying the pixels of a stream out as pictures.
+    """A way of arranging a stream's pixels as pictures.
 
     Attributes:
-        name: As the registry spells it.
+        name: Its name in the registry.
         encoding: Of the images.
         parameters: Of the layout.
-        is_exact: Whether the pixels return if the picture does.
-        is_shown: Whether the picture looks like the image, so that its colours are to be told.
+        is_exact: Whether the pixels are restored if the picture is.
+        is_shown: Whether the picture looks like the image, so that its colours are tagged.
         pixel_format: ffmpeg's name of the picture's format.
     """
 
@@ -316,7 +316,7 @@ class Layout:
         return self._arrangement.picture_size(width, height)
 
     def refuses(self, pixels: Pixels) -> str | None:
-        """Why the pixels of an image would not come back, or None if they do.
+        """Why an image's pixels would not be restored, or None if they would.
 
         Args:
             pixels: As `mp4ds.messages.encodings.pixel_view` gives them.
@@ -324,7 +324,7 @@ class Layout:
         return self._values.refuses(pixels)
 
     def to_picture(self, pixels: Pixels) -> Picture:
-        """The picture of pixels that are not refused; may be a view of them.
+        """The picture of accepted pixels; may be a view of them.
 
         Args:
             pixels: As `mp4ds.messages.encodings.pixel_view` gives them.
@@ -350,15 +350,15 @@ class Layout:
 
 
 def bind(name: str, encoding: Encoding, parameters: Parameters = NO_PARAMETERS) -> Layout:
-    """The layout of that name for the images of a stream.
+    """The layout with that name for the images of a stream.
 
     Args:
-        name: One that the encoding may have.
+        name: One allowed for the encoding.
         encoding: Of the images.
-        parameters: All that the layout needs and no other.
+        parameters: Exactly those that the layout needs.
 
     Raises:
-        ValueError: The encoding may not have it, or the parameters are not those it needs.
+        ValueError: The encoding does not allow it, or the parameters are not those it needs.
     """
     if name not in (*encoding.exact, encoding.lossy):
         raise ValueError(f"layout {name} does not carry {encoding.name} images")
@@ -383,10 +383,10 @@ def bind(name: str, encoding: Encoding, parameters: Parameters = NO_PARAMETERS) 
 
 
 def fit(name: str, encoding: Encoding, samples: Sequence[Pixels]) -> Layout | None:
-    """The layout with the parameters that suit samples of a stream, or None if none do.
+    """The layout with parameters that suit samples of a stream, or None if there are none.
 
     Args:
-        name: One that the encoding may have.
+        name: One allowed for the encoding.
         encoding: Of the images.
         samples: Pixels of some of its images, at least one.
 
@@ -401,7 +401,7 @@ def layout_for(encoding: Encoding, *, lossless: bool) -> Layout:
     """The layout that carries every image of an encoding, for a lossless or lossy codec.
 
     Raises:
-        OptionError: No lossy layout exists.
+        OptionError: There is no lossy layout.
     """
     name = encoding.general if lossless else encoding.lossy
     if name is None:
@@ -409,12 +409,12 @@ def layout_for(encoding: Encoding, *, lossless: bool) -> Layout:
     return bind(name, encoding)
 
 
-@lru_cache(maxsize=256)  # the images of a stream have one geometry
+@lru_cache(maxsize=256)  # the images of a stream share one geometry
 def why_not(encoding_name: str, *, width: int, height: int, step: int, size: int) -> str | None:
     """Why no layout carries an image of this geometry, or None if one does.
 
     Args:
-        encoding_name: As the message has it.
+        encoding_name: As in the message.
         width: Columns.
         height: Rows.
         step: Bytes per row.

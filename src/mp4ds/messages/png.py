@@ -1,4 +1,4 @@
-"""PNG: unpacked into pixels and a recipe, of which the same file is made again."""
+"""PNG: unpacked into pixels and a recipe, from which the same file is rebuilt."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class Rule:
     """How an encoder chooses the filter of each row.
 
     Attributes:
-        kinds: The filters tried, in order. The one whose bytes, taken as signed, have the
-            smallest sum of absolute values is taken; of equal ones the first.
+        kinds: The filters to try, in order. The one whose bytes, taken as signed, have the smallest
+            sum of absolute values is used; the first of equals.
         first: Filter of the first row, if it is always the same.
-        weight: What the number of a filter adds to its sum.
-        narrow: Whether filters are left out for images of one row or column, as libpng does.
+        weight: How much a filter's number adds to its sum.
+        narrow: Whether filters are skipped for images of one row or column, as in libpng.
     """
 
     kinds: tuple[int, ...]
@@ -54,7 +54,7 @@ RULES = MappingProxyType(
         **{f"1,{kind}": Rule((kind,), first=_SUB) for kind in range(2, 5)},
     }
 )
-"""Name of a rule -> the rule. A number is the filter of all rows; after ``1,`` of all but one."""
+"""Name of a rule -> the rule. A number is the filter of all rows; after ``1,`` of the others."""
 
 
 def unfilter(rows: Bytes, pixel_bytes: int) -> Bytes:
@@ -86,7 +86,7 @@ def unfilter(rows: Bytes, pixel_bytes: int) -> Bytes:
 
 
 def _unfilter_simple(rows: Bytes, pixel_bytes: int) -> Bytes:
-    """Undo filters of which none needs two neighbours."""
+    """Undo filters that need at most one neighbour."""
     out: Bytes = rows[:, 1:].copy()
     kinds = rows[:, 0]
     subs = np.flatnonzero(kinds == _SUB)
@@ -101,14 +101,14 @@ def _unfilter_simple(rows: Bytes, pixel_bytes: int) -> Bytes:
 def _unfilter_front(rows: Bytes, above: Bytes, pixel_bytes: int, out: Bytes) -> None:
     """Undo any filters, along a front that moves over all rows at once.
 
-    A pixel needs those left, above, and left above of it. On the front of pixels whose column
-    and row have the same sum, none needs another.
+    A pixel needs its left, upper, and upper left neighbours. Pixels on a front, whose column and
+    row have the same sum, do not need each other.
     """
     height, width = len(rows), (rows.shape[1] - 1) // pixel_bytes
     steps = height + width - 1
     coded = np.zeros((steps, height, pixel_bytes), np.uint8)
     _slanted(coded, width)[...] = rows[:, 1:].reshape(height, width, pixel_bytes)
-    # fronts[d + 2, y + 1] is the pixel (d - y, y); the row above stands at y = -1
+    # fronts[d + 2, y + 1] is the pixel (d - y, y); the row above is at y = -1
     fronts = np.zeros((steps + 2, height + 1, pixel_bytes), np.int16)
     fronts[1 : width + 1, 0] = above.reshape(width, pixel_bytes)
     kinds = rows[:, 0][:, None]
@@ -135,7 +135,7 @@ def _slanted(fronts: NDArray[Any], width: int) -> NDArray[Any]:
 
 
 def _paeth(left: _Wide, above: _Wide, corner: _Wide) -> _Wide:
-    """The neighbour nearest to left + above - corner; of equally near ones the first."""
+    """The neighbour nearest to left + above - corner; the first of equally near ones."""
     from_left = above - corner
     from_above = left - corner
     from_corner = np.abs(from_left + from_above)
@@ -149,7 +149,7 @@ def _paeth(left: _Wide, above: _Wide, corner: _Wide) -> _Wide:
 
 
 def filter_rows(pixels: Bytes, pixel_bytes: int, rule: Rule) -> Bytes:
-    """Filter rows as a rule says.
+    """Filter rows by a rule.
 
     Args:
         pixels: Shape (H, bytes of a row).
@@ -235,7 +235,7 @@ def _filtered(band: Bytes, above: Bytes, pixel_bytes: int, kind: int) -> Bytes:
     if kind == _SUB:
         return band - left
     if kind == _AVERAGE:
-        # the mean, rounded down, without a carry
+        # the mean, rounded down, without overflow
         return band - ((left & above) + ((left ^ above) >> 1))
     corner = _moved(above, pixel_bytes)
     wide = (part.astype(np.int16) for part in (left, above, corner))
@@ -272,7 +272,7 @@ PNG_ENCODINGS = {
     (2, 3): "rgb16",
     (2, 4): "rgba16",
 }
-"""Bytes of a sample and samples of a pixel -> the ROS image encoding that a PNG is taken for."""
+"""Bytes of a sample and samples of a pixel -> the ROS image encoding that a PNG is taken as."""
 _MAX_AROUND = 2**16  # bytes of other chunks
 _MAX_CHUNKS = 2**17
 _MIN_CHUNK = 256
@@ -294,7 +294,7 @@ _MEMORY_LEVELS = (8, 9)
 
 @dataclass(frozen=True, slots=True)
 class PngInfo:
-    """What a PNG's header says (11.2.1).
+    """A PNG's header (11.2.1).
 
     Attributes:
         width: Columns.
@@ -318,7 +318,7 @@ class PngInfo:
 
 @dataclass(frozen=True, slots=True)
 class PngRecipe:
-    """How to make a PNG of its pixels.
+    """How to make a PNG from its pixels.
 
     Attributes:
         filters: Name of a rule of `png_filters.RULES`.
@@ -327,7 +327,7 @@ class PngRecipe:
         memory_level: Deflate's memory level, 8 or 9.
         window_bits: Deflate's window, 9 to 15.
         zlib_header: The two bytes before the deflated data, in hexadecimal.
-        chunk_bytes: Image data in each IDAT chunk but the last; 0: one chunk.
+        chunk_bytes: Image data in each IDAT chunk except the last; 0: one chunk.
         before: Chunks between the header and the image data, in base64.
         after: What follows the image data, in base64.
     """
@@ -353,14 +353,14 @@ class _Parts:
 
 
 def zlib_build() -> str:
-    """The version of the zlib in use, which names other implementations where they say so."""
+    """The version of the zlib in use, which may name another implementation."""
     return zlib.ZLIB_RUNTIME_VERSION
 
 
 def zlib_fingerprint() -> str:
-    """A checksum of what the zlib in use makes of a fixed input.
+    """A checksum of the output of the zlib in use for a fixed input.
 
-    Where two machines have the same one, PNGs taken apart on one rebuild on the other: zlib
+    If two machines have the same one, PNGs unpacked on one can be rebuilt on the other: zlib
     1.2.8 to 1.3.1 have the same, zlib-ng another.
 
     Returns:
@@ -382,7 +382,7 @@ def parse(data: bytes | memoryview) -> PngInfo:
     """Read a PNG's header.
 
     Raises:
-        Refused: It is no PNG, or has a size that no video has.
+        Refused: It is not a PNG, or has a size that no video can have.
     """
     head = bytes(data[:33])
     if head[:8] != SIGNATURE or head[8:16] != b"\0\0\0\rIHDR" or len(head) < 33:
@@ -410,18 +410,18 @@ def check_whole(data: bytes | memoryview) -> None:
 
 
 def decode(data: bytes | memoryview, hint: PngRecipe | None = None) -> tuple[Pixels, PngRecipe]:
-    """Unpack a PNG whose bytes can be made again, which is tried.
+    """Unpack a PNG that can be rebuilt byte for byte, which is verified.
 
     Args:
         data: The whole PNG, with whatever follows it.
-        hint: Recipe of another image of the same encoder, which is tried first.
+        hint: Recipe of another image from the same encoder, tried first.
 
     Returns:
         Pixels of shape (H, W), or (H, W, C) with 2 to 4 channels in the file's order, uint8 or
-        uint16 in the machine's byte order; and the recipe with which `rebuild` gives the data.
+        uint16 in the machine's byte order; and the recipe with which `rebuild` restores the data.
 
     Raises:
-        Refused: It is no whole PNG, of a kind that is not unpacked, or does not rebuild.
+        Refused: It is incomplete, of an unsupported kind, or cannot be rebuilt.
     """
     parts = _split(data)
     info = parts.info
@@ -454,14 +454,14 @@ def decode(data: bytes | memoryview, hint: PngRecipe | None = None) -> tuple[Pix
 
 
 def rebuild(pixels: Pixels, recipe: PngRecipe) -> bytes:
-    """Make a PNG of its pixels.
+    """Make a PNG from its pixels.
 
     Args:
         pixels: As `decode` gave them.
         recipe: As `decode` gave it.
 
     Raises:
-        Refused: The recipe is none, or the pixels are of a kind that no PNG has.
+        Refused: The recipe is not valid, or no PNG can have such pixels.
     """
     rule = RULES.get(recipe.filters)
     if rule is None or not (recipe.chunk_bytes == 0 or recipe.chunk_bytes >= _MIN_CHUNK):
@@ -500,7 +500,7 @@ def _deflate(rows: NDArray[np.uint8], recipe: PngRecipe) -> bytes:
 
 
 def _chunk(body: bytes) -> bytes:
-    """A chunk of its type and data (5.3)."""
+    """A chunk from its type and data (5.3)."""
     return b"%b%b%b" % (
         (len(body) - 4).to_bytes(4, "big"),
         body,
@@ -509,7 +509,7 @@ def _chunk(body: bytes) -> bytes:
 
 
 def _split(data: bytes | memoryview) -> _Parts:
-    """Take a PNG apart around its image data."""
+    """Split a PNG around its image data."""
     info = parse(data)
     if info.color_type == _PALETTE or info.bit_depth not in (8, 16):
         raise Refused(f"its PNG has a palette, or {info.bit_depth} bits a sample")
@@ -540,7 +540,7 @@ def _split(data: bytes | memoryview) -> _Parts:
 
 
 def _chunks(data: memoryview, offset: int) -> Iterator[tuple[bytes, int, int]]:
-    """Type, begin and end of chunks, up to the one that ends a PNG."""
+    """Type, start and end of chunks, up to the one that ends a PNG."""
     for _ in range(_MAX_CHUNKS):
         if offset >= len(data):
             break
@@ -557,7 +557,7 @@ def _chunks(data: memoryview, offset: int) -> Iterator[tuple[bytes, int, int]]:
 
 
 def _chunk_rule(sizes: list[int]) -> int:
-    """How much goes into an IDAT chunk, 0 where all is in one."""
+    """Size of IDAT chunks, 0 if there is only one."""
     size = sizes[0] if len(sizes) > 1 else 0
     if size and (set(sizes[:-1]) != {size} or not 0 < sizes[-1] <= size or size < _MIN_CHUNK):
         raise Refused(f"{_NO_REBUILD}: its chunks follow no rule")
@@ -565,7 +565,7 @@ def _chunk_rule(sizes: list[int]) -> int:
 
 
 def _inflate(parts: _Parts) -> NDArray[np.uint8]:
-    """The filtered rows, shape (H, 1 + bytes of a row); never more than the header promises."""
+    """The filtered rows, shape (H, 1 + bytes of a row); never more than the header declares."""
     info = parts.info
     row_bytes = 1 + info.width * info.pixel_bytes
     size = row_bytes * info.height
@@ -590,16 +590,16 @@ def _to_pixels(rows: NDArray[np.uint8], info: PngInfo) -> Pixels:
 
 
 def _holds(parts: _Parts, recipe: PngRecipe) -> bool:
-    """Whether a recipe fits what need not be computed."""
+    """Whether a recipe matches what need not be computed."""
     same_chunks = recipe.chunk_bytes == parts.chunk_bytes or not parts.chunk_bytes
     return same_chunks and recipe.zlib_header == parts.deflated[:2].hex()
 
 
 def _codings(deflated: bytes, rows: NDArray[np.uint8]) -> Iterator[tuple[int, int, int, int]]:
-    """Deflate's parameters that code the beginning alike: level, strategy, memory and window."""
+    """Deflate parameters that reproduce the beginning: level, strategy, memory and window."""
     probe = rows.data.cast("B")[:_PROBE_BYTES]
     window = (deflated[0] >> 4) + 8
-    # libpng takes a window just larger than a small image, and shrinks what the header says
+    # libpng uses a window just larger than a small image, and a smaller one in the header
     windows = sorted({max(9, window), min(15, max(9, window + 1)), 15})
     for level, strategy in _CODINGS[deflated[1] >> 6]:
         for memory_level in _MEMORY_LEVELS:

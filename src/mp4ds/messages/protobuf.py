@@ -53,7 +53,7 @@ def fields_of_type(type_name: str) -> Mapping[str, Kind]:
     """Names and kinds of the fields of a message type.
 
     Raises:
-        WireError: It is none of `TYPES`.
+        WireError: It is not one of `TYPES`.
     """
     if type_name not in TYPES:
         raise WireError(f"type {type_name!r} is not modelled")
@@ -61,11 +61,11 @@ def fields_of_type(type_name: str) -> Mapping[str, Kind]:
 
 
 def join_fields(type_name: str, values: Mapping[str, Any]) -> Fields:
-    """What a message says besides its header and body.
+    """A message's fields besides its header and body.
 
     Args:
         type_name: One of `TYPES`.
-        values: All its fields of text, numbers and lists of numbers, by name.
+        values: All its text, number and number-list fields, by name.
 
     Raises:
         WireError: A calibration cannot be modelled.
@@ -98,10 +98,10 @@ def join_fields(type_name: str, values: Mapping[str, Any]) -> Fields:
 
 
 def join_wide_stamp(sec: int, nanosec: int) -> int:
-    """Nanoseconds, where seconds may be beyond what a column holds.
+    """Nanoseconds, where seconds may be out of a column's range.
 
     Raises:
-        WireError: A stamp that does not come back from them, or needs more than 64 bits.
+        WireError: The stamp cannot be restored from them, or needs more than 64 bits.
     """
     stamp = join_stamp(sec, nanosec)
     if not -_INT64 <= stamp < _INT64:
@@ -115,7 +115,7 @@ class Pieces:
 
     Attributes:
         between: The bytes before, between and after the slots.
-        names: The slots in the order in which they stand; ``body`` is the last before the body.
+        names: The slots in order; ``body`` is the last before the body.
     """
 
     between: tuple[bytes, ...]
@@ -127,7 +127,7 @@ class Pieces:
 
         Args:
             data: The message.
-            spans: Where each slot begins and ends, in the order in which they stand.
+            spans: Start and end of each slot, in order.
         """
         ends = (0, *(end for _, end in spans.values()))
         starts = (*(start for start, _ in spans.values()), len(data))
@@ -135,7 +135,7 @@ class Pieces:
         return cls(between, tuple(spans))
 
     def fill(self, values: Mapping[str, bytes]) -> tuple[bytes, bytes]:
-        """The message with its slots filled, as the bytes before and after the body."""
+        """The bytes before and after the body, with slots filled."""
         head, parts = b"", [self.between[0]]
         for name, piece in zip(self.names, self.between[1:], strict=True):
             parts.append(values[name])
@@ -165,7 +165,7 @@ _VARINT, _I64, _LEN, _I32 = 0, 1, 2, 5  # wire types
 _UINT64 = (1 << 64) - 1
 _BLANK = {"stamp": b"\0", "body": b"\0"}
 _SLOTS: Mapping[Kind, str] = {"time": "stamp", "data": "body"}
-_EMPTY: Mapping[Kind, Any] = {"text": "", "u32": 0}  # fields that hold it are left out
+_EMPTY: Mapping[Kind, Any] = {"text": "", "u32": 0}  # fields with this value are omitted
 
 # FieldDescriptorProto.Type -> the wire types in which such a field is written
 _DOUBLE, _FIXED32, _STRING, _MESSAGE, _BYTES, _UINT32 = 1, 7, 9, 11, 12, 13
@@ -182,7 +182,7 @@ _TIMESTAMPS = ("google.protobuf.Timestamp", ".google.protobuf.Timestamp")
 
 @dataclass(frozen=True, slots=True)
 class _Declared:
-    """A field that the schema declares."""
+    """A field declared by the schema."""
 
     name: str
     kind: Kind
@@ -202,7 +202,7 @@ class _Field:
 
 @dataclass(frozen=True, slots=True)
 class _Read:
-    """What is in a message, and where its slots are."""
+    """The contents of a message, and the positions of its slots."""
 
     stamp: int
     frame_id: str
@@ -219,7 +219,7 @@ class ProtobufForm:
         schema: A serialized FileDescriptorSet that declares it.
 
     Raises:
-        WireError: The type is another, or the schema does not declare it with its fields.
+        WireError: The type differs, or the schema does not declare it with its fields.
     """
 
     def __init__(self, type_name: str, schema: bytes) -> None:
@@ -316,7 +316,7 @@ def _declared(type_name: str, schema: bytes, kinds: Mapping[str, Kind]) -> Mappi
     for name, kind in kinds.items():
         field = declared.get(name)
         if field is None:
-            if name == "frame_id":  # older schemas of images have none
+            if name == "frame_id":  # older image schemas have none
                 continue
             raise WireError(f"its schema has no field {name!r}")
         is_repeated = field.label == _REPEATED
@@ -339,7 +339,7 @@ def _declaration(type_name: str, schema: bytes) -> Any:
     except (DecodeError, ValueError):  # the latter by protobuf's pure Python
         raise WireError("its schema is no FileDescriptorSet") from None
     name = tuple(type_name.rsplit(".", 1))
-    # compared one by one: what is not UTF-8 comes as bytes
+    # compared one by one: names that are not UTF-8 come as bytes
     found = [
         message
         for file in files
@@ -352,7 +352,7 @@ def _declaration(type_name: str, schema: bytes) -> Any:
 
 
 def _fields(data: memoryview) -> Iterator[_Field]:
-    """The fields of a message, one after the other."""
+    """The fields of a message, one after another."""
     at = 0
     while at < len(data):
         tag, at = _varint(data, at)
@@ -388,7 +388,7 @@ def _varint(data: memoryview, at: int) -> tuple[int, int]:
 
 
 def _varint_bytes(value: int) -> bytes:
-    """A varint in as few bytes as it needs."""
+    """A varint in as few bytes as possible."""
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
@@ -398,7 +398,7 @@ def _varint_bytes(value: int) -> bytes:
 
 
 def _take(values: dict[str, Any], declared: _Declared, field: _Field, data: memoryview) -> None:
-    """Put the value of a field to the others."""
+    """Add a field's value to the others."""
     raw = data[field.start : field.end]
     if declared.kind == "time":
         values[declared.name] = _stamp(raw)

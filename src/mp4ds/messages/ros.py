@@ -1,4 +1,4 @@
-"""Camera messages in the serialization of ROS 1 and in ROS 2's CDR.
+"""Camera messages in ROS 1's serialization and ROS 2's CDR.
 
 The two differ in order, alignment and header. ROS 1: little-endian, unaligned, header with seq,
 strings without NUL (wiki.ros.org/msg, "Fields"). CDR: a four-byte encapsulation, primitives
@@ -31,7 +31,7 @@ from mp4ds.messages.wire import (
 _MAX_DISTORTION = 1024
 _ALIGNMENT = 4  # of what follows a body: strings
 
-# (name, code): struct codes, s for a string, d* for an array of doubles that tells its length
+# (name, code): struct codes, s for a string, d* for a length-prefixed array of doubles
 _HEADER = (("header", ""),)
 _TIME = (("time", ""), ("frame_id", "s"))
 _BODY = ("body", "")
@@ -77,8 +77,8 @@ class RosWire:
 
     Attributes:
         name: ``ros1``, ``cdr-le`` or ``cdr-be``.
-        prefix: The encapsulation that a payload begins with.
-        order: Byte order as struct spells it.
+        prefix: The encapsulation at the start of a payload.
+        order: Byte order, in struct's notation.
         ros2: Whether it is CDR: aligned, NUL-terminated, without seq.
     """
 
@@ -91,7 +91,7 @@ class RosWire:
         """Reads a payload's fields.
 
         Raises:
-            WireError: It does not begin as it should.
+            WireError: It does not begin as expected.
         """
         if bytes(data[: len(self.prefix)]) != self.prefix:
             raise WireError("it does not begin like a plain serialization of its kind")
@@ -100,7 +100,7 @@ class RosWire:
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    """Where a message's slots are, bytes from its start; None where it has no such slot."""
+    """Byte offsets of a message's slots; None for a slot it does not have."""
 
     order: str
     sec_code: str
@@ -149,7 +149,7 @@ class RosForm:
         around = start + len(data) - end
         if around > MAX_BLANK:
             raise WireError(f"{around} bytes stand around its data")
-        # what follows is aligned by the body's length, so the blank keeps its last few places
+        # the alignment of what follows depends on the body's length, so the blank keeps it modulo 4
         kept = body_size % _ALIGNMENT if self._is_aligned_after else 0
         blank = bytearray(data[:start])
         places.fill(blank, Slots(0), kept)
@@ -192,7 +192,7 @@ class RosForm:
         return writer.getvalue()
 
     def _read(self, data: memoryview) -> tuple[dict[str, Any], _Places, int]:
-        """All field values, the places of the slots, and the size of the body."""
+        """All field values, the positions of the slots, and the size of the body."""
         ros2 = self._wire.ros2
         reader = self._wire.reader(data)
         values: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""The tables of serializations and of the message types that they hold."""
+"""The tables of serializations and their message types."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ROS = {
         RosWire("cdr-be", b"\x00\x00\x00\x00", ">", ros2=True),
     )
 }
-_ZSTD = b"\x28\xb5\x2f\xfd"  # begins what zstd compressed
+_ZSTD = b"\x28\xb5\x2f\xfd"  # magic of zstd
 _FOXGLOVE: Mapping[str, type[Fields]] = {
     "foxglove.RawImage": ImageFields,
     "foxglove.CompressedImage": CodedFields,
@@ -46,10 +46,10 @@ WIRES = (*_ROS, *_OTHERS)
 
 
 def kind_of(channel: Channel) -> type[Fields] | None:
-    """What the channel's messages say: fields of raw images, coded ones, or calibrations.
+    """The kind of a channel's messages: raw images, coded images, or calibrations.
 
     Returns:
-        The class of their fields; None for a channel that is none of a camera's.
+        The class of their fields; None for a channel that is not a camera's.
     """
     if channel.message_encoding not in ("ros1", "cdr"):
         return _FOXGLOVE.get(channel.type_name)
@@ -72,10 +72,10 @@ def wire_of(message_encoding: str, data: memoryview) -> str:
 
     Args:
         message_encoding: The channel's.
-        data: The payload; CDR tells its byte order in its first bytes.
+        data: The payload; CDR has its byte order in its first bytes.
 
     Raises:
-        WireError: No wire knows this serialization.
+        WireError: No wire has this serialization.
     """
     if message_encoding == "ros1" or message_encoding in _OTHERS:
         return message_encoding
@@ -114,18 +114,18 @@ def form_of(wire: str, type_name: str, schema: bytes) -> Form:
 def plain_message(
     wire: str, type_name: str, frame_id: str, fields: Fields, slots: Slots, body: bytes | memoryview
 ) -> bytes:
-    """A camera message as a plain serializer of ROS writes it.
+    """A camera message as written by a plain ROS serializer.
 
     Args:
-        wire: One of ROS.
-        type_name: As either ROS spells it.
+        wire: A ROS wire.
+        type_name: As spelled in either ROS.
         frame_id: Coordinate frame.
-        fields: What it says.
+        fields: Its fields.
         slots: Its times.
         body: Pixels or coded picture; empty for a calibration.
 
     Raises:
-        WireError: The type has no plain form, or a value no place in it.
+        WireError: The type has no plain form, or cannot represent a value.
     """
     form = form_of(wire, type_name, b"")
     blank = form.plain(frame_id, fields)

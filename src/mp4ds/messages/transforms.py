@@ -1,7 +1,7 @@
-"""Static transforms between coordinate frames, read out of /tf_static for extrinsics.
+"""Static transforms between coordinate frames, read from /tf_static for extrinsics.
 
-What is read here is a convenience copy: the messages themselves are stored verbatim, so that
-what does not parse, or makes no sense, is left out without harm.
+This is a convenience copy: the messages themselves are stored verbatim, so whatever does not parse,
+or makes no sense, can be left out without harm.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from mp4ds.messages.wire import PrimitiveReader, WireError
 from mp4ds.records import Channel, Schema
 
 MAX_TRANSFORMS = 1000
-"""Child frames that a collector keeps."""
+"""Maximum number of child frames in a collector."""
 
 _MAX_MESSAGE = 1 << 20
 _MAX_IN_MESSAGE = 10 * MAX_TRANSFORMS
 _MAX_SCHEMA = 1 << 20
 _MAX_SCHEMA_FILES = 100
-_TOLERANCE = 0.01  # of a rotation's squared norm, as tf2 has it
+_TOLERANCE = 0.01  # of a rotation's squared norm, as in tf2
 _TOPIC = "tf_static"
 _ROS_TYPES = {
     "tf2_msgs/TFMessage": ("list", "stamped"),
@@ -42,7 +42,7 @@ class Transform:
 
     Attributes:
         parent: The frame in which the child is placed.
-        child: The frame that is placed.
+        child: The frame whose pose this is.
         translation: x, y, z in metres.
         rotation: x, y, z, w of a unit quaternion.
     """
@@ -54,7 +54,7 @@ class Transform:
 
     @property
     def is_usable(self) -> bool:
-        """Whether tf2 would take it: two frames, finite numbers, a rotation of norm 1."""
+        """Whether tf2 would accept it: two frames, finite numbers, a rotation of norm 1."""
         return (
             bool(self.parent and self.child)
             and _name(self.parent) != _name(self.child)
@@ -67,17 +67,18 @@ Parser = Callable[[memoryview], list[Transform]]
 
 
 def transform_parser(channel: Channel) -> Parser:
-    """What gives the transforms of a channel's messages, whether they are usable or not.
+    """A parser of the transforms in a channel's messages, usable or not.
 
-    Takes tf2_msgs/TFMessage, tf/tfMessage and the ROS types of foxglove_msgs in ROS 1 and CDR;
+    Supports tf2_msgs/TFMessage, tf/tfMessage and the ROS types of foxglove_msgs in ROS 1 and CDR;
     foxglove.FrameTransform and foxglove.FrameTransforms in protobuf (by the recorded descriptor)
-    and JSON. Of the latter two, an absent translation is zero and an absent rotation is none.
+    and JSON. In the latter two, an absent translation is zero and an absent rotation is the
+    identity.
 
-    It raises `WireError` for a message that does not parse, or is beyond all measure (more than
+    It raises `WireError` for a message that does not parse, or is unreasonably large (more than
     1 MiB).
 
     Raises:
-        WireError: The type is none of transforms, or its descriptor does not parse.
+        WireError: The type is not one of transforms, or its descriptor does not parse.
     """
     parse = _parser(channel)
 
@@ -121,7 +122,7 @@ def _parse_ros(encoding: str, name: str, data: memoryview) -> list[Transform]:
     reader = PrimitiveReader(data, 4 if cdr else 0, _CDR_ORDERS.get(wire, "<"), aligned=cdr)
     amount, layout = _ROS_TYPES[name]
     count = reader.integer("I") if amount == "list" else 1
-    # a message that claims more than it holds ends in an error
+    # a message that declares more than it holds gives an error
     return [_read_ros(reader, layout, cdr=cdr) for _ in range(count)]
 
 
@@ -147,11 +148,11 @@ def _parse_json(data: memoryview) -> Any:
 
 
 def _protobuf_decoder(schema: Schema) -> Callable[[memoryview], Any]:
-    """Decodes messages of a recorded descriptor, whatever its field numbers."""
+    """Decodes messages by a recorded descriptor, whatever its field numbers."""
     if len(schema.data) > _MAX_SCHEMA:
         raise WireError(f"its descriptor has {len(schema.data)} bytes")
     try:
-        # a large import, which most recordings do without
+        # a large import that most recordings do not need
         descriptor_pb2 = import_module("google.protobuf.descriptor_pb2")
         pools = import_module("google.protobuf.descriptor_pool")
         factory = import_module("google.protobuf.message_factory")
@@ -177,7 +178,7 @@ def _protobuf_decoder(schema: Schema) -> Callable[[memoryview], Any]:
 
 
 def _in_order(files: dict[str, Any]) -> list[Any]:
-    """Descriptor files, each after those that it imports.
+    """Descriptor files, each after those it imports.
 
     Raises:
         ValueError: One is missing, they import each other, or there are too many.
@@ -240,12 +241,12 @@ def _numbers(node: Any, names: str, absent: tuple[float, ...]) -> list[float]:
 class TransformCollector:
     """The static transforms of a recording: the latest of each child frame.
 
-    A copy for the consumer's convenience, of what is stored verbatim: messages that do not parse
-    and transforms that tf2 would refuse are left out, and so are child frames beyond the limit.
+    A convenience copy of what is stored verbatim: messages that do not parse and transforms that
+    tf2 would refuse are left out, and so are child frames beyond the limit.
 
     Args:
-        known: Those of earlier messages, in their order.
-        limit: Most child frames.
+        known: Those of earlier messages, in order.
+        limit: Maximum number of child frames.
     """
 
     def __init__(self, known: Iterable[Transform] = (), *, limit: int = MAX_TRANSFORMS) -> None:
@@ -256,7 +257,7 @@ class TransformCollector:
 
     @staticmethod
     def takes(channel: Channel) -> bool:
-        """Whether a channel has static transforms: the last part of its topic is tf_static."""
+        """Whether a channel has static transforms, that is, its topic's last part is tf_static."""
         is_transform = channel.type_name in _FOXGLOVE_TYPES or _ros_name(channel) in _ROS_TYPES
         return is_transform and channel.topic.strip("/").rpartition("/")[2] == _TOPIC
 
@@ -294,8 +295,8 @@ class TransformCollector:
     def between(self, frame_ids: Iterable[str]) -> list[Transform]:
         """The transforms that connect cameras with each other and with the rest of the robot.
 
-        These are the ones between each camera's frame and the root of its tree, so that the path
-        from any camera to any other is there, and to the frames above them.
+        These are the ones between each camera's frame and the root of its tree, so that there is a
+        path from any camera to any other, and to the frames above them.
 
         Args:
             frame_ids: The cameras' frames.
@@ -311,7 +312,7 @@ def between(by_child: Mapping[str, Transform], frame_ids: Iterable[str]) -> list
     kept: set[str] = set()
     for frame_id in frame_ids:
         child = _name(frame_id)
-        # stops where another camera's path went on, and in a circle
+        # stops where another camera's path continued, and in a cycle
         while child in by_child and child not in kept:
             kept.add(child)
             child = _name(by_child[child].parent)

@@ -1,8 +1,8 @@
-"""The neutral parts of camera messages, and what every serialization can do with them.
+"""The neutral parts of camera messages, and the interface of serializations.
 
-A form knows one message type in one serialization. It splits a message into its body, its times
-and a blank, and fills a blank again; what it rebuilds is compared with the original by the
-caller, so nothing here needs to be trusted (spec/index.md, "Exactness").
+A form handles one message type in one serialization. It splits a message into its body, its times
+and a blank, and refills a blank; the caller compares the result with the original, so nothing here
+needs to be trusted (spec/index.md, "Exactness").
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from typing import Protocol
 
 NS = 10**9
 MAX_BLANK = 1 << 16
-"""Largest blank, bytes: what a message may hold besides its body."""
+"""Maximum size of a blank, bytes: what a message may hold besides its body."""
 
 
 class WireError(ValueError):
-    """A payload that does not parse as its type; the message says where it ends."""
+    """A payload that does not parse as its type; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImageFields:
-    """What a raw image says of its pixels.
+    """A raw image's description of its pixels.
 
     Attributes:
         encoding: ROS image encoding.
         width: Columns.
         height: Rows.
         step: Bytes per row.
-        is_bigendian: The byte as it stands; 0 where the type has none.
+        is_bigendian: The byte as it stands; 0 if the type has none.
     """
 
     encoding: str
@@ -42,12 +42,12 @@ class ImageFields:
 
 @dataclass(frozen=True, slots=True)
 class CodedFields:
-    """What a message says of the coded picture or packet that it holds.
+    """A message's description of its coded picture or packet.
 
     Attributes:
         format: The format or encoding, to the letter.
-        width: Columns of the image, 0 where the type does not say.
-        height: Rows of the image, 0 where the type does not say.
+        width: Columns of the image, 0 if the type does not say.
+        height: Rows of the image, 0 if the type does not say.
     """
 
     format: str
@@ -57,7 +57,7 @@ class CodedFields:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationFields:
-    """The calibration of a camera: all fields but the header.
+    """The calibration of a camera: all fields except the header.
 
     Attributes:
         height: Rows.
@@ -91,14 +91,14 @@ Fields = ImageFields | CodedFields | CalibrationFields
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """A camera message, taken apart.
+    """A camera message, split into parts.
 
     Attributes:
         stamp: Header stamp, nanoseconds.
-        seq: Header sequence number; None where the type has none, as in ROS 2.
-        pts: Presentation time of a packet; None where the type has none.
+        seq: Header sequence number; None if the type has none, as in ROS 2.
+        pts: Presentation time of a packet; None if the type has none.
         frame_id: As UTF-8.
-        fields: The rest of what it says.
+        fields: Its other fields.
         body: Pixels or coded picture, a view into the payload; empty for a calibration.
         blank: The message with stamp, seq, pts and body blank.
     """
@@ -114,7 +114,7 @@ class Parts:
 
 @dataclass(frozen=True, slots=True)
 class Slots:
-    """What differs between the messages that share a blank, besides the body."""
+    """What differs, besides the body, between messages that share a blank."""
 
     stamp: int
     seq: int | None = None
@@ -122,7 +122,7 @@ class Slots:
 
 
 class Template(Protocol):
-    """A blank whose slots are found."""
+    """A blank with located slots."""
 
     def around(self, slots: Slots, body_size: int) -> tuple[bytes, bytes]:
         """The bytes before and after the body.
@@ -132,14 +132,14 @@ class Template(Protocol):
             body_size: Bytes of the body.
 
         Raises:
-            WireError: A value has no place in this serialization.
+            WireError: This serialization cannot represent a value.
         """
         ...
 
     def padding(self, body_size: int) -> int:
-        """Zero bytes that a body of another length than the recorded one needs after it.
+        """Zero bytes needed after a body whose length differs from the recorded one.
 
-        What follows a body may be aligned by its length.
+        The alignment of what follows a body may depend on its length.
         """
         ...
 
@@ -149,11 +149,11 @@ class Form(Protocol):
 
     @property
     def wire(self) -> str:
-        """Name of the serialization, as sidecars spell it."""
+        """Name of the serialization in sidecars."""
         ...
 
     def split(self, data: memoryview) -> Parts:
-        """Take a message apart.
+        """Split a message.
 
         Raises:
             WireError: The payload does not parse, or cannot be modelled; says why.
@@ -164,19 +164,19 @@ class Form(Protocol):
         """The template of a blank.
 
         Raises:
-            WireError: It is no blank message of this form.
+            WireError: It is not a blank message of this form.
         """
         ...
 
     def plain(self, frame_id: str, fields: Fields) -> bytes | None:
-        """The blank as a plain serializer writes it; None where that is not modelled."""
+        """The blank as written by a plain serializer; None if that is not modelled."""
         ...
 
 
 def prove(template: Template, parts: Parts, data: memoryview) -> bool:
-    """Whether a message's template and parts give the message's bytes again."""
+    """Whether a message's template and parts restore the message's bytes."""
     head, tail = template.around(Slots(parts.stamp, parts.seq, parts.pts), len(parts.body))
-    end = len(data) - len(tail)  # the body itself is a view of what is there
+    end = len(data) - len(tail)  # the body itself is a view of the message
     return len(head) + len(parts.body) == end and data[: len(head)] == head and data[end:] == tail
 
 
@@ -184,7 +184,7 @@ def join_stamp(sec: int, nanosec: int) -> int:
     """Nanoseconds.
 
     Raises:
-        WireError: A stamp that does not come back from them.
+        WireError: The stamp cannot be restored from them.
     """
     if not 0 <= nanosec < NS:
         raise WireError("its stamp has a second or more in nanoseconds")
@@ -204,7 +204,7 @@ def text(raw: memoryview) -> str:
 
 
 def check_floats(values: Sequence[float]) -> None:
-    """Refuse what YAML cannot hold; such a message is stored verbatim.
+    """Refuse values that YAML cannot hold; such a message is stored verbatim.
 
     Raises:
         WireError: A value is infinite or not a number.
@@ -217,13 +217,13 @@ def check_floats(values: Sequence[float]) -> None:
 
 
 class PrimitiveReader:
-    """Reads primitives in order; `aligned` inserts the padding of CDR.
+    """Reads primitives in order; `aligned` skips CDR padding.
 
     Args:
         data: The payload.
         start: Where the fields begin; alignment counts from here.
         order: ``<`` or ``>``.
-        aligned: Whether primitives stand at multiples of their size.
+        aligned: Whether primitives are at multiples of their size.
     """
 
     def __init__(self, data: memoryview, start: int, order: str, *, aligned: bool) -> None:
@@ -234,7 +234,7 @@ class PrimitiveReader:
         self._aligned = aligned
 
     def align(self, size: int) -> int:
-        """Go to where the next primitive of that size stands; returns the offset."""
+        """Advance to the next primitive of that size; returns the offset."""
         if self._aligned:
             self.offset += -(self.offset - self._start) % size
         return self.offset
@@ -266,7 +266,7 @@ class PrimitiveReader:
         return view
 
     def string(self, *, terminated: bool) -> str:
-        """Read a length-prefixed string, in CDR with its closing NUL."""
+        """Read a length-prefixed string, in CDR with its terminating NUL."""
         size = self.integer("I")
         raw = self.raw(size)
         if terminated:
@@ -277,7 +277,7 @@ class PrimitiveReader:
 
 
 class PrimitiveWriter:
-    """Writes what `PrimitiveReader` reads, with padding of zeros."""
+    """Writes what `PrimitiveReader` reads, with zero padding."""
 
     def __init__(self, prefix: bytes, order: str, *, aligned: bool) -> None:
         self._data = bytearray(prefix)

@@ -1,24 +1,26 @@
-"""Which calibrations belong to which images, and their way into the streams of these."""
+"""Pairs calibrations with images, and hands them to the images' streams."""
 
 from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 from mp4ds.dataset.rebuild import CameraInfoWriter, MessageSplitter
 from mp4ds.errors import OptionError, Refused
+from mp4ds.format.models import CameraInfo
 from mp4ds.messages.serializations import is_calibration, is_camera, kind_of
 from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, Parts
+from mp4ds.packing.journal import Journal
 from mp4ds.packing.look import CameraMessage
 from mp4ds.packing.options import TopicSummary
-from mp4ds.packing.writer import StreamWriter
 from mp4ds.records import Channel, Message
 
 INFO_WINDOW = 50
-"""Stamps of a calibration channel that are compared, the latest."""
+"""Number of latest stamps of a calibration channel that are compared."""
 IMAGE_WINDOW = 1000
-"""Stamps of an image channel that they are compared with: images may be much more frequent."""
+"""Number of latest stamps of an image channel compared with them: images may come more often."""
 
 MAX_CHANNELS = 256
 """Calibration channels, and image channels, whose stamps are compared."""
@@ -41,20 +43,20 @@ _VIEWS = frozenset(
 
 
 def choose_pairs(choices: Sequence[str], channels: Sequence[Channel]) -> dict[int, int]:
-    """Pair what the user names.
+    """Pair what the user asks for.
 
-    Of several publishers on the topics, the first of the one is paired with the first of the
-    other, and so on.
+    With several publishers on the topics, the first of one is paired with the first of the other,
+    and so on.
 
     Args:
-        choices: ``IMAGE=INFO`` each, two topics as the recording spells them.
+        choices: ``IMAGE=INFO`` each, two topics, spelled as in the recording.
         channels: The recording's, as far as they are packed.
 
     Returns:
         Id of the calibration channel -> id of the image channel.
 
     Raises:
-        OptionError: A topic is unknown or not of its kind, or is given to two others.
+        OptionError: A topic is unknown or of the wrong kind, or is paired with two others.
     """
     images = _by_topic(filter(is_camera, channels))
     infos = _by_topic(filter(is_calibration, channels))
@@ -68,12 +70,13 @@ def choose_pairs(choices: Sequence[str], channels: Sequence[Channel]) -> dict[in
         if info in image_of:
             raise OptionError(
                 f"`camera_info` gives {info} to {image_of[info]} and to {image}: a calibration "
-                "topic belongs to one stream only. The other can do without: its messages are kept."
+                "topic can belong to one stream only. Leave one of the two out: all messages are "
+                "kept."
             )
         if image in image_of.values():
             other = next(key for key, value in image_of.items() if value == image)
             raise OptionError(
-                f"`camera_info` gives {other} and {info} to {image}: a stream has one "
+                f"`camera_info` gives {other} and {info} to {image}: a stream can have one "
                 "calibration topic only."
             )
         image_of[info] = image
@@ -115,9 +118,9 @@ def _check_kind(
         return
     listed = ", ".join(sorted(wanted)[:_LISTED]) + (", ..." if len(wanted) > _LISTED else "")
     problem = (
-        f"{topic!r} holds {known[topic] or 'messages without a type'}, no {noun}"
+        f"{topic!r} holds {known[topic] or 'messages without a type'}, not {noun}"
         if topic in known
-        else f"there is no topic {topic!r} among those that are packed"
+        else f"{topic!r} is not among the packed topics"
     )
     raise OptionError(f"`camera_info` {choice!r}: {problem}. Topics of {noun}: {listed or 'none'}.")
 
@@ -133,17 +136,17 @@ def pair_camera_infos(
 ) -> dict[int, int]:
     """Pair calibrations with images by the names of their topics.
 
-    A topic named ``camera_info``, or ``calibration`` as Foxglove's examples have it, belongs to
-    the image topic beside it in the same namespace. For coded images the namespace is that of
-    the image that they are a transport of: ``/cam/image_raw/compressed`` has its calibration on
-    ``/cam/camera_info``. Of several, raw images come first, of these ``image_raw``, else the
-    first by name; of coded ones the largest. librealsense's ``NAME/info/camera_info`` belongs to
-    ``NAME/image/data``. Of several publishers on a calibration topic none is paired.
+    A topic named ``camera_info``, or ``calibration`` as in Foxglove's examples, belongs to the
+    image topic in the same namespace. For coded images the namespace is that of the image they
+    transport: ``/cam/image_raw/compressed`` has its calibration on ``/cam/camera_info``. Among
+        several, raw images come first, with ``image_raw`` preferred, then the first by name; among
+        coded ones the largest. librealsense's ``NAME/info/camera_info`` belongs to
+        ``NAME/image/data``. With several publishers on a calibration topic none is paired.
 
     Args:
         channels: The recording's, as far as they are packed.
-        chosen: Pairs that hold already, such as those of `choose_pairs`.
-        sizes: Width and height of the images of channels, as far as they are known.
+        chosen: Existing pairs, such as those of `choose_pairs`.
+        sizes: Width and height of the channels' images, where known.
 
     Returns:
         Id of the calibration channel -> id of the image channel; the chosen ones too.
@@ -196,25 +199,25 @@ def _parent(topic: str) -> str:
 
 
 def _namespace_of_images(topic: str) -> str:
-    """Where the images of a calibration topic are: beside it, or where librealsense has them."""
+    """Namespace of a calibration topic's images: its own, or where librealsense puts them."""
     parent = _parent(topic)
     return f"{_parent(parent)}/image" if _leaf(parent) == "info" else parent
 
 
 def _base(image: Channel) -> str:
-    """The topic that a transport was given, which is the topic itself for a plain one."""
+    """The base topic of a transport; the topic itself for a plain one."""
     if _is_coded(image) and _leaf(image.topic) in _TRANSPORTS and _parent(image.topic):
         return _parent(image.topic)
     return image.topic.strip("/")
 
 
 def _namespaces(image: Channel) -> list[str]:
-    """Where its calibration may be: beside its base topic, else beside itself."""
+    """Namespaces its calibration may be in: that of its base topic, else its own."""
     return list(dict.fromkeys((_parent(_base(image)), _parent(image.topic))))
 
 
 def _camera(image: Channel) -> str:
-    """Equal for image topics that are views of one camera, as far as names tell."""
+    """Equal for image topics that are views of one camera, judging by names."""
     base = _base(image)
     return f"{_parent(base)}/" if _leaf(base) in _VIEWS else base
 
@@ -235,12 +238,12 @@ class _Track:
 
 
 class StampPairing:
-    """Pairs calibrations with images that have the same stamps, for what names leave unpaired.
+    """Pairs by stamps the calibrations that names leave unpaired.
 
-    `add` takes messages of calibration and image channels in the order of the recording. What is
-    kept are the latest `INFO_WINDOW` and `IMAGE_WINDOW` stamps of each channel, so that memory is
-    bounded and a channel that starts late is compared with what was recorded beside it. A
-    calibration channel is paired if
+    `add` takes messages of calibration and image channels in recorded order. The latest
+    `INFO_WINDOW` and `IMAGE_WINDOW` stamps of each channel are kept, so that memory is bounded and
+    a channel that starts late is compared with what was recorded at the same time. A calibration
+    channel is paired if
 
     - at least 3 of its stamps are an image channel's, and at least 80 % of those between that
       channel's first and last stamp (stamps of zero count as not found),
@@ -260,7 +263,7 @@ class StampPairing:
         Args:
             channel: Its channel, of calibrations or images.
             parts: The message.
-            size: Width and height of a coded image, where its message does not tell.
+            size: Width and height of a coded image, if not in its message.
         """
         is_info = isinstance(parts.fields, CalibrationFields)
         tracks = self._infos if is_info else self._images
@@ -279,13 +282,13 @@ class StampPairing:
         track.size = size if 0 in told else told
 
     def decide(self, paired: Mapping[int, int], *, final: bool = True) -> dict[int, int]:
-        """Pair by what was added so far.
+        """Pair what was added so far.
 
         Args:
-            paired: Pairs that hold already. These calibrations are not paired again, and these
-                images take no other calibration, but are still rivals of the others.
-            final: Whether the recording is at its end. Then, of channels that had fewer than 3
-                messages, all stamps must agree; before, they are not paired.
+            paired: Existing pairs. These calibrations are not paired again, and these images take
+                no other calibration, but still compete with the others.
+            final: Whether the recording has ended. Then all stamps must agree for channels with
+                fewer than 3 messages; before, these are not paired.
 
         Returns:
             Id of the calibration channel -> id of the image channel; the new ones only. Nothing
@@ -309,7 +312,7 @@ class StampPairing:
 
 
 def _only_camera(info: _Track, fitting: list[_Track], taken: set[int]) -> Channel | None:
-    """The best image channel, if all that fit are of one camera without a calibration."""
+    """The best image channel, if all that match are of one camera without a calibration."""
     same_frame = [image for image in fitting if info.frame_id and info.frame_id == image.frame_id]
     fitting = same_frame or fitting
     if len({_camera(image.channel) for image in fitting}) != 1:
@@ -335,7 +338,7 @@ def _fits(info: _Track, image: _Track, found: set[int], final: bool) -> bool:
 
 
 def _size_fits(calibration: CalibrationFields, size: tuple[int, int]) -> bool:
-    """Whether images of a size, where both are known, may be what was calibrated (REP 104)."""
+    """Whether a calibration can apply to images of a size (REP 104), if both are known."""
     if 0 in size or 0 in (calibration.width, calibration.height):
         return True
     return any(
@@ -356,15 +359,27 @@ def _image_sizes(calibration: CalibrationFields) -> Iterator[tuple[float, float]
 # ---------------------------------------------------------------- calibrations
 
 _MAX_PENDING = 1000
-"""Calibrations that wait for their stream; of a topic with more, all are kept verbatim."""
+"""Calibrations of a topic that may wait for their stream; with more, all are kept verbatim."""
+
+
+class CalibratedStream(Protocol):
+    """A stream that takes the calibrations of its camera.
+
+    Attributes:
+        channel: Of its messages.
+        camera_info: The calibrations, when all are there.
+    """
+
+    channel: Channel
+    camera_info: CameraInfo | None
 
 
 @dataclass
 class _InfoChannel:
-    """A calibration channel whose stream is there, or may come."""
+    """A calibration channel whose stream exists, or may still come."""
 
     writer: CameraInfoWriter
-    owner: StreamWriter | None = None
+    owner: CalibratedStream | None = None
     pending: list[tuple[Message, int]] = field(default_factory=list)
 
 
@@ -381,12 +396,13 @@ class Calibrations:
     Args:
         channels: The recording's, as far as they are packed.
         chosen: Pairs that the user names, ``IMAGE=INFO``.
-        surveyed: Pairs that stamps told before, by id; None to look at the stamps here.
+        surveyed: Pairs already found by stamps, by id; None to compare stamps here.
         topic_of: The summary of a channel's topic.
-        keep: Stores what belongs to no stream.
+        keep: Stores messages that belong to no stream.
+        journal: Where calibrations are noted; None: nowhere. Channels may appear later then.
 
     Raises:
-        OptionError: A chosen pair cannot be.
+        OptionError: A chosen pair is not possible.
     """
 
     def __init__(
@@ -397,25 +413,30 @@ class Calibrations:
         *,
         topic_of: Callable[[Channel], TopicSummary],
         keep: Callable[[Message], None],
+        journal: Journal | None = None,
     ) -> None:
         self._topic_of = topic_of
         self._keep = keep
+        self._journal = journal
         self._channels = {channel.id: channel for channel in channels}
         self._pairs = pair_camera_infos(channels, chosen=choose_pairs(chosen, channels))
         self._by_stamp = None
         if surveyed is not None:
             self._pairs.update(surveyed)
-        elif unpaired_infos(channels, self._pairs):
+        elif journal or unpaired_infos(channels, self._pairs):
             self._by_stamp = StampPairing()
         self._forms: dict[int, MessageSplitter] = {}
         self._infos: dict[int, _InfoChannel | None] = {}
         self._counts: Counter[tuple[object, ...]] = Counter()
-        self._streams: dict[tuple[object, ...], StreamWriter] = {}
+        self._streams: dict[tuple[object, ...], CalibratedStream] = {}
 
     def take(self, message: Message) -> None:
-        """Take a calibration into its stream, or keep it if it belongs to none."""
+        """Add a calibration to its stream, or keep it if it belongs to none."""
         channel = message.channel
-        # its place among those of all channels that cannot be told apart from its own
+        if self._journal is not None:
+            self._journal.calibration(message)
+        self._meet(channel)
+        # its position among those of all channels with the same identity
         ordinal = self._counts[channel.identity]
         self._counts[channel.identity] += 1
         if channel.id not in self._infos:
@@ -434,18 +455,25 @@ class Calibrations:
             self._keep(message)
 
     def saw(self, channel: Channel, seen: CameraMessage) -> None:
-        """Take notice of an image's stamp, for calibrations that names leave unpaired."""
+        """Note an image's stamp, for calibrations that names leave unpaired."""
+        self._meet(channel)
         if self._by_stamp is not None:
             size = seen.key.width, seen.key.height
             self._by_stamp.add(channel, seen.parts, size=size)
 
-    def adopt(self, stream: StreamWriter) -> None:
-        """Let a channel's first stream have the calibrations that waited for it."""
+    def _meet(self, channel: Channel) -> None:
+        """Pair a channel by its name if it was not known at the beginning."""
+        if channel.id not in self._channels:
+            self._channels[channel.id] = channel
+            self._pairs = pair_camera_infos(list(self._channels.values()), chosen=self._pairs)
+
+    def adopt(self, stream: CalibratedStream) -> None:
+        """Give a channel's first stream the calibrations that waited for it."""
         self._streams.setdefault(stream.channel.identity, stream)
         self._settle()
 
     def finish(self) -> None:
-        """Hand each stream its calibrations, and keep what waited for a stream in vain."""
+        """Hand each stream its calibrations, and keep those whose stream never came."""
         if self._by_stamp is not None:
             self._pairs.update(self._by_stamp.decide(self._pairs))
             self._settle()
@@ -462,7 +490,7 @@ class Calibrations:
             return None
         return _InfoChannel(CameraInfoWriter(channel), self._owner_of(channel.id))
 
-    def _owner_of(self, info_id: int) -> StreamWriter | None:
+    def _owner_of(self, info_id: int) -> CalibratedStream | None:
         image_id = self._pairs.get(info_id)
         if image_id is None:
             return None
@@ -481,11 +509,14 @@ class Calibrations:
         except Refused:
             return  # it is kept verbatim when it is taken or given up
         if len(state.pending) % INFO_WINDOW == 0:
-            self._pairs.update(self._by_stamp.decide(self._pairs, final=False))
+            found = self._by_stamp.decide(self._pairs, final=False)
+            if found and self._journal is not None:
+                self._journal.pairs(found)
+            self._pairs.update(found)
             self._settle()
 
     def _settle(self) -> None:
-        """Give owners to the channels that have none yet, as far as they are known."""
+        """Assign owners to channels without one, where known."""
         for info_id, state in self._infos.items():
             if state is None or state.owner is not None:
                 continue

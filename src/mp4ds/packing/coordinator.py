@@ -1,4 +1,4 @@
-"""Runs the tasks of divided packs on an engine, and makes the datasets of what they leave."""
+"""Runs the tasks of divided packs on an engine, and makes datasets from their results."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ Report = Callable[[PackProgress], None]
 
 
 class JobProgress:
-    """Adds up what tasks tell.
+    """Adds up the progress of tasks.
 
     Args:
         job: The job.
         target: The dataset.
-        report: Told several times a second; None for nobody.
+        report: Called several times a second; None for nobody.
     """
 
     def __init__(self, job: Job, target: Path, report: Report | None) -> None:
@@ -66,13 +66,13 @@ class JobProgress:
         self.bytes_written = 0
 
     def heard(self, name: str, told: Mapping[str, Any]) -> None:
-        """Take what a task tells of itself."""
+        """Take a task's report."""
         if "topics" in told:
             self._told[name] = told["topics"]
             self.report()
 
     def finished(self, name: str, topics: Mapping[str, tuple[int, int]], *, before: bool) -> None:
-        """Take notice of a task that is done.
+        """Note that a task is done.
 
         Args:
             name: Of the task.
@@ -85,7 +85,7 @@ class JobProgress:
         self.report()
 
     def report(self, phase: str = "packing", note: str = "", *, now: bool = False) -> None:
-        """Tell where the pack stands, unless it was told just now."""
+        """Report the pack's progress, unless it was just reported."""
         clock = time.monotonic()
         if self._report is None or (clock < self._next and not now):
             return
@@ -130,8 +130,8 @@ class JobProgress:
 
 _LISTED = 10
 _JOINED_AT_ONCE = 4  # more would only wait for the disk
-_SHARED = "all machines must share the folder of the dataset"
-_KEPT = "interrupted; what is finished is kept: run the same command again to go on"
+_SHARED = "all machines must share the dataset's folder"
+_KEPT = "interrupted; finished parts are kept: run the same command again to resume"
 
 
 class Coordinator:
@@ -140,9 +140,9 @@ class Coordinator:
     Args:
         runs: The packs.
         engine: Runs the tasks.
-        keep_going: Go on with other tasks where one fails.
-        share_of: Number of the share of the tasks to run, and how many shares there are.
-        report: Told of progress.
+        keep_going: Continue with other tasks if one fails.
+        share_of: Which share of the tasks to run, and the number of shares.
+        report: Called with progress.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class Coordinator:
         }
 
     def refuse_missing(self) -> None:
-        """Refuse to join what is not there.
+        """Refuse to join missing parts.
 
         Raises:
             OptionError: Names the parts that are missing.
@@ -174,7 +174,7 @@ class Coordinator:
                 listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
                 raise OptionError(
                     f"{run.target}: {len(names)} of {len(run.job.tasks)} parts are missing: "
-                    f"{listed}. Run their shards, or pack without `join` to make them here."
+                    f"{listed}. Run their shards, or pack without `join` to pack them here."
                 )
 
     def run(self) -> Iterator[PackRun]:
@@ -219,12 +219,12 @@ class Coordinator:
         self._progress[task[0]].heard(task[1], told)
 
     def _take(self, outcome: Outcome) -> bool:
-        """Take notice of a task's end; whether its result is there."""
+        """Note a task's end; returns whether its result exists."""
         folder, name = outcome.task
         run, progress = self._runs[folder], self._progress[folder]
         error, task = outcome.error, run.job.task(name)
         if error is None and not is_seen(lambda: run.place.is_done(task), run.place.parts):
-            error = ("TargetError", f"its result is not seen in {run.place.parts}; {_SHARED}")
+            error = ("TargetError", f"its result did not appear in {run.place.parts}; {_SHARED}")
         if error is None:
             self._tell_done(run, [task], before=False)
         else:
@@ -245,11 +245,11 @@ class Coordinator:
             progress.finished(task.name, topics, before=before)
 
     def finish(self, run: PackRun) -> PackSummary:
-        """Make the dataset of a pack whose tasks are done, and remove what it was made of.
+        """Make the dataset of a pack whose tasks are done, and remove the parts.
 
         Raises:
-            PartsFailedError: The disk refused; what is finished is kept.
-            FormatError: A part was damaged since it was made.
+            PartsFailedError: It could not be written; finished parts are kept.
+            FormatError: A part was damaged after it was made.
         """
         progress = self._progress[str(run.place.folder)]
         progress.report("joining", now=True)
@@ -277,7 +277,7 @@ class Coordinator:
                 run.target, [("joining", str(refused))], len(run.job.tasks), 1
             ) from None
         finally:
-            shutil.rmtree(folder, ignore_errors=True)  # gone already if all went well
+            shutil.rmtree(folder, ignore_errors=True)  # already gone if all went well
         run.place.remove()
         return summary
 
@@ -314,13 +314,13 @@ def _digest(place: Workplace, number: int) -> tuple[int, str]:
     record = read_record(folder) or {}
     size, sha256 = record.get("size"), str(record.get("sha256"))
     if not isinstance(size, int) or not re.fullmatch("[0-9a-f]{64}", sha256):
-        raise FormatError("file-missing", folder, "is gone, or damaged since it was made")
+        raise FormatError("file-missing", folder, "disappeared or was damaged after it was made")
     return size, sha256
 
 
 @contextmanager
 def claimed(runs: Sequence[PackRun], *, shared: bool) -> Iterator[None]:
-    """Hold the places of packs; what is left of none that has any result is removed at the end."""
+    """Lock the work folders of packs; those without any results are removed at the end."""
     with ExitStack() as stack:
         for run in runs:
             stack.enter_context(run.place.claimed(shared=shared))

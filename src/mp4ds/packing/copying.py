@@ -1,4 +1,4 @@
-"""A dataset packed again as it is: in part, or with other facts, and nothing encoded anew."""
+"""Copies a dataset, or a part of it, without re-encoding."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _OF_ENCODERS = (
 
 
 def is_copy(paths: Sequence[Path], options: PackOptions) -> bool:
-    """Whether it is one dataset, and nothing is said of how its videos are to be encoded."""
+    """Whether it is one dataset, and no option asks for encoding its videos."""
     usual = PackOptions()
     is_usual = all(getattr(options, name) == getattr(usual, name) for name in _OF_ENCODERS)
     return is_usual and len(paths) == 1 and dataset_at(paths[0]) is not None
@@ -35,7 +35,7 @@ def copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
     Args:
         path: The dataset.
         target: The folder to make.
-        options: What of it, and what is told of it.
+        options: Which part, and its description.
 
     Raises:
         Refused: It cannot be copied; says why. Nothing is left behind.
@@ -54,7 +54,7 @@ def copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
         folder.mkdir()
         span = span_in(dataset, options.slice)
         manifest = copy_part(dataset, folder, span=span, selected=selected, about=about)
-        if options.slice:  # of a whole file its SHA-256 was compared
+        if options.slice:  # whole files were checked against their SHA-256
             for problem in validate(folder, deep=True):
                 raise FormatError(problem.code, dataset.path, f"is damaged: {problem}")
         with Dataset(folder) as made:

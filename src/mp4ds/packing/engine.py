@@ -23,8 +23,8 @@ class Outcome:
 
     Attributes:
         task: Its arguments.
-        error: Class name and sentence of what it failed with; None where it was done.
-        facts: What it told at its end.
+        error: Class name and message of its error; None if it succeeded.
+        facts: What it reported at its end.
     """
 
     task: tuple[str, ...]
@@ -33,10 +33,10 @@ class Outcome:
 
 
 class Engine(Protocol):
-    """Runs tasks. Each is a call of one function of which engines know nothing.
+    """Runs tasks. Each is a call of a function that engines know nothing about.
 
-    The function takes the task's arguments, is idempotent, and leaves its result on the disk;
-    so a task may be run again, or twice at once, and no result passes through the engine.
+    The function takes the task's arguments, is idempotent, and leaves its result on disk; so a task
+    may be rerun, or run twice at once, and no result passes through the engine.
     """
 
     def run(
@@ -48,10 +48,10 @@ class Engine(Protocol):
 
         Args:
             tasks: Arguments of each, distinct.
-            on_progress: Called with what a running task tells, where the engine hears it.
+            on_progress: Called with a running task's reports, if the engine receives them.
 
         Yields:
-            The outcome of each task, as they end. Closing the generator ends what still runs.
+            The outcome of each task as it ends. Closing the generator ends running tasks.
         """
         ...
 
@@ -60,13 +60,13 @@ class Engine(Protocol):
 
 
 def give_back() -> None:
-    """Give back what a task took and left.
+    """Release the memory that a task took.
 
-    Encoders in cycles of references wait for a collector that does not see how large they are,
-    and the C library keeps what is freed.
+    Encoders in reference cycles wait for a collector that does not know how large they are, and the
+    C library keeps freed memory.
     """
     gc.collect()
-    with suppress(OSError, AttributeError):  # not the GNU one
+    with suppress(OSError, AttributeError):  # not the GNU C library
         ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
@@ -79,8 +79,8 @@ _POLL_SECONDS = 0.2
 class Workers:
     """A fixed number of threads; jobs of one key run in order on one of them.
 
-    A context manager: leaving it normally waits for all jobs, leaving it with an exception
-    drops those not begun. The first error of a job is raised at the next call.
+    A context manager: leaving it normally waits for all jobs, leaving it with an exception drops
+    those not started. The first error of a job is raised at the next call.
 
     Args:
         count: Threads; 0 runs each job at once in the calling thread.
@@ -102,7 +102,7 @@ class Workers:
         """Run a job after all earlier ones of the same key; waits while the queue is full.
 
         Raises:
-            BaseException: What an earlier job raised.
+            BaseException: An earlier job's error.
         """
         if not self._queues:
             job()
@@ -115,6 +115,11 @@ class Workers:
                 return
             except queue.Full:
                 continue
+
+    def is_late(self, key: int) -> bool:
+        """Whether jobs of a key wait for longer than they may; nobody is in a hurry here."""
+        del key
+        return False
 
     def _run(self, jobs: queue.Queue[Callable[[], None] | None]) -> None:
         while (job := jobs.get()) is not None:
@@ -134,7 +139,7 @@ class Workers:
         """Wait for all jobs and end the threads.
 
         Raises:
-            BaseException: What a job raised.
+            BaseException: A job's error.
         """
         for jobs in self._queues:
             jobs.put(None)
@@ -165,7 +170,7 @@ _TRIES = 2
 
 @dataclass
 class _Worker:
-    """A process, and the task that it is at work on."""
+    """A process, and the task it is working on."""
 
     process: subprocess.Popen[bytes]
     task: tuple[str, ...] | None
@@ -174,25 +179,25 @@ class _Worker:
     open_pipes: int = 2
 
     def died(self, task: tuple[str, ...]) -> Outcome:
-        """The outcome of a task that the process did not live to tell."""
+        """The outcome of a task whose process died."""
         code = self.process.wait()
         tail = self.stderr.decode(errors="replace").strip().splitlines()
         said = f": {tail[-1]}" if tail else ""
         if code < 0:
             name = signal.Signals(-code).name if -code in list(signal.Signals) else str(-code)
-            hint = ", perhaps for want of memory" if -code == signal.SIGKILL else ""
-            return Outcome(task, ("Killed", f"its process was ended by {name}{hint}{said}"))
-        return Outcome(task, ("Failed", f"its process ended with code {code}{said}"))
+            hint = ", perhaps for lack of memory" if -code == signal.SIGKILL else ""
+            return Outcome(task, ("Killed", f"its process was killed by {name}{hint}{said}"))
+        return Outcome(task, ("Failed", f"its process exited with code {code}{said}"))
 
     def order(self, task: tuple[str, ...]) -> None:
         """Give it its next task."""
         self.task = task
-        with suppress(OSError):  # it has died, which its pipes tell
+        with suppress(OSError):  # it has died, as its pipes will show
             _pipe(self.process.stdin).write(json.dumps(task).encode() + b"\n")
             _pipe(self.process.stdin).flush()
 
     def dismiss(self) -> None:
-        """Let it end: there is nothing more to do."""
+        """Let it exit: there is nothing more to do."""
         with suppress(OSError):
             _pipe(self.process.stdin).close()
 
@@ -244,7 +249,7 @@ class _Shift:
 
     @property
     def goes_on(self) -> bool:
-        """Whether there is anything to do or to wait for."""
+        """Whether there is anything left to do or to wait for."""
         return bool(self._waiting or self._workers)
 
     def fill(self, slots: int) -> None:
@@ -256,7 +261,8 @@ class _Shift:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
-                start_new_session=True,  # the terminal's Ctrl-C is for the one that ends the others
+                # the terminal's Ctrl-C is for the parent, which ends the others
+                start_new_session=True,
             )
             worker = _Worker(process, task)
             self._workers.append(worker)
@@ -269,7 +275,7 @@ class _Shift:
         return task
 
     def listen(self) -> Iterator[Outcome]:
-        """Wait until processes tell something, and take it in."""
+        """Wait for reports from processes, and handle them."""
         for key, _ in self._selector.select():
             worker, handle = key.data
             stream: Any = key.fileobj
@@ -299,7 +305,7 @@ class _Shift:
                         self._release(worker, is_ready=bool(told.get("ready")))
 
     def _release(self, worker: _Worker, *, is_ready: bool) -> None:
-        """Take notice that a process has done its task."""
+        """Note that a process has done its task."""
         worker.task = None
         if is_ready and self._waiting:
             worker.order(self._next())
@@ -307,7 +313,7 @@ class _Shift:
             worker.dismiss()
 
     def _bury(self, worker: _Worker) -> Iterator[Outcome]:
-        """Take notice of a process that has ended."""
+        """Note that a process has ended."""
         task = worker.task
         worker.process.wait()
         _close(worker)
@@ -320,7 +326,7 @@ class _Shift:
                 yield outcome
 
     def end(self) -> None:
-        """End the processes that are left, gently first."""
+        """End the remaining processes, gently first."""
         for worker in self._workers:
             worker.process.terminate()
         for worker in self._workers:

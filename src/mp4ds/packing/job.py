@@ -1,4 +1,4 @@
-"""A pack that is divided into tasks: what each is to do, on whatever machine it runs."""
+"""A pack divided into tasks: what each has to do, on whatever machine it runs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from mp4ds.registry import plugin
 from mp4ds.video.encoder import tool_versions
 
 TASK_NAME = r"source-[0-9]{1,9}|whole-[0-9]{1,9}|[0-9]{5,9}-[0-9]{1,9}|all"
-"""Pattern of the names of tasks, which are those of folders."""
+"""Pattern of task names, which are also folder names."""
 
 _MOST_THREADS = 4096
 _OUTCOME_OPTIONS = (
@@ -45,14 +45,14 @@ class Task:
 
     Attributes:
         name: Of the folder of its result.
-        start: It takes log times from here on, ns; None: from the first.
-        end: To before here; None: to the last.
-        topics: It takes these topics; None: all but `without`.
+        start: First log time it takes, ns; None: from the beginning.
+        end: Log time it stops before; None: to the end.
+        topics: It takes these topics; None: all except `without`.
         without: Topics that others take.
         others: Whether it takes attachments and metadata.
-        source: Number of the file whose digest is all it makes; None for others.
-        solo: Whether it takes its topics from end to end.
-        whole: Whether it takes the whole recording, so that nothing is to be joined.
+        source: Number of the file to hash, for tasks that do only that; None for others.
+        solo: Whether it takes its topics for the whole recording.
+        whole: Whether it takes the whole recording, so that there is nothing to join.
     """
 
     name: str
@@ -89,16 +89,16 @@ class Job:
     Attributes:
         paths: The recordings, absolute or URLs, as they were given.
         sources: The state of all their files.
-        options: Those that decide what comes out.
+        options: Those that determine the result.
         threads: Of each encoder.
-        workers: Streams that a task encodes side by side.
+        workers: Streams that a task encodes in parallel.
         task_bytes: Memory of the largest task.
         survey: What all tasks agree on.
         tasks: In the order of their time.
-        work: By topic, its messages and what one of them costs, in any unit.
+        work: By topic, its messages and the cost of one, in any unit.
         cameras: The topics of images.
         tools: Versions of what packs.
-        place: Inode of the folder in which it was begun; 0 before.
+        place: Inode of the folder in which it was started; 0 before.
     """
 
     paths: list[str]
@@ -167,18 +167,18 @@ class Job:
         names = {task.name for task in self.tasks}
         numbers = (self.threads, self.workers, self.task_bytes)
         if len(names) != len(self.tasks):
-            raise ValueError("tasks of one name")
+            raise ValueError("two tasks with the same name")
         paths = [*self.paths, *(source.path for source in self.sources)]
         if not all(isinstance(path, str) and "\0" not in path for path in paths):
-            raise ValueError("a file whose name is none")
+            raise ValueError("a file with an invalid name")
         if any(not 0 <= (task.source or 0) < len(self.sources) for task in self.tasks):
-            raise ValueError("a task of a file that is none of the recording")
+            raise ValueError("a task of a file that is not in the recording")
         if not all(isinstance(number, int) and number > 0 for number in numbers):
-            raise ValueError("no number of threads or bytes")
+            raise ValueError("not a number of threads or bytes")
         if max(self.threads, self.workers) > _MOST_THREADS:
             raise ValueError("too many threads")
         if set(self.options) != set(_OUTCOME_OPTIONS):
-            raise ValueError("other options")
+            raise ValueError("different options")
         self.about  # noqa: B018 - refuses what cannot be told
 
     @property
@@ -213,7 +213,7 @@ class Job:
 
     @property
     def slice(self) -> Slice:
-        """What of the recording is packed; false for all."""
+        """The slice of the recording to pack; false for all."""
         return Slice(*(self.options[name] for name in ("start", "end", "duration")))
 
     def digests(
@@ -221,11 +221,11 @@ class Job:
     ) -> list[tuple[str, int, str | None]]:
         """Name, size in bytes and SHA-256 of each file of the recording.
 
-        Those that are read in part only are not hashed.
+        Files read only in part are not hashed.
 
         Args:
             reader: The recording.
-            digest_of: Gives size and SHA-256 of a file by its number.
+            digest_of: Returns size and SHA-256 of a file by its number.
         """
         folder = reader.path if reader.path.is_dir() else None
         found: list[tuple[str, int, str | None]] = []
@@ -236,10 +236,10 @@ class Job:
         return found
 
     def check_sources(self, files: Sequence[Path] | None = None) -> None:
-        """Refuse a recording that is not what it was when the job was planned.
+        """Refuse a recording that has changed since the job was planned.
 
         Args:
-            files: Those that it consists of now, where that is known.
+            files: Its current files, if known.
 
         Raises:
             SourceError: Names the file that changed.
@@ -247,7 +247,7 @@ class Job:
         if files is not None and absolute(files) != [source.path for source in self.sources]:
             raise SourceError(
                 location(self.paths[0]),
-                "consists of other files than when its packing began",
+                "consists of different files than when packing began",
                 "Start over with `restart`.",
             )
         for source in self.sources:
@@ -258,7 +258,7 @@ class Job:
 
         Args:
             task: One of the job's.
-            exact: Streams that are made lossless, since a score is out of their reach.
+            exact: Streams made lossless because they cannot reach the score.
         """
         options = self.options
         return PartSettings(
@@ -294,17 +294,17 @@ def open_recording(
     images: ImageFolder | None = None,
     asked: Slice = WHOLE,
 ) -> BagReader:
-    """Open what is to be packed.
+    """Open the source to pack.
 
     Args:
         paths: Recordings and datasets that belong together, or a folder of images.
         salvage: Read what can be read of damaged recordings.
-        images: How the folder of images is read; None for recordings.
-        asked: What of it is to be packed.
+        images: How to read the folder of images; None for recordings.
+        asked: The slice to pack.
 
     Raises:
         SourceError: It cannot be read.
-        OptionError: The options do not suit it.
+        OptionError: The options do not apply to it.
     """
     reader = _open_whole(paths, salvage, images)
     if not asked:
@@ -318,26 +318,28 @@ def open_recording(
 
 def _open_whole(paths: Sequence[Path], salvage: bool, images: ImageFolder | None) -> BagReader:
     if salvage and any(map(dataset_at, paths)):
-        raise OptionError("`salvage` goes with recordings, not with a dataset.")
+        raise OptionError("`salvage` works with recordings, not with a dataset.")
     if images is None:
         return open_sources(paths, salvage=salvage, opener=_open_one)
     if salvage:
-        raise OptionError("`salvage` goes with recordings, not with a folder of images.")
+        raise OptionError("`salvage` works with recordings, not with a folder of images.")
     if len(paths) != 1:
-        raise OptionError(f"One folder of images is read at a time, and {len(paths)} were given.")
+        raise OptionError(
+            f"Only one folder of images can be imported at a time, but {len(paths)} were given."
+        )
     reader: BagReader = plugin("images")(paths[0], images)
     return reader
 
 
 def dataset_at(path: Path) -> Path | None:
-    """The folder of a dataset that is to be packed again; None for a recording."""
+    """The folder of a dataset that is to be repacked; None for a recording."""
     folder = path.parent if path.name == MANIFEST_NAME else path
-    if folder.suffix in RECORDING_SUFFIXES:  # at a URL, a question less
+    if folder.suffix in RECORDING_SUFFIXES:  # saves a request for URLs
         return None
     try:
         return folder if (folder / MANIFEST_NAME).is_file() else None
     except OSError:
-        return None  # whoever opens it says why
+        return None  # opening it will say why
 
 
 def _open_one(path: Path) -> BagReader:
@@ -361,7 +363,7 @@ def _task(item: Mapping[str, Any]) -> Task:
 
 
 def outcome_options(options: PackOptions) -> dict[str, Any]:
-    """The options that decide what comes out, as JSON has them."""
+    """The options that determine the result, as JSON values."""
     values = {name: getattr(options, name) for name in _OUTCOME_OPTIONS}
     values["gop"] = options.group_frames
     values["about"] = None if options.about is None else document_of(load_about(options.about))
@@ -373,22 +375,22 @@ def outcome_options(options: PackOptions) -> dict[str, Any]:
 
 
 def tools() -> dict[str, str]:
-    """Versions of what packs: parts that others made may not fit together."""
+    """Versions of the software used: parts made by different versions may not fit together."""
     return {"mp4ds": __version__, **tool_versions()}
 
 
 def absolute(paths: Sequence[Path]) -> list[str]:
-    """Recordings as a job names them."""
+    """Paths of recordings as stored in a job."""
     return [spelled(path) for path in paths]
 
 
 def is_hashed(path: Path, asked: Slice) -> bool:
-    """Whether a file of a recording is hashed: it is not where only a slice of it is read."""
+    """Whether a recording's file is hashed: not if only a slice of it is read."""
     return not asked or path.name == MANIFEST_NAME
 
 
 def span_of(reader: BagReader) -> Excerpt:
-    """What of a recording is read."""
+    """The part of a recording that is read."""
     return reader.span if isinstance(reader, SliceReader) else EVERYTHING
 
 

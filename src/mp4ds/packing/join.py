@@ -1,4 +1,4 @@
-"""Parts of a recording, packed apart, put together: segments of videos, columns, messages."""
+"""Joins separately packed parts of a recording: video segments, columns, messages."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class StreamJoin:
     """Collects the segments of one stream, in order.
 
     Args:
-        sidecar: Of the first segment; `add` is still to be called for it.
+        sidecar: Of the first segment, for which `add` must still be called.
         video: Its video.
     """
 
@@ -81,7 +81,7 @@ class StreamJoin:
         if len(self._columns) + sidecar.frames > MAX_FRAMES:
             return False
         if self._entry.differences(read_sample_entry(video)):
-            return False  # files of JPEG may differ in how their colours are sampled
+            return False  # JPEG files may differ in chroma subsampling
         if info is None or self._info is None:
             return True
         return (
@@ -94,7 +94,7 @@ class StreamJoin:
     def add(
         self, sidecar: StreamSidecar, video: Path, *, ordinal: int, info_ordinal: int = 0
     ) -> None:
-        """Take a segment that `takes` did not refuse.
+        """Add a segment accepted by `takes`.
 
         Args:
             sidecar: Of the segment.
@@ -119,7 +119,7 @@ class StreamJoin:
         """Write the video.
 
         Args:
-            stem: Its file name, without ending.
+            stem: Its file name, without extension.
             folder: Where.
 
         Returns:
@@ -127,7 +127,7 @@ class StreamJoin:
 
         Raises:
             VideoError: A segment is damaged.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         path = folder / f"{stem}.mp4"
         columns = self._columns.to_model()
@@ -197,12 +197,12 @@ class _Numbered(Generic[_ModelT]):
 
 
 def _key(model: object) -> str:
-    # by its text, in which 0.0 and -0.0 differ, and a NaN is like another
+    # by its text, in which 0.0 and -0.0 differ, and NaNs are equal
     return repr(model)
 
 
 class _JoinedColumns:
-    """Columns of segments, one after the other."""
+    """Columns of segments, one after another."""
 
     def __init__(self) -> None:
         self._columns: dict[str, list[NDArray[np.int64]]] = {}
@@ -238,7 +238,7 @@ class _JoinedColumns:
 
 @dataclass
 class _Counts:
-    """Messages that earlier parts had, by channel id and by topic."""
+    """Messages in earlier parts, by channel id and by topic."""
 
     channels: dict[int, int] = field(default_factory=dict)
     topics: dict[str, int] = field(default_factory=dict)
@@ -251,7 +251,7 @@ class Assembler:
         reader: The recording, indexed.
         selected: Whether a topic is packed.
         folder: The folder to fill, empty.
-        threads: Streams that are joined side by side.
+        threads: Streams to join in parallel.
     """
 
     def __init__(
@@ -267,7 +267,7 @@ class Assembler:
         self._threads = threads
         self._whole = PartRecord(folder)
         self._counts = _Counts()
-        self._channels: dict[object, list[Channel]] = {}  # by identity: several may be alike
+        self._channels: dict[object, list[Channel]] = {}  # by identity: several may be equal
         for channel in reader.channels:
             self._channels.setdefault(channel.identity, []).append(channel)
         self._joins: dict[object, list[StreamJoin]] = {}
@@ -278,8 +278,8 @@ class Assembler:
         """Take the next part.
 
         Args:
-            part: In the order of time among those of its chain.
-            chain: Which parts follow each other without overlapping.
+            part: In time order within its chain.
+            chain: Identifies parts that follow each other without overlapping.
 
         Raises:
             FormatError: A file of it is damaged.
@@ -330,11 +330,11 @@ class Assembler:
         """Write everything but the manifest.
 
         Args:
-            report: Called with the name of each file that is begun.
+            report: Called with the name of each file when it is started.
 
         Raises:
-            SourceError: The parts do not hold what the recording's index tells.
-            OSError: The disk refused.
+            SourceError: The parts do not match the recording's index.
+            OSError: It cannot be written.
         """
         self._check_counts()
         names = FileNames()
@@ -356,7 +356,7 @@ class Assembler:
         return whole
 
     def _check_counts(self) -> None:
-        """Refuse parts that together have not all messages: an index lies."""
+        """Refuse parts that together lack messages: an index is wrong."""
         stats = self._reader.stats()
         for channel in self._reader.channels:
             found = self._counts.channels.get(channel.id, 0)
@@ -365,8 +365,8 @@ class Assembler:
                 if found != due:
                     raise SourceError(
                         self._reader.path,
-                        f"is damaged: its index tells of {due} messages on {channel.topic}, "
-                        f"and {found} were found",
+                        f"is damaged: its index lists {due} messages on {channel.topic}, but "
+                        f"{found} were found",
                     )
 
     def _write_messages(self) -> None:
@@ -394,12 +394,12 @@ class Assembler:
 
 
 def _rotten(part: PartRecord, path: Path) -> FormatError:
-    """The error of a part's file that is not what was written; the part is made again."""
+    """The error for a part's file that changed after it was written; the part is made again."""
     part.forget()
     return FormatError(
         "checksum-mismatch",
         path,
-        "was damaged since it was written; run the same command again to make this part anew",
+        "was damaged after it was written; run the same command again to redo this part",
     )
 
 

@@ -1,4 +1,4 @@
-"""What a camera message holds, and to which stream it belongs."""
+"""Determines what a camera message holds, and to which stream it belongs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class StreamKey:
     Attributes:
         wire: Serialization.
         body: What a message's body is to the video (spec/registry.md, "Bodies").
-        codec: Codec of packets; empty where the video is encoded here.
+        codec: Codec of packets; empty if the video is encoded here.
         encoding: ROS image encoding of the frames.
         width: Columns.
         height: Rows.
@@ -49,13 +49,13 @@ class StreamKey:
 
 @dataclass(frozen=True, slots=True)
 class BodyFraming:
-    """What makes a body of a packet or of pixels, the same for many messages.
+    """What turns a packet or pixels into a body, the same for many messages.
 
     Attributes:
         framing: Start codes and delimiters that an mp4 does not keep.
         prefix: Bytes before the coded picture.
         png: How its file was written.
-        padding: What stands between rows of pixels, deflated; None: zeros.
+        padding: The row padding, deflated; None: zeros.
     """
 
     framing: str = ""
@@ -66,16 +66,16 @@ class BodyFraming:
 
 @dataclass(frozen=True, slots=True)
 class CameraMessage:
-    """A camera message, as far as its stream needs to know it.
+    """What a stream needs to know about a camera message.
 
     Attributes:
         key: Its stream's.
         form: How it is serialized.
-        parts: What it consists of.
-        wrap: What its body has beside the packet or pixels.
+        parts: Its parts.
+        wrap: What its body has besides the packet or pixels.
         pixels: Its pixels, shape as `pixel_view` gives it; None for a packet.
         keyframe: Whether decoding can begin at its packet.
-        parameters: What a decoder needs to know before the packet.
+        parameters: What a decoder needs before the packet.
     """
 
     key: StreamKey
@@ -88,20 +88,22 @@ class CameraMessage:
 
 
 class Looker:
-    """Looks into the messages of one channel.
+    """Inspects the messages of one channel.
 
     Args:
         channel: The channel.
         transcode: Decode JPEG files instead of taking them as packets.
+        is_live: Leave what takes long to be taken apart.
     """
 
-    def __init__(self, channel: Channel, *, transcode: bool = False) -> None:
+    def __init__(self, channel: Channel, *, transcode: bool = False, is_live: bool = False) -> None:
         self._is_packets = _holds_packets(channel)
         self._forms = MessageSplitter(channel)
         self._parsers: dict[str, PictureParser] = {}
         self._png: png.PngRecipe | None = None
         self._png_refusals = 0
         self._transcode = transcode
+        self._is_live = is_live
 
     def look(self, message: Message) -> CameraMessage:
         """What a message holds.
@@ -118,7 +120,7 @@ class Looker:
         raise Refused("it holds no image")
 
     def leave_out(self, seen: CameraMessage) -> None:
-        """Tell that no stream took what was seen last."""
+        """Note that no stream took the last message."""
         if seen.key.codec in self._parsers:
             self._parsers[seen.key.codec].leave_out()
 
@@ -170,7 +172,9 @@ class Looker:
 
     @contextmanager
     def _png_trial(self) -> Iterator[None]:
-        """Give up on a topic whose files are none that can be made again: trying is costly."""
+        """Give up on a topic whose files cannot be rebuilt: trying is costly."""
+        if self._is_live:
+            raise Refused("PNG and RVL files are stored as they are while recording")
         if self._png_refusals == _MAX_PNG_REFUSALS:
             raise Refused("PNG files of its topic do not rebuild")
         try:

@@ -1,4 +1,4 @@
-"""What a part of a pack records of itself, and the manifest made of these records."""
+"""The record of a packed part, and the manifest made from these records."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ _END = b'"}\n'
 
 
 def dump_kept(values: Mapping[str, Any]) -> bytes:
-    """The file of values.
+    """Serialize values to a file's content.
 
     Args:
-        values: At least one; such as JSON has.
+        values: JSON values, at least one.
     """
     text = json.dumps(values, indent=1).encode().removesuffix(b"}").rstrip()
     return text + _MARK + xxhash.xxh64_hexdigest(text).encode() + _END
@@ -57,11 +57,11 @@ def load_kept(data: bytes) -> dict[str, Any]:
     """The values of a file that `dump_kept` made.
 
     Raises:
-        ValueError: It is damaged, or another version's.
+        ValueError: It is damaged, or of another version.
     """
     text, mark, rest = data.rpartition(_MARK)
     if not mark or rest != xxhash.xxh64_hexdigest(text).encode() + _END:
-        raise ValueError("which is damaged, or another version's")
+        raise ValueError("which is damaged, or of another version")
     try:
         values: dict[str, Any] = json.loads(text + b"}")
     except RecursionError:
@@ -79,7 +79,7 @@ class PartStream:
     """A stream of a part, or of a whole recording.
 
     Attributes:
-        stem: File name of its video and sidecar, without ending.
+        stem: File name of its video and sidecar, without extension.
         sidecar: Its sidecar.
         is_renamed: Whether another stream had taken its plain name.
     """
@@ -91,11 +91,11 @@ class PartStream:
 
 @dataclass
 class PartRecord:
-    """What was packed of a recording into a folder, but for the manifest.
+    """What was packed into a folder, except for the manifest.
 
     Attributes:
         folder: Where the files are.
-        files: Names of those that were saved.
+        files: Names of the saved files.
         topics: What became of each topic, in the order of the recording.
         counts: Messages read by channel id.
         streams: In the order in which they began.
@@ -135,7 +135,7 @@ class PartRecord:
             self.span = (min(start, time), max(end, time))
 
     def save(self) -> None:
-        """Write the record; the part is whole then."""
+        """Write the record, which completes the part."""
         record = {
             "topics": [asdict(topic) for topic in self.topics.values()],
             "counts": {str(key): count for key, count in self.counts.items()},
@@ -154,7 +154,7 @@ class PartRecord:
         write_synced(self.folder / RECORD_NAME, dump_kept(record))
 
     def forget(self) -> None:
-        """Let it no longer count as whole, so that it is made again."""
+        """Mark it incomplete, so that it is made again."""
         (self.folder / RECORD_NAME).unlink(missing_ok=True)
 
     @classmethod
@@ -162,7 +162,7 @@ class PartRecord:
         """Read what `save` wrote.
 
         Raises:
-            FormatError: It is gone or damaged.
+            FormatError: It is missing or damaged.
         """
         record = read_record(folder)
         if record is None:
@@ -195,7 +195,7 @@ class PartRecord:
             losses=record.losses,
             files=list(record.files),
         )
-        if part.span:  # what no manifest takes is damage, too, and the part is made again
+        if part.span:  # values that no manifest accepts are damage, too, and the part is made again
             TimeRange(start=part.span[0], end=part.span[1])
         for loss in part.losses:
             LossEntry.from_record(loss)
@@ -204,13 +204,13 @@ class PartRecord:
         return part
 
     def check_counts(self, channels: Iterable[Channel]) -> None:
-        """Refuse a record that counts messages otherwise by topic than by channel.
+        """Refuse a record whose counts by topic and by channel differ.
 
         Args:
             channels: All of the recording.
 
         Raises:
-            FormatError: It does; the part is made again.
+            FormatError: They differ; the part is made again.
         """
         found: Counter[str] = Counter()
         for channel in channels:
@@ -223,7 +223,7 @@ class PartRecord:
 
 @dataclass(frozen=True, slots=True)
 class _Record:
-    """What the record of a part holds."""
+    """The contents of a part's record."""
 
     topics: list[TopicSummary]
     counts: dict[int, int]
@@ -237,11 +237,11 @@ class _Record:
 
 
 def _damaged(folder: Path) -> FormatError:
-    return FormatError("file-missing", folder, "is gone, or damaged since it was made")
+    return FormatError("file-missing", folder, "disappeared or was damaged after it was made")
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
-    """The record of a part; None where the part is not whole: a file is missing or cut short."""
+    """The record of a part; None if it is incomplete: a file is missing or cut short."""
     try:
         record: dict[str, Any] = load_kept((folder / RECORD_NAME).read_bytes())
         topics = record.setdefault("topics", [])
@@ -262,11 +262,11 @@ def _is_whole(folder: Path, name: str, size: int) -> bool:
 
 # ---------------------------------------------------------------- manifest
 
-_LARGER = 1.05  # than its source: more is to be explained
+_LARGER = 1.05  # times its source: anything larger is explained
 
 
 class Recorded(Protocol):
-    """What a manifest tells of a recording. See `BagReader`."""
+    """What a manifest needs of a recording. See `BagReader`."""
 
     @property
     def format(self) -> Format:
@@ -286,14 +286,14 @@ class Recorded(Protocol):
 
 @dataclass(frozen=True)
 class Origin:
-    """What a dataset is made of.
+    """The origin of a dataset.
 
     Attributes:
-        sources: The files of the recording, whatever was made of them in between.
-        derived_from: Datasets that were packed again, the oldest first.
-        losses: What these lost of the recording.
+        sources: The files of the original recording.
+        derived_from: Datasets that were repacked, the oldest first.
+        losses: What these could not read of the recording.
         left_out: Topics that they left out.
-        about: What is told of the recording.
+        about: Description of the recording.
     """
 
     sources: list[Source] = field(default_factory=list)
@@ -310,18 +310,18 @@ class Origin:
         about: About | None = None,
         span: Excerpt = EVERYTHING,
     ) -> Origin:
-        """The origin of what was read.
+        """The origin of the source that was read.
 
         Args:
-            files: The files of recordings, and of datasets that are packed again, each of which
+            files: The files of recordings, and of datasets that are repacked, each of which
                 begins with its manifest.
-            digests: Name, size in bytes and SHA-256 of each; None of those that were read in part.
+            digests: Name, size in bytes and SHA-256 of each; None for those read in part.
             about: What is told of the recording; None for what the datasets tell, if it is one
                 thing.
             span: What was packed of them.
 
         Raises:
-            SourceError: A file is not what the manifest of its dataset says.
+            SourceError: A file does not match its dataset's manifest.
         """
         origin = cls()
         told: list[About | None] = []
@@ -332,8 +332,8 @@ class Origin:
                 if sha256 not in (None, entry.sha256):
                     raise SourceError(
                         path,
-                        "does not have the SHA-256 that its dataset's manifest says",
-                        "See `mp4ds validate`, and copy it again.",
+                        "does not match the SHA-256 in its dataset's manifest",
+                        "Run `mp4ds validate` and copy it again.",
                     )
             elif path.name == MANIFEST_NAME and sha256 is not None:
                 manifest = load_manifest(path)
@@ -359,7 +359,7 @@ class Origin:
 def declare_rest(
     part: PartRecord, reader: BagReader, selected: Callable[[str], bool], writer: BagWriter
 ) -> None:
-    """Keep what the recording declares beside its messages.
+    """Keep what the recording declares besides its messages.
 
     Args:
         part: All that was packed; gets the topics without messages.
@@ -389,13 +389,13 @@ def _channels_of(part: PartRecord) -> set[tuple[object, ...]]:
 
 
 def write_manifest(part: PartRecord, recording: Recorded, origin: Origin, profile: str) -> None:
-    """Write the manifest of a whole recording: the dataset is complete then.
+    """Write the manifest of a whole recording, which completes the dataset.
 
     Args:
         part: All that was packed.
         recording: The recording.
         origin: What it was read from.
-        profile: What was asked for.
+        profile: The requested profile.
     """
     digests = {
         stream.sidecar.video.file: (
@@ -463,7 +463,7 @@ def summarize(
     Args:
         part: All that was packed.
         target: The dataset's final name.
-        source_bytes: Bytes of the source files; None where a slice was taken, for the bytes of
+        source_bytes: Bytes of the source files; None if a slice was taken, for the bytes of
             its messages.
         origin: What it was read from.
     """
@@ -479,7 +479,7 @@ def summarize(
         if video.quality is not None:
             topic.notes.append(str(video.quality))
         if stream.is_renamed:
-            topic.notes.append(f"stored as {video.file}: the plain name was taken")
+            topic.notes.append(f"stored as {video.file}: its usual name was taken")
     dataset_bytes, messages_bytes = folder_size(part.folder), part.messages_path.stat().st_size
     return PackSummary(
         dataset=target,
@@ -497,24 +497,27 @@ def summarize(
 def _why_larger(
     part: PartRecord, source_bytes: int, dataset_bytes: int, messages_bytes: int, origin: Origin
 ) -> str:
-    """A sentence where a dataset takes more than its source by more than 5 %; else empty."""
+    """Why a dataset is more than 5 % larger than its source; else empty."""
     if dataset_bytes <= _LARGER * source_bytes:
         return ""
     if any(earlier.profile != LOSSLESS for earlier in origin.derived_from):
-        return "the videos of a lossy dataset are not encoded again as small as they were"
+        return "re-encoding the videos of a lossy dataset does not make them as small as they were"
     if origin.derived_from:
-        return "the dataset that it was read from has the smaller form"
+        return "the source dataset was stored in a smaller form"
     raw = sum(topic.raw_bytes for topic in part.topics.values())
     if raw <= source_bytes:
-        return "a recording this small takes less than the index, definitions and sidecars"
+        return "a recording this small takes less space than the index, definitions and sidecars"
     if 2 * messages_bytes > dataset_bytes:
-        return "the source's own compression (bz2, say) packs small messages closer than zstd does"
+        return (
+            "the source's own compression (such as bz2) stores small messages more compactly "
+            "than zstd"
+        )
     if any(stream.sidecar.body == "packet" for stream in part.streams):
         return (
-            "JPEG files and video packets are kept as they are, those that repeat, too, which the "
-            "source's own compression stores once"
+            "JPEG files and video packets are kept as they are, including repeated ones, which "
+            "the source's own compression stores only once"
         )
-    return "the source's own compression packs its images closer than a video does"
+    return "the source's own compression stores its images more compactly than a video"
 
 
 def folder_size(folder: Path) -> int:
@@ -523,7 +526,7 @@ def folder_size(folder: Path) -> int:
 
 
 def dataset_files(path: Path) -> set[str] | None:
-    """Names of a dataset's files, by its manifest; None where that is none, or not understood."""
+    """Names of a dataset's files, from its manifest; None if that is missing or invalid."""
     try:
         manifest = load_manifest(path / MANIFEST_NAME)
     except (FormatError, SourceError, OSError):

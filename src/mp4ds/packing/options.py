@@ -1,4 +1,4 @@
-"""How to pack, what a pack tells while it runs, and what became of each topic."""
+"""Options, progress and results of a pack."""
 
 from __future__ import annotations
 
@@ -29,21 +29,25 @@ from mp4ds.records import Loss
 class ImageFolder(Options):
     """How a folder of images is read as a recording."""
 
-    layout: str | None = option("euroc, kitti, tum or plain; as found by default.")
-    stamps: str | None = option("Times, one a line; or times and file names.", metavar="FILE")
+    layout: str | None = option("euroc, kitti, tum or plain; default: detected.")
+    stamps: str | None = option(
+        "Text file with a time per line, or a time and a file name.", metavar="FILE"
+    )
     rate: str | None = option(
-        "Where there are no times, such as 20 or 30000/1001; of each camera, where the names tell "
-        "several.",
+        "Frame rate of images without times, such as 20 or 30000/1001; of each camera if the "
+        "file names show several.",
         metavar="HZ",
     )
     unit: str | None = option(
-        "Of times that are whole numbers: s, ms, us or ns; ns by default, if they have the digits."
+        "Unit of integer times: s, ms, us or ns; default: ns, if they have enough digits."
     )
-    calibration: str | None = option("As ROS's camera_calibration saves it.", metavar="YAML")
-    topic: str | None = option("Of plain images; /camera/image_raw by default.", None, "-t")
-    frame_id: str | None = option("Of plain images; camera by default.")
+    calibration: str | None = option(
+        "Calibration as saved by ROS's camera_calibration.", metavar="YAML"
+    )
+    topic: str | None = option("Topic of plain images; default: /camera/image_raw.", None, "-t")
+    frame_id: str | None = option("Frame id of plain images; default: camera.")
     encoding: str | None = option(
-        "Of plain images, such as bayer_rggb8 or 16UC1; as in the files by default."
+        "Encoding of plain images, such as bayer_rggb8 or 16UC1; default: as in the files."
     )
 
     def absolute(self) -> ImageFolder:
@@ -71,73 +75,75 @@ class PackOptions(SliceOptions):
     end: str | float | None = end()
     duration: str | float | None = duration()
     quality: str | None = option(
-        "lossless, visual, crf=N, or a score to keep: vmaf=99.5, psnr=42, ssim=0.98; by default "
-        "lossless, of a dataset as it was packed.",
+        "lossless, visual, crf=N, or a score to reach: vmaf=99.5, psnr=42, ssim=0.98; default: "
+        "lossless, or the quality of a repacked dataset.",
         None,
         "-q",
     )
     codec: str | None = option(
-        "h264, h265, ffv1 (lossless), av1, av1-10bit (lossy); of a graphics card av1-nvenc, "
-        "h264-nvenc, h265-nvenc, ...-vaapi or ...-videotoolbox; chosen by measurement by default."
+        "h264, h265, ffv1 (lossless), av1, av1-10bit (lossy); on a GPU av1-nvenc, h264-nvenc, "
+        "h265-nvenc, ...-vaapi or ...-videotoolbox; default: chosen by trial."
     )
-    preset: str | None = option("The encoder's preset, such as 6, veryfast or p4.")
-    transcode: bool = option(
-        "Encode JPEG images anew by `quality`, instead of copying them.", False
-    )
+    preset: str | None = option("Encoder preset, such as 6, veryfast or p4.")
+    transcode: bool = option("Re-encode JPEG images at `quality` instead of copying them.", False)
     camera_info: Sequence[str] = option(
-        "Topics that belong together, where names and stamps do not tell.",
+        "Pair topics whose names and stamps do not match them up.",
         (),
         metavar="IMAGE=INFO",
     )
     purpose: str | None = option(
-        "archive: smallest files. training: frames at random in the least time, lossless videos at "
-        "most 15 % larger; training=N: N %.",
+        "archive: smallest files. training: fastest random access, with lossless videos up to 15 "
+        "% larger; training=N: up to N %.",
         None,
         "--for",
         metavar="PURPOSE",
     )
     gop: int | None = option(
-        "Most frames from a key frame to the next; 10 by default, 30 where lossy.",
+        "Maximum key frame interval in frames; default: 10, or 30 if lossy.",
         least=1,
         most=MAX_GOP,
     )
     window: int | None = option(
-        "Frames of the busiest camera in a part of a long recording; 10 times `gop`, or 300.",
+        "Frames of the busiest camera per part of a long recording; default: 10 times `gop`, "
+        "or 300.",
         least=2,
         most=10_000_000,
     )
     jobs: int | None = option(
-        "Processes at a time; all cores by default.", None, "-j", least=1, most=1024
+        "Parallel processes; default: one per core.", None, "-j", least=1, most=1024
     )
     memory: int | None = option(
-        "Such as 8G; half of the machine's by default.", metavar="SIZE", parse=parse_size
+        "Memory limit, such as 8G; default: half of the machine's memory.",
+        metavar="SIZE",
+        parse=parse_size,
     )
     cluster: str | None = cluster()
-    join: bool = option("Make the dataset of what the shards packed.", False)
-    keep_going: bool = option("Where a part fails, go on with the others.", False)
-    salvage: bool = option("Pack what can be read of a damaged recording.", False)
-    restart: bool = option("Start over where an unfinished run was left.", False)
+    join: bool = option("Join what the shards packed into the dataset.", False)
+    keep_going: bool = option("If a part fails, continue with the others.", False)
+    salvage: bool = option("Pack what is still readable of a damaged recording.", False)
+    restart: bool = option("Discard an unfinished run and start over.", False)
     about: str | None = option(
-        "YAML with title, description, authors, license, doi, links or keywords.", metavar="FILE"
+        "YAML file with title, description, authors, license, doi, links or keywords.",
+        metavar="FILE",
     )
     force: bool = force()
     images: ImageFolder | None = option("How a folder of images is read as a recording.")
 
     @property
     def setting(self) -> QualitySetting:
-        """What `quality` says; lossless where it leaves that to the source.
+        """The parsed `quality`; lossless if it is left to the source.
 
         Raises:
-            OptionError: `quality` is none.
+            OptionError: `quality` is not valid.
         """
         return parse_quality(LOSSLESS if self.quality is None else self.quality)
 
     @property
     def group_frames(self) -> int:
-        """Most frames from one key frame to the next.
+        """Maximum key frame interval, frames.
 
         Raises:
-            OptionError: `quality` or `purpose` is none.
+            OptionError: `quality` or `purpose` is not valid.
         """
         from mp4ds.video.codecs import ARCHIVE_GOP, LOSSLESS_GOP, LOSSY_GOP, LOSSY_TRAINING_GOP
 
@@ -145,7 +151,10 @@ class PackOptions(SliceOptions):
         if purpose is None:
             return self.gop or (LOSSLESS_GOP if self.setting.lossless else LOSSY_GOP)
         if self.gop is not None:
-            raise OptionError("`purpose` chooses what `gop` says. Give one of them.")
+            raise OptionError(
+                "`purpose` chooses the key frame interval itself. Give `purpose` or `gop`, not "
+                "both."
+            )
         if not purpose.is_training:
             return ARCHIVE_GOP
         return LOSSLESS_GOP if self.setting.lossless else LOSSY_TRAINING_GOP
@@ -153,21 +162,21 @@ class PackOptions(SliceOptions):
 
 @dataclass(frozen=True)
 class PackProgress:
-    """Where a pack stands.
+    """Progress of a pack.
 
     Attributes:
-        dataset: What is being made.
+        dataset: The dataset being made.
         phase: ``planning``, ``packing``, ``joining`` or, for a URL, ``uploading``.
-        done: Share of the work of this phase that is done, 0 to 1; None where nothing tells.
+        done: Share of the work of this phase that is done, 0 to 1; None if unknown.
         bytes_read: Payload bytes of the messages packed so far.
         bytes_total: Bytes of the source files.
         bytes_written: Bytes of the dataset so far.
-        topics: Messages packed so far and in all (None: not known), by topic of a camera.
+        topics: Messages packed so far and in total (None: unknown), by camera topic.
         tasks_done: Parts that are done.
-        tasks_total: Parts that there are; 0 for a recording packed in one go.
-        tasks_before: Of those done, the ones that an earlier run did.
+        tasks_total: Number of parts; 0 for a recording packed in one go.
+        tasks_before: Parts done by an earlier run.
         failed: Parts that failed.
-        note: What is being done now, if it is worth telling.
+        note: Current activity, if worth reporting.
     """
 
     dataset: Path
@@ -191,7 +200,7 @@ class PackProgress:
 
 @dataclass
 class TopicSummary:
-    """What became of a topic.
+    """The result for a topic.
 
     Attributes:
         topic: Its name.
@@ -223,11 +232,11 @@ class TopicSummary:
         self.verbatim[reason] = (count + 1, first)
 
     def extend(self, later: TopicSummary, before: int) -> None:
-        """Add what became of later messages.
+        """Add the result for later messages.
 
         Args:
-            later: Of these messages alone.
-            before: Messages of the topic before them.
+            later: The result for these messages alone.
+            before: Number of the topic's messages before them.
         """
         self.messages += later.messages
         self.frames += later.frames
@@ -242,7 +251,7 @@ class TopicSummary:
 
 @dataclass(frozen=True)
 class PackSummary:
-    """What a pack did.
+    """The result of a pack.
 
     Attributes:
         dataset: The folder made.
@@ -253,9 +262,9 @@ class PackSummary:
         left_out: Topics left out on request.
         skipped: What the source holds and no dataset can: a phrase -> how many.
         losses: What could not be read of a damaged recording.
-        larger: Why the dataset is larger than its source, where it is by more than 5 %.
-        is_copy: Whether the videos of a dataset were copied; `raw_bytes` of topics are not known.
-        not_copied: Why a dataset's videos were encoded anew, where that was not asked for.
+        larger: Why the dataset is larger than its source, if by more than 5 %.
+        is_copy: Whether the videos of a dataset were copied; `raw_bytes` of topics are unknown.
+        not_copied: Why a dataset's videos were re-encoded without being asked to.
     """
 
     dataset: Path

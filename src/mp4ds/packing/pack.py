@@ -1,7 +1,7 @@
-"""Source -> dataset: images into videos, all the rest verbatim.
+"""Source -> dataset: images into videos, everything else verbatim.
 
 A short recording is packed in one pass. A long one is divided into tasks, which run on every
-core or on other machines, and whose results stay until all are there.
+core or on other machines, and whose results are kept until all are done.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ from mp4ds.packing.job import (
     outcome_options,
     span_of,
 )
+from mp4ds.packing.journal import is_unfinished
 from mp4ds.packing.manifest import (
     Origin,
     PartRecord,
@@ -68,12 +69,12 @@ class PackRun:
     Attributes:
         job: What is to be done.
         place: Where its parts are made.
-        paths: What is to be packed, as it was given.
+        paths: What to pack, as given by the user.
         target: The dataset.
         force: Replace an existing dataset.
-        is_new: Whether the job was planned just now.
+        is_new: Whether the job has just been planned.
         failures: Name and sentence of each task that failed.
-        exit_code: What the first of them asks for.
+        exit_code: That of the first failure.
     """
 
     job: Job
@@ -86,15 +87,15 @@ class PackRun:
     exit_code: int = 1
 
     def begin(self, options: dict[str, object], *, anew: bool, alone: bool) -> None:
-        """Take the place over; it is held.
+        """Take over the work folder, which is locked.
 
         Args:
-            options: Those that decide what comes out.
-            anew: Forget what is there.
-            alone: Nobody else is at work there.
+            options: Those that determine the result.
+            anew: Discard what is there.
+            alone: Nobody else is working there.
 
         Raises:
-            OptionError: An unfinished pack with other options is there.
+            OptionError: It holds an unfinished pack with other options.
             SourceError: The recording has changed since.
         """
         if anew and alone:
@@ -107,11 +108,11 @@ class PackRun:
 
     @property
     def missing(self) -> list[Task]:
-        """The tasks whose results are not there."""
+        """The tasks without results."""
         return [task for task in self.job.tasks if not self.place.is_done(task)]
 
     def fail(self, name: str, kind: str, sentence: str) -> None:
-        """Take notice of a task that failed."""
+        """Note that a task failed."""
         if not self.failures:
             self.exit_code = getattr(getattr(errors, kind, None), "exit_code", 1)
         self.failures.append((name, sentence))
@@ -143,16 +144,16 @@ def pack_in_one_pass(
 
     Args:
         reader: The recording.
-        job: Of one task.
+        job: A job of one task.
         folder: The folder to fill, empty.
         target: Its final name.
-        report: Told of progress several times a second.
-        exact: Streams that are made lossless, since a score is out of their reach.
+        report: Called with progress several times a second.
+        exact: Streams made lossless because they cannot reach the score.
 
     Raises:
-        SourceError: The recording is damaged, or changed while it was read.
-        OutOfReachError: A stream cannot have the score that was asked for.
-        OSError: The disk refused.
+        SourceError: The recording is damaged, or changed while it was being read.
+        OutOfReachError: A stream cannot reach the requested score.
+        OSError: It cannot be written.
     """
     total = sum(map(source_size, reader.files))
     stats = reader.stats()
@@ -209,10 +210,11 @@ def _digest(reader: BagReader, number: int) -> tuple[int, str]:
 
 # ---------------------------------------------------------------- pack
 
-# a short pack is mostly imports: what only divided packs, URLs and scores need is left to them
+# importing dominates a short pack: what only divided packs, URLs and scores need is imported there
 
 
 Report = Callable[[PackProgress], None]
+_USUAL = PackOptions()
 
 
 def pack(
@@ -226,22 +228,22 @@ def pack(
 
     Args:
         sources: A bag, rosbag2 folder, MCAP file or dataset, or several that belong together; or
-            URLs. A folder of images where the options have `images`.
+            URLs. A folder of images if the options have `images`.
         dataset: The folder to make, or its URL.
-        options: How; the default loses nothing.
+        options: How to pack; lossless by default.
         progress: Called several times a second.
 
     Returns:
-        What became of each topic.
+        The result for each topic.
 
     Raises:
         SourceError: The recording cannot be read.
-        TargetError: The dataset may not be written there.
-        WriteError: The disk refused.
+        TargetError: The dataset cannot be written there.
+        WriteError: The dataset could not be written.
         RemoteError: A store or web server fails.
         OptionError: An option is wrong.
-        PartsFailedError: Parts of a long recording failed; those finished are kept beside the
-            dataset, and calling again goes on with the others. Else nothing is left behind.
+        PartsFailedError: Parts of a long recording failed; finished ones are kept next to the
+            dataset, and calling it again resumes. Otherwise nothing is left behind.
     """
     paths = _paths(sources)
     chosen = _checked(options or PackOptions(), paths)
@@ -254,6 +256,8 @@ def _pack(
     store = remote(target)
     if store:
         return _pack_to_store(paths, store, options, progress)
+    if any(map(is_unfinished, paths)):
+        return _recovered(paths, target, options)
     if options.quality is None:
         return _copied(paths, target, options, progress)
     run = _plan(paths, target, options)
@@ -262,10 +266,24 @@ def _pack(
     return _pack_runs([run], options, progress)[0]
 
 
+def _recovered(paths: Sequence[Path], target: Path, options: PackOptions) -> PackSummary:
+    """The dataset of a recording that was cut off while `mp4ds record` made it."""
+    from mp4ds.packing.recovery import recover
+
+    usual = replace(_USUAL, salvage=True, force=options.force, about=options.about)
+    if len(paths) > 1 or replace(options, quality=None) != usual:
+        raise OptionError(
+            f"{paths[0]} was being recorded when it was cut off. Make a dataset of it first: mp4ds "
+            f"pack --salvage {paths[0]} -o DATASET, and pack that."
+        )
+    about = load_about(options.about) if options.about is not None else None
+    return recover(paths[0], target, force=options.force, about=about)
+
+
 def _copied(
     paths: Sequence[Path], target: Path, options: PackOptions, progress: Report | None
 ) -> PackSummary:
-    """Copy a dataset, or encode it anew where it cannot be copied."""
+    """Copy a dataset, or re-encode it if it cannot be copied."""
     from mp4ds.packing.copying import copy
 
     try:
@@ -308,17 +326,17 @@ def pack_share(
     *,
     progress: Report | None = None,
 ) -> None:
-    """Pack one machine's share of a recording; `pack` makes the dataset when all shares are there.
+    """Pack one machine's share of a recording; `pack` makes the dataset when all shares are done.
 
     Args:
         sources: As for `pack`, under the same path on all machines.
-        dataset: The folder to make in the end; beside it the parts are made.
-        share: Number of this share, from 1, and how many there are.
-        options: How; the same for all shares.
+        dataset: The folder to make in the end; parts are made next to it.
+        share: Number of this share, from 1, and the number of shares.
+        options: How to pack; the same for all shares.
         progress: Called several times a second.
 
     Raises:
-        Mp4dsError: As `pack`.
+        Mp4dsError: As for `pack`.
     """
     paths = _paths(sources)
     chosen = _checked(options or PackOptions(), paths, may_copy=False)
@@ -343,16 +361,16 @@ def pack_each(
 
     Args:
         sources: Each a bag, rosbag2 folder or MCAP file, or its URL.
-        folder: Where, or at which URL, to make the datasets; each is named as its recording.
+        folder: Folder or URL in which to make the datasets; each is named after its recording.
         options: How.
         progress: Called several times a second.
 
     Returns:
-        What became of each that was packed now, in the order of the sources; datasets that are
-        there already, of the same recordings, are left as they are.
+        The result for each one packed now, in the order of the sources; existing datasets of the
+        same recordings are left as they are.
 
     Raises:
-        Mp4dsError: As `pack`.
+        Mp4dsError: As for `pack`.
     """
     paths = _paths(sources)
     asked = options or PackOptions()
@@ -364,7 +382,8 @@ def pack_each(
         target = parent / (source.name if source.is_dir() else source.stem)
         if target in targets:
             raise OptionError(
-                f"{targets[target]} and {source} would both become {target}. Pack one elsewhere."
+                f"{targets[target]} and {source} would both become {target}. Pack one of them "
+                "elsewhere."
             )
         targets[target] = source
     if not remote(parent):
@@ -377,7 +396,7 @@ def pack_each(
     made: dict[Path, PackSummary] = {}
     runs = []
     for target, source in missing.items():
-        # what is copied, or goes to a URL, is made one after the other
+        # copies, and uploads to URLs, are made one after another
         if source in copied or remote(parent):
             own = _checked(asked, [source])
             made[target] = _pack([source], target, own, progress)
@@ -389,7 +408,7 @@ def pack_each(
 
 
 def _is_packed(source: Path, target: Path, options: PackOptions) -> bool:
-    """Whether a dataset of a recording is there already."""
+    """Whether a dataset of a recording already exists."""
     if not (target / MANIFEST_NAME).exists() if remote(target) else not os.path.lexists(target):
         return False
     try:
@@ -423,29 +442,29 @@ def _is_copy(paths: Sequence[Path], options: PackOptions) -> bool:
 
 
 def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = True) -> PackOptions:
-    """The options, with what is left to the sources; refuses those that contradict each other.
+    """The options, completed from the sources; refuses contradictory ones.
 
     Args:
-        options: As they were given.
+        options: As given by the user.
         paths: What is to be packed.
-        may_copy: A dataset may be copied; there is no quality then.
+        may_copy: A dataset may be copied, in which case no quality is needed.
 
     Raises:
-        OptionError: They do.
-        HardwareError: An encoder is asked for that this machine has not.
-        ScoringError: VMAF is asked for, and there is nothing that computes it.
+        OptionError: They contradict each other.
+        HardwareError: The requested encoder is not available on this machine.
+        ScoringError: VMAF is requested, but cannot be computed.
     """
     images = options.images.absolute() if options.images else None
     if options.about is not None:
-        load_about(options.about)  # refuses what it cannot tell before anything is read
+        load_about(options.about)  # fails before anything is read
     if may_copy and _is_copy(paths, options):
         return options
     asked = _quality_of(paths) if options.quality is None else options.quality
     quality = parse_quality(asked)
     if options.transcode and quality.lossless:
         raise OptionError(
-            "`transcode` goes with a lossy `quality`, such as visual: without loss, a JPEG file "
-            "is smaller than any video of its pixels."
+            "`transcode` needs a lossy `quality`, such as visual: a JPEG file is smaller than "
+            "any lossless video of its pixels."
         )
     check_codec(
         options.codec,
@@ -454,12 +473,12 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
         crf=quality.crf,
         varied=quality.target is not None,
     )
-    if not (options.cluster or options.join):  # else others encode, or did
+    if not (options.cluster or options.join):  # otherwise others encode, or have encoded
         check_hardware(options.codec)
     if quality.target and quality.target.metric == "vmaf" and not options.join:
         from mp4ds.video.libvmaf import find_ffmpeg
 
-        find_ffmpeg()  # says how to get one before anything is read
+        find_ffmpeg()  # fails before anything is read, saying how to get one
     transcode = options.transcode or (not quality.lossless and _has_transcoded(paths))
     chosen = replace(options, quality=str(quality), transcode=transcode, images=images)
     chosen.group_frames  # noqa: B018 - refuses a purpose that is none
@@ -467,10 +486,10 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
 
 
 def _quality_of(paths: Sequence[Path]) -> str:
-    """The quality of what was packed before; lossless for recordings.
+    """The quality of the source datasets; lossless for recordings.
 
     Raises:
-        OptionError: It does not tell what is wanted now.
+        OptionError: It does not determine the new quality.
     """
     folders = [dataset_at(path) for path in paths]
     found = {
@@ -480,11 +499,14 @@ def _quality_of(paths: Sequence[Path]) -> str:
         return LOSSLESS
     if len(found) == 1 and parse_quality(*found).crf is None:
         return found.pop()
-    raise OptionError(f"What was packed before has {', '.join(sorted(found))}. Give a `quality`.")
+    raise OptionError(
+        f"There is no default `quality` for what was packed as {', '.join(sorted(found))}. Give "
+        "one."
+    )
 
 
 def _has_transcoded(paths: Sequence[Path]) -> bool:
-    """Whether JPEG files were encoded anew when something was packed before."""
+    """Whether the source datasets have re-encoded JPEG files."""
     folders = [folder for path in paths if (folder := dataset_at(path))]
     return any(
         load_stream(folder / entry.sidecar).body == "jpeg"
@@ -501,7 +523,7 @@ def _plan(
     recordings: int = 1,
     is_share: bool = False,
 ) -> PackRun:
-    """The pack of a recording: one that was begun before, or a new one."""
+    """The pack of a recording: an unfinished one, or a new one."""
     check_target(target, force=options.force, owned=dataset_files, sources=paths)
     place = Workplace.beside(target)
     shared = is_share or options.join or options.cluster is not None
@@ -510,7 +532,8 @@ def _plan(
         return PackRun(job, place, paths, target, options.force, is_new=False)
     if options.join:
         raise OptionError(
-            f"There is nothing to join: {place.folder} holds no pack. Run the shards first."
+            f"There is nothing to join: {place.folder} holds no pack in progress. Run the "
+            "shards first."
         )
     with open_recording(
         paths, salvage=options.salvage, images=options.images, asked=options.slice

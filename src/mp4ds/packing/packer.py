@@ -1,4 +1,4 @@
-"""One recording, or one part of it, into videos, sidecars and verbatim messages."""
+"""Packs one recording, or a part of it, into videos, sidecars and verbatim messages."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import TypeVar
 
 from mp4ds.bags.mcap_write import McapWriter
-from mp4ds.bags.protocols import BagReader, BagWriter
+from mp4ds.bags.protocols import BagReader
 from mp4ds.bags.salvage.losses import losses_of
 from mp4ds.errors import OutOfReachError, Refused
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.messages.transforms import TransformCollector
 from mp4ds.packing.calibrations import Calibrations
 from mp4ds.packing.engine import Workers
+from mp4ds.packing.journal import Journal
 from mp4ds.packing.look import CameraMessage, Looker, StreamKey
 from mp4ds.packing.manifest import PartRecord, PartStream, declare_rest
 from mp4ds.packing.options import TopicSummary
@@ -26,9 +27,12 @@ from mp4ds.plan import FileNames, Selection
 from mp4ds.records import EVERYTHING, Attachment, Channel, Excerpt, Message, Record
 
 Exact = Mapping[tuple[int, StreamKey], str]
-"""Id of a channel and key of streams that no score is asked of any more -> why."""
+"""Channel id and key of streams that no longer need to reach a score -> why."""
 
-NOT_SURVEYED = "images of its size or encoding were not met where the recording was looked into"
+TOO_LATE = "recorded faster than it could be encoded"
+NOT_SURVEYED = (
+    "images of its size or encoding were not in the parts of the recording that were surveyed"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +40,8 @@ class _Item:
     """A message of a camera channel.
 
     Attributes:
-        ordinal: Its place among the channel's messages.
-        number: Its place among the topic's messages.
+        ordinal: Its position among the channel's messages.
+        number: Its position among the topic's messages.
         seen: What it holds.
     """
 
@@ -49,12 +53,12 @@ class _Item:
 
 @dataclass
 class _Route:
-    """Where the messages of one key go: into the first of the streams that takes them.
+    """Where the messages of one key go: into the first stream that accepts them.
 
     Attributes:
-        plans: How further streams for them may be made, the best first.
-        streams: Those that were made, in the order of the plans.
-        refusal: Why there is no stream for what none of these takes.
+        plans: Plans for further streams, the best first.
+        streams: Existing streams, in the order of the plans.
+        refusal: Why there is no stream for what none of these accept.
     """
 
     plans: list[TrackPlan]
@@ -80,11 +84,12 @@ class CameraRouter:
         reader: The recording.
         folder: Where the streams' files are made.
         settings: How to encode.
-        calibrations: Takes notice of new streams.
-        survey: What was decided before; None to decide here.
+        calibrations: Notified of new streams.
+        survey: Earlier decisions; None to decide here.
         topic_of: The summary of a channel's topic.
-        keep: Stores what no stream can carry exactly.
-        exact: Streams that are to be lossless although a score is asked for, and why.
+        keep: Stores what no stream can carry exactly, with the reason.
+        exact: Streams that must be lossless although a score is asked for, and why.
+        journal: Where to note what is done; None: nowhere.
     """
 
     def __init__(
@@ -96,12 +101,14 @@ class CameraRouter:
         survey: Survey | None,
         *,
         topic_of: Callable[[Channel], TopicSummary],
-        keep: Callable[[Message], None],
+        keep: Callable[[Message, str], None],
         exact: Exact,
+        journal: Journal | None = None,
     ) -> None:
         self._reader = reader
         self._folder = folder
         self._settings = settings
+        self._journal = journal
         self._calibrations = calibrations
         self._survey = survey
         self._topic_of = topic_of
@@ -113,7 +120,7 @@ class CameraRouter:
         self._renamed: set[str] = set()
 
     def take(self, message: Message, workers: Workers) -> None:
-        """Encode an image, hold it back, or keep it with the reason why no stream takes it."""
+        """Encode an image, hold it back, or keep it with the reason why no stream accepts it."""
         channel = message.channel
         state = self._state_of(channel)
         ordinal, number = state.count, self._topic_of(channel).messages - 1
@@ -122,7 +129,7 @@ class CameraRouter:
             seen = state.looker.look(message)
         except Refused as reason:
             self._settle(state, workers)
-            self._keep_verbatim(message, number, str(reason))
+            self._keep_verbatim(message, ordinal, number, str(reason))
             return
         self._calibrations.saw(channel, seen)
         item = _Item(message, ordinal, number, seen)
@@ -139,7 +146,8 @@ class CameraRouter:
 
     def _state_of(self, channel: Channel) -> _CameraChannel:
         if channel.identity not in self._channels:
-            looker = Looker(channel, transcode=self._settings.transcode)
+            settings = self._settings
+            looker = Looker(channel, transcode=settings.transcode, is_live=settings.is_live)
             state = self._channels[channel.identity] = _CameraChannel(looker)
             decisions = self._survey.decisions.get(channel.id) if self._survey else None
             if decisions is not None:
@@ -148,12 +156,12 @@ class CameraRouter:
         return self._channels[channel.identity]
 
     def settle(self, workers: Workers) -> None:
-        """Write everything that is held back: the recording is at its end."""
+        """Write everything held back: the recording has ended."""
         for state in self._channels.values():
             self._settle(state, workers)
 
     def _settle(self, state: _CameraChannel, workers: Workers) -> None:
-        """Decide how the held images are encoded, and write them in their order."""
+        """Decide how to encode the held images, and write them in order."""
         held, state.held = state.held, []
         for key in dict.fromkeys(item.seen.key for item in held):
             if key not in state.routes:
@@ -184,6 +192,10 @@ class CameraRouter:
         route = state.routes[item.seen.key]
         reason = route.refusal
         for stream in self._candidates(state, route, item):
+            number = self._streams.index(stream)
+            if workers.is_late(number):
+                reason = TOO_LATE
+                break
             try:
                 job = stream.accept(item.message, item.seen, item.ordinal)
             except Refused as refusal:
@@ -192,15 +204,15 @@ class CameraRouter:
             self._topic_of(item.message.channel).frames += 1
             if stream.frames == 1:
                 self._calibrations.adopt(stream)
-            workers.submit(self._streams.index(stream), job)
+            workers.submit(number, job)
             return
         state.looker.leave_out(item.seen)
-        self._keep_verbatim(item.message, item.number, route.refusal or reason)
+        self._keep_verbatim(item.message, item.ordinal, item.number, route.refusal or reason)
 
     def _candidates(
         self, state: _CameraChannel, route: _Route, item: _Item
     ) -> Iterator[StreamWriter]:
-        """The streams that may take a message; the next one is made when the others refuse."""
+        """The streams that may accept a message; the next one is made when the others refuse."""
         yield from route.streams
         while route.plans and not route.refusal:
             made = sum(len(other.streams) for other in state.routes.values())
@@ -230,6 +242,7 @@ class CameraRouter:
             plan=plan,
             settings=self._settings,
             rate=self._rate(channel),
+            journal=self._journal,
         )
         self._streams.append(stream)
         if renamed:
@@ -238,9 +251,11 @@ class CameraRouter:
             self._topic_of(channel).notes.append(stream.note)
         return stream
 
-    def _keep_verbatim(self, message: Message, number: int, reason: str) -> None:
+    def _keep_verbatim(self, message: Message, ordinal: int, number: int, reason: str) -> None:
+        if self._journal is not None:
+            self._journal.verbatim(message.channel, ordinal, number, reason)
         self._topic_of(message.channel).count_verbatim(reason, number)
-        self._keep(message)
+        self._keep(message, reason)
 
     def finish(self) -> list[PartStream]:
         """Complete all videos and write their sidecars; all jobs must have run."""
@@ -272,13 +287,13 @@ class PartSettings:
     Attributes:
         streams: How its streams are encoded.
         selected: Whether a topic is packed.
-        excerpt: What of the recording it is made from.
-        survey: What all parts agree on; None where there is but one part.
-        camera_info: Pairs of topics that the user names, ``IMAGE=INFO``.
-        workers: Streams that are encoded side by side.
+        excerpt: The part of the recording it covers.
+        survey: What all parts agree on; None if there is only one part.
+        camera_info: Pairs of topics given by the user, ``IMAGE=INFO``.
+        workers: Streams to encode in parallel.
         compression: Of messages.mcap.
         is_whole: Whether there are no other parts.
-        exact: Streams that are made lossless, since a score is out of their reach, and why.
+        exact: Streams made lossless because they cannot reach the score, and why.
     """
 
     streams: StreamSettings
@@ -293,10 +308,10 @@ class PartSettings:
 
 
 def until_in_reach(make: Callable[[Exact], _Made]) -> _Made:
-    """Pack; and again, with other streams lossless, while one cannot have the score asked for.
+    """Pack, and repeat with more streams lossless while one cannot reach the score.
 
     Args:
-        make: Packs, beginning anew each time; given the streams that are to be lossless.
+        make: Packs from the beginning, given the streams that must be lossless.
     """
     exact: dict[tuple[int, StreamKey], str] = {}
     while True:
@@ -316,9 +331,10 @@ class Packer:
         folder: The folder to fill, empty.
         settings: How.
         progress: Called after each record with what was packed so far.
+        journal: Where to note what is done; None: nowhere.
     """
 
-    _verbatim: BagWriter  # messages.mcap, open while `run` reads
+    _verbatim: McapWriter  # messages.mcap, open while `run` reads
 
     def __init__(
         self,
@@ -326,9 +342,11 @@ class Packer:
         folder: Path,
         settings: PartSettings,
         progress: Callable[[PartRecord], None] | None = None,
+        journal: Journal | None = None,
     ) -> None:
         self._reader = reader
         self._settings = settings
+        self._journal = journal
         self._progress = progress
         self._transforms = TransformCollector()
         self._part = PartRecord(folder)
@@ -339,6 +357,7 @@ class Packer:
             survey.pairs if survey else None,
             topic_of=self._part.topic,
             keep=self._keep,
+            journal=journal,
         )
         self._cameras = CameraRouter(
             reader,
@@ -349,6 +368,7 @@ class Packer:
             topic_of=self._part.topic,
             keep=self._keep,
             exact=settings.exact,
+            journal=journal,
         )
 
     def run(self) -> PartRecord:
@@ -357,7 +377,7 @@ class Packer:
         Raises:
             SourceError: The recording is damaged.
             OutOfReachError: A stream cannot have the score that was asked for.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         part = self._part
         try:
@@ -401,6 +421,8 @@ class Packer:
         if not self._settings.selected(channel.topic):
             part.left_out[channel.topic] = None
             return
+        if self._journal is not None and channel.id not in part.counts:
+            self._journal.channel(channel)
         part.counts[channel.id] = part.counts.get(channel.id, 0) + 1
         topic = part.topic(channel)
         topic.messages += 1
@@ -414,6 +436,7 @@ class Packer:
         else:
             self._keep(record)
 
-    def _keep(self, message: Message) -> None:
+    def _keep(self, message: Message, reason: str = "") -> None:
+        del reason
         self._verbatim.add_channel(message.channel)
         self._verbatim.write(message)

@@ -1,4 +1,4 @@
-"""Divides a pack into tasks that know nothing of each other."""
+"""Divides a pack into independent tasks."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ GOPS_PER_WINDOW = 10
 """Groups of pictures of the busiest camera in a window: a cut costs at most one key frame."""
 
 LEAST_WINDOW = 300
-"""Frames of a window, unless a user says something of it: a part takes some time to begin."""
+"""Minimum frames of a window, unless the user says otherwise: each part has some overhead."""
 
 
 def cut_times(times: Sequence[NDArray[np.int64]], frames: int) -> list[int]:
-    """Log times at which a recording is cut, each a message of a camera.
+    """Log times at which to cut a recording, each that of a camera message.
 
-    The busiest camera is cut after so many of its frames each; so is any other within the
-    windows in which it has more than twice as many.
+    The busiest camera is cut after that many of its frames; so is any other camera within windows
+    in which it has more than twice as many.
 
     Args:
         times: Sorted log times of each camera's messages, ns.
         frames: Frames of a window.
 
     Returns:
-        Increasing; each begins a window, and the first window begins before all.
+        Increasing; each begins a window, and the first window begins before all of them.
     """
     cuts: list[int] = []
     for column in sorted(times, key=len, reverse=True):
@@ -61,7 +61,7 @@ def cut_times(times: Sequence[NDArray[np.int64]], frames: int) -> list[int]:
 def _without_short_end(
     cuts: list[int], times: Sequence[NDArray[np.int64]], frames: int
 ) -> list[int]:
-    """Leave out a last cut after which little is left."""
+    """Drop a last cut that leaves little after it."""
     if not cuts:
         return cuts
     rest = max((len(column) - np.searchsorted(column, cuts[-1]) for column in times), default=0)
@@ -75,10 +75,10 @@ def spans_of(cuts: Sequence[int]) -> list[tuple[int | None, int | None]]:
 
 
 def group_topics(costs: Mapping[str, int], budget: int) -> list[list[str]]:
-    """Topics in groups of which each costs no more than a budget, where that can be.
+    """Group topics so that no group exceeds a budget, if possible.
 
     Args:
-        costs: Bytes of memory that each topic takes while it is packed.
+        costs: Memory that each topic takes while it is packed, bytes.
         budget: Bytes.
 
     Returns:
@@ -98,12 +98,12 @@ def group_topics(costs: Mapping[str, int], budget: int) -> list[list[str]]:
 
 
 def share(number: int, tasks: Sequence[tuple[str, ...]], shares: int) -> list[tuple[str, ...]]:
-    """One share of tasks of several machines: every so many-th.
+    """One machine's share of the tasks: every nth one.
 
     Args:
-        number: Of the share, from 1.
+        number: Number of the share, from 1.
         tasks: All, in an order on which all machines agree.
-        shares: How many there are.
+        shares: Number of shares.
     """
     return list(tasks[number - 1 :: shares])
 
@@ -111,22 +111,22 @@ def share(number: int, tasks: Sequence[tuple[str, ...]], shares: int) -> list[tu
 # ---------------------------------------------------------------- planning
 
 TASK_BYTES = 160 * 2**20
-"""A task's memory beside its encoders: the interpreter, libraries, and chunks of the source."""
+"""A task's memory besides its encoders: the interpreter, libraries, and chunks of the source."""
 
 _MESSAGES_IN_FLIGHT = 8
-_ASSUMED_ROW = 32  # bytes of a lossless encoder for each of a message
-_UNKNOWN_BYTES = 2**30  # of a task whose cameras no index tells
-_COPIED, _OTHER_COST = 0.02, 1_000.0  # of a message that is not encoded; only for progress
+_ASSUMED_ROW = 32  # bytes of a lossless encoder per byte of a message
+_UNKNOWN_BYTES = 2**30  # of a task whose cameras no index lists
+_COPIED, _OTHER_COST = 0.02, 1_000.0  # cost of a message that is not encoded; only for progress
 
 
 @dataclass(frozen=True, slots=True)
 class Resources:
-    """What a machine gives to a pack.
+    """Resources of a machine for a pack.
 
     Attributes:
         cores: Processors.
         memory: Bytes that may be used.
-        jobs: Processes at a time that were asked for, or None.
+        jobs: Requested number of processes, or None.
     """
 
     cores: int
@@ -135,28 +135,28 @@ class Resources:
 
     @classmethod
     def of(cls, options: PackOptions) -> Resources:
-        """Of this machine, as far as the options allow."""
+        """Those of this machine, within the options' limits."""
         return cls(available_cores(), options.memory or available_memory() // 2, options.jobs)
 
     def for_one_of(self, recordings: int) -> Resources:
-        """What each of several recordings gets that are packed at the same time."""
+        """The share of each of several recordings packed at the same time."""
         if recordings < 2:
             return self
         return replace(self, cores=max(1, self.cores // recordings), jobs=None)
 
     def slots(self, job: Job) -> int:
-        """Processes at a time for a job: as many as the cores keep busy and the memory holds.
+        """Number of processes for a job, limited by cores and memory.
 
         Raises:
             OptionError: Not one fits into the memory.
         """
         busy = max(1, self.cores // max(1, job.threads * job.workers))
-        fitting = (self.memory - TASK_BYTES) // job.task_bytes  # but for what coordinates them
+        fitting = (self.memory - TASK_BYTES) // job.task_bytes  # except for what coordinates them
         if fitting < 1 and self.memory < job.task_bytes:
             needed = -(-job.task_bytes // 2**20)
             raise OptionError(
-                f"`memory` of {self.memory // 2**20} MiB is too little: one encoder of the "
-                f"largest images takes about {needed} MiB with what is around it."
+                f"`memory` of {self.memory // 2**20} MiB is too little: encoding the largest "
+                f"images takes about {needed} MiB."
             )
         return min(self.jobs or busy, max(1, fitting))
 
@@ -169,7 +169,7 @@ def available_cores() -> int:
 
 
 def available_memory() -> int:
-    """Bytes of this machine's memory, or of the container's where that is less."""
+    """This machine's memory, or the container's limit if lower, bytes."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     for name in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
         try:
@@ -184,8 +184,8 @@ class _Topics:
     """The camera channels of a recording, by how they can be divided.
 
     Attributes:
-        free: Their messages do not depend on each other, so that they can be cut anywhere.
-        bound: Those that one task takes from end to end.
+        free: Their messages are independent, so that they can be cut anywhere.
+        bound: Those that a single task must take as a whole.
         infos: Topics of calibrations -> the topic of their images.
     """
 
@@ -203,10 +203,10 @@ def plan_job(
         reader: The recording.
         paths: What it was opened from.
         options: How to pack.
-        means: What there is to pack with.
+        means: The available resources.
 
     Returns:
-        The job; of one task where the recording is short, or without an index.
+        The job; a single task if the recording is short, or has no index.
 
     Raises:
         OptionError: An option is wrong.
@@ -301,7 +301,7 @@ def _digest_tasks(reader: BagReader, asked: Slice) -> list[Task]:
 def _work(
     reader: BagReader, channels: Sequence[Channel], survey: Survey
 ) -> dict[str, tuple[int, float]]:
-    """Messages of each topic, and what one costs: its bytes, more where it is encoded."""
+    """Messages of each topic, and the cost of one: its bytes, more if it is encoded."""
     stats = reader.stats()
     work: dict[str, tuple[int, float]] = {}
     for channel in channels:
@@ -317,7 +317,7 @@ def _work(
 def _topics(
     reader: BagReader, channels: Sequence[Channel], options: PackOptions
 ) -> tuple[_Topics, dict[int, int]]:
-    """How the camera channels can be divided, and the calibrations that names pair."""
+    """How the camera channels can be divided, and the calibrations paired by name."""
     cameras = [channel for channel in channels if is_camera(channel)]
     bound = {channel.topic for channel in cameras if _is_bound(reader, channel)}
     pairs = pair_camera_infos(channels, chosen=choose_pairs(options.camera_info, channels))
@@ -363,7 +363,7 @@ def _largest(groups: Sequence[Sequence[str]], costs: Mapping[str, int]) -> int:
 
 
 def _costs(reader: BagReader, topics: _Topics, survey: Survey, *, threads: int) -> dict[str, int]:
-    """Memory of each topic's encoders and of its messages on their way, bytes."""
+    """Memory of each topic's encoders and queued messages, bytes."""
     costs: dict[str, int] = {}
     for channel in topics.free:
         first = reader.first(channel)
@@ -382,16 +382,16 @@ def _encoder_bytes(decision: Decision, threads: int) -> int:
             if isinstance(plan, TargetPlan) and plan.target.metric == "vmaf":
                 from mp4ds.video.libvmaf import vmaf_bytes
 
-                # a window is scored when its encoder is gone
+                # a window is scored after its encoder is closed
                 needed = max(needed, vmaf_bytes(*size, threads))
             return needed
     return 0
 
 
 def _assumed_bytes(reader: BagReader, topics: _Topics, settings: StreamSettings) -> int:
-    """Memory of packing everything at once, before the images were looked at closely."""
+    """Memory for packing everything at once, estimated before looking at the images closely."""
     needed = TASK_BYTES
-    if settings.quality.target is not None:  # no crf is looked for yet
+    if settings.quality.target is not None:  # the crf is not searched for yet
         settings = replace(settings, quality=QualitySetting("visual"))
     for channel in topics.free:
         first = reader.first(channel)
@@ -413,7 +413,7 @@ def _tasks(
     reader: BagReader,
     asked: Slice,
 ) -> list[Task]:
-    """All tasks, those of one time together; the first group takes what is no camera's, too."""
+    """All tasks, those of one time together; the first group also has those without a camera."""
     apart = [_with_infos(group, topics) for group in groups[1:]]
     solo = [
         _with_infos([topic], topics)
@@ -430,6 +430,6 @@ def _tasks(
 
 
 def _with_infos(group: Sequence[str], topics: _Topics) -> tuple[str, ...]:
-    """Topics of a group, with those of the calibrations that go with them."""
+    """Topics of a group, including those of their calibrations."""
     infos = [info for info, image in topics.infos.items() if image in group]
     return tuple(sorted({*group, *infos}))

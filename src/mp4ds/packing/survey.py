@@ -1,4 +1,4 @@
-"""What is decided of a recording before it is packed in parts, so that all parts agree."""
+"""Decisions made about a recording before it is packed in parts, so that all parts agree."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ SAMPLES = 6
 """Images of a stream that show how it is best encoded."""
 
 MAX_STREAMS_PER_CHANNEL = 16
-"""A channel that changes its geometry more often than this is not split any further."""
+"""Limit of streams for a channel that keeps changing its geometry."""
 
 _MAX_LOOKS = 64
-# where a score is asked for: places beside the first that are looked at, and images of each
+# for a score: sampled places besides the first, and images at each
 _PLACES, _RUN = 2, 30
 _PAIRING_MESSAGES = 5_000
 
@@ -41,7 +41,7 @@ class Decision:
 
     Attributes:
         key: What they have in common.
-        plans: The best first; none where no video is made of them.
+        plans: The best first; none if no video is made from them.
         refusal: Why there is none.
     """
 
@@ -52,19 +52,19 @@ class Decision:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What all parts of a recording are to agree on.
+    """What all parts of a recording must agree on.
 
     Attributes:
-        decisions: Of the keys of each camera channel, by its id; channels that are packed by one
-            task alone are not here.
-        pairs: Calibration channels that stamps paired: their id -> that of the images.
+        decisions: For the keys of each camera channel, by its id; without channels packed by a
+            single task.
+        pairs: Calibration channels paired by stamps: their id -> that of the images.
     """
 
     decisions: Mapping[int, Sequence[Decision]] = field(default_factory=dict)
     pairs: Mapping[int, int] = field(default_factory=dict)
 
     def to_values(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """As JSON values."""
         return {
             "decisions": {
                 str(channel): [
@@ -185,7 +185,7 @@ def _samples(
     looker: Looker,
     settings: StreamSettings,
 ) -> list[CameraMessage]:
-    """The first images of one key from a log time on, as many as decide."""
+    """The first images of one key from a log time on, as many as needed to decide."""
     samples: list[CameraMessage] = []
     excerpt = Excerpt(start=start, topics=frozenset([channel.topic]), others=False)
     for number, record in enumerate(reader.records(excerpt)):
@@ -211,8 +211,8 @@ def survey_pairs(
     Args:
         reader: The recording, indexed.
         cameras: Camera channels whose messages do not depend on each other.
-        infos: Calibration channels, some of which are not paired.
-        pairs: Pairs that hold already.
+        infos: Calibration channels, some of which are unpaired.
+        pairs: Existing pairs.
     """
     topics = frozenset(channel.topic for channel in (*cameras, *infos))
     forms = {channel.id: MessageSplitter(channel) for channel in infos}

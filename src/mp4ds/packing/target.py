@@ -1,4 +1,4 @@
-"""Streams that are to have a score: their windows encoded, scored, and encoded again."""
+"""Streams that have to reach a score: their windows are encoded, scored, and re-encoded."""
 
 from __future__ import annotations
 
@@ -31,28 +31,29 @@ from mp4ds.video.planes import PLANES_FORMAT, PlaneMaker, Planes, PlaneSpool, de
 from mp4ds.video.scores import SMALLEST, largest_crf, psnr_scores, ssim_scores, vmaf_scores
 
 FALLS = {"vmaf": 0.3, "psnr": 0.4, "ssim": 0.001}
-"""Metric -> about how much less it is for each crf more, around what is asked for."""
+"""Metric -> about how much it drops per crf step, near typical targets."""
 
-_MOST_UP = 8  # crf from one window to the next
-_RANGE = 4  # of how fast scores fall, beside what is assumed
-_LAVISH = 0.5  # of the tolerance: a window with more too much is encoded again, with fewer bits
+_MOST_UP = 8  # maximum crf increase from one window to the next
+_RANGE = 4  # factor by which the fall of scores may differ from the assumed one
+# of the tolerance: a window that exceeds the target by more is re-encoded with fewer bits
+_LAVISH = 0.5
 _MOST_TRIMS = 2  # times
 _NOISE = 1e-9  # of sums of floats
 
 
 class CrfControl:
-    """Chooses the crf of one window after the other.
+    """Chooses the crf of each window in turn.
 
-    The mean of all frames does not fall below the target at any time, nor that of a window by
-    more than the tolerance: what earlier windows have too much, later ones may lack. Nor is a
-    window much better than it is to be, where a second try with fewer bits can tell.
+    The mean of all frames never falls below the target, nor that of a window by more than the
+    tolerance: the surplus of earlier windows can be used by later ones. Nor is a window much better
+    than required, if a second try with fewer bits can avoid it.
 
     Args:
         start: The crf of the first window.
-        smallest: That may be chosen.
-        largest: That may be chosen.
+        smallest: The smallest allowed.
+        largest: The largest allowed.
         tolerance: How far below the target the mean of a window may be.
-        fall: About how much less a score is for each crf more.
+        fall: About how much a score drops per crf step.
     """
 
     def __init__(
@@ -62,26 +63,26 @@ class CrfControl:
         self._smallest, self._largest = smallest, largest
         self._tolerance = tolerance
         self._assumed = self._fall = fall
-        self._surplus = 0.0  # of all frames together
+        self._surplus = 0.0  # over all frames
 
     def accepted(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
-        """The largest crf of those tried that is good enough; None where none is.
+        """The largest crf of those tried that is good enough; None if none is.
 
         Args:
             tried: Crf -> the mean score of the window's frames.
-            due: What is asked for.
-            frames: How many it has.
+            due: The required score.
+            frames: Number of its frames.
         """
         least = self._least(due, frames) - _NOISE
         return max((crf for crf, mean in tried.items() if mean >= least), default=None)
 
     def next(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
-        """The crf to encode a window with again; None where no more is to be tried.
+        """The crf to re-encode a window with; None if no further try is needed.
 
         Args:
             tried: Crf -> the mean score of the window, in the order they were tried.
-            due: What is asked for.
-            frames: How many it has.
+            due: The required score.
+            frames: Number of its frames.
         """
         self._learn(tried)
         best = self.accepted(tried, due, frames)
@@ -91,17 +92,17 @@ class CrfControl:
         return self._smaller(tried, best, due) if is_lavish else None
 
     def keep(self, tried: Mapping[int, float], crf: int, due: float, frames: int) -> None:
-        """Take a window as it was encoded with a crf, and choose that of the next one.
+        """Accept a window as encoded with a crf, and choose the crf of the next one.
 
         Args:
             tried: Crf -> the mean score of the window.
             crf: The one accepted.
-            due: What was asked for.
-            frames: How many it has.
+            due: The required score.
+            frames: Number of its frames.
         """
         mean = tried[crf]
         self._surplus = max(0.0, self._surplus + (mean - due) * frames)
-        room = (due - self._least(due, frames)) / 2  # half of it is for what is not foreseen
+        room = (due - self._least(due, frames)) / 2  # keep half in reserve
         up = int((mean - due + room) / self._fall)
         self.crf = min(crf + min(max(up, 0), _MOST_UP), self._largest)
 
@@ -134,7 +135,7 @@ class CrfControl:
 
 # ---------------------------------------------------------------- windows
 
-_FRAMES = 60  # of a window, or as many as are of one group of pictures, where that is longer
+_FRAMES = 60  # of a window, or one group of pictures if that is longer
 _MOST_FRAMES = 240
 
 
@@ -142,7 +143,7 @@ def window_frames(gop: int) -> int:
     """Frames of a window: whole groups of pictures, so that windows cost no more key frames.
 
     Args:
-        gop: Most frames from one key frame to the next.
+        gop: Maximum key frame interval, frames.
     """
     return min(max(1, _FRAMES // gop) * gop, _MOST_FRAMES)
 
@@ -152,13 +153,13 @@ class WindowCoder:
     """Encodes and scores windows.
 
     Attributes:
-        recipe: Codec and options; the crf is another one each time.
+        recipe: Codec and options; the crf varies.
         layout: How images become pictures.
         size: Columns and rows of an image.
-        target: Its metric is measured.
-        gop: Most frames from one key frame to the next.
+        target: The target, whose metric is measured.
+        gop: Maximum key frame interval, frames.
         threads: Of the encoder, and of libvmaf.
-        rate: Frames per second, where known.
+        rate: Frames per second, if known.
     """
 
     recipe: Recipe
@@ -176,7 +177,7 @@ class WindowCoder:
 
     @cached_property
     def ffmpeg(self) -> Ffmpeg | None:
-        """What computes VMAF, where that is the metric.
+        """The ffmpeg that computes VMAF, if that is the metric.
 
         Raises:
             ScoringError: There is none; says how to get one.
@@ -197,7 +198,7 @@ class WindowCoder:
         """Encode a window.
 
         Args:
-            frames: Those of the window, at least one.
+            frames: The window's frames, at least one.
             ticks: When each is shown, increasing.
             crf: Constant rate factor.
             path: The video to make.
@@ -206,9 +207,9 @@ class WindowCoder:
             The scores of its frames, in steps of the metric (`SCORE_STEPS`).
 
         Raises:
-            EncoderRefusedError: The codec does not take such pictures.
+            EncoderRefusedError: The encoder does not support such pictures.
             ScoringError: libvmaf failed.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         width, height = self.coded_size
         encoder = VideoEncoder(
@@ -231,9 +232,9 @@ class WindowCoder:
         return self._scores(frames, decoded_planes(path))
 
     def reachable(self, frames: PlaneSpool) -> float:
-        """The score to ask of a window: the target, or less where that is beyond it.
+        """The score required of a window: the target, or less if it is out of reach.
 
-        VMAF takes what is at rest for less than it is, even beside itself.
+        VMAF underrates still scenes, even compared with themselves.
 
         Raises:
             ScoringError: libvmaf failed.
@@ -245,12 +246,12 @@ class WindowCoder:
         return min(target.score, ceiling - target.tolerance)
 
     def mean(self, scores: NDArray[np.int64]) -> float:
-        """The mean of scores that are told in steps."""
+        """The mean of scores given in steps."""
         return float(np.mean(scores)) / SCORE_STEPS[self.target.metric]
 
     def _scores(self, frames: PlaneSpool, decoded: Iterable[Planes]) -> NDArray[np.int64]:
         if self.ffmpeg is not None:
-            # what moves in the first frame is told by the second
+            # motion in the first frame is measured with the second
             before = frames.frame(1) if len(frames) > 1 else None
             found = vmaf_scores(
                 frames, decoded, ffmpeg=self.ffmpeg, threads=self.threads, before=before
@@ -275,19 +276,19 @@ def target_plan(
     settings: StreamSettings,
     rate: float | None,
 ) -> TargetPlan:
-    """Look for the crf with which samples of a stream have a score.
+    """Find the crf at which samples of a stream reach a score.
 
     Args:
-        plan: How the stream is made; with the crf to try first.
+        plan: Plan of the stream, with the crf to try first.
         target: The score.
         key: Of the stream.
-        runs: Consecutive messages of it from one or several places, at least one message.
+        runs: Runs of its consecutive messages from one or several places, at least one message.
         settings: How to encode.
-        rate: Frames per second, where known.
+        rate: Frames per second, if known.
 
     Raises:
-        Refused: No crf gives it.
-        EncoderRefusedError: The encoder does not take such pictures.
+        Refused: No crf reaches it.
+        EncoderRefusedError: The encoder does not support such pictures.
         ScoringError: VMAF cannot be computed.
     """
     coder = _coder(plan, target, key, settings, rate)
@@ -364,8 +365,8 @@ def _start_crf(
 
 
 def _out_of_reach(target: QualityTarget, due: float, made: str) -> Refused:
-    """Why a stream is lossless: a score, what is due at least, and what there is."""
-    limit = f" of the {due:.2f} that its originals allow" if due < target.score else ""
+    """Why a stream is lossless: the target, the required score, and the one reached."""
+    limit = f" of the {due:.2f} that the originals allow" if due < target.score else ""
     return Refused(f"{target} is out of reach: {made}{limit}")
 
 
@@ -373,7 +374,7 @@ class TargetTrack:
     """See `Track`.
 
     The frames of a window are kept on disk as planes. When it is full it is encoded, decoded and
-    scored, and encoded again with a lower crf until it is good enough. The windows' videos are
+    scored, and re-encoded with a lower crf until it is good enough. The windows' videos are
     joined at the end.
     """
 
@@ -416,7 +417,7 @@ class TargetTrack:
         """See `Track.write`.
 
         Raises:
-            Refused: A window cannot have the score.
+            Refused: A window cannot reach the score.
         """
         if seen.pixels is not None:
             self._spool.append(self._maker.make(self._plan.layout.to_picture(seen.pixels)))
@@ -428,7 +429,7 @@ class TargetTrack:
         """Encode the window until it is good enough.
 
         Raises:
-            Refused: It is not with any crf.
+            Refused: No crf is good enough.
         """
         coder, control, target = self._coder, self._control, self._plan.target
         spool, due = self._spool, target.score
@@ -465,7 +466,7 @@ class TargetTrack:
         """See `Track.close`.
 
         Raises:
-            Refused: A window cannot have the score.
+            Refused: A window cannot reach the score.
         """
         try:
             if len(self._spool):

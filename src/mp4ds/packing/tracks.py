@@ -1,8 +1,8 @@
-"""What a stream's video is made of: pictures encoded here, or packets as they came."""
+"""What a stream's video is made from: pictures encoded here, or copied packets."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,16 +23,18 @@ from mp4ds.video.trial import choose
 
 @dataclass(frozen=True, slots=True)
 class StreamSettings:
-    """How streams are to be encoded.
+    """How to encode streams.
 
     Attributes:
-        quality: What was asked for.
+        quality: The requested quality.
         codec: Name of the codec, or None for the default.
         preset: Preset of the encoder, or None for the default.
         gop: Most frames between key frames.
         threads: Threads of each encoder.
-        transcode: Whether JPEG topics are encoded anew.
+        transcode: Whether JPEG topics are re-encoded.
         purpose: What the dataset is for; None for nothing in particular.
+        is_live: Whether it is encoded while it is recorded: with the fastest settings, untried,
+            into files of which a power cut leaves all but the end.
     """
 
     quality: QualitySetting
@@ -42,13 +44,18 @@ class StreamSettings:
     threads: int
     transcode: bool = False
     purpose: Purpose | None = None
+    is_live: bool = False
+
+
+OnPacket = Callable[[str, bytes], None]
+"""Told of a codec and a packet."""
 
 
 class Track(Protocol):
     """A video being written.
 
     Attributes:
-        note: What the user should know of it; empty if nothing.
+        note: What the user should know about it; empty if nothing.
     """
 
     note: str
@@ -65,8 +72,8 @@ class Track(Protocol):
             tick: Presentation time in ticks, greater than the last.
 
         Raises:
-            Refused: The video cannot have the score that was asked for.
-            OSError: The disk refused.
+            Refused: The video cannot reach the requested score.
+            OSError: It cannot be written.
         """
         ...
 
@@ -74,8 +81,8 @@ class Track(Protocol):
         """Finish the file.
 
         Raises:
-            Refused: The video cannot have the score that was asked for.
-            OSError: The disk refused.
+            Refused: The video cannot reach the requested score.
+            OSError: It cannot be written.
         """
         ...
 
@@ -84,30 +91,35 @@ class Track(Protocol):
         ...
 
     def describe(self) -> dict[str, Any]:
-        """What `mp4ds.format.models.Video` says of it, but for the file."""
+        """The fields of `mp4ds.format.models.Video`, except for the file."""
         ...
 
 
 class TrackPlan(Protocol):
-    """How a track may be made."""
+    """A way to make a track."""
 
     @property
     def profile(self) -> str:
-        """What the stream's sidecar calls it."""
+        """The profile in the stream's sidecar."""
         ...
 
     @property
     def exact(self) -> bool:
-        """Whether messages come back to the byte."""
+        """Whether messages are restored byte for byte."""
         ...
 
     @property
     def note(self) -> str:
-        """What the user should know of it; empty if nothing."""
+        """What the user should know about it; empty if nothing."""
         ...
 
     def open(
-        self, path: Path, seen: CameraMessage, settings: StreamSettings, rate: float | None
+        self,
+        path: Path,
+        seen: CameraMessage,
+        settings: StreamSettings,
+        rate: float | None,
+        on_packet: OnPacket | None = None,
     ) -> Track:
         """Begin the file.
 
@@ -116,9 +128,10 @@ class TrackPlan(Protocol):
             seen: The first message.
             settings: How to encode.
             rate: Frames per second, where known.
+            on_packet: Called with the codec and each packet, of live streams.
 
         Raises:
-            Refused: The encoder does not take such pictures.
+            Refused: The encoder does not support such pictures.
         """
         ...
 
@@ -141,20 +154,30 @@ class PicturePlan:
     gop: int = 0
 
     def open(
-        self, path: Path, seen: CameraMessage, settings: StreamSettings, rate: float | None
+        self,
+        path: Path,
+        seen: CameraMessage,
+        settings: StreamSettings,
+        rate: float | None,
+        on_packet: OnPacket | None = None,
     ) -> Track:
         """See `TrackPlan.open`."""
-        return _PictureTrack(self, path, seen.key, settings, rate)
+        return _PictureTrack(self, path, seen.key, settings, rate, on_packet)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetPlan(PicturePlan):
-    """Pictures, encoded here until they have a score. See `TrackPlan`."""
+    """Pictures, encoded here until they reach a score. See `TrackPlan`."""
 
     target: QualityTarget
 
     def open(
-        self, path: Path, seen: CameraMessage, settings: StreamSettings, rate: float | None
+        self,
+        path: Path,
+        seen: CameraMessage,
+        settings: StreamSettings,
+        rate: float | None,
+        on_packet: OnPacket | None = None,
     ) -> Track:
         """See `TrackPlan.open`."""
         from mp4ds.packing.target import TargetTrack
@@ -163,7 +186,7 @@ class TargetPlan(PicturePlan):
 
 
 def _recipes(plan: PicturePlan) -> Iterator[Recipe]:
-    """The recipe of a plan, then those of the other codecs that hold its pictures exactly."""
+    """The recipe of a plan, then those of other codecs that can hold its pictures exactly."""
     yield plan.recipe
     pixel_format = plan.layout.pixel_format
     for codec in lossless_codecs(pixel_format) if plan.recipe.lossless else ():
@@ -181,6 +204,7 @@ class _PictureTrack:
         key: StreamKey,
         settings: StreamSettings,
         rate: float | None,
+        on_packet: OnPacket | None,
     ) -> None:
         self._layout = layout = plan.layout
         self.note = plan.note
@@ -197,6 +221,7 @@ class _PictureTrack:
                     gop=plan.gop or settings.gop,
                     threads=settings.threads,
                     rate=rate,
+                    on_packet=on_packet and partial(on_packet, recipe.codec),
                 )
             except EncoderRefusedError as error:
                 path.unlink(missing_ok=True)
@@ -237,7 +262,7 @@ class _PictureTrack:
 def picture_facts(
     plan: PicturePlan, size: tuple[int, int], options: Mapping[str, str]
 ) -> dict[str, Any]:
-    """What `Track.describe` says of a video that is encoded here.
+    """`Track.describe` for a video that is encoded here.
 
     Args:
         plan: How it was made.
@@ -261,23 +286,35 @@ def picture_facts(
 
 @dataclass(frozen=True, slots=True)
 class PacketPlan:
-    """Packets as they came. See `TrackPlan`."""
+    """Packets, copied. See `TrackPlan`."""
 
     profile: str = "lossless"
     exact: bool = True
     note: str = ""
 
     def open(
-        self, path: Path, seen: CameraMessage, settings: StreamSettings, rate: float | None
+        self,
+        path: Path,
+        seen: CameraMessage,
+        settings: StreamSettings,
+        rate: float | None,
+        on_packet: OnPacket | None = None,
     ) -> Track:
         """See `TrackPlan.open`."""
-        return _PacketTrack(path, seen, rate, self.note)
+        return _PacketTrack(path, seen, rate, self.note, on_packet)
 
 
 class _PacketTrack:
     """See `Track`."""
 
-    def __init__(self, path: Path, seen: CameraMessage, rate: float | None, note: str) -> None:
+    def __init__(
+        self,
+        path: Path,
+        seen: CameraMessage,
+        rate: float | None,
+        note: str,
+        on_packet: OnPacket | None,
+    ) -> None:
         self.note = note
         self._key = seen.key
         self._begun = False
@@ -288,6 +325,7 @@ class _PacketTrack:
             height=seen.key.height,
             parameters=seen.parameters,
             rate=rate,
+            on_packet=on_packet and partial(on_packet, seen.key.codec),
         )
 
     def refuses(self, seen: CameraMessage) -> str | None:
@@ -334,16 +372,16 @@ def _color(recipe: Recipe) -> Color:
 
 # ---------------------------------------------------------------- planning
 
-_KEPT_JPEG = "JPEG files are kept as they are; --transcode encodes them anew"
-_MANY = 6  # files, of which there may be any number more
-_STREAM_BYTES = 3_000  # of a video without frames, and of its sidecar
+_KEPT_JPEG = "JPEG files are kept as they are; --transcode re-encodes them"
+_MANY = 6  # files, after which any number may follow
+_STREAM_BYTES = 3_000  # bytes of a video without frames, and of its sidecar
 _NEGLIGIBLE = 1 / 50
-"""Of the raw size: a video as small as this is kept although zstd would be smaller still."""
+"""Share of the raw size below which a video is kept even if zstd would be smaller."""
 
 
 def needs_trial(seen: CameraMessage, settings: StreamSettings) -> bool:
-    """Whether `plan_tracks` is better for having several messages."""
-    if seen.pixels is None:
+    """Whether `plan_tracks` benefits from having several messages."""
+    if seen.pixels is None or settings.is_live:
         return False
     if settings.quality.target is not None:
         return True
@@ -364,17 +402,17 @@ def plan_tracks(
 
     Args:
         samples: The first messages, at least one.
-        settings: What was asked for.
+        settings: The requested settings.
         rate: Frames per second, where known.
-        runs: Of messages of the same key, from several places of the recording, by which the crf
-            for a score is chosen. None: the samples.
+        runs: Runs of messages of the same key from several places of the recording, to choose the
+            crf for a score. None: the samples.
 
     Returns:
-        The best plan first; the last one takes every message of the key.
+        The best plan first; the last one accepts every message of the key.
 
     Raises:
-        Refused: A video would be larger than the messages are by zstd, or cannot have the
-            score that was asked for.
+        Refused: A video would be larger than the messages compressed by zstd, or cannot reach the
+            requested score.
         ScoringError: VMAF cannot be computed.
     """
     first = samples[0]
@@ -387,21 +425,23 @@ def plan_tracks(
         if target is None:
             return [plan]
         return _target_plans(plan, target, samples, runs, settings, rate)
+    if settings.is_live:
+        return _live_plans(samples[0], settings)
     return _lossless_plans(samples, settings)
 
 
 _SCORE_PRESET = "8"
-"""Of SVT-AV1 for a score: a window is encoded several times, and preset 7 with its lowest crf comes
-less near to a noisy original."""
+"""SVT-AV1's preset for a score: a window is encoded several times, and preset 7 at its lowest crf
+gets less close to a noisy original."""
 
 
 def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) -> PicturePlan:
     quality = settings.quality
     layout = layout_for(ENCODINGS[key.encoding], lossless=False)
     crf, preset = quality.crf, settings.preset
-    if crf is None:  # a score is looked for from there
+    if crf is None:  # the search for a score starts there
         crf, table_preset = visual_setting(rate)
-        if settings.codec in (None, *AV1):
+        if settings.codec in (None, *AV1) and not settings.is_live:
             usual = PURPOSE_PRESET if settings.purpose else str(table_preset)
             preset = preset or (_SCORE_PRESET if quality.target else usual)
     recipe = recipe_for(
@@ -411,6 +451,7 @@ def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) ->
         crf=crf,
         preset=preset,
         varied=quality.target is not None,
+        live=settings.is_live,
     )
     return PicturePlan(layout, recipe, str(quality), exact=False)
 
@@ -423,7 +464,7 @@ def _target_plans(
     settings: StreamSettings,
     rate: float | None,
 ) -> list[TrackPlan]:
-    """A plan that keeps a score, and one for images that cannot have it."""
+    """A plan that reaches a score, and one for images that cannot."""
     from mp4ds.packing.target import target_plan
 
     key = samples[0].key
@@ -459,7 +500,7 @@ def _lossless_plans(
         threads=settings.threads,
         purpose=settings.purpose,
     )
-    codec = settings.codec if asked else None  # else they were meant for lossy videos
+    codec = settings.codec if asked else None  # otherwise they were meant for lossy videos
     try:
         try:
             best = tried(codec=codec, preset=settings.preset if asked else None)
@@ -482,11 +523,22 @@ def _lossless_plans(
     return [plan, PicturePlan(general, recipe, "lossless", exact=True)]
 
 
+def _live_plans(seen: CameraMessage, settings: StreamSettings) -> list[TrackPlan]:
+    """Without loss, by what encodes in the least time (spec/notes.md)."""
+    layout = layout_for(ENCODINGS[seen.key.encoding], lossless=True)
+    able = lossless_codecs(layout.pixel_format)
+    codec, preset = settings.codec, settings.preset
+    if codec not in able:  # of those that are, H.264 has the fastest presets
+        codec, preset = ("h264" if "h264" in able else able[0]), None
+    recipe = recipe_for(layout.pixel_format, lossless=True, codec=codec, preset=preset, live=True)
+    return [PicturePlan(layout, recipe, "lossless", exact=True)]
+
+
 def _refuse_noise(samples: Sequence[CameraMessage], video_size: float) -> None:
-    """Refuse what a video would not make smaller.
+    """Refuse images that a video would not make smaller.
 
     Raises:
-        Refused: Tells both sizes.
+        Refused: Gives both sizes.
     """
     bodies = [seen.parts.body for seen in samples]
     raw = sum(map(len, bodies)) / len(bodies)
@@ -500,10 +552,10 @@ def _refuse_noise(samples: Sequence[CameraMessage], video_size: float) -> None:
 
 
 def _refuse_few(samples: Sequence[CameraMessage], video_size: float) -> None:
-    """Refuse a few files that are smaller than a video of them with its index and sidecar.
+    """Refuse a few files that are smaller than their video with its index and sidecar.
 
     Raises:
-        Refused: Says so.
+        Refused: They are.
     """
     is_file = samples[0].key.body in ("png", "rvl")
     if not is_file or len(samples) >= _MANY:
@@ -514,7 +566,7 @@ def _refuse_few(samples: Sequence[CameraMessage], video_size: float) -> None:
 
 
 def plan_to_values(plan: TrackPlan) -> dict[str, Any]:
-    """A plan as JSON has it."""
+    """A plan as JSON values."""
     values = {"profile": plan.profile, "exact": plan.exact, "note": plan.note}
     if isinstance(plan, PicturePlan):
         layout = plan.layout
@@ -529,10 +581,10 @@ def plan_to_values(plan: TrackPlan) -> dict[str, Any]:
 
 
 def plan_from_values(values: Mapping[str, Any]) -> TrackPlan:
-    """The plan that `plan_to_values` was given.
+    """The inverse of `plan_to_values`.
 
     Raises:
-        ValueError: It is none, or encodes as this version never does.
+        ValueError: It is not valid, or not one that this version makes.
     """
     common = {name: values[name] for name in ("profile", "exact", "note")}
     if "recipe" not in values:

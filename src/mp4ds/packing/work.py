@@ -1,6 +1,6 @@
 """One task of a divided pack; ``python -m mp4ds.packing.work FOLDER TASK`` runs it.
 
-Every engine calls `run_task`. It is idempotent: where its result is there, it does nothing.
+Every engine calls `run_task`. It is idempotent: if its result exists, it does nothing.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Progress = Callable[[dict[str, Any]], None]
 
 
 def run_task(folder: str, name: str, progress: Progress | None = None) -> None:
-    """Make the result of a task, unless it is there.
+    """Make the result of a task, unless it exists.
 
     Args:
         folder: Of the pack.
@@ -44,15 +44,15 @@ def run_task(folder: str, name: str, progress: Progress | None = None) -> None:
         progress: Called twice a second with frames and messages done, by topic.
 
     Raises:
-        SourceError: The recording is damaged, or not what it was.
-        OSError: The disk refused.
+        SourceError: The recording is damaged, or has changed.
+        OSError: It cannot be written.
     """
     with Tasks() as tasks:
         tasks.run(folder, name, progress)
 
 
 class Tasks:
-    """Runs tasks one after the other; a recording stays open between those of one pack."""
+    """Runs tasks one after another; a recording stays open between those of one pack."""
 
     def __init__(self) -> None:
         self._job: Job | None = None
@@ -61,9 +61,9 @@ class Tasks:
     def run(self, folder: str, name: str, progress: Progress | None = None) -> None:
         """See `run_task`."""
         place = Workplace(Path(folder))
-        job = place.job(shared=True)  # who runs the task has looked whose it is
+        job = place.job(shared=True)  # the caller has checked the owner
         if job is None:
-            raise Mp4dsError(f"{folder} holds no pack that was begun.")
+            raise Mp4dsError(f"{folder} holds no pack in progress.")
         task = job.task(name)
         with place.making(task) as into:
             if into is None:
@@ -95,7 +95,7 @@ class Tasks:
         part.save()
 
     def _open(self, job: Job) -> BagReader:
-        # an index of millions of messages is not to be read for every task
+        # avoid reading an index of millions of messages for every task
         if self._reader is None or self._job != job:
             self.close()
             self._reader = job.open()
@@ -122,21 +122,21 @@ def _digest(job: Job, number: int, into: Path) -> None:
 
 
 def told(part: PartRecord) -> dict[str, Any]:
-    """What a task tells of its progress: messages and bytes of each topic."""
+    """A task's progress: messages and bytes of each topic."""
     return {
         "topics": {topic.topic: (topic.messages, topic.raw_bytes) for topic in part.topics.values()}
     }
 
 
 def command(task: tuple[str, ...]) -> list[str]:
-    """The command line that runs a task, and then those that it is given on standard input."""
+    """The command line that runs a task, and then further ones from standard input."""
     return [sys.executable, "-m", "mp4ds.packing.work", *task]
 
 
 class _Orders:
     """The tasks of this process: the first, then one for each line of its standard input.
 
-    Where the input ends in the middle of a task, nobody waits for its result: the process ends.
+    If the input ends during a task, nobody waits for its result: the process exits.
     """
 
     def __init__(self, first: list[str]) -> None:
@@ -169,21 +169,21 @@ def _tell(values: dict[str, Any]) -> None:
 
 
 def _outcome(tasks: Tasks, folder: str, name: str) -> dict[str, Any]:
-    """Run a task and tell how it went."""
+    """Run a task and report its outcome."""
     begun, used = time.monotonic(), time.process_time()
     try:
         tasks.run(folder, name, _tell)
     except MemoryError:
         return {"error": ("MemoryError", "out of memory; try fewer `jobs`")}
     except (Mp4dsError, OSError) as error:
-        tasks.close()  # it may be damaged where it was read ahead
+        tasks.close()  # it may be damaged in the part that was prefetched
         said = str(error) if isinstance(error, Mp4dsError) else sentence_of(error)
         return {"error": (type(error).__name__, said), "ready": True}
     peak = _memory("VmHWM")
     give_back()
     return {
         "done": True,
-        # what large encoders leave in pieces is given back by ending only
+        # memory fragmented by large encoders is only released by exiting
         "ready": _memory("VmRSS") < _KEPT_BYTES,
         "seconds": time.monotonic() - begun,
         "cpu_seconds": time.process_time() - used,
@@ -192,7 +192,7 @@ def _outcome(tasks: Tasks, folder: str, name: str) -> dict[str, Any]:
 
 
 def _memory(name: str) -> int:
-    """A figure of this process's memory, in bytes; 0 where the system does not tell."""
+    """A figure of this process's memory, in bytes; 0 if unknown."""
     with contextlib.suppress(OSError, ValueError, IndexError):
         # not getrusage, which counts what the process was forked from
         words = Path("/proc/self/status").read_text().split()

@@ -1,14 +1,14 @@
 """The folder in which a divided pack is made: its job, and the results of its tasks.
 
-It stands beside the dataset, on the same file system, under a name that the dataset's tells, so
-that the same command finds it again. A task's result appears in it by one rename, when whole.
+It is next to the dataset, on the same file system, under a name derived from the dataset's, so that
+the same command finds it again. A task's result appears in it by one rename, when complete.
 
-Somebody else may have put a folder there: in a folder that users share, or by an archive that was
-unpacked. So nothing is read from it, written to it or removed from it unless all of it belongs to
-this user and has names that are made here, without any link; a job tells the inode of its folder,
-so that a copy is not taken for what was begun here; and how to encode is worked out again
-(`video.codecs.remade`). Trusted are other processes of the same user, and, where machines share the
-folder and see other inodes (--shard, --join, --cluster), whatever that user has put there.
+Somebody else may have put a folder there: in a shared folder, or in an unpacked archive. So nothing
+is read from it, written to it or removed from it unless all of it belongs to this user and has
+expected names, without any links; a job records the inode of its folder, so that a copy is not
+mistaken for the original; and encoder settings are derived again (`video.codecs.remade`). Other
+processes of the same user are trusted, and, where machines share the folder and see other inodes
+(--shard, --join, --cluster), so is whatever that user has put there.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 _NAMED = 3
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 
-_BEGUN = re.compile(rf"\.({TASK_NAME})\.[a-z0-9_]{{8}}")  # a result that is being made
+_BEGUN = re.compile(rf"\.({TASK_NAME})\.[a-z0-9_]{{8}}")  # a result in progress
 _NAMES = re.compile(  # from the folder on; of folders, with a slash at the end
     r"lock|job\.json|\.job\.json\.[^/]+\.part|parts/|(dataset|replaced)/(.*/)?[^/]*"
     rf"|parts/({TASK_NAME}|{_BEGUN.pattern})/(.*/)?[^/]*",
@@ -60,19 +60,19 @@ class Workplace:
 
     @classmethod
     def beside(cls, target: Path) -> Workplace:
-        """That of a dataset, whether it exists or not."""
+        """The work folder of a dataset, whether it exists or not."""
         return cls(target.parent / f".{target.name}{_SUFFIX}")
 
     @contextmanager
     def claimed(self, *, shared: bool) -> Iterator[None]:
-        """Hold the place while working in it.
+        """Lock the folder while working in it.
 
         Args:
             shared: Others may work on other tasks at the same time.
 
         Raises:
-            TargetError: Another pack is at work, the folder cannot be made, or holds what is not
-                made here.
+            TargetError: Another pack is working there, the folder cannot be created, or holds
+                unexpected entries.
             WriteError: The disk is full.
         """
         try:
@@ -88,14 +88,14 @@ class Workplace:
                 self._remove_empty()
                 raise WriteError(self.folder, error) from None
             raise TargetError(
-                self.folder, f"cannot be made: {error.strerror}", "Choose another folder."
+                self.folder, f"cannot be created: {error.strerror}", "Choose another folder."
             ) from None
         with os.fdopen(handle, "r+b") as file:
             try:
-                lock(file, shared=shared)  # without locks, results appear whole all the same
+                lock(file, shared=shared)  # even without locks, results appear complete
             except BlockingIOError:
                 raise TargetError(
-                    self.folder, "another mp4ds is at work there", "Wait for it, or end it."
+                    self.folder, "another mp4ds is working there", "Wait for it, or stop it."
                 ) from None
             self._check()
             self._give_back()
@@ -112,7 +112,9 @@ class Workplace:
                 found = path.lstat()
                 if not stat.S_ISDIR(found.st_mode):
                     raise TargetError(
-                        path, "is no folder, or a symbolic link", "Remove it; mp4ds makes its own."
+                        path,
+                        "is not a folder, or is a symbolic link",
+                        "Remove it; mp4ds creates its own.",
                     )
                 if not is_mine(found, self.folder.parent):
                     raise TargetError(path, "belongs to another user", "Choose another folder.")
@@ -143,8 +145,9 @@ class Workplace:
             listed = ", ".join(sorted(strange)[:_NAMED]) + ", ..." * (len(strange) > _NAMED)
             raise TargetError(
                 self.folder,
-                f"holds {len(strange)} names that mp4ds did not make there: {listed}",
-                "See what they are; without the folder, packing starts over.",
+                f"holds {len(strange)} item{'s' * (len(strange) != 1)} that mp4ds did not "
+                f"make: {listed}",
+                "Check what they are; if you remove the folder, packing starts over.",
             )
 
     def _give_back(self) -> None:
@@ -166,7 +169,7 @@ class Workplace:
         path = self.folder / _JOB_NAME
         try:
             if not stat.S_ISREG(path.lstat().st_mode):
-                raise TargetError(path, "is no file, or a symbolic link", "Remove it.")
+                raise TargetError(path, "is not a file, or is a symbolic link", "Remove it.")
             data = path.read_bytes()
         except OSError as error:
             if isinstance(error, TargetError):
@@ -178,12 +181,12 @@ class Workplace:
             raise TargetError(self.folder, f"holds an unfinished pack, {error}", _ANEW) from None
         if not shared and job.place != self.folder.lstat().st_ino:
             raise TargetError(
-                self.folder, "holds an unfinished pack that was not begun there", _ANEW
+                self.folder, "holds an unfinished pack that was started elsewhere", _ANEW
             )
         if job.tools != tools():
             theirs = ", ".join(f"{name} {version}" for name, version in job.tools.items())
             raise TargetError(
-                self.folder, f"holds a pack begun with other versions: {theirs}", _ANEW
+                self.folder, f"holds a pack started with other versions: {theirs}", _ANEW
             )
         return job
 
@@ -199,7 +202,7 @@ class Workplace:
         return job
 
     def check(self, job: Job, options: dict[str, object], paths: list[str]) -> None:
-        """Refuse to go on with a job that is another one.
+        """Refuse to continue with a job that is another one.
 
         Raises:
             OptionError: The options or recordings are others.
@@ -211,9 +214,8 @@ class Workplace:
         for name, value in options.items():
             if job.options.get(name) != value:
                 raise OptionError(
-                    f"The pack was begun with another `{name}`: "
-                    f"{job.options.get(name)!r}, and now it is {value!r}. Give the same to go on. "
-                    + _ANEW
+                    f"The pack was started with a different `{name}`: {job.options.get(name)!r}, "
+                    f"and now it is {value!r}. Give the same value to resume. " + _ANEW
                 )
         job.check_sources()
 
@@ -226,10 +228,10 @@ class Workplace:
         """Make the result of a task.
 
         Yields:
-            The folder to fill, with the record last; None where the result is there already.
+            The folder to fill, with the record last; None if the result is there already.
 
         Raises:
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         place = self.parts / task.name
         if self.is_done(task):
@@ -254,7 +256,7 @@ class Workplace:
             shutil.rmtree(folder, ignore_errors=True)
 
     def has_results(self) -> bool:
-        """Whether there is anything to go on from."""
+        """Whether there is anything to continue from."""
         try:
             return any(
                 read_record(place) is not None

@@ -1,1 +1,1 @@
-"""What is built on the core, which knows none of it."""
+"""What is built on the core, which does not depend on it."""

@@ -1,4 +1,4 @@
-"""Tasks on the workers of a Dask cluster: one that runs, jobs of a batch system, this machine."""
+"""Runs tasks on Dask workers: an existing cluster, batch jobs, or this machine."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ _MIB = 2**20
 
 
 class TaskFailedError(Exception):
-    """What a task failed with, in strings: the error itself may not survive the journey.
+    """A task's error, as strings: the error itself may not survive pickling.
 
     Args:
         kind: Name of its class.
-        sentence: What it says.
+        sentence: Its message.
     """
 
     def __init__(self, kind: str, sentence: str) -> None:
@@ -43,7 +43,7 @@ class TaskFailedError(Exception):
 
 
 class Room:
-    """The memory of a worker, as its tasks share it out among themselves.
+    """The memory of a worker, shared among its tasks.
 
     Args:
         size: Bytes.
@@ -56,13 +56,13 @@ class Room:
 
     @contextmanager
     def taken(self, count: int) -> Iterator[bool]:
-        """Hold some of it.
+        """Reserve some of it.
 
         Args:
             count: Bytes.
 
         Yields:
-            Whether they came free in a few seconds.
+            Whether it became free within a few seconds.
         """
         with self._changed:
             has_room = self._changed.wait_for(
@@ -80,18 +80,17 @@ class Room:
 def attempt(task: tuple[str, ...], *, function: Callable[..., None], task_bytes: int) -> None:
     """Run a task in a thread of this worker.
 
-    Where other tasks hold the worker's memory, it goes back to the scheduler, which gives it to
-    another worker or here again: a task that waited here would keep a thread, and would run
-    even if it is no longer wanted.
+    If other tasks hold the worker's memory, it goes back to the scheduler, which reassigns it: a
+    task that waited here would block a thread, and would run even if no longer wanted.
 
     Args:
-        task: Strings that the function takes.
+        task: The function's string arguments.
         function: What to call.
         task_bytes: Memory that it takes.
 
     Raises:
         TaskFailedError: It failed, or this worker is too small.
-        Reschedule: There is no room now.
+        Reschedule: There is not enough memory now.
     """
     from distributed import Reschedule, get_worker
 
@@ -105,7 +104,7 @@ def attempt(task: tuple[str, ...], *, function: Callable[..., None], task_bytes:
             f"on worker {worker.address}: it has {limit // _MIB} MiB of memory, and a task takes "
             f"up to {-(-task_bytes // _MIB)} MiB. Start workers with a larger --memory-limit.",
         )
-    # The worker keeps it, for all packs that it works for share its memory.
+    # Kept on the worker, since all its packs share its memory.
     room: Room = vars(worker).setdefault("mp4ds_room", Room(limit))
     with room.taken(task_bytes) as has_room:
         if not has_room:
@@ -122,7 +121,7 @@ def _call(function: Callable[..., None], task: tuple[str, ...], where: str) -> N
         kind = type(error).__name__
         raise TaskFailedError(kind, f"on worker {where}: {str(error) or kind}") from None
     finally:
-        give_back()  # with too much of it, a worker is paused and takes no more tasks
+        give_back()  # a worker using too much is paused and gets no more tasks
 
 
 # ---------------------------------------------------------------- batch systems
@@ -135,7 +134,7 @@ BATCH_SYSTEMS = {
     "htcondor": "HTCondorCluster",
     "oar": "OARCluster",
 }
-"""Name, which is that of its configuration, too -> class of dask-jobqueue."""
+"""Name, also of its configuration -> class of dask-jobqueue."""
 
 _MOST_JOBS = 16
 _SETTINGS = "~/.config/dask/jobqueue.yaml"
@@ -147,16 +146,16 @@ def batch_cluster(system: str, tasks: int) -> Iterator[tuple[JobQueueCluster, Ca
 
     Args:
         system: A name of `BATCH_SYSTEMS`.
-        tasks: How many there are to run.
+        tasks: Number of tasks to run.
 
     Yields:
-        The cluster, and what submits jobs again that have ended.
+        The cluster, and a function that resubmits jobs that have ended.
 
     Raises:
         ClusterError: The batch system refuses the jobs.
         OptionError: The configuration lacks something.
     """
-    module = importlib.import_module("dask_jobqueue")  # brings its part of the configuration
+    module = importlib.import_module("dask_jobqueue")  # loads its part of the configuration
     jobs = min(tasks, _jobs())
     with _opened_jobs(getattr(module, BATCH_SYSTEMS[system]), system) as cluster:
         problem = _submit(cluster, jobs)
@@ -164,11 +163,11 @@ def batch_cluster(system: str, tasks: int) -> Iterator[tuple[JobQueueCluster, Ca
             raise ClusterError(
                 system,
                 f"the jobs could not be submitted: {problem.rstrip('.')}",
-                f"Their settings are in {_SETTINGS}.",
+                f"The settings are in {_SETTINGS}.",
             )
 
         def refill() -> None:
-            _submit(cluster, jobs)  # what is refused now may be taken the next time
+            _submit(cluster, jobs)  # what is refused now may be accepted next time
 
         yield cluster, refill
 
@@ -187,17 +186,17 @@ def _opened_jobs(kind: type[JobQueueCluster], system: str) -> Iterator[JobQueueC
         cluster = kind()
     except (ValueError, TypeError, RuntimeError, OSError) as error:
         raise OptionError(
-            f"`cluster` {system}: {_line(error)} The settings are in {_SETTINGS}, "
-            f"under jobqueue: {system}."
+            f"`cluster` {system}: {_line(error)} The settings are in {_SETTINGS}, under jobqueue: "
+            f"{system}."
         ) from None
     with cluster:
         yield cluster
 
 
 def _submit(cluster: JobQueueCluster, jobs: int) -> str:
-    """Submit the jobs that are not there.
+    """Submit the missing jobs.
 
-    Unlike the cluster's own `scale`, it tells what the batch system refuses.
+    Unlike the cluster's own `scale`, it reports what the batch system refuses.
 
     Returns:
         What went wrong, or nothing.
@@ -212,7 +211,8 @@ def _submit(cluster: JobQueueCluster, jobs: int) -> str:
         finally:
             for name, job in list(cluster.workers.items()):
                 if job.job_id is None:
-                    job.status = Status.failed  # else the cluster takes it for one that begins
+                    # otherwise the cluster takes it for one that is starting
+                    job.status = Status.failed
                     del cluster.workers[name]
 
     try:
@@ -223,24 +223,24 @@ def _submit(cluster: JobQueueCluster, jobs: int) -> str:
 
 
 def _jobs() -> int:
-    """Most jobs at a time.
+    """Maximum number of jobs.
 
     Raises:
-        OptionError: The configuration has no number there.
+        OptionError: The configured value is not a number.
     """
     import dask
 
     jobs = dask.config.get("mp4ds.jobs", _MOST_JOBS)
     if not isinstance(jobs, int) or jobs < 1:
         raise OptionError(
-            f"DASK_MP4DS__JOBS, or mp4ds.jobs in the configuration of Dask, is {jobs!r}. "
-            "Give a number of jobs, from 1."
+            f"DASK_MP4DS__JOBS, or mp4ds.jobs in Dask's configuration, is {jobs!r}. Give a number "
+            "of jobs, 1 or more."
         )
     return jobs
 
 
 def _line(error: Exception) -> str:
-    """The line of an error that says most: of a command, the last that it wrote."""
+    """The most informative line of an error: for a command, the last one it wrote."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     if not lines:
         return type(error).__name__
@@ -258,17 +258,17 @@ _ENDED = ("closing", "closed")
 _LOOK_SECONDS = 5.0
 _WORKER_SECONDS = 5 * 60.0
 _BATCH_WORKER_SECONDS = 12 * 3600.0
-_GO_ON = "What is finished is kept: run the same command again to go on."
+_GO_ON = "Finished work is kept: run the same command again to resume."
 
 
 class Watch:
-    """Notices when nothing will be heard of tasks any more.
+    """Detects when tasks will never finish.
 
     Args:
         client: Connected.
-        address: What the user called the cluster.
-        patience: Seconds without any worker that are borne.
-        refill: Brings back workers that have ended, where that can be done from here.
+        address: The cluster's address as given by the user.
+        patience: Seconds to wait without any worker.
+        refill: Restarts workers that have ended, if that is possible from here.
     """
 
     def __init__(
@@ -287,7 +287,7 @@ class Watch:
         self._empty_since: float | None = None
 
     def begin(self) -> None:
-        """Begin to wait for tasks; the time before, in which there were none, does not count.
+        """Start waiting for tasks; earlier time without tasks does not count.
 
         Raises:
             ClusterError: The scheduler is lost.
@@ -297,7 +297,7 @@ class Watch:
         self.wait_until_connected()
 
     def look(self) -> None:
-        """Look after the cluster, unless that was done just now.
+        """Check the cluster, unless it was just checked.
 
         Raises:
             ClusterError: The scheduler is lost, or there have been no workers for too long.
@@ -309,13 +309,13 @@ class Watch:
         if self._client.status in _ENDED:
             raise self.lost()
         if self._client.status != "running":
-            return  # it connects again, or gives up
+            return  # it reconnects, or gives up
         if self._refill is not None:
             self._refill()
         try:
             has_workers = bool(self._client.nthreads())
         except OSError:
-            has_workers = False  # that is not known
+            has_workers = False  # unknown
         if has_workers:
             self._empty_since = None
         elif self._empty_since is None:
@@ -324,11 +324,11 @@ class Watch:
             raise ClusterError(
                 self._address,
                 f"has had no worker for {self._patience:g} s",
-                f"Start some, or see why they ended. {_GO_ON}",
+                f"Start some, or find out why they ended. {_GO_ON}",
             )
 
     def wait_until_connected(self) -> None:
-        """Wait for a client that connects again.
+        """Wait for a client to reconnect.
 
         Raises:
             ClusterError: The scheduler is lost.
@@ -339,16 +339,16 @@ class Watch:
             time.sleep(_CONNECT_POLL_SECONDS)
 
     def lost(self) -> ClusterError:
-        """What to raise when the scheduler does not know the tasks any more."""
+        """The error for when the scheduler no longer knows the tasks."""
         return ClusterError(
             self._address,
-            "the connection to the Dask scheduler was lost, or it has dropped the tasks",
-            f"See whether it still runs. {_GO_ON}",
+            "the connection to the Dask scheduler was lost, or it dropped the tasks",
+            f"Check whether it is still running. {_GO_ON}",
         )
 
 
 def check_address(address: str) -> None:
-    """Refuse what is no way to a cluster, or needs a package that is not there.
+    """Refuse an invalid cluster address, or one that needs a package that is not there.
 
     Raises:
         OptionError: Says what is wrong.
@@ -377,17 +377,17 @@ def _is_of_scheduler(address: str) -> bool:
 
 
 class Connection:
-    """A way to a cluster, opened when it is first needed, and kept.
+    """A connection to a cluster, opened on first use and kept.
 
-    Jobs of a batch system, which may have had to queue, are so of use to more than one run of
-    tasks. A context manager; what was started for it is ended with it.
+    So batch jobs, which may have had to queue, serve more than one run of tasks. A context manager;
+    whatever was started for it ends with it.
 
     Args:
         address: As `ClusterEngine` takes it.
-        tasks: Most that there are to run at a time.
+        tasks: Maximum number of parallel tasks.
 
     Raises:
-        OptionError: The address is none, or a package is missing.
+        OptionError: The address is not valid, or a package is missing.
     """
 
     def __init__(self, address: str, tasks: int) -> None:
@@ -398,11 +398,11 @@ class Connection:
         self._way: tuple[Client, Watch] | None = None
 
     def way(self) -> tuple[Client, Watch]:
-        """What tasks are handed out with, ready for some.
+        """The client and watch, ready for tasks.
 
         Raises:
-            ClusterError: No scheduler answers in 15 s, the batch system refuses the jobs, or the
-                scheduler was lost since.
+            ClusterError: No scheduler responds within 15 s, the batch system refuses the jobs, or
+                the scheduler was lost since.
             OptionError: The configuration lacks something.
         """
         if self._way is None:
@@ -420,14 +420,14 @@ class Connection:
 
 @contextmanager
 def _opened(address: str, tasks: int) -> Iterator[tuple[Client, Watch]]:
-    """Open the way to a cluster; what is started for it is ended with it.
+    """Open a connection to a cluster; whatever is started for it ends with it.
 
     Args:
-        address: One that `check_address` takes.
-        tasks: How many there are to run.
+        address: One accepted by `check_address`.
+        tasks: Number of tasks to run.
 
     Raises:
-        ClusterError: No scheduler answers in 15 s, or the batch system refuses the jobs.
+        ClusterError: No scheduler responds within 15 s, or the batch system refuses the jobs.
         OptionError: The configuration lacks something.
     """
     from distributed import Client
@@ -436,7 +436,7 @@ def _opened(address: str, tasks: int) -> Iterator[tuple[Client, Watch]]:
     is_batch = address in BATCH_SYSTEMS
     patience = _patience(_BATCH_WORKER_SECONDS if is_batch else _WORKER_SECONDS)
     with ExitStack() as stack:
-        stack.enter_context(silence_logging_cmgr(logging.CRITICAL))  # what matters is raised
+        stack.enter_context(silence_logging_cmgr(logging.CRITICAL))  # errors that matter are raised
         place: object = address
         refill = None
         if is_batch:
@@ -454,13 +454,13 @@ def _opened(address: str, tasks: int) -> Iterator[tuple[Client, Watch]]:
 
 
 def _check_scheduler(address: str) -> None:
-    """See whether a scheduler answers: a client waits for ever where something else listens.
+    """Check that a scheduler answers: a client waits forever if something else listens.
 
     Raises:
         ClusterError: None does.
         OptionError: There are no certificates.
     """
-    with ThreadPoolExecutor(1) as thread:  # in the caller's own, a loop may be running
+    with ThreadPoolExecutor(1) as thread:  # the caller's thread may have a running loop
         thread.submit(asyncio.run, _greet(address)).result()
 
 
@@ -472,8 +472,8 @@ async def _greet(address: str) -> None:
         arguments = Security().get_connection_args("client")
         if address.startswith("tls:") and arguments.get("ssl_context") is None:
             raise OptionError(
-                f"`cluster` {address} needs certificates: name them under distributed.comm.tls "
-                "in the configuration of Dask, ~/.config/dask/distributed.yaml."
+                f"`cluster` {address} needs certificates: set them under distributed.comm.tls in "
+                "Dask's configuration, ~/.config/dask/distributed.yaml."
             )
         greeting = connect(address, timeout=_CONNECT_SECONDS, **arguments)
         comm = await asyncio.wait_for(greeting, _CONNECT_SECONDS)
@@ -481,9 +481,9 @@ async def _greet(address: str) -> None:
         raise
     except (OSError, asyncio.TimeoutError) as error:
         raise _unreachable(address, error) from None
-    except Exception:  # of any kind, as it takes what it reads for lengths
+    except Exception:  # of any kind, since it interprets what it reads as lengths
         raise ClusterError(
-            address, "what answers there is not a Dask scheduler", "Check the port."
+            address, "the server there is not a Dask scheduler", "Check the port."
         ) from None
     comm.abort()
 
@@ -492,16 +492,17 @@ def _unreachable(address: str, error: Exception) -> ClusterError:
     reason = str(error.__cause__ or error)
     return ClusterError(
         address,
-        "no Dask scheduler could be reached" + (f" ({reason})" if reason else ""),
-        "Check the address, that `dask scheduler` runs there, and that a firewall lets it through.",
+        "no Dask scheduler can be reached" + (f" ({reason})" if reason else ""),
+        "Check the address, that `dask scheduler` is running there, and that no firewall "
+        "blocks it.",
     )
 
 
 @contextmanager
 def _local_cluster(tasks: int) -> Iterator[LocalCluster]:
-    """Workers of this user alone: who connects needs a certificate that is in memory only.
+    """Workers for this user only: connecting requires a certificate that is only in memory.
 
-    Dask listens for HTTP, too, whatever it is told: on the loopback, and there is nothing to see.
+    Dask also listens for HTTP, whatever the settings: on loopback, with nothing to see.
     """
     import dask
     from dask.system import CPU_COUNT
@@ -512,7 +513,7 @@ def _local_cluster(tasks: int) -> Iterator[LocalCluster]:
         "distributed.worker.http.routes": [],
     }
     with (
-        dask.config.set(no_pages),  # workers are given it when they start
+        dask.config.set(no_pages),  # workers get it when they start
         TemporaryDirectory(prefix="mp4ds-") as folder,
         LocalCluster(
             n_workers=min(tasks, CPU_COUNT),
@@ -530,10 +531,10 @@ def _local_cluster(tasks: int) -> Iterator[LocalCluster]:
 
 
 def _patience(seconds: float) -> float:
-    """Seconds without any worker that are borne.
+    """Seconds to wait without any worker.
 
     Raises:
-        OptionError: The configuration has no time there.
+        OptionError: The configured value is not a time.
     """
     import dask
     from dask.utils import parse_timedelta
@@ -543,8 +544,8 @@ def _patience(seconds: float) -> float:
         return float(parse_timedelta(patience))
     except (AttributeError, KeyError, TypeError, ValueError):
         raise OptionError(
-            "DASK_MP4DS__WORKER_TIMEOUT, or mp4ds.worker-timeout in the configuration of Dask, "
-            f"is {patience!r}. Give a time, such as '10 minutes'."
+            "DASK_MP4DS__WORKER_TIMEOUT, or mp4ds.worker-timeout in Dask's configuration, is "
+            f"{patience!r}. Give a time, such as '10 minutes'."
         ) from None
 
 
@@ -557,19 +558,19 @@ _MAX_DROPS = 3
 class ClusterEngine:
     """Runs each task on a worker of a Dask cluster. See `Engine`.
 
-    A task whose worker dies is run on another one, as often as the scheduler's
-    ``distributed.scheduler.allowed-failures`` says; one that raises is not run again. Tasks that
-    the scheduler drops, as it does when the connection breaks, are handed out again. What a task
-    tells while it runs is not heard.
+    A task whose worker dies is rerun on another one, as often as the scheduler's
+    ``distributed.scheduler.allowed-failures`` allows; one that raises is not rerun. Tasks that the
+    scheduler drops, as when the connection breaks, are resubmitted. Reports of running tasks are
+    not received.
 
     Args:
-        function: Called with the strings of a task; workers import it by its name.
+        function: Called with the strings of a task; workers import it by name.
         address: ``tcp://HOST:PORT`` or ``tls://HOST:PORT`` of a scheduler, which is left as it
             is; ``slurm``, ``pbs``, ``sge``, ``lsf``, ``htcondor`` or ``oar`` for jobs of that
             batch system, as dask-jobqueue is configured, which are ended after the last task;
-            ``local`` for workers on this machine. Or a connection, which several engines and runs
-            share.
-        task_bytes: Memory of a task; a worker runs as many at a time as its own holds.
+            ``local`` for workers on this machine. Or a connection, shared by several engines and
+            runs.
+        task_bytes: Memory of a task; a worker runs as many in parallel as fit into its memory.
 
     Raises:
         OptionError: The address is none of these, or a package is missing.
@@ -591,8 +592,8 @@ class ClusterEngine:
     ) -> Generator[Outcome, None, None]:
         """See `Engine.run`.
 
-        Closing the generator drops the tasks that wait; on a cluster that goes on, those that
-        run come to their end, for nothing stops the thread of a worker from outside.
+        Closing the generator drops waiting tasks; on a cluster that keeps running, running tasks
+        finish, since a worker's thread cannot be stopped from outside.
 
         Raises:
             ClusterError: No scheduler answers, it was lost, or there are no workers.
@@ -636,7 +637,7 @@ class ClusterEngine:
                     continue
                 task, _ = waiting.pop(ended.key)
                 outcome = self._outcome(task, ended)
-                del ended, _  # the scheduler forgets what nobody holds
+                del ended, _  # the scheduler forgets results that nobody holds
                 if outcome is not None:
                     yield outcome
                     continue
@@ -651,7 +652,7 @@ class ClusterEngine:
                     client.cancel([future for _, future in waiting.values()])
 
     def _outcome(self, task: tuple[str, ...], future: Future) -> Outcome | None:
-        """What became of a task; None where the scheduler has dropped it and nobody knows."""
+        """The outcome of a task; None if the scheduler has dropped it."""
         if future.status == "finished":
             return Outcome(task)
         if future.status != "error":
@@ -661,8 +662,8 @@ class ClusterEngine:
             return Outcome(task, (error.kind, error.sentence))
         if type(error).__name__ == "KilledWorker":
             said = (
-                f"{error.allowed_failures + 1} workers died over it, perhaps for want of memory: "
-                f"it takes up to {-(-self._task_bytes // _MIB)} MiB. Their logs tell more."
+                f"{error.allowed_failures + 1} workers died on it, perhaps for lack of memory: it "
+                f"takes up to {-(-self._task_bytes // _MIB)} MiB. See their logs."
             )
             return Outcome(task, ("Killed", said))
         lines = str(error.__cause__ or error).strip().splitlines() or [""]

@@ -1,7 +1,7 @@
-"""What a file holds, in the form in which readers of the format are compared.
+"""The contents of a file in the form used to compare readers.
 
-conformance/README.md says what each key means. Integers of 64 bits are strings, since JSON
-parsers keep 53 bits of a number.
+conformance/README.md says what each key means. 64-bit integers are strings, since JSON parsers keep
+only 53 bits of a number.
 """
 
 from __future__ import annotations
@@ -34,35 +34,35 @@ Values = dict[str, Any]
 
 
 def as_json(values: Values) -> str:
-    """The text of what `conformance_dump` returns, the same each time."""
+    """The result of `conformance_dump` as reproducible text."""
     return json.dumps(values, indent=1)
 
 
 def conformance_dump(
     path: Path | str, *, progress: Callable[[str, float | None], None] | None = None
 ) -> dict[str, Any]:
-    """What is in a sidecar with its video, or in a dataset, as JSON has it.
+    """The contents of a sidecar with its video, or of a dataset, as JSON values.
 
-    Every frame is decoded and every message rebuilt, a frame at a time; what is returned has a
-    few hashes for each.
+    Every frame is decoded and every message rebuilt, one frame at a time; the result has a few
+    hashes for each.
 
     Args:
         path: A sidecar, its video, a dataset or its manifest; or a URL.
         progress: Called with a phrase before each costly step.
 
     Returns:
-        ``problems``, and without any of them all that conformance/README.md lists.
+        ``problems``, and if there are none, everything listed in conformance/README.md.
 
     Raises:
-        SourceNotFoundError: There is nothing at the path.
-        SourceError: It is nothing of the kind.
+        SourceNotFoundError: The path does not exist.
+        SourceError: It is neither of these.
     """
     path = location(path)
     if path.name == MANIFEST_NAME:
         path = path.parent
     if path.is_dir() and not (path / MANIFEST_NAME).exists():
         raise SourceError(
-            path, f"is no dataset: there is no {MANIFEST_NAME} in it", "Give one dataset."
+            path, f"is not a dataset: there is no {MANIFEST_NAME} in it", "Give one dataset."
         )
     problems = [_problem(problem) for problem in validate(path, deep=True, progress=progress)]
     if problems:
@@ -79,7 +79,7 @@ def conformance_dump(
 
 
 def _problem(problem: Problem) -> Values:
-    """A problem; its place is the name of a file and a key in it, or a topic alone."""
+    """A problem; its place is a file name and a key in it, or just a topic."""
     file, _, key = problem.place.removesuffix(" at the top").partition(" at ")
     is_file = Path(file).suffix in (".yaml", ".yml", ".mp4", ".mcap")
     return {
@@ -141,7 +141,7 @@ def _stream(stream: Stream) -> Values:
 
 
 def _columns(columns: DecodedColumns) -> Values:
-    """Every column, also those that are absent and have a default."""
+    """Every column, including absent ones with their defaults."""
     zeros: NDArray[np.int64] = np.zeros(len(columns.stamp), np.int64)
     found = {
         "log_time": columns.log_time,
@@ -157,7 +157,7 @@ def _columns(columns: DecodedColumns) -> Values:
 
 
 def _decoded(stream: Stream) -> Values:
-    """Hashes of what the video has of each frame, and of what is made of it."""
+    """Hashes of each frame's packet in the video, and of what is decoded from it."""
     sidecar = stream.sidecar
     is_lossless = sidecar.profile == "lossless"
     is_packet = sidecar.body == "packet"
@@ -192,7 +192,7 @@ def _packets(stream: Stream) -> list[str]:
 
 
 def _planes(stream: Stream) -> Values | None:
-    """Of each picture; None where decoders may differ, or not every packet decodes."""
+    """Hashes of each picture; None if decoders may differ, or a packet cannot be decoded."""
     video = stream.sidecar.video
     if video.codec == "mjpeg":
         return None
@@ -212,7 +212,7 @@ def _planes(stream: Stream) -> Values | None:
 
 
 def _camera_info(stream: Stream) -> Values | None:
-    """The calibrations, their messages, and which of them holds for each frame."""
+    """The calibrations, their messages, and which of them applies to each frame."""
     info = stream.sidecar.camera_info
     if info is None:
         return None
@@ -244,7 +244,7 @@ def _camera_info(stream: Stream) -> Values | None:
 
 
 def _order(channel: ImageChannel) -> Values:
-    """In which file each message of a channel is, in the channel's order."""
+    """The file of each message of a channel, in the channel's order."""
     places = {
         ordinal: stream.path.name
         for stream in channel.streams
@@ -258,7 +258,7 @@ def _order(channel: ImageChannel) -> Values:
 
 
 def _messages(dataset: Dataset) -> Values:
-    """What messages.mcap holds."""
+    """The contents of messages.mcap."""
     topics = Counter[tuple[str, str]]()
     kinds = Counter[type]()
     for record in dataset.recorded_records():

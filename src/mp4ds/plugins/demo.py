@@ -1,7 +1,7 @@
-"""A small recording to try mp4ds on: a drive past coloured discs, seen by two cameras.
+"""A small recording to try mp4ds with: a drive past coloured discs, seen by two cameras.
 
-Made here, so that the first command of the README needs nothing but the package: a ROS 1 bag
-with a Bayer and an rgb camera, their calibrations, imu and tf. The same on every machine.
+Generated, so that the first command of the README needs only the package: a ROS 1 bag with a Bayer
+and an RGB camera, their calibrations, IMU and tf. The same on every machine.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ WIDTH, HEIGHT = 480, 360
 CAMERA_HZ = 15
 IMU_HZ = 100
 TF_HZ = 20
-_NOISE = 2.0  # standard deviation, grey levels: a camera indoors
+_NOISE = 2.0  # standard deviation, grey levels: like an indoor camera
 _DISCS = 12
 _IMAGE_TYPE = "sensor_msgs/Image"
 _INFO_TYPE = "sensor_msgs/CameraInfo"
@@ -58,7 +58,7 @@ def demo(output: Path | str = "demo.bag", *, seconds: float = 3.0, force: bool =
         Number of messages.
 
     Raises:
-        TargetError: The file may not be written there.
+        TargetError: The file cannot be written there.
     """
     target = Path(os.path.abspath(output))  # noqa: PTH100 - keeps links, unlike resolve()
     if target.suffix != ".bag":
@@ -95,14 +95,14 @@ def _channels() -> dict[str, Channel]:
 
 def _messages(seconds: float) -> Iterator[tuple[int, str, Callable[[], bytes]]]:
     rng = np.random.default_rng(1)
-    # images are made when they are written: one is in memory at a time
+    # images are made as they are written: only one is in memory at a time
     for hertz, topic, make in ((IMU_HZ, "/imu", _imu), (TF_HZ, "/tf", _transform)):
         for seq in range(max(1, int(seconds * hertz))):
             stamp = START_NS + seq * 10**9 // hertz
             yield stamp + int(rng.integers(50_000, 400_000)), topic, partial(make, seq, stamp)
     for camera in _CAMERAS:
         for seq in range(max(1, int(seconds * CAMERA_HZ))):
-            # a shutter that is a little late at times, and a driver that is later still
+            # a shutter that is sometimes a little late, and a driver that is later still
             stamp = START_NS + seq * 10**9 // CAMERA_HZ + int(rng.integers(0, 200_000))
             log_time = stamp + int(rng.integers(4_000_000, 9_000_000))
             yield log_time, f"/{camera.name}/image_raw", partial(_image, camera, seq, stamp)
@@ -135,7 +135,7 @@ def _ros1(type_name: str, frame_id: str, fields: Fields, slots: Slots, body: byt
 
 
 def _view(camera: _Camera, time: float) -> NDArray[np.float32]:
-    """What a camera sees: a floor, a wall, discs that come nearer. Shape (H, W, 3), 0 to 255."""
+    """A camera's view: a floor, a wall, approaching discs. Shape (H, W, 3), 0 to 255."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
     shade = 90 + 60 * (y / HEIGHT) + 12 * np.sin(x / 9 + time) * (y > HEIGHT / 2)
     picture: NDArray[np.float32] = np.stack([shade, shade * 0.95, shade * 0.85], axis=-1)

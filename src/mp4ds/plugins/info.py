@@ -38,7 +38,7 @@ _T = TypeVar("_T")
 
 @dataclass
 class TopicInfo:
-    """What is known of a topic.
+    """Information about a topic.
 
     Attributes:
         topic: Its name.
@@ -46,7 +46,7 @@ class TopicInfo:
         messages: Number of messages.
         rate_hz: Mean rate, from the log times of the first and the last message.
         jitter_ms: Standard deviation of the times between messages.
-        gaps: Places where messages are missing by the log times: see `intervals.lost_frames`.
+        gaps: Places where messages are missing, judging by log times: see `lost_frames`.
         longest_gap_s: The longest time between two messages.
         content: For images the encoding and size, for calibrations the focal length.
         stored: In a dataset, where and how: codec and file.
@@ -67,10 +67,10 @@ class TopicInfo:
 
 @dataclass
 class Info:
-    """What is known of a recording or dataset. Times are nanoseconds.
+    """Information about a recording or dataset. Times are nanoseconds.
 
     Attributes:
-        path: What was looked at.
+        path: The recording or dataset.
         kind: ``bag``, ``rosbag2``, ``mcap``, ``dataset`` or ``stream``.
         profile: ``ros1``, ``ros2`` ...
         bytes: Size on disk.
@@ -91,16 +91,16 @@ class Info:
 
 
 def info(path: Path | str, asked: Slice = WHOLE) -> Info:
-    """Look into a recording, a dataset, or a video with its sidecar.
+    """Inspect a recording, a dataset, or a video with its sidecar.
 
     Args:
-        path: Where it is, or its URL.
-        asked: What of it is looked into. Of a slice of a dataset, what would be unpacked.
+        path: Its path or URL.
+        asked: The slice to inspect. For a slice of a dataset, what would be unpacked.
 
     Raises:
-        SourceError: It is no recording or cannot be read.
+        SourceError: It is not a recording or cannot be read.
         FormatError: The dataset breaks a rule of the format.
-        OptionError: There is nothing in the slice.
+        OptionError: The slice is empty.
     """
     if asked:
         with open_recording([location(path)], asked=asked) as reader:
@@ -121,13 +121,13 @@ def _look(
 
 @dataclass(frozen=True, slots=True)
 class ReadingSpeed:
-    """What the frames of a topic cost on this machine, as they are.
+    """How long a topic's frames take to read on this machine.
 
     Attributes:
         topic: The topic.
         bytes_per_frame: Of its videos.
-        random_ms: Median time of one at a random place, milliseconds.
-        in_order_ms: Mean time of one of several that follow each other, milliseconds.
+        random_ms: Median time of a random frame, milliseconds.
+        in_order_ms: Mean time of a frame when reading in order, milliseconds.
     """
 
     topic: str
@@ -147,7 +147,7 @@ def reading_speeds(path: Path | str) -> list[ReadingSpeed]:
         path: A dataset, or a video with its sidecar; or its URL.
 
     Raises:
-        SourceError: It is no dataset, or cannot be read.
+        SourceError: It is not a dataset, or cannot be read.
         FormatError: The dataset breaks a rule of the format.
     """
     with Dataset(path) as dataset:
@@ -235,7 +235,7 @@ def _content(reader: BagReader, channel: Channel) -> str:
 
 
 def intrinsics_text(width: int, height: int, model: str, k: Any) -> str:
-    """One line for a calibration."""
+    """A calibration in one line."""
     return (
         f"{width}x{height} {model or '-'} fx={k[0]:.1f} fy={k[4]:.1f} cx={k[2]:.1f} cy={k[5]:.1f}"
     )
@@ -260,15 +260,15 @@ def _dataset_info(dataset: Dataset) -> Info:
         _add_stream(by_topic, stream)
     if dataset.manifest:
         result.notes += [
-            f"{item.topic}: {item.messages} messages stored verbatim from number {item.first} on: "
-            f"{item.reason}"
+            f"{item.topic}: {item.messages} messages stored verbatim, the first is number "
+            f"{item.first}: {item.reason}"
             for item in dataset.manifest.verbatim
         ]
         if dataset.manifest.about:
             result.notes += dataset.manifest.about.lines
         if dataset.manifest.derived_from:
             earlier = (f"{item.name} ({item.profile})" for item in dataset.manifest.derived_from)
-            result.notes.append(f"packed again from {', '.join(earlier)}")
+            result.notes.append(f"repacked from {', '.join(earlier)}")
         if dataset.manifest.topics_left_out:
             left_out = ", ".join(dataset.manifest.topics_left_out)
             result.notes.append(f"left out when packed: {left_out}")
@@ -278,7 +278,7 @@ def _dataset_info(dataset: Dataset) -> Info:
         if stream.sidecar.video.quality
     ]
     if any(stream.sidecar.stamps == "record-float" for stream in dataset.streams):
-        result.notes.append("times are record times that were stored as float seconds: not exact")
+        result.notes.append("times are record times stored as float seconds, so they are not exact")
     return result
 
 
@@ -307,16 +307,16 @@ def _add_stream(by_topic: dict[str, TopicInfo], stream: Stream) -> None:
 # ---------------------------------------------------------------- intrinsics
 
 MAX_LISTED = 1000
-"""Calibrations of a camera that are listed; of a self-calibrating one there may be more."""
+"""Maximum number of listed calibrations of a camera; a self-calibrating one may have more."""
 
 
 @dataclass(frozen=True, slots=True)
 class ListedCalibration:
-    """A calibration of a camera, and from where on it holds.
+    """A calibration of a camera, and where it starts to apply.
 
     Attributes:
-        message: Number of the message that it holds from, among its channel's; None where no
-            messages were recorded.
+        message: Number of the message it comes from, within its channel; None if no messages were
+            recorded.
         log_time: When that was recorded, nanoseconds.
         frame_id: Coordinate frame.
         width: Columns of the calibrated image.
@@ -326,10 +326,10 @@ class ListedCalibration:
         d: Distortion parameters.
         r: Rectification matrix, 3 x 3.
         p: Projection matrix, 3 x 4.
-        binning: Columns and rows binned into one, or None where both are 0.
-        roi: x_offset, y_offset, height, width, do_rectify, or None where all are 0.
-        k_effective: `k` for the images as they are, cut and binned; None where it is `k`.
-        p_effective: `p` for the images as they are; None where it is `p`.
+        binning: Columns and rows binned into one, or None if both are 0.
+        roi: x_offset, y_offset, height, width, do_rectify, or None if all are 0.
+        k_effective: `k` for the recorded images, cropped and binned; None if equal to `k`.
+        p_effective: `p` for the recorded images; None if equal to `p`.
     """
 
     message: int | None
@@ -354,11 +354,11 @@ class CameraCalibrations:
 
     Attributes:
         topic: Of the images; empty for calibrations that belong to no images.
-        info_topic: Of the calibrations; empty where the images have none.
+        info_topic: Of the calibrations; empty if the images have none.
         frame_id: Coordinate frame of the first image.
         sizes: Width and height of the images; several if they change, none if unknown.
-        calibrations: Each that differs from the one before, in the order of the recording.
-        more: Changes of the calibration beyond those listed.
+        calibrations: Each that differs from the previous one, in recorded order.
+        more: Number of further changes not listed.
     """
 
     topic: str
@@ -374,7 +374,7 @@ class Intrinsics:
     """The cameras of a recording or dataset.
 
     Attributes:
-        path: What was looked at.
+        path: The recording or dataset.
         kind: ``bag``, ``rosbag2``, ``mcap``, ``dataset`` or ``stream``.
         cameras: By topic; calibrations without images last.
         transforms: Static transforms that connect the cameras.
@@ -390,10 +390,10 @@ def intrinsics(path: Path | str) -> Intrinsics:
     """The intrinsics and extrinsics in a recording, a dataset, or a video with its sidecar.
 
     Args:
-        path: Where it is, or its URL.
+        path: Its path or URL.
 
     Raises:
-        SourceError: It is no recording or cannot be read.
+        SourceError: It is not a recording or cannot be read.
         FormatError: The dataset breaks a rule of the format.
     """
     return _look(path, _of_dataset, _of_recording)
@@ -461,7 +461,7 @@ class _History:
             self.more += 1
 
     def give(self, camera: CameraCalibrations) -> None:
-        """Hand all over to the camera."""
+        """Move all of it to the camera."""
         camera.info_topic = self.topic
         camera.calibrations += self.calibrations
         camera.more += self.more
@@ -471,10 +471,10 @@ class _History:
 
 
 class _Cameras:
-    """What one pass over messages tells of their cameras.
+    """Collects information about cameras in one pass over messages.
 
     Args:
-        channels: Gives the channels, as far as they are known by then.
+        channels: Returns the channels known so far.
     """
 
     def __init__(self, channels: Callable[[], Sequence[Channel]]) -> None:
@@ -483,7 +483,7 @@ class _Cameras:
         self._forms: dict[int, MessageSplitter] = {}
         self._seen: dict[int, tuple[str, tuple[int, int]]] = {}
         self._stamps = StampPairing()
-        self._known = -1  # channels when it was last decided whether stamps are needed
+        self._known = -1  # number of channels when it was last decided whether stamps are needed
         self._needs_stamps = False
         self.transforms = TransformCollector()
 
@@ -500,7 +500,7 @@ class _Cameras:
             self.transforms.add(channel, message.data)
 
     def _wants_stamps(self) -> bool:
-        """Whether names leave a calibration channel unpaired; some formats tell channels late."""
+        """Whether names leave a calibration channel unpaired; some formats reveal channels late."""
         channels = self._channels()
         if len(channels) != self._known:
             self._known = len(channels)
@@ -616,7 +616,7 @@ def _add_intrinsics(camera: CameraCalibrations, stream: Stream) -> None:
 
 
 def _verbatim(dataset: Dataset) -> list[CameraCalibrations]:
-    """Cameras without a stream, all messages of which are in messages.mcap."""
+    """Cameras without a stream, with all messages in messages.mcap."""
     models = [stream.sidecar.channel for stream in dataset.streams]
     models += [item.channel for s in dataset.streams if (item := s.sidecar.camera_info)]
     owned = {model.to_record(0).identity for model in models}

@@ -1,8 +1,8 @@
-"""Frames of datasets as samples for PyTorch.
+"""Frames of datasets as PyTorch samples.
 
-`FrameDataset` gives samples by number, in any order; `FrameStream` reads recordings from
-beginning to end, shuffled by windows. Both are made for a ``torch.utils.data.DataLoader`` with
-workers: docs/training.md shows how. Needs ``pip install 'mp4ds[torch]'``.
+`FrameDataset` returns samples by number, in any order; `FrameStream` reads recordings from
+beginning to end, shuffled by windows. Both are meant for a ``torch.utils.data.DataLoader`` with
+workers: see docs/training.md. Needs ``pip install 'mp4ds[torch]'``.
 """
 
 from __future__ import annotations

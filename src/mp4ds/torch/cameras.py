@@ -37,20 +37,20 @@ _T = TypeVar("_T")
 _DTYPES = ("native", "uint8", "float32")
 _BACKENDS = ("mp4ds", "torchcodec")
 
-# A worker must not free what its parent left for the garbage collector: a container of PyAV is
-# always in a reference cycle, and to free its decoder is to wait for threads that no fork copies.
+# A worker must not free what its parent left to the garbage collector: a PyAV container is always
+# in a reference cycle, and freeing its decoder waits for threads that a fork does not copy.
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=gc.freeze)
 
 
 @dataclass(frozen=True, slots=True)
 class TensorView:
-    """What of a camera's frames is wanted.
+    """How a camera's frames are wanted.
 
     Attributes:
         format: One of `mp4ds.dataset.views.FORMATS`.
         resize: Factor, or width and height, pixels.
-        crop: x, y, width, height before that, pixels.
+        crop: x, y, width, height, pixels, applied before it.
     """
 
     format: str = "rgb"
@@ -63,10 +63,10 @@ class Pictures:
     """How the frames of all cameras become tensors.
 
     Attributes:
-        views: What of each camera, in the order of the topics.
+        views: The view of each camera, in the order of the topics.
         dtype: ``native``, ``uint8`` or ``float32``.
         channels_first: (C, H, W) instead of (H, W, C).
-        backend: Who decodes.
+        backend: The decoding backend.
         device: Where the tensors are.
     """
 
@@ -77,18 +77,18 @@ class Pictures:
     device: str
 
     def tensor(self, pixels: Tensor, topic: str, format_name: str) -> Tensor:
-        """The tensor of frames: a view where nothing is to be computed.
+        """The tensor of frames: a view if no computation is needed.
 
         Args:
             pixels: Shape (N, H, W) or (N, H, W, C).
             topic: For errors.
-            format_name: What the pixels are.
+            format_name: Format of the pixels.
 
         Returns:
             Shape (N, C, H, W), or (N, H, W, C).
 
         Raises:
-            OptionError: They are no bytes, where ``uint8`` was asked for.
+            OptionError: They are not bytes, but ``uint8`` was requested.
         """
         if pixels.ndim == 3:
             pixels = pixels.unsqueeze(-1)
@@ -98,7 +98,7 @@ class Pictures:
         return self.arranged(pixels)
 
     def check(self, dtype: torch.dtype, topic: str) -> None:
-        """Refuse pixels that are no bytes, where these were asked for.
+        """Refuse pixels that are not bytes, if ``uint8`` was requested.
 
         Raises:
             OptionError: They are not.
@@ -106,12 +106,12 @@ class Pictures:
         if self.dtype == "uint8" and dtype != torch.uint8:
             kind = str(dtype).removeprefix("torch.")
             raise OptionError(
-                f"topic {topic}: has frames of {kind}, not uint8. Give dtype='native' to have "
-                "them as they are, or dtype='float32'."
+                f"topic {topic}: has frames of {kind}, not uint8. Give dtype='native' to get them "
+                "as stored, or dtype='float32'."
             )
 
     def arranged(self, pixels: Tensor) -> Tensor:
-        """Pixels of shape (..., H, W, C) with the channels where they are wanted; a view."""
+        """Pixels of shape (..., H, W, C) with the channels in the requested place; a view."""
         return pixels.movedim(-1, -3) if self.channels_first else pixels
 
 
@@ -135,10 +135,10 @@ def pictures_from(
     backend: str,
     device: str,
 ) -> Pictures:
-    """The choices of a user.
+    """The user's choices.
 
     Raises:
-        OptionError: One is unknown, or for a topic that is not there.
+        OptionError: One is unknown, or for a topic that does not exist.
     """
     dtype = str(dtype).removeprefix("torch.")
     _one_of("dtype", dtype, _DTYPES)
@@ -155,18 +155,18 @@ def pictures_from(
         for view in views:
             if view.format != "rgb" or view.resize is not None:
                 raise OptionError(
-                    "backend='torchcodec' gives format='rgb' without resize; use a transform."
+                    "backend='torchcodec' only gives format='rgb' without resize; use a transform."
                 )
     return Pictures(views, dtype, channels_first, backend, device)
 
 
 def _one_of(name: str, value: str, known: Sequence[str]) -> None:
     if value not in known:
-        raise OptionError(f"{name} is {value!r}, and not one of {', '.join(known)}.")
+        raise OptionError(f"{name} is {value!r}, not one of {', '.join(known)}.")
 
 
 def _each(name: str, given: _T | Mapping[str, _T], topics: Sequence[str], default: _T) -> list[_T]:
-    """A value for each topic, of one for all or a mapping."""
+    """A value for each topic, from one for all or a mapping."""
     if not isinstance(given, Mapping):
         return [given] * len(topics)
     unknown = [topic for topic in given if topic not in topics]
@@ -181,10 +181,10 @@ def _each(name: str, given: _T | Mapping[str, _T], topics: Sequence[str], defaul
 # ---------------------------------------------------------------- recordings
 
 Paths = Path | str | Sequence[Path | str]
-"""Datasets: folders, videos beside their sidecars, or URLs of such."""
+"""Datasets: folders, videos next to their sidecars, or URLs of these."""
 
 RESERVED = ("stamp_ns", "index", "dataset")
-"""Keys of a sample that no topic may have."""
+"""Sample keys that cannot be topic names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,8 +193,8 @@ class CameraSource:
 
     Attributes:
         topic: Of its images.
-        name: Of its file, without ending.
-        place: Path or URL of the sidecar, or of a video that has none.
+        name: Of its file, without extension.
+        place: Path or URL of the sidecar, or of a video without one.
         frames: Number of its frames.
     """
 
@@ -209,11 +209,11 @@ class Recording:
     """The samples of one dataset, in order: its rows.
 
     Attributes:
-        path: As the user named it.
+        path: As given by the user.
         sources: Its cameras, in the order of the topics.
         matches: Frame numbers, int64 of shape (rows, cameras); None: row n is frame n of the only
             camera.
-        unmatched: Frame numbers that are in no row, by topic.
+        unmatched: Frame numbers that are not in any row, by topic.
     """
 
     path: str
@@ -227,24 +227,25 @@ class Recording:
         return self.sources[0].frames if self.matches is None else len(self.matches)
 
     def frames(self, rows: NDArray[np.int64], camera: int) -> NDArray[np.int64]:
-        """Frame numbers of rows in a camera; the same shape."""
+        """A camera's frame numbers for rows; the same shape."""
         return rows if self.matches is None else self.matches[rows, camera]
 
 
 class Collection:
-    """The samples of several datasets, one after the other.
+    """The samples of several datasets, one after another.
 
-    Of a dataset with one camera only the manifest is read; to match several, their stamps.
+    For a dataset with one camera only the manifest is read; to match several cameras, also their
+    stamps.
 
     Args:
         paths: The datasets, or folders of them.
         topics: Topics or names of streams; None: those of the first dataset. All must have them.
-        sync_tolerance_ns: How far header stamps of a match may be apart, nanoseconds.
+        sync_tolerance_ns: Maximum distance of the header stamps of a match, nanoseconds.
 
     Raises:
-        OptionError: A topic is not there, or there is no sample.
+        OptionError: A topic does not exist, or there are no samples.
         FormatError: A manifest or sidecar breaks a rule of the format.
-        SourceError: A path is no dataset.
+        SourceError: A path is not a dataset.
     """
 
     def __init__(
@@ -256,7 +257,7 @@ class Collection:
             raise OptionError(f"topics is a list of topics, such as [{topics!r}].")
         if sync_tolerance_ns < 0:
             raise OptionError(
-                f"sync_tolerance_ns is {sync_tolerance_ns}, and must not be negative."
+                f"sync_tolerance_ns is {sync_tolerance_ns}, but must not be negative."
             )
         given = datasets_in(paths)
         known = _sources(given[0])
@@ -269,7 +270,7 @@ class Collection:
         if not self.starts[-1]:
             raise OptionError(
                 f"{given[0]}: no frames of {', '.join(self.topics)} have header stamps within "
-                f"{sync_tolerance_ns} ns of each other. Give a larger sync_tolerance_ns."
+                f"{sync_tolerance_ns} ns of each other. Use a larger sync_tolerance_ns."
             )
 
     @cached_property
@@ -278,7 +279,7 @@ class Collection:
         return np.cumsum([0, *(recording.rows for recording in self.recordings)], dtype=np.int64)
 
     def locate(self, samples: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Recording and row of each sample number, of 0 <= number < ``starts[-1]``."""
+        """Recording and row of each sample number, 0 <= number < ``starts[-1]``."""
         recordings = np.searchsorted(self.starts, samples, side="right") - 1
         return recordings.astype(np.int64), samples - self.starts[recordings]
 
@@ -313,7 +314,7 @@ def open_source(source: CameraSource) -> Stream | Video:
 
 
 def _sources(path: Path | str) -> list[CameraSource]:
-    """The cameras of a dataset; the manifest tells them without the sidecars."""
+    """The cameras of a dataset, from its manifest, without reading the sidecars."""
     folder = location(path)
     if folder.name == MANIFEST_NAME:
         folder = folder.parent
@@ -330,12 +331,12 @@ def _sources(path: Path | str) -> list[CameraSource]:
 
 def _check_topics(topics: Sequence[str], path: Path | str) -> None:
     if not topics:
-        raise OptionError(f"{path}: has no camera, or no topics were chosen.")
+        raise OptionError(f"{path}: has no camera, or no topics were selected.")
     twice = [topic for topic in topics if topics.count(topic) > 1]
     if twice:
         raise OptionError(
-            f"{path}: {twice[0]} stands twice among the topics. If it has several streams, choose "
-            "one by the name of its file."
+            f"{path}: {twice[0]} is given twice among the topics. If it has several streams, "
+            "choose one by its file name."
         )
     taken = [topic for topic in topics if topic in RESERVED]
     if taken:
@@ -360,10 +361,10 @@ def _choose(sources: list[CameraSource], topic: str, path: Path | str) -> Camera
 
 
 class TensorReader(Protocol):
-    """What decodes frames of a stream."""
+    """Decodes frames of a stream."""
 
     def read(self, frames: list[int]) -> Tensor:
-        """Frames in the order asked for, repeated as asked; (N, H, W) or (N, H, W, C)."""
+        """Frames in the requested order, with repetitions; (N, H, W) or (N, H, W, C)."""
         ...
 
     def close(self) -> None:
@@ -372,11 +373,11 @@ class TensorReader(Protocol):
 
 
 class StreamReader:
-    """Decodes by ``read`` of a stream; see `TensorReader`.
+    """Decodes with a stream's ``read``; see `TensorReader`.
 
     Args:
         stream: The stream.
-        view: What of its frames is wanted.
+        view: How its frames are wanted.
     """
 
     def __init__(self, stream: Stream | Video, view: TensorView) -> None:
@@ -384,13 +385,13 @@ class StreamReader:
         self._view = view
 
     def read(self, frames: list[int]) -> Tensor:
-        """As `TensorReader.read`."""
+        """Like `TensorReader.read`."""
         view = self._view
         pixels = self._stream.read(frames, format=view.format, resize=view.resize, crop=view.crop)
         return torch.from_numpy(pixels)  # shares the memory
 
     def read_into(self, frames: list[int], outs: Sequence[Tensor]) -> None:
-        """Frames into tensors of their own, each of shape (H, W) or (H, W, C)."""
+        """Read each frame into its own tensor, of shape (H, W) or (H, W, C)."""
         view = self._view
         arrays = [out.numpy() for out in outs]  # which share the memory
         self._stream.read_into(
@@ -398,7 +399,7 @@ class StreamReader:
         )
 
     def close(self) -> None:
-        """As `TensorReader.close`."""
+        """Like `TensorReader.close`."""
         self._stream.close()
 
 
@@ -407,7 +408,7 @@ class OpenCamera:
 
     Args:
         source: Which.
-        view: What of its frames is wanted.
+        view: How its frames are wanted.
         pictures: How they become tensors.
 
     Raises:
@@ -423,7 +424,7 @@ class OpenCamera:
             raise FormatError(
                 "frame-count",
                 source.place,
-                f"has {len(self.stream)} frames where {source.frames} are due",
+                f"has {len(self.stream)} frames, not {source.frames}",
             )
         self._reader: TensorReader = (
             TorchcodecReader(self.stream, view.crop, pictures.device)
@@ -442,18 +443,18 @@ class OpenCamera:
 
     @cached_property
     def period_ns(self) -> int:
-        """Median time between frames, nanoseconds; 0 of a single one."""
+        """Median time between frames, nanoseconds; 0 for a single frame."""
         gaps = np.diff(self.stamps[self._order])
         return int(np.median(gaps)) if len(gaps) else 0
 
     def nearest(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The frames whose stamps are nearest to times; the first of several such."""
+        """The frames whose stamps are nearest to times; the first of several."""
         stamps = self.stamps[self._order]
         return self._order[nearest(stamps, times)].astype(np.int64)
 
     @cached_property
     def key_frames(self) -> NDArray[np.int64]:
-        """Numbers of the frames at which decoding can begin, in order; all where none are told.
+        """Numbers of the frames at which decoding can begin, in order; all if unknown.
 
         Raises:
             VideoError: The video's index is damaged.
@@ -476,11 +477,11 @@ class OpenCamera:
             frames: Numbers, shape (N,), in any order.
 
         Returns:
-            Shape (N, C, H, W) or (N, H, W, C); memory of its own.
+            Shape (N, C, H, W) or (N, H, W, C); its own memory.
 
         Raises:
             SampleError: One of them cannot be decoded.
-            OptionError: They cannot be had as asked.
+            OptionError: They cannot be returned as requested.
         """
         numbers: list[int] = frames.tolist()
         pixels = self._decoded(numbers, lambda: self._reader.read(numbers))
@@ -490,13 +491,13 @@ class OpenCamera:
         """A tensor for frames, such as `read_into` takes.
 
         Args:
-            shape: That its frames are to have among each other.
+            shape: Leading dimensions.
 
         Returns:
-            Shape (*shape, H, W, C); None where frames are not decoded into tensors that are there.
+            Shape (*shape, H, W, C); None if frames cannot be decoded into existing tensors.
 
         Raises:
-            OptionError: The frames cannot be had as asked.
+            OptionError: The frames cannot be returned as requested.
         """
         if not isinstance(self._reader, StreamReader):
             return None
@@ -507,11 +508,11 @@ class OpenCamera:
         return torch.empty((*shape, *row.shape[1:3], *channels), dtype=dtype)
 
     def read_into(self, frames: NDArray[np.int64], outs: Sequence[Tensor]) -> None:
-        """Frames into tensors that are there, decoded in one pass.
+        """Decode frames into existing tensors in one pass.
 
         Args:
             frames: Numbers, shape (N,), in any order.
-            outs: A row for each of a tensor as `empty` gives, shape (H, W, C).
+            outs: For each frame a row of a tensor from `empty`, shape (H, W, C).
 
         Raises:
             SampleError: One of them cannot be decoded.
@@ -538,7 +539,7 @@ class OpenCamera:
             raise self._first_failure(numbers, error) from None
 
     def _first_failure(self, numbers: list[int], error: Mp4dsError) -> Mp4dsError:
-        """Which frame it was, since a sentence about many does not always tell."""
+        """Which frame failed, since an error about many does not always say."""
         for number in sorted(set(numbers)):
             try:
                 self._reader.read([number])
@@ -553,13 +554,13 @@ class OpenCamera:
 
 
 class OpenCameras:
-    """The cameras of one process that are open; those not used for long are closed.
+    """The open cameras of one process; the least recently used are closed.
 
-    A copy of it, by pickling or by a fork, has none open: a decoder's threads do not exist in
-    another process, and it would wait for them.
+    A copy, by pickling or forking, has none open: a decoder's threads do not exist in another
+    process, and it would wait for them.
 
     Args:
-        most: How many are open at most.
+        most: Maximum number of open cameras.
         pictures: How their frames become tensors.
 
     Raises:
@@ -571,7 +572,7 @@ class OpenCameras:
         self._pictures = pictures
         self._start()
         if most < 1:
-            raise OptionError(f"cache_files is {most}, and must be at least 1.")
+            raise OptionError(f"cache_files is {most}, but must be at least 1.")
 
     def _start(self) -> None:
         self._process = os.getpid()
@@ -582,13 +583,13 @@ class OpenCameras:
         return len(self._open)
 
     def get(self, recording: Recording, camera: int) -> OpenCamera:
-        """A camera of a recording, opened if need be.
+        """A camera of a recording, opened if needed.
 
         Raises:
             FormatError: It breaks a rule of the format.
         """
         if self._process != os.getpid():
-            # kept as it is: to close or free what the parent decodes with may never end here
+            # kept as it is: closing or freeing the parent's decoders could hang here
             self._inherited.append(self._open)
             self._open, self._process = OrderedDict(), os.getpid()
         source = recording.sources[camera]
@@ -601,13 +602,13 @@ class OpenCameras:
         return found
 
     def close(self) -> None:
-        """Close what this process has open."""
+        """Close the cameras of this process."""
         if self._process == os.getpid():
             while self._open:
                 self._open.popitem()[1].close()
 
     def __del__(self) -> None:
-        # a decoder that waits for the garbage collector may meet it in a forked process
+        # a decoder left to the garbage collector may be collected in a forked process
         self.close()
 
     def __getstate__(self) -> dict[str, Any]:

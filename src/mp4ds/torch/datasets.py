@@ -1,4 +1,4 @@
-"""Samples by number, and in the order of the recordings."""
+"""Samples by number, in the order of the recordings."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ class Stamped(Protocol):
         ...
 
     def nearest(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The frames whose stamps are nearest to times, of the same shape."""
+        """The frames with the nearest stamps; the shape of `times`."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Offsets:
-    """Offsets of the frames of a sample from its own, in rows or in nanoseconds.
+    """Offsets of a sample's frames from its own row, in rows or in nanoseconds.
 
     Attributes:
         steps: The offsets.
@@ -68,7 +68,7 @@ class Offsets:
     def frames(
         self, recording: Recording, camera: int, timeline: Stamped, rows: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Frame numbers of samples, and which of them only stand in for what is not there.
+        """Frame numbers of samples, and which of them are padding.
 
         Args:
             recording: Of the samples.
@@ -87,33 +87,33 @@ class Offsets:
         own = recording.frames(rows, camera)[:, None]
         stamps = timeline.stamps
         times = stamps[own] + steps
-        # with equal stamps, the nearest to its own time may be another frame
+        # with equal stamps, the frame nearest to its own time may be a different one
         found = np.where(steps == 0, own, timeline.nearest(times))
         tolerance = timeline.period_ns // 2 if self.tolerance_ns is None else self.tolerance_ns
         return found, np.abs(stamps[found] - times) > tolerance
 
 
 def offsets_from(values: Sequence[float], unit: Unit, tolerance_ns: int | None) -> Offsets:
-    """The offsets that a user gave.
+    """The user's offsets.
 
     Raises:
-        OptionError: They are none, or no numbers of that unit.
+        OptionError: There are none, or they are not valid in that unit.
     """
     given = tuple(values)
     if not given:
-        raise OptionError("offsets is empty; (0,) is the sample's own frame alone.")
+        raise OptionError("offsets is empty; use (0,) for the sample's own frame alone.")
     if unit == "frames":
         if any(isinstance(value, bool) or value != int(value) for value in given):
-            raise OptionError(f"offsets are {given}, and those in frames are whole numbers.")
+            raise OptionError(f"offsets are {given}, but offsets in frames must be integers.")
         if tolerance_ns is not None:
             raise OptionError('tolerance_ns belongs to offsets_in="seconds".')
         return Offsets(tuple(int(value) for value in given))
     if unit != "seconds":
-        raise OptionError(f"offsets_in is {unit!r}, and not one of frames, seconds.")
+        raise OptionError(f"offsets_in is {unit!r}, not one of frames, seconds.")
     if not all(abs(value) <= _MOST_SECONDS for value in given):
-        raise OptionError(f"offsets are {given}, and those in seconds are at most 1e9.")
+        raise OptionError(f"offsets are {given}, but offsets in seconds can be at most 1e9.")
     if tolerance_ns is not None and tolerance_ns < 0:
-        raise OptionError(f"tolerance_ns is {tolerance_ns}, and must not be negative.")
+        raise OptionError(f"tolerance_ns is {tolerance_ns}, but must not be negative.")
     return Offsets(tuple(round(value * 10**9) for value in given), True, tolerance_ns)
 
 
@@ -124,12 +124,12 @@ Transform = Callable[[Sample], Any]
 
 
 class Batch:
-    """Tensors that the samples of a batch are rows of, so that collating copies nothing.
+    """Tensors whose rows are the samples of a batch, so that collating copies nothing.
 
     Args:
-        samples: How many there are.
-        frames: Of each.
-        shared: Whether other processes are to have them.
+        samples: Number of samples.
+        frames: Frames per sample.
+        shared: Whether other processes need access.
     """
 
     def __init__(self, samples: int, frames: int, *, shared: bool) -> None:
@@ -138,10 +138,10 @@ class Batch:
         self._tensors: dict[int, torch.Tensor] = {}
 
     def tensor_for(self, camera: OpenCamera, number: int) -> torch.Tensor | None:
-        """The tensor of the camera of a number, of shape (samples, frames, H, W, C).
+        """The tensor of a camera, by its number, of shape (samples, frames, H, W, C).
 
         Returns:
-            None where frames of this recording are not made in such a one.
+            None if frames of this recording cannot be decoded into one.
         """
         found = camera.empty((0, 0))
         if found is None:
@@ -156,13 +156,13 @@ class Batch:
         shape = (*self._shape, *like.shape[2:])
         if not self._shared:
             return like.new_empty(shape)
-        # as torch's own collation does in a worker
+        # as torch's own collate does in a worker
         storage = torch.UntypedStorage._new_shared(prod(shape) * like.itemsize)
         return like.new_empty(0).set_(storage, 0, shape)
 
 
 def _whole(rows: Sequence[Any]) -> Any:
-    """The tensor that rows make up in their order; a new one where they do not."""
+    """The tensor whose rows these are, in order; a new one if they are not."""
     first = rows[0]
     if not all(isinstance(row, torch.Tensor) for row in rows):
         return default_collate(rows)
@@ -178,7 +178,7 @@ def _whole(rows: Sequence[Any]) -> Any:
 
 
 def _kind(row: torch.Tensor) -> tuple[object, ...]:
-    """What rows of one tensor have in common."""
+    """What all rows of one tensor share."""
     return row.untyped_storage().data_ptr(), row.dtype, row.device, row.shape, row.stride()
 
 
@@ -189,8 +189,8 @@ class SampleReader:
         collection: The samples.
         pictures: How their frames become tensors.
         offsets: Which frames a sample has.
-        transform: What makes of a sample that which is given; None: nothing.
-        cache_files: How many videos are open at most.
+        transform: Applied to each sample; None for nothing.
+        cache_files: Maximum number of open videos.
 
     Raises:
         OptionError: `cache_files` is less than one.
@@ -221,7 +221,7 @@ class SampleReader:
             return self.cameras.get(recording, 0).key_frames
 
     def batch(self, samples: int, *, shared: bool) -> Batch:
-        """For so many samples; see `Batch`."""
+        """A batch of that many samples; see `Batch`."""
         return Batch(samples, len(self._offsets.steps), shared=shared)
 
     def read(
@@ -236,8 +236,8 @@ class SampleReader:
         Args:
             number: Of the recording.
             rows: The samples, shape (N,), in any order.
-            batch: What they are part of; None: nothing.
-            places: Their places in it.
+            batch: The batch they belong to; None for none.
+            places: Their positions in it.
 
         Raises:
             SampleError: A frame cannot be read.
@@ -277,7 +277,7 @@ class SampleReader:
     def _rows(
         self, camera: OpenCamera, frames: NDArray[np.int64], rows: Sequence[torch.Tensor]
     ) -> list[torch.Tensor]:
-        """As `_windows`, read into rows of a batch's tensor, each of shape (T, H, W, C)."""
+        """Like `_windows`, but read into rows of a batch's tensor, each of shape (T, H, W, C)."""
         camera.read_into(frames.ravel(), [frame for row in rows for frame in row])
         arranged = [self._pictures.arranged(row) for row in rows]
         return [row[0] for row in arranged] if self._offsets == Offsets() else arranged
@@ -285,7 +285,7 @@ class SampleReader:
 
 @contextmanager
 def _named(path: str, topic: str) -> Iterator[None]:
-    """Say in an error of which dataset and topic it is."""
+    """Add the dataset and topic to errors."""
     try:
         yield
     except OptionError:
@@ -302,51 +302,50 @@ SYNC_TOLERANCE_NS = 20_000_000
 
 
 class FrameDataset(Dataset):
-    """Frames of datasets by number, for a DataLoader that shuffles.
+    """Frames of datasets by number, for a shuffling DataLoader.
 
-    A sample is a dictionary, here of the topics ``/left`` and ``/right``::
+    A sample is a dictionary, here for the topics ``/left`` and ``/right``::
 
         {"/left": uint8 (T, C, H, W), "/right": ..., "/left_is_pad": bool (T,), ...,
          "stamp_ns": int, "index": int, "dataset": int}
 
     T is the number of offsets; with the default, one, tensors are (C, H, W). C is 1 for grey
-    images. ``is_pad`` tells which frames stand in for some that are not there. ``stamp_ns`` is the
-    header stamp of the first topic's frame, ``index`` the sample's number, ``dataset`` that of
-    the path. The samples of a batch are rows of one tensor for each camera, which `collate` gives
-    as it is: copy those that you keep.
+    images. ``is_pad`` marks frames that are padding for missing ones. ``stamp_ns`` is the header
+    stamp of the first topic's frame, ``index`` the sample's number, ``dataset`` that of the path.
+    The samples of a batch are rows of one tensor per camera, which `collate` returns without
+    copying: copy those that you keep.
 
-    Of several cameras, a sample has the frames that belong together: they are matched by header
-    stamp (`mp4ds.Dataset.sync`), each frame at most once, and `unmatched` has the others.
+    With several cameras, a sample has frames matched by header stamp (`mp4ds.Dataset.sync`), each
+    frame at most once; `unmatched` has the others.
 
-    It may be pickled and forked. Videos are opened when first needed, by each process for itself.
+    It may be pickled and forked. Each process opens videos itself when first needed.
 
     Args:
         paths: Datasets, one or several: folders, sidecars, videos, URLs; or folders of datasets
             and patterns such as ``drives/*``.
         topics: Cameras; None: all of the first dataset. The others must have them, too.
-        offsets: Of the frames of a sample from its own: ``(-1, 0)`` is the one before it and
-            itself.
+        offsets: Frames of a sample relative to its own: ``(-1, 0)`` is the previous one and itself.
         offsets_in: ``frames``: samples of the same recording before and after. ``seconds``: in
             each camera the frame whose stamp is nearest.
-        tolerance_ns: With seconds, how far a stamp may be from its time without being padding;
-            None: half the median time between the camera's frames.
-        sync_tolerance_ns: How far stamps of different cameras may be apart in a sample.
+        tolerance_ns: With seconds, how far a stamp may be from its time before it counts as
+            padding; None: half the median time between the camera's frames.
+        sync_tolerance_ns: Maximum distance of the stamps of different cameras in a sample.
         format: ``rgb``, ``bgr``, ``gray``; ``native``: the pixels as recorded; ``depth_m``: depths
             in metres, float32. A mapping by topic gives each camera its own; so do mappings for
             `resize` and `crop`.
         resize: Factor, or width and height in pixels.
         crop: x, y, width, height in pixels; before `resize`.
-        dtype: ``native``: as decoded, which is uint8 but for cameras of more bits. ``uint8``: the
-            same, and refused for those. ``float32``: 0 to 1; native pixels keep their numbers.
+        dtype: ``native``: as decoded, uint8 except for cameras of more bits. ``uint8``: the same,
+            but refused for those. ``float32``: 0 to 1; native pixels keep their values.
         channels_first: (C, H, W), not (H, W, C).
-        transform: Called with each sample; what it returns takes the sample's place.
-        cache_files: How many videos a process has open at most.
-        backend: ``torchcodec`` decodes with that, which converts colours a little differently.
-        device: With ``torchcodec``, where to decode and have the tensors, such as ``cuda``.
+        transform: Called with each sample; its return value replaces the sample.
+        cache_files: Maximum number of open videos per process.
+        backend: ``torchcodec`` decodes with torchcodec, whose colours differ slightly.
+        device: With ``torchcodec``, where to decode and keep the tensors, such as ``cuda``.
 
     Raises:
         OptionError: An option is wrong, a topic is not there, or there is no sample.
-        SourceError: A path is no dataset.
+        SourceError: A path is not a dataset.
         FormatError: A manifest or sidecar breaks a rule of the format.
     """
 
@@ -391,7 +390,7 @@ class FrameDataset(Dataset):
 
     @property
     def paths(self) -> list[str]:
-        """The datasets; a sample's ``dataset`` is the number of one."""
+        """The datasets; a sample's ``dataset`` is an index into these."""
         return [recording.path for recording in self._collection.recordings]
 
     @property
@@ -401,7 +400,7 @@ class FrameDataset(Dataset):
 
     @property
     def unmatched(self) -> list[dict[str, NDArray[np.int64]]]:
-        """Of each dataset, the numbers of the frames that are in no sample, by topic."""
+        """For each dataset, the numbers of the frames that are not in any sample, by topic."""
         return [recording.unmatched for recording in self._collection.recordings]
 
     def __len__(self) -> int:
@@ -411,12 +410,12 @@ class FrameDataset(Dataset):
         return self.__getitems__([index])[0]
 
     def __getitems__(self, indices: Sequence[SupportsIndex]) -> list[Any]:
-        """Samples, in the order asked for.
+        """Samples, in the requested order.
 
-        The frames of each camera are decoded in one pass, in the order that is cheapest.
+        The frames of each camera are decoded in one pass, in the cheapest order.
 
         Raises:
-            IndexError: There is no sample of a number.
+            IndexError: There is no sample with a number.
             SampleError: A frame cannot be read.
         """
         wanted = np.array([self._number(index) for index in indices], np.int64)
@@ -432,18 +431,17 @@ class FrameDataset(Dataset):
         return samples
 
     def collate(self, samples: Sequence[Any]) -> Any:
-        """What `torch.utils.data.default_collate` makes of samples, without copying frames.
+        """Like `torch.utils.data.default_collate`, without copying frames.
 
         For ``DataLoader(dataset, collate_fn=dataset.collate)``. Samples of one batch are rows of
-        one tensor for each camera, which is given as it is; with channels first, it is in the
-        memory format ``channels_last``. Workers then read into memory that is shared with the
-        process of the loader. What is not so, such as what a `transform` made, is collated as
-        usual.
+        one tensor per camera, which is returned as it is; with channels first, it has the memory
+        format ``channels_last``. Workers then read into memory shared with the loader's process.
+        Anything else, such as the results of a `transform`, is collated as usual.
 
         Args:
             samples: Of one batch.
         """
-        self._collates = True  # the next batch is read where it can stay
+        self._collates = True  # read the next batch into its final place
         if not samples or not all(isinstance(sample, dict) for sample in samples):
             return default_collate(samples)
         return {key: _whole([sample[key] for sample in samples]) for key in samples[0]}
@@ -451,9 +449,9 @@ class FrameDataset(Dataset):
     def _number(self, index: SupportsIndex) -> int:
         number = as_integer(index)
         if not -len(self) <= number < len(self):
-            raise IndexError(f"there are {len(self)} samples, and none of number {number}")
+            raise IndexError(f"there are {len(self)} samples, and none with number {number}")
         return number % len(self)
 
     def close(self) -> None:
-        """Close the videos that this process has open; they are opened again when needed."""
+        """Close this process's videos; they are reopened when needed."""
         self._reader.cameras.close()

@@ -1,4 +1,4 @@
-"""The FFmpeg that PyAV brings, for torchcodec where the system has none.
+"""PyAV's FFmpeg for torchcodec, if the system has none.
 
 ``LD_LIBRARY_PATH=$(python -m mp4ds.torch.ffmpeg) python train.py``
 """
@@ -17,7 +17,7 @@ _NAME = re.compile(r"(lib(?:av|sw)[a-z]+)-[0-9a-f]+(\.so\.[0-9]+)[0-9.]*")
 
 
 def link_libraries(folder: Path | None = None) -> Path:
-    """Make a folder in which PyAV's libraries have the names that others look for.
+    """Make a folder in which PyAV's libraries have their usual names.
 
     Args:
         folder: Where; None for one in the user's cache.
@@ -26,19 +26,19 @@ def link_libraries(folder: Path | None = None) -> Path:
         The folder, for ``LD_LIBRARY_PATH``.
 
     Raises:
-        OptionError: PyAV has no libraries of its own.
+        OptionError: PyAV does not bundle libraries.
     """
     parts = [part for part in files("av") or () if part.parent.name == "av.libs"]
     names = {part.name: Path(str(part.locate())).resolve() for part in parts}
     if not names:
-        raise OptionError("This PyAV brings no shared libraries (.so) of its own.")
+        raise OptionError("This PyAV does not bundle shared libraries (.so).")
     if folder is None:
         cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(cache) / "mp4ds" / f"ffmpeg-av{version('av')}"
     folder.mkdir(parents=True, exist_ok=True)
     for name, path in names.items():
         match = _NAME.fullmatch(name)
-        # they look for each other beside them, by the names that they have
+        # they look for each other in their own folder, by their actual names
         for link in (name, *([match[1] + match[2]] if match else [])):
             place = folder / link
             if place.is_symlink() and place.readlink() == path:

@@ -36,8 +36,8 @@ def window_starts(recording: Recording, length: int, keys: NDArray[np.int64]) ->
     """The first sample of each window, and the end of the last; int64.
 
     A window begins with the first sample at or after a multiple of `length` whose frame of the
-    first camera comes first behind a key frame, and ends where the next one begins. So windows are
-    a partition of the samples, whatever key frames there are, and some may be empty.
+    first camera is the first one after a key frame, and ends where the next one begins. So windows
+    partition the samples, whatever the key frames, and some may be empty.
 
     Args:
         recording: Of the samples.
@@ -59,15 +59,15 @@ def mixed(
     random: np.random.Generator,
     skip: int = 0,
 ) -> Iterator[Any]:
-    """What is read of items, in random order as far as a buffer allows.
+    """Items as read, in random order within the limits of a buffer.
 
     Args:
-        items: What to read, in the order that is cheapest.
+        items: What to read, in the cheapest order.
         read: Reads one.
         size: Of the buffer; 0 keeps the order.
-        random: Decides.
-        skip: How many of the first are left out. They are not read; those that the buffer has by
-            then are read when they are given.
+        random: The source of randomness.
+        skip: How many to skip at the beginning, without reading them; what the buffer holds by then
+            is read when it is yielded.
     """
     kept: list[tuple[_T, Any]] = []
     for item in items:
@@ -88,22 +88,22 @@ def mixed(
 
 
 class FrameStream(IterableDataset):
-    """Frames of datasets as fast as videos are decoded: from beginning to end.
+    """Frames of datasets at full decoding speed, from beginning to end.
 
     The recordings are cut into windows that begin with a key frame. Windows come in random
     order, shared among the workers of a DataLoader and the processes of a distributed training;
-    each sample is read once an epoch, by one of them. Inside a window frames follow each other,
-    unless a `buffer` mixes them.
+    each sample is read once per epoch, by one of them. Within a window, frames are in order, unless
+    a `buffer` mixes them.
 
-    Processes of a distributed training get equal numbers of samples, for which some are given
-    twice or left out: see `drop_last`. To share evenly, each process reads the indexes of all
-    videos once; one process alone reads them as it comes to them.
+    Processes of a distributed training get equal numbers of samples, so some samples are repeated
+    or left out: see `drop_last`. To share evenly, each process reads the indexes of all videos
+    once; a single process reads them when needed.
 
-    Samples are as those of `FrameDataset` with one frame each. Give no ``shuffle`` to the
-    DataLoader. torchdata's StatefulDataLoader keeps and restores where an epoch stands.
+    Samples are like those of `FrameDataset` with one frame each. Do not give ``shuffle`` to the
+    DataLoader. torchdata's StatefulDataLoader saves and restores the position in an epoch.
 
     Args:
-        paths: As of `FrameDataset`, and so are `topics`, `sync_tolerance_ns`, `format`,
+        paths: As for `FrameDataset`, and so are `topics`, `sync_tolerance_ns`, `format`,
             `resize`, `crop`, `dtype`, `channels_first`, `transform`, `cache_files`, `backend`
             and `device`.
         topics: Cameras.
@@ -115,21 +115,21 @@ class FrameStream(IterableDataset):
         channels_first: Of the tensors.
         transform: Of the samples.
         window: Samples of a window; the key frames of the first camera make it a little
-            shorter or longer. Several times the distance of key frames, or decoding costs more.
-        shuffle: Whether windows are in random order.
+            shorter or longer. Use several key frame intervals, or decoding costs more.
+        shuffle: Whether windows come in random order.
         seed: Of the order; the same in all processes.
-        buffer: Samples that are kept to mix their order; 0: none.
+        buffer: Number of samples to keep for mixing; 0: none.
         rank: Number of this process of a distributed training.
-        world_size: How many there are.
-        drop_last: Of a distributed training, as of DistributedSampler: leave out the last samples
-            that cannot be shared evenly. Else the first of the epoch are given again.
-        cache_files: Videos that are open at most; one for each camera at least.
+        world_size: Number of processes.
+        drop_last: For distributed training, as in DistributedSampler: leave out the last samples
+            that cannot be shared evenly. Otherwise the first ones of the epoch are repeated.
+        cache_files: Maximum number of open videos; at least one per camera.
         backend: Who decodes.
-        device: Where.
+        device: Where to decode.
 
     Raises:
         OptionError: An option is wrong, a topic is not there, or there is no sample.
-        SourceError: A path is no dataset.
+        SourceError: A path is not a dataset.
         FormatError: A manifest or sidecar breaks a rule of the format.
     """
 
@@ -160,8 +160,8 @@ class FrameStream(IterableDataset):
         self._collection = Collection(paths, topics=topics, sync_tolerance_ns=sync_tolerance_ns)
         if cache_files < len(self.topics):
             raise OptionError(
-                f"cache_files is {cache_files}, and must be at least {len(self.topics)}: one for "
-                "each camera."
+                f"cache_files is {cache_files}, but must be at least {len(self.topics)}: one per "
+                "camera."
             )
         pictures = pictures_from(
             self.topics,
@@ -182,7 +182,7 @@ class FrameStream(IterableDataset):
         self._drop_last = drop_last
         self._starts: dict[int, NDArray[np.int64]] = {}
         self._given = self._resumed = 0
-        # in shared memory, so that workers that outlive an epoch learn of the next
+        # in shared memory, so that persistent workers learn of the next epoch
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
 
     @property
@@ -192,7 +192,7 @@ class FrameStream(IterableDataset):
 
     @property
     def samples(self) -> int:
-        """Number of samples of an epoch, of all processes together."""
+        """Number of samples per epoch, over all processes."""
         return int(self._collection.starts[-1])
 
     def set_epoch(self, epoch: int) -> None:
@@ -208,31 +208,33 @@ class FrameStream(IterableDataset):
         self._epoch.fill_(epoch)
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the epoch stands in this process: what `load_state_dict` takes.
+        """Position in the epoch in this process, for `load_state_dict`.
 
-        Of the iterator that was made last.
+        Refers to the most recent iterator.
         """
         return {"epoch": int(self._epoch), "given": self._given, "order": self._order()}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Let the next iterator go on where another one stood; what that gave is not read.
+        """Let the next iterator resume where another one was, without rereading earlier samples.
 
         Args:
-            state_dict: Of the same process or worker, of a stream with the same options.
+            state_dict: From the same process or worker, of a stream with the same options.
 
         Raises:
-            OptionError: It is of another order of samples.
+            OptionError: It belongs to a different order of samples.
         """
         other = state_dict["order"]
         for name, own in self._order().items():
             if other[name] != own:
-                problem = f"the state is of a stream with {name} {other[name]!r}, and this one has"
+                problem = (
+                    f"the state is from a stream with {name} {other[name]!r}, but this one has"
+                )
                 raise OptionError(f"{problem} {own!r}.")
         self.set_epoch(state_dict["epoch"])
         self._given = self._resumed = state_dict["given"]
 
     def _order(self) -> dict[str, Any]:
-        """What the order of samples depends on, besides the epoch."""
+        """Everything besides the epoch that determines the order of samples."""
         share, shares = self._share()
         return {
             "samples": self.samples,
@@ -288,7 +290,7 @@ class FrameStream(IterableDataset):
             for number, window in windows[share::shares]:
                 yield from ((number, row) for row in self._window_rows(number, window))
             return
-        # equal parts of all windows in a row: no more than one window is divided for each share
+        # equal parts of all windows in sequence: at most one window is divided per share
         lengths = [len(self._window_rows(*window)) for window in windows]
         starts = np.cumsum([0, *lengths[:-1]])
         total = self.samples
@@ -315,9 +317,9 @@ def _check(**numbers: int) -> None:
     for name, value in numbers.items():
         least = 1 if name in ("window", "world_size") else 0
         if value < least:
-            raise OptionError(f"{name} is {value}, and must be at least {least}.")
+            raise OptionError(f"{name} is {value}, but must be at least {least}.")
     if numbers.get("rank", 0) >= numbers.get("world_size", 1):
         raise OptionError(
-            f"rank is {numbers['rank']}, and must be less than the world_size, "
+            f"rank is {numbers['rank']}, but must be less than the world_size, "
             f"{numbers['world_size']}."
         )

@@ -1,4 +1,4 @@
-"""Decoding by torchcodec, on a processor or a graphics card."""
+"""Decoding by torchcodec, on a CPU or GPU."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class TorchcodecReader:
         device: Such as ``cpu`` or ``cuda``.
 
     Raises:
-        OptionError: torchcodec is missing, mistakes the video's range or beginning, or the
+        OptionError: torchcodec is missing or misinterprets the video's range or beginning, or the
             video's pictures are not the images.
         VideoError: It cannot open the video.
     """
@@ -39,16 +39,16 @@ class TorchcodecReader:
             _check_layout(stream)
             if stream.hidden_frames:
                 raise OptionError(
-                    f"topic {stream.topic}: torchcodec shows wrong frames at the beginning of a "
-                    "video that was cut out of another. Use backend='mp4ds', or a dataset that was "
-                    "packed with a `codec`."
+                    f"topic {stream.topic}: torchcodec returns wrong frames at the beginning of a "
+                    "video cut out of another. Use backend='mp4ds', or a dataset packed with a "
+                    "`codec`."
                 )
         if remote(self._path):
-            raise OptionError(f"{self._path}: backend='torchcodec' reads local files alone.")
+            raise OptionError(f"{self._path}: backend='torchcodec' only reads local files.")
         columns, rows = stream.image_size
         x, y, width, height = crop or (0, 0, columns, rows)
         if not (0 <= x < x + width <= columns and 0 <= y < y + height <= rows):
-            raise OptionError(f"topic {stream.topic}: crop {crop} is not within {columns}x{rows}.")
+            raise OptionError(f"topic {stream.topic}: crop {crop} is not inside {columns}x{rows}.")
         self._rows, self._columns = slice(y, y + height), slice(x, x + width)
         self._decoder = self._opened(device)
         self._check_range(stream)
@@ -64,8 +64,8 @@ class TorchcodecReader:
             reason = (str(error).strip() or type(error).__name__).splitlines()[0]
             raise OptionError(
                 f"torchcodec is installed but cannot be used: {reason} If it finds no FFmpeg, "
-                "install that, or start with the one of PyAV: "
-                "LD_LIBRARY_PATH=$(python -m mp4ds.torch.ffmpeg) python ..."
+                "install it, or use the one in PyAV: LD_LIBRARY_PATH=$(python -m "
+                "mp4ds.torch.ffmpeg) python ..."
             ) from None
         try:
             # with exact seeking, frame n is the n-th shown, whatever its presentation time
@@ -76,23 +76,23 @@ class TorchcodecReader:
             raise self._refused(error) from None
 
     def _check_range(self, stream: Stream | Video) -> None:
-        """Refuse a video whose range torchcodec mistakes.
+        """Refuse a video whose range torchcodec misinterprets.
 
-        Of AV1, torchcodec 0.13 on a CPU was seen to take the full range for the limited one: the
-        contrast is then 255 / 219 of what it is, and what is dark or bright is lost.
+        On a CPU, torchcodec 0.13 treats full-range AV1 as limited: contrast is then too high by 255
+        / 219, and dark and bright details are clipped.
         """
         if not len(stream):
             return
-        with closing(stream):  # it opens its video again where that is asked of it
+        with closing(stream):  # it reopens its video when needed
             first = stream.read([0], format="rgb")[0]
         ours = first[self._rows, self._columns].astype(np.int16)
         mistaken = ((ours - 16) * (255 / 219)).clip(0, 255)
         theirs = self.read([0])[0].cpu().numpy()
         if np.abs(theirs - mistaken).mean() < np.abs(theirs - ours).mean():
             raise OptionError(
-                f"topic {stream.topic}: torchcodec takes its video of the full range for one of "
-                "the limited, so that the contrast would be wrong. Use backend='mp4ds', or a "
-                "dataset that was packed with `codec` h264."
+                f"topic {stream.topic}: torchcodec decodes its full-range video as limited-range, "
+                "so the contrast would be wrong. Use backend='mp4ds', or a dataset packed with "
+                "`codec` h264."
             )
 
     def _refused(self, error: Exception) -> VideoError:
@@ -100,10 +100,10 @@ class TorchcodecReader:
         return VideoError("decode-failed", self._path, f"torchcodec cannot decode it: {reason}")
 
     def read(self, frames: list[int]) -> Tensor:
-        """Frames in the order asked for, repeated as asked; shape (N, H, W, 3), uint8.
+        """Frames in the requested order, with repetitions; shape (N, H, W, 3), uint8.
 
         Raises:
-            VideoError: One does not decode.
+            VideoError: One cannot be decoded.
         """
         try:
             pixels: Tensor = self._decoder.get_frames_at(frames).data
@@ -112,19 +112,19 @@ class TorchcodecReader:
         return pixels[:, self._rows, self._columns]
 
     def close(self) -> None:
-        """Let the decoder go."""
+        """Release the decoder."""
         self._decoder = None
 
 
 def _check_layout(stream: Stream) -> None:
     """Refuse pictures that are not the images, or that have more than 8 bits.
 
-    Of lossy videos, 10 bits hold images of 8.
+    In lossy videos, 10-bit pictures hold 8-bit images.
     """
     image, video = stream.sidecar.image, stream.sidecar.video
     is_8_bits = video.pixel_format in (None, TEN_BITS) or not video.pixel_format.endswith("le")
     if not LAYOUTS[video.layout].is_shown or not is_8_bits:
         raise OptionError(
             f"topic {stream.topic}: {image.encoding} images are stored in the layout "
-            f"{video.layout}, which torchcodec does not turn into colours. Use backend='mp4ds'."
+            f"{video.layout}, which torchcodec cannot convert to colour. Use backend='mp4ds'."
         )

@@ -39,15 +39,15 @@ _NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Reduction:
-    """Smaller images, and fewer of them. Every stream is reduced by itself.
+    """Smaller images, and fewer of them. Every stream is reduced separately.
 
     Attributes:
         resize: A factor, or width and height in pixels; None for as recorded.
-        every: Only each frame of which the number in its stream is a multiple of this.
-        max_rate: Most frames in a second, on the average; see `at_most`. None for all.
+        every: Keep frames whose number in the stream is a multiple of this.
+        max_rate: Maximum frames per second on average; see `at_most`. None for all.
 
     Raises:
-        OptionError: There is no such size, number or rate.
+        OptionError: The size, number or rate is not valid.
     """
 
     resize: float | tuple[int, int] | None = None
@@ -58,7 +58,7 @@ class Reduction:
         if self.resize is not None:
             _check_size(self.resize)
         if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
-            raise OptionError(f"`every` {self.every!r} is no number of frames: use 1 or more.")
+            raise OptionError(f"`every` {self.every!r} is not a number of frames: use 1 or more.")
         rate = self.max_rate
         if rate is not None and not (
             isinstance(rate, int | float)
@@ -66,13 +66,13 @@ class Reduction:
             and math.isfinite(rate)
             and 0 < rate <= _NS
         ):
-            raise OptionError(f"`max_rate` {rate!r} is no rate: use Hz, such as 10.")
+            raise OptionError(f"`max_rate` {rate!r} is not a rate: use Hz, such as 10.")
 
     def size_of(self, stream: Stream) -> tuple[int, int] | None:
-        """Width and height that images of a stream get; None where they have them already.
+        """New width and height for a stream's images; None if unchanged.
 
         Raises:
-            OptionError: They are beyond what an image can have.
+            OptionError: They are too large for an image.
         """
         if self.resize is None:
             return None
@@ -80,7 +80,7 @@ class Reduction:
         return size if size != stream.image_size else None
 
     def choice_of(self, stream: Stream, choice: Choice = everything) -> Choice:
-        """Of the frames of a stream that are wanted those that are given."""
+        """Restrict the wanted frames of a stream to those that are kept."""
         return marked(self.kept(stream.columns), choice) if self.leaves_out else choice
 
     @property
@@ -89,7 +89,7 @@ class Reduction:
         return self.every > 1 or self.max_rate is not None
 
     def kept(self, columns: DecodedColumns) -> NDArray[np.bool_]:
-        """Which frames of a stream are given, shape (frames,)."""
+        """Which frames of a stream are kept, shape (frames,)."""
         is_kept = np.zeros(len(columns.stamp), np.bool_)
         is_kept[:: self.every] = True
         if self.max_rate is not None:
@@ -107,15 +107,15 @@ def _check_size(resize: Any) -> None:
         is_known = is_known and is_number and 0 < side <= MAX_SIDE
     if not is_known:
         raise OptionError(
-            f"`resize` {resize!r} is no size: use a factor such as 0.5, or width and height of 1 "
-            f"to {MAX_SIDE} pixels."
+            f"`resize` {resize!r} is not a size: use a factor such as 0.5, or width and height of "
+            f"1 to {MAX_SIDE} pixels."
         )
 
 
 def times_of(columns: DecodedColumns) -> NDArray[np.int64]:
     """When the frames were taken, nanoseconds: by their stamps, or by their log times.
 
-    The latter where most stamps do not increase, as those of cameras that leave them zero.
+    The latter if most stamps do not increase, as with cameras that leave them zero.
     """
     steps = np.diff(columns.stamp)
     is_sound = 2 * int((steps > 0).sum()) >= len(steps)
@@ -123,13 +123,13 @@ def times_of(columns: DecodedColumns) -> NDArray[np.int64]:
 
 
 def at_most(rate: float, times: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which frames are kept of a camera that is to have no more than a rate.
+    """Which frames of a camera to keep for a maximum rate.
 
-    A grid of points, 1 / rate apart, begins at the first frame. For each point the first frame
-    is kept that comes less than half of the camera's usual interval before it (and less than half
-    of the grid's), or after it. So a camera of 30 Hz loses nothing at 30 Hz, though its frames
-    come a little too early or too late, and two of three frames remain of it at 20 Hz. After a
-    gap, or where the time goes backward, the grid begins anew.
+    A grid of points, 1 / rate apart, begins at the first frame. For each point the first frame is
+    kept that comes less than half of the camera's usual interval (and of the grid's) before it, or
+    after it. So a 30 Hz camera loses nothing at 30 Hz, even if its frames come a little early or
+    late, and keeps two of three frames at 20 Hz. After a gap, or when time goes backwards, the grid
+    starts over.
 
     Args:
         rate: Hz.
@@ -160,7 +160,7 @@ class Given:
     """An image in its new form.
 
     Attributes:
-        fields: What its message says of it.
+        fields: Its message's fields.
         body: Pixels, file or packet.
         is_key: For a packet, whether decoding can begin with it.
     """
@@ -172,7 +172,7 @@ class Given:
 
 @dataclass(frozen=True, slots=True)
 class Undecoded:
-    """A message that stays as recorded, since its picture does not decode.
+    """A message that stays as recorded, since its picture cannot be decoded.
 
     Attributes:
         payload: The message.
@@ -183,14 +183,14 @@ class Undecoded:
 
 @dataclass(frozen=True, slots=True)
 class ImageForm:
-    """What images are to be given as.
+    """The form to convert images to.
 
     Attributes:
         kind: One of `mp4ds.unpacking.republish.KINDS`.
         ros1: Whether the messages are for ROS 1.
         jpeg_quality: Of new JPEG files, 1 to 100.
         size: Width and height in pixels; None for as recorded.
-        keeps_format: Whether files are called what they were called, where they hold the same.
+        keeps_format: Whether files keep their format field if they hold the same.
     """
 
     kind: str
@@ -202,11 +202,11 @@ class ImageForm:
 
 @dataclass(frozen=True, slots=True)
 class Maker:
-    """What makes the new form of an image.
+    """Makes the new form of an image.
 
     Attributes:
-        resizing: What its pixels become first.
-        give: The form, of pixels of that size.
+        resizing: Applied to its pixels first.
+        give: Makes the form from pixels of that size.
     """
 
     resizing: Resizing
@@ -214,10 +214,10 @@ class Maker:
 
 
 def maker(sidecar: StreamSidecar, header: Header, form: ImageForm) -> Maker:
-    """What makes the new form of an image that a header belongs to.
+    """The maker for images with a header.
 
     Raises:
-        Refused: There is no such form of it; says why.
+        Refused: It has no such form; says why.
     """
     is_inverse = is_inverse_depth(sidecar, header)
     if is_inverse and len(header.prefix) != 2 * HEADER_BYTES:
@@ -242,12 +242,12 @@ def maker(sidecar: StreamSidecar, header: Header, form: ImageForm) -> Maker:
 
 @dataclass(frozen=True, slots=True)
 class Resizing:
-    """How pixels of a stream are made smaller, as its frames are.
+    """How pixels of a stream are resized.
 
     Attributes:
-        resize: Makes them so.
-        encoding: Theirs after that.
-        scale: What the video can give at once.
+        resize: Resizes them.
+        encoding: Their encoding after that.
+        scale: What the decoder can do directly.
     """
 
     resize: Callable[[Pixels], Pixels]
@@ -255,21 +255,21 @@ class Resizing:
     scale: Scale | None
 
     def pixels(self, stream: Stream, picture: Picture) -> Pixels:
-        """The pixels of a picture that was decoded with `scale`, in their size."""
+        """The resized pixels of a picture that was decoded with `scale`."""
         if self.scale:
             return picture[0]
         return self.resize(stream.rebuilder.pixels(picture))
 
 
 def resizer(sidecar: StreamSidecar, encoding: str, size: tuple[int, int] | None) -> Resizing:
-    """How pixels of a stream are made smaller.
+    """How to resize pixels of a stream.
 
-    A Bayer mosaic and the YUV of cameras cannot be resized as they are, and become RGB.
+    Bayer mosaics and camera YUV cannot be resized as they are, and become RGB.
 
     Args:
         sidecar: The stream's.
         encoding: Of the pixels.
-        size: Width and height to make; None for as they are.
+        size: Width and height to make; None to keep them.
     """
     if size is None:
         return Resizing(lambda pixels: pixels, encoding, None)
@@ -300,7 +300,7 @@ def encoding_of(sidecar: StreamSidecar, header: Header) -> str:
         return own.name
     if _is_depth(sidecar, header):
         if told not in DEPTHS:
-            raise Refused(f"its format {header.format!r} does not tell the unit of its depths")
+            raise Refused(f"its format {header.format!r} does not give the unit of its depths")
         return told
     known = ENCODINGS.get(told, own)
     is_alike = known.rows == 1 and known.channels == own.channels == 1
@@ -324,13 +324,13 @@ def format_of(encoding: str, form: ImageForm, *, has_mosaic: bool) -> str:
     Args:
         encoding: Of the image.
         form: The form.
-        has_mosaic: Whether the file shows a Bayer mosaic as it is, and not its colours.
+        has_mosaic: Whether the file shows a raw Bayer mosaic, not its colours.
     """
     known = ENCODINGS[encoding]
     if known.even != (1, 1) or known.rows != 1 or (known.mosaic and not has_mosaic):
         encoding = "rgb8"
     elif encoding == "8UC4" and form.kind == "jpeg":
-        encoding = "8UC3"  # alpha is left out
+        encoding = "8UC3"  # alpha is dropped
     if encoding in _COLOURS:
         inner = "bgr16" if encoding.endswith("16") else "bgr8"
     else:
@@ -358,13 +358,13 @@ VIDEO_KINDS = ("compressed-video", "ffmpeg")
 _VIDEO_CODECS = ("h264", "h265", "av1", "vp9")  # formats of Foxglove's CompressedVideo
 
 Frames = Callable[[Choice, bool], Iterator[tuple[int, Given | Undecoded]]]
-"""One for each frame of a stream that is wanted, with its number, in order.
+"""Yields each wanted frame of a stream with its number, in order.
 
-Packets come with those that they refer to, from a key frame on.
+Packets come with those they refer to, from a key frame on.
 
 Args:
     choice: Which are wanted.
-    verify: Compare the whole video first, for where no digest tells damage.
+    verify: Check the whole video first, for when no digest would reveal damage.
 
 Raises:
     FormatError: The stream is damaged.
@@ -372,10 +372,10 @@ Raises:
 
 
 def frames_of(stream: Stream, form: ImageForm) -> Frames:
-    """How the images of a stream are given in another form.
+    """How to convert the images of a stream.
 
     Raises:
-        Refused: They cannot be; says why.
+        Refused: They cannot be converted; says why.
     """
     if form.kind in VIDEO_KINDS:
         return _video(stream, form.kind)
@@ -403,10 +403,10 @@ def files_of(
     Args:
         stream: The stream.
         choice: Which are wanted.
-        verify: Compare the whole video first, where messages have no digests.
+        verify: Check the whole video first, if messages have no digests.
 
     Raises:
-        FormatError: A message does not come back as it was recorded.
+        FormatError: A message differs from what was recorded.
     """
     variants = stream.columns.variant
     starts = [len(header.prefix) // 2 for header in stream.sidecar.headers]
@@ -420,18 +420,18 @@ def _video(stream: Stream, kind: str) -> Frames:
     codec = sidecar.video.codec
     if codec not in _VIDEO_CODECS:
         known, name = ", ".join(_VIDEO_CODECS), type_of(kind).rpartition("/")[2]
-        raise Refused(f"{name} has the codecs {known}, and this video is {codec}")
+        raise Refused(f"{name} supports the codecs {known}, but this video is {codec}")
     if sidecar.body != "packet" and not sidecar.layout.is_shown:
         raise Refused(
-            f"its video does not show the images as they are seen (layout {sidecar.layout.name})"
+            f"its video does not show the images as they look (layout {sidecar.layout.name})"
         )
     if stream.hidden_frames:
-        raise Refused("the first packets of a slice refer to others, which are not part of it")
+        raise Refused("the first packets of the slice depend on packets outside it")
     return partial(_packets_of, stream)
 
 
 def _packets_of(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[int, Given]]:
-    """The packets of the video, which stand alone from each key frame on."""
+    """The packets of the video, self-contained from each key frame on."""
     if verify:
         _verify(stream)
     codec, image = stream.sidecar.video.codec, stream.sidecar.image
@@ -459,7 +459,7 @@ def _own_files(
 def _from_pixels(
     stream: Stream, make: Maker, form: ImageForm, choice: Choice, verify: bool
 ) -> Iterator[tuple[int, Given]]:
-    """From raw images, whose bytes are compared with their digests."""
+    """From raw images, checked against their digests."""
     image = stream.sidecar.image
     fields = ImageFields(image.encoding, image.width, image.height, image.step, image.is_bigendian)
     for index, body in _bodies(stream, choice, verify):
@@ -478,7 +478,7 @@ def _from_pixels(
 
 
 def _bodies(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[int, memoryview]]:
-    """The bodies of the messages, each compared with its digest."""
+    """The bodies of the messages, each checked against its digest."""
     sidecar = stream.sidecar
     form = form_for(sidecar.channel.to_record(0), sidecar.wire, str(stream.path))
     if sidecar.digests is None and verify:
@@ -515,7 +515,7 @@ def _packets(stream: Stream) -> PacketReader:
 
 
 def _verify(stream: Stream) -> None:
-    """Compare the video with its SHA-256 or, without one, all messages with their digests."""
+    """Check the video against its SHA-256 or, without one, all messages against their digests."""
     stream.verify_video()
     if stream.sidecar.video.sha256 is None and stream.sidecar.digests is not None:
         for make in stream.makers():
@@ -527,13 +527,12 @@ def image_files(
 ) -> Iterator[tuple[int, bytes | memoryview]]:
     """The images of a stream as files, each with its number.
 
-    JPEG files stay as they were recorded if that is what is wanted, all others are those of the
-    stream's frames.
+    JPEG files are kept as recorded if JPEG is wanted; all others are made from the stream's frames.
 
     Args:
         stream: The stream.
         kind: ``png`` or ``jpeg``.
-        reduction: How much smaller or fewer they are.
+        reduction: How to reduce them.
         jpeg_quality: Of new JPEG files, 1 to 100.
 
     Raises:

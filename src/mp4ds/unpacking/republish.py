@@ -1,4 +1,4 @@
-"""Which topics of a dataset are given in another form: raw, as files or packets; smaller, fewer."""
+"""Converts the images of topics: to raw images, files or packets; smaller, or fewer."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from mp4ds.unpacking.types import Types, type_of
 from mp4ds.video.packets import PacketReader
 
 KINDS = ("raw", "jpeg", "png", "compressed-video", "ffmpeg")
-"""What images can be given as."""
+"""What images can be converted to."""
 
 _SUFFIXES = {
     "jpeg": "compressed",
@@ -63,7 +63,7 @@ def republished_topic(topic: str, type_name: str, kind: str) -> str:
 
     Args:
         topic: As recorded.
-        type_name: Of its messages, which are a camera's.
+        type_name: Of its messages, which must be a camera's.
         kind: One of `KINDS`.
     """
     family = _FAMILIES[type_name.replace(".", "/").rpartition("/")[2]]
@@ -80,17 +80,17 @@ def republished_topic(topic: str, type_name: str, kind: str) -> str:
 
 
 class FreeTopics:
-    """Gives each republished topic a name that no other one has.
+    """Gives each republished topic a unique name.
 
     Args:
-        taken: Topics that are there anyway.
+        taken: Existing topics.
     """
 
     def __init__(self, taken: Iterable[str]) -> None:
         self._taken = set(taken)
 
     def take(self, topic: str, kind: str) -> str:
-        """The topic, or one made of it and its kind, one of `KINDS`, where it is taken."""
+        """The topic, or one made from it and its kind, one of `KINDS`, where it is taken."""
         while topic in self._taken:
             topic += "_" + kind.replace("-", "_")
         self._taken.add(topic)
@@ -102,11 +102,11 @@ class FreeTopics:
 
 @dataclass(frozen=True)
 class CalibrationSource:
-    """Gives the calibration messages of a stream.
+    """Yields the calibration messages of a stream.
 
     Attributes:
         rebuilder: Makes them.
-        is_kept: Which are given, shape (messages,).
+        is_kept: Which are kept, shape (messages,).
     """
 
     rebuilder: CameraInfoRebuilder
@@ -114,11 +114,11 @@ class CalibrationSource:
 
     @property
     def left_out(self) -> int:
-        """How many are not given."""
+        """How many are left out."""
         return int((~self.is_kept).sum())
 
     def messages(self, channel: Channel, choice: Choice) -> Iterator[tuple[int, Message]]:
-        """Those that are wanted, each with its place among the channel's messages."""
+        """The wanted ones, each with its ordinal."""
         chosen = choice if self.is_kept.all() else marked(self.is_kept, choice)
         return self.rebuilder.messages(channel, chosen(self.rebuilder.columns))
 
@@ -126,21 +126,21 @@ class CalibrationSource:
 def calibration_source(
     stream: Stream, size: tuple[int, int] | None, is_kept: NDArray[np.bool_] | None
 ) -> CalibrationSource | None:
-    """What gives the calibration messages of a stream whose images are reduced.
+    """The calibration messages of a stream whose images are reduced.
 
-    Where images are left out, so are the calibrations that have the stamps of these alone. Those
-    whose stamps no image has stay.
+    If images are left out, so are the calibrations that only have their stamps. Those whose stamps
+    no image has are kept.
 
     Args:
-        stream: The stream; has such messages.
-        size: Width and height that its images get; None for as recorded.
-        is_kept: Which of its images are given; None for all.
+        stream: The stream, which must have such messages.
+        size: New width and height of its images; None for as recorded.
+        is_kept: Which of its images are kept; None for all.
 
     Returns:
-        None where they stay as recorded.
+        None if they stay as recorded.
 
     Raises:
-        Refused: There are no such messages of another size; says why.
+        Refused: They cannot be adapted to another size; says why.
     """
     info, columns = stream.sidecar.camera_info, stream.camera_info_columns
     if info is None or columns is None or (size is None and is_kept is None):
@@ -154,7 +154,7 @@ def calibration_source(
     except FormatError:
         if size is None:
             raise
-        raise Refused("calibrations of this type are not made for another size") from None
+        raise Refused("calibrations of this type cannot be adapted to another size") from None
     stamps = columns.stamp
     is_wanted = np.ones(len(stamps), np.bool_)
     if is_kept is not None:
@@ -165,8 +165,8 @@ def calibration_source(
 
 # ---------------------------------------------------------------- republisher
 
-_NOT_DECODED = "its picture does not decode"
-_REFERS = "packets of a video refer to each other, so that none can be left out; give another form"
+_NOT_DECODED = "its picture cannot be decoded"
+_REFERS = "video packets depend on each other, so none can be left out; use another form"
 _ALREADY = {
     "raw": "raw images",
     "jpeg": "JPEG files",
@@ -178,12 +178,12 @@ _ALREADY = {
 
 @dataclass(frozen=True)
 class Republished:
-    """What became of a topic.
+    """The result for a topic.
 
     Attributes:
-        topic: Where its images are now.
+        topic: The new topic of its images.
         type_name: Of their messages.
-        instead_of: The topic that they would have had, if another one has it.
+        instead_of: The topic they would have had, if it is taken.
     """
 
     topic: str
@@ -193,15 +193,15 @@ class Republished:
 
 @dataclass(frozen=True)
 class _Plan:
-    """How the messages of a stream are given.
+    """How the messages of a stream are written.
 
     Attributes:
         stream: The stream.
         kind: Of the new messages; empty for as recorded.
         frames: Makes them; None for as recorded.
-        is_kept: Which of them are given; None for all.
-        size: Width and height that they get; None for as recorded.
-        is_moved: Whether they go to a channel of their own.
+        is_kept: Which of them are kept; None for all.
+        size: Their new width and height; None for as recorded.
+        is_moved: Whether they go to a new channel.
     """
 
     stream: Stream
@@ -213,28 +213,28 @@ class _Plan:
 
 
 class Republisher:
-    """Gives the images of a dataset in another form: plans when made, works as it is read.
+    """Converts the images of a dataset: planned on creation, done while reading.
 
-    Messages that only become smaller stay on their channel: raw images, JPEG and PNG files of
-    ROS stay what they are, and packets of video become raw images, unless a kind is given.
-    Messages that only become fewer stay as recorded, byte for byte. Calibrations become those of
-    the smaller images, and fewer with the images whose stamps they have.
+    Messages that are only resized stay on their channel: raw images, JPEG and PNG files of
+    ROS keep their kind, and video packets become raw images, unless a kind is given.
+    Messages of which only some are left out stay as recorded, byte for byte. Calibrations are
+    adapted to the size, and left out with the images whose stamps they have.
 
     Args:
         dataset: The dataset.
         kind: One of `KINDS`; None for as recorded.
-        encoding: Message encoding of the recording to make: ``ros1`` or ``cdr``.
+        encoding: Message encoding of the output: ``ros1`` or ``cdr``.
         selected: Whether a topic is wanted.
         jpeg_quality: Of new JPEG files, 1 to 100.
-        reduction: How much smaller or fewer images are given; None for as recorded.
+        reduction: How to reduce images; None for as recorded.
 
     Attributes:
         channels: The new channels.
         sources: Makes the messages of streams and calibrations; see `Dataset.records`.
-        republished: What became of each topic.
-        as_recorded: Camera topics of which messages stay as recorded: reason -> how many. Grows
+        republished: The result for each topic.
+        as_recorded: Camera topics with messages that stay as recorded: reason -> how many. Grows
             while the messages are read.
-        thinned: Topics of which messages are left out -> how many.
+        thinned: Topics with messages left out -> how many.
 
     Raises:
         OptionError: There is no such kind, or it cannot be reduced.
@@ -279,11 +279,11 @@ class Republisher:
 
     @property
     def omitted(self) -> Mapping[str, int]:
-        """What the new messages have no place for: a phrase -> how many."""
+        """What the new messages cannot hold: a phrase -> how many."""
         return self._omitted + sum((Counter(t.omitted) for t in self._types.values()), Counter())
 
     def empties(self, channel: Channel) -> bool:
-        """Whether all messages of a channel of the dataset go to new ones, as far as is known."""
+        """Whether all messages of a channel of the dataset are expected to go to new channels."""
         return channel.id in self._emptied
 
     def makes(self, channel: Channel) -> bool:
@@ -293,7 +293,7 @@ class Republisher:
     # ------------------------------------------------------------ what is given how
 
     def _plan(self, item: ImageChannel) -> list[_Plan]:
-        """The streams of a channel that are given in another form, or fewer, and how."""
+        """The streams of a channel that are converted or thinned, and how."""
         plans = [self._plan_stream(stream, item.channel.topic) for stream in item.streams]
         return [plan for plan in plans if plan.frames or plan.is_kept is not None]
 
@@ -311,7 +311,7 @@ class Republisher:
                     frames = frames_of(stream, form)
                     return self._thinned(_Plan(stream, kind, frames, is_kept, size, not is_done))
                 if is_kept is None:
-                    raise Refused(f"they are {_ALREADY[kind]} already")
+                    raise Refused(f"they are already {_ALREADY[kind]}")
             except Refused as reason:
                 count = len(stream) if is_kept is None else int(is_kept.sum())
                 self._keep(topic, str(reason), count)
@@ -338,7 +338,7 @@ class Republisher:
         return ImageForm(kind, encoding == "ros1", self._jpeg_quality, size, keeps_format=is_done)
 
     def _is_done(self, stream: Stream, kind: str) -> bool:
-        """Whether the messages are of a kind already, in whichever ROS has the same type."""
+        """Whether the messages already have a kind, in either ROS."""
         sidecar = stream.sidecar
         channel = sidecar.channel.to_record(0)
         name = channel.type_name.replace("/msg/", "/")
@@ -408,7 +408,7 @@ class Republisher:
         cameras = {channel.topic for channel in dataset.channels if is_camera(channel)}
         for entry in dataset.manifest.verbatim if dataset.manifest else []:
             if entry.topic in cameras and selected(entry.topic):
-                self._keep(entry.topic, f"stored as it was: {entry.reason}", entry.messages)
+                self._keep(entry.topic, f"stored verbatim: {entry.reason}", entry.messages)
 
     def _keep(self, topic: str, reason: str, count: int) -> None:
         reasons = self.as_recorded.setdefault(topic, {})
@@ -425,7 +425,7 @@ class Republisher:
         recorded: Channel,
         choice: Choice,
     ) -> Iterator[tuple[int, Message]]:
-        """The messages of a stream, each with its place among those of the recorded channel."""
+        """The messages of a stream, each with its ordinal in the recorded channel."""
         stream = plan.stream
         columns, headers = stream.columns, stream.sidecar.headers
         count = 0
@@ -449,20 +449,20 @@ class Republisher:
             yield ordinal, message_at(columns, index, made or recorded, payload)
         due = len(stream) if plan.is_kept is None else int(plan.is_kept.sum())
         if choice is everything and count != due:
-            problem = f"has {count} frames or more, {due} are due"
+            problem = f"has {count} frames or more, not {due}"
             raise FormatError("frame-count", stream.video_path, problem)
 
 
 def check_kind(kind: str | None, reduction: Reduction) -> None:
-    """Refuse to reduce what is the video as it is.
+    """Refuse to reduce copied video.
 
     Raises:
         OptionError: Says what to do.
     """
     if kind in VIDEO_KINDS and (reduction.leaves_out or reduction.resize is not None):
         raise OptionError(
-            f"`resize`, `every` and `max_rate` do not go with `images` {kind}, which gives the "
-            "video as it is. Use raw, jpeg or png."
+            f"`resize`, `every` and `max_rate` cannot be combined with `images` {kind}, which "
+            "copies the video. Use raw, jpeg or png."
         )
 
 
@@ -478,7 +478,7 @@ def _fewer(plan: _Plan, channel: Channel, choice: Choice) -> Iterator[tuple[int,
 
 
 def _kind_of(stream: Stream) -> str:
-    """What the images of a stream are, or become where there is no smaller form of that kind."""
+    """The kind of a stream's images, or what they become if that kind cannot be resized."""
     sidecar = stream.sidecar
     if sidecar.body == "jpeg" or holds_files(sidecar, "jpeg"):
         return "jpeg"
@@ -490,7 +490,7 @@ def _kind_of(stream: Stream) -> str:
 
 
 def _refers(stream: Stream) -> bool:
-    """Whether there are messages of a stream that are of no use without those before them."""
+    """Whether a stream has messages that are useless without earlier ones."""
     if stream.sidecar.body != "packet":
         return False
     codec = stream.sidecar.video.codec

@@ -19,11 +19,11 @@ _KEY_FRAME = 1  # AV_PKT_FLAG_KEY
 
 @dataclass(frozen=True, slots=True)
 class VideoFields:
-    """What a message says of a packet of video.
+    """A message's fields for a video packet.
 
     Attributes:
         codec: Name in the registry.
-        encoding: ROS image encoding of the images that the video was made of.
+        encoding: ROS image encoding of the images that the video was made from.
         width: Columns of the images.
         height: Rows of the images.
         pixel_format: Of the video as ffmpeg calls it.
@@ -46,14 +46,14 @@ class VideoFields:
         else:
             before = "bgr8"
             shown = "rgb8" if self.encoding.startswith("rgb") else "bgr8"
-        pixel_format = self.pixel_format.replace("yuvj", "yuv")  # the video itself tells its range
+        pixel_format = self.pixel_format.replace("yuvj", "yuv")  # the video itself has its range
         return ";".join((codec, pixel_format, before, shown))
 
 
 def video_message(
     encoding: str, slots: Slots, frame_id: str, codec: str, body: bytes | memoryview
 ) -> bytes:
-    """A CompressedVideo: what follows the data is aligned in CDR.
+    """A CompressedVideo; what follows the data is aligned in CDR.
 
     Args:
         encoding: ``ros1`` or ``cdr``.
@@ -63,7 +63,7 @@ def video_message(
         body: The packet.
 
     Raises:
-        WireError: The stamp has no place in the serialization.
+        WireError: The serialization cannot represent the stamp.
     """
     is_cdr = encoding == "cdr"
     head = _begun(encoding, slots)
@@ -83,7 +83,7 @@ def ffmpeg_message(
     body: bytes | memoryview,
     is_key: bool,
 ) -> bytes:
-    """An FFMPEGPacket, whose fields ROS 1 has in another order and under other names.
+    """An FFMPEGPacket, whose fields have another order and other names in ROS 1.
 
     Args:
         encoding: ``ros1`` or ``cdr``.
@@ -94,7 +94,7 @@ def ffmpeg_message(
         is_key: Whether decoding can begin with it.
 
     Raises:
-        WireError: The stamp or a number has no place in the serialization.
+        WireError: The serialization cannot represent the stamp or a number.
     """
     is_cdr = encoding == "cdr"
     head = _begun(encoding, slots, has_seq=not is_cdr)
@@ -105,7 +105,7 @@ def ffmpeg_message(
     told.put("Q", slots.pts or 0)
     told.put("B", _KEY_FRAME if is_key else 0)
     if is_cdr:
-        head.put("B", 0)  # not of a machine that stores big endian
+        head.put("B", 0)  # not from a big-endian machine
         head.put("I", len(body))
         return b"".join((head.getvalue(), body))
     head.put("I", len(body))
@@ -113,7 +113,7 @@ def ffmpeg_message(
 
 
 def _begun(encoding: str, slots: Slots, *, has_seq: bool = False) -> PrimitiveWriter:
-    """A message up to its stamp."""
+    """A message up to and including its stamp."""
     is_cdr = encoding == "cdr"
     seconds, nanoseconds = divmod(slots.stamp, NS)
     if not (-(2**31) if is_cdr else 0) <= seconds < (2**31 if is_cdr else 2**32):
@@ -137,7 +137,7 @@ _TYPES = {
     "ffmpeg": "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
 }
 _VIDEO = "string frame_id\nuint8[] data\nstring format\n"
-_DEFINITIONS = {  # of the types that are not among the standard ones
+_DEFINITIONS = {  # of the non-standard types
     ("compressed-video", "ros1"): f"time timestamp\n{_VIDEO}",
     ("compressed-video", "cdr"): f"builtin_interfaces/Time timestamp\n{_VIDEO}",
     ("ffmpeg", "ros1"): (
@@ -157,7 +157,7 @@ _OF_TYPE = ("type", "md5sum", _DEFINITION)
 
 
 def type_of(kind: str) -> str:
-    """The type that images of a kind have, as ROS 1 spells it."""
+    """The type of images of a kind, as spelled in ROS 1."""
     return _TYPES[kind].replace("/msg/", "/")
 
 
@@ -177,7 +177,7 @@ class Types:
 
     @property
     def omitted(self) -> Mapping[str, int]:
-        """What the channels told and the target has no place for: a phrase -> how many."""
+        """What the channels had and the target cannot hold: a phrase -> how many."""
         return self._converter.omitted
 
     @property
@@ -187,14 +187,14 @@ class Types:
 
     @property
     def no_seq(self) -> str:
-        """What is left out where they have none."""
+        """What is left out if they have none."""
         without = "ROS 2" if self.encoding == "cdr" else "CompressedVideo"
-        return f"messages with a header's sequence number, which {without} has not"
+        return f"messages with a header sequence number, which {without} does not have"
 
     def channel(self, source: Channel, channel_id: int, topic: str) -> Channel:
         """The channel for the images of another one.
 
-        Latching, QoS and the publisher's name are kept, what belongs to the type is the new
+        Latching, QoS and the publisher's name are kept; whatever belongs to the type is the new
         type's.
 
         Args:
@@ -218,7 +218,7 @@ class Types:
         made = self._converter.channel(Channel(channel_id, topic, encoding, schema, kept))
         if self._kind != "ffmpeg" or encoding == self.encoding:
             return made
-        schema, digest = self._defined(self.encoding)  # the other ROS has another type
+        schema, digest = self._defined(self.encoding)  # the other ROS has a different type
         return replace(
             made, schema=schema, metadata={**made.metadata, _HASHES[self.encoding]: digest}
         )
@@ -250,7 +250,7 @@ class Types:
             is_key: For a packet, whether decoding can begin with it.
 
         Raises:
-            WireError: The stamp or a number has no place in the serialization.
+            WireError: The serialization cannot represent the stamp or a number.
         """
         stamp = _wrapped(slots.stamp, signed=self.encoding == "cdr")
         slots = Slots(stamp, slots.seq, slots.pts)
@@ -280,7 +280,7 @@ def _generated(schema: Schema, world: World) -> tuple[Schema, str]:
 
 
 def _wrapped(stamp: int, *, signed: bool) -> int:
-    """A stamp whose seconds have the bits that they had in the other ROS."""
+    """A stamp whose seconds have the same bits as in the other ROS."""
     seconds, nanoseconds = divmod(stamp, NS)
     if -(2**31) <= seconds < 2**32:
         seconds %= 2**32

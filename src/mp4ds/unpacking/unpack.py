@@ -48,12 +48,15 @@ from mp4ds.unpacking.republish import KINDS, Republished, Republisher, check_kin
 class UnpackOptions(SliceOptions):
     """How to unpack."""
 
-    storage: str | None = option("sqlite3 or mcap, for rosbag2; as recorded, or mcap.")
+    storage: str | None = option(
+        "Storage of rosbag2: sqlite3 or mcap; default: as recorded, else mcap."
+    )
     image_format: str | None = option(
-        "png (exact) or jpeg, for images; JPEG files as recorded, else png."
+        "png (exact) or jpeg, for `to` images; default: JPEG files as recorded, others as png."
     )
     images: str | None = option(
-        "Give all cameras as raw, jpeg, png, compressed-video or ffmpeg; as recorded by default.",
+        "Convert all cameras to raw, jpeg, png, compressed-video or ffmpeg messages; "
+        "default: as recorded.",
         metavar="KIND",
     )
     jpeg_quality: int = jpeg_quality()
@@ -65,22 +68,24 @@ class UnpackOptions(SliceOptions):
     start: str | float | None = start()
     end: str | float | None = end()
     duration: str | float | None = duration()
-    skip_unconvertible: bool = option("Leave out what the output cannot hold, and count it.", False)
+    skip_unconvertible: bool = option(
+        "Leave out, and count, what the output format cannot hold.", False
+    )
     force: bool = force()
 
     @property
     def reduction(self) -> Reduction:
-        """How much smaller or fewer images are given.
+        """How to reduce images.
 
         Raises:
-            OptionError: There is no such size, number or rate.
+            OptionError: The size, number or rate is not valid.
         """
         return Reduction(self.resize, self.every, self.max_rate)
 
 
 @dataclass(frozen=True)
 class UnpackProgress:
-    """Where an unpack stands: messages written, and how many there are (0: not known)."""
+    """Progress of an unpack: messages written, and their total (0: unknown)."""
 
     messages: int
     messages_total: int
@@ -88,7 +93,7 @@ class UnpackProgress:
 
 @dataclass(frozen=True)
 class UnpackSummary:
-    """What an unpack did.
+    """The result of an unpack.
 
     Attributes:
         output: The recording or folder made.
@@ -96,12 +101,12 @@ class UnpackSummary:
         converted: Types converted between ROS 1 and ROS 2, by topic.
         omitted: What the target cannot hold and was left out: a phrase -> how many.
         left_out: Topics left out on request.
-        republished: What became of the topics whose images are given in another form.
-        as_recorded: Where another form was asked for, the camera topics of which messages stay
-            as recorded: reason -> how many.
-        unconvertible: Topics of which messages are left out, as the target cannot hold them:
+        republished: The results for topics whose images are converted.
+        as_recorded: If a conversion was requested, the camera topics with messages that stay as
+            recorded: reason -> how many.
+        unconvertible: Topics with messages left out because the target cannot hold them:
             reason -> how many.
-        thinned: Topics of which messages are left out, as fewer were asked for -> how many.
+        thinned: Topics with messages left out because fewer were requested -> how many.
     """
 
     output: Path
@@ -129,14 +134,14 @@ def write_images(
     jpeg_quality: int,
     reduction: Reduction,
 ) -> Iterator[None]:
-    """Write one file per frame, called by its number, and stamps.csv that tells the times of each.
+    """Write one file per frame, named by its number, and stamps.csv with their times.
 
     Args:
         stream: The stream.
         folder: Where to write; empty.
         image_format: ``png`` or ``jpeg``; None for JPEG files as they were recorded, else PNG.
-        jpeg_quality: Of JPEG files that are made, 1 to 100.
-        reduction: How much smaller or fewer they are.
+        jpeg_quality: Of new JPEG files, 1 to 100.
+        reduction: How to reduce them.
 
     Yields:
         After each file.
@@ -160,7 +165,7 @@ def write_images(
 
 
 def image_names(folder: Path) -> set[str] | None:
-    """Names of the files of image folders, by their stamps.csv; None where there is none."""
+    """Names of the files of image folders, by their stamps.csv; None if there is none."""
     if not folder.is_dir():
         return None
     names: set[str] = set()
@@ -185,7 +190,7 @@ def _names_in(stamps: Path) -> set[str]:
 TARGETS = ("bag", "rosbag2", "mcap", "images")
 _SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
 _WORLDS = {"bag": "ros1", "rosbag2": "ros2"}
-_OURS = "mp4ds:"  # metadata records by which a dataset remembers what a rosbag2 folder said
+_OURS = "mp4ds:"  # metadata records in which a dataset keeps the contents of a rosbag2 folder
 
 
 def unpack(
@@ -196,16 +201,16 @@ def unpack(
     *,
     progress: Callable[[UnpackProgress], None] | None = None,
 ) -> UnpackSummary:
-    """Write a dataset's recording again.
+    """Write a dataset's recording.
 
-    Every message of a lossless stream is compared with its digest on the way.
+    Every message of a lossless stream is checked against its digest.
 
     Args:
         dataset: A dataset, or one video with its sidecar; or its URL.
-        to: ``bag``, ``rosbag2``, ``mcap`` or ``images``; None for the recording's own format, of
-            one video ``mcap``.
-        output: The file or folder to make, or its URL; None for the dataset's name beside it, or
-            in the current folder where the dataset is at a URL.
+        to: ``bag``, ``rosbag2``, ``mcap`` or ``images``; None for the recording's own format, or
+            ``mcap`` for a single video.
+        output: The file or folder to make, or its URL; None for the dataset's name, next to it, or
+            in the current folder if the dataset is at a URL.
         options: How.
         progress: Called after every few messages.
 
@@ -215,8 +220,8 @@ def unpack(
     Raises:
         FormatError: The dataset is damaged; nothing is left behind.
         ConversionError: The target cannot hold a topic; names it.
-        TargetError: The output may not be written there.
-        WriteError: The disk refused; nothing is left behind.
+        TargetError: The output cannot be written there.
+        WriteError: The output could not be written; nothing is left behind.
         RemoteError: A store or web server fails.
     """
     chosen = options or UnpackOptions()
@@ -252,20 +257,20 @@ def unpack_each(
     jobs: int = 1,
     progress: Callable[[UnpackProgress], None] | None = None,
 ) -> list[UnpackSummary]:
-    """Write the recordings of several datasets again; see `unpack`.
+    """Write the recordings of several datasets; see `unpack`.
 
     Args:
         datasets: Datasets, folders of them, or patterns.
         to: See `unpack`.
-        folder: Where to write, each named as its dataset; made if it is not there. None: each
-            beside its dataset.
+        folder: Where to write, each named after its dataset; created if missing. None: each next to
+            its dataset.
         options: How.
-        jobs: Datasets at a time.
-        progress: Called after each dataset, with the numbers of these.
+        jobs: Datasets to process in parallel.
+        progress: Called after each dataset, with their counts.
 
     Raises:
-        OptionError: Two would get one name.
-        Mp4dsError: As `unpack`; those written before stay.
+        OptionError: Two would get the same name.
+        Mp4dsError: As for `unpack`; those already written are kept.
     """
     outputs: dict[Path, Path | None] = {}
     for dataset in datasets_in(datasets):
@@ -275,7 +280,7 @@ def unpack_each(
     named = [output for output in outputs.values() if output is not None]
     twice = [output for output, count in Counter(named).items() if count > 1]
     if twice:
-        raise OptionError(f"Two datasets would become {twice[0]}. Unpack one elsewhere.")
+        raise OptionError(f"Two datasets would become {twice[0]}. Unpack one of them elsewhere.")
     if folder is not None and not remote(location(folder)):
         location(folder).mkdir(exist_ok=True)
     work = partial(_unpack_one, to=to, options=options)
@@ -287,8 +292,8 @@ def unpack_each(
                 progress(UnpackProgress(len(summaries), len(outputs)))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"interrupted; {len(summaries)} of {len(outputs)} datasets are unpacked, and nothing "
-            "unfinished was left behind"
+            f"interrupted; {len(summaries)} of {len(outputs)} datasets were unpacked, and no "
+            "partial output was left behind"
         ) from None
     return summaries
 
@@ -309,25 +314,25 @@ def _check(to: str, options: UnpackOptions) -> None:
     """Refuse options that are unknown or contradict each other.
 
     Raises:
-        OptionError: Says which, and what there is.
+        OptionError: Says which, and lists the valid ones.
     """
     if to not in TARGETS:
         raise OptionError(f"`to` {to!r} is not known. Use {', '.join(TARGETS)}.")
     if options.storage not in (None, "sqlite3", "mcap"):
         raise OptionError(f"`storage` {options.storage!r} is not known. Use sqlite3 or mcap.")
     if options.storage and to != "rosbag2":
-        raise OptionError(f"`storage` goes with `to` rosbag2, not with `to` {to}.")
+        raise OptionError(f"`storage` works with `to` rosbag2, not with `to` {to}.")
     if options.image_format not in (None, "png", "jpeg"):
         raise OptionError(f"`image_format` {options.image_format!r} is not known. Use png or jpeg.")
     if options.images not in (None, *KINDS):
         raise OptionError(f"`images` {options.images!r} is not known. Use {', '.join(KINDS)}.")
     if options.images and to == "images":
-        raise OptionError("`images` goes with a recording; with `to` images, use `image_format`.")
+        raise OptionError("`images` is for recordings; with `to` images, use `image_format`.")
     check_kind(options.images, options.reduction)
 
 
 def default_output(dataset: Path, to: str) -> Path:
-    """The output for a dataset when none is named: beside it, never the source's own name."""
+    """The default output for a dataset: next to it, never the source's own name."""
     if remote(dataset):
         stem = dataset.name if dataset.is_dir() else dataset.stem
         return Path(f"{stem}_unpacked{_SUFFIXES[to]}")
@@ -372,7 +377,7 @@ def _unpack_recording(
 ) -> UnpackSummary:
     selected = Selection(options.topics, options.exclude)
     selected.check(channel.topic for channel in dataset.channels)
-    # a recording returns to its own format as it was, whatever serialization it holds
+    # a recording is restored to its own format unchanged, whatever its serializations
     source = dataset.manifest.format if dataset.manifest else ""
     converter = Converter(None if source == to else _WORLDS.get(to))
     republisher = _republisher(dataset, to, options, selected)
@@ -407,7 +412,7 @@ def _unpack_recording(
             raise FormatError(
                 "message-count",
                 dataset.path,
-                f"holds {found} messages where its manifest says {total}",
+                f"holds {found} messages, but its manifest says {total}",
             )
     omitted = Counter(writer.omitted) + Counter(converter.omitted)
     if republisher:
@@ -458,7 +463,7 @@ class _Topics:
         self._republished: set[int] = set()
 
     def declare(self, dataset: Dataset, republisher: Republisher | None) -> None:
-        """Declare the chosen channels, and the definitions that none refers to.
+        """Declare the selected channels, and the definitions that no channel refers to.
 
         Raises:
             ConversionError: The target cannot hold some of them; names all.
@@ -501,14 +506,14 @@ class _Topics:
             self._summary.converted.append(channel.topic)
 
     def write(self, message: Message) -> bool:
-        """Write a message of a chosen channel; returns whether it is of one."""
+        """Write a message of a selected channel; returns whether it belongs to one."""
         source = message.channel
         if source.id in self._refused:
             return self._skip(source, self._refused[source.id])
         if source.id not in self._channels:
             if not self._selected(source.topic):
                 return False
-            self._add(source)  # it was to have no message any more, and has one after all
+            self._add(source)  # it was expected to have no messages left, but has one
         channel, payload = self._channels[source.id], message.data
         try:
             if source.id not in self._republished:
@@ -528,14 +533,16 @@ class _Topics:
 
 
 def _refusal(problems: dict[str, str]) -> ConversionError:
-    """What to raise for topics that the target cannot hold; why by topic."""
+    """The error for topics that the target cannot hold, with the reason for each."""
     first, *others = problems
     listed = [problems[first], *(f"topic {topic}: {problems[topic]}" for topic in others)]
     return ConversionError(
         first,
         "; ".join(listed),
-        "Exclude with " + " ".join(f"`exclude` {shlex.quote(topic)}" for topic in problems) + ", "
-        "skip and count with `skip_unconvertible`, or unpack to mcap, which keeps all as it is.",
+        "Exclude with "
+        + " ".join(f"`exclude` {shlex.quote(topic)}" for topic in problems)
+        + ", leave out and count with `skip_unconvertible`, or unpack to mcap, which keeps "
+        "everything unchanged.",
     )
 
 
@@ -545,7 +552,7 @@ def _write_other(
     if isinstance(record, Attachment):
         writer.add_attachment(record)
         return
-    # what we noted of a rosbag2 folder is of no use to another format
+    # our record of a rosbag2 folder is useless in another format
     ours = source == "rosbag2" and record.name.startswith(_OURS)
     if not ours or to == "rosbag2":
         writer.add_metadata(record)
@@ -589,7 +596,7 @@ def _unpack_images(
 
 
 def _given(stream: Stream, reduction: Reduction, summary: UnpackSummary) -> int:
-    """How many frames of a stream are given; tells of those that are left out."""
+    """How many frames of a stream are kept; reports those left out."""
     count = len(stream)
     if reduction.leaves_out:
         count = int(reduction.kept(stream.columns).sum())

@@ -156,7 +156,7 @@ class Group:
     Attributes:
         first: Number of the key frame's packet.
         end: Number of the next group's.
-        parser: Of its packets; None where all is known without.
+        parser: Of its packets; None if all is known without.
         pieces: In the order coded.
         shows: For each packet known the number of the piece that makes its picture come out.
     """
@@ -304,7 +304,7 @@ class FrameAccess:
     Args:
         path: The video.
         codec: Name in the registry.
-        frames: Number of frames that are due; None where only the video tells.
+        frames: Number of frames that are due; None if only the video tells.
         maker: Makes pictures of its frames.
         threads: Of the decoder. One takes the least CPU time; with more, one frame comes sooner.
         references: What the sidecar says of them, so that no packets are read to find out.
@@ -347,19 +347,19 @@ class FrameAccess:
         try:
             table = read_sample_table(self._file, self._path.stat().st_size, str(self._path))
         except Refused as error:
-            raise UnknownStructure(f"its index is not read: {error}") from None
+            raise UnknownStructure(f"its index cannot be used: {error}") from None
         known = CODECS.get(self._codec)
         if known is None or table.codec not in known.entries:
             raise UnknownStructure(f"its track is {table.codec!r}")
         if frames is not None and len(table.order) != frames:
             raise VideoError(
-                "frame-count", self._path, f"has {len(table.order)} frames, {frames} are due"
+                "frame-count", self._path, f"has {len(table.order)} frames, not {frames}"
             )
         if (table.width, table.height) != self._maker.coded_size:
-            raise UnknownStructure("its frames have another size")
+            raise UnknownStructure("its frames have a different size")
         if int(table.order.min()) + len(table.order) != len(table.sizes) or not table.sync[0]:
             raise UnknownStructure(
-                "it has later frames that are not shown, or begins without a key frame"
+                "it has trailing frames that are not shown, or does not start with a key frame"
             )
         return table
 
@@ -371,7 +371,9 @@ class FrameAccess:
 
     def _unfit(self, error: ValueError) -> FormatError:
         return FormatError(
-            "references-invalid", self._path, f"does not fit the references in its sidecar: {error}"
+            "references-invalid",
+            self._path,
+            f"does not match the references in its sidecar: {error}",
         )
 
     def pictures_of(

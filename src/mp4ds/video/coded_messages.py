@@ -78,7 +78,7 @@ class PictureParser:
 
     def __init__(self, codec: str) -> None:
         if codec not in PACKET_CODECS:
-            raise ValueError(f"codec {codec!r} is none of {', '.join(PACKET_CODECS)}")
+            raise ValueError(f"codec {codec!r} is not one of {', '.join(PACKET_CODECS)}")
         self._pictures: _Pictures = _pictures_of(codec)
         self._whole = False
 

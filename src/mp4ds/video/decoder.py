@@ -36,7 +36,7 @@ def jpeg_pixels(data: bytes | memoryview, size: tuple[int, int]) -> tuple[str, N
         The ROS encoding, ``mono8`` or ``rgb8``, and pixels of shape (H, W) or (H, W, 3).
 
     Raises:
-        Refused: It does not decode, or is of another size or kind.
+        Refused: It cannot be decoded, or is of another size or kind.
     """
     from PIL.JpegImagePlugin import JpegImageFile
 
@@ -67,7 +67,7 @@ class JpegDecoder:
         """The frame of a packet; none of the empty one that ends a video.
 
         Raises:
-            InvalidDataError: It does not decode.
+            InvalidDataError: It cannot be decoded.
         """
         if packet is None or not packet.size:
             return []
@@ -108,7 +108,7 @@ class VideoDecoder:
         frames: Number of frames that are due.
         picture_format: Pixel format of the pictures wanted.
         picture_size: Width and height of the pictures wanted.
-        matrix: Matrix coefficients of the video's colours; None where the video itself tells.
+        matrix: Matrix coefficients of the video's colours; None if the video itself tells.
         full_range: Whether its samples use their full range, unless the video itself tells.
         sequential: Decode with all cores, for reading in order.
 
@@ -166,15 +166,13 @@ class VideoDecoder:
 
         Raises:
             VideoError: ``decode-failed`` with the frame's number, or ``frame-count`` when the
-                video ends early or goes on.
+                video ends early or continues.
         """
         self._seek(0, 0)
         number = 0
         for frame in self._decoded(0):
             if number == self._frames:
-                raise VideoError(
-                    "frame-count", self._path, f"goes on after the {self._frames} frames due"
-                )
+                raise VideoError("frame-count", self._path, f"has more than {self._frames} frames")
             yield self._maker.make(frame, scale=scale)
             number += 1
         if number != self._frames:
@@ -206,9 +204,9 @@ class VideoDecoder:
     def decodable_pictures(
         self, indices: Iterable[int], scale: Scale | None = None
     ) -> Iterator[tuple[int, Picture | None]]:
-        """As `pictures_at`, for what others encoded: None for a picture that does not decode.
+        """Like `pictures_at`, for what others encoded: None for a picture that cannot be decoded.
 
-        Where a packet was lost before it was recorded, those that refer to it do not decode.
+        Where a packet was lost before it was recorded, those that refer to it cannot be decoded.
         """
         for index, frame in self._chosen(indices, lambda _: self._decodable()):
             yield index, None if frame is None else self._maker.make(frame, scale=scale)
@@ -270,7 +268,7 @@ class VideoDecoder:
             ticks = [entry.timestamp for entry in self._stream.index_entries][self._media.hidden :]
             if len(ticks) != self._frames:
                 raise VideoError(
-                    "frame-count", self._path, f"has {len(ticks)} frames, {self._frames} are due"
+                    "frame-count", self._path, f"has {len(ticks)} frames, not {self._frames}"
                 )
             self._ticks = np.sort(np.array(ticks, dtype=np.int64))
         return self._ticks

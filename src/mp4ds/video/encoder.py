@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
@@ -18,7 +18,7 @@ from mp4ds.errors import EncoderRefusedError, HardwareError
 from mp4ds.messages.arrangements import Picture
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import HARDWARE, Recipe
-from mp4ds.video.media import raise_if_scarce
+from mp4ds.video.media import new_mp4, raise_if_scarce
 from mp4ds.video.pixels import PictureConverter, picture_to_frame
 
 _THREADS = Path("/proc/self/task")
@@ -80,6 +80,8 @@ class VideoEncoder:
         gop: Most frames from one key frame to the next.
         threads: Threads of the encoder.
         rate: Frames per second, if known; a hint for the encoder's look-ahead.
+        on_packet: Called with each packet before it is written. What was written can then be read
+            at any time; see `new_mp4`.
 
     Raises:
         EncoderRefusedError: The codec does not take such pictures.
@@ -97,9 +99,11 @@ class VideoEncoder:
         gop: int,
         threads: int,
         rate: float | None,
+        on_packet: Callable[[bytes], None] | None = None,
     ) -> None:
         self.recipe = recipe
         self.frames = 0
+        self._on_packet = on_packet
         self._picture_format = picture_format
         # a camera's own YUV keeps its range
         self._converter = PictureConverter(
@@ -107,15 +111,7 @@ class VideoEncoder:
         )
         self.width, self.height = coded_size(recipe, width, height)
         self.options = {**_options(recipe, self.width, self.height), "g": str(gop)}
-        self._container = av.open(
-            str(path.absolute()),  # ffmpeg takes a relative name with a colon for an address
-            "w",
-            format="mp4",
-            options={
-                "video_track_timescale": str(TIMESCALE),
-                "movie_timescale": str(TIMESCALE),
-            },
-        )
+        self._container = new_mp4(path, is_durable=on_packet is not None)
         try:
             self._open_stream(threads, rate)
         except MemoryError:  # which FFmpegError may be, too: no fault of the pictures
@@ -154,7 +150,7 @@ class VideoEncoder:
             tick: Presentation time in ticks, greater than the last.
 
         Raises:
-            OSError: The disk refused.
+            OSError: It cannot be written.
             HardwareError: A device failed.
         """
         frame = picture_to_frame(
@@ -167,9 +163,14 @@ class VideoEncoder:
         frame.pts = tick
         frame.time_base = _TIME_BASE
         frame.color_range = color_range(self.recipe)
-        for packet in self._encoded(frame):
-            self._container.mux(packet)
+        self._mux(self._encoded(frame))
         self.frames += 1
+
+    def _mux(self, packets: Sequence[Any]) -> None:
+        for packet in packets:
+            if self._on_packet is not None:
+                self._on_packet(bytes(packet))
+            self._container.mux(packet)
 
     def _encoded(self, frame: av.VideoFrame | None) -> Sequence[Any]:
         try:
@@ -188,12 +189,11 @@ class VideoEncoder:
         """Finish the file.
 
         Raises:
-            OSError: The disk refused.
+            OSError: It cannot be written.
             HardwareError: A device failed.
         """
         try:
-            for packet in self._encoded(None):
-                self._container.mux(packet)
+            self._mux(self._encoded(None))
         finally:
             self._container.close()
 
@@ -291,7 +291,7 @@ def check_hardware(codec: str | None) -> None:
     """Open an encoder for a moment, if it is one of the hardware.
 
     Args:
-        codec: As ``--codec`` has it.
+        codec: As given to ``--codec``.
 
     Raises:
         HardwareError: It cannot be used here; says why, and what to do.
@@ -306,7 +306,7 @@ def refuse_if_unusable(codec: str, width: int, height: int) -> None:
     To be called after an encoder of the hardware could not be opened.
 
     Args:
-        codec: As ``--codec`` has it.
+        codec: As given to ``--codec``.
         width: Columns of the pictures.
         height: Rows of the pictures.
 
@@ -320,8 +320,9 @@ def refuse_if_unusable(codec: str, width: int, height: int) -> None:
         return
     raise hardware_error(
         codec,
-        "the device refused an encoder, and took one a moment later: there were too many at a time",
-        "Give fewer `jobs`",
+        "the device refused an encoder, but accepted one a moment later: too many were open "
+        "at once",
+        "Use fewer `jobs`",
     )
 
 
@@ -329,7 +330,7 @@ def device_for(codec: str) -> HWAccel | None:
     """The device that an encoder's pictures have to be on, for PyAV to bring them there.
 
     Args:
-        codec: As ``--codec`` has it.
+        codec: As given to ``--codec``.
     """
     kind = HARDWARE[codec].device if codec in HARDWARE else ""
     return HWAccel(kind) if kind else None
@@ -339,7 +340,7 @@ def surface_format(codec: str) -> str:
     """The pixel format of pictures on an encoder's device; empty: it takes them as they are.
 
     Args:
-        codec: As ``--codec`` has it.
+        codec: As given to ``--codec``.
     """
     return "nv12" if codec in HARDWARE and HARDWARE[codec].device else ""
 
@@ -350,13 +351,13 @@ def _open_once(codec: str, width: int, height: int) -> None:
         raise hardware_error(
             codec,
             f"PyAV {av.__version__} was built without {found.encoder}",
-            f"It needs {found.needs}, and a PyAV whose ffmpeg has {found.encoder}",
+            f"It needs {found.needs}, and a PyAV whose FFmpeg has {found.encoder}",
         )
     if found.device and int(av.__version__.split(".")[0]) < _UPLOADS_SINCE:
         raise hardware_error(
             codec,
-            f"PyAV {av.__version__} cannot bring pictures to {found.encoder}",
-            f"Install PyAV {_UPLOADS_SINCE}, whose ffmpeg has to have it",
+            f"PyAV {av.__version__} cannot upload pictures to {found.encoder}",
+            f"Install PyAV {_UPLOADS_SINCE} with an FFmpeg that has it",
         )
     with _told() as lines:
         try:

@@ -39,7 +39,7 @@ def read_still(path: Path) -> tuple[str, NDArray[np.uint8]]:
         The ROS encoding, ``mono8`` or ``rgb8``, and pixels of shape (H, W) or (H, W, 3).
 
     Raises:
-        SourceError: It is no image, is too large, or has other than 8 bits.
+        SourceError: It is not an image, is too large, or has other than 8 bits.
     """
     from PIL import Image
 
@@ -50,9 +50,7 @@ def read_still(path: Path) -> tuple[str, NDArray[np.uint8]]:
                 if max(image.size) > MAX_SIDE:
                     raise SourceError(path, f"has sides of more than {MAX_SIDE} pixels")
                 if image.mode not in (*_GREY, *_COLOURS):
-                    raise SourceError(
-                        path, f"has samples of another kind than 8 bits ({image.mode})"
-                    )
+                    raise SourceError(path, f"does not have 8-bit samples ({image.mode})")
                 is_grey = image.mode in _GREY
                 pixels = np.asarray(image.convert("L" if is_grey else "RGB"), np.uint8)
     except SourceError:
@@ -101,7 +99,7 @@ _HEAD = 64
 _NETPBM = re.compile(rb"P([56])" + 3 * rb"(?:\s|#[^\n]*\n)+([0-9]{1,9})" + rb"\s")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _TIFF_BITS = 258
-_CONVERT = "Convert it first, so that what becomes of its values is your choice."
+_CONVERT = "Convert it first, so that you decide how its values are mapped."
 
 # mode of Pillow -> the encoding of ROS
 _ENCODINGS = {
@@ -129,7 +127,7 @@ def read_image(path: Path) -> tuple[str, Pixels]:
         The ROS encoding, and pixels of shape (H, W) or (H, W, C), little-endian.
 
     Raises:
-        SourceError: It is no image, or its values cannot be had as they are.
+        SourceError: It is not an image, or its values cannot be had as they are.
     """
     try:
         with path.open("rb") as file:
@@ -148,7 +146,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file, by its header.
 
     Raises:
-        SourceError: It is no image.
+        SourceError: It is not an image.
     """
     return _header(path)[:2]
 
@@ -157,7 +155,7 @@ def image_kind(path: Path) -> str:
     """Size and kind of pixels of an image file, in words, by its header.
 
     Raises:
-        SourceError: It is no image.
+        SourceError: It is not an image.
     """
     return "{}x{} {}".format(*_header(path))
 
@@ -186,7 +184,9 @@ def _still(path: Path, head: bytes) -> tuple[str, Pixels]:
             with Image.open(path, formats=STILL_FORMATS) as image:
                 _check_size(path, *image.size)
                 if getattr(image, "n_frames", 1) > 1:
-                    raise SourceError(path, "holds several images", "Give each a file of its own.")
+                    raise SourceError(
+                        path, "holds several images", "Save each to a file of its own."
+                    )
                 if _is_deep_colour(image, head):
                     return _deep_colour(path, "png" if image.format == "PNG" else "tiff")
                 if image.mode == "1":
@@ -194,7 +194,7 @@ def _still(path: Path, head: bytes) -> tuple[str, Pixels]:
                 if image.mode == "I" and image.format == "PNG":  # 16 bits, in older Pillow
                     return "mono16", np.asarray(image).astype(np.uint16)
                 if image.mode not in _ENCODINGS:
-                    raise SourceError(path, f"has pixels of the kind {image.mode}", _CONVERT)
+                    raise SourceError(path, f"has pixels of mode {image.mode}", _CONVERT)
                 return _ENCODINGS[image.mode], np.asarray(image)
         except Image.DecompressionBombError as error:
             raise SourceError(path, f"is too large: {error}") from None
@@ -202,7 +202,7 @@ def _still(path: Path, head: bytes) -> tuple[str, Pixels]:
 
 def _check_size(path: Path, width: int, height: int) -> None:
     if not 1 <= min(width, height) <= max(width, height) <= MAX_SIDE:
-        raise SourceError(path, f"has {width}x{height} pixels, which is beyond {MAX_SIDE} a side")
+        raise SourceError(path, f"has {width}x{height} pixels, more than {MAX_SIDE} a side")
 
 
 def _is_deep_colour(image: Any, head: bytes) -> bool:
@@ -220,7 +220,7 @@ def _deep_colour(path: Path, codec: str) -> tuple[str, Pixels]:
     packet = av.Packet(path.read_bytes())
     frames = [*context.decode(packet), *context.decode(None)]
     if len(frames) != 1 or frames[0].format.name not in _DEEP:
-        raise SourceError(path, "has more than 8 bits in a form that is not known", _CONVERT)
+        raise SourceError(path, "has more than 8 bits per sample in an unsupported form", _CONVERT)
     name = frames[0].format.name
     return _DEEP[name], frames[0].to_ndarray().astype(np.uint16, copy=False)
 
@@ -234,7 +234,7 @@ def _netpbm(path: Path) -> tuple[str, Pixels]:
     width, height, highest = map(int, match.groups()[1:])
     _check_size(path, width, height)
     if not 1 <= highest < 2**16:
-        raise SourceError(path, f"has values up to {highest}, which is beyond 16 bits")
+        raise SourceError(path, f"has values up to {highest}, which exceeds 16 bits")
     channels = 3 if match[1] == b"6" else 1
     dtype = np.dtype(">u2" if highest > 255 else "u1")
     start, count = match.end(), width * height * channels
@@ -284,13 +284,13 @@ class ImageFile:
         self._jpeg = image_format == "jpeg"
         if known.dtype not in ("u1", "u2") or known.general.startswith("stack"):
             raise OptionError(
-                f"{image_format} cannot hold {encoding} images: it has neither signs, floats nor "
-                "two channels. Unpack to a recording."
+                f"{image_format} cannot hold {encoding} images: it supports no signed, float or "
+                "two-channel samples. Unpack to a recording."
             )
         if self._jpeg and known.bytes_per_sample == 2:
             raise OptionError(f"JPEG cannot hold {encoding} images; use png")
         if not 1 <= quality <= 100:
-            raise OptionError(f"a JPEG quality of {quality}: use 1 to 100")
+            raise OptionError(f"JPEG quality is {quality}: use 1 to 100")
         self._quality = quality
         self._layout = _layout(known, demosaic=self._jpeg)
         self._is_yuv = self._layout.pixel_format in CHROMA_SHIFTS
@@ -379,7 +379,7 @@ _ENCODING_OF = {
 
 
 def shown_format(encoding: Encoding) -> str | None:
-    """Name in ffmpeg of what the pixels look like, or None where they are no light.
+    """Name in ffmpeg of what the pixels look like, or None if they cannot be displayed.
 
     Depths, signed numbers, floats, and pairs of channels are data. A Bayer mosaic is its own
     format, and YUV its planes.
@@ -403,7 +403,7 @@ def encoding_as(encoding: Encoding, colours: str) -> str | None:
     """The ROS encoding of pixels made into ``rgb``, ``bgr`` or ``gray``; 16 bits stay 16 bits.
 
     Returns:
-        None where the pixels are no light.
+        None if the pixels cannot be displayed.
     """
     if shown_format(encoding) is None:
         return None
@@ -434,7 +434,7 @@ class Renderer:
     ) -> None:
         shown = shown_format(encoding)
         if shown is None:
-            raise ValueError(f"{encoding.name} images show nothing")
+            raise ValueError(f"{encoding.name} images cannot be displayed")
         self._encoding = encoding
         self._source = shown
         self._target = shown_format(ENCODINGS[target])

@@ -13,6 +13,7 @@ from av.error import FFmpegError
 
 from mp4ds.errors import RemoteError, VideoError
 from mp4ds.files.urls import remote
+from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import CODECS
 
 _FILES = (errno.EMFILE, errno.ENFILE)
@@ -93,7 +94,9 @@ class Media:
                 "video-unreadable", self._path, f"has {len(tracks)} video tracks, not one"
             )
         if tracks[0].codec_context is None or tracks[0].codec_context.codec is None:
-            raise VideoError("video-unreadable", self._path, "has a video track of no known codec")
+            raise VideoError(
+                "video-unreadable", self._path, "has a video track with an unknown codec"
+            )
         return tracks[0]
 
     @cached_property
@@ -116,13 +119,13 @@ class Media:
         found = context.codec.canonical_name
         if found != (CODECS[codec].ffmpeg if codec in CODECS else codec):
             raise VideoError(
-                "codec-mismatch", self._path, f"is coded as {found} where its sidecar says {codec}"
+                "codec-mismatch", self._path, f"is coded as {found}, but its sidecar says {codec}"
             )
         if coded_size is not None and (context.width, context.height) != coded_size:
             raise VideoError(
                 "geometry-mismatch",
                 self._path,
-                f"has {context.width}x{context.height} pixels where its sidecar says "
+                f"has {context.width}x{context.height} pixels, but its sidecar says "
                 f"{coded_size[0]}x{coded_size[1]}",
             )
 
@@ -150,7 +153,7 @@ def open_input(source: Any, container: str = "mp4") -> Any:
 
 
 def pixel_format_of(context: Any) -> str:
-    """Ffmpeg's name of the pixel format of a video's codec context; empty where none is told.
+    """Ffmpeg's name of the pixel format of a video's codec context; empty if none is told.
 
     PyAV 17, which Python 3.10 has, crashes where it is asked for `pix_fmt` then.
     """
@@ -168,7 +171,7 @@ class _Source:
         self.close = stream.close
 
     def read(self, size: int = -1) -> bytes:
-        """Read so many bytes; after an error, none."""
+        """Read that many bytes; after an error, none."""
         if self._has_failed:
             return b""
         try:
@@ -176,3 +179,27 @@ class _Source:
         except RemoteError:
             self._has_failed = True
             raise
+
+
+_FRAGMENT_US = 500_000
+
+
+def new_mp4(path: Path, *, is_durable: bool = False) -> Any:
+    """An mp4 to write to, its times in ticks of the track.
+
+    Args:
+        path: The file to make, when the first packet comes.
+        is_durable: Whether what was written can be read before the file is complete: it consists of
+            fragments of half a second, until it is closed and becomes an ordinary mp4.
+    """
+    options = {
+        "video_track_timescale": str(TIMESCALE),
+        "movie_timescale": str(TIMESCALE),
+        "avoid_negative_ts": "disabled",  # an edit list hides what comes before 0
+    }
+    if is_durable:
+        options["movflags"] = "+hybrid_fragmented+delay_moov"
+        options["frag_duration"] = str(_FRAGMENT_US)
+        options["flush_packets"] = "1"
+    # ffmpeg takes a relative name with a colon for an address
+    return av.open(str(path.absolute()), "w", format="mp4", options=options)

@@ -49,7 +49,7 @@ def boxes(file: BinaryIO, start: int, end: int, *, outermost: bool = False) -> I
     Args:
         file: Where they are.
         start: Byte where the first begins.
-        end: Byte after the last. Fewer than 8 bytes before it are no box, as in QuickTime.
+        end: Byte after the last. Fewer than 8 bytes before it are not a box, as in QuickTime.
         outermost: Whether they are in no other box, so that the last may have no size.
 
     Raises:
@@ -142,7 +142,7 @@ class SampleEntry:
         if self.size != other.size:
             return f"their size ({self.size} and {other.size})"
         kinds = sorted({kind for kind, _ in set(self.boxes) ^ set(other.boxes)})
-        return f"what they say of their codec ({', '.join(kinds) or 'order or depth'})"
+        return f"their codec configuration ({', '.join(kinds) or 'order or depth'})"
 
 
 def read_sample_entry(path: Path) -> SampleEntry:
@@ -166,7 +166,7 @@ def read_sample_entry(path: Path) -> SampleEntry:
             return parse_descriptions(file, box)
         except DamagedBoxError as error:
             raise VideoError(
-                "video-unreadable", path, f"has no description of one track: {error}"
+                "video-unreadable", path, f"has no track description: {error}"
             ) from None
 
 
@@ -421,9 +421,7 @@ def read_sample_table(stream: BinaryIO, size: int, place: str) -> SampleTable:
             raise VideoError("video-unreadable", place, f"has {len(tracks)} video tracks, not one")
         return _parse_track(movie, tracks[0], size)
     except DamagedBoxError as error:
-        raise VideoError(
-            "video-unreadable", place, f"has no index that can be read: {error}"
-        ) from None
+        raise VideoError("video-unreadable", place, f"has no readable index: {error}") from None
 
 
 def _read_movie(stream: BinaryIO, size: int) -> _Movie:
@@ -524,7 +522,7 @@ def _sizes(movie: _Movie, tables: dict[bytes, Box], file_size: int) -> Integers:
 
 
 def _places(movie: _Movie, tables: dict[bytes, Box], sizes: Integers, file_size: int) -> Integers:
-    """Samples lie in chunks, one after the other; what a chunk holds is told where it changes."""
+    """Samples lie in chunks, one after another; what a chunk holds is told where it changes."""
     if b"co64" in tables:
         chunks = movie.table(tables[b"co64"], _LONG_NUMBER)
     else:
@@ -559,7 +557,7 @@ def _times(movie: _Movie, tables: dict[bytes, Box], count: int) -> tuple[Integer
     delays = _repeated(movie.table(tables[b"ctts"], _DELAYS), count, "ctts")
     if np.any(np.abs(delays) > _LONGEST_DELAY):
         raise Refused("a frame is shown too long after its decoding")
-    # where delays are negative, decoding has to begin earlier
+    # where delays are negative, decoding must begin earlier
     return decoding + min(int(delays.min()), 0), decoding + delays
 
 
@@ -607,7 +605,7 @@ def _edit(movie: _Movie, track: Box, timescale: int) -> _Edit | None:
     if any(start != -1 for start in starts[:-1]) or starts[-1] < 0:
         raise Refused("it has several edits")
     if rows["speed"][-1] != _NORMAL_SPEED or not durations[-1]:
-        raise Refused("it has an edit that stands still or has no end")
+        raise Refused("it has an edit that freezes a frame or has no end")
     edit = _Edit(sum(durations[:-1]), starts[-1], durations[-1])
     if max(edit.delay, edit.start + edit.duration) > _LATEST:
         raise DamagedBoxError("an edit is too late")

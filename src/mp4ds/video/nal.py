@@ -77,7 +77,7 @@ def join_plain(units: Sequence[bytes]) -> bytes:
 
 
 def split_length_prefixed(packet: bytes | memoryview) -> list[bytes]:
-    """The NAL units of an mp4's packet, which stand behind lengths of four bytes.
+    """The NAL units of an mp4's packet, each preceded by a length of four bytes.
 
     Raises:
         Refused: The lengths do not add up, or there are too many.
@@ -140,7 +140,7 @@ def parameter_units(codec: str, configuration: bytes) -> list[bytes]:
             (AV1 in ISOBMFF, 2.3).
 
     Raises:
-        Refused: It is malformed, or NAL units do not stand behind lengths of four bytes.
+        Refused: It is malformed, or its NAL units are not preceded by lengths of four bytes.
     """
     if codec == "h264":
         return _avc_units(configuration)
@@ -210,7 +210,7 @@ class PictureOrder:
         return self._last is not None
 
     def restart(self, lsb: int = 0) -> None:
-        """Begin anew, from low bits."""
+        """Begin again, from low bits."""
         self._msb, self._lsb, self._last = 0, lsb, None
 
     def take(self, lsb: int, bits: int, *, counts: bool = True) -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 import struct
 from array import array
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import av
+import xxhash
 from av.error import FFmpegError
 
 from mp4ds.errors import Refused, SegmentsDifferError, VideoError
@@ -19,7 +20,7 @@ from mp4ds.times import TIMESCALE
 from mp4ds.video import av1, h264, h265, nal
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.coded_messages import PACKET_CODECS, plain_body
-from mp4ds.video.media import Media, open_input, pixel_format_of, raise_if_scarce
+from mp4ds.video.media import Media, new_mp4, open_input, pixel_format_of, raise_if_scarce
 from mp4ds.video.mp4 import SampleEntry, read_sample_entry
 from mp4ds.video.nal import parameter_units
 
@@ -42,6 +43,8 @@ class PacketWriter:
         parameters: Parameter sets or sequence header, as `PictureParser.parameters` has them;
             used if the first body is without.
         rate: Frames per second, if known: it gives the last frame its duration.
+        on_packet: Called with each packet before it is written. What was written can then be read
+            at any time; see `new_mp4`.
 
     Raises:
         ValueError: The codec is another one; lists those.
@@ -56,9 +59,11 @@ class PacketWriter:
         height: int,
         parameters: bytes = b"",
         rate: float | None = None,
+        on_packet: Callable[[bytes], None] | None = None,
     ) -> None:
+        self._on_packet = on_packet
         if codec not in PACKET_CODECS:
-            raise ValueError(f"codec {codec!r} is none of {', '.join(PACKET_CODECS)}")
+            raise ValueError(f"codec {codec!r} is not one of {', '.join(PACKET_CODECS)}")
         self.codec = codec
         self.width, self.height = width, height
         self._path = path
@@ -86,7 +91,7 @@ class PacketWriter:
 
         Raises:
             Refused: It is the first, and cannot be decoded or has another size.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         plain = plain_body(self.codec, body)
         if self._container is None:
@@ -100,6 +105,8 @@ class PacketWriter:
         packet.pts = packet.dts = tick
         packet.duration = round(TIMESCALE / self._rate)
         packet.is_keyframe = keyframe
+        if self._on_packet is not None:
+            self._on_packet(plain)
         self._container.mux(packet)
         self._ticks.append(tick)
         self._sizes.append(len(plain))
@@ -116,7 +123,7 @@ class PacketWriter:
         """
         plain = plain_body(self.codec, body)
         if self.codec in ("mjpeg", "png"):
-            self._container = new_mp4(self._path)
+            self._container = new_mp4(self._path, is_durable=self._on_packet is not None)
             self._stream = self._container.add_mux_stream(
                 self.codec, rate=self._rate, width=self.width, height=self.height
             )
@@ -126,7 +133,7 @@ class PacketWriter:
                 context = template.codec_context
                 if (context.width, context.height) != (self.width, self.height):
                     raise Refused("its first picture cannot be decoded")
-                self._container = new_mp4(self._path)
+                self._container = new_mp4(self._path, is_durable=self._on_packet is not None)
                 self._stream = self._container.add_stream_from_template(template, opaque=True)
         self._stream.time_base = _TIME_BASE
 
@@ -135,7 +142,7 @@ class PacketWriter:
 
         Raises:
             VideoError: The file does not hold every packet as it was written.
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         if not self._ticks:
             self.abandon()
@@ -169,20 +176,6 @@ class PacketWriter:
             self.close()
         else:
             self.abandon()
-
-
-def new_mp4(path: Path) -> Any:
-    """An mp4 to write to, its times in ticks of the track."""
-    return av.open(
-        str(path.absolute()),  # ffmpeg takes a relative name with a colon for an address
-        "w",
-        format="mp4",
-        options={
-            "video_track_timescale": str(TIMESCALE),
-            "movie_timescale": str(TIMESCALE),
-            "avoid_negative_ts": "disabled",  # an edit list hides what comes before 0
-        },
-    )
 
 
 def _probe(codec: str, parameters: bytes, plain: bytes) -> Any:
@@ -233,7 +226,7 @@ class PacketReader:
         sizes: Bytes of each shown packet.
         keyframes: For each shown packet whether decoding can begin there, as 0 or 1.
         extradata: What the track says about the codec: avcC, hvcC or av1C.
-        pixel_format: Of its pictures as ffmpeg calls it; empty where not known.
+        pixel_format: Of its pictures as ffmpeg calls it; empty if unknown.
 
     Raises:
         VideoError: ``file-missing``, ``video-unreadable``, ``codec-mismatch``,
@@ -260,7 +253,7 @@ class PacketReader:
             if not count:
                 raise VideoError("frame-count", path, "has no frames")
             if frames is not None and count != frames:
-                raise VideoError("frame-count", path, f"has {count} frames, {frames} are due")
+                raise VideoError("frame-count", path, f"has {count} frames, not {frames}")
             ticks, self._sizes, self._places = array("q"), array("q"), array("q")
             self._keyframes = bytearray()
             for entry in entries:
@@ -298,7 +291,7 @@ class PacketReader:
         """
         key = self._keyframes.rfind(1, 0, self.hidden + index + 1)
         if key < 0:
-            raise VideoError("video-unreadable", self._path, "begins without a key frame")
+            raise VideoError("video-unreadable", self._path, "does not start with a key frame")
         return key - self.hidden
 
     def packet(self, index: int) -> bytes:
@@ -321,7 +314,7 @@ class PacketReader:
         """All packets in order.
 
         Raises:
-            VideoError: As `packet`.
+            VideoError: As for `packet`.
         """
         return map(self.packet, range(len(self)))
 
@@ -344,7 +337,7 @@ def cut_segment(
 ) -> None:
     """Write consecutive frames of a video into a file of their own.
 
-    What stands between the first of them and the key frame before it comes, too, since they refer
+    What is between the first of them and the key frame before it comes, too, since they refer
     to it; an edit list hides it.
 
     Args:
@@ -356,7 +349,7 @@ def cut_segment(
 
     Raises:
         VideoError: The source cannot be read, or the result does not hold every packet as it was.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     entry = read_sample_entry(source)
     try:
@@ -390,8 +383,73 @@ def cut_segment(
         raise
 
 
+def packet_digest(codec: str, packet: bytes, *, is_stored: bool) -> int:
+    """XXH64 of a packet, the same before it is written into an mp4 and when it is read from there.
+
+    Args:
+        codec: Name in the registry.
+        packet: The packet.
+        is_stored: Whether it is as an mp4 holds it.
+
+    Raises:
+        Refused: It is damaged.
+    """
+    if codec in _UNITS:
+        units = nal.split_length_prefixed(packet) if is_stored else nal.split(packet)[0]
+        packet = nal.join_plain(units)
+    elif codec == "av1":
+        packet = packet.removeprefix(av1.DELIMITER)
+    return xxhash.xxh64_intdigest(packet)
+
+
+def copy_fragments(
+    source: Path, codec: str, ticks: Sequence[int], digests: Sequence[int], target: Path
+) -> int:
+    """Write what is there of a durable video that was cut off into an ordinary one.
+
+    Args:
+        source: A file of which `new_mp4` says that it is durable.
+        codec: Name in the registry.
+        ticks: Presentation times of the frames that are wanted, in ticks of 1 / `TIMESCALE` s.
+        digests: Of their packets; see `packet_digest`.
+        target: The file to make, if any of these is there.
+
+    Returns:
+        How many of them are there, from the first on.
+
+    Raises:
+        VideoError: The result would not hold every packet as it was.
+        OSError: The disk refused.
+    """
+    try:
+        entry = read_sample_entry(source)
+        media = Media(source)
+    except VideoError:  # not one fragment is there
+        return 0
+    written = _Written(codec)
+    with closing(media), closing(new_mp4(target)) as container:
+        stream = _new_stream(container, media.track, entry)
+        duration = max(1, ticks[1] - ticks[0]) if len(ticks) > 1 else TIMESCALE // 30
+        with suppress(FFmpegError, Refused):  # at its torn end
+            packets = media.container.demux(media.track)
+            for tick, digest, packet in zip(ticks, digests, packets, strict=False):
+                data, is_key = bytes(packet), packet.is_keyframe
+                is_whole = packet_digest(codec, data, is_stored=True) == digest
+                if packet.pts != tick or not is_whole:
+                    break
+                container.mux(_packet_at(data, stream, tick, duration, is_key=is_key))
+                written.add(tick, len(data), is_key=is_key)
+        if written.ticks:
+            _finish(container, target)
+    if not written.ticks:
+        target.unlink(missing_ok=True)
+        return 0
+    written.check(target, entry)
+    return len(written.ticks)
+
+
 def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) -> int:
-    """Write the packets of videos one after the other into one file.
+    """Write the packets of videos one after another into one file.
 
     The file is as one `VideoEncoder` or `PacketWriter` would have made it of the same packets:
     its track describes them in the same words, and its last frame lasts as long as that of the
@@ -414,7 +472,7 @@ def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) 
         VideoError: A segment cannot be read, there are not as many ticks as frames, or the
             result does not hold every packet as it was.
         ValueError: There are no segments, or the ticks do not increase.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     if not segments:
         raise ValueError("there are no segments to join")
@@ -429,7 +487,7 @@ def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) 
 
 
 class _Written:
-    """What the index of the file that is made has to say."""
+    """What the index of the new file must say."""
 
     def __init__(self, codec: str) -> None:
         self.codec = codec
@@ -450,7 +508,7 @@ class _Written:
         """
         if not self._is_in(path):
             raise VideoError(
-                "decode-failed", path, "would not hold the packets as they are: one is damaged"
+                "decode-failed", path, "would not hold the packets unchanged: one is damaged"
             )
         if difference := entry.differences(read_sample_entry(path)):
             raise VideoError(
@@ -463,7 +521,7 @@ class _Written:
                 found = (reader.ticks, reader.sizes, reader.keyframes)
                 return found == (self.ticks, self.sizes, self.keyframes)
         except VideoError:
-            return False  # the muxer goes on after some damages, and the index is wrong then
+            return False  # the muxer continues after some damages, and the index is wrong then
 
 
 def _copy(
@@ -478,7 +536,7 @@ def _copy(
                 _copy_segment(segment, ticks, container, stream, duration, written)
             if next(ticks, None) is not None:
                 raise VideoError(
-                    "frame-count", target, f"would have {len(written.ticks)} frames, more are due"
+                    "frame-count", target, f"would have only {len(written.ticks)} frames"
                 )
         except BaseException:
             # closing completes the file, which may fail, too; the first error tells more
@@ -525,7 +583,7 @@ def _copy_segment(
             tick = next(ticks, None)
             if tick is None:
                 raise VideoError(
-                    "frame-count", path, f"has {len(reader)} frames, {index} of them are due"
+                    "frame-count", path, f"has {len(reader)} frames, but {index} are needed"
                 )
             if written.ticks and tick <= written.ticks[-1]:
                 raise ValueError(f"tick {tick} does not follow {written.ticks[-1]}")
@@ -575,7 +633,7 @@ def _common_entry(segments: Sequence[Path]) -> SampleEntry:
 
 
 class StandAlonePackets(PacketReader):
-    """The packets of a video as they stand alone, for whoever decodes without the mp4.
+    """The packets of a video as they stand alone, for anyone who decodes without the mp4.
 
     H.264 and H.265 come as Annex B with start codes of four bytes, AV1 as temporal units that
     begin with a delimiter; all with the parameters of the stream before each key frame. VP9
@@ -587,7 +645,7 @@ class StandAlonePackets(PacketReader):
         frames: Number of packets that are due, if known.
 
     Raises:
-        VideoError: As `PacketReader`, or the codec's parameters are damaged.
+        VideoError: As for `PacketReader`, or the codec's parameters are damaged.
     """
 
     def __init__(self, path: Path, *, codec: str, frames: int | None = None) -> None:

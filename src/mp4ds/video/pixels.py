@@ -119,7 +119,7 @@ _DECODED_AS = {
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Colours and size of pictures that are made of the video's own samples at once.
+    """Colours and size of pictures that are made from the video's own samples at once.
 
     Attributes:
         pixel_format: ``rgb24`` or ``bgr24``.
@@ -347,7 +347,7 @@ def frame_to_picture(
         raise VideoError(
             "geometry-mismatch",
             place,
-            f"has frames of {frame.width}x{frame.height} where {width}x{height} are due",
+            f"has frames of {frame.width}x{frame.height}, not {width}x{height}",
         )
     if picture_format.startswith("bayer_"):
         colours = _packed(frame, "rgb24", converter)
@@ -373,7 +373,7 @@ def _planes(
         raise VideoError(
             "codec-mismatch",
             place,
-            f"decodes to {frame.format.name} where {' or '.join(expected)} is due",
+            f"decodes to {frame.format.name}, not {' or '.join(expected)}",
         )
     if picture_format.startswith("gray"):
         sizes = [(height, width)]
@@ -419,7 +419,7 @@ class PictureMaker:
         coded_size: Width and height of its frames.
         picture_format: Pixel format of the pictures wanted.
         picture_size: Width and height of the pictures wanted.
-        matrix: Matrix coefficients of the video's colours; None where the video itself tells.
+        matrix: Matrix coefficients of the video's colours; None if the video itself tells.
         full_range: Whether its samples use their full range, unless the video itself tells.
     """
 

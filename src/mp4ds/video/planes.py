@@ -55,7 +55,7 @@ def planes_of(frame: av.VideoFrame) -> Planes:
 
 
 def planes_in(frame: NDArray[np.uint8], width: int, height: int) -> Planes:
-    """The planes of a frame that stand one after the other, as views.
+    """The planes of a frame that stand one after another, as views.
 
     Args:
         frame: uint8, shape (width * height * 3 / 2,).
@@ -80,7 +80,7 @@ def decoded_planes(path: Path) -> Iterator[Planes]:
         Views that hold until the next one is asked for.
 
     Raises:
-        VideoError: It does not decode, or to something else.
+        VideoError: It cannot be decoded, or to something else.
     """
     media = Media(path)
     try:
@@ -188,7 +188,7 @@ class PlaneSpool:
         """Keep one more frame.
 
         Raises:
-            OSError: The disk refused.
+            OSError: It cannot be written.
         """
         self._file.seek(self._count * self._size)
         for plane in planes:
@@ -212,7 +212,7 @@ class PlaneSpool:
         while rest:
             count = self._file.readinto(rest)
             if not count:
-                raise OSError("frames that were kept on disk have been cut short")
+                raise OSError("frames kept on disk were truncated")
             rest = rest[count:]
         return planes_in(data, self.width, self.height)
 
@@ -227,7 +227,7 @@ class PlaneSpool:
 
 # ---------------------------------------------------------------- samples as decoded
 
-# where green, blue, red and alpha stand in a pixel of packed formats
+# positions of green, blue, red and alpha in a pixel of packed formats
 _PACKED = {
     "rgb24": (1, 2, 0),
     "bgr24": (1, 0, 2),
@@ -252,7 +252,7 @@ class RawPicture:
     planes: tuple[NDArray[Any], ...]
 
     def tobytes(self) -> bytes:
-        """The planes one after the other, by rows without padding."""
+        """The planes one after another, by rows without padding."""
         return b"".join(plane.tobytes() for plane in self.planes)
 
 
@@ -261,7 +261,8 @@ def raw_pictures(path: Path, *, is_gray: bool) -> Iterator[RawPicture]:
 
     Args:
         path: An mp4 with one video track.
-        is_gray: Whether chroma is no part of it: decoders make it up for a grey video, or do not.
+        is_gray: Whether it has no chroma: decoders make it up for a grey video, or do
+            not.
 
     Yields:
         Views that hold until the next one is asked for.

@@ -1,4 +1,4 @@
-"""Frames of a video by number, at the least cost that its codec allows; videos of others."""
+"""Frames of a video by number, at the least cost that its codec allows; third-party videos."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def open_frames(
     return FrameReader(open_access, open_decoder)
 
 
-# ---------------------------------------------------------------- videos of others
+# ---------------------------------------------------------------- third-party videos
 
 _SECOND = 1_000_000_000
 _LATEST = 2**63 // _SECOND - 1  # seconds
@@ -212,7 +212,7 @@ class VideoFile:
         return ticks, np.sort(table.presentation[table.sync])
 
     def _read_packets(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """As `_read_ticks`, from the packets, all of which are read."""
+        """Like `_read_ticks`, from the packets, all of which are read."""
         ticks, keys = [], []
         try:
             for packet in self._media.container.demux(self._stream):

@@ -23,7 +23,7 @@ _PPS_BYTES = 64
 
 
 def _units(data: memoryview) -> Iterator[memoryview]:
-    """The NAL units of a packet, which stand behind lengths of four bytes."""
+    """The NAL units of a packet, each preceded by a length of four bytes."""
     at = 0
     for _ in range(MAX_UNITS):
         if at == len(data):
@@ -494,7 +494,7 @@ class StructureRecorder:
         """What was found.
 
         Returns:
-            None where the references of a frame are not known, or the structures are too many or
+            None if the references of a frame are not known, or the structures are too many or
             too long.
         """
         try:

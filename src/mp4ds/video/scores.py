@@ -115,7 +115,7 @@ class Scores:
     """Scores of each frame of a clip, float64, shape (frames,).
 
     Attributes:
-        vmaf: 0 to 100; None where there is no libvmaf.
+        vmaf: 0 to 100; None if there is no libvmaf.
         psnr_y: Of luma, dB.
         psnr_cb: Of blue chroma, dB.
         psnr_cr: Of red chroma, dB.
@@ -162,7 +162,7 @@ SMALLEST = 16
 
 
 class Scorer:
-    """Scores clips; may be used for one after the other.
+    """Scores clips; may be used for one after another.
 
     Args:
         ffmpeg: What computes VMAF, from `find_ffmpeg`; None: there is only PSNR and SSIM.
@@ -241,7 +241,7 @@ def vmaf_scores(
             libvmaf takes the first frame for a still one, and scores it less.
 
     Raises:
-        ScoringError: As `Scorer.score`.
+        ScoringError: As for `Scorer.score`.
     """
     pairs = _pairs(reference, decoded)
     first = _first(pairs)
@@ -299,7 +299,7 @@ def _pairs(
     for number, (original, made) in enumerate(zip_longest(reference, decoded)):
         if original is None or made is None:
             longer = "decoded frames" if original is None else "originals"
-            raise ScoringError(f"There are more {longer} than the {number} of the others.")
+            raise ScoringError(f"There are more {longer} than the {number} in the other sequence.")
         if first is None:
             first = _kind(original)
             _check(original)
@@ -372,7 +372,7 @@ def largest_crf(
 
     good, bad = smallest - 1, largest + 1  # the first does, the second does not, as far as is known
     crf = min(max(guess, smallest), largest)
-    least = _STEP if fall is None else 1  # that it goes on; doubled each time
+    least = _STEP if fall is None else 1  # that it continues; doubled each time
     while bad - good > 1 and (most is None or len(known) < most):
         width = bad - good
         found = at(crf)

@@ -202,7 +202,7 @@ class Coded:
     Attributes:
         key: Bytes of the key frame.
         other: Mean bytes of the others.
-        key_seconds: CPU time of decoding the key frame; 0 where it was not measured.
+        key_seconds: CPU time of decoding the key frame; 0 if it was not measured.
         other_seconds: Mean CPU time of decoding another.
     """
 

@@ -54,7 +54,7 @@ class Vp9Pictures:
 
         Raises:
             NoPicture: It shows none; a muxer would join it with the next packet.
-            Refused: It shows several, or is no VP9.
+            Refused: It shows several, or is not VP9.
         """
         shown = 0
         keyframe = False

@@ -117,7 +117,7 @@ class LossLog:
         return self._one_more(draft)
 
     def lost_of_kind(self, kind: Hashable, offset: int | None, problem: str) -> Draft:
-        """As `lost`, for what is found again and again and is one loss.
+        """Like `lost`, for what is found again and again and is one loss.
 
         Returns:
             The loss of that kind, without a size: it may be scattered.
@@ -146,7 +146,7 @@ class LossLog:
         """
         drafts = [*self._drafts, *self._more]
         if messages and not drafts:
-            drafts = [Draft(None, None, "the file counts more messages than it holds", messages)]
+            drafts = [Draft(None, None, "the file declares more messages than it holds", messages)]
         unknown = [draft for draft in drafts if draft.messages is None]
         if messages is not None and unknown:
             known = sum(draft.messages or 0 for draft in drafts)
@@ -192,8 +192,8 @@ class Tally:
     messages and be none.
 
     Args:
-        log: Where losses are put down.
-        topic_of: The topic of a channel, None where it is not known.
+        log: Where losses are recorded.
+        topic_of: The topic of a channel, None if unknown.
 
     Attributes:
         is_doubtful: Whether messages are held.
@@ -230,7 +230,7 @@ class Tally:
         Args:
             expected: Messages by channel that an index at the end of the file tells, if any.
             end: Byte where it should end, and its own index begin.
-            span: Least and greatest log time that its messages can have, ns, if known.
+            span: Earliest and latest log time that its messages can have, ns, if known.
         """
         self.close()
         self._begin(expected)
@@ -348,7 +348,7 @@ class Tally:
             for draft in losses[1:]:
                 draft.add(0, ())
         elif total:
-            problem = "an index lists other messages than there are"
+            problem = "an index does not match the messages"
             self._log.lost(None, None, problem).add(0 if self._is_verified else total, topics)
         self._losses = []
 
@@ -493,7 +493,7 @@ class FileSalvage(Salvage):
 
     @abstractmethod
     def _pass(self, log: LossLog) -> Iterator[Record]:
-        """Read everything once, putting down what is lost."""
+        """Read everything once, recording what is lost."""
 
     @property
     def _orderly(self) -> Callable[[], BagReader] | None:
@@ -542,7 +542,7 @@ def losses_of(reader: BagReader) -> Sequence[Loss]:
 
 
 class MultiSalvage(MultiReader):
-    """As `MultiReader`, of what can be read of each part. See `SalvageReader`.
+    """Like `MultiReader`, of what can be read of each part. See `SalvageReader`.
 
     Args:
         openers: Each opens one part; a part is open only while it is read.

@@ -47,7 +47,7 @@ class McapPass:
     Args:
         path: Its name.
         window: At its start.
-        log: Where losses are put down.
+        log: Where losses are recorded.
         declared: Schemas and channels, those of the summary at first.
         summary: What could be read of it.
         decompress: Makes the payload of a message from what the file holds, if anything does.
@@ -55,7 +55,7 @@ class McapPass:
     Attributes:
         offset: Byte where the record being read begins.
         found: Records of an MCAP file that were met.
-        count: Messages that the file has by its statistics; None where it does not tell.
+        count: Messages that the file has by its statistics; None if unknown.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class McapPass:
         for channel_id, schema_id in self._undefined.items():
             topic = self._topic_of(channel_id)
             if schema_id not in self._schemas and topic is not None:
-                problem = f"the definition of its messages, schema {schema_id}, is not there"
+                problem = f"the definition of its messages, schema {schema_id}, is missing"
                 self._log.lost(None, None, problem).add(0, [topic])
 
     def _begin(self) -> Iterator[Found]:
@@ -202,7 +202,7 @@ class McapPass:
             yield message
 
     def _message(self, body: memoryview, offset: int) -> Message | None:
-        """A message; None where it is lost.
+        """A message; None if it is lost.
 
         Raises:
             DamageError: It is shorter than its fields.
@@ -211,14 +211,14 @@ class McapPass:
         channel = self._channel(head.channel_id)
         data: bytes | memoryview = head.data
         if channel is None:
-            problem = f"messages of channel {head.channel_id}, of which no record tells"
+            problem = f"messages of channel {head.channel_id}, whose record is missing"
             self._lose_message(head.channel_id, head.log_time, offset, problem)
             return None
         if self._decompress:
             try:
                 data = self._decompress(head.data)
             except DamageError:
-                problem = f"messages of {channel.topic} of which the compression is damaged"
+                problem = f"messages of {channel.topic} whose compressed data is damaged"
                 loss = self._lose_message(head.channel_id, head.log_time, offset, problem)
                 loss.topics[channel.topic] = None
                 return None
@@ -251,7 +251,7 @@ class McapPass:
         chunk = _Chunk.unpacked(have[frame.head :])
         self._tally.open(None, offset + frame.size, chunk.span)
         if chunk.is_plain and chunk.problem:
-            # Its records stand in the file like any other: what is wrong hides no others.
+            # Its records are in the file like any other: what is wrong hides no others.
             if chunk.is_doubtful:
                 self._plain = _Plain(offset, offset + frame.size, chunk.problem)
             window.skip(frame.head + chunk.head)
@@ -341,10 +341,10 @@ class _Chunk:
         content: Records.
         is_plain: Whether it is not compressed.
         head: Bytes of the chunk's body before its records.
-        used: Bytes of the chunk's body that it was made of, as far as that shows.
-        problem: What is wrong with it, a phrase; empty where nothing is.
+        used: Bytes of the chunk's body that it was made from, as far as that shows.
+        problem: What is wrong with it, a phrase; empty if nothing is.
         is_doubtful: Whether the content may be something else than what was recorded.
-        span: Least and greatest log time that its messages can have, ns.
+        span: Earliest and latest log time that its messages can have, ns.
         records: Opcodes and bodies, where its checksum vouches for them; else empty.
     """
 
@@ -382,8 +382,7 @@ class _Chunk:
             problem = ""
         elif crc and not problem:
             problem = (
-                "a chunk does not match its checksum: its messages were kept, "
-                "though something of them is not as it was"
+                "a chunk does not match its checksum: its messages were kept, but some are altered"
             )
         used = records + 8 + unpacked.used if unpacked.used else 0
         is_doubtful = bool(problem) and (not unpacked.is_sound or not unpacked.problem)
@@ -393,7 +392,7 @@ class _Chunk:
 
 
 def _message_count(statistics: mcap_records.Statistics | None) -> int | None:
-    """How many messages a file has; None where its statistics contradict themselves."""
+    """How many messages a file has; None if its statistics contradict themselves."""
     if statistics is None:
         return None
     counts, total = statistics.channel_message_counts, int(statistics.message_count)
@@ -453,7 +452,7 @@ class McapSalvage(FileSalvage):
 
     @staticmethod
     def _declare(declare: Callable[[], None]) -> None:
-        with contextlib.suppress(DamageError):  # it is told when it is read
+        with contextlib.suppress(DamageError):  # it is reported when it is read
             declare()
 
     def _read_header(self) -> None:
@@ -499,7 +498,7 @@ class McapSalvage(FileSalvage):
 
     @property
     def start(self) -> int | None:
-        """The earliest log time by the summary, ns; None where it does not tell."""
+        """The earliest log time by the summary, ns; None if unknown."""
         span = self._summary.chunks.span()
         return span[0] if span else None
 
@@ -546,4 +545,4 @@ class McapSalvage(FileSalvage):
             self._position = window.position
             self._count = reading.count
             if self.is_alone and not reading.found and not self._declared.channels:
-                raise SourceError(self.path, "holds no record of an MCAP file")
+                raise SourceError(self.path, "holds no MCAP records")

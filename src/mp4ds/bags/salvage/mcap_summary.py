@@ -91,7 +91,7 @@ class McapFraming:
         return None
 
     def _candidates(self, view: memoryview, end: int) -> list[int]:
-        """Where an opcode stands before a length that is not too long."""
+        """Where an opcode is before a length that is not too long."""
         data = np.frombuffer(view, np.uint8)[: end + _HEAD]
         if len(data) < _HEAD:
             return []
@@ -144,7 +144,7 @@ def _string(body: memoryview, offset: int) -> int:
 
 
 def _chunk_length(body: memoryview) -> int | None:
-    """Bytes of a chunk's body by its fields, None where they are not those of a chunk."""
+    """Bytes of a chunk's body by its fields, None if they are not those of a chunk."""
     if len(body) < _CHUNK_FIXED:
         return None
     (length,) = struct.unpack_from("<I", body, 28)
@@ -222,7 +222,7 @@ class SalvagedSummary:
     """A summary section. What counts on its being whole is left out where it is not.
 
     Attributes:
-        offset: Byte where it begins, None where there is none.
+        offset: Byte where it begins, None if there is none.
         schemas: Schema records, in their order.
         channels: Channel records, in their order.
         statistics: The statistics record, if there is one.
@@ -272,7 +272,7 @@ class SalvagedSummary:
         self.chunks.finish()
 
     def stats(self) -> dict[int, ChannelStats]:
-        """Counts and spans by channel id; empty where it does not tell."""
+        """Counts and spans by channel id; empty if it does not tell."""
         if self.statistics is None:
             return {}
         whole = self.statistics.message_start_time, self.statistics.message_end_time
@@ -286,10 +286,10 @@ class SalvagedSummary:
 
 
 def read_summary(path: Path) -> SalvagedSummary:
-    """The summary of a file, empty where it has none or its place is not known.
+    """The summary of a file, empty if it has none or its place is not known.
 
     Raises:
-        SourceError: The disk does not give it.
+        SourceError: It cannot be read.
     """
     summary = SalvagedSummary()
     with Window.of_file(path) as window:

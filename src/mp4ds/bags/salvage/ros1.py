@@ -140,7 +140,7 @@ class BagIndex:
     Attributes:
         channels: By connection number, in the order of the index.
         chunks: Byte offsets of the chunks, sorted.
-        due: Byte where the index should begin by the header of the bag, None where not known.
+        due: Byte where the index should begin by the header of the bag, None if unknown.
         offset: The same, where there is an index.
     """
 
@@ -172,7 +172,7 @@ class BagIndex:
         """All that there is was added: where that is not all chunks, it tells of none.
 
         Args:
-            chunks: How many there are by the header of the bag, None where it does not tell.
+            chunks: How many there are by the header of the bag, None if unknown.
 
         Returns:
             Whether all chunks are there.
@@ -187,7 +187,7 @@ class BagIndex:
         return is_whole
 
     def counts(self, chunk: int) -> dict[int, int] | None:
-        """Messages by connection of the chunk at a byte; None where it is not listed."""
+        """Messages by connection of the chunk at a byte; None if it is not listed."""
         if chunk not in self._infos:
             return None
         found: dict[int, int] = {}
@@ -196,7 +196,7 @@ class BagIndex:
         return found
 
     def span(self, chunk: int) -> tuple[int, int] | None:
-        """First and last log time of the chunk at a byte, ns; None where it is not listed."""
+        """First and last log time of the chunk at a byte, ns; None if it is not listed."""
         info = self._infos.get(chunk)
         return (info[0], info[1]) if info else None
 
@@ -217,7 +217,7 @@ class BagIndex:
         return self._later[position] if position < len(self._later) else None
 
     def stats(self, connections: Iterable[int]) -> dict[int, ChannelStats]:
-        """Counts and spans of the chunks by connection; empty where no chunk is listed."""
+        """Counts and spans of the chunks by connection; empty if no chunk is listed."""
         total = {connection: ChannelStats(0, 0, 0) for connection in connections}
         for chunk in self.chunks:
             start, end, _ = self._infos[chunk]
@@ -236,7 +236,7 @@ def read_index(path: Path) -> BagIndex:
     """The index of a bag: all of it, or else what connections the end of the file tells.
 
     Raises:
-        SourceError: The bag is encrypted, or the disk does not give it.
+        SourceError: The bag is encrypted, or cannot be read.
     """
     index = BagIndex()
     framing = Ros1Framing()
@@ -346,7 +346,7 @@ class Ros1Salvage(FileSalvage):
                 yield from held.release(None)
             self._position = window.offset
             if self.is_alone and not reading.found and not self._channels:
-                raise SourceError(self.path, "holds no record of a ROS 1 bag")
+                raise SourceError(self.path, "holds no ROS 1 bag records")
 
 
 class _Pass:
@@ -435,15 +435,19 @@ class _Pass:
             self._scan.body(frame)
 
     def _message(self, frame: RecordFrame[int], body: bytes, offset: int) -> Message | None:
-        """A message; None where it is lost."""
+        """A message; None if it is lost."""
         connection, log_time = number(frame.fields[b"conn"]), time(frame.fields[b"time"])
         channel = self._channels.get(connection)
         if log_time >= MAX_TIME:
-            self._lose(offset, frame.size, "a message has a time past 2^32 seconds, none of ROS")
+            self._lose(
+                offset,
+                frame.size,
+                "a message has a time past 2^32 seconds, which ROS cannot represent",
+            )
             return None
         if channel is None:
             self._tally.stray(connection, log_time)
-            problem = f"messages of connection {connection}, of which no record tells"
+            problem = f"messages of connection {connection}, whose record is missing"
             loss = self._log.lost_of_kind(connection, offset, problem)
             loss.add(1, ())
             return None

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from mp4ds.bags.mcap import is_mcap
-from mp4ds.bags.mcap_records import SALVAGE_REMEDY, unzstd
+from mp4ds.bags.mcap_records import unzstd
 from mp4ds.bags.protocols import Format, SourcePart, merged
 from mp4ds.bags.rosbag2_files import MAGIC as ZSTD_MAGIC
 from mp4ds.bags.rosbag2_files import (
@@ -38,7 +38,7 @@ class StorageFile:
     Attributes:
         path: The file.
         is_compressed: Whether it is compressed as a whole.
-        messages: How many messages it has by metadata.yaml, None where that does not tell.
+        messages: How many messages it has by metadata.yaml, None if unknown.
     """
 
     path: Path
@@ -57,7 +57,7 @@ def find_storage(path: Path) -> tuple[BagInfo | None, list[StorageFile], list[Lo
         of the folder is missing or could not be read.
 
     Raises:
-        SourceError: There is no storage file, or the disk does not give it.
+        SourceError: There is no storage file, or cannot be read.
     """
     if not path.exists():
         raise SourceNotFoundError(path)
@@ -99,8 +99,7 @@ def _info(folder: Path, losses: list[Loss]) -> BagInfo | None:
 
 def unreadable(name: str, error: SourceError, messages: int | None) -> Loss:
     """A file of which nothing can be read."""
-    problem = str(error).removeprefix(f"{error.path}: ").removesuffix(SALVAGE_REMEDY)
-    return Loss(name, None, None, problem.rstrip(" .;"), messages)
+    return Loss(name, None, None, error.problem, messages)
 
 
 def _names(folder: Path, info: BagInfo | None, losses: list[Loss]) -> Sequence[str]:
@@ -113,7 +112,9 @@ def _names(folder: Path, info: BagInfo | None, losses: list[Loss]) -> Sequence[s
     others = unlisted_storage(folder, listed)
     if info:
         for name in sorted(others, key=_number):
-            losses.append(Loss(name, None, None, f"is not listed in {METADATA_FILE}; was read", 0))
+            losses.append(
+                Loss(name, None, None, f"is not listed in {METADATA_FILE}, but was read", 0)
+            )
     found = [name for name in listed if (folder / name).is_file()]
     return sorted([*found, *others], key=_number) if others else found
 
@@ -149,7 +150,7 @@ class Rosbag2Salvage(Salvage):
             long as it is read; the system's temporary folder by default.
 
     Raises:
-        SourceError: There is no storage file, or the disk does not give it.
+        SourceError: There is no storage file, or cannot be read.
     """
 
     format: Format = "rosbag2"
@@ -178,7 +179,7 @@ class Rosbag2Salvage(Salvage):
                 self._channels.take_over(number, reader)
         if self._readers and self._readers[0] is None:
             # Its channels are wanted before anything is read: keep it until it was.
-            with contextlib.suppress(SourceError):  # it is told when it is read
+            with contextlib.suppress(SourceError):  # it is reported when it is read
                 self._first_copy = self._unpacked.enter_context(self._decompressed(0))
                 self._first_tables = self._first_copy.tables
                 self._channels.take_over(0, self._first_copy)
@@ -205,7 +206,7 @@ class Rosbag2Salvage(Salvage):
         return readers
 
     def _storage_reader(self, file: StorageFile) -> Storage | None:
-        """The reader of a storage file; None where it must be decompressed first."""
+        """The reader of a storage file; None if it must be decompressed first."""
         is_whole = self._info is not None and self._info.compression == "message"
         is_listed_so = self._info is not None and self._info.storage == "mcap"
         if is_listed_so or ".mcap" in file.path.suffixes or is_mcap(file.path, is_compressed=False):
@@ -296,7 +297,7 @@ class Rosbag2Salvage(Salvage):
         lost = [loss for number in sorted(found) for loss in found[number]]
         losses += bounded([*self._missing, *lost])
         if losses and not self._given and not self.channels:
-            raise SourceError(self.path, f"holds no message that can be read: {losses[-1].problem}")
+            raise SourceError(self.path, f"holds no readable message: {losses[-1].problem}")
 
     def _file_records(self, number: int, found: dict[int, Sequence[Loss]]) -> Iterator[Record]:
         try:

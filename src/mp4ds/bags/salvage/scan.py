@@ -25,7 +25,7 @@ class ByteStream(Protocol):
     """What a window is over: a file, or the content of a compressed one."""
 
     def read(self, length: int, /) -> bytes:
-        """Read so many bytes; fewer at the end only."""
+        """Read that many bytes; fewer at the end only."""
         ...
 
     def close(self) -> None:
@@ -44,7 +44,7 @@ class Window:
 
     Attributes:
         offset: Byte at which the window begins.
-        size: Bytes of the whole file, None where it is not known.
+        size: Bytes of the whole file, None if unknown.
     """
 
     def __init__(
@@ -85,12 +85,12 @@ class Window:
 
     @property
     def problem(self) -> str:
-        """Why the content ended before the file did, a phrase; empty where it did not."""
+        """Why the content ended before the file did, a phrase; empty if it did not."""
         return str(getattr(self._source, "problem", ""))
 
     @property
     def left(self) -> int | None:
-        """Bytes before the reader, None where that is not known."""
+        """Bytes before the reader, None if unknown."""
         if self.size is not None:
             return max(0, self.size - self.offset)
         return len(self._data) - self._at if self._ended else None
@@ -99,7 +99,7 @@ class Window:
         """The next bytes, fewer at the end only. Reads what is there, whatever is asked for.
 
         Raises:
-            SourceError: The disk does not give them.
+            SourceError: They cannot be read.
         """
         if len(self._data) - self._at < length and not self._ended:
             self._fill(length)
@@ -122,7 +122,7 @@ class Window:
         self._data, self._at = b"".join(pieces), 0
 
     def skip(self, length: int) -> None:
-        """Go on by so many bytes, which may be more than were looked at."""
+        """Continue by that many bytes, which may be more than were looked at."""
         while length > 0:
             step = min(length, len(self._data) - self._at) or len(self.peek(min(length, BLOCK)))
             if not step:
@@ -132,7 +132,7 @@ class Window:
             length -= step
 
     def look(self, distance: int, length: int) -> bytes | None:
-        """Bytes far ahead, without reading up to them; None where that cannot be done."""
+        """Bytes far ahead, without reading up to them; None if that cannot be done."""
         if self._ended or distance + length <= len(self._data) - self._at:
             return bytes(self.peek(distance + length)[distance:])
         if self.size is None:
@@ -163,7 +163,7 @@ class Window:
 # ---------------------------------------------------------------- scan
 
 MAX_UNPROVEN = 64 * 2**20
-"""Bytes of a record that is taken for one though no other record follows it."""
+"""Bytes of a record that is taken as one though no other record follows it."""
 
 _KindT = TypeVar("_KindT")
 
@@ -190,7 +190,7 @@ class Framing(Protocol):
 
     Attributes:
         lookahead: So many bytes are enough to tell a record.
-        outer: Kinds of records that stand in no chunk.
+        outer: Kinds of records that are in no chunk.
     """
 
     lookahead: int
@@ -212,7 +212,7 @@ class Framing(Protocol):
         Args:
             view: Where to look.
             end: Byte before which it must begin.
-            is_followed: Whether a record, or the end, stands at a byte of the view or past it.
+            is_followed: Whether a record, or the end, is at a byte of the view or past it.
             kinds: Only records of these kinds; None for all.
         """
         ...
@@ -243,10 +243,10 @@ class Scan:
             frame = self._framing.frame(view)
             if frame:
                 return frame
-            self.resync(self._window.offset, "what stands there is no record")
+            self.resync(self._window.offset, "no valid record here")
 
     def body(self, frame: RecordFrame[int]) -> bytes | None:
-        """Take a record. None where it is damaged; the scan then has gone on."""
+        """Take a record. None if it is damaged; the scan then has gone on."""
         if not self.is_proven(frame):
             self.resync(self._window.offset, self.cut_or_damaged(frame))
             return None
@@ -276,7 +276,7 @@ class Scan:
         return frame.size <= MAX_UNPROVEN or self.is_followed(frame.size)
 
     def is_followed(self, size: int) -> bool:
-        """Whether a record, or the end, stands after so many bytes."""
+        """Whether a record, or the end, is after that many bytes."""
         ahead = self._window.look(size, self._framing.lookahead)
         if ahead is None:
             return size <= 2**30  # a stream: so much is believed
@@ -299,7 +299,7 @@ class Scan:
         passed: int = 1,
         kinds: Collection[int] | None = None,
     ) -> None:
-        """Go on to the next record that shows beyond doubt.
+        """Continue to the next record that shows beyond doubt.
 
         Args:
             start: Where the damage begins.
@@ -346,8 +346,8 @@ class Unpacked(NamedTuple):
 
     Attributes:
         content: What came out, from its beginning.
-        used: Bytes of the data that belong to it, 0 where that does not show.
-        problem: What is wrong, a phrase; empty where nothing is.
+        used: Bytes of the data that belong to it, 0 if that does not show.
+        problem: What is wrong, a phrase; empty if nothing is.
         is_sound: Whether what came out is what went in, though some of it may be missing.
     """
 
@@ -375,7 +375,9 @@ def unpack(compression: str, data: memoryview, size: int) -> Unpacked:
     start = bytes(data[:4])
     found = next((name for magic, name in _MAGIC.items() if start.startswith(magic)), compression)
     if found not in _MACHINES:
-        return Unpacked(b"", 0, f"a chunk is compressed by {compression!r}, which is not known")
+        return Unpacked(
+            b"", 0, f"a chunk is compressed with {compression!r}, which is not supported"
+        )
     pieces: list[bytes] = []
     left = size + 1
     machine = _MACHINES[found]()

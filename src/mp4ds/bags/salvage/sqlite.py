@@ -36,7 +36,7 @@ from mp4ds.errors import Refused, SourceError
 from mp4ds.records import Channel, Message, Record, Schema
 
 _MAX_SMALL_ROW = 2**24
-_MAX_ROWS = 10**5  # of a table that is no table of messages
+_MAX_ROWS = 10**5  # of a table other than that of messages
 _MAX_DEPTH = 32
 _CACHED_LEAVES = 32
 
@@ -57,7 +57,7 @@ class Tree:
 
 
 class MessageRow:
-    """Where the values of a message stand in its row: times are ns."""
+    """Where the values of a message are in its row: times are ns."""
 
     __slots__ = ("blob", "size", "time", "topic_id")
 
@@ -139,7 +139,7 @@ class Database:
                     yield [row.rowid, *found]
 
     def payload(self, page: bytes, row: Row) -> bytes | None:
-        """All bytes of a row; None where they are not all there."""
+        """All bytes of a row; None if they are not all there."""
         if row.size > self.pages.all_bytes:
             return None
         pieces = [page[row.start : row.start + row.local]]
@@ -153,7 +153,7 @@ class Database:
             pieces.append(more[4 : 4 + min(left, room)])
             left -= room
             if (left > 0) != (number != 0):
-                return None  # the chain ends early, or goes on after its end
+                return None  # the chain ends early, or continues after its end
         return b"".join(pieces)
 
     def free_pages(self) -> set[int]:
@@ -235,7 +235,7 @@ def index_messages(database: Database, log: LossLog, expected: int | None) -> Me
 
     Args:
         database: The database.
-        log: Where pages that cannot be understood are put down.
+        log: Where pages that cannot be understood are recorded.
         expected: How many messages there should be, where something else tells.
     """
     pages = database.pages
@@ -343,7 +343,7 @@ def open_small_tables(path: Path, shown: Path) -> tuple[SqliteReader, str]:
 
     Returns:
         A reader that knows topics, definitions and tables, and is not to be asked for
-        messages; and why sqlite3 does not open the file, a phrase, empty where it does.
+        messages; and why sqlite3 does not open the file, a phrase, empty if it does.
 
     Raises:
         SourceError: The file is missing, empty, or unreadable.
@@ -444,7 +444,7 @@ def _plain(value: Value) -> Value:
 class SqliteSalvage(FileSalvage):
     """Reads what is there of one ``.db3`` file, page by page. See `SalvageReader`.
 
-    A transaction that was not finished is left out, one that stands in a write-ahead log is
+    A transaction that was not finished is left out, one that is in a write-ahead log is
     read from there; the files are not changed and not copied. Messages come by log time. Their
     places, 22 bytes each, are held in memory.
 
@@ -496,7 +496,7 @@ class SqliteSalvage(FileSalvage):
     def start(self) -> int | None:
         """The earliest log time, ns, where sqlite3 can tell it; else None."""
         if self._small.path != self.path:
-            return None  # its tables were made anew, without messages
+            return None  # its tables were recreated, without messages
         try:
             return self._small.start
         except SourceError:
@@ -546,7 +546,7 @@ class SqliteSalvage(FileSalvage):
         channel = self._channels.get(found.topic_id)
         try:
             if channel is None:
-                raise Refused(f"messages of topic id {found.topic_id}, of which no row tells")
+                raise Refused(f"messages of topic id {found.topic_id}, which has no row")
             data = self._payload(database, page, row, found, channel.topic)
         except Refused as lost:
             loss = log.lost_of_kind(str(lost), database.pages.offset(number), str(lost))
@@ -566,11 +566,11 @@ class SqliteSalvage(FileSalvage):
             raise Refused(f"messages of {topic} with a time before 1970")
         payload = database.payload(page, row) if row.size <= self._left else None
         if payload is None:
-            raise Refused(f"messages of {topic} of which pages are damaged or missing")
+            raise Refused(f"messages of {topic} with damaged or missing pages")
         self._left -= len(payload)
         data = payload[found.blob :]
         try:
             return self._decompress(data) if self._decompress else data
         except DamageError:
-            problem = f"messages of {topic} of which the compression is damaged"
+            problem = f"messages of {topic} whose compressed data is damaged"
             raise Refused(problem) from None

@@ -21,14 +21,14 @@ Value = int | float | str | bytes | None
 
 
 class Row(NamedTuple):
-    """A row of a table, of which only the beginning stands in its page.
+    """A row of a table, of which only the beginning is in its page.
 
     Attributes:
         rowid: Its key.
         start: Byte of the page where its payload begins.
         size: Bytes of the payload.
-        local: How many of these stand in the page.
-        overflow: Number of the page where it goes on, 0 where it does not.
+        local: How many of these are in the page.
+        overflow: Number of the page where it continues, 0 if it does not.
     """
 
     rowid: int
@@ -43,7 +43,7 @@ class Leaf(NamedTuple):
 
     Attributes:
         rows: Those that can be understood, in their order.
-        is_damaged: Whether there are others, or it is no page of rows at all.
+        is_damaged: Whether there are others, or it is not a page of rows at all.
     """
 
     rows: list[Row]
@@ -110,7 +110,7 @@ def _row(page: bytes, place: int, usable: int) -> Row | None:
 
 
 def local_bytes(size: int, usable: int) -> int:
-    """Bytes of a payload that stand in the page of its row."""
+    """Bytes of a payload that are in the page of its row."""
     if size <= usable - 35:
         return size
     least = (usable - 12) * 32 // 255 - 23
@@ -142,7 +142,7 @@ def children(page: bytes, header: int) -> tuple[list[tuple[int, int | None]], bo
 
 
 def serial_types(payload: bytes) -> tuple[list[int], int] | None:
-    """The types of a row's values, and where the values begin; None where it is no row."""
+    """The types of a row's values, and where the values begin; None if it is not a row."""
     try:
         size, at = varint(payload, 0)
         types: list[int] = []
@@ -155,7 +155,7 @@ def serial_types(payload: bytes) -> tuple[list[int], int] | None:
 
 
 def values(payload: bytes) -> list[Value] | None:
-    """All values of a row that is whole; None where it is no row."""
+    """All values of a row that is whole; None if it is not a row."""
     found = serial_types(payload)
     if found is None:
         return None
@@ -222,7 +222,7 @@ class Pages:
         size: Bytes of a page.
         usable: Bytes of a page that hold data.
         count: Pages that there are; the last may be cut short.
-        promised: Pages that there should be by the header; 0 where it does not tell.
+        promised: Pages that there should be by the header; 0 if it does not tell.
         pending: What a file beside the database holds of it, a phrase; empty for nothing.
 
     Raises:
@@ -378,7 +378,7 @@ class Pages:
                 place += size + 8
             start = -(-place // sector) * sector
         if found:
-            self.pending = f"a change that was not finished, which {path.name} takes back"
+            self.pending = f"an unfinished change, which {path.name} rolls back"
 
     def close(self) -> None:
         """Close the files."""
@@ -394,14 +394,14 @@ class Pages:
 
 
 def _number_of_rows(sample: bytes, size: int) -> int:
-    """How many rows stand in pages that are sound, if these have a size."""
+    """How many rows are in pages that are sound, if these have a size."""
     pages = (sample[start : start + size] for start in range(size, len(sample), size))
     leaves = (leaf_cells(page, 0, size) for page in pages)
     return sum(len(leaf.rows) for leaf in leaves if not leaf.is_damaged)
 
 
 def _wal_sums(order: str, data: bytes, sums: tuple[int, int]) -> tuple[int, int]:
-    """Go on with the checksum of a write-ahead log."""
+    """Continue with the checksum of a write-ahead log."""
     first, second = sums
     for left, right in struct.iter_unpack(f"{order}II", data):
         first = (first + left + second) & 0xFFFFFFFF

@@ -1,1 +1,1 @@
-"""Settings of encoders, tried on clips of a recording."""
+"""Compares encoder settings on clips of a recording."""

@@ -1,4 +1,4 @@
-"""The cameras of what is evaluated, and their clips as the encoder is given them."""
+"""The cameras to evaluate, and their clips as encoder input."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from mp4ds.video.planes import PlaneMaker, Planes, planes_in
 
 _SECOND = 1_000_000_000
 _VIDEOS = (".mp4", ".m4v", ".mov", ".yaml", ".yml")
-_AT_ONCE = 8  # frames of a dataset that are in memory
+_AT_ONCE = 8  # frames of a dataset in memory at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +66,10 @@ class EvaluatedCamera:
     Attributes:
         topic: Its topic, or the name of a video or folder.
         times: Log times of all its images, nanoseconds, sorted.
-        read: Images by number, which increase; those that hold none are left out.
-        is_jpeg: Whether its images are recorded as JPEG files, which ``mp4ds pack`` encodes anew
-            only if it is told to.
-        lossy: What took something from them before, if anything is known to.
+        read: Yields images by increasing number, without messages that hold none.
+        is_jpeg: Whether its images are recorded as JPEG files, which ``mp4ds pack`` re-encodes only
+            on request.
+        lossy: The lossy encoding they already went through, if known.
     """
 
     topic: str
@@ -87,12 +87,12 @@ class EvaluatedCamera:
 
 @dataclass
 class EvaluatedSource:
-    """What is to be evaluated. A context manager.
+    """A source to evaluate. A context manager.
 
     Attributes:
         path: Where it is.
-        cameras: Those that may be of use.
-        left_out: Topics of cameras that are not, and why.
+        cameras: Its usable cameras.
+        left_out: Topics of unusable cameras, and why.
     """
 
     path: Path
@@ -111,7 +111,7 @@ def open_source(path: Path | str, *, fps: float) -> EvaluatedSource:
     """Open a recording, a dataset, a video, or a folder of images.
 
     Args:
-        path: Where it is, or the URL of one that is no folder of images.
+        path: Where it is, or the URL of one that is not a folder of images.
         fps: Frames per second of a folder of images.
 
     Raises:
@@ -147,7 +147,7 @@ def _of_recording(reader: BagReader) -> tuple[list[EvaluatedCamera], dict[str, s
         if first is None or not len(own):
             left_out[channel.topic] = "has no images"
         elif kind_of(channel) is CodedFields and depends_on_others(channel, first):
-            left_out[channel.topic] = "holds video packets, which mp4ds pack copies"
+            left_out[channel.topic] = "has video packets, which `mp4ds pack` copies"
         else:
             cameras.append(_of_channel(reader, channel, own, _is_jpeg(first)))
     return cameras, left_out
@@ -193,7 +193,7 @@ def _of_dataset(dataset: Dataset) -> list[EvaluatedCamera]:
 
 
 def _of_frames(frames: Frames) -> EvaluatedCamera:
-    # a lossy video has been demosaiced already, and would not be the better for it twice
+    # a lossy video has already been demosaiced; doing it again would not help
     is_lossy = isinstance(frames, Stream) and frames.sidecar.profile != LOSSLESS
     form = "rgb" if is_lossy and ENCODINGS[frames.encoding].mosaic else "native"
     order = np.argsort(frames.log_times, kind="stable")
@@ -237,36 +237,36 @@ def _of_images(folder: Path, paths: Sequence[Path], fps: float) -> EvaluatedCame
             yield Shot(encoding, pixels, width, height, time, time)
 
     if len(paths) > 1 and times[1] == times[0]:
-        raise SourceError(folder, f"has no time between its images at {fps:g} frames per second")
+        raise SourceError(folder, f"leaves no time between its images at {fps:g} frames per second")
     return EvaluatedCamera(folder.resolve().name, times, read)
 
 
 # ---------------------------------------------------------------- clips
 
 _BLOCK = 2**20
-_DETAIL = (128, 96)  # columns and rows that are shown beside each other
-_MOST_PIXELS = 16  # samples: of less no scores are made
+_DETAIL = (128, 96)  # columns and rows shown side by side
+_MOST_PIXELS = 16  # samples: smaller frames are not scored
 
 
 @dataclass(frozen=True)
 class Clip:
-    """Frames of a camera as the encoder is given them, in a file beside.
+    """Frames of a camera as encoder input, in a separate file.
 
     Attributes:
         topic: Of the camera.
         encoding: ROS encoding of its images.
-        picture_format: Pixel format of their pictures, which tells how they are tagged.
+        picture_format: Pixel format of their pictures, which determines their tags.
         image_size: Width and height of an image.
         width: Columns of a frame, even.
         height: Rows of a frame, even.
         ticks: When each frame is shown, as in a packed video.
-        rate: Frames per second of the camera, or of the clip where it has fewer.
+        rate: Frames per second of the camera, or of the clip if lower.
         digest: Of the frames and ticks.
-        detail: x, y, width and height of the part that is shown.
-        detail_frame: Number of the frame that is shown.
+        detail: x, y, width and height of the detail shown.
+        detail_frame: Number of the frame shown.
         start: Log time of the first frame, seconds from the camera's first one.
-        source_frames: Images of the camera in all.
-        other_frames: Images between that are of another size or encoding, or unreadable.
+        source_frames: Total number of the camera's images.
+        other_frames: Images in between with another size or encoding, or unreadable.
     """
 
     topic: str
@@ -298,12 +298,12 @@ class Clip:
 
 
 def clip_to_json(clip: Clip) -> str:
-    """A clip but for its frames, as text."""
+    """A clip except for its frames, as text."""
     return json.dumps(asdict(clip))
 
 
 def clip_from_json(text: str) -> Clip:
-    """What `clip_to_json` was given."""
+    """The inverse of `clip_to_json`."""
     values = json.loads(text)
     for name in ("image_size", "ticks", "detail"):
         values[name] = tuple(values[name])
@@ -314,7 +314,7 @@ def clip_from_json(text: str) -> Clip:
 
 
 def chosen(times: NDArray[np.int64], origin: int, options: EvaluateOptions) -> list[int]:
-    """The images of a representative clip, or of that which was asked for.
+    """The images of a representative clip, or of the requested one.
 
     Args:
         times: Of a camera's images, nanoseconds, sorted.
@@ -339,17 +339,17 @@ def chosen(times: NDArray[np.int64], origin: int, options: EvaluateOptions) -> l
         last = int(np.searchsorted(times, begin + round(options.duration * _SECOND)))
     found = list(range(first, min(count, last)))
     if not found:
-        raise Refused("has no images in the time that was asked for")
+        raise Refused("has no images in the requested time")
     return found
 
 
 def chosen_at_rate(times: NDArray[np.int64], rate: float, frames: int) -> list[int]:
-    """Images from the middle of a camera's time, at fewer per second than it took.
+    """Images from the middle of a camera's recording, at a lower rate.
 
     Args:
         times: Nanoseconds, sorted, at least one.
         rate: Per second.
-        frames: How many at most.
+        frames: Maximum number.
     """
     period = _SECOND / rate
     start, end = int(times[0]), int(times[-1])
@@ -363,18 +363,18 @@ def chosen_at_rate(times: NDArray[np.int64], rate: float, frames: int) -> list[i
 
 
 def make_clip(camera: EvaluatedCamera, indices: list[int], rate: float | None, path: Path) -> Clip:
-    """Read frames, and write them as planes, one after the other.
+    """Read frames, and write them as planes, one after another.
 
     Args:
-        camera: Whose images to take.
+        camera: The camera.
         indices: Numbers of the images, increasing.
         rate: Frames per second.
-        path: The file to make of the planes; beside it the clip is described.
+        path: The file to make of the planes; the clip's description goes next to it.
 
     Raises:
-        Refused: The camera's images are of no use.
+        Refused: The camera's images are not usable.
         SourceError: The source is damaged.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     digest = xxhash.xxh3_128()
     clock = PresentationClock()
@@ -400,7 +400,7 @@ def make_clip(camera: EvaluatedCamera, indices: list[int], rate: float | None, p
                 if len(ticks) <= max(1, len(indices) // 2):
                     middle, number = planes, len(ticks) - 1
         if first is None or middle is None:
-            raise Refused("has no images that can be read in the time of its clip")
+            raise Refused("has no readable images in its clip")
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
@@ -434,16 +434,16 @@ def _layout_of(shot: Shot) -> Layout:
     encoding = ENCODINGS[shot.encoding]
     if encoding.lossy is None:
         raise Refused(
-            f"has {encoding.name} images, which are no light of 8 bits: mp4ds pack keeps them "
+            f"has {encoding.name} images, which are not 8-bit images: `mp4ds pack` keeps them "
             "lossless"
         )
     if min(shot.width, shot.height) < _MOST_PIXELS:
-        raise Refused(f"has images of {shot.width}x{shot.height}, too small to be scored")
+        raise Refused(f"has images of {shot.width}x{shot.height}, too small to score")
     return layout_for(encoding, lossless=False)
 
 
 def _detail(luma: NDArray[np.uint8]) -> tuple[int, int, int, int]:
-    """The part of a frame with most detail, at an even place."""
+    """The part of a frame with the most detail, at even coordinates."""
     rows, columns = luma.shape
     width, height = min(_DETAIL[0], columns), min(_DETAIL[1], rows)
     best, place = -1.0, (0, 0)
@@ -467,7 +467,7 @@ class ClipFile:
         path: The file that `make_clip` made.
 
     Raises:
-        SourceError: It is not whole.
+        SourceError: It is incomplete.
     """
 
     def __init__(self, path: Path) -> None:
@@ -476,11 +476,11 @@ class ClipFile:
         clip = self.clip
         size = clip.width * clip.height * 3 // 2
         if path.stat().st_size != size * clip.frames:
-            raise SourceError(path, "is not whole", "Remove the folder and evaluate again.")
+            raise SourceError(path, "is incomplete", "Remove the folder and evaluate again.")
         self._frames = np.memmap(path, np.uint8, "r", shape=(clip.frames, size))
 
     def fetch(self) -> None:
-        """Read all once, so that what follows does not wait for a disk or a network."""
+        """Read everything once, so that later reads do not wait for a disk or network."""
         with self._path.open("rb") as file:
             while file.read(_BLOCK):
                 pass
@@ -494,7 +494,7 @@ class ClipFile:
 
 
 def detail_of(planes: Planes, clip: Clip) -> Planes:
-    """The part of a frame that is shown."""
+    """The detail of a frame."""
     x, y, width, height = clip.detail
     luma = planes[0][y : y + height, x : x + width]
     u, v = (plane[y // 2 : (y + height) // 2, x // 2 : (x + width) // 2] for plane in planes[1:])
@@ -502,7 +502,7 @@ def detail_of(planes: Planes, clip: Clip) -> Planes:
 
 
 def clip_seconds(clip: Clip) -> float:
-    """How long the clip is shown, its last frame as long as the others."""
+    """Duration of the clip, its last frame as long as the others."""
     if clip.frames < 2:
         return 1 / (clip.rate or 1.0)
     ticks_per_second = _SECOND / NS_PER_TICK

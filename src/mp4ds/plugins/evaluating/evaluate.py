@@ -1,8 +1,8 @@
-"""Settings of encoders, tried on clips of a recording: quality, size and time.
+"""Compares encoder settings on clips of a recording: quality, size and time.
 
-Each camera gives a short clip, which is encoded as `mp4ds pack` would encode it with every
-setting of a grid, decoded, and compared with what the encoder was given. What was measured is
-kept in the folder of the evaluation, so that the same call goes on where it was interrupted.
+A short clip of each camera is encoded as `mp4ds pack` would, with every setting of a grid, decoded,
+and compared with the encoder's input. Results are kept in the evaluation's folder, so that the same
+call resumes where it was interrupted.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from mp4ds.video.encoder import check_hardware
 from mp4ds.video.libvmaf import VMAF_MODEL, Ffmpeg, find_ffmpeg
 from mp4ds.video.scores import largest_crf
 
-_NEAR = 1.05  # rates that differ by less are the same
+_NEAR = 1.05  # rates that differ by less count as equal
 _SHORT = 30  # frames
 _MODEL_ROWS = 1080
 
@@ -69,13 +69,13 @@ class CameraTrial:
     """The trial of one camera.
 
     Args:
-        camera: Which.
-        name: Of its files.
+        camera: The camera.
+        name: Name for its files.
         options: How.
         grid: What to try.
         trials: What runs it.
         work: Folder for clips.
-        report: Told when something was done.
+        report: Called when something was done.
     """
 
     def __init__(
@@ -107,8 +107,8 @@ class CameraTrial:
             origin: Log time at which the source begins, nanoseconds.
 
         Raises:
-            Refused: The camera's images are of no use.
-            ScoringError: Nothing could be tried.
+            Refused: The camera's images are not usable.
+            ScoringError: No setting could be tried.
         """
         self._tell("reading")
         place = self._clip(chosen(self._camera.times, origin, self._options), self._camera.rate)
@@ -180,41 +180,44 @@ class CameraTrial:
         target, options = self._target, self._options
         if self._camera.lossy:
             self._notes.append(
-                f"its images are lossy already ({self._camera.lossy}): scores tell how near to "
-                "these a setting comes, not to what the camera saw"
+                f"its images are already lossy ({self._camera.lossy}): scores measure the "
+                "distance from these, not from what the camera saw"
             )
         if reachable < target.score:
             self._notes.append(
-                f"the clip beside itself has {target.metric} {reachable + CEILING_MARGIN:.2f}: "
-                f"the target is {CEILING_MARGIN} less, {reachable:.2f} instead of {target.score:g}"
+                f"the clip scored against itself has {target.metric} "
+                f"{reachable + CEILING_MARGIN:.2f}, so the target is {CEILING_MARGIN} below that, "
+                f"{reachable:.2f} instead of {target.score:g}"
             )
         if all(score_of(cell, target) < reachable for cell in cells):
             best = max(cells, key=lambda cell: score_of(cell, target))
             self._notes.append(
-                f"no setting reaches {target.metric} {reachable:.2f}; the best one is "
-                f"{best.setting.name} with {score_of(best, target):.2f}: try a smaller --crf"
+                f"no setting reaches {target.metric} {reachable:.2f}; the best is "
+                f"{best.setting.name} with {score_of(best, target):.2f}: try a lower --crf"
             )
         if clip.other_frames:
             self._notes.append(
-                f"{clip.other_frames} images within the clip are of another size or encoding, or "
-                "cannot be read, and are left out of it"
+                f"{clip.other_frames} images in the clip have a different size or encoding, or "
+                "cannot be read, and are left out"
             )
         if self._camera.is_jpeg:
-            self._notes.append("was recorded as JPEG files, which mp4ds pack --transcode encodes")
+            self._notes.append(
+                "was recorded as JPEG files, which `mp4ds pack --transcode` re-encodes"
+            )
         if clip.frames < _SHORT:
-            self._notes.append(f"a clip of {clip.frames} frames tells little: give more --frames")
+            self._notes.append(f"a clip of {clip.frames} frames says little: give more --frames")
         if clip.height > _MODEL_ROWS and "vmaf" in cells[0].scores:
             self._notes.append(
-                f"{VMAF_MODEL} is a model of {_MODEL_ROWS} rows; it is used for {clip.height}, "
-                "too, and not the one for 4K, so that cameras compare"
+                f"{VMAF_MODEL} is made for {_MODEL_ROWS} rows; it is used for {clip.height} rows "
+                "too, instead of the 4K model, so that cameras are comparable"
             )
         if options.jobs > 1 or options.cluster:
-            self._notes.append("times are those of settings that were tried side by side")
+            self._notes.append("times were measured with several settings running at once")
         machines = sorted({cell.machine for cell in cells} - {""})
         if len(machines) > 1:
             self._notes.append(
-                f"times are those of {len(machines)} machines, {', '.join(machines)}, and compare "
-                "as far as these are alike"
+                f"times were measured on {len(machines)} machines, {', '.join(machines)}, and are "
+                "comparable only if these are alike"
             )
 
     # ------------------------------------------------------------ rates
@@ -224,7 +227,9 @@ class CameraTrial:
         for rate in sorted(set(self._options.rates)):
             own = self._camera.rate
             if own is None or rate > own * _NEAR:
-                self._notes.append(f"has no {rate:g} images per second: not tried at this rate")
+                self._notes.append(
+                    f"has fewer than {rate:g} images per second: not tried at this rate"
+                )
                 continue
             self._tell(f"looking for the crf at {rate:g} Hz")
             indices = chosen_at_rate(self._camera.times, rate, self._options.frames)
@@ -276,7 +281,7 @@ class CameraTrial:
     def _data_set(self) -> DataSet | None:
         rate = self._camera.rate
         if rate is None:
-            self._notes.append("has no rate, so that nothing is said of hours of it")
+            self._notes.append("has no frame rate, so no storage estimate is given")
             return None
         return DataSet(self._options.streams or 1, self._options.hours or 1.0, rate)
 
@@ -290,10 +295,10 @@ class CameraTrial:
 
 
 def _measured(found: dict[Setting | None, Found], setting: Setting | None) -> dict[str, Any]:
-    """What was measured with a setting.
+    """The measurements of a setting.
 
     Raises:
-        ScoringError: Nothing was; says why.
+        ScoringError: There are none; says why.
     """
     values = found[setting]
     if isinstance(values, Failure):
@@ -305,7 +310,7 @@ def _measured(found: dict[Setting | None, Found], setting: Setting | None) -> di
 
 _FOLDERS = ("cells", "pictures", "plots")
 _WORK = "work-"
-_NOTE_NAME = "mp4ds_evaluation.json"  # in folders that an evaluation has made
+_NOTE_NAME = "mp4ds_evaluation.json"  # marks folders made by an evaluation
 
 
 def evaluate(
@@ -315,28 +320,28 @@ def evaluate(
     output: Path | str | None = None,
     progress: Callable[[EvaluateProgress], None] | None = None,
 ) -> Evaluation:
-    """Try a grid of encoder settings on clips of a recording's cameras.
+    """Compare a grid of encoder settings on clips of a recording's cameras.
 
     Args:
         source: A bag, rosbag2 folder, MCAP, dataset, video, or folder of images; or a URL.
         options: How.
-        output: Folder of the results; None: ``NAME_evaluation`` in the current folder. Results
-            that are there already are used.
+        output: Folder of the results; None: ``NAME_evaluation`` in the current folder. Existing
+            results are reused.
         progress: Called when something was done.
 
     Returns:
-        What was found; the folder has it as tables, plots and a page.
+        The results; the folder has them as tables, plots and a page.
 
     Raises:
         SourceError: The source cannot be read, or has no camera that could be tried.
         OptionError: An option is wrong.
-        HardwareError: An encoder is asked for that this machine has not.
-        TargetError: The folder may not be used.
-        ScoringError: There is no libvmaf, and the target is one of VMAF; or no setting could be
+        HardwareError: A requested encoder is not available on this machine.
+        TargetError: The folder cannot be used.
+        ScoringError: The target is a VMAF score but libvmaf is missing; or no setting could be
             tried.
-        ClusterError: The cluster does not answer, or was lost; what was measured is kept.
+        ClusterError: The cluster does not respond, or was lost; results so far are kept.
         RemoteError: A store or web server fails.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     chosen = options or EvaluateOptions()
     check_options(chosen)
@@ -376,7 +381,7 @@ def _ffmpeg(target: ScoreGoal) -> Ffmpeg | None:
     except ScoringError as error:
         if target.metric == "vmaf":
             raise ScoringError(
-                f"{error} Or give a target of another metric, such as `target` psnr_y=42."
+                f"{error} Or choose another metric, such as `target` psnr_y=42."
             ) from None
         return None
 
@@ -399,10 +404,10 @@ def _is_evaluation(path: Path) -> bool:
 
 @contextmanager
 def _work_in(folder: Path) -> Iterator[Path]:
-    """A folder for what is not kept, within that of the evaluation.
+    """A folder for temporary files, inside that of the evaluation.
 
-    It has a new name each time: workers of a cluster may still be at a trial of a run that was
-    interrupted, and must not take another clip for theirs.
+    It has a new name each time: cluster workers may still be running a trial of an interrupted run,
+    and must not mistake another clip for theirs.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_synced(folder / _NOTE_NAME, json.dumps({"mp4ds": __version__}).encode())
@@ -413,7 +418,7 @@ def _work_in(folder: Path) -> Iterator[Path]:
 
 
 def _origin(source: EvaluatedSource) -> int:
-    """Log time at which the source begins, as far as its cameras tell, nanoseconds."""
+    """Log time at which the source begins, judging by its cameras, nanoseconds."""
     return min((int(camera.times[0]) for camera in source.cameras if len(camera.times)), default=0)
 
 

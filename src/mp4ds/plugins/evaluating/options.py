@@ -1,4 +1,4 @@
-"""What an evaluation is asked for, and the grid of settings that it comes to."""
+"""The options of an evaluation, and the resulting grid of settings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mp4ds.video.codecs import AV1, HARDWARE, LOSSY_GOP, MAX_CRF, check_codec
 from mp4ds.video.scores import METRICS
 
 ENCODER_NAMES = {"svtav1": "av1", "x264": "h264", "x265": "h265"}
-"""Names of the encoders -> of the codecs, as `mp4ds pack` takes them."""
+"""Encoder names -> codec names of `mp4ds pack`."""
 
 _DEFAULT_PRESETS = {
     **dict.fromkeys(AV1, ("6", "8")),
@@ -28,12 +28,12 @@ _CRF = re.compile(r"([0-9]{1,2})(?::([0-9]{1,2})(?::([0-9]{1,2}))?)?")
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """How a clip is encoded, in the words of ``mp4ds pack``.
+    """How to encode a clip, in the terms of ``mp4ds pack``.
 
     Attributes:
         codec: ``av1``, ``av1-10bit``, ``h264``, ``h265``, or an encoder of the hardware, such as
             ``h264-nvenc``.
-        preset: Of its encoder; empty where it has none.
+        preset: Of its encoder; empty if it has none.
         crf: Constant rate factor.
         gop: Most frames between key frames.
     """
@@ -45,12 +45,12 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """Short, and different for each of a grid."""
+        """A short name, unique within a grid."""
         return " ".join(filter(None, (self.codec, self.preset, f"crf {self.crf}")))
 
     @property
     def pack_options(self) -> str:
-        """The options of ``mp4ds pack`` that encode so."""
+        """The corresponding options of ``mp4ds pack``."""
         preset = f" --preset {self.preset}" if self.preset else ""
         gop = f" --gop {self.gop}" if self.gop != LOSSY_GOP else ""
         return f"--quality crf={self.crf} --codec {self.codec}{preset}{gop}"
@@ -58,11 +58,11 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class ScoreGoal:
-    """The score that a setting is to reach.
+    """The score that a setting has to reach.
 
     Attributes:
         metric: One of `mp4ds.video.scores.METRICS`.
-        score: What its mean over the frames is to be.
+        score: Required mean over the frames.
     """
 
     metric: str = "vmaf"
@@ -76,7 +76,7 @@ def _rates(text: str) -> tuple[float, ...]:
     try:
         return tuple(float(word) for word in parse_words(text))
     except ValueError:
-        raise OptionError(f"`rates` {text!r} is no list of numbers, such as 2,5,10.") from None
+        raise OptionError(f"`rates` {text!r} is not a list of numbers, such as 2,5,10.") from None
 
 
 @dataclass(frozen=True)
@@ -84,49 +84,53 @@ class EvaluateOptions(Options):
     """How to evaluate."""
 
     codecs: Sequence[str] = option(
-        "Of svtav1, x264 and x265, with commas between; or as `mp4ds pack` calls them.",
+        "Comma-separated: svtav1, x264, x265, or codec names of `mp4ds pack`.",
         ("svtav1", "x264", "x265"),
         parse=parse_words,
         default_text="svtav1,x264,x265",
     )
     crf: Sequence[str] = option(
-        "Such as 16:25, 16:25:3 or 16,20,24.",
+        "crf values to try, such as 16:25, 16:25:3 or 16,20,24.",
         ("16:25:3",),
         parse=parse_words,
         default_text="16:25:3",
     )
     presets: Sequence[str] = option(
-        "Such as 6,8,medium; each is tried with the codecs that have it.", (), parse=parse_words
+        "Presets, such as 6,8,medium; each is tried with the codecs that have it.",
+        (),
+        parse=parse_words,
     )
-    topics: Sequence[str] = option("Only cameras that match.", (), "-t", metavar="GLOB")
-    exclude: Sequence[str] = option("Leave out cameras that match.", (), "-x", metavar="GLOB")
+    topics: Sequence[str] = option("Only matching cameras.", (), "-t", metavar="GLOB")
+    exclude: Sequence[str] = option("Leave out matching cameras.", (), "-x", metavar="GLOB")
     start: float | None = option(
-        "Where the clips begin; from the middle by default.", metavar="SECONDS"
+        "Where the clips begin; default: clips from the middle.", metavar="SECONDS"
     )
-    duration: float | None = option("Of the clips, instead of `frames`.", metavar="SECONDS")
+    duration: float | None = option("Length of the clips, instead of `frames`.", metavar="SECONDS")
     frames: int = option("Of a clip.", 150, least=1)
-    fps: float = option("Of a folder of images.", 30.0)
-    target: str = option("The score to reach: vmaf, psnr_y ... or ssim.", "vmaf=99.5")
+    fps: float = option("Frame rate of a folder of images.", 30.0)
+    target: str = option("Score to reach, such as vmaf=99.5, psnr_y=42 or ssim=0.98.", "vmaf=99.5")
     rates: Sequence[float] = option(
-        "Such as 2,5,10,20,30,60: the crf that reaches the target at these rates.",
+        "Also find the crf that reaches the target at these frame rates, such as 2,5,10,20,30,60.",
         (),
         metavar="HZ",
         parse=_rates,
     )
-    streams: int | None = option("Cameras of a data set, whose size is told.", least=1)
-    hours: float | None = option("How long they record.")
-    gop: int = option("Most frames from a key frame to the next.", LOSSY_GOP, least=1, most=100_000)
+    streams: int | None = option("Number of cameras to estimate a dataset's size for.", least=1)
+    hours: float | None = option("Hours of recording to estimate it for.")
+    gop: int = option("Maximum key frame interval in frames.", LOSSY_GOP, least=1, most=100_000)
     threads: int | None = option(
-        "Of an encoder; all cores by default, one on a cluster.", least=1, most=1024
+        "Threads per encoder; default: all cores, or one on a cluster.", least=1, most=1024
     )
-    jobs: int = option("Settings at a time; 1 for true times.", 1, "-j", least=1, most=1024)
+    jobs: int = option(
+        "Settings tried in parallel; use 1 for accurate times.", 1, "-j", least=1, most=1024
+    )
     cluster: str | None = cluster()
 
     @property
     def encoder_threads(self) -> int:
         """Threads of an encoder."""
         if self.cluster:
-            return self.threads or 1  # its workers have a core each
+            return self.threads or 1  # its workers have one core each
         return self.threads or max(1, (os.cpu_count() or 1) // self.jobs)
 
     @property
@@ -134,17 +138,17 @@ class EvaluateOptions(Options):
         """The score to reach.
 
         Raises:
-            OptionError: `target` is none.
+            OptionError: `target` is not valid.
         """
         return parse_target(self.target)
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """What is tried.
+    """The settings to try.
 
     Attributes:
-        presets: Of each codec, in the order that was asked for.
+        presets: Of each codec, in the requested order.
         crfs: Increasing.
         gop: Most frames between key frames.
     """
@@ -165,18 +169,18 @@ class Grid:
 
 
 def grid_of(options: EvaluateOptions) -> Grid:
-    """The grid that was asked for.
+    """The requested grid.
 
     Raises:
         OptionError: There is no such codec, preset or crf, or too many of them.
     """
     codecs = list(dict.fromkeys(map(_codec, options.codecs)))
     if not codecs:
-        raise OptionError("`codecs` names none.")
+        raise OptionError("`codecs` is empty.")
     grid = Grid(_presets(codecs, options.presets), parse_crfs(options.crf), options.gop)
     if not 0 < len(grid.settings()) <= _MOST_CELLS:
         raise OptionError(
-            f"{len(grid.settings())} settings are to be tried; give `codecs`, `presets` and `crf` "
+            f"{len(grid.settings())} settings were asked for; give `codecs`, `presets` and `crf` "
             f"that make 1 to {_MOST_CELLS}."
         )
     return grid
@@ -198,7 +202,7 @@ def _presets(codecs: Sequence[str], asked: Sequence[str]) -> dict[str, tuple[str
         found[codec] = own or _DEFAULT_PRESETS[codec]
     for preset in asked:
         if not any(preset in own for own in found.values()):
-            raise OptionError(f"`presets` {preset!r} is none of {', '.join(codecs)}.")
+            raise OptionError(f"`presets` {preset!r} is not a preset of {', '.join(codecs)}.")
     return found
 
 
@@ -214,7 +218,7 @@ def parse_crfs(texts: Sequence[str]) -> tuple[int, ...]:
     """The values of ``18``, ``16:25`` and ``16:25:3``.
 
     Raises:
-        OptionError: One is none of these.
+        OptionError: One is not valid.
     """
     found: set[int] = set()
     for text in texts:
@@ -223,20 +227,22 @@ def parse_crfs(texts: Sequence[str]) -> tuple[int, ...]:
             None, None, None
         )  # fmt: skip
         if first is None or step == 0:
-            raise OptionError(f"`crf` {text!r} is none. Give one such as 18, 16:25 or 16:25:3.")
+            raise OptionError(
+                f"`crf` {text!r} is not valid. Use a value such as 18, 16:25 or 16:25:3."
+            )
         found.update(range(first, (first if last is None else last) + 1, step or 1))
     if not found or min(found) < 1 or max(found) > max(MAX_CRF.values()):
         raise OptionError(
-            f"`crf` {', '.join(texts)} has values beyond 1 to {max(MAX_CRF.values())}."
+            f"`crf` {', '.join(texts)} has values outside 1 to {max(MAX_CRF.values())}."
         )
     return tuple(sorted(found))
 
 
 def parse_target(text: str) -> ScoreGoal:
-    """The target of ``vmaf=99.5``, ``psnr_y=42`` or ``ssim=0.98``; a number alone is of VMAF.
+    """The target of ``vmaf=99.5``, ``psnr_y=42`` or ``ssim=0.98``; a bare number means VMAF.
 
     Raises:
-        OptionError: It is none.
+        OptionError: It is not valid.
     """
     metric, has_metric, score = text.rpartition("=")
     metric = metric if has_metric else "vmaf"
@@ -246,7 +252,7 @@ def parse_target(text: str) -> ScoreGoal:
         value = -1.0
     if metric not in METRICS or not 0 < value <= 100:
         raise OptionError(
-            f"`target` {text!r} is none. Give METRIC=SCORE, such as vmaf=99.5; there are "
+            f"`target` {text!r} is not valid. Use METRIC=SCORE, such as vmaf=99.5; metrics: "
             f"{', '.join(METRICS)}."
         )
     return ScoreGoal(metric, value)
@@ -266,11 +272,11 @@ def check_options(options: EvaluateOptions) -> None:
     if options.start is not None and not 0 <= options.start < float("inf"):
         raise OptionError(f"`start` {options.start:g} is not a number of seconds.")
     if options.cluster and options.jobs != 1:
-        raise OptionError("`jobs` is for this machine; how many a `cluster` tries is up to it.")
+        raise OptionError("`jobs` is for this machine; a `cluster` decides how many run at once.")
     parse_target(options.target)
 
 
 def first_guess(codec: str, rate: float | None) -> int:
-    """A crf to begin the search for a target with."""
+    """The crf at which to start the search for a target."""
     crf, _ = visual_setting(rate)
     return crf if codec in AV1 else crf - 2

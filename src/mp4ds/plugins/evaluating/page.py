@@ -1,4 +1,4 @@
-"""The files that tell what an evaluation found: tables, plots, and one page."""
+"""The files of an evaluation's results: tables, plots, and one page."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ COSTS = {
     "bitrate": ("kbps", "kbit/s", "quality against bitrate"),
     "time": ("encode_cpu_seconds", "CPU seconds per frame", "quality against time"),
 }
-"""Of each plot what a setting costs, how that is called, and its title."""
+"""For each plot: the cost of a setting, its label, and the plot's title."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Axis:
-    """Where figures are drawn.
+    """How values map to pixels.
 
     Attributes:
-        low: The least figure.
-        high: The greatest one.
-        begin: Place of the least one, pixels.
-        end: Place of the greatest one, pixels.
-        is_log: Whether equal quotients are equally far apart.
+        low: The lowest value.
+        high: The highest value.
+        begin: Position of the lowest value, pixels.
+        end: Position of the highest value, pixels.
+        is_log: Whether the scale is logarithmic.
     """
 
     low: float
@@ -53,7 +53,7 @@ class _Axis:
     is_log: bool
 
     def at(self, value: float) -> float:
-        """Place of a figure."""
+        """Position of a value."""
         low, high = self.low, self.high
         if self.is_log:
             low, high, value = math.log(low), math.log(high), math.log(value)
@@ -118,7 +118,7 @@ def plot(camera: CameraEvaluation, kind: str) -> list[Shape]:
     shapes.append(
         Line([(SIZE[0] - _RIGHT + 11, legend), (SIZE[0] - _RIGHT + 25, legend)], _FRONT, 6)
     )
-    shapes.append(Text((SIZE[0] - _RIGHT + 30, legend), "none is better"))
+    shapes.append(Text((SIZE[0] - _RIGHT + 30, legend), "Pareto front"))
     return shapes
 
 
@@ -176,8 +176,8 @@ code { background: #f2f2f2; padding: 1px 4px; }
 """
 _CELL_HEADS = (
     *("codec", "preset", "crf", "kbit/s", "bytes/frame", "frames/s", "CPU s/frame"),
-    *("decoded frames/CPU s", "VMAF", "harmonic", "5 %", "least"),
-    *("PSNR Y", "PSNR Cb", "PSNR Cr", "SSIM", "whole, MB", "whole, min"),
+    *("decoded frames/CPU s", "VMAF", "harmonic", "5 %", "min"),
+    *("PSNR Y", "PSNR Cb", "PSNR Cr", "SSIM", "all, MB", "all, min"),
 )
 _STATISTICS = ("mean", "harmonic_mean", "percentile_5", "minimum")
 
@@ -203,14 +203,14 @@ def _head(result: Evaluation) -> Iterator[str]:
     source = escape(result.source.name)
     for item in result.recommended:
         yield (
-            f"<p class=first>The {escape(item.why)} that reaches the target of every camera "
-            f"(at least {item.score:.2f}): <code>mp4ds pack {source} -o DATASET "
+            f"<p class=first>The {escape(item.why)} that reaches every camera's target (score at "
+            f"least {item.score:.2f}): <code>mp4ds pack {source} -o DATASET "
             f"{escape(item.options)}</code></p>"
         )
     if not result.recommended:
-        yield "<p class=first>No setting that was tried reaches the target of every camera.</p>"
+        yield "<p class=first>None of the settings reaches every camera's target.</p>"
     for topic, reason in result.left_out.items():
-        yield f"<p>{escape(topic)} is left out: {escape(reason)}.</p>"
+        yield f"<p>{escape(topic)} was left out: {escape(reason)}.</p>"
     versions = ", ".join(f"{name} {version}" for name, version in result.versions.items())
     yield f"<p>Measured with {escape(versions)}.</p>"
 
@@ -240,10 +240,10 @@ def _facts(camera: CameraEvaluation) -> str:
     rate = f"{camera.rate:.2f} Hz, " if camera.rate else ""
     ceiling = ", ".join(f"{name} {value.mean:.2f}" for name, value in camera.ceiling.items())
     return (
-        f"{camera.encoding}, {width}x{height}, {rate}{camera.source_frames} images; a clip of "
-        f"{camera.frames} frames from {camera.start:.2f} s on, {camera.seconds:.2f} s long. "
-        f"The clip beside itself has {ceiling}: no setting has more. "
-        f"The target is {camera.target.metric} {camera.reachable:.2f}."
+        f"{camera.encoding}, {width}x{height}, {rate}{camera.source_frames} images; clip of "
+        f"{camera.frames} frames starting at {camera.start:.2f} s, {camera.seconds:.2f} s long. "
+        f"Scored against itself, the clip has {ceiling}: no setting can score higher. The target "
+        f"is {camera.target.metric} {camera.reachable:.2f}."
     )
 
 
@@ -291,7 +291,7 @@ def _score(cell: Cell, metric: str, statistic: str, digits: int) -> str:
 def _rates(camera: CameraEvaluation) -> Iterator[str]:
     if not camera.rates:
         return
-    yield f"<h3>The crf that reaches {camera.target.metric} {camera.target.score:g}</h3>"
+    yield f"<h3>crf that reaches {camera.target.metric} {camera.target.score:g}, by frame rate</h3>"
     heads = (
         *("Hz", "frames", "codec", "preset", "crf", "score", "ceiling", "bytes/frame"),
         *("s/frame", "kbit/s"),
@@ -339,8 +339,8 @@ def _storage(camera: CameraEvaluation) -> Iterator[str]:
 
 
 def _pictures(result: Evaluation, camera: CameraEvaluation) -> Iterator[str]:
-    yield "<h3>The same detail of each, twice enlarged</h3>"
-    shown = [("what the encoder was given", camera.ground_truth)]
+    yield "<h3>The same detail in each, enlarged twice</h3>"
+    shown = [("encoder input", camera.ground_truth)]
     for cell in camera.cells:
         score = _score(cell, camera.target.metric, "mean", 2)
         words = f"{cell.setting.name}: {camera.target.metric} {score}, {cell.kbps:.0f} kbit/s"
@@ -378,7 +378,7 @@ def write_files(result: Evaluation, options: EvaluateOptions) -> None:
         options: What was asked for.
 
     Raises:
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     folder = result.output
     write_synced(folder / "evaluation.csv", table(result).encode())

@@ -1,4 +1,4 @@
-"""What an evaluation found, and what the figures of each camera come to."""
+"""The results of an evaluation, and conclusions for each camera."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from mp4ds.video.scores import ScoreSummary
 
 @dataclass(frozen=True)
 class Cell:
-    """What one setting made of one clip.
+    """The results of one setting on one clip.
 
     Attributes:
         setting: How it was encoded.
-        encode_seconds: Time that encoding the clip took.
-        encode_cpu_seconds: CPU time that it took, of all threads.
-        decode_fps: Frames decoded in a second of CPU time.
+        encode_seconds: Time to encode the clip.
+        encode_cpu_seconds: CPU time of that, over all threads.
+        decode_fps: Frames decoded per second of CPU time.
         size: Bytes of the coded frames of the clip.
         frame_bytes: Bytes of a frame of a long video.
         kbps: Kilobits per second of a long video.
-        encode_fps: Frames encoded in a second.
+        encode_fps: Frames encoded per second.
         scores: Of the clip, by metric.
         picture: Name of the PNG file of its detail, in the folder of the evaluation.
         whole_bytes: Bytes of the camera's whole recording.
         whole_seconds: Time to encode the camera's whole recording.
-        machine: Name of that which took these times; empty where it was not kept.
+        machine: Name of the machine that measured the times; empty if unknown.
     """
 
     setting: Setting
@@ -59,13 +59,13 @@ class RateRow:
         rate: Frames per second.
         frames: Of the clip that was tried.
         setting: The largest crf that reaches the target.
-        reached: Whether it does; else it is the best there is.
+        reached: Whether it does; otherwise it is the best setting.
         score: Of the target's metric, mean.
         frame_bytes: Bytes of a frame of a long video.
         frame_seconds: Time to encode a frame.
         kbps: Kilobits per second.
-        ceiling: Score of the clip beside itself.
-        tried: Encodings that the search took.
+        ceiling: Score of the clip against itself.
+        tried: Number of encodings in the search.
     """
 
     rate: float
@@ -82,13 +82,13 @@ class RateRow:
 
 @dataclass(frozen=True, slots=True)
 class StorageRow:
-    """What one way of storing frames takes.
+    """The cost of one way of storing frames.
 
     Attributes:
         form: ``raw``, ``YUV 4:4:4``, ``RGB``, ``JPEG 90``, ``JPEG 75`` or a setting.
         frame_bytes: Bytes of a frame.
-        gigabytes: Of the data set that was asked for, units of 10^9 bytes.
-        days: To encode it here, one camera after the other; None for what is not encoded.
+        gigabytes: Size of the data set, in units of 10^9 bytes.
+        days: Time to encode it here, one camera after another; None if not encoded.
         cpu_days: CPU time of that.
     """
 
@@ -101,7 +101,7 @@ class StorageRow:
 
 @dataclass(frozen=True, slots=True)
 class DataSet:
-    """A data set whose size is told.
+    """A data set whose size is estimated.
 
     Attributes:
         streams: Cameras.
@@ -120,7 +120,7 @@ class DataSet:
 
     @property
     def described(self) -> str:
-        """In words."""
+        """A description in words."""
         cameras = f"{self.streams} camera{'s' * (self.streams != 1)}"
         hours = f"{self.hours:g} hour{'s' * (self.hours != 1)}"
         return f"{cameras} for {hours} at {self.rate:.2f} Hz"
@@ -134,7 +134,7 @@ class Recommendation:
         why: ``smallest`` or ``fastest``.
         setting: What to pack with.
         score: Mean of the target's metric.
-        options: The options of ``mp4ds pack`` that encode so.
+        options: The corresponding options of ``mp4ds pack``.
     """
 
     why: str
@@ -145,7 +145,7 @@ class Recommendation:
 
 @dataclass
 class CameraEvaluation:
-    """What was found of one camera.
+    """The results for one camera.
 
     Attributes:
         topic: Of its images.
@@ -155,19 +155,19 @@ class CameraEvaluation:
         rate: Images per second.
         frames: Of the clip.
         start: Seconds from the camera's first image at which the clip begins.
-        seconds: That the clip lasts.
-        source_frames: Images in all.
+        seconds: Duration of the clip.
+        source_frames: Total number of images.
         raw_bytes: Bytes of an image as recorded.
-        ceiling: Scores of the clip beside itself: no setting has better ones.
+        ceiling: Scores of the clip against itself, which no setting can exceed.
         target: The score to reach.
-        reachable: The same, or less where the ceiling is too near.
+        reachable: The same, or lower if the ceiling is too close.
         cells: By setting, in the order of the grid.
         recommended: The smallest and the fastest setting that reach the target; empty if none.
-        rates: By rate and preset; empty where not asked for.
-        data_set: Of which `storage` tells the size.
-        storage: What storing it takes, in several forms.
+        rates: By rate and preset; empty if not asked for.
+        data_set: The data set that `storage` is for.
+        storage: The cost of storing it, in several forms.
         ground_truth: Name of the PNG file of the clip's detail.
-        notes: What else is to be known.
+        notes: Anything else worth knowing.
     """
 
     topic: str
@@ -194,18 +194,18 @@ class CameraEvaluation:
 
 @dataclass
 class Evaluation:
-    """What was found of a recording.
+    """The results for a recording.
 
     Attributes:
-        source: What was evaluated.
+        source: The evaluated source.
         output: The folder with the results.
         cameras: In the order of their topics.
         left_out: Topics of cameras that were not evaluated, and why.
-        versions: Of what made the videos and the scores.
+        versions: Of the software that made the videos and scores.
         recommended: The smallest and the fastest setting that reach the targets of all cameras,
-            with the least score of them; empty if none.
-        tried: Settings that were tried now.
-        known: Settings whose results were there already.
+            with their lowest score; empty if none.
+        tried: Settings tried in this run.
+        known: Settings with existing results.
     """
 
     source: Path
@@ -220,12 +220,12 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True)
 class EvaluateProgress:
-    """Where an evaluation stands.
+    """Progress of an evaluation.
 
     Attributes:
-        camera: Topic at work.
-        what: What is being done.
-        done: Settings done of this camera; searches are not counted.
+        camera: Current topic.
+        what: Current activity.
+        done: Settings of this camera that are done, not counting searches.
         total: Settings of this camera.
     """
 
@@ -238,10 +238,10 @@ class EvaluateProgress:
 # ---------------------------------------------------------------- tables
 
 CEILING_MARGIN = 0.2
-"""Of VMAF: a target nearer to the ceiling than this cannot be told from noise."""
+"""In VMAF: a target closer to the ceiling than this is indistinguishable from noise."""
 
 Rated = tuple[Sequence[Cell], float]
-"""What was found of a camera, and the score that it is to reach."""
+"""The results for a camera, and the score to reach."""
 
 _JPEG_QUALITIES = (90, 75)
 _JPEG_FRAMES = 20
@@ -249,11 +249,11 @@ _DAY = 86_400
 
 
 def reachable_score(target: ScoreGoal, ceiling: float) -> float:
-    """The target, or less where the ceiling is too near.
+    """The target, or less if the ceiling is too close.
 
     Args:
-        target: What was asked for.
-        ceiling: Score of the clip beside itself.
+        target: The requested target.
+        ceiling: Score of the clip against itself.
     """
     return min(target.score, ceiling - CEILING_MARGIN) if target.metric == "vmaf" else target.score
 
@@ -268,10 +268,10 @@ def recommend(cameras: Sequence[Rated], target: ScoreGoal) -> list[Recommendatio
 
     Args:
         cameras: At least one.
-        target: Its metric is compared.
+        target: The target, whose metric is compared.
 
     Returns:
-        None where no setting does.
+        None if no setting does.
     """
     able = set.intersection(
         *(
@@ -286,7 +286,8 @@ def recommend(cameras: Sequence[Rated], target: ScoreGoal) -> list[Recommendatio
     def total(setting: Setting, figure: str) -> float:
         return sum(float(getattr(cell, figure)) for cell in cells if cell.setting == setting)
 
-    ordered = sorted(able, key=lambda setting: setting.name)  # so that ties have one outcome
+    # so that ties are resolved consistently
+    ordered = sorted(able, key=lambda setting: setting.name)
     found = []
     for why, figure in (("smallest", "frame_bytes"), ("fastest", "encode_cpu_seconds")):
         setting = min(ordered, key=lambda item, figure=figure: total(item, figure))  # type: ignore[misc]
@@ -296,12 +297,12 @@ def recommend(cameras: Sequence[Rated], target: ScoreGoal) -> list[Recommendatio
 
 
 def pareto(cells: Sequence[Cell], cost: Sequence[float], target: ScoreGoal) -> list[int]:
-    """Numbers of the cells than which none is both better and cheaper, the cheapest first.
+    """Indices of the Pareto-optimal cells, the cheapest first.
 
     Args:
         cells: Of one camera.
         cost: Of each cell.
-        target: Its metric is compared.
+        target: The target, whose metric is compared.
     """
     found: list[int] = []
     best = -np.inf
@@ -313,9 +314,9 @@ def pareto(cells: Sequence[Cell], cost: Sequence[float], target: ScoreGoal) -> l
 
 
 def storage(clip: Clip, path: Path, chosen: Cell, data_set: DataSet) -> list[StorageRow]:
-    """What the frames of a data set take in several forms.
+    """The cost of storing the frames of a data set, in several forms.
 
-    JPEG files are made of some of the clip's frames.
+    JPEG files are made from some of the clip's frames.
 
     Args:
         clip: Of the camera.

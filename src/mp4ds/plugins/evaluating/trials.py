@@ -1,4 +1,4 @@
-"""Settings tried on clips, each in a process of its own, and what was measured, kept."""
+"""Tries settings on clips, each in its own process, and keeps the measurements."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ from mp4ds.video.scores import Scorer, Scores, ScoreSummary
 from mp4ds.video.trial import encoder_bytes
 
 REFUSED = "refused"
-"""Key of a result that says why the encoder does not take such frames."""
+"""Key of a result that says why the encoder refused the frames."""
 
 _ENLARGED = 2
 _NO_VMAF = "none"
-_PROCESS_BYTES = 200 * 2**20  # the interpreter, libraries, and frames that are compared
+_PROCESS_BYTES = 200 * 2**20  # the interpreter, libraries, and frames being compared
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What a process is to do.
+    """The job of a process.
 
     Attributes:
         clip: File of the clip.
         result: File to make.
         picture: PNG file to make of the detail.
-        setting: How to encode; None: the clip is scored as it is, which is its ceiling.
+        setting: How to encode; None: score the clip against itself, which gives its ceiling.
         threads: Of the encoder and of libvmaf.
-        versions: What it is to be tried with; see `versions_of`.
+        versions: The versions to use; see `versions_of`.
     """
 
     clip: str
@@ -67,7 +67,7 @@ class Trial:
 
     @classmethod
     def from_json(cls, text: bytes) -> Trial:
-        """What `to_json` made."""
+        """The inverse of `to_json`."""
         values = json.loads(text)
         setting = values.pop("setting")
         return cls(setting=Setting(**setting) if setting else None, **values)
@@ -79,7 +79,7 @@ def command(task: tuple[str, ...]) -> list[str]:
 
 
 def run_task(job: str) -> None:
-    """Run a task on a worker of a cluster, in a process of its own as on this machine.
+    """Run a task on a cluster worker, in a separate process as on this machine.
 
     Args:
         job: The file of a `Trial`.
@@ -88,9 +88,7 @@ def run_task(job: str) -> None:
         Mp4dsError: It failed; says why.
     """
     if not Path(job).is_file():
-        raise Mp4dsError(
-            f"{job} is not there: all machines must share the folder of the evaluation."
-        )
+        raise Mp4dsError(f"{job} does not exist: all machines must share the evaluation's folder.")
     for outcome in ProcessEngine(command, 1).run([(job,)], lambda *_: None):
         if outcome.error is not None:
             raise Mp4dsError(outcome.error[1])
@@ -106,26 +104,26 @@ def task_bytes(clip: Clip, settings: Sequence[Setting | None], threads: int) -> 
     """
     size = clip.width, clip.height
     encoders = [encoder_bytes(_recipe(clip, item), *size, threads) for item in settings if item]
-    # what an encoder took is not all given back before frames are scored
+    # not all of an encoder's memory is released before frames are scored
     return _PROCESS_BYTES + max(encoders, default=0) + vmaf_bytes(*size, threads)
 
 
 def versions_of(ffmpeg: Ffmpeg | None) -> dict[str, str]:
-    """Versions of what makes videos and scores here: with others, results may be others.
+    """Versions of the software that makes videos and scores here: others may give other results.
 
     Args:
-        ffmpeg: What computes VMAF; None: nothing.
+        ffmpeg: Computes VMAF; None for no VMAF.
     """
     vmaf = ffmpeg.version if ffmpeg else _NO_VMAF
     return {**tool_versions(), "mp4ds": __version__, "vmaf": vmaf}
 
 
 def run(trial: Trial) -> None:
-    """Encode, decode, score, and write what was measured.
+    """Encode, decode, score, and write the measurements.
 
     Raises:
-        Mp4dsError: Other versions are installed here, or libvmaf failed.
-        OSError: The disk refused.
+        Mp4dsError: Different versions are installed here, or libvmaf failed.
+        OSError: It cannot be written.
     """
     ffmpeg = _ffmpeg(trial.versions)
     clip = ClipFile(Path(trial.clip))
@@ -153,10 +151,10 @@ def _write(path: Path, values: dict[str, Any]) -> None:
 
 
 def _ffmpeg(versions: dict[str, str]) -> Ffmpeg | None:
-    """What computes VMAF here.
+    """The ffmpeg that computes VMAF here.
 
     Raises:
-        Mp4dsError: Versions are not those that were asked for, or there is no libvmaf.
+        Mp4dsError: Versions differ from those requested, or libvmaf is missing.
     """
     ffmpeg = None if versions["vmaf"] == _NO_VMAF else find_ffmpeg()
     here = versions_of(ffmpeg)
@@ -166,7 +164,9 @@ def _ffmpeg(versions: dict[str, str]) -> Ffmpeg | None:
         if here.get(name) != version
     ]
     if others:
-        raise Mp4dsError(f"there are other versions: {', '.join(others)}. Install the same.")
+        raise Mp4dsError(
+            f"versions differ between machines: {', '.join(others)}. Install the same."
+        )
     return ffmpeg
 
 
@@ -181,7 +181,7 @@ def _recipe(clip: Clip, setting: Setting) -> Recipe:
 
 
 def _encoded(clip: ClipFile, recipe: Recipe, trial: Trial, video: Path) -> dict[str, Any]:
-    """Encode the clip as `mp4ds pack` does, and decode it; what that took."""
+    """Encode the clip as `mp4ds pack` does, and decode it; returns the cost."""
     facts, gop = clip.clip, trial.setting.gop if trial.setting else 1
     clip.fetch()
     wall, cpu = time.perf_counter(), time.process_time()
@@ -245,7 +245,7 @@ def _tell(values: dict[str, Any]) -> None:
 
 
 def _end_with_parent() -> None:
-    """Nobody waits for the result any more: what is written under a final name is whole."""
+    """Exit when nobody waits for the result any more: files with final names are complete."""
     while os.read(sys.stdin.fileno(), 4096):
         pass
     os._exit(1)
@@ -277,7 +277,7 @@ class Engines:
 
     Args:
         options: Of the evaluation.
-        most: Trials that there are at a time.
+        most: Maximum number of parallel trials.
 
     Raises:
         OptionError: There is no such cluster, or a package is missing.
@@ -325,7 +325,7 @@ class Failure:
     """A setting that could not be tried.
 
     Attributes:
-        setting: Which.
+        setting: The setting.
         sentence: Why.
     """
 
@@ -334,7 +334,7 @@ class Failure:
 
 
 Found = dict[str, Any] | Failure
-"""What was measured with a setting, or why nothing was."""
+"""The measurements of a setting, or why there are none."""
 
 
 @dataclass(frozen=True)
@@ -342,7 +342,7 @@ class ClipPlace:
     """A clip and where its frames are.
 
     Attributes:
-        clip: What is known of it.
+        clip: Its description.
         path: Its file.
         name: Of its camera, for names of files.
     """
@@ -356,10 +356,11 @@ class Trials:
     """The trials of one evaluation.
 
     Args:
-        folder: Where results are kept; in ``cells`` and ``pictures``.
-        work: Where files are that are not kept.
+        folder: Where results are kept, in ``cells`` and ``pictures``.
+        work: Folder for temporary files.
         engines: Run them.
-        versions: Of what makes videos and scores: with others, all is measured anew.
+        versions: Of the software that makes videos and scores; if they change, everything is
+            measured again.
         threads: Of an encoder.
     """
 
@@ -386,18 +387,19 @@ class Trials:
         settings: Sequence[Setting | None],
         on_done: Callable[[int], None] = lambda _: None,
     ) -> dict[Setting | None, Found]:
-        """Try settings on a clip, but for those whose results are there.
+        """Try settings on a clip, except for those with existing results.
 
         Args:
             place: The clip.
             settings: Each once; None scores the clip as it is.
-            on_done: Called with the number of settings that are done, None left out.
+            on_done: Called with the number of settings done, not counting None.
 
         Returns:
-            What was measured by setting, or why nothing was.
+            The measurements by setting, or why there are none.
 
         Raises:
-            ScoringError: The clip as it is could not be scored, so that the others are of no use.
+            ScoringError: The clip could not be scored against itself, which makes the others
+                useless.
             ClusterError: The cluster does not answer, or was lost.
         """
         found: dict[Setting | None, Found] = {}
@@ -421,15 +423,17 @@ class Trials:
         return found
 
     def _found(self, place: ClipPlace, setting: Setting | None, outcome: Outcome) -> Found:
-        """What became of a trial.
+        """The outcome of a trial.
 
         Raises:
-            ScoringError: It failed, and without it the others are of no use.
+            ScoringError: It failed, and the others are useless without it.
         """
         sentence = outcome.error[1] if outcome.error else ""
         if not sentence and not self._is_seen(place, setting):
             folder = self._folder / "cells"
-            sentence = f"its result is not seen in {folder}; all machines must share this folder."
+            sentence = (
+                f"its result did not appear in {folder}; all machines must share this folder."
+            )
         result = None if sentence else self._read(place, setting)
         if result is not None:
             self.tried += 1
@@ -473,13 +477,14 @@ class Trials:
         return f"pictures/{self._name(place, setting)}.png"
 
     def _read(self, place: ClipPlace, setting: Setting | None) -> Found | None:
-        """What was measured before, if that is whole."""
+        """Earlier measurements, if complete."""
         try:
             values = json.loads(self._result(place, setting).read_bytes())
             if REFUSED in values:
                 return Failure(setting, str(values[REFUSED]))
             scores = {name: ScoreSummary(**score) for name, score in values["scores"].items()}
-            figures = [values[name] for name in _MEASURED] if setting else []  # else not encoded
+            # otherwise not encoded
+            figures = [values[name] for name in _MEASURED] if setting else []
             figures += [figure for score in scores.values() for figure in asdict(score).values()]
             if not all(isinstance(figure, (int, float)) for figure in figures):
                 return None

@@ -1,4 +1,4 @@
-"""COLMAP: images, and a sparse model of cameras, and of poses where they are known."""
+"""COLMAP: images, and a sparse model of cameras, and of poses if known."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from mp4ds.plugins.exporting.motion import (
 )
 
 _MODEL = "sparse/0"
-_HALF_PIXEL = 0.5  # COLMAP counts from the corner of a pixel, ROS and OpenCV from its middle
+_HALF_PIXEL = 0.5  # COLMAP counts from the corner of a pixel, ROS and OpenCV from its centre
 
 
 def write(job: ExportJob) -> None:
     """Write the format."""
     source = job.source
-    poses = _poses(job)  # first: no frame is decoded for a topic that cannot be taken
+    poses = _poses(job)  # first: no frame is decoded if the topic is unsuitable
     cameras = that_png_holds(source.cameras, source.ledger)
     cameras = [of_different_times(camera, source.ledger) for camera in cameras]
     folder = job.path / _MODEL
@@ -50,13 +50,13 @@ def write(job: ExportJob) -> None:
         job.write_png_files(camera, f"images/{place}", [f"images/{file}" for file in files])
         calibration = camera.calibration
         if calibration is None:
-            job.note(f"{camera.topic}: it is not calibrated, and so is not in cameras.txt")
+            job.note(f"{camera.topic}: not calibrated, so it is not in cameras.txt")
             continue
         found = model_of(calibration)
         if found is None:
             job.note(
                 f"{camera.topic}: COLMAP has no model for distortion "
-                f"{calibration.distortion_model!r}, so that it is not in cameras.txt"
+                f"{calibration.distortion_model!r}, so it is not in cameras.txt"
             )
             continue
         hold_calibration(camera, source.ledger)
@@ -75,9 +75,9 @@ def write(job: ExportJob) -> None:
 
 
 def model_of(calibration: Calibration) -> tuple[str, list[float]] | None:
-    """COLMAP's camera model and its parameters; None where it has none.
+    """COLMAP's camera model and its parameters; None if it has none.
 
-    A model without the parameters that are all zero is the same, and taken where it is simpler.
+    If all extra parameters are zero, the simpler equivalent model is used.
     """
     k = calibration.k
     values = [k[0], k[4], k[2] + _HALF_PIXEL, k[5] + _HALF_PIXEL]
@@ -94,7 +94,7 @@ def model_of(calibration: Calibration) -> tuple[str, list[float]] | None:
 
 @dataclass(frozen=True)
 class PoseTrack:
-    """Poses of a body over time, by which those between two are told.
+    """Poses of a body over time, for interpolation.
 
     Attributes:
         times: Nanoseconds, increasing, shape (poses,).
@@ -106,7 +106,7 @@ class PoseTrack:
 
     @classmethod
     def of(cls, rows: Iterable[tuple[int, tuple[float, ...]]]) -> PoseTrack:
-        """The poses of rows by time; of those with one time the first."""
+        """The poses of rows by time; the first of several with the same time."""
         found = [*in_order(rows)]
         times = np.array([time for time, _ in found], np.int64)
         values = np.array([row for _, row in found], np.float64).reshape(-1, 7)
@@ -114,7 +114,7 @@ class PoseTrack:
         return cls(times, values[places])
 
     def at(self, time: int) -> Pose | None:
-        """The pose of a time, between those before and after it; None beyond the first and last."""
+        """The interpolated pose at a time; None outside the first and last."""
         after = int(np.searchsorted(self.times, time))
         if after < len(self.times) and self.times[after] == time:
             return pose_matrix(self.values[after, :3], self.values[after, 3:])
@@ -130,7 +130,7 @@ class PoseTrack:
 def _between(
     start: NDArray[np.float64], end: NDArray[np.float64], share: float
 ) -> NDArray[np.float64]:
-    """The rotation at a share of the shorter way from one quaternion to another."""
+    """The rotation at a fraction of the shorter way from one quaternion to another."""
     start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
     cosine = float(start @ end)
     if cosine < 0:
@@ -145,18 +145,18 @@ def _between(
 
 
 def _poses(job: ExportJob) -> Poses | None:
-    """The poses that were asked for.
+    """The requested poses.
 
     Raises:
-        OptionError: The topic is not there, of another type, or places no frame.
+        OptionError: The topic does not exist, has the wrong type, or names no child frame.
     """
     if not job.options.poses:
         return None
     poses = Poses(job.source.dataset, job.options.poses)
     if not poses.body:
         raise OptionError(
-            f"`poses` {poses.topic} does not say which frame it places, and a camera's pose "
-            "needs it. Give an Odometry or a TransformStamped."
+            f"`poses` {poses.topic} does not say whose pose it gives, which is needed for a "
+            "camera's pose. Use an Odometry or TransformStamped topic."
         )
     return poses
 
@@ -173,8 +173,8 @@ def _write_images(
             place = tree.pose(camera.frame_id, poses.body)
             if place is None:
                 job.note(
-                    f"{camera.topic}: no static transforms tell {camera.frame_id!r} in "
-                    f"{poses.body!r}, so that its images are not in images.txt"
+                    f"{camera.topic}: no static transforms connect {camera.frame_id!r} to "
+                    f"{poses.body!r}, so its images are not in images.txt"
                 )
                 continue
             missing = 0
@@ -191,9 +191,9 @@ def _write_images(
             if missing:
                 job.note(
                     f"{camera.topic}: {missing} of {len(camera)} images are before the first or "
-                    "after the last pose, and so are not in images.txt"
+                    "after the last pose, so they are not in images.txt"
                 )
     (job.path / _MODEL / "points3D.txt").write_text("# no points\n", encoding="utf-8")
     job.source.ledger.hold(poses.topic, len(track.times))
     job.places[f"{_MODEL}/images.txt"] = poses.topic
-    job.note(f"{poses.topic}: poses of images are told, between those that were recorded")
+    job.note(f"{poses.topic}: poses of images are interpolated between the recorded ones")

@@ -59,7 +59,7 @@ def write(job: ExportJob) -> None:
         _write_sensor(job.path / place, "imu", topic, pose, [])
         job.note(f"{topic}: orientation and covariances have no place in an IMU's data.csv")
     if poses is not None:
-        job.note(f"{poses.topic}: of a message the position and orientation are held")
+        job.note(f"{poses.topic}: only position and orientation are kept")
         rows = ((time, (*v[:3], v[6], *v[3:6])) for time, v in poses.rows())
         _write_rows(job, "mav0/pose0", poses.topic, _POSE_HEAD, rows)
         pose = tree.pose(poses.body, body)
@@ -69,7 +69,7 @@ def write(job: ExportJob) -> None:
 def _known_pose(job: ExportJob, tree: StaticTree, frame: str, body: str, topic: str) -> Pose | None:
     pose = tree.pose(frame, body)
     if pose is None:
-        job.note(f"{topic}: no static transforms tell T_BS of {frame!r} in {body!r}")
+        job.note(f"{topic}: no static transforms give T_BS of {frame!r} in {body!r}")
     return pose
 
 
@@ -85,11 +85,11 @@ def _write_camera(job: ExportJob, place: str, camera: ExportedCamera, pose: Pose
     lines = [f"rate_hz: {camera.rate:.6g}", f"resolution: [{width}, {height}]"]
     calibration = hold_calibration(camera, job.source.ledger)
     if calibration is None:
-        job.note(f"{camera.topic}: it is not calibrated")
+        job.note(f"{camera.topic}: not calibrated")
     else:
         model, coefficients = distortion(calibration)
         if model not in _MODELS:
-            job.note(f"{camera.topic}: distortion {model} is none of EuRoC's and told by its name")
+            job.note(f"{camera.topic}: EuRoC has no distortion {model}; it is given by its name")
         k = calibration.k
         lines += [
             "camera_model: pinhole",
@@ -104,10 +104,9 @@ _MODELS = ("radial-tangential", "equidistant", "none")
 
 
 def distortion(calibration: Calibration) -> tuple[str, list[float]]:
-    """Name and coefficients of a distortion, as EuRoC has them where it knows it.
+    """Name and coefficients of a distortion, in EuRoC's terms if it has them.
 
-    Coefficients that are zero at the end of a longer ROS model are left out: the model is the
-    same.
+    Trailing zero coefficients of a longer ROS model are left out: the model is the same.
     """
     name, values = calibration.distortion_model, list(calibration.d)
     if not any(values) and name in ("", "none", "plumb_bob", "rational_polynomial"):

@@ -1,4 +1,4 @@
-"""Dataset -> the formats of other tools, as far as each can hold it; the rest is counted."""
+"""Dataset -> the formats of other tools, keeping what each supports; the rest is counted."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mp4ds.format.fields import document_of
 from mp4ds.plugins.exporting.job import ExportedDataset, ExportJob, ExportOptions, ExportSummary
 
 NOTE_NAME = "mp4ds_export.json"
-"""File of an exported folder that tells what it holds and leaves out."""
+"""File in an exported folder that lists what it holds and leaves out."""
 
 FORMATS = {
     "euroc": "EuRoC",
@@ -31,10 +31,10 @@ FORMATS = {
     "rerun": "Rerun",
     "lerobot": "LeRobot",
 }
-"""Formats, each written by the module of its name -> what it is called."""
+"""Formats, each written by the module of that name -> display name."""
 
 _LIBRARIES = {"rerun": "rerun-sdk", "lerobot": "pyarrow"}
-_SEVERAL = ("lerobot",)  # which hold several datasets
+_SEVERAL = ("lerobot",)  # formats that hold several datasets
 _FILES = {"rerun": ".rrd"}
 _OPTIONS_OF = {
     "poses": ("euroc", "tum", "colmap"),
@@ -55,7 +55,7 @@ def export(
     *,
     progress: Callable[[str, float | None], None] | None = None,
 ) -> ExportSummary:
-    """Write a dataset in the format of another tool, as far as that can hold it.
+    """Export a dataset to another tool's format, keeping what that format supports.
 
     Args:
         datasets: A dataset, or one video with its sidecar, or its URL; for lerobot also several,
@@ -63,17 +63,16 @@ def export(
         to: ``euroc``, ``tum``, ``kitti``, ``colmap``, ``rerun`` or ``lerobot``.
         output: The folder to make; for rerun the file.
         options: How.
-        progress: Called with a phrase now and then, and the share of the frames that are given
-            where that is known.
+        progress: Called now and then with a phrase, and the share of frames done if known.
 
     Returns:
-        What was written, and every message that was not, counted by its reason.
+        What was written, and every message that was not, counted by reason.
 
     Raises:
-        OptionError: An option is wrong, or the format can hold nothing of the dataset.
+        OptionError: An option is wrong, or the format cannot hold anything of the dataset.
         FormatError: The dataset is damaged; nothing is left behind.
-        TargetError: The output may not be written there.
-        WriteError: The disk refused; nothing is left behind.
+        TargetError: The output cannot be written there.
+        WriteError: The output could not be written; nothing is left behind.
         RemoteError: A store or web server fails.
     """
     chosen = options or ExportOptions()
@@ -82,7 +81,7 @@ def export(
     paths = datasets_in(datasets)
     _check(to, paths, chosen)
     if remote(location(output)):
-        raise OptionError(f"{output} is a URL: export to this machine, then upload it.")
+        raise OptionError(f"{output} is a URL: export to a local folder, then upload it.")
     target = Path(os.path.abspath(output))  # noqa: PTH100
     try:
         writer: Callable[[ExportJob], None] = import_module(f"mp4ds.plugins.exporting.{to}").write
@@ -104,7 +103,7 @@ def export(
             stack.enter_context(sliced(one, chosen.slice, path.parent / str(number)))
             for number, one in enumerate(opened)
         ]
-        if to == "lerobot":  # whose videos are of colours
+        if to == "lerobot":  # whose videos are in colour
             chosen = replace(chosen, pixels="rgb")
         sources = [ExportedDataset(dataset, chosen) for dataset in opened]
         job = ExportJob(path, target, chosen, sources, progress or (lambda *_: None))
@@ -112,7 +111,7 @@ def export(
         summary = _summary(job, to)
         if not any(summary.messages.values()):
             raise OptionError(
-                f"{FORMATS[to]} can hold no topic of {opened[0].path}: "
+                f"{FORMATS[to]} cannot hold any topic of {opened[0].path}: "
                 f"{_first_reason(summary) or 'it has no messages'}."
             )
         if path.is_dir():
@@ -130,23 +129,26 @@ def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
     """Refuse options that are unknown or contradict each other.
 
     Raises:
-        OptionError: Says which, and what there is.
+        OptionError: Says which, and lists the valid ones.
     """
     if to not in FORMATS:
         raise OptionError(f"format {to!r} is not known. Use {', '.join(FORMATS)}.")
     if len(paths) > 1 and to not in _SEVERAL:
         raise OptionError(
-            f"{FORMATS[to]} holds one dataset, and {len(paths)} are given: export each by itself."
+            f"{FORMATS[to]} holds a single dataset, but {len(paths)} were given: export them "
+            "one by one."
         )
     usual = ExportOptions()
     for name, formats in _OPTIONS_OF.items():
         if getattr(options, name) != getattr(usual, name) and to not in formats:
-            raise OptionError(f"`{name}` goes with {', '.join(formats)}, not with {to}.")
+            raise OptionError(f"`{name}` works with {', '.join(formats)}, not with {to}.")
     if to == "lerobot" and options.pixels not in ("seen", "rgb"):
-        raise OptionError(f"LeRobot's videos are of colours: `pixels` {options.pixels} is not.")
+        raise OptionError(
+            f"LeRobot's videos are in colour: `pixels` {options.pixels} does not apply."
+        )
     if options.tolerance_ns is not None and options.tolerance_ns < 0:
-        raise OptionError("`tolerance_ns` is the most time between frames: use 0 or more.")
-    _ = options.reduction  # refuses its own
+        raise OptionError("`tolerance_ns` is the maximum time between frames: use 0 or more.")
+    _ = options.reduction  # refuses invalid ones
 
 
 def _summary(job: ExportJob, to: str) -> ExportSummary:

@@ -1,4 +1,4 @@
-"""What an export is made of: its cameras, and the account of what is held and left out."""
+"""The basis of an export: its cameras, and the account of what is kept and left out."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _nanoseconds(milliseconds: str) -> int:
         return round(float(milliseconds) * _NS_PER_MS)
     except (ValueError, OverflowError):
         raise OptionError(
-            f"`tolerance_ns` {milliseconds!r} is no number of milliseconds."
+            f"`tolerance_ns` {milliseconds!r} is not a number of milliseconds."
         ) from None
 
 
@@ -66,26 +66,26 @@ class ExportOptions(SliceOptions):
     every: int = every()
     max_rate: float | None = max_rate()
     pixels: str = option(
-        "seen: as recorded, but Bayer and YUV as RGB; native keeps a mosaic; rgb; gray.",
+        "seen: as recorded, but Bayer and YUV as RGB; native: keep Bayer mosaics; rgb; gray.",
         "seen",
         metavar="KIND",
     )
     tolerance_ns: int | None = option(
-        "Only frames of which every camera has one within this time.",
+        "Keep only frames that all cameras have within this time of each other.",
         None,
         "--sync",
         metavar="MS",
         parse=_nanoseconds,
     )
-    poses: str | None = option("Of poses, for euroc, tum and colmap.", metavar="TOPIC")
+    poses: str | None = option("Topic with poses, for euroc, tum and colmap.", metavar="TOPIC")
     fps: int | None = option(
-        "Of lerobot; the rate of the first camera by default.", least=1, most=1000
+        "Frame rate for lerobot; default: that of the first camera.", least=1, most=1000
     )
-    state: str | None = option("observation.state of lerobot.", metavar="TOPIC")
-    action: str | None = option("action of lerobot.", metavar="TOPIC")
-    task: str = option("What the robot does, for lerobot.", "", metavar="TEXT")
-    codec: str = option("av1, h264 or h265: of videos made for lerobot.", "av1")
-    crf: int = option("Their quality; less is better.", 30, least=0, most=63)
+    state: str | None = option("Topic for lerobot's observation.state.", metavar="TOPIC")
+    action: str | None = option("Topic for lerobot's action.", metavar="TOPIC")
+    task: str = option("Task description, for lerobot.", "", metavar="TEXT")
+    codec: str = option("Video codec for lerobot: av1, h264 or h265.", "av1")
+    crf: int = option("Quality of lerobot's videos; lower is better.", 30, least=0, most=63)
     force: bool = force()
 
     def __post_init__(self) -> None:
@@ -100,28 +100,28 @@ class ExportOptions(SliceOptions):
 
     @property
     def reduction(self) -> Reduction:
-        """How much smaller or fewer images are given.
+        """How to reduce images.
 
         Raises:
-            OptionError: There is no such size, number or rate.
+            OptionError: The size, number or rate is not valid.
         """
         return Reduction(self.resize, self.every, self.max_rate)
 
 
 @dataclass(frozen=True)
 class ExportSummary:
-    """What an export did.
+    """The result of an export.
 
-    Every message of the datasets is counted once, as one that the export holds or by the reason
-    why it does not.
+    Every message of the datasets is counted once, either as kept or by the reason why it is left
+    out.
 
     Attributes:
         output: The folder or file made.
         format: Its format.
         places: Part of the output -> the topic that is in it.
-        messages: Messages that it holds, by topic.
-        left_out: Topic -> reason -> messages that it does not hold.
-        notes: What else the format does not say as it was recorded.
+        messages: Kept messages, by topic.
+        left_out: Topic -> reason -> messages left out.
+        notes: Other deviations from the recording.
     """
 
     output: Path
@@ -135,14 +135,14 @@ class ExportSummary:
 # ---------------------------------------------------------------- ledger
 
 AS_RECORDED = "stored as recorded in messages.mcap, not as video"
-NOT_CHOSEN = "not chosen"
+NOT_CHOSEN = "not selected"
 
 
 class Ledger:
     """Counts the messages of a dataset, by topic.
 
     Attributes:
-        held: Messages that the export holds, by topic.
+        held: Kept messages, by topic.
         left_out: Topic -> reason -> messages.
     """
 
@@ -157,24 +157,24 @@ class Ledger:
         self.left_out: dict[str, dict[str, int]] = {}
 
     def total(self, topic: str) -> int:
-        """Messages of a topic that the dataset has."""
+        """Number of the dataset's messages on a topic."""
         return self._totals[topic]
 
     def hold(self, topic: str, count: int = 1) -> None:
-        """The export holds so many messages more."""
+        """Count kept messages."""
         self.held[topic] = self.held.get(topic, 0) + count
 
     def leave(self, topic: str, reason: str, count: int) -> None:
-        """So many messages more are left out."""
+        """Count messages that are left out."""
         if count:
             reasons = self.left_out.setdefault(topic, {})
             reasons[reason] = reasons.get(reason, 0) + count
 
     def settle(self, chosen: Callable[[str], bool], name: str) -> None:
-        """Give the messages that nobody counted their reason.
+        """Count the remaining messages with their reason.
 
         Args:
-            chosen: Whether a topic was asked for.
+            chosen: Whether a topic was selected.
             name: Of the format.
         """
         for topic, total in self._totals.items():
@@ -192,14 +192,14 @@ class Ledger:
 # ---------------------------------------------------------------- cameras
 
 _THINNED = "left out on request (--every, --max-rate)"
-_INVERSE = "quantised inverse depths; `mp4ds unpack --images raw` makes depths of them"
+_INVERSE = "quantised inverse depths; `mp4ds unpack --images raw` converts them to depths"
 
 Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class ExportedCamera:
-    """The frames of a stream that are given, by time.
+    """The exported frames of a stream, by time.
 
     Attributes:
         stream: The stream.
@@ -228,31 +228,31 @@ class ExportedCamera:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of what is given, pixels."""
+        """Width and height of the exported images, pixels."""
         height, width = self.view.shape[:2]
-        if self.view.is_plain:  # of YUV, rows are more than the image has
+        if self.view.is_plain:  # YUV has more rows than the image
             return self.stream.image_size
         return width, height
 
     @property
     def is_as_recorded(self) -> bool:
-        """Whether all frames are given, as they were recorded and in their order."""
+        """Whether all frames are exported as recorded and in order."""
         is_whole = np.array_equal(self.numbers, np.arange(len(self.stream)))
         return self.view.is_plain and is_whole
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """The calibration of what is given, when the first frame was taken; None if unknown."""
+        """The calibration of the exported images at the first frame; None if unknown."""
         if not len(self):
             return None
         found = self.stream.intrinsics_at(int(self.numbers[0]))
-        if found is None or not found.k[0]:  # a camera that is not calibrated says zeros
+        if found is None or not found.k[0]:  # an uncalibrated camera has zeros
             return None
         return Placement((0, 0, *self.stream.image_size), self.size).calibration(found)
 
     @property
     def rate(self) -> float:
-        """Usual frames in a second; 0 where there is one frame."""
+        """Usual frame rate; 0 if there is only one frame."""
         usual = usual_interval(intervals(self.times))
         return 1e9 / usual if usual else 0.0
 
@@ -261,10 +261,10 @@ class ExportedCamera:
         return replace(self, numbers=self.numbers[places], times=self.times[places])
 
     def pictures(self) -> Iterator[tuple[int, Pixels]]:
-        """What is given of each frame, in the order of the video.
+        """The exported pixels of each frame, in the order of the video.
 
         Yields:
-            Place among `numbers`, and pixels of `view.encoding` that are the caller's.
+            Index into `numbers`, and pixels of `view.encoding` owned by the caller.
 
         Raises:
             FormatError: The stream is damaged.
@@ -288,16 +288,16 @@ class ExportedCamera:
 def chosen_cameras(
     streams: Sequence[Stream], options: ExportOptions, ledger: Ledger, notes: list[str]
 ) -> list[ExportedCamera]:
-    """The cameras of some streams: those that are calibrated first, then by topic.
+    """The cameras of some streams: calibrated ones first, then by topic.
 
     Args:
         streams: The streams.
         options: Which frames, and how.
         ledger: Counts those that are left out.
-        notes: Told what frames become.
+        notes: Receives what frames are converted to.
 
     Raises:
-        OptionError: Frames of a stream cannot be given so.
+        OptionError: Frames of a stream cannot be converted that way.
     """
     reduction = options.reduction
     cameras = []
@@ -311,7 +311,9 @@ def chosen_cameras(
         ledger.leave(stream.topic, _THINNED, len(stream) - len(kept))
         times = times_of(columns)
         if times is not columns.stamp:
-            notes.append(f"{stream.topic}: its stamps do not increase, log times are told instead")
+            notes.append(
+                f"{stream.topic}: its stamps do not increase, so log times are used instead"
+            )
         kept = kept[np.argsort(times[kept], kind="stable")]
         view = _view(stream, options, notes)
         cameras.append(ExportedCamera(stream, kept, times[kept], view))
@@ -331,16 +333,16 @@ def _view(stream: Stream, options: ExportOptions, notes: list[str]) -> View:
         keeps = (
             ", which --pixels native keeps" if known.mosaic and colours != options.pixels else ""
         )
-        notes.append(f"{stream.topic}: its pixels are made of {kind}{keeps}")
+        notes.append(f"{stream.topic}: its pixels are converted from {kind}{keeps}")
     if encoding_as(known, "rgb") is None:
-        colours = "native"  # depths and other numbers have no colours
+        colours = "native"  # depths and other measurements have no colours
     return view_of(
         stream.topic, known, stream.image_size, format=colours, resize=options.resize, crop=None
     )
 
 
 def is_plain(encoding: Encoding) -> bool:
-    """Whether an image of an encoding looks like what it shows: neither a mosaic nor YUV."""
+    """Whether an encoding can be shown directly: neither a mosaic nor YUV."""
     return not encoding.mosaic and encoding.rows == 1 and encoding.even == (1, 1)
 
 
@@ -351,14 +353,14 @@ def _matched(
     times = {str(number): camera.times for number, camera in enumerate(cameras)}
     matches = synchronize(times, tolerance_ns=tolerance_ns)
     for number, camera in enumerate(cameras):
-        reason = "not every camera has a frame of this time (--sync)"
+        reason = "not every camera has a frame at this time (--sync)"
         ledger.leave(camera.topic, reason, len(matches.unmatched[str(number)]))
     columns = zip(cameras, matches.indices.T, strict=True)
     return [camera.at(places) for camera, places in columns]
 
 
 def that_png_holds(cameras: Sequence[ExportedCamera], ledger: Ledger) -> list[ExportedCamera]:
-    """Those of which the images can be PNG files; the others are left out."""
+    """The cameras whose images PNG files can hold; the others are left out."""
     found = []
     for camera in cameras:
         name = camera.view.encoding.name
@@ -372,16 +374,18 @@ def that_png_holds(cameras: Sequence[ExportedCamera], ledger: Ledger) -> list[Ex
 
 
 def of_different_times(camera: ExportedCamera, ledger: Ledger) -> ExportedCamera:
-    """The camera with one frame of each time, where files are called by it."""
+    """The camera with one frame per time, for formats that name files by time."""
     is_new = np.diff(camera.times, prepend=camera.times[:1] - 1) != 0
     ledger.leave(
-        camera.topic, "another frame has the same time, and so its name", int((~is_new).sum())
+        camera.topic,
+        "another frame has the same time, and therefore the same name",
+        int((~is_new).sum()),
     )
     return camera.at(np.flatnonzero(is_new))
 
 
 def hold_calibration(camera: ExportedCamera, ledger: Ledger) -> Calibration | None:
-    """The calibration of a camera, counted as held once: formats have no place for its times."""
+    """The calibration of a camera, counted as kept once: formats cannot hold its times."""
     info = camera.stream.sidecar.camera_info
     if info is None or camera.calibration is None:
         return None
@@ -392,9 +396,9 @@ def hold_calibration(camera: ExportedCamera, ledger: Ledger) -> Calibration | No
         same = [number for number, item in enumerate(info.calibrations) if item is used]
         is_same = np.isin(columns.variant, same)
         ledger.hold(topic)
-        ledger.leave(topic, "repeats the calibration that is held", int(is_same.sum()) - 1)
+        ledger.leave(topic, "repeats the exported calibration", int(is_same.sum()) - 1)
         ledger.leave(
-            topic, "another calibration: one of each camera is held", int((~is_same).sum())
+            topic, "a different calibration: only one per camera is exported", int((~is_same).sum())
         )
     return camera.calibration
 
@@ -405,13 +409,13 @@ _TELL_EVERY = 16  # frames
 
 
 class ExportedDataset:
-    """A dataset that is exported.
+    """A dataset being exported.
 
     Attributes:
         dataset: The dataset.
         ledger: Counts its messages.
-        cameras: Its chosen streams.
-        notes: What the format does not say as it was recorded.
+        cameras: Its selected streams.
+        notes: Deviations from the recording.
     """
 
     def __init__(self, dataset: Dataset, options: ExportOptions) -> None:
@@ -428,20 +432,20 @@ class ExportedDataset:
         self.cameras = chosen_cameras(streams, options, self.ledger, self.notes)
 
     def chosen(self, topic: str) -> bool:
-        """Whether a topic was asked for, by a glob or by its name."""
+        """Whether a topic was selected, by a glob or by name."""
         return self._selected(topic) or topic in self._named
 
 
 @dataclass
 class ExportJob:
-    """An export that is being made.
+    """An export in progress.
 
     Attributes:
         path: Where to make it.
-        target: What it will be called.
+        target: Its final name.
         options: How.
-        sources: The datasets, one but for formats that hold several.
-        tell: Called with a phrase now and then, and the share of the frames that are given.
+        sources: The datasets, one except for formats that hold several.
+        tell: Called now and then with a phrase, and the share of frames done.
         places: Part of the output -> the topic that is in it.
     """
 
@@ -455,11 +459,11 @@ class ExportJob:
 
     @property
     def source(self) -> ExportedDataset:
-        """The dataset, for formats that hold one."""
+        """The dataset, for formats that hold only one."""
         return self.sources[0]
 
     def note(self, sentence: str) -> None:
-        """Tell what the format does not say as it was recorded."""
+        """Note a deviation from the recording."""
         if sentence not in self.source.notes:
             self.source.notes.append(sentence)
 
@@ -468,7 +472,7 @@ class ExportJob:
 
         Args:
             camera: The camera.
-            place: The part of the output that they are told to be in.
+            place: The part of the output they are listed under.
             names: Path of each frame's file from the output's folder.
         """
         folder = self.path / names[0].rpartition("/")[0] if names else self.path
@@ -482,7 +486,7 @@ class ExportJob:
     def counted(
         self, items: Iterator[tuple[int, bytes]], what: str, total: int
     ) -> Iterator[tuple[int, bytes]]:
-        """The same items; tells how many there were now and then."""
+        """The same items, with progress reported now and then."""
         for number, item in enumerate(items):
             if number % _TELL_EVERY == 0:
                 due = sum(len(camera) for source in self.sources for camera in source.cameras)

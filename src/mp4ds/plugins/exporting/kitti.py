@@ -19,7 +19,9 @@ def write(job: ExportJob) -> None:
     source = job.source
     cameras = that_png_holds(source.cameras, source.ledger)
     for camera in cameras[_MOST_CAMERAS:]:
-        source.ledger.leave(camera.topic, f"KITTI counts {_MOST_CAMERAS} cameras", len(camera))
+        source.ledger.leave(
+            camera.topic, f"KITTI numbers at most {_MOST_CAMERAS} cameras", len(camera)
+        )
     cameras = cameras[:_MOST_CAMERAS]
     job.path.mkdir()
     tree = StaticTree(static_transforms(source.dataset))
@@ -35,8 +37,8 @@ def write(job: ExportJob) -> None:
         (job.path / "times.txt").write_text(text, encoding="utf-8")
     if len({len(camera) for camera in cameras}) > 1:
         job.note(
-            "cameras have different numbers of frames, so that those of one number are not of one "
-            "time; --sync MS gives only those that belong together"
+            "cameras have different numbers of frames, so frames with the same number were not "
+            "taken at the same time; --sync MS keeps only those that match"
         )
 
 
@@ -52,15 +54,15 @@ def _write_camera(job: ExportJob, number: int, camera: ExportedCamera) -> None:
 def _calibration_lines(
     job: ExportJob, tree: StaticTree, first: ExportedCamera, number: int, camera: ExportedCamera
 ) -> list[str]:
-    """The lines of a camera, in the names and order of calib_cam_to_cam.txt."""
+    """The lines of a camera, with the names and order of calib_cam_to_cam.txt."""
     calibration = hold_calibration(camera, job.source.ledger)
     if calibration is None:
-        job.note(f"{camera.topic}: it is not calibrated")
+        job.note(f"{camera.topic}: not calibrated")
         return []
     if calibration.distortion_model not in ("", "plumb_bob") or len(calibration.d) > _FULL_D:
         job.note(
-            f"{camera.topic}: distortion {calibration.distortion_model} with {len(calibration.d)} "
-            "parameters is none of KITTI's; D holds them as they are"
+            f"{camera.topic}: KITTI has no distortion {calibration.distortion_model} with "
+            f"{len(calibration.d)} parameters; D holds them unchanged"
         )
     key, (width, height) = f"{number:02d}", camera.size
     lines = [
@@ -70,7 +72,7 @@ def _calibration_lines(
     ]
     pose = tree.pose(first.frame_id, camera.frame_id)
     if pose is None:
-        job.note(f"{camera.topic}: no static transforms tell R_{key} and T_{key}")
+        job.note(f"{camera.topic}: no static transforms give R_{key} and T_{key}")
     else:
         lines.append(_line(f"R_{key}", pose[:3, :3].ravel().tolist()))
         lines.append(_line(f"T_{key}", pose[:3, 3].tolist()))

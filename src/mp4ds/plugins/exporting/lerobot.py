@@ -24,7 +24,7 @@ from mp4ds.video.codecs import CODECS, recipe_for
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.packets import PacketReader, join_segments
 
-_STEP_FROM = 300  # pixels of a side, from which on fewer are looked at
+_STEP_FROM = 300  # pixels of a side, above which pixels are subsampled
 _SIDE = 150
 
 Floats = NDArray[np.float64]
@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Statistics:
-    """Least, greatest, mean and standard deviation of each number of a feature.
+    """Minimum, maximum, mean and standard deviation of each number of a feature.
 
     Attributes:
         least: Shape of the feature; (3, 1, 1) of pictures.
@@ -50,13 +50,13 @@ class Statistics:
 
     @classmethod
     def of(cls, values: NDArray[Any]) -> Statistics:
-        """Of rows, shape (rows, numbers)."""
+        """Statistics of rows, shape (rows, numbers)."""
         rows = values.astype(np.float64)
         return cls(rows.min(0), rows.max(0), rows.mean(0), rows.std(0), len(rows))
 
     @classmethod
     def of_picture(cls, pixels: Pixels) -> Statistics:
-        """Of a picture's colours from 0 to 1, of a part of its pixels where it is large.
+        """Statistics of a picture's colours from 0 to 1, subsampled if it is large.
 
         Args:
             pixels: uint8, shape (H, W, 3).
@@ -75,7 +75,7 @@ class Statistics:
         )
 
     def as_lists(self) -> dict[str, Any]:
-        """By the names that LeRobot has."""
+        """The statistics under LeRobot's names."""
         return {
             "min": self.least.tolist(),
             "max": self.most.tolist(),
@@ -86,7 +86,7 @@ class Statistics:
 
 
 def merged(parts: Sequence[Statistics]) -> Statistics:
-    """The statistics of all that the parts are of."""
+    """The statistics of all parts combined."""
     counts = np.array([part.count for part in parts], np.float64)
     weights = counts / counts.sum()
     means = np.stack([part.mean for part in parts])
@@ -118,7 +118,7 @@ def write_frames(
         path: The file.
         vectors: Feature -> numbers, shape (frames, numbers).
         length: Frames.
-        fps: Frames in a second.
+        fps: Frames per second.
         episode: Number of the episode.
         first: Number of its first frame among those of all episodes.
     """
@@ -126,7 +126,7 @@ def write_frames(
     for name, values in vectors.items():
         flat = pa.array(values.ravel(), pa.float32())
         count = values.shape[1]
-        # a single number stands by itself
+        # a single number is stored as a scalar
         columns[name] = flat if count == 1 else pa.FixedSizeListArray.from_arrays(flat, count)
     numbers = np.arange(length, dtype=np.int64)
     columns["timestamp"] = pa.array((numbers / fps).astype(np.float32))
@@ -169,25 +169,25 @@ def _write(path: Path, table: Any) -> None:
 
 VERSION = "v3.0"
 CHUNK = 1000
-"""Files in a folder."""
+"""Files per folder."""
 
 Integers = NDArray[np.int64]
 
 _NS = 10**9
-_GOP = 2  # frames between key frames, as LeRobot has them: samples are read one by one
-_SAMPLES = 100  # frames of which the statistics of a camera are made
+_GOP = 2  # frames between key frames, as in LeRobot: samples are read individually
+_SAMPLES = 100  # frames used for a camera's statistics
 _MOST_THREADS = 8
 _TELL_EVERY = 16  # frames
-_PLAYED = ("av1", "h264", "h265", "vp9")  # codecs of videos that are taken as they are
-# whose decoders tell the full range by the pixel format, too: of others, torchcodec, LeRobot's
-# decoder, was seen to take it for the limited one
+_PLAYED = ("av1", "h264", "h265", "vp9")  # codecs of videos that are copied
+# whose decoders also signal full range by the pixel format: for others, torchcodec, LeRobot's
+# decoder, mistakes it for limited range
 _RANGE_TOLD = ("h264", "h265")
 _VECTORS = {"observation.state": "state", "action": "action"}  # feature -> option
 
 
 @dataclass
 class Episode:
-    """What a dataset became.
+    """A dataset as an episode.
 
     Attributes:
         length: Frames.
@@ -217,9 +217,9 @@ def write(job: ExportJob) -> None:
         found = _features(source, job, episode, fps)
         if features and found != features:
             raise OptionError(
-                f"{source.dataset.path} has other cameras, sizes or numbers than "
-                f"{job.sources[0].dataset.path}, and episodes of LeRobot have the same. Choose "
-                "with `topics`, and `resize` WxH."
+                f"{source.dataset.path} differs in cameras, sizes or vector lengths from "
+                f"{job.sources[0].dataset.path}, but LeRobot episodes must agree. Select with "
+                "`topics`, and `resize` WxH."
             )
         features = found
         write_frames(
@@ -239,10 +239,10 @@ def write(job: ExportJob) -> None:
     _write_json(job.path / "meta/stats.json", statistics)
     _write_json(job.path / "meta/info.json", _info(episodes, features, fps))
     if not task:
-        job.note("no --task is given: the task of every frame is empty")
+        job.note("no --task was given: every frame's task is empty")
     job.note(
-        f"stamps are those of {fps} frames in a second from the first frame on; the recorded "
-        "ones have no place"
+        f"stamps count up at {fps} frames per second from the first frame; recorded stamps are "
+        "not kept"
     )
 
 
@@ -261,16 +261,16 @@ def _shown(source: ExportedDataset) -> list[ExportedCamera]:
     for camera in source.cameras:
         reason = ""
         if camera.view.encoding.name != "rgb8":
-            reason = f"LeRobot's videos show colours of 8 bits, and no {camera.stream.encoding}"
+            reason = f"LeRobot's videos are in 8-bit colour, not {camera.stream.encoding}"
         if reason or not len(camera):
             source.ledger.leave(camera.topic, reason, len(camera))
             continue
         is_later = camera.numbers >= np.maximum.accumulate(camera.numbers)
-        source.ledger.leave(camera.topic, "its stamp goes backward", int((~is_later).sum()))
+        source.ledger.leave(camera.topic, "its stamp goes backwards", int((~is_later).sum()))
         found.append(camera.at(np.flatnonzero(is_later)))
     if not found:
         raise OptionError(
-            f"{source.dataset.path} has no camera for LeRobot: its videos show colours of 8 bits."
+            f"{source.dataset.path} has no camera for LeRobot, whose videos are in 8-bit colour."
         )
     return found
 
@@ -292,11 +292,11 @@ class _Maker:
         end = min(int(camera.times[-1]) for camera in cameras)
         if end < start:
             raise OptionError(
-                f"{source.dataset.path}: its cameras have no time in common. Choose some with "
+                f"{source.dataset.path}: its cameras do not overlap in time. Select some with "
                 "`topics`."
             )
         length = ((end - start) * fps + _NS // 2) // _NS + 1
-        # integers all the way: a float would move late frames
+        # integers throughout: floats would shift late frames
         self._times = start + (np.arange(length, dtype=np.int64) * _NS + fps // 2) // fps
 
     def make(self) -> Episode:
@@ -329,7 +329,7 @@ class _Maker:
         unused[used] = False
         ledger.leave(
             camera.topic,
-            f"another frame is nearer to each of {self._fps} in a second",
+            f"another frame is nearer at {self._fps} frames per second",
             int((unused & is_within).sum()),
         )
         ledger.leave(
@@ -339,8 +339,8 @@ class _Maker:
         )
         if length > len(used):
             self._source.notes.append(
-                f"{camera.topic}: {length - len(used)} of {length} frames repeat the one before, "
-                f"to be {self._fps} in a second"
+                f"{camera.topic}: {length - len(used)} of {length} frames repeat the previous "
+                f"one, to reach {self._fps} per second"
             )
         path = self._job.path / _video_path(feature, self._number)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -360,7 +360,7 @@ class _Maker:
         ):
             camera.stream.verify_video()
             join_segments([camera.stream.video_path], ticks.tolist(), path)
-            self._source.notes.append(f"{camera.topic}: its video is copied, not encoded anew")
+            self._source.notes.append(f"{camera.topic}: its video is copied, not re-encoded")
             return _video_facts(path, size, sidecar.video.codec)
         return self._encode(camera.at(used), repeats.tolist(), ticks.tolist(), path)
 
@@ -369,7 +369,7 @@ class _Maker:
     ) -> dict[str, Any]:
         options = self._job.options
         recipe = recipe_for("rgb24", lossless=False, codec=options.codec, crf=options.crf)
-        recipe = replace(recipe, full_range=False)  # for which LeRobot's decoder takes all AV1
+        recipe = replace(recipe, full_range=False)  # which LeRobot's decoder assumes for all AV1
         encoder = VideoEncoder(
             path,
             recipe,
@@ -409,8 +409,8 @@ class _Maker:
         for time, values in in_order(vectors.rows()):
             if len(values) != count:
                 raise OptionError(
-                    f"{vectors.topic} has messages of {count} and of {len(values)} numbers, and "
-                    "LeRobot has as many in each frame."
+                    f"{vectors.topic} has messages of {count} and of {len(values)} numbers, but "
+                    "LeRobot needs the same number in each frame."
                 )
             times.append(time)
             rows.append(values)
@@ -419,13 +419,12 @@ class _Maker:
         self._source.ledger.hold(vectors.topic, used)
         self._source.ledger.leave(
             vectors.topic,
-            f"another message is nearer to each of {self._fps} frames in a second",
+            f"another message is nearer at {self._fps} frames per second",
             len(rows) - used,
         )
         away = int(np.abs(np.array(times, np.int64)[places] - self._times).max())
         self._source.notes.append(
-            f"{vectors.topic}: numbers are those nearest to each frame, at most {away / _NS:.3f} s "
-            "from it"
+            f"{vectors.topic}: each frame gets the nearest message, at most {away / _NS:.3f} s away"
         )
         return np.array(rows, np.float32).reshape(-1, count)[places]
 
@@ -471,7 +470,7 @@ def _features(
 def _row(
     number: int, episode: Episode, task: str, fps: int, episodes: Sequence[Episode]
 ) -> dict[str, Any]:
-    """What the table of episodes says of one."""
+    """The row of an episode in the table of episodes."""
     first = sum(other.length for other in episodes[:number])
     chunk, file = divmod(number, CHUNK)
     row: dict[str, Any] = {

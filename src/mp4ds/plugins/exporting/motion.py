@@ -21,7 +21,7 @@ Pose = NDArray[np.float64]
 
 
 def rotation_matrix(quaternion: Iterable[float]) -> NDArray[np.float64]:
-    """The rotation of a quaternion x, y, z, w, which need not be of length 1; shape (3, 3)."""
+    """The rotation of a quaternion x, y, z, w of any length; shape (3, 3)."""
     x, y, z, w = np.array([*quaternion], np.float64)
     scale = 2.0 / (x * x + y * y + z * z + w * w)
     return np.array(
@@ -68,10 +68,10 @@ def inverse(pose: Pose) -> Pose:
 
 
 class StaticTree:
-    """Where frames are that do not move against each other.
+    """Relative poses of static frames.
 
     Args:
-        transforms: Of child frames, the last of each.
+        transforms: The last transform of each child frame.
     """
 
     def __init__(self, transforms: Iterable[Transform]) -> None:
@@ -97,7 +97,7 @@ class StaticTree:
         return root, pose
 
     def pose(self, frame: str, within: str) -> Pose | None:
-        """Pose of a frame in another one; None where no static transforms connect them."""
+        """Pose of a frame in another one; None if no static transforms connect them."""
         if not frame or not within:
             return None
         if frame.removeprefix("/") == within.removeprefix("/"):
@@ -108,7 +108,7 @@ class StaticTree:
 
 
 def static_transforms(dataset: Dataset) -> list[Transform]:
-    """The static transforms of a dataset: of its messages, and those that its manifest lists."""
+    """The static transforms of a dataset: from its messages and its manifest."""
     listed = dataset.manifest.transforms if dataset.manifest else []
     collector = TransformCollector(
         Transform(
@@ -133,7 +133,7 @@ Row = tuple[int, tuple[float, ...]]
 """Time in nanoseconds, and values."""
 
 _NS = 10**9
-_WINDOW = 1000  # messages that may come too early
+_WINDOW = 1000  # messages that may be out of order
 _ROS = ("ros1", "cdr")
 
 
@@ -146,7 +146,7 @@ def ros_type(dataset: Dataset, topic: str) -> str:
 
 
 def topics_of(dataset: Dataset, type_name: str, chosen: Callable[[str], bool]) -> list[str]:
-    """The chosen topics that have a ROS type."""
+    """The selected topics with a ROS type."""
     topics = dict.fromkeys(channel.topic for channel in dataset.channels)
     return [topic for topic in topics if chosen(topic) and ros_type(dataset, topic) == type_name]
 
@@ -157,7 +157,7 @@ def stamp_of(header: Any) -> int:
 
 
 def frame_of(dataset: Dataset, topic: str) -> str:
-    """Coordinate frame of the first message of a topic; empty where there is none."""
+    """Coordinate frame of the first message of a topic; empty if there is none."""
     first = next(dataset.messages([topic]), None)
     return "" if first is None else str(first.decoded.header.frame_id)
 
@@ -166,7 +166,7 @@ def imu_rows(dataset: Dataset, topic: str) -> Iterator[Row]:
     """Angular velocity x, y, z in rad/s, then acceleration x, y, z in m/s^2, of an IMU.
 
     Raises:
-        SourceError: A message is not of the type that its topic tells.
+        SourceError: A message does not match its topic's type.
     """
     for message in dataset.messages([topic]):
         values = message.decoded
@@ -191,10 +191,10 @@ class Poses:
 
     Attributes:
         topic: The topic.
-        body: Frame that is placed; empty where messages do not say.
+        body: Frame whose poses these are; empty if messages do not say.
 
     Raises:
-        OptionError: The topic is not there, or of another type.
+        OptionError: The topic does not exist, or has the wrong type.
     """
 
     def __init__(self, dataset: Dataset, topic: str) -> None:
@@ -204,8 +204,8 @@ class Poses:
         if name not in POSES:
             known = ", ".join(POSES)
             raise OptionError(
-                f"`poses` {topic} is {f'of type {name}' if name else 'no topic of ROS'} in "
-                f"{dataset.path}. Give one of {known}."
+                f"`poses` {topic} is {f'of type {name}' if name else 'not a ROS topic'} in "
+                f"{dataset.path}. Use a topic of type {known}."
             )
         self._parts = POSES[name]
         first = next(dataset.messages([topic]), None)
@@ -215,7 +215,7 @@ class Poses:
         """Position x, y, z in metres, then the quaternion x, y, z, w.
 
         Raises:
-            SourceError: A message is not of the type that its topic tells.
+            SourceError: A message does not match its topic's type.
         """
         for message in self._dataset.messages([self.topic]):
             values = message.decoded
@@ -228,10 +228,10 @@ class Vectors:
 
     Attributes:
         topic: The topic.
-        names: Of the numbers of the first message, as far as it tells.
+        names: Names of the numbers, from the first message, if it has them.
 
     Raises:
-        OptionError: The topic is not there, of another type, or has no message.
+        OptionError: The topic does not exist, has the wrong type, or no message.
     """
 
     _TYPES = (
@@ -246,8 +246,8 @@ class Vectors:
         name = ros_type(dataset, topic)
         if name not in self._TYPES:
             raise OptionError(
-                f"{option} {topic} is {f'of type {name}' if name else 'no topic of ROS'} in "
-                f"{dataset.path}. Give one of {', '.join(self._TYPES)}."
+                f"{option} {topic} is {f'of type {name}' if name else 'not a ROS topic'} in "
+                f"{dataset.path}. Use a topic of type {', '.join(self._TYPES)}."
             )
         self._is_joints = name == self._TYPES[0]
         first = next(dataset.messages([topic]), None)
@@ -266,7 +266,7 @@ class Vectors:
         """The numbers; an array has no stamp and gets its log time.
 
         Raises:
-            SourceError: A message is not of the type that its topic tells.
+            SourceError: A message does not match its topic's type.
         """
         for message in self._dataset.messages([self.topic]):
             time = stamp_of(message.decoded.header) if self._is_joints else message.log_time_ns
@@ -274,11 +274,11 @@ class Vectors:
 
 
 def in_order(rows: Iterable[Row], window: int = _WINDOW) -> Iterator[Row]:
-    """Rows by time, of which each comes at most so many rows too early.
+    """Sort rows by time, of which each is at most `window` rows out of order.
 
     Args:
         rows: In the order of the recording.
-        window: Rows that are held back.
+        window: Number of rows to hold back.
     """
     waiting: list[tuple[int, int, tuple[float, ...]]] = []
     for number, (time, values) in enumerate(rows):

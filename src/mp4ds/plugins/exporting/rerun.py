@@ -24,7 +24,7 @@ _TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 _IMU, _JOINTS = "sensor_msgs/Imu", "sensor_msgs/JointState"
 _POSES_ALONE = ("geometry_msgs/PoseStamped", "geometry_msgs/TransformStamped")
 _STAMP, _RECORDED = "stamp", "recorded"
-_MOST_DEPTH = 64  # frames above each other
+_MOST_DEPTH = 64  # depth of nested frames
 
 
 def write(job: ExportJob) -> None:
@@ -71,11 +71,11 @@ class _Writer:
         return [channel.topic for channel in self._dataset.channels if takes(channel)]
 
     def _moving(self) -> Iterator[RecordedMessage]:
-        """The messages of /tf and its kin."""
+        """The messages of /tf and similar topics."""
         return self._dataset.messages(self._tf_topics) if self._tf_topics else iter(())
 
     def _path(self, frame: str, *more: str) -> str:
-        """Entity of a frame: below its parents."""
+        """Entity path of a frame, below its parents."""
         names = [_name(frame) or "unknown"]
         while len(names) < _MOST_DEPTH and (parent := self._parents.get(names[-1])):
             if parent in names:
@@ -121,12 +121,12 @@ class _Writer:
         for topic in dict.fromkeys(self._static_topics):
             if self._source.chosen(topic):
                 ledger.hold(topic, ledger.total(topic))
-                self._job.note(f"{topic}: of each child frame the last transform is held")
+                self._job.note(f"{topic}: only the last transform of each child frame is kept")
         for message in self._moving():
             if self._write_moving(message):
                 ledger.hold(message.topic)
             else:
-                ledger.leave(message.topic, "a frame has several parents, and in Rerun one", 1)
+                ledger.leave(message.topic, "a frame has several parents; Rerun allows one", 1)
         for topic in self._tf_topics:
             self._job.places[rerun.new_entity_path(["tf"])] = topic
 
@@ -156,7 +156,7 @@ class _Writer:
         encoding = camera.view.encoding
         is_light = encoding_as(encoding, "rgb") is not None
         if not is_light and encoding.name not in _UNITS_IN_METRE:
-            reason = f"Rerun has neither light nor depths of {encoding.name}"
+            reason = f"Rerun cannot hold {encoding.name} as an image or as depths"
             self._source.ledger.leave(camera.topic, reason, len(camera))
             return False
         calibration = hold_calibration(camera, self._source.ledger)
@@ -243,12 +243,12 @@ class _Writer:
             count += 1
         self._source.ledger.hold(topic, count)
         self._job.places[rerun.new_entity_path(parts)] = topic
-        self._job.note(f"{topic}: orientation and covariances are not held")
+        self._job.note(f"{topic}: orientation and covariances are not kept")
 
     # ------------------------------------------------------------ poses and joints
 
     def _write_poses(self, topic: str, kind: str) -> None:
-        """Log poses as transforms of the topic's entity, below the frame that they are in."""
+        """Log poses as transforms of the topic's entity, below their parent frame."""
         names = ["poses", *topic.strip("/").split("/")]
         count, path = 0, ""
         for message in self._dataset.messages([topic]):
@@ -263,10 +263,10 @@ class _Writer:
         if path:
             self._job.places[path] = topic
         if kind not in _POSES_ALONE:
-            self._job.note(f"{topic}: of a message the position and orientation are held")
+            self._job.note(f"{topic}: only position and orientation are kept")
 
     def _write_joints(self, topic: str) -> None:
-        """Log positions, velocities and efforts, a series of each joint."""
+        """Log positions, velocities and efforts, one series per joint."""
         parts = ["joints", *topic.strip("/").split("/")]
         count = 0
         for message in self._dataset.messages([topic]):

@@ -19,13 +19,13 @@ _IMU = "sensor_msgs/Imu"
 
 
 def seconds(time: int) -> str:
-    """Nanoseconds as seconds, all digits of them."""
+    """Nanoseconds as seconds, with all digits."""
     sign, (whole, part) = "-" if time < 0 else "", divmod(abs(time), _NS)
     return f"{sign}{whole}.{part:09d}"
 
 
 def is_depth(camera: ExportedCamera) -> bool:
-    """Whether images are depths: by their encoding, or their topic's name where they are mono16."""
+    """Whether images are depths: by their encoding, or by topic name if mono16."""
     encoding = camera.view.encoding
     has_light = encoding_as(encoding, "rgb") is not None
     return not has_light or (encoding.name == "mono16" and "depth" in camera.topic.lower())
@@ -42,15 +42,15 @@ def write(job: ExportJob) -> None:
         for camera in alike[:1]:
             _write_images(job, kind, of_different_times(camera, source.ledger))
         for camera in alike[1:]:
-            reason = f"TUM has one {kind} camera, which is {alike[0].topic} (choose by --topics)"
+            reason = f"TUM has one {kind} camera, here {alike[0].topic} (select with --topics)"
             source.ledger.leave(camera.topic, reason, len(camera))
     imus = topics_of(source.dataset, _IMU, source.chosen)
     if imus:
         rows = ((time, values[3:]) for time, values in imu_rows(source.dataset, imus[0]))
         _write_rows(job, "accelerometer.txt", imus[0], "timestamp ax ay az", rows)
-        job.note(f"{imus[0]}: TUM has the acceleration of an IMU only")
+        job.note(f"{imus[0]}: TUM only keeps an IMU's acceleration")
     if poses is not None:
-        job.note(f"{poses.topic}: of a message the position and orientation are held")
+        job.note(f"{poses.topic}: only position and orientation are kept")
         head = "timestamp tx ty tz qx qy qz qw"
         _write_rows(job, "groundtruth.txt", poses.topic, head, poses.rows())
     if any(camera.calibration for camera in cameras):
@@ -62,9 +62,9 @@ def _write_images(job: ExportJob, kind: str, camera: ExportedCamera) -> None:
     job.write_png_files(camera, kind, names)
     heads = ["color images" if kind == "rgb" else "depth maps", f"file: {camera.topic}"]
     if kind == "depth":
-        unit = "as recorded, of ROS one millimetre (depth factor 1000, not TUM's 5000)"
+        unit = "as recorded, in ROS one millimetre (depth factor 1000, not TUM's 5000)"
         heads.append(f"unit: {unit}")
-        job.note(f"{camera.topic}: the unit of depths is {unit}")
+        job.note(f"{camera.topic}: depths are in units {unit}")
     rows = zip(map(seconds, camera.times.tolist()), names, strict=True)
     _write_list(job.path / f"{kind}.txt", [*heads, "timestamp filename"], map(" ".join, rows))
 

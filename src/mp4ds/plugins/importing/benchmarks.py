@@ -72,7 +72,7 @@ def find_euroc(folder: Path, options: ImageFolder) -> Scene:
         elif sensor.name.startswith(_POSES):
             _add_poses(scene, sensor)
         else:
-            scene.leave_out(sensor, f"{sensor.name}, which is neither camera, IMU nor pose")
+            scene.leave_out(sensor, f"{sensor.name}, which is not a camera, IMU or pose")
     root = folder / "mav0" if (folder / "mav0").is_dir() else folder
     for path in sorted(root.iterdir()):
         if path.is_file() and path.suffix == ".yaml":
@@ -84,7 +84,7 @@ def find_euroc(folder: Path, options: ImageFolder) -> Scene:
 
 
 def _described(scene: Scene, sensor: Path) -> dict[str, Any]:
-    """What sensor.yaml says, which is kept; its pose becomes a transform."""
+    """The contents of sensor.yaml, which is kept; its pose becomes a transform."""
     path = sensor / "sensor.yaml"
     if not path.is_file():
         return {}
@@ -96,7 +96,7 @@ def _described(scene: Scene, sensor: Path) -> dict[str, Any]:
         try:
             scene.transforms.append(transform(_BODY, sensor.name, pose[:3, :3], pose[:3, 3]))
         except ValueError as error:
-            raise SourceError(path, f"tells no pose: {error}") from None
+            raise SourceError(path, f"holds no valid pose: {error}") from None
     return values
 
 
@@ -124,14 +124,14 @@ def _add_table(scene: Scene, sensor: Path, kind: str, frame_id: str, values: int
 
 
 def _add_poses(scene: Scene, sensor: Path) -> None:
-    """Position and w, x, y, z of the quaternion; velocities and biases have no place in a pose."""
+    """Position and w, x, y, z of the quaternion; a pose cannot hold velocities and biases."""
     path = sensor / LIST
     stamps, rows = read_table(path, of_unit("ns", scene.skipped), 7, more=True)
     poses = rows[:, [0, 1, 2, 4, 5, 6, 3]]
     scene.tables.append(SensorTable(f"/{sensor.name}", "pose", _WORLD, stamps, poses))
     scene.files.append(path)
     if any(len(split(line)) > 8 for _, line in lines_of(path)):
-        scene.skipped[f"rows of {sensor.name} of which the pose alone was taken"] = len(rows)
+        scene.skipped[f"rows of {sensor.name} of which only the pose was taken"] = len(rows)
 
 
 # ---------------------------------------------------------------- kitti
@@ -200,7 +200,7 @@ def find_kitti(folder: Path, options: ImageFolder) -> Scene:
     used = {path for file in scene.files for path in (file, *file.parents)}
     for path in sorted(folder.iterdir()):
         if path not in used:
-            scene.leave_out(path, f"{path.name}, which is no camera")
+            scene.leave_out(path, f"{path.name}, which is not a camera")
     return scene
 
 
@@ -210,7 +210,7 @@ def find_kitti(folder: Path, options: ImageFolder) -> Scene:
 def _find_raw(folder: Path, cameras: list[Path]) -> Scene:
     scene = Scene(folder)
     values: _Calibrations | None = None
-    # the calibrations of a day stand beside its recordings
+    # the calibrations of a day are next to its recordings
     for place in (folder.absolute().parent, folder):
         for path in sorted(place.glob("calib_*.txt")):
             scene.files.append(path)
@@ -232,7 +232,7 @@ def _find_raw(folder: Path, cameras: list[Path]) -> Scene:
 def _raw_calibration(
     scene: Scene, name: str, values: _Calibrations | None, number: str, files: list[Path]
 ) -> CalibrationFields | None:
-    """Of images that are rectified or not, which their size tells; the pose is noted."""
+    """Calibration of rectified or unrectified images, judging by their size; the pose is noted."""
     if not files or values is None or f"P_rect_{number}" not in values:
         return None
     size = image_size(files[0])
@@ -241,7 +241,7 @@ def _raw_calibration(
         _place(scene, name, np.eye(3), _origin(p))
         return _rectified(size, p)
     if size != values.size(f"S_{number}"):
-        scene.skipped[f"calibrations of {name}, made for images of another size"] = 1
+        scene.skipped[f"calibrations of {name}, made for a different image size"] = 1
         return None
     rotation = values.numbers(f"R_{number}", 9).reshape(3, 3)
     translation = values.numbers(f"T_{number}", 3)
@@ -289,7 +289,7 @@ def _find_odometry(folder: Path) -> Scene:
 
 
 def _rectified(size: tuple[int, int], p: Matrix) -> CalibrationFields:
-    """The calibration of images that are rectified: they have the projection alone."""
+    """The calibration of rectified images, which only have a projection."""
     return CalibrationFields(
         width=size[0],
         height=size[1],
@@ -302,7 +302,7 @@ def _rectified(size: tuple[int, int], p: Matrix) -> CalibrationFields:
 
 
 def _origin(p: Matrix) -> Matrix:
-    """Where a rectified camera is in the first one, metres: of P = K [I | t] it is -t."""
+    """Position of a rectified camera in the first one, metres: for P = K [I | t] it is -t."""
     matrix = p.reshape(3, 4)
     try:
         return np.asarray(-np.linalg.solve(matrix[:, :3], matrix[:, 3]), np.float64)
@@ -329,13 +329,13 @@ def _read_stamps(path: Path, files: list[Path], read: Callable[[str], int]) -> N
     if len(stamps) != len(files):
         place = files[0].parent if files else path.parent
         raise SourceError(
-            path, f"has {len(stamps)} times, and there are {len(files)} images in {place}"
+            path, f"has {len(stamps)} times, but there are {len(files)} images in {place}"
         )
     return stamps
 
 
 def _read_calibrations(path: Path) -> _Calibrations:
-    """Lists of numbers by their names; what is no list of numbers is left out."""
+    """Lists of numbers by their names; what is not a list of numbers is left out."""
     found: dict[str, Matrix] = {}
     for _, line in lines_of(path):
         key, _, text = line.partition(":")
@@ -384,7 +384,7 @@ def find_tum(folder: Path, options: ImageFolder) -> Scene:
     for place, listed in folders.items():
         scene.files.append(place)
         if place != folder and (unlisted := len(members(place)) - len(listed)):
-            scene.skipped[f"files in {place.name} that no list names"] = unlisted
+            scene.skipped[f"files in {place.name} that are not in any list"] = unlisted
     for name, (kind, frame_id, values) in _TABLES.items():
         path = folder / f"{name}.txt"
         if path.is_file():
@@ -393,5 +393,5 @@ def find_tum(folder: Path, options: ImageFolder) -> Scene:
             scene.files.append(path)
     for path in sorted(folder.iterdir()):
         if path not in scene.files:
-            scene.leave_out(path, f"{path.name}, which is not of the layout")
+            scene.leave_out(path, f"{path.name}, which is not part of the layout")
     return scene

@@ -1,4 +1,4 @@
-"""The table of layouts of folders, and folders without one."""
+"""The table of folder layouts, and plain folders."""
 
 from __future__ import annotations
 
@@ -41,22 +41,22 @@ from mp4ds.plugins.importing.scene import (
 )
 from mp4ds.video.images import STILL_SUFFIXES, image_kind, image_size
 
-_MOST = 8  # cameras; more words are no names of cameras
+_MOST = 8  # cameras; more words are not names of cameras
 _LOOKED_AT = 8
-# a number, but for that of a camera such as cam0
+# a number, except for that of a camera such as cam0
 _NUMBER = re.compile(r"(?<!\d)(?<!cam)(?<!camera)\d+|(?<=cam)\d{2,}|(?<=camera)\d{2,}", re.I)
 _HEX = re.compile(r"[0-9a-f]+", re.I)
 _WORD = re.compile(r"[^\W_]+")
 _ADVICE = (
-    "One rate does not tell their times. Give `stamps` FILE with a time and a file name in each "
-    "line, or put those of each camera into a folder of its own."
+    "A single rate cannot give their times. Give `stamps` FILE with a time and a file name per "
+    "line, or put each camera's images into a folder of its own."
 )
 
 
 def by_camera(folder: Path, images: Sequence[Path]) -> Mapping[str, list[Path]]:
-    """The images of each camera by its name, which is empty where there is one camera.
+    """The images of each camera by its name, which is empty if there is one camera.
 
-    There are several where the names have different words or endings and the same numbers:
+    There are several if the names have different words or extensions and the same numbers:
     ``color_0001.jpg`` and ``depth_0001.png``.
 
     Args:
@@ -64,7 +64,7 @@ def by_camera(folder: Path, images: Sequence[Path]) -> Mapping[str, list[Path]]:
         images: In order.
 
     Raises:
-        SourceError: Nothing tells whether they are of one camera.
+        SourceError: It is unclear whether they are from one camera.
     """
     kinds: dict[str, list[Path]] = {}
     for path in images:
@@ -76,8 +76,8 @@ def by_camera(folder: Path, images: Sequence[Path]) -> Mapping[str, list[Path]]:
             first, second = (paths[0].name for paths in list(kinds.values())[:2])
             raise SourceError(
                 folder,
-                f"holds images of several kinds by their names, such as {first} and {second}, and "
-                "not the same numbers of each",
+                f"holds images of several kinds, judging by names such as {first} and {second}, "
+                "but their numbers differ",
                 _ADVICE,
             )
         cameras = dict(zip(_names(list(kinds)), kinds.values(), strict=True))
@@ -91,17 +91,17 @@ def _numbers(path: Path) -> tuple[int, ...]:
 
 
 def _may_be_cameras(images: Sequence[Path], numbers: Sequence[list[tuple[int, ...]]]) -> bool:
-    """Whether there are a few kinds, and one number is in several of them."""
+    """Whether there are a few kinds that share numbers."""
     if not 1 < len(numbers) <= _MOST or min(map(len, numbers)) < 2:
         return False
     endings = {path.suffix.lower() for path in images}
     if len(endings) < len(numbers) and all(_HEX.fullmatch(path.stem) for path in images):
-        return False  # letters are digits, too
+        return False  # hexadecimal letters are digits, too
     return len(set().union(*numbers)) < len(images)
 
 
 def _names(kinds: Sequence[str]) -> list[str]:
-    """A name for each camera: the words that not all have; else the ending of its files."""
+    """A name for each camera: the words that differ, else its files' extension."""
     words = [_WORD.findall(Path(kind).stem) for kind in kinds]
     shared = set(words[0]).intersection(*words)
     names = ["_".join(word for word in own if word not in shared) for own in words]
@@ -114,7 +114,7 @@ def _names(kinds: Sequence[str]) -> list[str]:
 
 
 def _check_turns(folder: Path, images: Sequence[Path]) -> None:
-    """Refuse images of two cameras in turns; a camera may well change its size."""
+    """Refuse interleaved images of two cameras; one camera may well change its size."""
     kinds = [_kind(path) for path in images[:_LOOKED_AT]]
     changes = [place for place in range(1, len(kinds)) if kinds[place] != kinds[place - 1]]
     if len(changes) >= len(set(kinds)) > 1:
@@ -122,14 +122,16 @@ def _check_turns(folder: Path, images: Sequence[Path]) -> None:
             f"{images[place].name} ({kinds[place]})" for place in (changes[0] - 1, changes[0])
         )
         raise SourceError(
-            folder, f"holds images of several kinds in turns, such as {first} and {second}", _ADVICE
+            folder,
+            f"holds images of several kinds interleaved, such as {first} and {second}",
+            _ADVICE,
         )
 
 
 def _kind(path: Path) -> str:
     try:
         return image_kind(path)
-    except SourceError:  # JPEG files are kept whatever is in them
+    except SourceError:  # JPEG files are kept whatever they contain
         return path.suffix.lower()
 
 
@@ -147,20 +149,22 @@ def images_in(folder: Path) -> list[Path]:
 
 
 def _in_order(path: Path) -> tuple[list[tuple[int, str]], str]:
-    """Orders 9 before 10, with zeros before it or without."""
+    """Sorts 9 before 10, with or without leading zeros."""
     parts = re.split(r"([0-9]+)", path.name)
     return [(int(part or 0), "") if n % 2 else (0, part) for n, part in enumerate(parts)], path.name
 
 
 def find_plain(folder: Path, options: ImageFolder) -> Scene:
-    """The images of a folder: of one camera, or of several where a rate tells their times.
+    """The images of a folder: of one camera, or of several if a rate gives their times.
 
     Raises:
-        SourceError: There are none, or nothing tells their times.
+        SourceError: There are none, or their times are unknown.
         OptionError: An option is wrong.
     """
     if options.stamps and options.rate:
-        raise OptionError("`stamps` tells the times that `rate` makes up. Give one of them.")
+        raise OptionError(
+            "`stamps` gives the times that `rate` would make up. Give only one of them."
+        )
     scene = Scene(folder)
     images = images_in(folder)
     if not images:
@@ -180,7 +184,7 @@ def find_plain(folder: Path, options: ImageFolder) -> Scene:
     others = [path for path in members(folder) if path.resolve() not in read]
     others = [path for path in others if path.suffix.lower() not in STILL_SUFFIXES]
     if others:
-        scene.skipped[f"files in {folder.resolve().name} that are no images"] = len(others)
+        scene.skipped[f"files in {folder.resolve().name} that are not images"] = len(others)
     scene.files.append(folder)
     return scene
 
@@ -198,13 +202,13 @@ def _camera(
 
 
 def _by_rate(folder: Path, images: list[Path], options: ImageFolder) -> list[SceneCamera]:
-    """The cameras whose images are in a folder, all from the same time on."""
+    """The cameras whose images are in a folder, all starting at the same time."""
     found = by_camera(folder, images)
     given = [key for key in ("topic", "frame_id", "encoding") if getattr(options, key) is not None]
     if len(found) > 1 and given:
         raise OptionError(
-            f"`{given[0]}` is for the images of one camera, and {folder} holds "
-            f"those of {', '.join(found)}. Put each into a folder of its own."
+            f"`{given[0]}` is for the images of one camera, but {folder} holds those of "
+            f"{', '.join(found)}. Put each into a folder of its own."
         )
     try:
         return [
@@ -219,16 +223,16 @@ def _elsewhere(folder: Path) -> str:
     """Where images are, if not in the folder itself."""
     places = [path for path in sorted(folder.iterdir()) if path.is_dir() and images_in(path)]
     if not places:
-        return ", and no layout that is known"
+        return ", and is not in a known layout"
     listed = ", ".join(path.name for path in places[:_LISTED])
     more = ", ..." if len(places) > _LISTED else ""
-    return f" itself, and no layout that is known; there are some in {listed}{more}"
+    return f" itself, and is not in a known layout; there are some in {listed}{more}"
 
 
 def _by_list(
     scene: Scene, images: list[Path], path: Path, unit: str | None
 ) -> tuple[list[Path], NDArray[np.int64]]:
-    """The images of a list of times, which may name them."""
+    """The images of a list of times, which may also name them."""
     rows: Rows = [(number, split(line)) for number, line in lines_of(path)]
     header = rows.pop(0)[1] if rows and not any(map(is_number, rows[0][1])) else []
     if not rows:
@@ -245,20 +249,20 @@ def _by_list(
         unit = "ns"
     unit = unit or unit_of([values[0] for _, values in chosen if is_number(values[0])])
     if unit is None:
-        raise OptionError(f"{path}: its times are whole numbers of an unknown unit. Give `unit`.")
+        raise OptionError(f"{path}: its times are integers of an unknown unit. Give `unit`.")
     read = of_unit(unit, scene.skipped)
     if name is not None:
         return listed_images(path, scene.folder, read, chosen)
     stamps = read_times(path, chosen, read)
     if len(stamps) != len(images):
         raise SourceError(
-            path, f"has {len(stamps)} times, and there are {len(images)} images in {scene.folder}"
+            path, f"has {len(stamps)} times, but there are {len(images)} images in {scene.folder}"
         )
     return images, stamps
 
 
 def _columns(path: Path, number: int, values: list[str]) -> tuple[int, int | None]:
-    """Where a line has its time, and the name of an image, if it has one."""
+    """Positions of a line's time, and of an image name, if any."""
     time = next((place for place, value in enumerate(values) if is_number(value)), None)
     if time is None:
         raise SourceError(path, f"line {number} has no time")
@@ -276,11 +280,13 @@ def _by_name(scene: Scene, images: list[Path], unit: str | None) -> NDArray[np.i
         unit = unit or unit_of(names)
     elif unit is not None:
         wrong = next(path for path in images if not is_number(path.stem))
-        raise SourceError(wrong, "has a name that is no time", "Give `stamps` FILE or `rate` HZ.")
+        raise SourceError(
+            wrong, "has a name that is not a time", "Give `stamps` FILE or `rate` HZ."
+        )
     if unit is None or not all(map(is_number, names)):
         raise SourceError(
             scene.folder,
-            "holds images whose names are no times in nanoseconds or decimal seconds",
+            "holds images whose names are not times in nanoseconds or decimal seconds",
             "Give `stamps` FILE, `rate` HZ, or the `unit` of the names.",
         )
     read = of_unit(unit, scene.skipped)
@@ -289,7 +295,7 @@ def _by_name(scene: Scene, images: list[Path], unit: str | None) -> NDArray[np.i
         try:
             stamps[place] = read(path.stem)
         except Refused as error:
-            raise SourceError(path, f"has a name that is no time: {error}") from None
+            raise SourceError(path, f"has a name that is not a time: {error}") from None
     return stamps
 
 
@@ -305,7 +311,7 @@ class FolderLayout:
     Attributes:
         matches: Whether a folder has it.
         find: Finds what it holds.
-        is_calibrated: Whether it tells calibrations of its own.
+        is_calibrated: Whether it has its own calibrations.
     """
 
     matches: Callable[[Path], bool]
@@ -319,7 +325,7 @@ LAYOUTS: Mapping[str, FolderLayout] = {
     "tum": FolderLayout(is_tum, find_tum, is_calibrated=False),
     "plain": FolderLayout(lambda folder: True, find_plain, is_calibrated=False),
 }
-"""In the order in which they are tried."""
+"""Layouts, in the order in which they are tried."""
 
 
 def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
@@ -327,25 +333,25 @@ def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
 
     Args:
         folder: The folder, on this machine.
-        options: How it is read.
+        options: How to read it.
 
     Raises:
-        SourceError: It cannot be read as asked; says why and what to do.
-        OptionError: The options do not suit its layout.
+        SourceError: It cannot be read; says why and what to do.
+        OptionError: The options do not apply to its layout.
     """
     if remote(folder):
-        raise SourceError(folder, "is not read where it is", "Download it first.")
+        raise SourceError(folder, "cannot be read remotely", "Download it first.")
     if not folder.exists():
         raise SourceNotFoundError(folder)
     if not folder.is_dir():
-        raise SourceError(folder, "is no folder of images")
+        raise SourceError(folder, "is not a folder of images")
     _check(options)
     try:
         name = options.layout or next(key for key in LAYOUTS if LAYOUTS[key].matches(folder))
         layout = LAYOUTS[name]
         _check_for(name, layout, options)
         if not layout.matches(folder):
-            raise SourceError(folder, f"is not laid out as {name} is", "Leave out `layout`.")
+            raise SourceError(folder, f"does not have the layout {name}", "Omit `layout`.")
         scene = layout.find(folder, options)
     except OSError as error:
         if isinstance(error, SourceError):
@@ -370,22 +376,24 @@ def _check(options: ImageFolder) -> None:
 
 
 def _check_for(name: str, layout: FolderLayout, options: ImageFolder) -> None:
-    """Refuse options that go with other layouts only."""
+    """Refuse options for other layouts."""
     given = [key for key in _PLAIN_ONLY if getattr(options, key) is not None]
     if name != "plain" and given:
         raise OptionError(
-            f"`{given[0]}` is for plain folders of images, and this one has the "
-            f"layout {name}, which tells it. Give `layout` plain, or leave it out."
+            f"`{given[0]}` is for plain folders of images, but this one has the layout {name}, "
+            f"which already defines it. Give `layout` plain, or omit `{given[0]}`."
         )
     if layout.is_calibrated and options.calibration:
-        raise OptionError(f"`calibration` is not for the layout {name}, which has its own.")
+        raise OptionError(
+            f"`calibration` cannot be used with the layout {name}, which has its own."
+        )
 
 
 def _calibrate(scene: Scene, path: Path) -> None:
-    """Give all cameras a calibration that is theirs by its size.
+    """Give all cameras a calibration that matches their size.
 
     Raises:
-        SourceError: It is none, or made for images of another size.
+        SourceError: It is not valid, or made for a different image size.
     """
     calibration = ros_calibration(path)
     for camera in scene.cameras:
@@ -393,8 +401,8 @@ def _calibrate(scene: Scene, path: Path) -> None:
         if size not in (None, (calibration.width, calibration.height)):
             raise SourceError(
                 path,
-                f"is for images of {calibration.width}x{calibration.height}, and those of "
-                f"{camera.topic} have {size[0]}x{size[1]}",
+                f"is for images of {calibration.width}x{calibration.height}, but those of "
+                f"{camera.topic} are {size[0]}x{size[1]}",
             )
     scene.cameras = [replace(camera, calibration=calibration) for camera in scene.cameras]
     if path.resolve() not in {file.resolve() for file in scene.files}:

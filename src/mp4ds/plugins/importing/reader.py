@@ -1,4 +1,4 @@
-"""A folder of images as a recording of ROS 2: each message is made when it is read."""
+"""A folder of images as a ROS 2 recording: each message is made when it is read."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 _WIRE, _PREFIX = "cdr-le", b"\x00\x01\x00\x00"
-_UNKNOWN = (-1.0, *(0.0 for _ in range(8)))  # a covariance of what is not measured
+_UNKNOWN = (-1.0, *(0.0 for _ in range(8)))  # the covariance of what is not measured
 _NOT_TOLD = (0.0,) * 9
 
 
@@ -57,7 +57,7 @@ def camera_message(
         body: Pixels or file of an image.
 
     Raises:
-        WireError: It has no place in the serialization.
+        WireError: The serialization cannot represent it.
     """
     return plain_message(_WIRE, type_name, frame_id, fields, Slots(stamp), body)
 
@@ -83,7 +83,7 @@ def _imu(stamp: int, frame_id: str, row: Sequence[float]) -> bytes:
 
 
 def _accelerometer(stamp: int, frame_id: str, row: Sequence[float]) -> bytes:
-    """Acceleration x, y, z in m/s^2: an Imu that measures nothing else."""
+    """Acceleration x, y, z in m/s^2, as an Imu that measures nothing else."""
     writer = _new()
     _header(writer, stamp, frame_id)
     writer.put("d", 0.0, 0.0, 0.0, 1.0, *_UNKNOWN, 0.0, 0.0, 0.0, *_UNKNOWN, *row, *_NOT_TOLD)
@@ -118,7 +118,7 @@ def _header(writer: PrimitiveWriter, stamp: int, frame_id: str) -> None:
 # ---------------------------------------------------------------- the reader
 
 FILE_LIST = "images.csv"
-"""Name of the attachment that tells which message was made of which file."""
+"""Name of the attachment that lists which message was made from which file."""
 
 _JPEG = (".jpg", ".jpeg")
 _TF_STATIC = "/tf_static"
@@ -132,7 +132,7 @@ class _Track:
         channel: The channel.
         stamps: Their times, nanoseconds, sorted.
         make: Makes the payload of a message by its number.
-        files: What each is made of; empty where it is not of files.
+        files: The file of each message; empty if not made from files.
     """
 
     channel: Channel
@@ -160,16 +160,16 @@ class _Track:
 
 
 class ImagesReader:
-    """Reads what a layout found in a folder. See `BagReader`.
+    """Reads a scene found by a layout. See `BagReader`.
 
-    Log times and publish times are the stamps. JPEG files become CompressedImage as they are, all
-    other images Image; each image has a CameraInfo, where its calibration is known.
+    Log times and publish times are the stamps. JPEG files become CompressedImage unchanged, all
+    other images Image; each image has a CameraInfo if its calibration is known.
 
     Args:
-        scene: What there is.
+        scene: What the folder holds.
     """
 
-    # what another recorder of such messages would have written
+    # what a recorder of such messages would have written
     format: Format = "mcap"
     profile = "ros2"
     library = ""
@@ -202,8 +202,8 @@ class ImagesReader:
         is_jpeg = np.array([path.suffix.lower() in _JPEG for path in camera.files], bool)
         if camera.encoding and is_jpeg.any():
             raise OptionError(
-                f"{camera.topic} has JPEG files, which are kept as they are: "
-                f"they have no encoding {camera.encoding}."
+                f"{camera.topic} has JPEG files, which are kept as they are: `encoding` "
+                f"{camera.encoding} cannot apply to them."
             )
         for chosen, topic, type_name in (
             (~is_jpeg, camera.topic, IMAGE),
@@ -253,7 +253,7 @@ class ImagesReader:
         self.position = sum(map(source_size, self.files))
 
     def _attachments(self) -> Iterator[Attachment]:
-        """What messages do not say: the calibrations to the letter, and the names of the files."""
+        """What messages cannot hold: the original calibrations, and the file names."""
         yield self._attached(FILE_LIST, "text/csv", self._file_list())
         for path in self._kept:
             try:
@@ -316,7 +316,7 @@ def _image_message(
     told, pixels = read_image(path)
     encoding = ENCODINGS[camera.encoding or told]
     if not _suits(encoding, pixels):
-        raise SourceError(path, f"holds {told} pixels, which cannot be {encoding.name}")
+        raise SourceError(path, f"has {told} pixels, which cannot be {encoding.name}")
     height, width = pixels.shape[:2]
     step = width * encoding.pixel_bytes
     fields = ImageFields(encoding.name, width, height, step, is_bigendian=0)
@@ -325,7 +325,7 @@ def _image_message(
 
 def _suits(encoding: Encoding, pixels: Pixels) -> bool:
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
-    is_whole = encoding.rows == 1  # an image of YUV planes is no picture
+    is_whole = encoding.rows == 1  # image files cannot hold YUV planes
     return is_whole and channels == encoding.channels and pixels.dtype == np.dtype(encoding.dtype)
 
 

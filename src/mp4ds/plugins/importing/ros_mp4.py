@@ -1,6 +1,6 @@
 """A video and the YAML of the tool published with the paper (version 0), as a whole dataset.
 
-Nothing is coded anew: the packets of the video get the times of the YAML, which the sidecar keeps.
+Nothing is re-encoded: the video's packets get the times of the YAML, which the sidecar keeps.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _MAX_STAMP = 2**32 * 10**9 - 1
 
 @dataclass(frozen=True)
 class _Bag:
-    """What is known of the bag that the video was made of."""
+    """What is known about the original bag."""
 
     format: Format = "bag"
     profile: str = _PROFILE
@@ -48,7 +48,7 @@ class _Bag:
 def import_ros_mp4(
     video: Path | str, sidecar: Path | str, dataset: Path | str, *, force: bool = False
 ) -> PackSummary:
-    """Make a dataset of a video and the YAML of the tool published with the paper.
+    """Make a dataset from a video and YAML of the tool published with the paper.
 
     Args:
         video: The mp4.
@@ -57,28 +57,30 @@ def import_ros_mp4(
         force: Replace an existing dataset.
 
     Returns:
-        What became of the topic.
+        The result for the topic.
 
     Raises:
         SourceError: A file is missing or cannot be read.
-        FormatError: The YAML is not whole, or the video is not the one that it tells of.
+        FormatError: The YAML is incomplete, or does not match the video.
         OptionError: The YAML is of another tool, or a path is a URL.
-        TargetError: The dataset may not be written there.
-        WriteError: The disk refused; nothing is left behind.
+        TargetError: The dataset cannot be written there.
+        WriteError: The dataset could not be written; nothing is left behind.
     """
     source, described = _local(video), _local(sidecar)
     for path in (source, described):
         if not path.is_file():
             raise (
-                SourceNotFoundError(path) if not path.exists() else SourceError(path, "is no file")
+                SourceNotFoundError(path)
+                if not path.exists()
+                else SourceError(path, "is not a file")
             )
     target = Path(os.path.abspath(_local(dataset)))  # noqa: PTH100 - keeps links, unlike resolve()
     states = [SourceState.of(source), SourceState.of(described)]
-    old = load_stream(described, video=_ANY)  # users may have named theirs as they like
+    old = load_stream(described, video=_ANY)  # users may have renamed theirs
     if old.stamps != "record-float":
         raise OptionError(
-            f"{described} is no YAML of the tool published with the paper: it is a sidecar of "
-            "mp4ds already."
+            f"{described} is not YAML file of the tool published with the paper: it is already "
+            "an mp4ds sidecar."
         )
     with (
         staged(target, force=force, owned=dataset_files, sources=[source, described]) as folder,
@@ -102,7 +104,7 @@ def _local(path: Path | str) -> Path:
 
 
 def _check(video: Path, described: Path, old: StreamSidecar) -> None:
-    """Refuse a YAML that does not tell of the video.
+    """Refuse a YAML that does not match the video.
 
     Raises:
         FormatError: Says why.
@@ -113,11 +115,11 @@ def _check(video: Path, described: Path, old: StreamSidecar) -> None:
             raise FormatError(
                 "frame-count",
                 video,
-                f"has {len(reader)} frames, and {described} tells the times of {old.frames}",
+                f"has {len(reader)} frames, but {described} has the times of {old.frames}",
             )
     stamps = old.columns.stamp.decode(old.frames)
     if stamps.min() < 0 or stamps.max() > _MAX_STAMP:
-        raise FormatError("column-invalid", described, "has times that ROS 1 has no bits for")
+        raise FormatError("column-invalid", described, "has times outside the range of ROS 1")
 
 
 def _part_of(video: Path, old: StreamSidecar, folder: Path) -> PartRecord:
@@ -150,5 +152,5 @@ def _part_of(video: Path, old: StreamSidecar, folder: Path) -> PartRecord:
 
 
 def _completed(channel: ChannelModel) -> ChannelModel:
-    """With the definition and md5sum, which a bag needs and that tool did not keep."""
+    """The channel with definition and md5sum, which a bag needs and that tool did not keep."""
     return ChannelModel.from_record(Converter(_PROFILE).channel(channel.to_record(0)))

@@ -1,4 +1,4 @@
-"""What a layout finds in a folder, and how its lists, times and calibrations are read."""
+"""The contents of a folder as found by a layout, and parsers for lists, times and calibrations."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 """Nanoseconds of each unit."""
 
 MAX_STAMP = 2**31 * 10**9 - 1
-"""The latest time that a message of ROS 2 has bits for, nanoseconds: in 2038."""
+"""The latest time that a ROS 2 message can represent, nanoseconds: in 2038."""
 
-ROUNDED = "times finer than a nanosecond, which were rounded to it"
+ROUNDED = "times finer than a nanosecond, which were rounded"
 
-_CERTAIN_DIGITS = 16  # of nanoseconds since 1970; a count of seconds or images has fewer
+_CERTAIN_DIGITS = 16  # of nanoseconds since 1970; counts of seconds or images have fewer
 _NUMBER = re.compile(r"\+?([0-9]{1,40})(?:(\.[0-9]{0,40})?([eE][-+]?[0-9]{1,2})?)?")
 _DATE = re.compile(r"([0-9]{4}-[0-9]{2}-[0-9]{2}[ T][0-9]{2}:[0-9]{2}:[0-9]{2})(\.[0-9]{1,40})?")
 
@@ -40,10 +40,10 @@ def is_number(text: str) -> bool:
 
 
 def unit_of(texts: Sequence[str]) -> str | None:
-    """The unit that numbers have: seconds if one has decimals, nanoseconds if they are long.
+    """The unit of numbers: seconds if one has decimals, nanoseconds if they are long.
 
     Returns:
-        ``s`` or ``ns``; None if nothing tells.
+        ``s`` or ``ns``; None if unknown.
     """
     if any(not text.lstrip("+").isdigit() for text in texts):
         return "s"
@@ -52,7 +52,7 @@ def unit_of(texts: Sequence[str]) -> str | None:
 
 
 def of_unit(unit: str, found: Counter[str]) -> Callable[[str], int]:
-    """What reads numbers of a unit.
+    """A parser for numbers of a unit.
 
     Args:
         unit: One of `UNITS`.
@@ -65,14 +65,14 @@ def of_unit(unit: str, found: Counter[str]) -> Callable[[str], int]:
 
     def read(text: str) -> int:
         if not _NUMBER.fullmatch(text):
-            raise Refused(f"{text!r} is no time in {unit}")
+            raise Refused(f"{text!r} is not a time in {unit}")
         return _checked(Fraction(text) * scale, text, found)
 
     return read
 
 
 def of_date(found: Counter[str]) -> Callable[[str], int]:
-    """What reads ``2011-09-26 13:02:25.964389445``, which is taken for UTC. See `of_unit`."""
+    """A parser for ``2011-09-26 13:02:25.964389445``, taken as UTC. See `of_unit`."""
 
     def read(text: str) -> int:
         match = _DATE.fullmatch(text.strip())
@@ -81,7 +81,7 @@ def of_date(found: Counter[str]) -> Callable[[str], int]:
         except ValueError:
             whole = None
         if match is None or whole is None:
-            raise Refused(f"{text!r} is no date and time")
+            raise Refused(f"{text!r} is not a date and time")
         seconds = timegm(whole.timetuple()) + Fraction(f"0{match[2] or ''}")
         return _checked(seconds * UNITS["s"], text, found)
 
@@ -91,7 +91,7 @@ def of_date(found: Counter[str]) -> Callable[[str], int]:
 def _checked(time: Fraction, text: str, found: Counter[str]) -> int:
     nanoseconds = round(time)
     if not 0 <= nanoseconds <= MAX_STAMP:
-        raise Refused(f"{text!r} is not a time from 1970 to 2038, which is what ROS 2 has")
+        raise Refused(f"{text!r} is not between 1970 and 2038, the range of ROS 2 times")
     if nanoseconds != time:
         found[ROUNDED] += 1
     return nanoseconds
@@ -101,18 +101,18 @@ def at_rate(count: int, rate: str) -> NDArray[np.int64]:
     """Times of images at a rate, from 0 on, rounded to nanoseconds.
 
     Args:
-        count: How many.
+        count: Number of images.
         rate: Images per second, such as ``20``, ``29.97`` or ``30000/1001``.
 
     Raises:
-        Refused: It is no rate.
+        Refused: It is not a rate.
     """
     try:
         found = Fraction(rate)
     except (ValueError, ZeroDivisionError):
         found = Fraction(0)
     if not Fraction(1, 10**6) <= found <= 10**6:
-        raise Refused(f"{rate!r} is no rate in Hz")
+        raise Refused(f"{rate!r} is not a rate in Hz")
     times = [round(number * 10**9 / found) for number in range(count)]
     if times and times[-1] > MAX_STAMP:
         raise Refused(f"{rate!r} Hz is too slow for {count} images")
@@ -121,7 +121,7 @@ def at_rate(count: int, rate: str) -> NDArray[np.int64]:
 
 # ---------------------------------------------------------------- geometry
 
-_TOLERANCE = 1e-2  # of a rotation that a file gives with few digits
+_TOLERANCE = 1e-2  # of a rotation given with few digits
 
 Matrix = NDArray[np.float64]
 
@@ -136,12 +136,12 @@ def quaternion(rotation: Matrix) -> tuple[float, float, float, float]:
         rotation: Shape (3, 3).
 
     Raises:
-        ValueError: It is none.
+        ValueError: It is not a rotation.
     """
     m = rotation
     is_near = np.abs(m @ m.T - np.eye(3)).max(initial=0) < _TOLERANCE
     if not np.isfinite(m).all() or not is_near or np.linalg.det(m) < 0:
-        raise ValueError("its rotation is none")
+        raise ValueError("its rotation is not valid")
     symmetric = np.empty((4, 4))
     symmetric[:3, :3] = m + m.T - np.trace(m) * np.eye(3)
     vector = [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]
@@ -157,12 +157,12 @@ def transform(parent: str, child: str, rotation: Matrix, translation: Matrix) ->
 
     Args:
         parent: The frame in which the child is.
-        child: The frame that is placed.
+        child: The frame whose pose this is.
         rotation: Shape (3, 3).
         translation: Metres, shape (3,).
 
     Raises:
-        ValueError: The rotation is none.
+        ValueError: The rotation is not valid.
     """
     if not np.isfinite(translation).all():
         raise ValueError("its translation is not finite")
@@ -191,10 +191,10 @@ _OPENCV_TAG = re.compile(rb"(?m)(?<=:)[ \t]*!!opencv-matrix(?=[ \t]*\r?$)")
 
 
 def _without_opencv(data: bytes) -> bytes:
-    """YAML without what only OpenCV's FileStorage writes: its directive, and a tag of matrices."""
+    """YAML without OpenCV FileStorage's extras: its directive, and its matrix tag."""
     if not (header := _OPENCV_HEADER.match(data)):
         return data
-    lines = b"#\n" * header[0].count(b"\n")  # errors name the line
+    lines = b"#\n" * header[0].count(b"\n")  # keeps line numbers in errors
     return lines + _OPENCV_TAG.sub(b"", data[header.end() :])
 
 
@@ -202,11 +202,13 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """The values of a small YAML file, which OpenCV may have written.
 
     Raises:
-        SourceError: It is none, or uses more of YAML than maps, lists and plain values.
+        SourceError: It is not valid, or uses more of YAML than maps, lists and plain values.
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise SourceError(path, f"is larger than {_MAX_BYTES} bytes, and no calibration")
+            raise SourceError(
+                path, f"is larger than {_MAX_BYTES} bytes, so it cannot be a calibration"
+            )
         return yamlio.load(_without_opencv(path.read_bytes()), str(path))
     except FormatError as error:
         raise SourceError(path, error.problem) from None
@@ -218,7 +220,7 @@ def ros_calibration(path: Path) -> CalibrationFields:
     """The calibration that ROS's camera_calibration saves.
 
     Raises:
-        SourceError: It is none; says what is missing or wrong.
+        SourceError: It is not valid; says what is missing or wrong.
     """
     values = read_yaml(path)
     try:
@@ -237,8 +239,8 @@ def ros_calibration(path: Path) -> CalibrationFields:
     except ValueError as error:
         raise SourceError(
             path,
-            f"is no calibration: {error}",
-            "Give a YAML file as ROS's camera_calibration saves it.",
+            f"is not a valid calibration: {error}",
+            "Give a YAML file saved by ROS's camera_calibration.",
         ) from None
 
 
@@ -250,7 +252,7 @@ def euroc_calibration(path: Path, values: dict[str, Any]) -> CalibrationFields:
         values: Of `read_yaml`.
 
     Raises:
-        SourceError: It is none; says what is missing or wrong.
+        SourceError: It is not valid; says what is missing or wrong.
     """
     try:
         model = str(_known(values, "camera_model"))
@@ -272,39 +274,37 @@ def euroc_calibration(path: Path, values: dict[str, Any]) -> CalibrationFields:
             p=projection(k),
         )
     except ValueError as error:
-        raise SourceError(path, f"is no calibration: {error}") from None
+        raise SourceError(path, f"is not a valid calibration: {error}") from None
 
 
 def euroc_pose(path: Path, values: dict[str, Any]) -> Matrix | None:
     """``T_BS`` of EuRoC's sensor.yaml: the pose of the sensor in the body, shape (4, 4).
 
     Raises:
-        SourceError: It is none.
+        SourceError: It is not valid.
     """
     if "T_BS" not in values:
         return None
     try:
         return np.array(_matrix(values, "T_BS", 16)).reshape(4, 4)
     except ValueError as error:
-        raise SourceError(path, f"tells no pose: {error}") from None
+        raise SourceError(path, f"holds no valid pose: {error}") from None
 
 
 def projection(k: Sequence[float]) -> tuple[float, ...]:
-    """The projection matrix, 3 x 4 by rows, of a camera that is not rectified."""
+    """The projection matrix, 3 x 4 by rows, of an unrectified camera."""
     return (*k[0:3], 0.0, *k[3:6], 0.0, *k[6:9], 0.0)
 
 
 def _distortion(name: str, values: tuple[float, ...]) -> dict[str, Any]:
     if name not in _MODELS:
         known = ", ".join(_MODELS)
-        raise ValueError(f"distortion_model {name!r} is not known; there are {known}")
+        raise ValueError(f"distortion_model {name!r} is not known; known are {known}")
     model, counts = _MODELS[name]
     if len(values) not in counts:
         listed = " or ".join(map(str, counts))
-        raise ValueError(
-            f"{name} has {listed} distortion_coefficients, and there are {len(values)}"
-        )
-    if model == "plumb_bob":  # ROS's has the third radial one, too
+        raise ValueError(f"{name} has {listed} distortion_coefficients, not {len(values)}")
+    if model == "plumb_bob":  # ROS's also has the third radial coefficient
         values = (*values, 0.0)[:5]
     return {"distortion_model": model, "d": values}
 
@@ -337,13 +337,13 @@ def _matrix(
 def _numbers(values: Any, key: str, count: int | None) -> tuple[float, ...]:
     if not isinstance(values, list) or len(values) != (len(values) if count is None else count):
         listed = "numbers" if count is None else f"{count} numbers"
-        raise ValueError(f"{key} is no list of {listed}")
+        raise ValueError(f"{key} is not a list of {listed}")
     return tuple(_number(value, key) for value in values)
 
 
 def _number(value: Any, key: str) -> float:
     try:
-        # YAML 1.1 has spellings of floats, such as 1., that are texts in the subset
+        # YAML 1.1 allows floats such as 1., which are strings in the subset
         number = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):
         number = math.nan
@@ -367,8 +367,8 @@ class SceneCamera:
         frame_id: Coordinate frame.
         files: The images.
         stamps: Their times, nanoseconds, int64, shape (images,).
-        calibration: Its intrinsics, where they are known.
-        encoding: ROS image encoding; None: the one that the files tell.
+        calibration: Its intrinsics, if known.
+        encoding: ROS image encoding; None: as in the files.
     """
 
     topic: str
@@ -379,7 +379,7 @@ class SceneCamera:
     encoding: str | None = None
 
     def by_time(self) -> SceneCamera:
-        """The same in the order of the times; those of one time stay in theirs."""
+        """The same sorted by time, stably."""
         order = np.argsort(self.stamps, kind="stable")
         files = [self.files[number] for number in order.tolist()]
         return replace(self, files=files, stamps=self.stamps[order])
@@ -387,7 +387,7 @@ class SceneCamera:
 
 @dataclass(frozen=True)
 class SensorTable:
-    """Measurements of a sensor that is no camera.
+    """Measurements of a sensor that is not a camera.
 
     Attributes:
         topic: Its topic.
@@ -404,22 +404,22 @@ class SensorTable:
     rows: NDArray[np.float64]
 
     def by_time(self) -> SensorTable:
-        """The same in the order of the times."""
+        """The same sorted by time."""
         order = np.argsort(self.stamps, kind="stable")
         return replace(self, stamps=self.stamps[order], rows=self.rows[order])
 
 
 @dataclass
 class Scene:
-    """All that a folder holds.
+    """Everything in a folder.
 
     Attributes:
         folder: The folder.
-        files: What it was read from; folders of images among them.
+        files: What it was read from, including folders of images.
         cameras: Its cameras.
         tables: Its other sensors.
-        transforms: Where they are.
-        kept: Files that are stored as they are: what messages do not say all of.
+        transforms: Their poses.
+        kept: Files to store as they are, because messages do not hold all of them.
         skipped: What is left out: a phrase -> how many.
     """
 
@@ -432,7 +432,7 @@ class Scene:
     skipped: Counter[str] = field(default_factory=Counter)
 
     def leave_out(self, path: Path, what: str) -> None:
-        """Count the files of something that does not become messages."""
+        """Count files that do not become messages."""
         files = [path] if path.is_file() else [item for item in path.rglob("*") if item.is_file()]
         if files:
             self.skipped[f"files of {what}"] += len(files)
@@ -442,18 +442,18 @@ def lines_of(path: Path) -> Iterator[tuple[int, str]]:
     """Number, from 1, and text of each line that is neither blank nor a comment.
 
     Raises:
-        SourceError: It is no text, or cannot be read.
+        SourceError: It is not a text file, or cannot be read.
     """
     try:
         if path.stat().st_size > MAX_TEXT:
-            raise SourceError(path, f"is larger than {MAX_TEXT} bytes, and no list")
+            raise SourceError(path, f"is larger than {MAX_TEXT} bytes, so it cannot be a list")
         with path.open(encoding="utf-8-sig") as stream:
             for number, line in enumerate(iter(lambda: stream.readline(_MAX_LINE), ""), start=1):
                 text = line.strip()
                 if text and not text.startswith("#"):
                     yield number, text
     except UnicodeDecodeError:
-        raise SourceError(path, "is no text") from None
+        raise SourceError(path, "is not a text file") from None
     except OSError as error:
         raise SourceError(path, f"cannot be read: {error.strerror}") from None
 
@@ -469,10 +469,10 @@ Rows = list[tuple[int, list[str]]]
 
 
 def read_times(path: Path, rows: Rows, read: Callable[[str], int]) -> NDArray[np.int64]:
-    """The times with which the rows of a list begin.
+    """The times at the start of a list's rows.
 
     Raises:
-        SourceError: One is none; names its line.
+        SourceError: One is not valid; names its line.
     """
     times = np.empty(len(rows), np.int64)
     for place, (number, values) in enumerate(rows):
@@ -492,10 +492,10 @@ def read_table(
         path: The file.
         read: Reads a time.
         values: Numbers of each row after the time.
-        more: Whether further ones may follow, which are not read.
+        more: Whether further numbers may follow, which are ignored.
 
     Raises:
-        SourceError: A line has other values; names it.
+        SourceError: A line has different values; names it.
     """
     rows = [(number, split(line)) for number, line in lines_of(path)]
     times = read_times(path, rows, read)
@@ -506,7 +506,7 @@ def read_table(
         try:
             table[place] = [float(text) for text in row[1 : values + 1]]
         except ValueError:
-            raise SourceError(path, f"line {number} holds something else than numbers") from None
+            raise SourceError(path, f"line {number} holds something other than numbers") from None
     return times, table
 
 
@@ -517,12 +517,12 @@ def listed_images(
 
     Args:
         path: The list.
-        folder: In which the files are.
+        folder: The folder of the files.
         read: Reads a time.
-        rows: The lines of the list, where they were read already.
+        rows: The lines of the list, if already read.
 
     Raises:
-        SourceError: A line is no time and name, or its file is not there.
+        SourceError: A line is not a time and name, or its file does not exist.
     """
     if rows is None:
         rows = [(number, _time_and_name(line)) for number, line in lines_of(path)]
@@ -543,5 +543,5 @@ def _listed(path: Path, folder: Path, number: int, values: list[str]) -> Path:
         raise SourceError(path, f"line {number} names a file outside of {folder}: {name}")
     image = folder / name
     if not image.is_file():
-        raise SourceError(path, f"line {number} names {image}, which is not there")
+        raise SourceError(path, f"line {number} names {image}, which does not exist")
     return image

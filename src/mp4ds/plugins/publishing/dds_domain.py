@@ -412,20 +412,27 @@ class _Sought:
             Policy.IgnoreLocal.Participant,
         )
         try:
-            topic = Topic(self._participant, self._topic, self._class(endpoint))
+            topic = Topic(
+                self._participant, self._topic, publisher_type(self._participant, endpoint)
+            )
             return [DataReader(self._participant, topic, qos=qos)]
         except DDSException:
             return []  # a second type of the topic: a participant knows one
 
-    def _class(self, endpoint: Any) -> Any:
-        """The publisher's own type where it tells it, as readers then have to have it."""
-        from cyclonedds.core import DDSException
-        from cyclonedds.dynamic import get_types_for_typeid
 
-        if endpoint.type_id is not None:
-            try:
-                found = get_types_for_typeid(self._participant, endpoint.type_id, _TYPE_PATIENCE)
-                return as_is(found[0])
-            except DDSException:
-                pass  # ROS goes by the name alone
-        return opaque_type(endpoint.type_name.replace("::", "."))
+def publisher_type(participant: Any, endpoint: Any) -> Any:
+    """The class of a publisher's messages: where it tells its own type, readers have to have it.
+
+    Args:
+        participant: Who asks.
+        endpoint: The publisher, as discovery tells of it.
+    """
+    from cyclonedds.core import DDSException
+    from cyclonedds.dynamic import get_types_for_typeid
+
+    if endpoint.type_id is not None:
+        try:
+            return as_is(get_types_for_typeid(participant, endpoint.type_id, _TYPE_PATIENCE)[0])
+        except DDSException:
+            pass  # ROS goes by the name alone
+    return opaque_type(endpoint.type_name.replace("::", "."))

@@ -81,9 +81,9 @@ class RclpyPublisher:
         """
         from rclpy.exceptions import InvalidTopicNameException
 
-        kind = _message_class(topic, type_name)
+        kind = message_class(topic, type_name)
         try:
-            return self._node.create_publisher(kind, topic, _profile(qos))
+            return self._node.create_publisher(kind, topic, qos_profile(qos))
         except InvalidTopicNameException:
             remedy = "Play it under another name."
             raise ConversionError(topic, "ROS 2 has no topics of such names", remedy) from None
@@ -137,8 +137,8 @@ class RclpyPublisher:
     def _subscribe(
         self, topic: str, type_name: str, qos: Qos, on_raw: Callable[[bytes], None]
     ) -> None:
-        kind = _message_class(topic, type_name)
-        self._node.create_subscription(kind, topic, on_raw, _profile(qos), raw=True)
+        kind = message_class(topic, type_name)
+        self._node.create_subscription(kind, topic, on_raw, qos_profile(qos), raw=True)
 
     def serve(self, controls: Controls) -> None:
         """Offer the services of `ros2 bag play`, where rosbag2_interfaces is installed."""
@@ -196,7 +196,12 @@ class RclpyPublisher:
         self.close()
 
 
-def _message_class(topic: str, type_name: str) -> Any:
+def message_class(topic: str, type_name: str) -> Any:
+    """The class of a topic's messages.
+
+    Raises:
+        ConversionError: The type is not installed.
+    """
     from rosidl_runtime_py.utilities import get_message
 
     try:
@@ -206,7 +211,8 @@ def _message_class(topic: str, type_name: str) -> Any:
         raise ConversionError(topic, problem, "Install and source its package.") from None
 
 
-def _profile(qos: Qos) -> Any:
+def qos_profile(qos: Qos) -> Any:
+    """A quality of service as rclpy has it."""
     from rclpy.duration import Duration
     from rclpy.qos import (
         DurabilityPolicy,

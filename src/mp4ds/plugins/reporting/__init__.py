@@ -1,1 +1,1 @@
-"""A dataset as a page for the browser, and its frames as images."""
+"""A dataset as an HTML report, and its frames as images."""

@@ -1,4 +1,4 @@
-"""What the page knows of a camera: its columns, its times, its calibrations."""
+"""The page's data about a camera: its columns, timing and calibrations."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from mp4ds.times import (
 )
 
 Scores = Mapping[str, NDArray[np.float32]]
-"""By the name of the measure; one for each frame, NaN where there is none."""
+"""By metric name; one score per frame, NaN if there is none."""
 
 _MOST_SCORE_BYTES = 2**30
 _MOST_MEASURES = 16
@@ -45,16 +45,16 @@ def read_scores(path: Path) -> dict[str, dict[str, NDArray[np.float32]]]:
         By topic or name of a stream's file.
 
     Raises:
-        OptionError: It cannot be read, or is no such file.
+        OptionError: It cannot be read, or is not such a file.
     """
     try:
         if path.stat().st_size > _MOST_SCORE_BYTES:
-            raise OptionError(f"`scores` {path} has more than {_MOST_SCORE_BYTES} bytes.")
+            raise OptionError(f"`scores` {path} is larger than {_MOST_SCORE_BYTES} bytes.")
         found = json.loads(path.read_bytes())
     except OSError as error:
         raise OptionError(f"`scores` {path} cannot be read: {error.strerror}.") from None
     except (ValueError, RecursionError):
-        raise OptionError(f"`scores` {path} is no JSON.") from None
+        raise OptionError(f"`scores` {path} is not valid JSON.") from None
     if not isinstance(found, dict):
         raise _unlike(path)
     return {topic: _measures(path, measures) for topic, measures in found.items()}
@@ -80,7 +80,7 @@ def _measures(path: Path, measures: object) -> dict[str, NDArray[np.float32]]:
 def _unlike(path: Path) -> OptionError:
     return OptionError(
         f'`scores` {path} is not of the form {{"/topic": {{"vmaf": [98.7, null, ...]}}}}, with at '
-        f"most {_MOST_MEASURES} measures of a topic."
+        f"most {_MOST_MEASURES} metrics per topic."
     )
 
 
@@ -88,14 +88,14 @@ def scores_of(stream: Stream, scores: Mapping[str, Scores]) -> Scores:
     """The scores of one stream.
 
     Raises:
-        OptionError: There are not as many as frames.
+        OptionError: Their number differs from that of the frames.
     """
     found = scores.get(stream.path.stem) or scores.get(stream.topic) or {}
     for name, values in found.items():
         if len(values) != len(stream):
             raise OptionError(
-                f"{stream.topic} has {len(stream)} frames, and {len(values)} scores {name!r}: "
-                "give one for each frame, null where there is none."
+                f"{stream.topic} has {len(stream)} frames but {len(values)} scores {name!r}: give "
+                "one per frame, or null where there is none."
             )
     return found
 
@@ -103,31 +103,31 @@ def scores_of(stream: Stream, scores: Mapping[str, Scores]) -> Scores:
 # ---------------------------------------------------------------- timing
 
 _MS = 1e6  # nanoseconds
-_WIDER = 2  # times the span of the log times, beyond which stamps are of several clocks
+_WIDER = 2  # times the span of the log times; beyond it, stamps come from several clocks
 _SLACK_NS = 10 * 10**9
 _DAY_NS = 86_400 * 10**9
-_NO_STAMPS, _OTHER_CLOCK = "no header stamps", "stamps of another clock"
+_NO_STAMPS, _OTHER_CLOCK = "no header stamps", "stamps from another clock"
 
 
 @dataclass(frozen=True)
 class Timing:
-    """The times of one camera in figures. Milliseconds, None where there are too few frames.
+    """Timing statistics of one camera, in milliseconds; None if there are too few frames.
 
     Attributes:
         frames: Number of frames.
         rate_hz: Mean rate by the median interval.
-        median_ms: Median of the intervals between stamps that advance.
+        median_ms: Median of the positive intervals between stamps.
         jitter_ms: Standard deviation of the intervals.
-        p99_ms: 99th percentile of how far an interval is from the median.
+        p99_ms: 99th percentile of the intervals' distance from the median.
         longest_ms: Longest interval.
         lost: Frames missing by the stamps: see `lost_frames`.
         gaps: Places where they are missing.
-        repeated: Frames with the stamp of the one before.
-        backward: Frames with an earlier stamp than the one before.
-        seq_missing: Numbers that the header's `seq` leaves out; None where there is no `seq`.
+        repeated: Frames with the same stamp as the previous one.
+        backward: Frames with an earlier stamp than the previous one.
+        seq_missing: Numbers missing in the header's `seq`; None if there is no `seq`.
         delay_median_ms: Median of log time minus stamp.
-        delay_least_ms: Least of them.
-        delay_most_ms: Most of them.
+        delay_least_ms: Their minimum.
+        delay_most_ms: Their maximum.
     """
 
     frames: int
@@ -147,7 +147,7 @@ class Timing:
 
 
 def timing_of(stamps: Integers, log_times: Integers, seq: Integers | None) -> Timing:
-    """The figures of one camera.
+    """The timing statistics of one camera.
 
     Args:
         stamps: Header stamps, nanoseconds, at least one.
@@ -182,7 +182,7 @@ def _missing_numbers(seq: Integers) -> int:
 
 
 def nearest_offsets(stamps: Integers, reference: Integers) -> Floats:
-    """How much later each frame is than the reference's frame that is nearest, nanoseconds.
+    """How much later each frame is than the nearest reference frame, nanoseconds.
 
     Args:
         stamps: Of a camera.
@@ -193,7 +193,7 @@ def nearest_offsets(stamps: Integers, reference: Integers) -> Floats:
 
 
 def untimed(cameras: Sequence[Mapping[str, Integers]]) -> list[str]:
-    """Why the stamps of each camera cannot be compared with those of the others; empty: they can.
+    """Why the stamps of each camera cannot be compared with the others'; empty if they can.
 
     Args:
         cameras: Columns ``stamp`` and ``log_time`` of each.
@@ -203,7 +203,7 @@ def untimed(cameras: Sequence[Mapping[str, Integers]]) -> list[str]:
         abs(float(np.median(differences(columns["log_time"], columns["stamp"])))) > _DAY_NS
         for columns in cameras
     ]
-    # where all are far from the record times, as in a simulation, they are near each other
+    # if all are far from the record times, as in a simulation, they are close to each other
     pairs = list(zip(have_stamps, is_far, strict=True))
     has_near = (True, False) in pairs
     return [
@@ -212,9 +212,9 @@ def untimed(cameras: Sequence[Mapping[str, Integers]]) -> list[str]:
 
 
 def axis_of(cameras: Sequence[Mapping[str, Integers]]) -> str:
-    """By which times all cameras are shown together: ``stamp`` or ``log_time``.
+    """Which times synchronise all cameras: ``stamp`` or ``log_time``.
 
-    Stamps, where those of every camera mostly advance, and they are all of one clock.
+    Stamps, if those of every camera mostly advance and come from one clock.
 
     Args:
         cameras: Columns ``stamp`` and ``log_time`` of each.
@@ -251,7 +251,7 @@ def pack_column(values: NDArray[np.int64]) -> dict[str, str]:
         values: At least one.
 
     Returns:
-        ``start`` and ``step`` in decimal digits, since a number of a page has 53 bits, and
+        ``start`` and ``step`` in decimal digits, since JavaScript numbers have 53 bits, and
         ``values`` in base64.
     """
     with np.errstate(over="ignore"):
@@ -281,7 +281,7 @@ def _varints(values: NDArray[np.uint64]) -> bytes:
 
 
 def pack_floats(values: NDArray[np.float32]) -> str:
-    """Numbers of 32 bits, little-endian, in base64; NaN where there is none."""
+    """32-bit floats, little-endian, in base64; NaN if there is none."""
     return base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()
 
 
@@ -301,9 +301,9 @@ class Overlay:
     """Lines over an image.
 
     Attributes:
-        lines: Each a list of x, y, x, y ... as parts of the image's width and height.
-        axes: Those of `lines` that pass through the principal point, by number.
-        center: x and y of the principal point, as parts of the width and height.
+        lines: Each a list of x, y, x, y ... as fractions of the image's width and height.
+        axes: Indices of the `lines` through the principal point.
+        center: x and y of the principal point, as fractions of the width and height.
         problem: Why there are no lines; empty if there are.
     """
 
@@ -314,12 +314,12 @@ class Overlay:
 
 
 def overlay_of(calibration: Calibration, image_size: tuple[int, int], topic: str) -> Overlay:
-    """A grid of straight lines, equally far apart in a plane before the camera.
+    """A grid of evenly spaced straight lines in a plane in front of the camera.
 
     Args:
         calibration: Of the camera.
         image_size: Width and height of the images, pixels.
-        topic: Of the images: on one of image_proc's rectified topics P holds, without distortion.
+        topic: Of the images: on image_proc's rectified topics P applies, without distortion.
     """
     k, p = (np.array(matrix) for matrix in effective(fields_of(calibration)))
     is_rectified = any(part.startswith("image_rect") for part in topic.split("/"))
@@ -360,7 +360,7 @@ def _name(model: str) -> str:
 def _problem(
     calibration: Calibration, matrix: Floats, d: Sequence[float], image_size: tuple[int, int]
 ) -> str:
-    """Why there can be no grid."""
+    """Why no grid is possible."""
     size = calibration.width, calibration.height
     if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
         return "the camera is not calibrated"
@@ -373,19 +373,19 @@ def _problem(
         return ""
     name = _name(calibration.distortion_model)
     if name not in _POLYNOMIAL | _FISHEYE:
-        return f"the distortion model {calibration.distortion_model!r} is not known here"
+        return f"the distortion model {calibration.distortion_model!r} is not supported here"
     if not np.isfinite(d).all() or any(d[_MOST_D:]):
-        return "its sensor is tilted, which is not drawn"
+        return "its sensor is tilted, which is not supported"
     return ""
 
 
 def _distort(
     x: Floats, y: Floats, model: str, d: Sequence[float]
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Where a lens puts points of the plane at distance 1, and which of them are in its view."""
+    """Where a lens maps points of the plane at distance 1, and which of them are in view."""
     if not any(d):
         return x, y, np.ones(len(x), np.bool_)
-    with np.errstate(all="ignore"):  # far outside of the view
+    with np.errstate(all="ignore"):  # far outside the view
         if model in _FISHEYE:
             return _fisheye(x, y, d)
         return _polynomial(x, y, d)
@@ -414,7 +414,7 @@ def _polynomial(
     above = 1 + square * (k1 + square * (k2 + square * k3))
     below = 1 + square * (k4 + square * (k5 + square * k6))
     factor = above / below
-    # beyond where the picture turns back, the polynomial means nothing
+    # beyond its turning point the polynomial is meaningless
     above_slope = k1 + square * (2 * k2 + square * 3 * k3)
     below_slope = k4 + square * (2 * k5 + square * 3 * k6)
     slope = factor + 2 * square * (above_slope * below - above * below_slope) / (below * below)
@@ -426,7 +426,7 @@ def _polynomial(
 
 
 def _inside(u: Floats, v: Floats, is_sound: NDArray[np.bool_]) -> list[list[float]]:
-    """The parts of a line that are within the image."""
+    """The parts of a line inside the image."""
     with np.errstate(invalid="ignore"):
         seen = is_sound & (np.abs(u - 0.5) < 0.5 + _MARGIN) & (np.abs(v - 0.5) < 0.5 + _MARGIN)
     edges = np.flatnonzero(np.diff(np.concatenate(([0], seen.astype(np.int8), [0]))))
@@ -441,10 +441,10 @@ def _inside(u: Floats, v: Floats, is_sound: NDArray[np.bool_]) -> list[list[floa
 # ---------------------------------------------------------------- cameras
 
 _MOST_CALIBRATIONS = 64
-"""Changes of a calibration that the page lists; of a self-calibrating camera there are more."""
+"""Calibration changes listed on the page; a self-calibrating camera has more."""
 
 _MOST_OVERLAYS = 8
-_NOT_SEEN = Overlay([], [], [], "what is played is not the image")
+_NOT_SEEN = Overlay([], [], [], "the video that is played does not show the image")
 
 
 @dataclass
@@ -453,12 +453,12 @@ class ReportedCamera:
 
     Attributes:
         stream: The stream.
-        name: Its topic, or that with the name of its file where the topic has several.
-        times: Presentation times of its frames, microseconds; None where the video is damaged.
-        video: URL of what the page plays, from the page; empty: nothing.
+        name: Its topic, with its file name if the topic has several streams.
+        times: Presentation times of its frames, microseconds; None if the video is damaged.
+        video: URL of the video to play, relative to the page; empty: none.
         is_proxy: Whether that is a proxy.
         note: Why there is a proxy, or nothing to play.
-        caption: What the pictures show besides the image.
+        caption: How the pictures differ from the image.
         scores: Of its frames.
     """
 
@@ -491,7 +491,7 @@ class ReportedCamera:
         _ = self.stream.camera_info_columns
 
     def timing(self) -> Timing:
-        """Its figures."""
+        """Its timing statistics."""
         return timing_of(self.stamps, self.log_times, self.stream.columns.seq)
 
     def columns(self) -> dict[str, Any]:
@@ -507,7 +507,7 @@ class ReportedCamera:
         return columns
 
     def facts(self, number: int, reference: ReportedCamera | None, untimed: str) -> dict[str, Any]:
-        """What the page shows of it besides its columns.
+        """What the page shows about it besides its columns.
 
         Args:
             number: Of the camera on the page.
@@ -538,18 +538,18 @@ class ReportedCamera:
 
     @property
     def _is_seen(self) -> bool:
-        """Whether what is played looks like the image."""
+        """Whether the played video looks like the image."""
         return self.is_proxy or not why_not_seen(self.stream)
 
     def _shown(self) -> list[float]:
-        """The image's part of the width and height of what is played: a video may be padded."""
+        """The image's fraction of the played video's width and height: a video may be padded."""
         image, video = self.stream.sidecar.image, self.stream.sidecar.video
         if self.is_proxy or not self._is_seen:
             return [1.0, 1.0]
         return [image.width / video.width, image.height / video.height]
 
     def _calibrations(self) -> dict[str, Any]:
-        """Each calibration that differs from the one before, and the frame it holds from."""
+        """Each calibration that differs from the previous one, and its first frame."""
         info = self.stream.sidecar.camera_info
         if info is None:
             return {"calibrations": [], "calibration_topic": "", "calibrations_more": 0}
@@ -561,7 +561,7 @@ class ReportedCamera:
             changes = np.flatnonzero(np.diff(columns.variant, prepend=-1))
             variants = columns.variant[changes]
             frames = np.searchsorted(self.log_times, columns.log_time[changes], side="left")
-            frames[0] = 0  # the first one holds before it, too
+            frames[0] = 0  # the first one also applies before it
         listed: list[dict[str, Any]] = []
         size = self.stream.image_size
         pairs = zip(variants.tolist(), frames.tolist(), strict=False)
@@ -581,7 +581,7 @@ class ReportedCamera:
 
 
 def _offset(stamps: NDArray[np.int64], reference: NDArray[np.int64]) -> dict[str, float]:
-    """Figures of the offsets to another camera, milliseconds."""
+    """Statistics of the offsets to another camera, milliseconds."""
     offsets = nearest_offsets(stamps, reference) / 1e6
     return {
         "median_ms": float(np.median(offsets)),

@@ -1,4 +1,4 @@
-"""Many datasets in one table, and as one page with a picture and the report of each."""
+"""Many datasets in one table, and as a page with a picture and report of each."""
 
 from __future__ import annotations
 
@@ -38,18 +38,18 @@ _NS = 10**9
 
 @dataclass(frozen=True)
 class Brief:
-    """What a manifest says of its dataset.
+    """A dataset's summary from its manifest.
 
     Attributes:
         path: The dataset.
-        profile: What was asked for.
+        profile: Its profile.
         format: Of the recording.
-        messages: How many there are.
-        frames: Of these, frames of videos, by topic.
+        messages: Number of messages.
+        frames: How many of these are video frames, by topic.
         start: First log time, nanoseconds; None without messages.
         end: Last log time, nanoseconds.
         bytes: Of its files.
-        title: What it is called.
+        title: Its title.
     """
 
     path: Path
@@ -69,14 +69,14 @@ class Brief:
 
 
 def brief(path: Path) -> Brief:
-    """What the manifest of a dataset says.
+    """Summarise a dataset from its manifest.
 
     Raises:
-        SourceError: It is no dataset.
+        SourceError: It is not a dataset.
         FormatError: The manifest breaks a rule of the format.
     """
     if not (path / MANIFEST_NAME).is_file():
-        raise SourceError(path, "is no dataset", "Give folders that `mp4ds pack` made.")
+        raise SourceError(path, "is not a dataset", "Give folders made by `mp4ds pack`.")
     manifest = load_manifest(path / MANIFEST_NAME)
     by_topic: dict[str, int] = {}
     for stream in manifest.streams:
@@ -104,7 +104,7 @@ class OverviewSummary:
 
     Attributes:
         index: The page.
-        datasets: How many it shows.
+        datasets: Number of datasets shown.
         problems: What could not be shown.
     """
 
@@ -125,20 +125,20 @@ def reports(
 
     Args:
         datasets: Datasets, folders of them, or patterns; on this machine.
-        folder: Where the page is made. The report of each stands in its dataset.
+        folder: Where to make the page. Each report is in its dataset.
         options: How the reports are made.
         jobs: Datasets at a time.
-        progress: Called with a phrase, and the share that is done.
+        progress: Called with a phrase, and the share done.
 
     Raises:
-        SourceError: There is no dataset.
-        OptionError: An option is of one report.
-        TargetError: The page may not be written there.
-        WriteError: The disk refused.
+        SourceError: A path is not a dataset.
+        OptionError: An option is for single reports only.
+        TargetError: The page cannot be written there.
+        WriteError: The page could not be written.
     """
     chosen = options or ReportOptions()
     if chosen.output is not None or chosen.scores is not None or chosen.slice:
-        raise OptionError("`scores`, `start`, `end` and `duration` go with one dataset.")
+        raise OptionError("`scores`, `start`, `end` and `duration` work with one dataset only.")
     found = datasets_in(datasets)
     for path in found:
         if remote(path):
@@ -171,7 +171,7 @@ def reports(
 def _shown(
     item: tuple[int, Path], options: ReportOptions, pictures: Path
 ) -> tuple[Brief | None, list[str]]:
-    """Make report and picture of one dataset; what its manifest says, and what is wrong."""
+    """Make report and picture of one dataset; returns its summary and any problems."""
     number, path = item
     try:
         told = brief(path)

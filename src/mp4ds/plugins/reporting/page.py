@@ -1,4 +1,4 @@
-"""The page's files: what never changes, and the data of a dataset as scripts."""
+"""The page's files: static ones, and the data of a dataset as scripts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mp4ds.plugins.reporting.cameras import ReportedCamera, axis_of, untimed
 from mp4ds.records import Message
 
 _MOST_READ = 2**30
-"""Bytes of messages.mcap that are read to find out how much of it each topic is."""
+"""Maximum size of messages.mcap up to which it is read to measure each topic's share."""
 
 
 @dataclass
@@ -31,12 +31,12 @@ class TopicRow:
 
     Attributes:
         topic: Its name.
-        type_name: Its message type, of several publishers all.
+        type_name: Its message type; all types if publishers differ.
         messages: Number of messages.
         rate_hz: Mean rate by log time, or None.
         stored: Names of its files.
-        recorded_bytes: Of its messages' data as recorded; None where it is not known.
-        stored_bytes: Of its videos and sidecars; None where it has none.
+        recorded_bytes: Of its messages' data as recorded; None if unknown.
+        stored_bytes: Of its videos and sidecars; None if it has none.
         is_camera: Whether it has a video.
     """
 
@@ -51,7 +51,7 @@ class TopicRow:
 
     @property
     def ratio(self) -> float | None:
-        """How many times smaller it is stored; None where it is not known."""
+        """Compression ratio; None if unknown."""
         if not self.recorded_bytes or not self.stored_bytes:
             return None
         return self.recorded_bytes / self.stored_bytes
@@ -106,9 +106,9 @@ def _add_stream(rows: dict[str, TopicRow], stream: Stream) -> None:
 
 
 def recorded_bytes(stream: Stream) -> int | None:
-    """Bytes of a stream's images as recorded; None where files were made into pixels.
+    """Bytes of a stream's images as recorded; None if files were converted to pixels.
 
-    Packets are counted as large as their video.
+    Packets count as the size of their video.
     """
     sidecar = stream.sidecar
     if sidecar.body == "pixels":
@@ -120,7 +120,7 @@ def recorded_bytes(stream: Stream) -> int | None:
 
 
 def _bytes_in_messages(dataset: Dataset) -> Counter[str] | None:
-    """Bytes of each topic's messages in messages.mcap; None where the file is too large to ask."""
+    """Bytes of each topic's messages in messages.mcap; None if the file is too large to read."""
     sizes: Counter[str] = Counter()
     if dataset.manifest is None:
         return sizes
@@ -155,17 +155,17 @@ def write_folder(
     topics: list[TopicRow],
     notes: list[str],
 ) -> None:
-    """Write all of the report but its index.html and proxies.
+    """Write all of the report except index.html and proxies.
 
     Args:
         folder: Where to.
-        dataset: What it is about.
+        dataset: The dataset.
         cameras: In the order of the page.
         topics: Of the dataset.
         notes: What else is worth knowing.
 
     Raises:
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     for part in (files("mp4ds.plugins.reporting") / "page").iterdir():
         if part.name.endswith((".js", ".css")):
@@ -178,12 +178,12 @@ def write_folder(
 
 
 def _call(name: str, *values: Any) -> bytes:
-    """A script that hands values to the page."""
+    """A script that passes values to the page."""
     return f"mp4dsReport.{name}({', '.join(map(as_script, values))});\n".encode()
 
 
 def as_script(value: Any) -> str:
-    """A value as a script has it: ASCII, and safe within an element of a page, too.
+    """A value as JavaScript: ASCII, and safe inside an HTML element.
 
     Numbers that are not finite become null.
     """
@@ -207,7 +207,7 @@ def _facts(
     both = [{"stamp": c.stamps, "log_time": c.log_times} for c in cameras]
     axis, reasons = axis_of(both), untimed(both)
     columns = [c.stamps if axis == "stamp" else c.log_times for c in cameras]
-    # at most: the page shows a frame from the latest time so far on
+    # running maximum: the page shows a frame from the latest time so far
     base = min((int(times[0]) for times in columns), default=0)
     timed = [number for number, reason in enumerate(reasons) if not reason]
     reference = timed[0] if len(timed) > 1 else None
@@ -238,7 +238,7 @@ def _shortened(notes: Iterable[str]) -> list[str]:
 
 
 def _summary(dataset: Dataset, topics: list[TopicRow]) -> dict[str, Any]:
-    """Figures of the whole dataset; bytes, nanoseconds as text, and None for what is not known."""
+    """Figures of the whole dataset: bytes, nanoseconds as text, and None if unknown."""
     manifest = dataset.manifest
     summary: dict[str, Any] = {
         "messages": sum(row.messages for row in topics),
@@ -263,7 +263,7 @@ def _summary(dataset: Dataset, topics: list[TopicRow]) -> dict[str, Any]:
 
 
 def utc_text(time_ns: int) -> str:
-    """A time in UTC, to the second; empty beyond the calendar."""
+    """A time in UTC, to the second; empty outside the calendar."""
     try:
         moment = datetime.fromtimestamp(time_ns // 10**9, timezone.utc)
     except (OverflowError, OSError, ValueError):
@@ -274,17 +274,17 @@ def utc_text(time_ns: int) -> str:
 def _notes(dataset: Dataset) -> Iterable[str]:
     manifest = dataset.manifest
     if any(stream.sidecar.stamps == "record-float" for stream in dataset.streams):
-        yield "Times are record times that were stored as float seconds: they are not exact."
+        yield "Times are record times stored as float seconds, so they are not exact."
     if manifest is None:
         return
     if manifest.about:
         yield from manifest.about.lines
     for item in manifest.verbatim:
         yield (
-            f"{item.topic}: {item.messages} messages are in messages.mcap as they were, from "
-            f"number {item.first} on: {item.reason}."
+            f"{item.topic}: {item.messages} messages are stored verbatim in messages.mcap, the "
+            f"first is number {item.first}: {item.reason}."
         )
     for loss in manifest.losses:
-        yield f"Lost when it was packed: {loss.file}: {loss.problem}."
+        yield f"Lost when packing: {loss.file}: {loss.problem}."
     if manifest.topics_left_out:
-        yield f"Left out when it was packed: {', '.join(manifest.topics_left_out)}."
+        yield f"Left out when packing: {', '.join(manifest.topics_left_out)}."

@@ -1,4 +1,4 @@
-"""What browsers show of a stream: its own video, or a small one in its place."""
+"""What browsers can show of a stream: its own video, or a small replacement."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ _PLAYED = {
     "av1": frozenset({"yuv420p", "yuvj420p", "gray", "yuv420p10le", "gray10le"}),
     "vp9": _8BIT,
 }
-"""What Chromium was seen to show as it is; others play less of it."""
+"""What Chromium plays directly, by test; other browsers play less."""
 
-_FEW = ("hevc",)  # where the system or the graphics card decodes it
+_FEW = ("hevc",)  # if the system or the GPU decodes it
 
 
 def why_not_in_browsers(path: Path) -> str:
-    """Why browsers do not play a video; empty if Chromium and its kin do.
+    """Why browsers do not play a video; empty if Chromium-based ones do.
 
     Args:
         path: An mp4.
@@ -49,7 +49,7 @@ def why_not_in_browsers(path: Path) -> str:
     if name not in _PLAYED:
         return f"{'few browsers play' if name in _FEW else 'no browser plays'} {name}"
     if pixel_format not in _PLAYED[name]:
-        return f"no browser plays {name} of the pixel format {pixel_format}"
+        return f"no browser plays {name} in the pixel format {pixel_format}"
     return ""
 
 
@@ -57,26 +57,26 @@ def why_not_in_browsers(path: Path) -> str:
 
 Bytes = NDArray[np.uint8]
 
-_SAMPLES = 9  # frames, of which the range of the values is taken
-_LOW, _HIGH = 1.0, 99.0  # percentiles between which numbers get their colours
-_WHITE = 99.9  # percentile of light that is white
-_SIDE = 256  # pixels at most of a frame that is sampled
-# from near to far: violet, blue, green, yellow; what has no value is black
+_SAMPLES = 9  # frames sampled for the range of values
+_LOW, _HIGH = 1.0, 99.0  # percentiles mapped to the ends of the colour scale
+_WHITE = 99.9  # percentile shown as white
+_SIDE = 256  # maximum side of a sampled frame, pixels
+# from near to far: violet, blue, green, yellow; missing values are black
 _COLOURS = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
 
 
 class Look:
-    """Makes pictures of a stream's images; not to be shared between threads.
+    """Makes displayable pictures of a stream's images; not to be shared between threads.
 
-    Mosaics are interpolated; light of 16 bits is scaled so that the brightest is white; depths
-    and other numbers get colours, their first channel that of several.
+    Mosaics are interpolated; 16-bit images are scaled so that the brightest is white; depths and
+    other measurements are shown in false colour, using the first of several channels.
 
     Args:
-        stream: Its frames are sampled, where their range must be known.
+        stream: Its frames are sampled if their range is needed.
         size: Width and height of the pictures.
 
     Attributes:
-        caption: What else than the image is shown; empty for plain light.
+        caption: How the pictures differ from the image; empty if they do not.
     """
 
     def __init__(self, stream: Frames, size: tuple[int, int]) -> None:
@@ -95,10 +95,10 @@ class Look:
         if not self._is_light:
             self._low, self._high = _range(_sampled(stream), _LOW, _HIGH)
             first = "the first of its channels, " if encoding.channels > 1 else ""
-            self.caption = f"in colours: {first}{self._low:.4g} to {self._high:.4g}"
+            self.caption = f"in false colour: {first}{self._low:.4g} to {self._high:.4g}"
         elif self._view.dtype != np.uint8:
             self._high = _range(_sampled(stream), _LOW, _WHITE)[1]
-            self.caption = f"of 16 bits: white is {self._high:.0f}"
+            self.caption = f"16 bits: white is {self._high:.0f}"
 
     def picture(self, pixels: Pixels) -> Bytes:
         """A new picture, shape (H, W, 3).
@@ -117,7 +117,7 @@ class Look:
         return picture
 
     def _scaled(self, values: Pixels) -> NDArray[np.float64]:
-        """Values as 0 to 255; those beyond the range at its ends."""
+        """Values scaled to 0 to 255, clipped to the range."""
         with np.errstate(invalid="ignore", over="ignore"):
             scaled = (values.astype(np.float64) - self._low) * (255 / (self._high - self._low))
         places: NDArray[np.float64] = np.nan_to_num(np.clip(np.rint(scaled), 0, 255))
@@ -125,7 +125,7 @@ class Look:
 
 
 def pictures_in_order(stream: Stream) -> Iterator[tuple[int, Pixels | None]]:
-    """The pixels of all frames; None for a packet that does not decode by what was recorded.
+    """The pixels of all frames; None for a packet that cannot be decoded by what was recorded.
 
     Raises:
         VideoError: The video is damaged.
@@ -141,7 +141,7 @@ def pictures_in_order(stream: Stream) -> Iterator[tuple[int, Pixels | None]]:
 
 
 def _sampled(stream: Frames) -> list[Pixels]:
-    """Pixels of a few frames, of which a part stands for the whole."""
+    """Pixels of a few frames, subsampled."""
     numbers = sorted(set(np.linspace(0, len(stream) - 1, _SAMPLES).astype(int).tolist()))
     found = []
     for number in numbers:
@@ -159,7 +159,7 @@ def _first(pixels: Pixels) -> Pixels:
 
 
 def _is_value(numbers: Pixels) -> NDArray[np.bool_]:
-    """Whether there is a number: sensors say 0, infinity or NaN where they measured nothing."""
+    """Whether a value is valid: sensors report 0, infinity or NaN if they measured nothing."""
     is_value: NDArray[np.bool_] = np.isfinite(numbers) & (numbers != 0)
     return is_value
 
@@ -183,9 +183,9 @@ def _colour_table() -> Bytes:
 
 # ---------------------------------------------------------------- proxies
 
-_VERSION = 1  # of how proxies are made
+_VERSION = 1  # of the way proxies are made
 _CRF, _PRESET = 26, "veryfast"
-_GOP = 24  # a step back decodes as many frames at most
+_GOP = 24  # a step back decodes at most that many frames
 _LEAST_SIDE = 32
 _MOST_THREADS = 8
 _TELL_EVERY = 32  # frames
@@ -196,7 +196,7 @@ def presentation_times(stream: Stream) -> NDArray[np.int64]:
     """When a player shows each frame of a stream's video, microseconds, as its mp4 says.
 
     Raises:
-        VideoError: It cannot be read, or has another number of frames than its sidecar says.
+        VideoError: It cannot be read, or its number of frames differs from its sidecar.
     """
     path = stream.video_path
     if not path.is_file():
@@ -211,7 +211,7 @@ def presentation_times(stream: Stream) -> NDArray[np.int64]:
     ticks = table.presentation[table.order]
     if len(ticks) != len(stream):
         raise VideoError(
-            "frame-count", path, f"has {len(ticks)} frames where its sidecar says {len(stream)}"
+            "frame-count", path, f"has {len(ticks)} frames, but its sidecar says {len(stream)}"
         )
     whole, part = np.divmod(ticks, table.timescale)
     times: NDArray[np.int64] = whole * _MICROSECONDS + part * _MICROSECONDS // table.timescale
@@ -224,15 +224,15 @@ def why_not_seen(stream: Stream) -> str:
     """Why a stream's video does not look like its images; empty if it does."""
     if stream.sidecar.body == "packet" or stream.sidecar.layout.is_shown:
         return ""
-    return f"its picture is not the image (layout {stream.sidecar.video.layout})"
+    return f"the coded picture does not show the image (layout {stream.sidecar.video.layout})"
 
 
 def proxy_size(image_size: tuple[int, int], width: int) -> tuple[int, int]:
-    """Width and height of a proxy: even, and no larger than the images, but for tiny ones.
+    """Width and height of a proxy: even, and no larger than the images, except for tiny ones.
 
     Args:
         image_size: Of the images.
-        width: Most columns.
+        width: Maximum width.
     """
     factor = min(1.0, width / image_size[0])
     sides = [max(_LEAST_SIDE, 2 * round(side * factor / 2)) for side in image_size]
@@ -240,7 +240,7 @@ def proxy_size(image_size: tuple[int, int], width: int) -> tuple[int, int]:
 
 
 def proxy_key(stream: Stream, size: tuple[int, int]) -> str:
-    """What tells whether a proxy would be made in the same way again; empty if nothing does."""
+    """A key that is equal if a proxy would be made the same way again; empty if unknown."""
     digest = stream.sidecar.video.sha256
     return (
         f"{_VERSION} {digest} {size[0]}x{size[1]} crf={_CRF} {_PRESET} g={_GOP}" if digest else ""
@@ -265,11 +265,11 @@ def make_proxy(
         progress: Called with a phrase now and then.
 
     Returns:
-        What its pictures show besides the image; see `Look`.
+        Its caption; see `Look`.
 
     Raises:
         VideoError: The stream's video cannot be decoded.
-        OSError: The disk refused.
+        OSError: It cannot be written.
     """
     look = Look(stream, size)
     recipe = recipe_for("rgb24", lossless=False, codec="h264", crf=_CRF, preset=_PRESET)
@@ -287,7 +287,7 @@ def make_proxy(
     picture = np.zeros((size[1], size[0], 3), np.uint8)
     try:
         for number, pixels in pictures_in_order(stream):
-            if pixels is not None:  # else the one before stays
+            if pixels is not None:  # otherwise the previous one stays
                 picture = look.picture(pixels)
             encoder.write((picture,), int(times[number]))
             if number % _TELL_EVERY == 0:

@@ -1,7 +1,7 @@
-"""``report``: a dataset as a page for the browser, beside its files.
+"""``report``: a dataset as an HTML page next to its files.
 
 index.html and a folder ``report`` are added to the dataset, or written elsewhere. The page plays
-the dataset's own videos where browsers do, else small proxies; its columns are exact.
+the dataset's own videos if browsers can, else small proxies; its columns are exact.
 """
 
 from __future__ import annotations
@@ -58,22 +58,24 @@ _KEYS_NAME = "proxies.json"
 
 @dataclass(frozen=True)
 class ReportOptions(SliceOptions):
-    """How a report is made."""
+    """How to make a report."""
 
     output: Path | None = option(
-        "Where to write it; into the dataset if not said.", None, "-o", metavar="FOLDER"
+        "Folder to write to; default: the dataset itself.", None, "-o", metavar="FOLDER"
     )
     start: str | float | None = start()
     end: str | float | None = end()
     duration: str | float | None = duration()
     proxies: str = option(
-        "Small videos for what no browser shows (auto), for all, or none.", "auto", metavar="WHICH"
+        "Make small videos for cameras browsers cannot play (auto), for all, or for none.",
+        "auto",
+        metavar="WHICH",
     )
     proxy_width: int = option(
-        "Most columns of a proxy.", 640, metavar="PIXELS", least=64, most=3840
+        "Maximum width of a proxy.", 640, metavar="PIXELS", least=64, most=3840
     )
-    scores: Path | None = option("Quality scores of frames, to be plotted.", metavar="JSON")
-    force: bool = force("Replace an index.html that is no report.")
+    scores: Path | None = option("Quality scores per frame, to plot.", metavar="JSON")
+    force: bool = force("Replace an index.html that is not a report.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -83,12 +85,12 @@ class ReportOptions(SliceOptions):
 
 @dataclass(frozen=True)
 class CameraSummary:
-    """What the page plays of a stream.
+    """What the page plays for a stream.
 
     Attributes:
         topic: Its topic.
         plays: Its own ``video``, a ``proxy``, or ``nothing``.
-        note: Why, where it is not its own.
+        note: Why, if it is not its own video.
     """
 
     topic: str
@@ -102,10 +104,10 @@ class ReportSummary:
 
     Attributes:
         index: The page.
-        files: What it needs, by path from the folder that dataset and page have in common.
+        files: The files it needs, by path from the common folder of dataset and page.
         cameras: In the order of the page.
-        bytes: Size of all that was written.
-        problems: What of the dataset could not be shown.
+        bytes: Total size of what was written.
+        problems: What could not be shown of the dataset.
     """
 
     index: Path
@@ -116,7 +118,7 @@ class ReportSummary:
 
     @property
     def start(self) -> str:
-        """Path of the page's URL, where `files` are served."""
+        """Path of the page's URL when `files` are served."""
         return quote(next(name for name, path in self.files.items() if path == self.index))
 
 
@@ -126,20 +128,20 @@ def report(
     *,
     progress: Callable[[str], None] | None = None,
 ) -> ReportSummary:
-    """Make the page of a dataset. A report of before is replaced; its proxies are used again.
+    """Make the page of a dataset. An existing report is replaced; its proxies are reused.
 
     Args:
         dataset: A dataset, or one video with its sidecar, on this machine.
-        options: How. Of a slice a dataset is made first, at `output`.
+        options: How. A slice is first made into a dataset, at `output`.
         progress: Called with a phrase now and then.
 
     Raises:
-        SourceError: There is no dataset.
-        FormatError: The dataset breaks a rule of the format. A damaged video is no error, but
+        SourceError: It is not a dataset.
+        FormatError: The dataset breaks a rule of the format. A damaged video is not an error, but
             one of the summary's problems.
         OptionError: An option is wrong.
-        TargetError: The report may not be written there.
-        WriteError: The disk refused; what was there before is still there.
+        TargetError: The report cannot be written there.
+        WriteError: The report could not be written; what was there before remains.
     """
     chosen = options or ReportOptions()
     tell = progress or (lambda _: None)
@@ -149,7 +151,7 @@ def report(
         if remote(opened.path):
             raise SourceError(opened.path, "is not on this machine", "Copy the dataset first.")
         if opened.manifest is None and chosen.output is None:
-            raise OptionError("A video alone has no folder for a report: give `output`.")
+            raise OptionError("A single video has no folder for a report: give `output`.")
         folder = Path(os.path.abspath(chosen.output or opened.path))  # noqa: PTH100 - as named
         _check_place(folder, force=chosen.force)
         scores = _scores(opened, chosen.scores)
@@ -161,7 +163,7 @@ def report(
             except BaseException:
                 if is_new:
                     with suppress(OSError):
-                        folder.rmdir()  # nothing unfinished stays, nor an empty folder
+                        folder.rmdir()  # leave neither partial output nor an empty folder
                 raise
         except OSError as error:
             raise as_write_error(error, folder) from error
@@ -170,12 +172,12 @@ def report(
 def _report_slice(
     dataset: Path | str, options: ReportOptions, tell: Callable[[str], None]
 ) -> ReportSummary:
-    """The report of a slice, which becomes a dataset for it."""
+    """The report of a slice, which is first made into a dataset."""
     from mp4ds.packing.options import PackOptions
     from mp4ds.packing.pack import pack
 
     if options.output is None:
-        raise OptionError("Give `output`, for a dataset of the slice with its report in it.")
+        raise OptionError("Give `output`: where to write the slice as a dataset with its report.")
     tell("copying the slice")
     span = PackOptions(
         start=options.start, end=options.end, duration=options.duration, force=options.force
@@ -189,18 +191,18 @@ def _scores(dataset: Dataset, path: Path | None) -> Mapping[str, Scores]:
     """The scores of a file.
 
     Raises:
-        OptionError: It has some of a topic that is no stream.
+        OptionError: It has scores for an unknown stream.
     """
     scores = read_scores(path) if path else {}
     for topic in scores:
         if topic not in dataset:
             known = ", ".join(dataset.topics) or "none"
-            raise OptionError(f"`scores` {path} has {topic!r}, which is none of {known}.")
+            raise OptionError(f"`scores` {path} has {topic!r}, which is not one of {known}.")
     return scores
 
 
 def _check_place(folder: Path, *, force: bool) -> None:
-    """Refuse early what may not be replaced.
+    """Refuse early if something must not be replaced.
 
     Raises:
         TargetError: Says what.
@@ -285,7 +287,7 @@ def _give_video(
     unplayable = why_not_in_browsers(stream.video_path)
     camera.note = unplayable or why_not_seen(stream)
     if options.proxies == "all" or (camera.note and options.proxies == "auto"):
-        camera.note = camera.note or "asked for"
+        camera.note = camera.note or "requested"
         camera.video, camera.caption = proxies.give(stream, camera.times, options.proxy_width, tell)
         camera.is_proxy = True
     elif not unplayable:
@@ -293,12 +295,12 @@ def _give_video(
 
 
 def _url(path: Path, folder: Path) -> str:
-    """Of a file, from a page in a folder."""
+    """URL of a file, relative to a page in a folder."""
     return quote(Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix())
 
 
 class _Proxies:
-    """The proxies of a report that is being made, and those of the one before."""
+    """The proxies of a report in progress, and those of the previous one."""
 
     def __init__(self, *, old: Path, new: Path) -> None:
         self._old = old / PROXIES_NAME
@@ -312,10 +314,10 @@ class _Proxies:
     def give(
         self, stream: Stream, times: NDArray[np.int64], width: int, tell: Callable[[str], None]
     ) -> tuple[str, str]:
-        """Make a proxy, or take the one that was made before.
+        """Make a proxy, or reuse an earlier one.
 
         Returns:
-            Its URL from the page, and what its pictures show besides the image.
+            Its URL relative to the page, and its caption.
         """
         self._new.mkdir(exist_ok=True)
         name = f"{stream.path.stem}.mp4"
@@ -330,7 +332,7 @@ class _Proxies:
         return f"{FOLDER_NAME}/{PROXIES_NAME}/{quote(name)}", caption
 
     def _take(self, name: str) -> bool:
-        """Have the old proxy in the new report, too."""
+        """Reuse an old proxy in the new report."""
         try:
             os.link(self._old / name, self._new / name)
         except OSError:
@@ -342,7 +344,7 @@ class _Proxies:
         return True
 
     def write_keys(self) -> None:
-        """Write what the proxies were made of, for the next report."""
+        """Write the keys of the proxies, for the next report."""
         if self._made:
             (self._new / _KEYS_NAME).write_text(json.dumps(self._made))
 

@@ -1,7 +1,7 @@
-"""Shows a page to this machine's browsers, with byte ranges, which they need to seek.
+"""Serves a page to this machine's browsers, with byte ranges, which they need for seeking.
 
-Other sites in such a browser, and other users of this machine, can reach the port, too. They do
-not know the token in the paths, and what they include is refused.
+Other sites in such a browser, and other users of this machine, can reach the port, too. They do not
+know the token in the paths, and embedding is refused.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _HOST = "127.0.0.1"
 _BLOCK = 1 << 18
 _LONGEST_RANGE = 64  # characters
 _TOKEN_BYTES = 18
-_SAME_SITE = ("none", "same-origin")  # Sec-Fetch-Site: typed by the user, or of this page
+_SAME_SITE = ("none", "same-origin")  # Sec-Fetch-Site: typed by the user, or from this page
 _GUARDS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -32,7 +32,7 @@ _GUARDS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-"""Headers of every answer: no other site includes, frames or keeps hold of it."""
+"""Headers of every response: no other site may include, frame or retain it."""
 
 _TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -46,13 +46,13 @@ class ReportServer:
     """Serves some files, and nothing else. A context manager.
 
     Args:
-        files: What there is, by the path of its URL, ``/index.html`` without quoting. A token
-            that cannot be guessed goes before it.
+        files: The files, by URL path, such as ``/index.html``, unquoted. An unguessable token
+            precedes it.
         start: Path of the page, quoted.
-        port: To listen at; 0 for a free one.
+        port: Port to listen on; 0 for a free one.
 
     Attributes:
-        root: What all URLs begin with, without a slash at the end.
+        root: Prefix of all URLs, without a trailing slash.
         url: Of the page.
 
     Raises:
@@ -72,7 +72,7 @@ class ReportServer:
         self.url = f"{self.root}{start}"
 
     def serve(self) -> None:
-        """Answer until it is interrupted."""
+        """Serve until interrupted."""
         self._server.serve_forever(0.2)
 
     def stop(self) -> None:
@@ -90,7 +90,7 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Say nothing of connections that the browser broke off."""
+        """Ignore connections closed by the browser."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 
@@ -104,7 +104,7 @@ class _Handler(BaseHTTPRequestHandler):
         super().__init__(*arguments)  # type: ignore[arg-type]
 
     def log_message(self, *_: object) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
     def do_HEAD(self) -> None:
         self._answer(with_body=False)
@@ -118,15 +118,15 @@ class _Handler(BaseHTTPRequestHandler):
         super().end_headers()
 
     def _is_own(self) -> bool:
-        """Whether the page itself asks, or the user who opened it, and no other site."""
+        """Whether the request comes from the page or the user, not from another site."""
         port = self.connection.getsockname()[1]
         hosts = [f"{name}:{port}" for name in (_HOST, "localhost")]
         if port == 80:
             hosts += [_HOST, "localhost"]
-        if self.headers.get("Host") not in hosts:  # else another site, by a name of its own
+        if self.headers.get("Host") not in hosts:  # otherwise another site, under its own name
             return False
-        site = self.headers.get("Sec-Fetch-Site", "none")  # old browsers do not say
-        # a link to the page may stand anywhere, in a terminal that is a web page, say
+        site = self.headers.get("Sec-Fetch-Site", "none")  # old browsers do not send it
+        # a link to the page may be anywhere, such as in a web-based terminal
         return site in _SAME_SITE or self.headers.get("Sec-Fetch-Dest") == "document"
 
     def _answer(self, *, with_body: bool) -> None:
@@ -167,7 +167,7 @@ class _Handler(BaseHTTPRequestHandler):
         while left and (block := file.read(min(left, _BLOCK))):
             self.wfile.write(block)
             left -= len(block)
-        if left:  # the file became shorter
+        if left:  # the file was truncated
             self.close_connection = True
 
     def _refuse(self, status: HTTPStatus, content_range: str = "") -> None:
@@ -183,10 +183,10 @@ def byte_range(asked: str, size: int) -> tuple[int, int] | None:
 
     Args:
         asked: The header ``Range``.
-        size: Bytes that there are.
+        size: Size of the file.
 
     Returns:
-        All of it where the header is of another kind; None where nothing of it is there.
+        All of it if the header is of another kind; None if the range is outside the file.
     """
     match = re.fullmatch(r"bytes=([0-9]*)-([0-9]*)", asked.strip()[:_LONGEST_RANGE])
     if not match or not (match[1] or match[2]):

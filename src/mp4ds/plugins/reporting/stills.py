@@ -37,7 +37,7 @@ _MOST_SIDE = 16384  # pixels of a sheet
 _SHEET_WIDTH = 320  # of a frame on it
 _GAP, _LABEL, _TEXT = 6, 18, 12  # pixels of a sheet
 _PAGE, _INK = (24, 28, 32), (222, 226, 230)
-_BEYOND_NS = 10**9  # that a time may be before the first frame, or after the last one
+_BEYOND_NS = 10**9  # how far a time may be before the first frame, or after the last
 _QUALITY = 92
 _NS = 10**9
 
@@ -46,7 +46,7 @@ def parse_sheet(text: str) -> tuple[int, int]:
     """Columns and rows of ``5x4``.
 
     Raises:
-        OptionError: It is no such text.
+        OptionError: It is not of that form.
     """
     match = re.fullmatch(r"([1-9][0-9]{0,2})x([1-9][0-9]{0,2})", text.strip().lower())
     if not match:
@@ -56,41 +56,41 @@ def parse_sheet(text: str) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class StillOptions(SliceOptions):
-    """Which frames are saved, and how."""
+    """Which frames to save, and how."""
 
-    topic: str = option("Of the camera, where there are several.", "", "-t")
+    topic: str = option("Camera topic, if there are several.", "", "-t")
     at: str | None = option(
-        "Seconds from the first frame, or since 1970; nanoseconds since 1970; an ISO date; or "
-        "#NUMBER of the frame.",
+        "Seconds from the first frame or since 1970, nanoseconds since 1970, an ISO date, or #N "
+        "for frame number N.",
         metavar="TIME",
     )
     sheet: tuple[int, int] | None = option(
-        "So many frames beside and below each other.", metavar="5x4", parse=parse_sheet
+        "Columns and rows of a contact sheet.", metavar="5x4", parse=parse_sheet
     )
     start: str | float | None = start()
     end: str | float | None = end()
     duration: str | float | None = duration()
     resize: float | tuple[int, int] | None = resize(
-        "Size of the frame, or of each; 320 columns on a sheet by default."
+        "Size of the image, or of each frame on a sheet (default there: 320 columns)."
     )
-    exact: bool = option("The samples as recorded, as unpack --to images has them.", False)
+    exact: bool = option("Keep the samples as recorded, as unpack --to images does.", False)
     force: bool = force()
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if (self.at is None) == (self.sheet is None):
-            raise OptionError("Give either `at` TIME or `sheet` 5x4.")
+            raise OptionError("Give either `at` or `sheet`, such as `sheet` 5x4.")
         if self.slice and not self.sheet:
-            raise OptionError("`start`, `end` and `duration` go with `sheet`.")
+            raise OptionError("`start`, `end` and `duration` only work with `sheet`.")
         if self.exact and (self.sheet or self.resize is not None):
-            raise OptionError("`exact` goes neither with `sheet` nor with `resize`.")
+            raise OptionError("`exact` cannot be combined with `sheet` or `resize`.")
         if self.sheet and not 1 <= self.sheet[0] * self.sheet[1] <= _MOST_FRAMES:
-            raise OptionError(f"`sheet` has 1 to {_MOST_FRAMES} frames.")
+            raise OptionError(f"`sheet` can have 1 to {_MOST_FRAMES} frames.")
 
 
 @dataclass(frozen=True)
 class SavedFrame:
-    """A frame of an image that was saved.
+    """A frame in a saved image.
 
     Attributes:
         index: Its number.
@@ -105,7 +105,7 @@ class SavedFrame:
 
 @dataclass(frozen=True)
 class StillSummary:
-    """An image that was saved.
+    """A saved image.
 
     Attributes:
         output: The file.
@@ -121,10 +121,10 @@ class StillSummary:
 
 
 def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> StillSummary:
-    """Save a frame, or a contact sheet of frames that are equally far apart.
+    """Save a frame, or a contact sheet of evenly spaced frames.
 
-    A frame looks as it does for the eye: mosaics are interpolated, light of 16 bits stays of 16
-    bits in a PNG file, depths and other numbers get colours.
+    A frame is shown as it looks: mosaics are interpolated, 16-bit images stay 16-bit in a PNG file,
+    depths and other measurements are in false colour.
 
     Args:
         dataset: A dataset, or one video with its sidecar; or its URL.
@@ -135,13 +135,13 @@ def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> St
         OptionError: An option is wrong, or the file cannot hold the image.
         FrameNotFoundError: The camera has no frame near the time.
         VideoError: A frame cannot be decoded.
-        TargetError: The output may not be written there.
-        WriteError: The disk refused.
+        TargetError: The output cannot be written there.
+        WriteError: The output could not be written.
     """
     target = Path(output)
     kind = _SUFFIXES.get(target.suffix.lower())
     if kind is None:
-        raise OptionError(f"{target} is neither a .png nor a .jpg: give a name that ends so.")
+        raise OptionError(f"{target} is not a .png or .jpg: give a name with one of these endings.")
     with Dataset(dataset) as opened:
         stream = _chosen(opened, options.topic)
         if options.sheet:
@@ -184,7 +184,9 @@ def _chosen(dataset: Dataset, topic: str) -> Frames:
             raise OptionError(f"{error.args[0]}.") from None
     if len(dataset.topics) != 1:
         known = ", ".join(dataset.topics) or "none"
-        raise OptionError(f"{dataset.path} has several cameras or none: give `topic` of {known}.")
+        raise OptionError(
+            f"{dataset.path} does not have exactly one camera: give a `topic` of {known}."
+        )
     return dataset[dataset.topics[0]]
 
 
@@ -192,9 +194,9 @@ def _chosen(dataset: Dataset, topic: str) -> Frames:
 
 
 def spread(count: int, wanted: int) -> list[int]:
-    """Numbers of frames that are equally far apart, in the middle of as many parts.
+    """Numbers of evenly spaced frames, each in the middle of its part.
 
-    All, where there are not more than are wanted.
+    All, if there are no more than wanted.
     """
     if count <= wanted:
         return list(range(count))
@@ -216,10 +218,10 @@ def _places(stream: Frames, asked: Slice) -> tuple[int, int]:
 
 
 def number_at(stream: Frames, text: str) -> int:
-    """Number of the frame that is nearest to a time, or that was asked for by number.
+    """Number of the frame nearest to a time, or given by number.
 
     Raises:
-        OptionError: The text is no time, or there is no frame of that number.
+        OptionError: The text is not a time, or there is no frame with that number.
         FrameNotFoundError: The time is more than a second before the first frame, or after the
             last one.
     """
@@ -258,7 +260,7 @@ def _still(stream: Frames, number: int, kind: str, options: StillOptions) -> tup
 def _sheet(
     stream: Frames, numbers: list[int], sheet: tuple[int, int], resize: Resize
 ) -> NDArray[np.uint8]:
-    """All frames on one picture, each with its number and time."""
+    """All frames in one picture, each with its number and time."""
     width, height = stream.image_size
     factor = min(1.0, _SHEET_WIDTH / width)
     size = size_after(stream.topic, (width, height), factor if resize is None else resize)
@@ -268,7 +270,7 @@ def _sheet(
     whole = columns * cell[0] + _GAP, rows * cell[1] + _GAP + _LABEL
     if max(whole) > _MOST_SIDE:
         raise OptionError(
-            f"A sheet of {whole[0]}x{whole[1]} pixels is larger than {_MOST_SIDE}: give `resize`."
+            f"A sheet of {whole[0]}x{whole[1]} pixels exceeds {_MOST_SIDE} a side: give `resize`."
         )
     look = Look(stream, size)
     page = Page(whole, paper=_PAGE, ink=_INK, text_size=_TEXT)

@@ -7,7 +7,7 @@ var mp4dsColumns = (() => {
     return bytes;
   };
 
-  /** A column as mp4ds.plugins.reporting.cameras.pack_column wrote it: BigInt64Array of so many values. */
+  /** A column as written by mp4ds.plugins.reporting.cameras.pack_column: a BigInt64Array of `count` values. */
   function decode(packed, count) {
     const bytes = bytesOf(packed.values), out = new BigInt64Array(count);
     const step = BigInt(packed.step);
@@ -34,7 +34,7 @@ var mp4dsColumns = (() => {
       out[i] = value += step + residual;
       if (value !== out[i]) value = out[i];  // modulo 2^64
     }
-    if (place !== bytes.length) throw new Error("a column has another length than it should");
+    if (place !== bytes.length) throw new Error("a column has the wrong length");
     return out;
   }
 
@@ -43,7 +43,7 @@ var mp4dsColumns = (() => {
     return Float64Array.from({length: bytes.length / 4}, (_, i) => view.getFloat32(4 * i, true));
   };
 
-  /** Number of the last entry that is at most `value`, -1 if none is; of increasing values. */
+  /** Index of the last entry not above `value`, or -1; values must increase. */
   function lastAtMost(values, value) {
     let low = 0, high = values.length;
     while (low < high) {
@@ -53,14 +53,14 @@ var mp4dsColumns = (() => {
     return low - 1;
   }
 
-  /** Milliseconds from each frame to the next; entry 0, before which there is none, is NaN. */
+  /** Milliseconds from the previous frame to each; entry 0 has none and is NaN. */
   function intervals(stamps) {
     const out = new Float64Array(stamps.length).fill(NaN);
     for (let i = 1; i < stamps.length; i++) out[i] = Number(stamps[i] - stamps[i - 1]) / 1e6;
     return out;
   }
 
-  /** Frames missing before each frame (above 0), as intervals.py has it; repeated or earlier stamps are -1. */
+  /** Frames lost before each frame (above 0), by the rule of intervals.py; repeated or earlier stamps are -1. */
   function lost(steps, usual) {
     const out = new Float64Array(steps.length);
     const short = i => i > 0 && i < steps.length ? Math.min(Math.max(usual - steps[i], 0), usual) : 0;
@@ -75,7 +75,7 @@ var mp4dsColumns = (() => {
   const delays = (logTimes, stamps) =>
     Float64Array.from(stamps, (stamp, i) => Number(logTimes[i] - stamp) / 1e6);
 
-  /** How much later each frame is than the reference's nearest one, milliseconds. */
+  /** How much later each frame is than the nearest reference frame, milliseconds. */
   function offsets(stamps, reference) {
     const ordered = BigInt64Array.from(reference).sort(), out = new Float64Array(stamps.length);
     for (let i = 0, at = 0; i < stamps.length; i++) {
@@ -89,7 +89,7 @@ var mp4dsColumns = (() => {
     return out;
   }
 
-  /** Where frames are on the common axis: nanoseconds from its start, never falling. */
+  /** Positions of frames on the common axis: nanoseconds from its start, never decreasing. */
   function positions(times, base) {
     const out = new Float64Array(times.length);
     let latest = -Infinity;

@@ -3,12 +3,12 @@
 "use strict";
 var mp4dsPlayer = (() => {
   const {lastAtMost} = mp4dsColumns;
-  const HELD = 2e9;       // a longer interval is waited through with the video paused
-  const SLACK = 0.2e9;    // that the clock may be away from what the slowest video shows
-  const SLOWER = 500, FASTER = 2000;  // ms of waiting, and of none, that change the pace by e
-  const LEAST_PACE = 1 / 16;          // that browsers play at
-  const LATE = 500;       // ms after which a frame that was sought, and was there before, is taken for shown
-  const LOST = 5000;      // and another one, if the browser does not say that it is
+  const HELD = 2e9;       // during longer intervals the video is paused
+  const SLACK = 0.2e9;    // how far the clock may be ahead of the slowest video
+  const SLOWER = 500, FASTER = 2000;  // ms of waiting, and of not waiting, that change the pace by a factor e
+  const LEAST_PACE = 1 / 16;          // the slowest rate browsers support
+  const LATE = 500;       // ms after which a frame sought again is assumed to be shown
+  const LOST = 5000;      // ms for any other frame, if the browser does not report it
 
   class Camera {
     constructor(facts, number, parts) {
@@ -17,7 +17,7 @@ var mp4dsPlayer = (() => {
       this.busy = this.isReady = this.isBroken = this.isHidden = false;
     }
 
-    /** Take the columns: stamp and logTime (BigInt64Array), position and ticks (numbers). */
+    /** Takes the columns: stamp and logTime (BigInt64Array), position and ticks (numbers). */
     take(columns) {
       Object.assign(this, columns);
       const mean = (this.position.at(-1) - this.position[0]) / Math.max(1, this.frames - 1);
@@ -34,7 +34,7 @@ var mp4dsPlayer = (() => {
         this.isBroken = true;
         this.busy = false;
         const detail = video.error && video.error.message ? ` (${video.error.message})` : "";
-        this.say(`This browser cannot play ${this.facts.file}${detail}. mp4ds report --proxies all makes videos that every browser plays.`);
+        this.say(`This browser cannot play ${this.facts.file}${detail}. mp4ds report --proxies all makes videos that play in every browser.`);
       });
       if (video.requestVideoFrameCallback) this.watch();
       video.src = this.facts.video;
@@ -60,20 +60,20 @@ var mp4dsPlayer = (() => {
 
     frameAt(time) { return lastAtMost(this.position, time); }
 
-    /** The frame whose presentation time is nearest, microseconds. */
+    /** The frame with the nearest presentation time, microseconds. */
     frameOfTick(tick) {
       const n = Math.max(0, lastAtMost(this.ticks, tick));
       const hasNext = n + 1 < this.ticks.length && this.ticks[n + 1] - tick < tick - this.ticks[n];
       return hasNext ? n + 1 : n;
     }
 
-    /** Seconds of the video in the middle of a frame. */
+    /** Video time, in seconds, at the middle of a frame. */
     middle(n) {
       const next = n + 1 < this.ticks.length ? this.ticks[n + 1] : Math.max(this.video.duration * 1e6 || 0, this.ticks[n] + 2);
       return (this.ticks[n] + Math.min(next, this.ticks[n] + HELD / 1e3)) / 2e6;
     }
 
-    /** Where the video is to be at a time, in seconds of the video. */
+    /** Where the video should be at a time, in seconds of video time. */
     secondsAt(time) {
       const n = Math.max(0, this.frameAt(time)), next = n + 1;
       if (next >= this.frames) return this.ticks[n] / 1e6 + (time - this.position[n]) / 1e9;
@@ -82,7 +82,7 @@ var mp4dsPlayer = (() => {
       return (this.ticks[n] + part * (this.ticks[next] - this.ticks[n])) / 1e6;
     }
 
-    /** How far the clock may go on from a time, by the frame on the screen. */
+    /** How far the clock may advance from a time, given the frame on screen. */
     reach(time, slack) {
       if (!this.isPlayable) return Infinity;
       const due = Math.max(0, this.frameAt(time)), {shown} = this;
@@ -91,7 +91,7 @@ var mp4dsPlayer = (() => {
       return shown + 1 < this.frames ? this.position[shown + 1] + slack : Infinity;
     }
 
-    /** Seek to a frame, or as soon as the seek before is done. */
+    /** Seek to a frame, once any earlier seek is done. */
     want(n) {
       this.wanted = n;
       if (!this.video || !this.ticks || this.isBroken || this.isHidden) this.show(n);
@@ -112,7 +112,7 @@ var mp4dsPlayer = (() => {
       if (!this.video.paused) return;
       if (this.wanted !== this.sought && !this.isFollowing) { this.seek(); return; }
       const sought = this.sought;
-      // no picture is presented where the one that is sought is on the screen already
+      // no new picture is presented if the one sought is already on screen
       const settle = () => {
         if (!this.busy && !this.isPresented && this.sought === sought && this.video.paused) this.show(sought);
       };
@@ -125,7 +125,7 @@ var mp4dsPlayer = (() => {
       this.onShown(this);
     }
 
-    /** Go along while the clock runs. */
+    /** Follow the running clock. */
     follow(time, speed) {
       this.isFollowing = true;
       if (!this.isPlayable) { this.wanted = Math.max(0, this.frameAt(time)); this.show(this.wanted); return; }
@@ -150,7 +150,7 @@ var mp4dsPlayer = (() => {
         this.rate(0);  // until all have started
         this.isStarting = true;
         video.play().catch(() => {});
-      } else if (late < -0.15 * far) {  // the clock waits, for this one too if it shows too little
+      } else if (late < -0.15 * far) {  // the clock waits, for this video too if it shows too little
         video.pause();
         this.sought = -1;
         if (!isShown) this.want(n);
@@ -166,7 +166,7 @@ var mp4dsPlayer = (() => {
       if (this.video.playbackRate !== rounded) this.video.playbackRate = rounded;
     }
 
-    /** Leave it out, or show it again at a time. */
+    /** Hide it, or show it again at a time. */
     hide(isHidden, time) {
       this.isHidden = isHidden;
       this.stop();
@@ -187,7 +187,7 @@ var mp4dsPlayer = (() => {
 
     tell() { for (const listener of this.listeners) listener(); }
 
-    /** Show a time; of `camera`, if one is given, just the frame `n`. */
+    /** Show a time; if `camera` is given, it shows exactly frame `n`. */
     go(time, camera = null, n = 0) {
       this.time = Math.max(0, Math.min(this.end, time));
       for (const each of this.cameras) {
@@ -198,7 +198,7 @@ var mp4dsPlayer = (() => {
       this.tell();
     }
 
-    /** So many frames of the leading camera on, or back. */
+    /** Step forward or back by frames of the leading camera. */
     step(count) {
       const lead = this.lead;
       if (!lead || !lead.position) return;
@@ -227,7 +227,7 @@ var mp4dsPlayer = (() => {
 
     toggle() { if (this.isPlaying) this.pause(); else this.play(); }
 
-    /** The clock runs on, but not away from what a video shows: it waits, and then goes slower. */
+    /** The clock runs, but not ahead of any video: it waits, then slows down. */
     advance(now) {
       if (!this.isPlaying) return;
       const passed = Math.max(0, now - this.last), slack = SLACK * Math.max(1, this.speed);
@@ -241,12 +241,12 @@ var mp4dsPlayer = (() => {
         isLate = true;
       }
       const pace = this.pace * Math.exp(isLate ? -passed / SLOWER : passed / FASTER);
-      // until the page looks again, no video is to get further than that
+      // no video may get further than this before the next update
       this.pace = Math.max(LEAST_PACE, Math.min(1, pace, SLACK / 1e6 / (passed || 1)));
       this.time = Math.min(next, this.end);
       if (this.time >= this.end) { this.pause(); return; }
       for (const camera of this.cameras) if (camera.position) camera.follow(this.time, this.speed * this.current);
-      // videos that already play are not to run away from those that are about to
+      // videos already playing must not run ahead of those about to start
       const isStarting = this.cameras.some(camera => camera.isStarting && camera.isPlayable);
       this.current = isStarting ? LEAST_PACE : this.pace;
       this.tell();

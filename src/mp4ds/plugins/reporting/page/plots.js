@@ -4,7 +4,7 @@ var mp4dsPlots = (() => {
   const BLOCK = 32, SAMPLED = 20000;
   const LEFT = 58, RIGHT = 8, TOP = 8, BOTTOM = 20;
 
-  /** Least and most of any part of a series, by blocks of blocks; NaN counts for nothing. */
+  /** Minimum and maximum of any range of a series, by a pyramid of blocks; NaN is ignored. */
   class Reduction {
     constructor(values) {
       this.levels = [[values, values]];
@@ -20,7 +20,7 @@ var mp4dsPlots = (() => {
       }
     }
 
-    /** [least, most] of the entries from `from` up to but not `to`. */
+    /** [minimum, maximum] of the entries from `from` up to but excluding `to`. */
     range(from, to) {
       let least = Infinity, most = -Infinity;
       for (let level = 0; from < to; level++) {
@@ -44,7 +44,7 @@ var mp4dsPlots = (() => {
     }
   }
 
-  /** Values below which 0.5 % and 99.5 % of a series are; of a sample of it. */
+  /** The 0.5 and 99.5 percentiles of a series, from a sample of it. */
   function usualRange(values) {
     const every = Math.max(1, Math.floor(values.length / SAMPLED)), found = [];
     for (let i = 0; i < values.length; i += every) if (!Number.isNaN(values[i])) found.push(values[i]);
@@ -53,7 +53,7 @@ var mp4dsPlots = (() => {
     return [found[Math.floor(0.005 * (found.length - 1))], found[Math.ceil(0.995 * (found.length - 1))]];
   }
 
-  /** A canvas of as many pixels as the screen has: [context, width, height] in CSS pixels. */
+  /** A canvas at the screen's pixel density: [context, width, height] in CSS pixels. */
   function prepare(canvas, height) {
     const width = Math.max(1, canvas.clientWidth), ratio = window.devicePixelRatio || 1;
     if (height) canvas.style.height = `${height}px`;
@@ -73,7 +73,7 @@ var mp4dsPlots = (() => {
     return {line: value("--line"), text: value("--muted"), strong: value("--text"), accent: value("--accent"), warn: value("--warn")};
   };
 
-  /** Round steps that divide a range into about so many parts. */
+  /** Round steps that divide a range into about `count` parts. */
   function ticks(from, to, parts) {
     const rough = (to - from) / Math.max(1, parts);
     if (!(rough > 0) || !Number.isFinite(rough)) return [from];
@@ -105,7 +105,7 @@ var mp4dsPlots = (() => {
     return value.toFixed(size >= 1000 ? 0 : size >= 100 ? 1 : size >= 1 ? 2 : 3);
   }
 
-  /** What part of time is seen, the same for all plots and the time line; nanoseconds. */
+  /** The visible range of time, shared by all plots and the timeline; nanoseconds. */
   class View {
     constructor(end) { this.end = end; this.from = 0; this.to = end; this.listeners = []; }
     set(from, to) {
@@ -143,7 +143,7 @@ var mp4dsPlots = (() => {
     }
   }
 
-  /** A plot of series over time: {name, colour, x, y, shown()}, x never falling. */
+  /** A plot of series over time: {name, colour, x, y, shown()}, x never decreasing. */
   class TimePlot {
     constructor(canvas, label, view, {unit, stems = false, onTime}) {
       Object.assign(this, {canvas, label, view, unit, stems, series: [], isFull: false, cursor: null, now: 0});
@@ -187,13 +187,13 @@ var mp4dsPlots = (() => {
       canvas.addEventListener("pointerleave", () => { this.cursor = null; this.request(); });
       canvas.addEventListener("dblclick", () => this.view.all());
       canvas.addEventListener("wheel", event => {
-        if (!event.ctrlKey && !event.shiftKey) return;  // else the page scrolls
+        if (!event.ctrlKey && !event.shiftKey) return;  // otherwise the page scrolls
         event.preventDefault();
         this.view.zoom(timeAt(event), Math.exp((event.deltaY || event.deltaX) / 300));
       }, {passive: false});
     }
 
-    /** Entries of a series that are seen: [first, end]. */
+    /** Visible entries of a series: [first, end]. */
     seen(series) {
       const {from, to} = this.view, last = mp4dsColumns.lastAtMost;
       const first = Math.max(0, last(series.x, from - 0.5));
@@ -230,7 +230,7 @@ var mp4dsPlots = (() => {
       context.rect(LEFT, 0, axes.right - LEFT, axes.bottom + 1);
       context.clip();
       const shown = this.series.filter(series => series.shown());
-      context.globalAlpha = shown.length > 1 ? 0.75 : 1;  // none hides the others
+      context.globalAlpha = shown.length > 1 ? 0.75 : 1;  // so that no series hides the others
       for (const series of shown) this.drawSeries(context, axes, series, xOf);
       context.globalAlpha = 1;
       this.drawCursor(context, axes, colours, xOf);
@@ -276,7 +276,7 @@ var mp4dsPlots = (() => {
       }
     }
 
-    /** [column, least, most] of each column of pixels that has an entry. */
+    /** [column, minimum, maximum] of each pixel column that has entries. */
     columns(series, width) {
       const {from, to} = this.view, found = [], last = mp4dsColumns.lastAtMost;
       const count = Math.max(1, Math.floor(width));
@@ -310,7 +310,7 @@ var mp4dsPlots = (() => {
       }
     }
 
-    /** Says the values at the cursor, or at the time that is shown. */
+    /** Writes the values at the cursor, or at the current time. */
     tell() {
       const time = this.cursor ?? this.now;
       const values = this.series.filter(series => series.shown()).map(series => {
@@ -321,7 +321,7 @@ var mp4dsPlots = (() => {
     }
   }
 
-  /** How often values occur: series {name, colour, y, shown()}. */
+  /** A histogram of series {name, colour, y, shown()}. */
   class Histogram {
     constructor(canvas, label, {unit}) {
       Object.assign(this, {canvas, label, unit, series: [], bins: 61});
@@ -337,7 +337,7 @@ var mp4dsPlots = (() => {
 
     request() { requestAnimationFrame(() => this.draw()); }
 
-    /** Shares of each bin from -reach to reach; what lies beyond is in neither. */
+    /** Share of values in each bin from -reach to reach; values outside are not counted. */
     count() {
       const reach = Math.max(1e-3, ...this.series.filter(s => s.shown()).map(s => s.reach)) * 1.1;
       this.reach = reach;
@@ -376,7 +376,7 @@ var mp4dsPlots = (() => {
         context.lineTo(axes.right, axes.bottom);
         context.stroke();
       }
-      this.label.textContent = `% of the intervals, ${this.unit}`;
+      this.label.textContent = `% of intervals, ${this.unit}`;
     }
   }
 

@@ -1,7 +1,7 @@
 /* Puts the page together. data.js and the columns of each camera call in here. */
 "use strict";
 var mp4dsReport = (() => {
-  // each as far as can be from those before it, on light and on dark (farthest points in OKLab)
+  // each as far as possible from the ones before, on light and on dark (farthest points in OKLab)
   const COLOURS = ["#3b82f6", "#f97316", "#10b981", "#a855f7", "#ef4444", "#eab308", "#786020", "#c8b0e8", "#b00080", "#f830c0",
     "#685898", "#5828f8", "#58e000", "#00d0f8", "#008800", "#008890", "#b07898", "#a09000", "#b03020", "#f880f8"];
   const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8];
@@ -32,12 +32,12 @@ var mp4dsReport = (() => {
     }
     const dot = element("span", {class: "dot"});
     dot.style.background = colour;
-    const head = element("header", {title: "Steps follow this camera"}, [dot, element("h3", {text: facts.name}),
+    const head = element("header", {title: "Step by this camera's frames"}, [dot, element("h3", {text: facts.name}),
       element("span", {class: "kind", text: `${facts.encoding} ${facts.width}×${facts.height} · ${facts.codec} ${facts.profile}`})]);
     if (facts.proxy) head.append(element("span", {class: "badge", text: "proxy", title: facts.note}));
     const close = element("button", {type: "button", class: "close", text: "×", title: "Hide this camera (h)", "aria-label": `Hide ${facts.name}`});
     head.append(close);
-    const stage = element("div", {class: "stage", title: "Enlarge, or back (e)"}, [fit]);
+    const stage = element("div", {class: "stage", title: "Enlarge or restore (e)"}, [fit]);
     const panel = element("article", {class: "camera"}, [head, stage, readout]);
     if (facts.caption) panel.append(element("div", {class: "caption", text: `Shown ${facts.caption}`}));
     find("cameras").append(panel);
@@ -48,7 +48,7 @@ var mp4dsReport = (() => {
     return camera;
   }
 
-  /** Another frame of a camera is on the screen. */
+  /** Called when a camera shows another frame. */
   function told(camera) {
     const n = camera.shown, {values} = camera;
     values.frame.textContent = `${n} of ${camera.frames}`;
@@ -85,7 +85,7 @@ var mp4dsReport = (() => {
     context.stroke();
   }
 
-  /** Give a camera the width of the page, and take it from the others; again: give it back. */
+  /** Enlarge a camera to the width of the page; again: restore all. */
   function enlarge(camera) {
     const isLarge = camera && camera.panel.classList.contains("large");
     for (const each of player.cameras) each.panel.classList.toggle("large", each === camera && !isLarge);
@@ -96,7 +96,7 @@ var mp4dsReport = (() => {
     redraw();
   }
 
-  /** Hide a camera, whose video then costs nothing, or show it again. */
+  /** Hide a camera, so that its video costs nothing, or show it again. */
   function hide(camera, isHidden) {
     const shown = player.cameras.filter(each => !each.isHidden && each !== camera);
     if (isHidden && !shown.length) return;
@@ -107,7 +107,7 @@ var mp4dsReport = (() => {
     arrange();
   }
 
-  /** As many columns as the cameras that are shown need, and the names of the others. */
+  /** Lay out the visible cameras in columns, and list the hidden ones. */
   function arrange() {
     const hidden = player.cameras.filter(camera => camera.isHidden), count = player.cameras.length - hidden.length;
     find("cameras").style.setProperty("--columns", String(count <= 1 ? 1 : count <= 4 ? 2 : count <= 9 ? 3 : 4));
@@ -159,20 +159,20 @@ var mp4dsReport = (() => {
     return report.plots[name] = plot;
   }
 
-  /** Say under a plot which cameras would only bend its axis, and why. */
+  /** Say under a plot which cameras are left out, and why: they would only distort its axis. */
   function leaveOut(plot, cameras) {
     const names = cameras.map(({facts}) => `${facts.name} (${facts.untimed})`);
-    if (names.length) plot.canvas.after(element("p", {class: "hint", text: `Without ${names.join(", ")}`}));
+    if (names.length) plot.canvas.after(element("p", {class: "hint", text: `Not shown: ${names.join(", ")}`}));
   }
 
   function addPlots() {
     const cameras = player.cameras.filter(camera => camera.position), shown = camera => () => camera.isSeen;
     const add = (plot, camera, y) => plot.add({name: camera.facts.name, colour: camera.colour, x: camera.position, y, shown: shown(camera)});
     const interval = timePlot("interval", "Interval between frames", "ms");
-    const {canvas, value} = plotPanel("Jitter: interval less its median");
+    const {canvas, value} = plotPanel("Jitter: interval minus median interval");
     const jitter = report.plots.jitter = new mp4dsPlots.Histogram(canvas, value, {unit: "ms"});
-    const lost = timePlot("lost", "Lost frames (up), repeated or backward (down)", "frames", {stems: true});
-    const delay = timePlot("delay", "Record time less header stamp", "ms");
+    const lost = timePlot("lost", "Lost frames (up), repeated or backward stamps (down)", "frames", {stems: true});
+    const delay = timePlot("delay", "Record time minus header stamp", "ms");
     const stampless = cameras.filter(camera => !camera.hasStamps), strange = cameras.filter(camera => camera.facts.untimed);
     for (const camera of cameras) {
       if (!camera.facts.untimed) add(delay, camera, mp4dsColumns.delays(camera.logTime, camera.stamp));
@@ -233,7 +233,7 @@ var mp4dsReport = (() => {
     timeline.request();
   }
 
-  /** Nanoseconds from the start for what a user wrote: seconds from there, or ns since 1970. */
+  /** Nanoseconds from the start for user input: seconds from the start, or ns since 1970. */
   function timeOf(text) {
     const clean = text.trim();
     if (/^\d{12,19}$/.test(clean)) return Number(BigInt(clean) - BigInt(data.base));
@@ -245,7 +245,7 @@ var mp4dsReport = (() => {
     return clean && Number.isFinite(seconds) ? seconds * 1e9 : null;
   }
 
-  /** The time that the address asks for by #t=, or null. */
+  /** The time given in the address as #t=, or null. */
   function timeOfAddress() {
     let asked = null;
     try { asked = /^#t=(.+)$/.exec(decodeURIComponent(location.hash)); } catch { /* no text: it asks for nothing */ }
@@ -295,7 +295,7 @@ var mp4dsReport = (() => {
 
   const waiting = new Map();
 
-  /** The columns of a camera, called by report/columns-N.js. */
+  /** Receives the columns of a camera; called by report/columns-N.js. */
   report.columns = (number, columns) => waiting.get(number)(columns);
 
   function load(camera) {
@@ -322,7 +322,7 @@ var mp4dsReport = (() => {
   async function start() {
     document.title = `${data.name} - mp4ds report`;
     find("name").textContent = data.name;
-    find("footer").textContent = `mp4ds ${data.version}. Cameras are shown together by their ${data.axis === "stamp" ? "header stamps" : "record times"}.`;
+    find("footer").textContent = `mp4ds ${data.version}. Cameras are synchronised by their ${data.axis === "stamp" ? "header stamps" : "record times"}.`;
     const cameras = data.cameras.map(cameraPanel);
     player = report.player = new mp4dsPlayer.Player(cameras, 0);
     arrange();
@@ -347,13 +347,13 @@ var mp4dsReport = (() => {
     player.go(timeOfAddress() ?? 0);
   }
 
-  /** What the page is about, called by report/data.js. */
+  /** Receives the page's data; called by report/data.js. */
   report.dataset = facts => {
     data = report.data = facts;
     start().then(report.done, report.failed);
   };
 
-  /** Resolves when every camera shows the frame that it should. */
+  /** Resolves when every camera shows the frame it should. */
   report.settled = async () => {
     await report.ready;
     while (!player.isSettled) await new Promise(resolve => setTimeout(resolve, 25));

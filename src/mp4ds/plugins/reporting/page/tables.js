@@ -26,13 +26,13 @@ var mp4dsTables = (() => {
   const optional = (value, digits) => value === null || value === undefined ? "" : value.toFixed(digits);
   const grouped = value => value === null || value === undefined ? "" : value.toLocaleString("en");
 
-  /** Nanoseconds since 1970 (BigInt) as seconds with all nine digits. */
+  /** Nanoseconds since 1970 (BigInt) as seconds with nine decimals. */
   function stampText(time) {
     const size = time < 0n ? -time : time;
     return `${time < 0n ? "-" : ""}${size / 1000000000n}.${String(size % 1000000000n).padStart(9, "0")}`;
   }
 
-  /** Nanoseconds since 1970 as date and time in UTC; empty beyond the calendar. */
+  /** Nanoseconds since 1970 as date and time in UTC; empty outside the calendar. */
   function dateText(time) {
     let whole = time / 1000000000n, part = time % 1000000000n;
     if (part < 0n) { part += 1000000000n; whole -= 1n; }
@@ -87,9 +87,9 @@ var mp4dsTables = (() => {
       if (reference) row.push(offset ? `${numberText(offset.median_ms)} (99 % within ${numberText(offset.p99_ms)})` : camera.untimed || "reference");
       return row;
     }));
-    return "Interval is the median between header stamps, jitter the standard deviation. An interval of more than 1.5 medians counts as lost frames, unless shorter ones beside it make up for it; "
-      + "repeated frames have the stamp of the one before."
-      + (reference ? ` Offset is each frame's stamp less that of the nearest frame of ${reference}.` : "");
+    return "Interval is the median interval between header stamps, jitter its standard deviation. An interval longer than 1.5 medians counts as lost frames, unless shorter neighbouring intervals make up for it; "
+      + "repeated frames have the same stamp as the previous frame."
+      + (reference ? ` Offset is each frame's stamp minus that of the nearest frame of ${reference}.` : "");
   }
 
   function topics(place, data) {
@@ -105,18 +105,18 @@ var mp4dsTables = (() => {
     const made = [];
     for (const camera of data.cameras) {
       for (const item of camera.calibrations.slice(0, 8)) {
-        const size = `${item.width}x${item.height}`, from = item.from_frame ? `from frame ${item.from_frame} on` : "from the start";
+        const size = `${item.width}x${item.height}`, from = item.from_frame ? `from frame ${item.from_frame}` : "from the start";
         const lines = [`K  = ${rowsOf(item.k, 3)}`, `D  = ${item.d.map(numberOf).join(", ")}`, `R  = ${rowsOf(item.r, 3)}`, `P  = ${rowsOf(item.p, 4)}`];
         if (item.binning_x || item.binning_y) lines.push(`binning ${item.binning_x} x ${item.binning_y}`);
         if (item.roi) lines.push(`ROI ${item.roi.width}x${item.roi.height} at ${item.roi.x_offset}, ${item.roi.y_offset}`);
         if (item.overlay && item.overlay.problem) lines.push(`no grid: ${item.overlay.problem}`);
         made.push(element("div", {class: "calibration"}, [
           element("h3", {text: camera.name}),
-          element("p", {class: "muted", text: `${item.distortion_model || "no model"}, ${size}, frame ${item.frame_id || "without a name"}, ${from}`}),
+          element("p", {class: "muted", text: `${item.distortion_model || "no model"}, ${size}, frame ${item.frame_id || "(unnamed)"}, ${from}`}),
           element("p", {class: "muted", text: camera.calibration_topic}), element("pre", {text: lines.join("\n")})]));
       }
       const more = camera.calibrations.length - 8 + camera.calibrations_more;
-      if (more > 0) made.push(element("p", {class: "muted", text: `${camera.name}: ${more} changes more; mp4ds info --intrinsics lists them`}));
+      if (more > 0) made.push(element("p", {class: "muted", text: `${camera.name}: ${more} more changes; mp4ds info --intrinsics lists them`}));
     }
     place.replaceChildren(...made);
     return made.length > 0;

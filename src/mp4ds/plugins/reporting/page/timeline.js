@@ -33,7 +33,7 @@ var mp4dsTimeline = (() => {
       this.pending = requestAnimationFrame(() => { this.pending = 0; this.draw(); });
     }
 
-    /** The lanes change with the view alone; the line of the time moves over them. */
+    /** The lanes change only with the view; the time cursor moves over them. */
     draw() {
       const {player, view} = this, lanes = player.cameras.length, row = lanes > 8 ? 5 : 8, top = 18;
       const [context, width, height] = mp4dsPlots.prepare(this.canvas, top + lanes * row + 4), colours = mp4dsPlots.theme();

@@ -1,0 +1,174 @@
+"""``mp4ds record``: the keyboard of a recorder, what it shows, and what it did."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Optional
+
+import typer
+
+from mp4ds.cli.keyboard import Keyboard
+from mp4ds.cli.options import JsonFlag, takes
+from mp4ds.cli.output import complain, print_json, print_pack, say
+from mp4ds.cli.process import caught_signals, told_errors
+from mp4ds.errors import OptionError
+from mp4ds.plugins.recording.record import RecordOptions, open_recorder
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from mp4ds.plugins.recording.record import RecordProgress, RecordSummary
+
+_LOG_S = 10.0
+_SHOWN = 20  # topics
+
+
+@takes(RecordOptions, without=("to",))
+def record(
+    options: Callable[[], RecordOptions],
+    topics: Annotated[
+        Optional[list[str]],  # noqa: UP045 - read at run time by typer
+        typer.Argument(metavar="TOPIC...", help="Names, or globs in quotes; or -a for all."),
+    ] = None,
+    output: Annotated[
+        Optional[str],  # noqa: UP045 - read at run time by typer
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="DATASET",
+            help="The folder to make; named by the time by default.",
+        ),
+    ] = None,
+    ros1: Annotated[bool, typer.Option("--ros1", help="From ROS 1.")] = False,
+    ros2: Annotated[
+        bool, typer.Option("--ros2", help="From ROS 2, by rclpy or else by Cyclone DDS.")
+    ] = False,
+    no_keyboard: Annotated[
+        bool, typer.Option("--disable-keyboard-controls", help="Leave the keyboard alone.")
+    ] = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Record topics of a live robot into a dataset, until Ctrl-C.
+
+    Lossless by default, by what encodes in the least time. What cannot be encoded in time is kept
+    as it came. Keys: space pauses, q stops.
+    """
+    with told_errors(as_json), ExitStack() as stack:
+        if ros1 and ros2:
+            raise OptionError("--ros1 contradicts --ros2.")
+        kind = "ros1" if ros1 else "ros2" if ros2 else None
+        report = stack.enter_context(record_progress(is_quiet=as_json))
+        recorder = stack.enter_context(
+            open_recorder(topics or (), output, replace(options(), to=kind), progress=report)
+        )
+        complain(f"recording from {recorder.address}")
+        stack.enter_context(caught_signals(recorder.stop))
+        if not no_keyboard:
+            stack.enter_context(Keyboard({" ": recorder.toggle_paused, "q": recorder.stop}))
+        summary = recorder.run()
+    if as_json:
+        print_json(summary)
+    else:
+        print_record(summary)
+    if summary.dropped or summary.lost:
+        raise typer.Exit(1)
+
+
+@contextmanager
+def record_progress(*, is_quiet: bool) -> Iterator[Callable[[RecordProgress], None]]:
+    """On a terminal, a table of the topics; in a log, a line every 10 s; warnings anywhere.
+
+    Args:
+        is_quiet: Warnings only.
+    """
+    from rich.console import Console
+    from rich.live import Live
+
+    console = Console(stderr=True)
+    told: set[str] = set()
+    next_line = 0.0
+
+    def warn(state: RecordProgress) -> None:
+        for warning in state.warnings:
+            if warning not in told:
+                told.add(warning)
+                complain(warning)
+        for topic, item in state.topics.items():
+            for count, what in (
+                (item.dropped, "messages are dropped: the buffer is full (--buffsize)"),
+                (item.verbatim, "images come faster than they can be encoded: kept as they come"),
+                (item.lost, "the middleware loses messages"),
+            ):
+                if count and (line := f"{topic}: {what}") not in told:
+                    told.add(line)
+                    complain(line)
+
+    def log(state: RecordProgress) -> None:
+        nonlocal next_line
+        warn(state)
+        if state.seconds >= next_line and not is_quiet:
+            next_line = state.seconds + _LOG_S
+            complain(_line(state))
+
+    if is_quiet or not console.is_terminal:
+        yield log
+        return
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+
+        def show(state: RecordProgress) -> None:
+            warn(state)
+            live.update(_table(state), refresh=True)
+
+        yield show
+
+
+def _line(state: RecordProgress) -> str:
+    count = sum(item.messages for item in state.topics.values())
+    rate = sum(item.bytes_per_s for item in state.topics.values())
+    parts = [
+        f"{state.state} {state.seconds:.0f} s",
+        f"{count} messages",
+        f"{rate / 1e6:.1f} MB/s received",
+        f"{state.bytes_written / 1e6:.1f} MB written",
+    ]
+    if state.waiting_bytes >= 1e6:
+        parts.append(f"{state.waiting_bytes / 1e6:.0f} MB waiting")
+    return " · ".join(parts)
+
+
+def _table(state: RecordProgress) -> Table:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=_line(state), title_justify="left", box=None, pad_edge=False)
+    for name in ("topic", "messages", "Hz", "MB/s", "verbatim", "lost"):
+        table.add_column(name, justify="left" if name == "topic" else "right")
+    busiest = sorted(state.topics.items(), key=lambda item: -item[1].bytes_per_s)
+    for topic, item in busiest[:_SHOWN]:
+        gone = item.dropped + item.lost
+        share = f"{100 * item.verbatim / item.messages:.0f} %" if item.verbatim else ""
+        table.add_row(
+            Text(topic),
+            str(item.messages),
+            f"{item.hz:.1f}",
+            f"{item.bytes_per_s / 1e6:.2f}",
+            share,
+            str(gone) if gone else "",
+        )
+    if len(busiest) > _SHOWN:
+        table.add_row(Text(f"and {len(busiest) - _SHOWN} more"))
+    return table
+
+
+def print_record(summary: RecordSummary) -> None:
+    """Tell what was recorded."""
+    for path in summary.recovered:
+        say(f"{path}: made of a recording that was cut off earlier")
+    for made in summary.datasets:
+        print_pack(made)
+    for topic, count in summary.dropped.items():
+        say(f"{topic}: {count} messages dropped, since the buffer was full")
+    for topic, count in summary.lost.items():
+        say(f"{topic}: {count} messages lost by the middleware")

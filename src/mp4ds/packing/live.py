@@ -1,0 +1,307 @@
+"""A recording that is being made, packed while its messages come.
+
+Nothing waits: an image that its encoder has no time for is kept verbatim, what there is no memory
+for is dropped and counted. What came is on the disk within `DURABLE_S`, but for the frames that an
+encoder holds (spec/index.md, "Recordings that are being made").
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.bags.protocols import Format
+from mp4ds.packing.engine import Workers
+from mp4ds.packing.journal import JOURNAL_NAME, Journal
+from mp4ds.packing.manifest import PartRecord
+from mp4ds.packing.packer import TOO_LATE, Packer, PartSettings
+from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Record, Schema
+
+LATE_S = 0.5
+"""Seconds that an image may wait for its encoder."""
+
+DURABLE_S = 2.0
+"""Seconds within which what came is on the disk, but for the frames that an encoder holds."""
+
+_CHECKPOINT_S = 0.5
+
+
+class Intake:
+    """Messages on their way from those who receive them to the one who packs them.
+
+    Args:
+        most_bytes: Payloads that wait at most; beyond, the oldest messages are dropped and counted.
+    """
+
+    def __init__(self, most_bytes: int) -> None:
+        self.dropped: Counter[str] = Counter()
+        self.received: Counter[str] = Counter()
+        self.received_bytes: Counter[str] = Counter()
+        self._most = most_bytes
+        self._bytes = 0
+        self._waiting: deque[Message] = deque()
+        self._changed = threading.Condition()
+        self._is_closed = False
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Payloads that wait."""
+        return self._bytes
+
+    def put(self, message: Message) -> None:
+        """Take a message, from any thread; it never waits."""
+        topic = message.channel.topic
+        with self._changed:
+            if self._is_closed:
+                return
+            self.received[topic] += 1
+            self.received_bytes[topic] += len(message.data)
+            while self._waiting and self._bytes + len(message.data) > self._most:
+                gone = self._waiting.popleft()
+                self._bytes -= len(gone.data)
+                self.dropped[gone.channel.topic] += 1
+            self._waiting.append(message)
+            self._bytes += len(message.data)
+            self._changed.notify()
+
+    def take(self, wait_s: float) -> Message | None:
+        """The next message; None where none came in time.
+
+        Raises:
+            EOFError: There are no more.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._is_closed, wait_s)
+            if self._waiting:
+                message = self._waiting.popleft()
+                self._bytes -= len(message.data)
+                return message
+            if self._is_closed:
+                raise EOFError
+            return None
+
+    def close(self) -> None:
+        """Take nothing more; what waits is still given out."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+
+
+class PromptWorkers(Workers):
+    """A thread for each key; nobody waits for one, but is told that it is late. See `Workers`."""
+
+    def __init__(self) -> None:
+        super().__init__(0)
+        self._begun: dict[int, deque[float]] = {}
+        self._jobs: dict[int, deque[Callable[[], None]]] = {}
+        self._own: dict[int, threading.Thread] = {}
+        self._work = threading.Condition()
+        self._is_ending = False
+
+    def submit(self, key: int, job: Callable[[], None]) -> None:
+        """See `Workers.submit`; it does not wait."""
+        self._raise_error()
+        with self._work:
+            if key not in self._own:
+                self._begun[key], self._jobs[key] = deque(), deque()
+                self._own[key] = threading.Thread(target=self._run_jobs, args=(key,), daemon=True)
+                self._own[key].start()
+            self._begun[key].append(time.monotonic())
+            self._jobs[key].append(job)
+            self._work.notify_all()
+
+    def is_late(self, key: int) -> bool:
+        """Whether the job that has waited longest has done so for `LATE_S`."""
+        return self.age(key) > LATE_S
+
+    def age(self, key: int) -> float:
+        """Seconds since the job that is next, or at work, came; 0 where there is none."""
+        with suppress(IndexError, KeyError):
+            return time.monotonic() - self._begun[key][0]
+        return 0.0
+
+    def _run_jobs(self, key: int) -> None:
+        jobs, begun = self._jobs[key], self._begun[key]
+        while True:
+            with self._work:
+                self._work.wait_for(lambda: jobs or self._is_ending)
+                if not jobs:
+                    return
+                job = jobs.popleft()
+            try:
+                if self._error is None:
+                    job()
+            except BaseException as error:
+                self._error = self._error or error
+            begun.popleft()
+            del job  # and the message that it holds
+
+    def join(self) -> None:
+        """See `Workers.join`."""
+        with self._work:
+            self._is_ending = True
+            self._work.notify_all()
+        for thread in self._own.values():
+            thread.join()
+        self._raise_error()
+
+
+class LiveRecording:
+    """What is told of a recording while it is made. See `BagReader`.
+
+    Args:
+        path: Where it is made.
+        format: What it would have been recorded as: ``bag`` or ``rosbag2``.
+        profile: ``ros1`` or ``ros2``.
+    """
+
+    library = ""
+    files: Sequence[Path] = ()
+    unused_schemas: Sequence[Schema] = ()
+    skipped: Mapping[str, int] = MappingProxyType({})
+    position = 0
+    is_indexed = False
+
+    def __init__(self, path: Path, format: Format, profile: str) -> None:  # noqa: A002
+        self.path = path
+        self.format: Format = format
+        self.profile = profile
+        self.channels: list[Channel] = []
+
+    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+        """Nothing: messages come to `LivePacker`."""
+        del excerpt
+        return iter(())
+
+    def stats(self) -> Mapping[int, ChannelStats]:
+        """Nothing is known of what will come."""
+        return {}
+
+    def times(self) -> Mapping[int, NDArray[np.int64]]:
+        """Nothing is known of what will come."""
+        return {}
+
+    def first(self, channel: Channel) -> Message | None:
+        """Nothing is known of what will come."""
+        del channel
+        return None
+
+    def __enter__(self) -> LiveRecording:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+class LivePacker(Packer):
+    """Packs messages as they come. See `Packer`; of its results nothing differs.
+
+    Args:
+        recording: What is recorded.
+        folder: The folder to fill, empty.
+        settings: How; of live streams.
+        journal: Where to note what is done.
+        intake: Where messages come from.
+        is_over: Asked between messages whether no more belong to this recording.
+        on_read: Called when the last message was taken, before videos are finished.
+    """
+
+    def __init__(
+        self,
+        recording: LiveRecording,
+        folder: Path,
+        settings: PartSettings,
+        journal: Journal,
+        *,
+        intake: Intake,
+        is_over: Callable[[PartRecord], bool],
+        on_read: Callable[[], None],
+    ) -> None:
+        super().__init__(recording, folder, settings, journal=journal)
+        self._recording = recording
+        self._folder = folder
+        self._intake = intake
+        self._is_over = is_over
+        self._on_read = on_read
+
+    @property
+    def part(self) -> PartRecord:
+        """What was packed so far."""
+        return self._part
+
+    def _read(self) -> None:
+        known: set[int] = set()
+        next_checkpoint = time.monotonic() + _CHECKPOINT_S
+        with _Syncing(self._folder) as syncing, PromptWorkers() as workers:
+            while not self._is_over(self._part):
+                try:
+                    message = self._intake.take(max(0.0, next_checkpoint - time.monotonic()))
+                except EOFError:
+                    break
+                if message is not None:
+                    if message.channel.id not in known:
+                        known.add(message.channel.id)
+                        self._recording.channels.append(message.channel)
+                    self._take(message, workers)
+                if time.monotonic() >= next_checkpoint:
+                    self._verbatim.flush()
+                    syncing.ask()
+                    next_checkpoint = time.monotonic() + _CHECKPOINT_S
+            self._on_read()
+            self._cameras.settle(workers)
+        self._calibrations.finish()
+
+    def _keep(self, message: Message, reason: str = "") -> None:
+        # where there is no time to encode, there is none to compress either
+        self._verbatim.add_channel(message.channel)
+        self._verbatim.write(message, compress=reason != TOO_LATE)
+
+
+class _Syncing:
+    """Lets the disk have what was written, on a thread of its own. A context manager."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._asked = threading.Event()
+        self._is_ending = False
+        self._thread = threading.Thread(target=self._run, name="sync", daemon=True)
+
+    def ask(self) -> None:
+        """Have everything that was written so far put onto the disk soon."""
+        self._asked.set()
+
+    def _run(self) -> None:
+        while self._asked.wait() and not self._is_ending:
+            self._asked.clear()
+            # the journal first, without which a frame is of no use
+            for path in sorted(self._folder.iterdir(), key=lambda path: path.name != JOURNAL_NAME):
+                with suppress(OSError):  # what the disk refuses, its writer is told, too
+                    _sync(path)
+            with suppress(OSError):
+                _sync(self._folder)
+
+    def __enter__(self) -> _Syncing:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._is_ending = True
+        self._asked.set()
+        self._thread.join()
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        getattr(os, "fdatasync", os.fsync)(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,226 @@
+"""A dataset of what is there of a recording that was cut off, by its journal."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.bags.mcap_records import MAGIC
+from mp4ds.bags.mcap_write import McapWriter
+from mp4ds.bags.protocols import Format, write_record
+from mp4ds.bags.salvage.losses import losses_of
+from mp4ds.bags.salvage.mcap import McapSalvage
+from mp4ds.dataset.rebuild import columns_model
+from mp4ds.files.outputs import begins_with, staged
+from mp4ds.format.fields import MESSAGES_NAME
+from mp4ds.format.manifest import About
+from mp4ds.format.models import CameraInfo
+from mp4ds.format.sidecars import dump_document
+from mp4ds.messages.serializations import is_calibration, is_camera
+from mp4ds.messages.transforms import TransformCollector
+from mp4ds.packing.calibrations import Calibrations
+from mp4ds.packing.journal import FRAME_COLUMNS, JOURNAL_NAME, Notes, StreamNote
+from mp4ds.packing.manifest import (
+    Origin,
+    PartRecord,
+    PartStream,
+    dataset_files,
+    summarize,
+    write_manifest,
+)
+from mp4ds.packing.options import PackSummary
+from mp4ds.packing.writer import stream_sidecar
+from mp4ds.records import Channel, Loss, Message
+from mp4ds.video.packets import copy_fragments
+
+CUT_OFF = "the recording was cut off; what came in its last two seconds may be missing"
+_UNKNOWN = "kept as it was when the recording was cut off"
+
+
+def recover(
+    folder: Path, target: Path, *, force: bool = False, about: About | None = None
+) -> PackSummary:
+    """Make the dataset of a recording that was cut off; nothing is encoded anew.
+
+    Args:
+        folder: Where the recording was made; it stays as it is.
+        target: The dataset.
+        force: Replace an existing one.
+        about: What is told of the recording.
+
+    Raises:
+        SourceError: It is being recorded, or its journal is damaged.
+        TargetError: The dataset may not be written there.
+        WriteError: The disk refused.
+    """
+    notes = Notes.read(folder / JOURNAL_NAME)
+    with staged(target, force=force, owned=dataset_files, sources=[folder]) as made:
+        made.mkdir()
+        part = _Recovery(folder, made, notes).run()
+        recorded = _Recorded(notes.facts["format"], notes.facts["profile"])  # type: ignore[arg-type]
+        origin = Origin(about=about)
+        write_manifest(part, recorded, origin, notes.facts["quality"])
+        source_bytes = sum(path.stat().st_size for path in folder.iterdir())
+        return summarize(part, target, source_bytes, origin)
+
+
+@dataclass(frozen=True)
+class _Recorded:
+    """See `mp4ds.packing.manifest.Recorded`."""
+
+    format: Format
+    profile: str
+    library: str = ""
+
+
+@dataclass
+class _Stream:
+    """A stream whose video is there. See `CalibratedStream`."""
+
+    note: StreamNote
+    channel: Channel
+    columns: dict[str, NDArray[Any]]
+    camera_info: CameraInfo | None = None
+
+
+class _Recovery:
+    """See `recover`."""
+
+    def __init__(self, folder: Path, made: Path, notes: Notes) -> None:
+        self._folder = folder
+        self._notes = notes
+        self._part = PartRecord(made)
+        self._by_identity = {channel.identity: channel for channel in notes.channels.values()}
+        self._kept: Counter[int] = Counter()  # camera messages that are not in videos, by channel
+
+    def run(self) -> PartRecord:
+        """Make videos, messages and sidecars."""
+        part = self._part
+        for channel in self._by_identity.values():
+            part.topic(channel)
+        streams = [stream for note in self._notes.streams if (stream := self._stream(note))]
+        with McapWriter(part.messages_path, profile=self._notes.facts["profile"]) as writer:
+            self._copy(writer)
+            self._calibrate(streams, writer)
+            in_videos = {stream.channel.id for stream in streams}
+            for channel in self._by_identity.values():
+                if channel.id not in in_videos:
+                    writer.add_channel(channel)
+        for channel in filter(is_camera, self._by_identity.values()):
+            self._number([item for item in streams if item.channel.id == channel.id], channel)
+        part.streams = [self._finished(stream) for stream in streams]
+        end = part.span[1] if part.span else None
+        part.losses.append(Loss(JOURNAL_NAME, None, None, CUT_OFF, start=end))
+        return part
+
+    def _stream(self, note: StreamNote) -> _Stream | None:
+        """The frames of a stream that are in its video and in the journal; None without any."""
+        noted = self._notes.frames[note.stem]
+        values = {name: np.array(column) for name, column in zip(FRAME_COLUMNS, noted, strict=True)}
+        name = f"{note.stem}.mp4"
+        source, target = self._folder / name, self._part.folder / name
+        packets, ticks = self._notes.packets[note.stem], values["tick"].tolist()
+        frames = copy_fragments(source, note.video["codec"], ticks, packets, target)
+        if not frames:
+            return None
+        channel = self._notes.channels[note.channel]
+        stream = _Stream(note, channel, {name: column[:frames] for name, column in values.items()})
+        topic = self._part.topic(channel)
+        topic.messages += frames
+        topic.frames += frames
+        topic.raw_bytes += int(stream.columns["size"].sum())
+        self._part.saw(stream.columns["log_time"].tolist())
+        return stream
+
+    def _copy(self, writer: McapWriter) -> None:
+        """The messages that were kept as they came; calibrations are taken from the journal."""
+        path, part = self._folder / MESSAGES_NAME, self._part
+        if not (path.is_file() and path.stat().st_size and begins_with(path, MAGIC)):
+            return  # nothing of it reached the disk
+        transforms = TransformCollector()
+        with McapSalvage(path) as reader:
+            reader.is_alone = False
+            for record in reader.records():
+                if not isinstance(record, Message) or is_calibration(record.channel):
+                    continue
+                channel = self._known(record.channel)
+                self._saw(channel, record)
+                self._kept[channel.id] += is_camera(channel)
+                transforms.add(channel, record.data)
+                write_record(writer, record.of_channel(channel))
+            part.losses.extend(losses_of(reader))
+        part.transforms = transforms.transforms
+
+    def _known(self, channel: Channel) -> Channel:
+        """A channel of messages.mcap under the id that the journal has for it."""
+        own = replace(channel, id=-1 - len(self._by_identity))
+        return self._by_identity.setdefault(channel.identity, own)
+
+    def _saw(self, channel: Channel, message: Message) -> None:
+        topic = self._part.topic(channel)
+        topic.messages += 1
+        topic.raw_bytes += len(message.data)
+        self._part.saw([message.log_time])
+
+    def _calibrate(self, streams: Sequence[_Stream], writer: McapWriter) -> None:
+        calibrations = Calibrations(
+            list(self._notes.channels.values()),
+            (),
+            self._notes.pairs,
+            topic_of=self._part.topic,
+            keep=partial(write_record, writer),
+        )
+        for stream in streams:
+            calibrations.adopt(stream)
+        for message in self._notes.calibrations():
+            self._saw(message.channel, message)
+            calibrations.take(message)
+        calibrations.finish()
+
+    def _number(self, streams: Sequence[_Stream], channel: Channel) -> None:
+        """Number the messages of a camera channel that are there without gaps."""
+        kept = self._notes.verbatim[channel.id][: self._kept[channel.id]]
+        every = [item for note in self._notes.streams for item in self._ordinals(note, channel)]
+        next_one = max([-1, *every, *(item[0] for item in self._notes.verbatim[channel.id])]) + 1
+        for ordinal in range(next_one, next_one + self._kept[channel.id] - len(kept)):
+            kept.append((ordinal, ordinal, _UNKNOWN))  # its line did not reach the disk
+        there = [stream.columns["ordinal"] for stream in streams]
+        sorted_ = np.sort(np.concatenate([*there, np.array([item[0] for item in kept], np.int64)]))
+        for stream in streams:
+            stream.columns["ordinal"] = np.searchsorted(sorted_, stream.columns["ordinal"])
+        for _, number, reason in kept:
+            self._part.topic(channel).count_verbatim(reason, number)
+
+    def _ordinals(self, note: StreamNote, channel: Channel) -> Sequence[int]:
+        """Places of a stream's frames among all messages of a channel; none of another's."""
+        if note.channel != channel.id:
+            return ()
+        return self._notes.frames[note.stem][FRAME_COLUMNS.index("ordinal")]
+
+    def _finished(self, stream: _Stream) -> PartStream:
+        note, folder = stream.note, self._part.folder
+        columns = dict(stream.columns)
+        digests = columns["digest"]
+        not_there = {"tick", "digest", "size"}
+        not_there |= set() if note.has_seq else {"seq"}
+        not_there |= set() if note.has_pts else {"pts"}
+        columns = {name: column for name, column in columns.items() if name not in not_there}
+        sidecar = stream_sidecar(
+            note,
+            stream.channel,
+            folder / f"{note.stem}.mp4",
+            headers=self._notes.headers[note.stem][: int(columns["variant"].max()) + 1],
+            camera_info=stream.camera_info,
+            columns=columns_model(columns),
+            frames=len(digests),
+            digests=digests.tolist(),
+        )
+        (folder / f"{note.stem}.yaml").write_bytes(dump_document(sidecar))
+        return PartStream(note.stem, sidecar)

@@ -1,0 +1,211 @@
+"""Receives messages of ROS 2 without an installed ROS: over DDS, with Eclipse Cyclone DDS."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+from mp4ds.bags.protocols import Format
+from mp4ds.plugins.publishing.dds import dds_qos
+from mp4ds.plugins.publishing.dds_domain import (
+    DdsListener,
+    domain_id,
+    open_participant,
+    publisher_type,
+)
+from mp4ds.plugins.publishing.ros2_writers import Qos, load_overrides
+from mp4ds.plugins.recording.ros2_channels import (
+    announced_definition,
+    asked_qos,
+    channel_of,
+    is_hidden,
+    ros_type,
+    standard_definition,
+    time_of,
+)
+from mp4ds.plugins.recording.source import SourceOptions, SourceState, Wanted
+from mp4ds.records import Channel, Message
+
+_DEPTH = 100
+"""Messages of a topic that may wait in DDS: they are taken out at once."""
+
+_SETTLE_S = 0.3
+"""Seconds between a topic's first publisher and its subscription: what all offer decides."""
+
+_PREFIX = "rt/"
+_HASH = re.compile(rb"(?:^|;)typehash=(RIHS01_[0-9a-f]{64});")
+_BATCH = 100
+_CLOCK = "/clock"
+
+
+@dataclass
+class _Topic:
+    """A topic that somebody publishes, and which is wanted."""
+
+    since: float
+    is_wanted: bool
+    endpoints: dict[Any, Any] = field(default_factory=dict)
+    reader: Any = None
+
+
+class DdsSource:
+    """Receives as a participant of DDS by itself. See `Source`.
+
+    Args:
+        options: How; the node has no name in DDS.
+
+    Raises:
+        PublishError: Cyclone DDS is not there.
+        OptionError: There is no such domain.
+    """
+
+    format: Format = "rosbag2"
+    profile = "ros2"
+
+    def __init__(self, options: SourceOptions) -> None:
+        self.state = SourceState()
+        self._options = options
+        overrides = options.qos_overrides
+        self._overrides = load_overrides(overrides) if overrides is not None else {}
+        domain = domain_id(None)
+        self._participant = open_participant(domain)
+        self.address = f"DDS domain {domain}, by Cyclone DDS"
+        self._listener = DdsListener(self._participant)
+        self._topics: dict[str, _Topic] = {}
+        self._count = 0
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._sim_time_ns: int | None = None
+
+    def start(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+        """See `Source.start`."""
+        if self._options.use_sim_time:
+            self._sim_time_ns = 0
+        self._thread = threading.Thread(
+            target=self._look, args=(wanted, take), name="topics", daemon=True
+        )
+        self._thread.start()
+
+    def _look(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+        from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+
+        found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        poll_s = self._options.poll_s
+        deadline = time.monotonic() + 2 * _SETTLE_S
+        while not self._ended.wait(poll_s or _SETTLE_S):
+            for endpoint in found.take(_BATCH):
+                if endpoint.sample_info.valid_data:
+                    self._meet(endpoint, wanted)
+            for name, topic in self._topics.items():
+                if topic.reader is None and time.monotonic() - topic.since > _SETTLE_S:
+                    self._subscribe(name, topic, take)
+                self._count_lost(name, topic)
+            if poll_s is None and time.monotonic() > deadline:
+                return
+
+    def _meet(self, endpoint: Any, wanted: Wanted) -> None:
+        name = endpoint.topic_name
+        topic = f"/{name.removeprefix(_PREFIX)}"
+        is_bare = not name.startswith(_PREFIX)
+        if is_bare or not ros_type(endpoint.type_name):
+            return
+        is_wanted = wanted(topic) and (self._options.hidden or not is_hidden(topic))
+        if is_wanted or (topic == _CLOCK and self._sim_time_ns is not None):
+            known = self._topics.setdefault(topic, _Topic(time.monotonic(), is_wanted))
+            known.endpoints[endpoint.key] = endpoint
+
+    def _subscribe(self, name: str, topic: _Topic, take: Callable[[Message], None]) -> None:
+        from cyclonedds.core import DDSException
+        from cyclonedds.sub import DataReader
+        from cyclonedds.topic import Topic
+
+        endpoints = list(topic.endpoints.values())
+        offered = [offered_by(endpoint.qos) for endpoint in endpoints]
+        type_hash = _hash_of(endpoints[0].qos)
+        kind = publisher_type(self._participant, endpoints[0])
+        type_name = ros_type(endpoints[0].type_name)
+        definition = standard_definition(type_name, type_hash)
+        definition = definition or announced_definition(kind, type_hash)
+        if not definition:
+            self.state.warnings[f"{name}: the definition of {type_name} is not known here"] = None
+        channel = channel_of(self._count, name, type_name, definition, type_hash, offered)
+        self._count += 1
+        qos = self._overrides.get(name, asked_qos(offered, _DEPTH))
+        try:
+            made = Topic(self._participant, _PREFIX + name.lstrip("/"), kind)
+            topic.reader = DataReader(
+                self._participant, made, qos=dds_qos(qos, user_data=_user_data(type_hash))
+            )
+        except DDSException as error:
+            topic.reader = False
+            self.state.warnings[f"{name}: cannot be received: {error.msg}"] = None
+            return
+        if name == _CLOCK and self._sim_time_ns is not None:
+            self._listener.hear(topic.reader, self._tick)
+        if topic.is_wanted:
+            self.state.topics[name] = None
+            self._listener.hear(topic.reader, partial(self._received, channel, take))
+
+    def _tick(self, sample: Any) -> None:
+        self._sim_time_ns = time_of(sample.payload)
+
+    def _received(self, channel: Channel, take: Callable[[Message], None], sample: Any) -> None:
+        data = sample.payload
+        sent = sample.sample_info.source_timestamp
+        now = time.time_ns() if self._sim_time_ns is None else self._sim_time_ns
+        take(Message(channel, now, sent if sent > 0 else now, 0, data))
+
+    def _count_lost(self, name: str, topic: _Topic) -> None:
+        if topic.reader:
+            status = topic.reader.get_sample_lost_status()
+            if status.total_count:
+                self.state.lost[name] = status.total_count
+
+    def close(self) -> None:
+        """See `Source.close`."""
+        if self._ended.is_set():
+            return
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join()
+        self._listener.close()
+        self._topics.clear()
+        self._participant = None
+
+
+def _hash_of(qos: Any) -> str:
+    from cyclonedds.core import Policy
+
+    found = _HASH.search(qos[Policy.Userdata].data) if Policy.Userdata in qos else None
+    return found[1].decode() if found else ""
+
+
+def _user_data(type_hash: str) -> str:
+    return f"typehash={type_hash};" if type_hash else ""
+
+
+def offered_by(qos: Any) -> Qos:
+    """What a publisher offers, of what discovery tells: not how many messages it keeps.
+
+    Args:
+        qos: As Cyclone DDS has it.
+    """
+    from cyclonedds.core import Policy
+
+    is_best_effort = Policy.Reliability.BestEffort in qos
+    is_latched = Policy.Durability.TransientLocal in qos
+    return Qos(
+        reliability="best_effort" if is_best_effort else "reliable",
+        durability="transient_local" if is_latched else "volatile",
+        deadline_ns=_finite(qos[Policy.Deadline].deadline) if Policy.Deadline in qos else None,
+        lifespan_ns=_finite(qos[Policy.Lifespan].lifespan) if Policy.Lifespan in qos else None,
+    )
+
+
+def _finite(nanoseconds: int) -> int | None:
+    return nanoseconds if 0 < nanoseconds < 2**63 - 1 else None

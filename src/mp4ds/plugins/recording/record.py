@@ -1,0 +1,580 @@
+"""A live robot -> datasets: what comes is encoded and put onto the disk as it comes."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+
+from mp4ds.dataset.checks import validate
+from mp4ds.errors import Mp4dsError, OptionError, RecordError, TargetExistsError, WriteError
+from mp4ds.files.outputs import check_target, move_into_place, sync, work_folder
+from mp4ds.format.manifest import About
+from mp4ds.format.sidecars import load_about
+from mp4ds.options import Options, exclude, force, option, parse_size
+from mp4ds.packing.journal import JOURNAL_NAME, Journal, is_unfinished
+from mp4ds.packing.live import Intake, LivePacker, LiveRecording
+from mp4ds.packing.manifest import (
+    Origin,
+    PartRecord,
+    dataset_files,
+    folder_size,
+    summarize,
+    write_manifest,
+)
+from mp4ds.packing.options import PackSummary
+from mp4ds.packing.packer import PartSettings
+from mp4ds.packing.planning import available_cores
+from mp4ds.packing.recovery import recover
+from mp4ds.packing.tracks import StreamSettings
+from mp4ds.plan import LOSSLESS, MAX_GOP, Selection, parse_quality
+from mp4ds.plugins.publishing.publisher import sourced
+from mp4ds.plugins.recording.source import Source, SourceOptions, Wanted, open_source
+from mp4ds.records import Message
+from mp4ds.video.codecs import LOSSLESS_GOP, LOSSY_GOP, check_codec
+
+UNFINISHED = ".recording"
+"""What the name of a folder ends with in which a recording is made."""
+
+_NS = 1_000_000_000
+_REPORT_S = 0.2
+
+
+@dataclass(frozen=True)
+class RecordOptions(Options):
+    """How to record."""
+
+    to: str | None = option("ros1 or ros2; what is sourced by default.")
+    all: bool = option("Record all topics, also those that appear later.", False, "-a")
+    regex: str = option("Record topics that match, besides those named.", "", "-e")
+    exclude: Sequence[str] = exclude("--exclude", "--exclude-topics")
+    exclude_regex: str = option("Leave out topics that match.", "", "--exclude-regex")
+    duration: float | None = option("Stop after so many seconds.", None, "--duration")
+    max_duration: float | None = option(
+        "Begin another dataset after so many seconds; 0: never.",
+        None,
+        "--max-bag-duration",
+        "-d",
+        metavar="SECONDS",
+    )
+    max_size: int | None = option(
+        "Begin another dataset when this one is so large, such as 4G.",
+        None,
+        "--max-size",
+        metavar="SIZE",
+        parse=parse_size,
+    )
+    buffer: int = option(
+        "Messages that may wait, in MB; beyond, the oldest are dropped and counted.",
+        256,
+        "--buffsize",
+        "-b",
+        least=1,
+        most=1_000_000,
+    )
+    quality: str = option("lossless, visual or crf=N.", LOSSLESS, "-q")
+    codec: str | None = option("As of pack; by default what encodes in the least time.")
+    preset: str | None = option("The encoder's preset; its fastest exact one by default.")
+    gop: int | None = option(
+        "Most frames from a key frame to the next; 10 by default, 30 where lossy.",
+        least=1,
+        most=MAX_GOP,
+    )
+    start_paused: bool = option("Start paused.", False, "--start-paused", "--pause")
+    use_sim_time: bool = option("Log the times of /clock.", False)
+    node: str = option("Name of the node.", "mp4ds_recorder", "--node-name")
+    discover: bool = option("Look for new topics.", True, "--discovery/--no-discovery")
+    polling_interval: float = option(
+        "Milliseconds between looks for new topics.", 100.0, "--polling-interval", "-p"
+    )
+    hidden: bool = option("Hidden topics too (ROS 2).", False, "--include-hidden-topics")
+    qos_overrides: Path | None = option(
+        "QoS by topic, for ROS 2.", None, "--qos-profile-overrides-path", metavar="YAML"
+    )
+    about: str | None = option(
+        "YAML with title, description, authors, license, doi, links or keywords.", metavar="FILE"
+    )
+    force: bool = force()
+
+
+@dataclass(frozen=True)
+class TopicProgress:
+    """How a topic stands.
+
+    Attributes:
+        messages: Received.
+        hz: Messages a second, lately.
+        bytes_per_s: Received a second, lately.
+        verbatim: Camera messages that are kept as they came.
+        dropped: Messages for which there was no memory.
+        lost: Messages that the middleware says it lost.
+    """
+
+    messages: int
+    hz: float
+    bytes_per_s: float
+    verbatim: int
+    dropped: int
+    lost: int
+
+
+@dataclass(frozen=True)
+class RecordProgress:
+    """How a recording stands.
+
+    Attributes:
+        dataset: That is being made.
+        seconds: Since it began.
+        state: ``recording``, ``paused`` or ``finishing``.
+        topics: By name.
+        waiting_bytes: Payloads that wait.
+        bytes_written: Of this dataset.
+        warnings: Sentences, each once.
+    """
+
+    dataset: Path
+    seconds: float
+    state: str
+    topics: Mapping[str, TopicProgress]
+    waiting_bytes: int
+    bytes_written: int
+    warnings: Sequence[str]
+
+
+@dataclass
+class RecordSummary:
+    """What was recorded.
+
+    Attributes:
+        datasets: What was made.
+        seconds: How long it took.
+        dropped: Messages for which there was no memory, by topic.
+        lost: Messages that the middleware says it lost, by topic.
+        recovered: Datasets made of recordings that were cut off earlier.
+        warnings: Sentences.
+    """
+
+    datasets: list[PackSummary] = field(default_factory=list)
+    seconds: float = 0.0
+    dropped: dict[str, int] = field(default_factory=dict)
+    lost: dict[str, int] = field(default_factory=dict)
+    recovered: list[Path] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def record(
+    topics: Sequence[str] = (),
+    dataset: Path | str | None = None,
+    options: RecordOptions | None = None,
+    *,
+    progress: Callable[[RecordProgress], None] | None = None,
+) -> RecordSummary:
+    """Record topics until interrupted.
+
+    Args:
+        topics: Names or globs; none with `all` or `regex`.
+        dataset: The folder to make; named by the time where None.
+        options: How.
+        progress: Called a few times a second.
+
+    Returns:
+        What was recorded.
+
+    Raises:
+        OptionError: An option is wrong.
+        PublishError: ROS is not there.
+        TargetError: The dataset may not be written there.
+        RecordError: The disk refused; what came before stays in the folder ``NAME.recording``, of
+            which `mp4ds.pack` makes a dataset with `salvage`.
+    """
+    with open_recorder(topics, dataset, options, progress=progress) as recorder:
+        return recorder.run()
+
+
+@contextmanager
+def open_recorder(
+    topics: Sequence[str] = (),
+    dataset: Path | str | None = None,
+    options: RecordOptions | None = None,
+    *,
+    source: Source | None = None,
+    progress: Callable[[RecordProgress], None] | None = None,
+) -> Iterator[Recorder]:
+    """A recorder, which is not running yet. See `record`.
+
+    Args:
+        topics: See `record`.
+        dataset: See `record`.
+        options: See `record`.
+        source: Where messages come from, closed here; None for what the options say.
+        progress: See `record`.
+    """
+    chosen = options or RecordOptions()
+    if not (topics or chosen.all or chosen.regex):
+        raise OptionError("Name topics, or give `all` or `regex`.")
+    wanted = Wanted(
+        () if chosen.all else topics,
+        regex="" if chosen.all else chosen.regex,
+        exclude=chosen.exclude,
+        exclude_regex=chosen.exclude_regex,
+    )
+    settings = _settings(chosen)
+    about = load_about(chosen.about) if chosen.about is not None else None
+    if source is None:
+        source = open_source(
+            chosen.to or sourced(),
+            SourceOptions(
+                chosen.node,
+                use_sim_time=chosen.use_sim_time,
+                poll_s=chosen.polling_interval / 1000 if chosen.discover else None,
+                hidden=chosen.hidden,
+                qos_overrides=chosen.qos_overrides,
+            ),
+        )
+    with ExitStack() as stack:
+        stack.callback(source.close)
+        target = (
+            Path(dataset)
+            if dataset is not None
+            else Path(f"{datetime.now():mp4ds_%Y_%m_%d-%H_%M_%S}")
+        )
+        yield Recorder(target.absolute(), chosen, settings, wanted, source, about, progress)
+
+
+def _settings(options: RecordOptions) -> StreamSettings:
+    quality = parse_quality(options.quality)
+    if quality.target is not None:
+        raise OptionError(
+            f"`quality` {options.quality} needs several tries. Record without loss, or visual, and "
+            "pack the dataset with that quality."
+        )
+    for name, seconds in (("duration", options.duration), ("max_duration", options.max_duration)):
+        if seconds is not None and not 0 <= seconds < 1e9:
+            raise OptionError(f"`{name}` {seconds:g} is not a number of seconds from 0.")
+    check_codec(options.codec, options.preset, lossless=quality.lossless, crf=quality.crf)
+    return StreamSettings(
+        quality=quality,
+        codec=options.codec,
+        preset=options.preset,
+        gop=options.gop or (LOSSLESS_GOP if quality.lossless else LOSSY_GOP),
+        threads=1 if quality.lossless else available_cores(),
+        is_live=True,
+    )
+
+
+class Recorder:
+    """Records until it is stopped. See `open_recorder`.
+
+    Args:
+        target: The dataset, absolute.
+        options: How.
+        settings: Of its streams.
+        wanted: Which topics.
+        source: Where messages come from.
+        about: What is told of the recording.
+        progress: Called a few times a second.
+    """
+
+    def __init__(
+        self,
+        target: Path,
+        options: RecordOptions,
+        settings: StreamSettings,
+        wanted: Wanted,
+        source: Source,
+        about: About | None,
+        progress: Callable[[RecordProgress], None] | None,
+    ) -> None:
+        self._target = target
+        self._options = options
+        self._settings = settings
+        self._wanted = wanted
+        self._source = source
+        self._about = about
+        self._progress = progress
+        self._intake = Intake(options.buffer * 10**6)
+        self._changed = threading.Event()
+        self._is_stopped = False
+        self._is_paused = options.start_paused
+        self._splits: list[_Split] = []
+        self._rates: dict[str, tuple[float, int, int, float, float]] = {}
+        self.address = source.address
+
+    @property
+    def received(self) -> int:
+        """Messages that came so far."""
+        return sum(self._intake.received.values())
+
+    # ------------------------------------------------------------ controls
+
+    @property
+    def is_paused(self) -> bool:
+        """Whether messages are left out."""
+        return self._is_paused
+
+    def pause(self) -> None:
+        """Leave out what comes from now on."""
+        self._is_paused = True
+
+    def resume(self) -> None:
+        """Record again."""
+        self._is_paused = False
+
+    def toggle_paused(self) -> None:
+        """Pause, or resume."""
+        self._is_paused = not self._is_paused
+
+    def split(self) -> None:
+        """Begin another dataset."""
+        if self._splits:
+            self._splits[-1].is_asked = True
+
+    def stop(self) -> None:
+        """Stop; `run` then finishes what was recorded."""
+        self._is_stopped = True
+        self._changed.set()
+
+    # ------------------------------------------------------------ running
+
+    def run(self) -> RecordSummary:
+        """Record until it is stopped.
+
+        Raises:
+            Mp4dsError: As `record`.
+        """
+        summary = RecordSummary(recovered=self._recover())
+        begun = time.monotonic()
+        self._begin_split()
+        try:
+            self._source.start(self._wanted, self._take)
+            while not self._is_stopped:
+                self._changed.wait(_REPORT_S)
+                self._changed.clear()
+                self._go_on(begun)
+        finally:
+            self._source.close()
+            self._intake.close()
+            self._drain(begun)
+            for split in self._splits:
+                self._finish(split, begun)
+        summary.datasets = [split.made for split in self._splits if split.made]
+        summary.seconds = time.monotonic() - begun
+        summary.dropped = dict(self._intake.dropped)
+        summary.lost = dict(self._source.state.lost)
+        summary.warnings = list(self._source.state.warnings)
+        return summary
+
+    def _take(self, message: Message) -> None:
+        if not self._is_paused:
+            self._intake.put(message)
+
+    def _go_on(self, begun: float) -> None:
+        current = self._splits[-1]
+        if current.error is not None:
+            self._is_stopped = True
+        elif current.is_read:
+            self._begin_split()
+        if self._options.duration and time.monotonic() - begun >= self._options.duration:
+            self._is_stopped = True
+        self._report(begun, "paused" if self._is_paused else "recording")
+
+    def _begin_split(self) -> None:
+        number = len(self._splits)
+        is_numbered = bool(self._options.max_duration or self._options.max_size or number)
+        target = self._target
+        if is_numbered:
+            target = target.with_name(f"{target.name}_{number}")
+        self._splits.append(_Split(self, target, is_spare=number > 0, tell=self._changed.set))
+
+    def _drain(self, begun: float) -> None:
+        """Take what waits, into further datasets where it does not belong to this one."""
+        while True:
+            split = self._splits[-1]
+            while not split.is_read and not split.join(_REPORT_S):
+                self._report(begun, "finishing")
+            if split.error is not None or not self._intake.waiting_bytes:
+                return
+            self._begin_split()
+
+    def _finish(self, split: _Split, begun: float) -> None:
+        """Wait for a dataset.
+
+        Raises:
+            Mp4dsError: It could not be made.
+        """
+        while not split.join(_REPORT_S):
+            self._report(begun, "finishing")
+        split.raise_error()
+
+    def _report(self, begun: float, state: str) -> None:
+        if self._progress is None:
+            return
+        split, now = self._splits[-1], time.monotonic()
+        verbatim = split.verbatim
+        topics = {
+            topic: self._topic(topic, now, verbatim.get(topic, 0))
+            for topic in sorted({*self._source.state.topics, *self._intake.received})
+        }
+        self._progress(
+            RecordProgress(
+                dataset=split.target,
+                seconds=now - begun,
+                state=state,
+                topics=topics,
+                waiting_bytes=self._intake.waiting_bytes,
+                bytes_written=split.size,
+                warnings=list(self._source.state.warnings),
+            )
+        )
+
+    def _topic(self, topic: str, now: float, verbatim: int) -> TopicProgress:
+        count, size = self._intake.received[topic], self._intake.received_bytes[topic]
+        then, its_count, its_size, hz, rate = self._rates.get(topic, (now, count, size, 0.0, 0.0))
+        if now - then >= 1.0 or topic not in self._rates:
+            elapsed = max(now - then, _REPORT_S)
+            hz, rate = (count - its_count) / elapsed, (size - its_size) / elapsed
+            self._rates[topic] = (now, count, size, hz, rate)
+        return TopicProgress(
+            messages=count,
+            hz=hz,
+            bytes_per_s=rate,
+            verbatim=verbatim,
+            dropped=self._intake.dropped[topic],
+            lost=self._source.state.lost[topic],
+        )
+
+    def _recover(self) -> list[Path]:
+        """Make datasets of the recordings beside this one that were cut off."""
+        made = []
+        for folder in sorted(self._target.parent.glob(f"*{UNFINISHED}")):
+            target = folder.with_name(folder.name.removesuffix(UNFINISHED))
+            if not is_unfinished(folder) or target.exists():
+                continue
+            with suppress(
+                Mp4dsError, OSError
+            ):  # another recorder is at work, or `pack` tells why not
+                recover(folder, target)
+                if not validate(target):
+                    shutil.rmtree(folder)
+                made.append(target)
+        return made
+
+
+class _Split:
+    """One dataset of a recording, made on a thread of its own."""
+
+    def __init__(
+        self, recorder: Recorder, target: Path, *, is_spare: bool, tell: Callable[[], None]
+    ) -> None:
+        options, source = recorder._options, recorder._source
+        self.target = target
+        self.made: PackSummary | None = None
+        self.error: BaseException | None = None
+        self.is_read = False
+        self.is_asked = False
+        self._is_spare = is_spare  # not made where nothing came any more
+        self._tell = tell
+        self._force = options.force
+        self._about = recorder._about
+        self._most_ns = round((options.max_duration or 0) * _NS)
+        self._most_bytes = options.max_size
+        self._next_look = 0.0
+        self.folder = target.with_name(target.name + UNFINISHED)
+        check_target(target, force=options.force, owned=dataset_files)
+        try:
+            self.folder.mkdir()
+        except FileExistsError:
+            raise TargetExistsError(self.folder) from None
+        except OSError as error:
+            raise WriteError(target, error) from None
+        facts = {"format": source.format, "profile": source.profile}
+        self._profile = str(recorder._settings.quality)
+        self._journal = Journal(self.folder, {**facts, "quality": self._profile})
+        self._recording = LiveRecording(target, source.format, source.profile)
+        self._packer = LivePacker(
+            self._recording,
+            self.folder,
+            PartSettings(recorder._settings, selected=Selection()),
+            self._journal,
+            intake=recorder._intake,
+            is_over=self._is_over,
+            on_read=self._on_read,
+        )
+        self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
+        self._thread.start()
+
+    @property
+    def size(self) -> int:
+        """Bytes of its files."""
+        with suppress(OSError):
+            return folder_size(self.folder)
+        return 0
+
+    @property
+    def verbatim(self) -> Counter[str]:
+        """Camera messages that are kept as they came, by topic."""
+        topics = list(self._packer.part.topics.values())
+        return Counter({t.topic: sum(count for count, _ in t.verbatim.values()) for t in topics})
+
+    def _is_over(self, part: PartRecord) -> bool:
+        if self.error is not None or self.is_asked:
+            return True
+        if self._most_ns and part.span and part.span[1] - part.span[0] >= self._most_ns:
+            return True
+        if self._most_bytes and time.monotonic() >= self._next_look:
+            self._next_look = time.monotonic() + _REPORT_S
+            return self.size >= self._most_bytes
+        return False
+
+    def _on_read(self) -> None:
+        self.is_read = True
+        self._tell()
+
+    def _run(self) -> None:
+        try:
+            part = self._packer.run()
+            if self._is_spare and not part.counts:
+                shutil.rmtree(self.folder)
+                return
+            origin = Origin(about=self._about)
+            write_manifest(part, self._recording, origin, self._profile)
+            self.made = summarize(part, self.target, None, origin)
+            self._journal.close()
+            (self.folder / JOURNAL_NAME).unlink()
+            sync(self.folder)
+            with work_folder(self.target.parent, f".{self.target.name}.") as old:
+                move_into_place(
+                    self.folder,
+                    self.target,
+                    old / self.target.name,
+                    force=self._force,
+                    owned=dataset_files,
+                )
+        except BaseException as error:
+            self.error = error
+        finally:
+            self._journal.close()
+            self._tell()
+
+    def join(self, seconds: float) -> bool:
+        """Wait until it is made; returns whether it is."""
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
+
+    def raise_error(self) -> None:
+        """Raise what it failed with.
+
+        Raises:
+            RecordError: The disk refused.
+        """
+        if self.error is None:
+            return
+        if isinstance(self.error, OSError) and not isinstance(self.error, Mp4dsError):
+            raise RecordError(self.folder, self.target, self.error) from self.error
+        raise self.error

@@ -1,0 +1,124 @@
+"""Receives messages of ROS 1, through rospy."""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from mp4ds.bags.protocols import Format
+from mp4ds.bags.ros1_records import make_channel
+from mp4ds.errors import PublishError
+from mp4ds.plugins.publishing.ros1 import ANSWER_S, answer, start_node
+from mp4ds.plugins.recording.source import SourceOptions, SourceState, Wanted
+from mp4ds.records import Channel, Message
+
+_RECEIVED_BYTES = 2**18
+"""That are taken from a socket at a time; rospy's 64 KB cost it a third more."""
+
+_LEAST_POLL_S = 0.5
+"""Seconds between questions to the master: it is asked over the network."""
+
+_DEAF = "the ROS master does not answer: new topics are not seen"
+_TIME = struct.Struct("<II")
+_CLOCK = "/clock"
+
+
+class RospySource:
+    """Receives in ROS 1 as a node of its own. See `Source`.
+
+    Each publisher of a topic has a channel of its own, whose metadata is the header of its
+    connection, as `rosbag record` keeps it.
+
+    Args:
+        options: How.
+
+    Raises:
+        PublishError: There is no rospy, or no master answers.
+    """
+
+    format: Format = "bag"
+    profile = "ros1"
+
+    def __init__(self, options: SourceOptions) -> None:
+        self.state = SourceState()
+        self._options = options
+        self._rospy, self.address = start_node(options.node)
+        self._subscribers: dict[str, Any] = {}
+        self._channels: dict[tuple[str, tuple[tuple[str, str], ...]], Channel] = {}
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._sim_time_ns: int | None = None
+
+    def start(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+        """See `Source.start`."""
+        if self._options.use_sim_time or self._follows_clock():
+            self._sim_time_ns = 0
+            self._subscribe(_CLOCK, self._tick)
+        if not self._look(wanted, take):
+            raise PublishError(self.address, "the ROS master does not answer any more")
+        if self._options.poll_s is not None:
+            self._thread = threading.Thread(
+                target=self._keep_looking, args=(wanted, take), name="topics", daemon=True
+            )
+            self._thread.start()
+
+    def _follows_clock(self) -> bool:
+        return bool(self._rospy.get_param("/use_sim_time", False))
+
+    def _keep_looking(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+        while not self._ended.wait(max(self._options.poll_s or 0.0, _LEAST_POLL_S)):
+            if not self._look(wanted, take):
+                self.state.warnings["the ROS master does not answer: new topics are not seen"] = (
+                    None
+                )
+
+    def _look(self, wanted: Wanted, take: Callable[[Message], None]) -> bool:
+        """Subscribe to what is published and wanted; returns whether the master answered."""
+        try:
+            found = answer(self._rospy.get_published_topics, ANSWER_S)
+        except (OSError, self._rospy.ROSException):
+            return False
+        for topic, _ in found or ():
+            if topic not in self._subscribers and wanted(topic):
+                self._subscribers[topic] = self._subscribe(
+                    topic, partial(self._received, topic, take)
+                )
+                self.state.topics[topic] = None
+        return found is not None
+
+    def _subscribe(self, topic: str, receive: Callable[[Any], None]) -> Any:
+        return self._rospy.Subscriber(
+            topic, self._rospy.AnyMsg, receive, buff_size=_RECEIVED_BYTES, tcp_nodelay=True
+        )
+
+    def _received(self, topic: str, take: Callable[[Message], None], message: Any) -> None:
+        now = time.time_ns() if self._sim_time_ns is None else self._sim_time_ns
+        channel = self._channel(topic, message._connection_header)
+        take(Message(channel, now, now, 0, message._buff))
+
+    def _tick(self, message: Any) -> None:
+        sec, nsec = _TIME.unpack_from(message._buff)
+        self._sim_time_ns = sec * 10**9 + nsec
+
+    def _channel(self, topic: str, header: Mapping[str, str]) -> Channel:
+        key = topic, tuple(sorted(header.items()))
+        with self._lock:
+            if key not in self._channels:
+                raw = {name.encode(): value.encode() for name, value in header.items()}
+                self._channels[key] = make_channel(len(self._channels), topic.encode(), raw)
+            return self._channels[key]
+
+    def close(self) -> None:
+        """See `Source.close`."""
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join(ANSWER_S)
+        for subscriber in self._subscribers.values():
+            subscriber.unregister()
+        self._subscribers.clear()
+        self._rospy.signal_shutdown("the recording has ended")

@@ -1,0 +1,188 @@
+"""Receives messages of ROS 2 by the ROS that is installed: rclpy, with any of its middlewares."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from mp4ds.bags.protocols import Format
+from mp4ds.errors import ConversionError, PublishError
+from mp4ds.plugins.publishing.ros2 import message_class, qos_profile
+from mp4ds.plugins.publishing.ros2_writers import CLOCK, CLOCK_QOS, CLOCK_TYPE, Qos, load_overrides
+from mp4ds.plugins.recording.ros2_channels import (
+    asked_qos,
+    channel_of,
+    installed_definition,
+    is_hidden,
+    standard_definition,
+    time_of,
+)
+from mp4ds.plugins.recording.source import SourceOptions, SourceState, Wanted
+from mp4ds.records import Channel, Message
+
+_DEPTH = 100
+"""Messages of a topic that may wait in the middleware: they are taken out at once."""
+
+_SPIN_S = 0.1
+_INFINITE_NS = 2**63 - 1
+
+
+class RclpySource:
+    """Receives as a node of the ROS that is sourced. See `Source`.
+
+    The packages with the types of the messages have to be installed there.
+
+    Args:
+        options: How.
+
+    Raises:
+        PublishError: No ROS 2 is sourced.
+    """
+
+    format: Format = "rosbag2"
+    profile = "ros2"
+
+    def __init__(self, options: SourceOptions) -> None:
+        try:
+            import rclpy
+            from rclpy.context import Context
+            from rclpy.executors import SingleThreadedExecutor
+        except ImportError as error:
+            problem = f"rclpy is missing ({error}); source a ROS 2 first"
+            raise PublishError("ROS 2", problem) from None
+        self.state = SourceState()
+        self._options = options
+        overrides = options.qos_overrides
+        self._overrides = load_overrides(overrides) if overrides is not None else {}
+        self._context = Context()
+        rclpy.init(args=[], context=self._context)
+        self._node = rclpy.create_node(options.node, context=self._context)
+        self.address = f"ROS 2, by rclpy as {self._node.get_name()}"
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._subscriptions: dict[str, Any] = {}
+        self._sim_time_ns: int | None = None
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+        """See `Source.start`."""
+        if self._options.use_sim_time:
+            self._sim_time_ns = 0
+            kind = message_class(CLOCK, CLOCK_TYPE)
+            self._node.create_subscription(
+                kind, CLOCK, self._tick, qos_profile(CLOCK_QOS), raw=True
+            )
+        self._look(wanted, take)
+        self._thread = threading.Thread(
+            target=self._spin, args=(wanted, take), name="mp4ds-rclpy", daemon=True
+        )
+        self._thread.start()
+
+    def _spin(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+        from rclpy.executors import ExternalShutdownException
+
+        poll_s = self._options.poll_s
+        next_look = time.monotonic() + (poll_s or 0.0)
+        try:
+            while not self._ended.is_set() and self._context.ok():
+                self._executor.spin_once(timeout_sec=_SPIN_S)
+                if poll_s is not None and time.monotonic() >= next_look:
+                    self._look(wanted, take)
+                    next_look = time.monotonic() + poll_s
+        except ExternalShutdownException:
+            pass
+
+    def _look(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+        """Subscribe to what is published and wanted."""
+        for topic, kinds in self._node.get_topic_names_and_types():
+            if topic in self._subscriptions or not wanted(topic):
+                continue
+            if is_hidden(topic) and not self._options.hidden:
+                continue
+            publishers = self._node.get_publishers_info_by_topic(topic)
+            if not publishers:
+                continue
+            if len(kinds) > 1:
+                self._subscriptions[topic] = None
+                self.state.warnings[f"{topic}: has several types, {', '.join(kinds)}"] = None
+                continue
+            self._subscriptions[topic] = self._subscribe(topic, kinds[0], publishers, take)
+
+    def _subscribe(
+        self, topic: str, type_name: str, publishers: Sequence[Any], take: Callable[[Message], None]
+    ) -> Any:
+        try:
+            kind = message_class(topic, type_name)
+        except ConversionError as error:
+            self.state.warnings[str(error)] = None
+            return None
+        offered = [offered_by(item.qos_profile) for item in publishers]
+        type_hash = _hash_text(getattr(publishers[0], "topic_type_hash", None))
+        share = [Path(p, "share") for p in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if p]
+        definition = installed_definition(type_name, share)
+        definition = definition or standard_definition(type_name, type_hash)
+        if not definition:
+            self.state.warnings[f"{topic}: the definition of {type_name} is not known here"] = None
+        channel = channel_of(
+            len(self._subscriptions), topic, type_name, definition, type_hash, offered
+        )
+        qos = self._overrides.get(topic, asked_qos(offered, _DEPTH))
+        self.state.topics[topic] = None
+        return self._node.create_subscription(
+            kind, topic, partial(self._received, channel, take), qos_profile(qos), raw=True
+        )
+
+    def _received(
+        self, channel: Channel, take: Callable[[Message], None], raw: bytes, info: Any
+    ) -> None:
+        # rclpy tells of when a message was sent where a callback cannot do without
+        now = time.time_ns() if self._sim_time_ns is None else self._sim_time_ns
+        sent = info["source_timestamp"]
+        take(Message(channel, now, sent if sent > 0 else now, 0, raw))
+
+    def _tick(self, raw: bytes) -> None:
+        self._sim_time_ns = time_of(raw)
+
+    def close(self) -> None:
+        """See `Source.close`."""
+        if self._ended.is_set():
+            return
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join()
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+
+def offered_by(profile: Any) -> Qos:
+    """A QoS profile of rclpy as mp4ds has it."""
+    history = profile.history.name.lower()
+    liveliness = profile.liveliness.name.lower()
+    return Qos(
+        history=history if history in ("keep_last", "keep_all") else "keep_last",
+        depth=max(1, profile.depth),
+        reliability=profile.reliability.name.lower(),
+        durability=profile.durability.name.lower(),
+        deadline_ns=_finite(profile.deadline),
+        lifespan_ns=_finite(profile.lifespan),
+        liveliness=liveliness if liveliness.startswith("manual") else "automatic",
+        lease_ns=_finite(profile.liveliness_lease_duration),
+    )
+
+
+def _finite(duration: Any) -> int | None:
+    nanoseconds = int(duration.nanoseconds)
+    return nanoseconds if 0 < nanoseconds < _INFINITE_NS else None
+
+
+def _hash_text(type_hash: Any) -> str:
+    """``RIHS01_...`` of what rclpy has from Jazzy on; empty where it has none."""
+    value = bytes(getattr(type_hash, "value", None) or b"")
+    return f"RIHS{type_hash.version:02}_{value.hex()}" if any(value) else ""

@@ -1,0 +1,235 @@
+"""Channels of ROS 2 as rosbag2 records them: definitions, type hashes, QoS profiles."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterator, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, get_args
+
+from rosbags.typesys.store import Typestore
+
+from mp4ds.bags.rosbag2_metadata import dump_yaml
+from mp4ds.bags.types import World, by_library, make_store, ros2_world, types_of
+from mp4ds.errors import Refused
+from mp4ds.plugins.publishing.ros2_writers import Qos
+from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
+
+_DISTRIBUTION = "jazzy"
+_ENCODING = "ros2msg"
+_SEPARATOR = "=" * 80
+_NS = 10**9
+_INFINITE = {"sec": 2**63 // _NS, "nsec": 2**63 % _NS - 1}
+_FIELD = re.compile(r"^\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+\w+")
+_PRIMITIVE = re.compile(r"bool|byte|char|u?int(?:8|16|32|64)|float(?:32|64)|w?string")
+_DDS_NAME = re.compile(r"(?:\w+(?:::|\.))+dds_(?:::|\.)\w+_")
+
+
+def qos_text(profiles: Sequence[Qos]) -> str:
+    """QoS profiles as rosbag2 writes them from metadata version 9 on."""
+    return dump_yaml(
+        [
+            {
+                "history": profile.history,
+                "depth": profile.depth,
+                "reliability": profile.reliability,
+                "durability": profile.durability,
+                "deadline": _duration(profile.deadline_ns),
+                "lifespan": _duration(profile.lifespan_ns),
+                "liveliness": profile.liveliness,
+                "liveliness_lease_duration": _duration(profile.lease_ns),
+                "avoid_ros_namespace_conventions": profile.avoid_ros_namespace_conventions,
+            }
+            for profile in profiles
+        ]
+    )
+
+
+def _duration(nanoseconds: int | None) -> dict[str, int]:
+    if nanoseconds is None:
+        return dict(_INFINITE)
+    return dict(zip(("sec", "nsec"), divmod(nanoseconds, _NS), strict=True))
+
+
+def asked_qos(profiles: Sequence[Qos], depth: int) -> Qos:
+    """What to ask of publishers so that each of them is heard, chosen as rosbag2 does.
+
+    Args:
+        profiles: What they offer.
+        depth: Messages that may wait.
+    """
+    is_reliable = bool(profiles) and all(profile.is_reliable for profile in profiles)
+    is_latched = bool(profiles) and all(profile.is_latched for profile in profiles)
+    return Qos(
+        depth=depth,
+        reliability="reliable" if is_reliable else "best_effort",
+        durability="transient_local" if is_latched else "volatile",
+        avoid_ros_namespace_conventions=any(
+            profile.avoid_ros_namespace_conventions for profile in profiles
+        ),
+    )
+
+
+def is_hidden(topic: str) -> bool:
+    """Whether ROS 2 hides a topic: a part of its name begins with an underscore."""
+    return any(part.startswith("_") for part in topic.split("/"))
+
+
+def channel_of(
+    number: int, topic: str, type_name: str, definition: str, type_hash: str, qos: Sequence[Qos]
+) -> Channel:
+    """A channel as rosbag2 records it.
+
+    Args:
+        number: Its id.
+        topic: Its topic.
+        type_name: Such as ``sensor_msgs/msg/Image``.
+        definition: With those of its parts; empty where it is not known.
+        type_hash: ``RIHS01_...``; empty where it is not known.
+        qos: What its publishers offer.
+    """
+    schema = Schema(type_name, _ENCODING if definition else "", definition.encode())
+    metadata = {QOS_KEY: qos_text(qos), **({HASH_KEY: type_hash} if type_hash else {})}
+    return Channel(number, topic, "cdr", schema, metadata)
+
+
+def time_of(clock: bytes | memoryview) -> int:
+    """Nanoseconds that a message of /clock tells, in CDR."""
+    sec, nanosec = struct.unpack_from("<iI" if clock[1] & 1 else ">iI", clock, 4)
+    return int(sec) * _NS + int(nanosec)
+
+
+# ---------------------------------------------------------------- definitions
+
+
+@cache
+def _world() -> World:
+    return ros2_world(_DISTRIBUTION)
+
+
+def standard_definition(type_name: str, type_hash: str) -> str:
+    """The definition of a type that ROS 2 ships; empty where it has none, or another hash.
+
+    Args:
+        type_name: Such as ``sensor_msgs/msg/Image``.
+        type_hash: As it was announced; empty where it was not.
+    """
+    if type_name not in _world().standard:
+        return ""
+    return _proven(Schema(type_name, _ENCODING, b""), type_hash)
+
+
+def _proven(schema: Schema, type_hash: str) -> str:
+    """A definition with those of its parts, if it has the hash that was announced."""
+    try:
+        store: Typestore = make_store(types_of(schema, _world()), _world())
+        if type_hash and by_library("", store.hash_rihs01, schema.name) != type_hash:
+            return ""
+        text: str = by_library("", store.generate_msgdef, schema.name)[0]
+        return text
+    except Refused:
+        return ""
+
+
+def installed_definition(type_name: str, share: Sequence[Path]) -> str:
+    """The definition of a type as it is installed, with those of its parts, as rosbag2 keeps it.
+
+    Args:
+        type_name: Such as ``sensor_msgs/msg/Image``.
+        share: Folders in which packages are.
+
+    Returns:
+        The text; empty where a part is not installed as a ``.msg`` file.
+    """
+    found: dict[str, str] = {}
+    todo = [type_name]
+    while todo:
+        name = todo.pop(0)
+        if name in found:
+            continue
+        package, _, short = name.partition("/msg/")
+        paths = [folder / package / "msg" / f"{short}.msg" for folder in share]
+        text = next((path.read_text() for path in paths if path.is_file()), None)
+        if text is None:
+            return ""
+        found[name] = text
+        todo += _parts(text, package)
+    main, *parts = found.items()
+    rest = (f"\n{_SEPARATOR}\nMSG: {name.replace('/msg/', '/')}\n{text}" for name, text in parts)
+    return "".join((main[1], *rest))
+
+
+def _parts(text: str, package: str) -> Iterator[str]:
+    """Names of the types of a definition's fields, but for those that are built in."""
+    for line in text.splitlines():
+        match = _FIELD.match(line.partition("#")[0])
+        if match and not _PRIMITIVE.fullmatch(match[1]):
+            rooms = match[1].split("/")
+            yield f"{rooms[0] if len(rooms) > 1 else package}/msg/{rooms[-1]}"
+
+
+# ---------------------------------------------------------------- DDS
+
+
+def ros_type(dds_name: str) -> str:
+    """The type of ROS that DDS calls ``std_msgs::msg::dds_::String_``; empty for others."""
+    if not _DDS_NAME.fullmatch(dds_name):
+        return ""
+    *rooms, _, name = dds_name.replace("::", ".").split(".")
+    return "/".join((*rooms, name.removesuffix("_")))
+
+
+def announced_definition(kind: Any, type_hash: str) -> str:
+    """The definition of a type that a publisher announces over DDS.
+
+    Args:
+        kind: Its class, a structure of IDL.
+        type_hash: As it was announced, by which the definition is proven.
+
+    Returns:
+        The text with the definitions of its parts; empty where it cannot be proven.
+    """
+    if not type_hash:
+        return ""
+    try:
+        texts = dict(_structures(kind))
+    except (Refused, AttributeError, TypeError, ValueError):
+        return ""
+    main, *parts = texts.items()
+    rest = (f"\n{_SEPARATOR}\nMSG: {name.replace('/msg/', '/')}\n{text}" for name, text in parts)
+    return _proven(Schema(main[0], _ENCODING, "".join((main[1], *rest)).encode()), type_hash)
+
+
+def _structures(kind: Any) -> Iterator[tuple[str, str]]:
+    """Name and fields of a structure, then of its parts."""
+    parts: list[Any] = []
+    lines = [f"{_spelled(hint, parts)} {name}" for name, hint in kind.__annotations__.items()]
+    yield ros_type(kind.__idl_typename__), "\n".join(lines) + "\n"
+    for part in parts:
+        yield from _structures(part)
+
+
+def _spelled(hint: Any, parts: list[Any]) -> str:
+    """A field's type as a ``.msg`` file has it."""
+    from cyclonedds.idl import types
+
+    inner, *notes = get_args(hint) or (hint,)
+    note = notes[0] if notes else None
+    if isinstance(note, types.array):
+        return f"{_spelled(note.subtype, parts)}[{note.length}]"
+    if isinstance(note, types.sequence):
+        bound = f"<={note.max_length}" if note.max_length else ""
+        return f"{_spelled(note.subtype, parts)}[{bound}]"
+    if isinstance(note, types.bounded_str):
+        return f"string<={note.max_length}"
+    if isinstance(note, str):
+        return note
+    if inner in (str, bool):
+        return {str: "string", bool: "bool"}[inner]
+    name = ros_type(inner.__idl_typename__)
+    if not name:
+        raise Refused("it has a part that is not a message of ROS")
+    parts.append(inner)
+    return name.replace("/msg/", "/")

@@ -1,0 +1,158 @@
+"""What a recorder gets its messages from, and which topics it wants."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Protocol
+
+from mp4ds.bags.protocols import Format
+from mp4ds.errors import OptionError
+from mp4ds.plan import Selection
+from mp4ds.records import Message
+
+
+class Wanted:
+    """Which topics are recorded.
+
+    Args:
+        topics: Names, or globs; empty for all.
+        regex: A pattern that is found in a topic's name; empty for none. Topics that it or `topics`
+            tell are wanted.
+        exclude: Names, or globs, that are not wanted in any case.
+        exclude_regex: A pattern that no wanted topic's name has.
+
+    Raises:
+        OptionError: A pattern is not valid.
+    """
+
+    def __init__(
+        self,
+        topics: Sequence[str] = (),
+        *,
+        regex: str = "",
+        exclude: Sequence[str] = (),
+        exclude_regex: str = "",
+    ) -> None:
+        self._named = Selection([_rooted(topic) for topic in topics]) if topics else None
+        self._exclude = Selection([_rooted(topic) for topic in exclude]) if exclude else None
+        self._regex = _compiled("regex", regex)
+        self._exclude_regex = _compiled("exclude_regex", exclude_regex)
+
+    def __call__(self, topic: str) -> bool:
+        """Whether a topic is recorded."""
+        if self._exclude and self._exclude(topic):
+            return False
+        if self._exclude_regex and self._exclude_regex.search(topic):
+            return False
+        if self._named is None and self._regex is None:
+            return True
+        is_named = self._named is not None and self._named(topic)
+        return is_named or bool(self._regex and self._regex.search(topic))
+
+
+def _rooted(topic: str) -> str:
+    return "/" + topic.strip().lstrip("/")
+
+
+def _compiled(option: str, pattern: str) -> re.Pattern[str] | None:
+    try:
+        return re.compile(pattern) if pattern else None
+    except re.error as error:
+        raise OptionError(f"`{option}` {pattern!r} is not a valid pattern: {error}.") from None
+
+
+@dataclass
+class SourceState:
+    """What a source tells besides its messages; written by its own threads.
+
+    Attributes:
+        lost: Messages that the middleware says it lost, by topic.
+        warnings: Sentences to be shown once each.
+        topics: Those that are subscribed to.
+    """
+
+    lost: Counter[str] = field(default_factory=Counter)
+    warnings: dict[str, None] = field(default_factory=dict)
+    topics: dict[str, None] = field(default_factory=dict)
+
+
+class Source(Protocol):
+    """Receives messages of the topics that are wanted, those that appear later too.
+
+    Attributes:
+        format: What its messages would have been recorded as by ROS's own recorder.
+        profile: ``ros1`` or ``ros2``.
+        address: Where it listens, for users.
+        state: What it tells.
+    """
+
+    format: Format
+    profile: str
+    address: str
+    state: SourceState
+
+    def start(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+        """Begin to receive, on threads of its own.
+
+        Args:
+            wanted: Which topics.
+            take: Called with each message, from any thread; it never waits. A channel has one id,
+                and another id than all others.
+
+        Raises:
+            PublishError: The middleware refuses.
+        """
+        ...
+
+    def close(self) -> None:
+        """Receive nothing more."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class SourceOptions:
+    """How a source receives.
+
+    Attributes:
+        node: Name of the node.
+        use_sim_time: Whether log times are those of /clock.
+        poll_s: Seconds between looks for new topics; None for one look only.
+        hidden: Whether topics are taken of which a part begins with an underscore.
+        qos_overrides: YAML of QoS by topic.
+    """
+
+    node: str
+    use_sim_time: bool = False
+    poll_s: float | None = 0.1
+    hidden: bool = False
+    qos_overrides: Path | None = None
+
+
+_SOURCES: Mapping[str, str] = {
+    "ros1": "ros1:RospySource",
+    "ros2": "ros2:RclpySource",
+    "dds": "dds:DdsSource",
+}
+
+
+def open_source(kind: str, options: SourceOptions) -> Source:
+    """A source.
+
+    Args:
+        kind: ``ros1`` or ``ros2``; for ROS 2 that is Cyclone DDS where no ROS 2 is sourced.
+        options: How it receives.
+
+    Raises:
+        PublishError: The middleware is not there.
+    """
+    if kind == "ros2" and find_spec("rclpy") is None:
+        kind = "dds"
+    module, _, name = _SOURCES[kind].partition(":")
+    made: Source = getattr(import_module(f"mp4ds.plugins.recording.{module}"), name)(options)
+    return made

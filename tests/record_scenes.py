@@ -1,0 +1,80 @@
+"""A recorder's source that plays a recording: in this process, or in one that is killed.
+
+    python record_scenes.py RECORDING DATASET RATE
+
+records at so many times the recorded speed, until it is ended.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from mp4ds.bags.formats import open_sources
+from mp4ds.bags.protocols import Format
+from mp4ds.plugins.recording.record import RecordOptions, open_recorder
+from mp4ds.plugins.recording.source import SourceState, Wanted
+from mp4ds.records import Message
+
+
+class PlayedSource:
+    """The messages of a recording, then the end. See `mp4ds.plugins.recording.source.Source`.
+
+    Args:
+        paths: The recording.
+        rate: Times the recorded speed; None for as fast as they are read.
+        before: Called before each message, by its number.
+    """
+
+    address = "a recording"
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        *,
+        rate: float | None = None,
+        before: Callable[[int], object] = lambda number: None,
+    ) -> None:
+        self.state = SourceState()
+        self.stop: Callable[[], None] = lambda: None
+        self._paths = list(paths)
+        self._rate = rate
+        self._before = before
+        with open_sources(self._paths) as reader:
+            self.format: Format = reader.format
+            self.profile = reader.profile
+
+    def start(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+        threading.Thread(target=self._play, args=(wanted, take), daemon=True).start()
+
+    def _play(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+        begun, first = time.monotonic(), None
+        with open_sources(self._paths) as reader:
+            for number, record in enumerate(reader.records()):
+                if not isinstance(record, Message) or not wanted(record.channel.topic):
+                    continue
+                self._before(number)
+                first = record.log_time if first is None else first
+                if self._rate:
+                    due = begun + (record.log_time - first) / 1e9 / self._rate
+                    time.sleep(max(0.0, due - time.monotonic()))
+                self.state.topics[record.channel.topic] = None
+                take(replace(record, data=bytes(record.data)))
+        self.stop()
+
+    def close(self) -> None:
+        pass
+
+
+def _main(recording: str, dataset: str, rate: str) -> None:
+    source = PlayedSource([Path(recording)], rate=float(rate))
+    with open_recorder((), dataset, RecordOptions(all=True), source=source) as recorder:
+        recorder.run()
+
+
+if __name__ == "__main__":
+    _main(*sys.argv[1:])

@@ -1,0 +1,358 @@
+"""`mp4ds record` of recordings that are played: what comes, what is late, what a cut leaves."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mp4ds
+from each import each
+from mp4ds.bags.formats import open_sources
+from mp4ds.errors import OptionError, RecordError, SourceError, TargetExistsError
+from mp4ds.packing import live
+from mp4ds.packing.journal import JOURNAL_NAME
+from mp4ds.packing.options import PackOptions
+from mp4ds.packing.packer import TOO_LATE
+from mp4ds.packing.recovery import CUT_OFF
+from mp4ds.plugins.recording.record import RecordOptions, RecordSummary, open_recorder
+from mp4ds.plugins.recording.source import Wanted
+from mp4ds.records import Message
+from record_scenes import PlayedSource
+from scenes import Scene, scene
+from sources import SOURCES
+from waiting import until
+
+Compare = Callable[..., list[str]]
+HERE = Path(__file__).parent
+
+
+def write(folder: Path, source: str = "bag-none", of: Scene | None = None) -> list[Path]:
+    (folder / "source").mkdir()
+    made = of or scene("bayer_rggb8", frames=40)
+    return SOURCES[source](folder / "source", replace(made, silent={}))  # nobody hears of those
+
+
+def recorded(source: PlayedSource, target: Path, **options: Any) -> RecordSummary:
+    with open_recorder(
+        (), target, RecordOptions(**{"all": True, **options}), source=source
+    ) as recorder:
+        source.stop = recorder.stop
+        return recorder.run()
+
+
+def again(dataset: Path, folder: Path, to: str | None = None) -> Path:
+    output = folder / f"{dataset.name}_again"
+    if (to or "bag") == "bag":
+        output = output.with_suffix(".bag")
+    mp4ds.unpack(dataset, to, output)
+    return output
+
+
+def reasons(summary: mp4ds.PackSummary, topic: str) -> dict[str, int]:
+    (found,) = (item for item in summary.topics if item.topic == topic)
+    return {reason: count for reason, (count, _) in found.verbatim.items()}
+
+
+# ---------------------------------------------------------------- what comes
+
+
+@each(
+    "source, encoding",
+    [
+        ("bag-none", "bayer_rggb8"),
+        ("bag-none", "16UC1"),
+        ("bag-none", "rgb8"),
+        ("rosbag2-mcap-v5", "mono8"),
+        ("rosbag2-sqlite3-v5", "32FC1"),
+        ("rosbag2-mcap-v5", "yuv422_yuy2"),
+    ],
+)
+def test_what_comes_is_there(source: str, encoding: str, tmp_path: Path, compare: Compare) -> None:
+    paths = write(tmp_path, source, scene(encoding, frames=20))
+    summary = recorded(PlayedSource(paths), tmp_path / "live")
+    assert mp4ds.validate(tmp_path / "live", deep=True) == []
+    (made,) = summary.datasets
+    assert {item.frames for item in made.topics if "image" in item.topic} == {20}
+    assert not summary.dropped
+    assert not (tmp_path / "live.recording").exists()
+    to = "rosbag2" if source.startswith("rosbag2") else "bag"
+    assert compare(paths, again(tmp_path / "live", tmp_path, to)) == []
+    with mp4ds.open(tmp_path / "live") as dataset:
+        stream = dataset["/cam/image_raw"]
+        assert stream[7].intrinsics.k[0] > 0  # calibrations have found their images
+        assert stream[13].data.shape[0] == 48
+
+
+def test_quality(tmp_path: Path, compare: Compare) -> None:
+    paths = write(tmp_path)
+    recorded(PlayedSource(paths), tmp_path / "live", quality="visual")
+    assert mp4ds.validate(tmp_path / "live", deep=True) == []
+    found = compare(paths, again(tmp_path / "live", tmp_path), ignore_pixels=["/cam/image_raw"])
+    assert found == []
+    with mp4ds.open(tmp_path / "live") as dataset:
+        assert dataset["/cam/image_raw"].sidecar.video.codec == "av1"
+
+
+def test_topics_that_are_wanted() -> None:
+    wanted = Wanted(("cam/*",), regex="imu$", exclude=["/cam/info"], exclude_regex="depth")
+    topics = ("/cam/image", "/cam/info", "/cam/depth", "/front/imu", "/imu/raw")
+    assert [*filter(wanted, topics)] == ["/cam/image", "/front/imu"]
+    assert all(map(Wanted(), topics))
+    with pytest.raises(OptionError, match="not a valid pattern"):
+        Wanted(regex="(")
+
+
+@each(
+    "options, said",
+    [
+        ({"all": False}, "Name topics"),
+        ({"quality": "vmaf=95"}, "several tries"),
+        ({"duration": -1.0}, "duration"),
+        ({"max_duration": float("nan")}, "max_duration"),
+        ({"codec": "av1"}, "lossless"),
+    ],
+)
+def test_options_that_make_no_sense(options: dict[str, Any], said: str, tmp_path: Path) -> None:
+    source = PlayedSource(write(tmp_path))
+    with pytest.raises(OptionError, match=said):
+        recorded(source, tmp_path / "live", **options)
+    assert not list(tmp_path.glob("live*"))
+
+
+def test_what_is_there_is_kept(tmp_path: Path) -> None:
+    paths = write(tmp_path, of=scene("mono8", frames=2))
+    (tmp_path / "live").mkdir()
+    with pytest.raises(TargetExistsError):
+        recorded(PlayedSource(paths), tmp_path / "live")
+    (tmp_path / "live").rmdir()
+    recorded(PlayedSource(paths), tmp_path / "live")
+    recorded(PlayedSource(paths), tmp_path / "live", force=True)
+    assert mp4ds.validate(tmp_path / "live") == []
+
+
+# ---------------------------------------------------------------- splits, pauses
+
+
+def test_datasets_of_a_length(tmp_path: Path, compare: Compare) -> None:
+    paths = write(tmp_path)
+    summary = recorded(PlayedSource(paths), tmp_path / "live", max_duration=0.5)
+    made = [item.dataset for item in summary.datasets]
+    assert [path.name for path in made] == ["live_0", "live_1", "live_2"]
+    mp4ds.pack(made, tmp_path / "whole")
+    assert compare(paths, again(tmp_path / "whole", tmp_path)) == []
+
+
+def test_datasets_of_a_size(tmp_path: Path, compare: Compare, monkeypatch: Any) -> None:
+    monkeypatch.setattr("mp4ds.plugins.recording.record._REPORT_S", 0.0)
+    paths = write(tmp_path, of=scene("mono8", frames=60, width=320, height=240))
+    summary = recorded(PlayedSource(paths, rate=4.0), tmp_path / "live", max_size=1_000_000)
+    made = [item.dataset for item in summary.datasets]
+    assert len(made) > 1
+    mp4ds.pack(made, tmp_path / "whole")
+    assert compare(paths, again(tmp_path / "whole", tmp_path)) == []
+
+
+def test_pauses_and_splits_on_demand(tmp_path: Path) -> None:
+    paths = write(tmp_path)
+    with open_sources(paths) as reader:
+        total = sum(isinstance(record, Message) for record in reader.records())
+    source = PlayedSource(paths, before=lambda number: controls(number))
+    with open_recorder((), tmp_path / "live", RecordOptions(all=True), source=source) as recorder:
+        source.stop = recorder.stop
+
+        def controls(number: int) -> None:
+            if number == total // 4:
+                recorder.toggle_paused()
+                assert recorder.is_paused
+            elif number == total // 2:
+                recorder.resume()
+            elif number == 3 * total // 4:
+                recorder.split()
+                until(lambda: (tmp_path / "live_1.recording").exists())
+
+        summary = recorder.run()
+    assert [item.dataset.name for item in summary.datasets] == ["live", "live_1"]
+    there = sum(topic.messages for item in summary.datasets for topic in item.topics)
+    assert there == total - (total // 2 - total // 4)
+
+
+# ---------------------------------------------------------------- too much
+
+
+def test_what_cannot_be_encoded_in_time(
+    tmp_path: Path, compare: Compare, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Images are kept as they came while their encoder is late, and packed later."""
+    paths = write(tmp_path)
+    late = iter([False] * 10 + [True] * 15 + [False] * 1000)
+    monkeypatch.setattr(live.PromptWorkers, "is_late", lambda self, key: next(late))
+    summary = recorded(PlayedSource(paths), tmp_path / "live")
+    (made,) = summary.datasets
+    assert reasons(made, "/cam/image_raw") == {TOO_LATE: 15}
+    assert mp4ds.validate(tmp_path / "live", deep=True) == []
+    assert compare(paths, again(tmp_path / "live", tmp_path)) == []
+    packed = mp4ds.pack(tmp_path / "live", tmp_path / "later", PackOptions(quality="lossless"))
+    assert reasons(packed, "/cam/image_raw") == {}
+    assert compare(paths, again(tmp_path / "later", tmp_path)) == []
+
+
+def test_encoders_that_are_late() -> None:
+    workers, gate, begun = live.PromptWorkers(), threading.Event(), threading.Event()
+    with workers:
+        assert workers.age(1) == 0.0
+        workers.submit(1, lambda: begun.set() or (gate.wait() and None))  # type: ignore[func-returns-value]
+        begun.wait()
+        assert not workers.is_late(2)
+        until(lambda: workers.is_late(1))
+        gate.set()
+        until(lambda: not workers.age(1))
+
+
+def test_a_buffer_that_is_full(tmp_path: Path) -> None:
+    message = next(iter(messages(write(tmp_path))))
+    intake = live.Intake(3 * len(message.data))
+    for number in range(5):
+        intake.put(replace(message, sequence=number))
+    assert intake.dropped == {message.channel.topic: 2}
+    intake.close()
+    intake.put(message)
+    found = [intake.take(0.0) for _ in range(3)]
+    assert [item.sequence for item in found if item] == [2, 3, 4]
+    with pytest.raises(EOFError):
+        intake.take(0.0)
+    assert intake.received == {message.channel.topic: 5}
+
+
+def messages(paths: list[Path]) -> Iterator[Message]:
+    with open_sources(paths) as reader:
+        for record in reader.records():
+            if isinstance(record, Message):
+                yield record
+
+
+def test_a_disk_that_is_full(
+    tmp_path: Path, compare: Compare, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = write(tmp_path)
+
+    def refuse(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("mp4ds.plugins.recording.record.write_manifest", refuse)
+    with pytest.raises(RecordError, match=r"No space left.*--salvage .*live\.recording"):
+        recorded(PlayedSource(paths), tmp_path / "live")
+    assert not (tmp_path / "live").exists()
+    mp4ds.pack(tmp_path / "live.recording", tmp_path / "live", PackOptions(salvage=True))
+    assert compare(paths, again(tmp_path / "live", tmp_path)) == []
+
+
+# ---------------------------------------------------------------- power cuts
+
+
+@pytest.fixture
+def cut_off(tmp_path: Path) -> tuple[list[Path], Path]:
+    """A recording, and a folder in which it was being recorded when the recorder was killed."""
+    paths = write(tmp_path, of=scene("bayer_rggb8", frames=400, width=64, height=48))
+    folder = tmp_path / "live.recording"
+    command = [sys.executable, str(HERE / "record_scenes.py"), str(paths[0]), folder.stem, "2"]
+    process = subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.DEVNULL)
+    video = folder / "cam_image_raw.mp4"
+    until(lambda: video.exists() and video.stat().st_size > 40_000, process)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    return paths, folder
+
+
+def assert_prefix(paths: list[Path], dataset: Path, folder: Path) -> dict[str, int]:
+    """What is in a dataset are the first messages of each topic; returns how many."""
+    assert mp4ds.validate(dataset, deep=True) == []
+    due: dict[str, list[Message]] = {}
+    for message in messages(paths):
+        due.setdefault(message.channel.topic, []).append(message)
+    found: dict[str, list[Message]] = {}
+    for message in messages([again(dataset, folder)]):
+        found.setdefault(message.channel.topic, []).append(message)
+    for topic, there in found.items():
+        for one, other in zip(due[topic], there, strict=False):
+            assert (one.log_time, bytes(one.data)) == (other.log_time, bytes(other.data))
+            assert one.channel.identity == other.channel.identity
+    return {topic: len(there) for topic, there in found.items()}
+
+
+def test_a_recorder_that_is_killed(cut_off: tuple[list[Path], Path], tmp_path: Path) -> None:
+    paths, folder = cut_off
+    with pytest.raises(OptionError, match="--salvage"):
+        mp4ds.pack(folder, tmp_path / "salvaged", PackOptions(quality="visual"))
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    summary = mp4ds.pack(folder, tmp_path / "salvaged", PackOptions(salvage=True))
+    assert summary.losses[-1].problem == CUT_OFF
+    found = assert_prefix(paths, tmp_path / "salvaged", tmp_path)
+    assert found["/cam/image_raw"] > 5
+    assert found["/cam/camera_info"] >= found["/cam/image_raw"]
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_files_that_are_torn(cut_off: tuple[list[Path], Path], tmp_path: Path) -> None:
+    """Whatever of the files' ends reached the disk, what comes back is what was recorded."""
+    paths, folder = cut_off
+    names = ("cam_image_raw.mp4", "messages.mcap", JOURNAL_NAME)
+    for number, name in enumerate(names * 3):
+        torn = tmp_path / f"torn{number}.recording"
+        shutil.copytree(folder, torn)
+        data = (torn / name).read_bytes()
+        cut = max(len(data) // 2, len(data) - 1 - 977 * (number + 1) ** 2)
+        for kind, rest in (("cut", b""), ("zeros", bytes(len(data) - cut))):
+            (torn / name).write_bytes(data[:cut] + rest)
+            made = tmp_path / f"made{number}{kind}"
+            mp4ds.pack(torn, made, PackOptions(salvage=True))
+            found = assert_prefix(paths, made, tmp_path)
+            assert set(found) <= {message.channel.topic for message in messages(paths)}
+
+
+def test_the_next_recording_recovers_the_last(
+    cut_off: tuple[list[Path], Path], tmp_path: Path
+) -> None:
+    paths, folder = cut_off
+    summary = recorded(PlayedSource(paths), tmp_path / "next")
+    assert summary.recovered == [tmp_path / "live"]
+    assert not folder.exists()
+    assert_prefix(paths, tmp_path / "live", tmp_path)
+    assert mp4ds.validate(tmp_path / "next", deep=True) == []
+
+
+def test_a_recording_that_is_being_made_is_left_alone(tmp_path: Path) -> None:
+    seen = []
+
+    def look(number: int) -> None:
+        if number == 30:
+            folder = tmp_path / "live.recording"
+            until(lambda: (folder / JOURNAL_NAME).exists())
+            with pytest.raises(SourceError, match="is being recorded"):
+                mp4ds.pack(folder, tmp_path / "early", PackOptions(salvage=True))
+            seen.append(number)
+
+    recorded(PlayedSource(write(tmp_path), before=look), tmp_path / "live")
+    assert seen == [30]
+    assert not (tmp_path / "early").exists()
+
+
+def test_a_folder_that_is_damaged(cut_off: tuple[list[Path], Path], tmp_path: Path) -> None:
+    _, folder = cut_off
+    journal = folder / JOURNAL_NAME
+    data = journal.read_bytes()
+    journal.write_bytes(b"x" + data[1:])
+    with pytest.raises(SourceError, match="damaged at its beginning"):
+        mp4ds.pack(folder, tmp_path / "made", PackOptions(salvage=True))
+    journal.write_bytes(data[: data.index(b"\n") + 1])
+    summary = mp4ds.pack(folder, tmp_path / "made", PackOptions(salvage=True))
+    assert all("image" not in item.topic or not item.frames for item in summary.topics)
+    assert mp4ds.validate(tmp_path / "made", deep=True) == []

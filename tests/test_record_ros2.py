@@ -1,0 +1,234 @@
+"""`mp4ds record` in ROS 2: over DDS from a real participant, and by rclpy as the fake has it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+import mp4ds
+from mp4ds.bags.formats import open_reader
+from mp4ds.plugins.publishing.ros2_writers import Qos, recorded_qos
+from mp4ds.plugins.recording.record import RecordOptions, open_recorder
+from mp4ds.plugins.recording.ros2_channels import (
+    asked_qos,
+    installed_definition,
+    is_hidden,
+    qos_text,
+    ros_type,
+    standard_definition,
+)
+from mp4ds.plugins.recording.source import SourceOptions, Wanted, open_source
+from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Message, Schema
+from ros2_sides import SIDES, STORE, Side, channel, message, padded, until
+from scenes import scene
+
+STRING, IMAGE, TF = "std_msgs/msg/String", "sensor_msgs/msg/Image", "tf2_msgs/msg/TFMessage"
+LATCHED = "- {history: 1, depth: 5, reliability: 1, durability: 1}"
+BEST_EFFORT = "- {history: 1, depth: 5, reliability: 2, durability: 2}"
+
+
+@pytest.fixture(params=SIDES)
+def side(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
+    with SIDES[request.param](monkeypatch) as found:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(found.options.get("domain", 0)))
+        yield found
+
+
+class Heard:
+    """What a source receives, by topic."""
+
+    def __init__(self) -> None:
+        self.payloads: dict[str, list[bytes]] = defaultdict(list)
+        self.channels: dict[str, Channel] = {}
+        self.times: list[tuple[int, int]] = []
+
+    def take(self, message: Message) -> None:
+        self.channels[message.channel.topic] = message.channel
+        self.times.append((message.publish_time, message.log_time))
+        self.payloads[message.channel.topic].append(bytes(message.data))
+
+
+def test_every_message_is_received(side: Side) -> None:
+    """Topics that appear later too, each by the quality of service of its publishers."""
+    strings = channel("/robot/name", STRING)
+    lossy = channel("/robot/tf", TF, qos=BEST_EFFORT)
+    latched = channel("/robot/map", STRING, qos=LATCHED)
+    sent = {one.topic: [message(one.type_name, n) for n in range(9)] for one in (strings, lossy)}
+    heard = Heard()
+    source = open_source("ros2", SourceOptions("recorder"))
+    with side.open() as publisher:
+        publisher.advertise(latched)
+        publisher.publish(latched, message(STRING, 77), 0)
+        source.start(Wanted(), heard.take)
+        for one in (strings, lossy):
+            publisher.advertise(one)
+            assert until(lambda one=one: publisher.subscribers(one) == 1)
+            for payload in sent[one.topic]:
+                publisher.publish(one, payload, 0)
+                assert until(lambda one=one, payload=payload: ends_with(heard, one.topic, payload))
+        assert until(lambda: heard.payloads["/robot/map"])
+        source.close()
+    assert [*map(padded, heard.payloads["/robot/map"])] == [padded(message(STRING, 77))]
+    for topic, payloads in sent.items():
+        assert [*map(padded, heard.payloads[topic])] == [*map(padded, payloads)]
+    assert all(0 < publish <= log <= time.time_ns() for publish, log in heard.times)
+    found = heard.channels["/robot/map"]
+    assert found.schema == Schema(STRING, "ros2msg", b"string data\n")
+    assert found.metadata[HASH_KEY] == STORE.hash_rihs01(STRING)
+    (told,) = recorded_qos(found.metadata[QOS_KEY])
+    assert (told.is_reliable, told.is_latched) == (True, True)
+    (told,) = recorded_qos(heard.channels["/robot/tf"].metadata[QOS_KEY])
+    assert (told.is_reliable, told.is_latched) == (False, False)
+    assert not source.state.lost
+    assert not source.state.warnings
+
+
+def ends_with(heard: Heard, topic: str, payload: bytes) -> bool:
+    return bool(heard.payloads[topic]) and padded(heard.payloads[topic][-1]) == padded(payload)
+
+
+def test_a_recording_is_a_rosbag2(side: Side, tmp_path: Path) -> None:
+    recorded = channel("/cam/image_raw", IMAGE)
+    drive = scene("mono8", frames=30, with_info=False).messages
+    images = [one.payload("cdr") for one in drive if one.topic == "/cam/image_raw"]
+    options = RecordOptions(to="ros2", all=True)
+    with side.open() as publisher:
+        publisher.advertise(recorded)
+        with open_recorder((), tmp_path / "live", options) as recorder:
+
+            def publish() -> None:
+                assert until(lambda: publisher.subscribers(recorded) == 1)
+                for payload in images:
+                    publisher.publish(recorded, payload, 0)
+                until(lambda: recorder.received == len(images))
+                recorder.stop()
+
+            threading.Thread(target=publish).start()
+            (made,) = recorder.run().datasets
+    (topic,) = (item for item in made.topics if item.topic == "/cam/image_raw")
+    assert (topic.messages, topic.frames) == (30, 30)
+    mp4ds.unpack(tmp_path / "live", None, tmp_path / "again")
+    with open_reader(tmp_path / "again") as reader:
+        assert reader.format == "rosbag2"
+        found = [bytes(one.data) for one in reader.records() if isinstance(one, Message)]
+    assert [*map(padded, found)] == [*map(padded, images)]
+
+
+def test_hidden_topics_are_left_out(side: Side) -> None:
+    hidden, plain = channel("/robot/_internal", STRING), channel("/robot/name", STRING)
+    heard = Heard()
+    with side.open() as publisher:
+        for one in (hidden, plain):
+            publisher.advertise(one)
+        source = open_source("ros2", SourceOptions("recorder"))
+        source.start(Wanted(), heard.take)
+        assert until(lambda: publisher.subscribers(plain) == 1)
+        source.close()
+    assert [*source.state.topics] == ["/robot/name"]
+
+
+def test_a_type_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By rclpy it is left out, with a warning."""
+    with SIDES["rclpy"](monkeypatch) as side, side.open() as publisher:
+        publisher.advertise(channel("/robot/name", STRING))
+        del side.peer._bus.kinds[STRING]
+        source = open_source("ros2", SourceOptions("recorder"))
+        source.start(Wanted(), Heard().take)
+        source.close()
+    (warning,) = source.state.warnings
+    assert "'std_msgs/msg/String' is not installed" in warning
+
+
+def test_a_definition_that_is_announced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over DDS types tell their fields, which their hash proves."""
+    text = (
+        "std_msgs/Header header\nmy_msgs/Part[<=3] parts\nfloat64[3] point\nstring<=5 name\n"
+        "uint8[] data\nbool is_on\n\n"
+        + "=" * 80
+        + "\nMSG: my_msgs/Part\nint16 number\nbyte flags\n"
+    )
+    schema = Schema("my_msgs/msg/Whole", "ros2msg", text.encode())
+    recorded = Channel(1, "/robot/whole", "cdr", schema, {})
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(text, "my_msgs/msg/Whole"))
+    heard = Heard()
+    with SIDES["dds"](monkeypatch) as side, side.open() as publisher:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(side.options["domain"]))
+        publisher.advertise(recorded)
+        source = open_source("dds", SourceOptions("recorder"))
+        source.start(Wanted(), heard.take)
+        assert until(lambda: publisher.subscribers(recorded) == 1)
+        payload = bytes(store.serialize_cdr(whole(store), "my_msgs/msg/Whole"))
+        publisher.publish(recorded, payload, 0)
+        assert until(lambda: heard.payloads["/robot/whole"])
+        source.close()
+    found = heard.channels["/robot/whole"]
+    assert found.metadata[HASH_KEY] == store.hash_rihs01("my_msgs/msg/Whole")
+    assert found.schema
+    again = get_typestore(Stores.ROS2_JAZZY)
+    again.register(get_types_from_msg(found.schema.data.decode(), "my_msgs/msg/Whole"))
+    assert again.hash_rihs01("my_msgs/msg/Whole") == store.hash_rihs01("my_msgs/msg/Whole")
+
+
+def whole(store: Any) -> Any:
+    from rosbags.convert.converter import default_message
+
+    return default_message(store, "my_msgs/msg/Whole")
+
+
+# ---------------------------------------------------------------- without a network
+
+
+def test_qos_as_rosbag2_writes_it() -> None:
+    profiles = [Qos(depth=3, durability="transient_local", deadline_ns=1_500_000_000), Qos()]
+    assert [*recorded_qos(qos_text(profiles))] == profiles
+    text = qos_text(profiles)
+    assert "sec: 9223372036\n    nsec: 854775807" in text
+    assert "history: keep_last\n  depth: 3\n  reliability: reliable" in text
+
+
+def test_qos_that_hears_all_publishers() -> None:
+    reliable, lossy = Qos(), Qos(reliability="best_effort")
+    latched = Qos(durability="transient_local")
+    for offered, is_reliable, is_latched in (
+        ([reliable, reliable], True, False),
+        ([reliable, lossy], False, False),
+        ([latched, latched], True, True),
+        ([latched, reliable], True, False),
+    ):
+        asked = asked_qos(offered, 100)
+        assert (asked.is_reliable, asked.is_latched, asked.depth) == (is_reliable, is_latched, 100)
+
+
+def test_names() -> None:
+    assert is_hidden("/a/_b/c")
+    assert not is_hidden("/a/b_c")
+    assert ros_type("std_msgs::msg::dds_::String_") == STRING
+    assert ros_type("std_msgs.msg.dds_.String_") == STRING
+    assert ros_type("Shape::Type") == ""
+
+
+def test_definitions_that_are_installed(tmp_path: Path) -> None:
+    for name, text in {
+        "a_msgs/msg/A": "# a comment b_msgs/Z z\nint32 X=3\nB b\nb_msgs/C[] c # d_msgs/D d\n",
+        "a_msgs/msg/B": "string<=4 name 'x'\nfloat32[2] y\n",
+        "b_msgs/msg/C": "a_msgs/B b\nwstring text\n",
+    }.items():
+        path = tmp_path / f"{name}.msg"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    found = installed_definition("a_msgs/msg/A", [tmp_path / "none", tmp_path])
+    separator = "\n" + "=" * 80 + "\n"
+    main, *parts = found.split(separator)
+    assert main.startswith("# a comment")
+    assert [part.partition("\n")[0] for part in parts] == ["MSG: a_msgs/B", "MSG: b_msgs/C"]
+    assert installed_definition("a_msgs/msg/Gone", [tmp_path]) == ""
+    assert standard_definition(STRING, "RIHS01_" + 64 * "0") == ""
+    assert standard_definition(STRING, STORE.hash_rihs01(STRING)) == "string data\n"
