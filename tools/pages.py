@@ -98,6 +98,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         kind = "tree" if place.is_dir() else "blob"
         return f"{match[1]}{config.repo_url}/{kind}/main/{target}{match[3]}"
 
+    # in tables, GitHub wants a pipe within code escaped, and Python-Markdown does not
+    markdown = re.sub("`[^`\n]+`", lambda code: code[0].replace("\\|", "|"), markdown)
     return re.sub(r"(\]\()([^)#\s]*)((?:#[^)\s]*)?\))", changed, markdown)
 
 
@@ -183,7 +185,7 @@ def _paragraphs(text: str) -> str:
 
 
 def _field(key: str, kinds: list[type[Options]]) -> str:
-    return f"`{key}`" if any(key in shown_of(kind) for kind in kinds) else ""
+    return _code(key) if any(key in shown_of(kind) for kind in kinds) else ""
 
 
 def _text(text: str) -> str:
@@ -191,10 +193,15 @@ def _text(text: str) -> str:
     return html.escape(text.strip(), quote=False).replace("|", "\\|").replace("*", "\\*")
 
 
+def _code(words: str) -> str:
+    """Words of a command line, in one line where there is room."""
+    return f'<code class="words">{html.escape(words).replace("|", "&#124;")}</code>'
+
+
 def _table(header: tuple[str, ...], rows: list[tuple[str, str, str]]) -> str:
     lines = [f"| {' | '.join(header)} |", f"|{' --- |' * len(header)}"]
     for words, *others in rows:
-        told = f"<code>{html.escape(words).replace('|', '&#124;')}</code>"
+        told = _code(words)
         lines.append(f"| {' | '.join([told, *others][: len(header)])} |")
     return "\n".join(lines) + "\n"
 

@@ -16,7 +16,7 @@ import mp4ds
 from mp4ds.plugins.demo import demo
 
 ROOT = Path(__file__).resolve().parents[1]
-REPORT = {"x": 0, "y": 0, "width": 1280, "height": 925}
+REPORT = {"x": 0, "y": 0, "width": 1280, "height": 955}
 EVALUATION = {"x": 0, "y": 0, "width": 800, "height": 900}
 _READY = "typeof mp4dsReport === 'object' && mp4dsReport.ready.then(() => true)"
 _SETTLED = "mp4dsReport.settled()"
