@@ -8,6 +8,7 @@ encoder holds (spec/index.md, "Recordings that are being made").
 from __future__ import annotations
 
 import os
+import sys
 import threading
 import time
 from collections import Counter, deque
@@ -33,6 +34,9 @@ DURABLE_S = 2.0
 """Seconds within which what came is on the disk, but for the frames that an encoder holds."""
 
 _CHECKPOINT_S = 0.5
+_NICE = 10
+_BEHIND = 1 / 8
+"""Of the buffer: where so much waits, images are not encoded but written as they came."""
 
 
 class Intake:
@@ -51,6 +55,11 @@ class Intake:
         self._waiting: deque[Message] = deque()
         self._changed = threading.Condition()
         self._is_closed = False
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether so much waits that it should be taken out in the quickest way."""
+        return self._bytes > self._most * _BEHIND
 
     @property
     def waiting_bytes(self) -> int:
@@ -97,10 +106,15 @@ class Intake:
 
 
 class PromptWorkers(Workers):
-    """A thread for each key; nobody waits for one, but is told that it is late. See `Workers`."""
+    """A thread for each key; nobody waits for one, but is told that it is late. See `Workers`.
 
-    def __init__(self) -> None:
+    Args:
+        is_behind: Whether there are more urgent things to do than jobs.
+    """
+
+    def __init__(self, is_behind: Callable[[], bool] = lambda: False) -> None:
         super().__init__(0)
+        self._is_behind = is_behind
         self._begun: dict[int, deque[float]] = {}
         self._jobs: dict[int, deque[Callable[[], None]]] = {}
         self._own: dict[int, threading.Thread] = {}
@@ -120,8 +134,8 @@ class PromptWorkers(Workers):
             self._work.notify_all()
 
     def is_late(self, key: int) -> bool:
-        """Whether the job that has waited longest has done so for `LATE_S`."""
-        return self.age(key) > LATE_S
+        """Whether there is no time for a job: another has waited for `LATE_S`."""
+        return self._is_behind() or self.age(key) > LATE_S
 
     def age(self, key: int) -> float:
         """Seconds since the job that is next, or at work, came; 0 where there is none."""
@@ -131,6 +145,8 @@ class PromptWorkers(Workers):
 
     def _run_jobs(self, key: int) -> None:
         jobs, begun = self._jobs[key], self._begun[key]
+        if sys.platform == "linux":  # where threads have priorities: to receive comes first
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         while True:
             with self._work:
                 self._work.wait_for(lambda: jobs or self._is_ending)
@@ -241,7 +257,7 @@ class LivePacker(Packer):
     def _read(self) -> None:
         known: set[int] = set()
         next_checkpoint = time.monotonic() + _CHECKPOINT_S
-        with _Syncing(self._folder) as syncing, PromptWorkers() as workers:
+        with _Syncing(self._folder) as syncing, PromptWorkers(self._is_behind) as workers:
             while not self._is_over(self._part):
                 try:
                     message = self._intake.take(max(0.0, next_checkpoint - time.monotonic()))
@@ -259,6 +275,9 @@ class LivePacker(Packer):
             self._on_read()
             self._cameras.settle(workers)
         self._calibrations.finish()
+
+    def _is_behind(self) -> bool:
+        return self._intake.is_behind
 
     def _keep(self, message: Message, reason: str = "") -> None:
         # where there is no time to encode, there is none to compress either

@@ -1,0 +1,290 @@
+"""`mp4ds record` beside ``rosbag record`` in ROS 1, from the same publisher in one run.
+
+    python benchmarks/recording.py [--seconds S] [--kills N] [--only SECTION ...] [--folder F]
+
+needs ROS 1 (see `.ci/run`): a real master, in a network of its own where that is possible, a rospy
+node that publishes, and ROS's own recorder. Sections:
+
+- steady: two Bayer cameras of 640x480 at 30 Hz and an IMU of 200 Hz: whether all messages are
+  there, with the bytes, stamps and connection headers of ``rosbag record``; what both cost.
+- overload: four cameras of 2448x2048 at 15 Hz, which no two cores can encode, from a publisher
+  that waits for its subscribers: what of that which ``rosbag record`` kept is not there, and how
+  much memory it took.
+- kills: N times ``kill -9`` at a random moment: seconds between the last message that is there and
+  the end, and whether all before are those that ``rosbag record`` has.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import xxhash
+from rosbags.rosbag1 import Reader
+
+import clips
+from measure import print_machine, print_table
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from roscore import RECORD, Core, missing, python, wait_until
+
+PUBLISHER = str(Path(__file__).with_name("recording_publisher.py"))
+OTHERS = "/rosout.*|/clock"
+STEADY = (2, "640x480", 30, 200, 30)
+OVERLOAD = (4, "2448x2048", 15, 0, 0)
+NS = 10**9
+_TICKS = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass
+class Cost:
+    """What a process has cost so far.
+
+    Attributes:
+        cpu: Seconds, user and system.
+        written: Bytes that it had written to disk.
+        peak: Bytes of memory at most.
+    """
+
+    cpu: float
+    written: int
+    peak: int
+
+    @classmethod
+    def of(cls, pid: int) -> Cost:
+        """Of a process that runs."""
+        place = Path("/proc", str(pid))
+        fields = (place / "stat").read_text().rpartition(")")[2].split()
+        told = dict(
+            line.split(":", 1)
+            for name in ("io", "status")
+            for line in (place / name).read_text().splitlines()
+        )
+        return cls(
+            (int(fields[11]) + int(fields[12])) / _TICKS,
+            int(told["write_bytes"]),
+            1024 * int(told["VmHWM"].split()[0]),
+        )
+
+
+Messages = Mapping[str, Sequence[tuple[int, str]]]
+"""Stamp in the header, ns, and digest of each message, by topic."""
+
+
+def messages(bag: Path) -> tuple[Messages, dict[str, Any]]:
+    """What is in a bag, and the connection headers by topic."""
+    found, heads = defaultdict(list), {}
+    with Reader(bag) as reader:
+        for connection in reader.connections:
+            ext = connection.ext
+            told = (connection.msgtype, connection.digest, ext.callerid, ext.latching)
+            heads[connection.topic] = (*told, connection.msgdef.data)
+        for connection, _, data in reader.messages():
+            secs, nsecs = int.from_bytes(data[4:8], "little"), int.from_bytes(data[8:12], "little")
+            digest = xxhash.xxh64_hexdigest(data)
+            found[connection.topic].append((secs * NS + nsecs, digest))
+    return dict(found), heads
+
+
+def ours(target: Path, *options: str) -> list[str]:
+    """The command that records into a dataset."""
+    given = ("-a", "--ros1", "-o", str(target), "--exclude-regex", OTHERS)
+    return python("mp4ds", "record", *given, "--disable-keyboard-controls", *options)
+
+
+def theirs(bag: Path) -> list[str]:
+    """The command of ROS's own recorder."""
+    return [RECORD, "-a", "-O", str(bag), "-x", OTHERS]
+
+
+def publisher(core: Core, *robot: object) -> Any:
+    """A robot; see recording_publisher.py."""
+    command = [*core._prefix, *python(PUBLISHER, *map(str, robot))]
+    path = {"PYTHONPATH": str(Path(PUBLISHER).parent)}
+    return subprocess.Popen(
+        command, env={**core.environment, **path}, stdout=subprocess.PIPE, text=True
+    )
+
+
+def said(process: Any) -> Any:
+    """What a robot says next."""
+    line = process.stdout.readline()
+    if not line:
+        raise SystemExit(f"the publisher ended: {process.wait()}")
+    return json.loads(line)
+
+
+def end(process: subprocess.Popen[str]) -> int:
+    """End a recorder as Ctrl-C does."""
+    process.send_signal(2)
+    return process.wait()
+
+
+def unpacked(dataset: Path, folder: Path) -> Path:
+    """The bag of a dataset."""
+    bag = folder / f"{dataset.name}-again.bag"
+    bag.unlink(missing_ok=True)
+    command = [sys.executable, "-m", "mp4ds", "-q", "unpack", str(dataset), "--to", "bag"]
+    subprocess.run([*command, "-o", str(bag)], check=True)
+    return bag
+
+
+def beside(core: Core, folder: Path, seconds: float, *robot: Any) -> None:
+    """Record with both, and print what each has and cost."""
+    dataset, bag = folder / "live", folder / "rosbag.bag"
+    for path in (dataset, bag):
+        shutil.rmtree(path, ignore_errors=True)
+        path.unlink(missing_ok=True)
+    recorders = {"mp4ds": core.start(*ours(dataset)), "rosbag": core.start(*theirs(bag))}
+    source = publisher(core, *robot, seconds, 2)
+    assert said(source) == "begun"
+    before = {name: Cost.of(one.pid) for name, one in recorders.items()}
+    begun = time.monotonic()
+    sent = said(source)
+    source.wait()
+    elapsed = time.monotonic() - begun
+    after = {name: Cost.of(one.pid) for name, one in recorders.items()}
+    codes = {name: end(one) for name, one in recorders.items()}
+    print(f"- published for {elapsed:.1f} s")
+    for line in (core.folder / "python.log").read_text().splitlines():
+        if "dropped" in line:
+            print(f"- {line}")
+    print()
+    (found, heads), (due, their_heads) = messages(unpacked(dataset, folder)), messages(bag)
+    rows = [
+        (
+            name,
+            f"{100 * (after[name].cpu - before[name].cpu) / elapsed:.0f} %",
+            f"{(after[name].written - before[name].written) / 1e6 / elapsed:.1f}",
+            f"{after[name].peak / 2**20:.0f}",
+            f"{sum(path.stat().st_size for path in files) / 1e6:.0f}",
+            codes[name],
+        )
+        for name, files in (("mp4ds", list(dataset.iterdir())), ("rosbag", [bag]))
+    ]
+    print_table(("", "CPU of a core", "MB/s to disk", "peak MiB", "MB in all", "exit code"), rows)
+    print()
+    kept = json.loads(_info(dataset))
+    rows = []
+    for topic in sorted({*due, *found}):
+        one, other = dict(found.get(topic, [])), dict(due.get(topic, []))
+        missing_here = [stamp for stamp in other if one.get(stamp) != other[stamp]]
+        rows.append(
+            (
+                topic,
+                sent.get(topic, ""),
+                len(found.get(topic, [])),
+                len(due.get(topic, [])),
+                len(missing_here),
+                kept.get(topic, ""),
+                "equal" if heads.get(topic) == their_heads.get(topic) else "DIFFERS",
+            )
+        )
+    columns = ("topic", "published", "in mp4ds", "in rosbag", "only in rosbag, or other bytes")
+    print_table((*columns, "verbatim", "connection"), rows)
+
+
+def _info(dataset: Path) -> str:
+    """Messages of each topic that were kept verbatim, with reasons, as JSON."""
+    from mp4ds.format.sidecars import load_manifest
+
+    entries = load_manifest(dataset / "dataset.yaml").verbatim
+    return json.dumps({one.topic: f"{one.messages}: {one.reason}" for one in entries})
+
+
+# ---------------------------------------------------------------- kills
+
+
+def kills(core: Core, folder: Path, count: int) -> None:
+    """Kill the recorder again and again, and print what was lost."""
+    chance = random.Random(7)
+    bag = folder / "rosbag.bag"
+    bag.unlink(missing_ok=True)
+    reference = core.start(*theirs(bag))
+    source = publisher(core, *STEADY, 0, 1)
+    assert said(source) == "begun"
+    made: list[tuple[Path, int]] = []
+    for number in range(count):
+        dataset = folder / f"killed{number}"
+        for path in (dataset, dataset.with_name(f"{dataset.name}.recording")):
+            shutil.rmtree(path, ignore_errors=True)
+        recorder = core.start(*ours(dataset))
+        unfinished = dataset.with_name(f"{dataset.name}.recording")
+        wait_until(lambda path=unfinished: any(path.glob("cam*.mp4")) if path.exists() else False)
+        time.sleep(chance.uniform(1.0, 6.0))
+        killed = time.time_ns()
+        recorder.kill()
+        recorder.wait()
+        made.append((unfinished, killed))
+    source.terminate()
+    source.wait()
+    end(reference)
+    due, _ = messages(bag)
+    lost: dict[str, list[float]] = defaultdict(list)
+    wrong = 0
+    for unfinished, killed in made:
+        dataset = unfinished.with_name(unfinished.name.removesuffix(".recording"))
+        command = [sys.executable, "-m", "mp4ds", "-q", "pack", "--salvage", str(unfinished)]
+        subprocess.run([*command, "-o", str(dataset)], check=True)
+        found, _ = messages(unpacked(dataset, folder))
+        for topic, there in found.items():
+            first, last = there[0][0], there[-1][0]
+            expected = [item for item in due[topic] if first <= item[0] <= last]
+            wrong += there != expected
+            lost[topic].append((killed - last) / NS)
+    rows = [
+        (topic, len(times), f"{max(times):.2f}", f"{sorted(times)[len(times) // 2]:.2f}")
+        for topic, times in sorted(lost.items())
+    ]
+    print_table(("topic", "kills", "most seconds lost", "median"), rows)
+    print(f"\ntopics of which something before the last message differs: {wrong}")
+
+
+SECTIONS = ("steady", "overload", "kills")
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--seconds", type=float, default=60.0, help="of the steady recording")
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--only", action="append", choices=SECTIONS, help="all by default")
+    parser.add_argument("--folder", type=Path, help="keeps the recordings")
+    arguments = parser.parse_args()
+    if why := missing():
+        raise SystemExit(why)
+    clips.check_data()
+    print_machine()
+    with tempfile.TemporaryDirectory() as made:
+        folder = arguments.folder or Path(made)
+        folder.mkdir(parents=True, exist_ok=True)
+        logs = Path(made, "logs")
+        logs.mkdir()
+        for name in arguments.only or SECTIONS:
+            print(f"\n### {name}\n\n- load before: {os.getloadavg()[0]:.2f}\n", flush=True)
+            with Core(logs) as core:
+                if name == "steady":
+                    beside(core, folder, arguments.seconds, *STEADY)
+                elif name == "overload":
+                    beside(core, folder, 10.0, *OVERLOAD)
+                else:
+                    kills(core, folder, arguments.kills)
+
+
+if __name__ == "__main__":
+    main()
