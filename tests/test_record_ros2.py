@@ -7,7 +7,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -119,6 +119,43 @@ def test_a_recording_is_a_rosbag2(side: Side, tmp_path: Path) -> None:
         assert reader.format == "rosbag2"
         found = [bytes(one.data) for one in reader.records() if isinstance(one, Message)]
     assert [*map(padded, found)] == [*map(padded, images)]
+
+
+def test_services(side: Side) -> None:
+    """Those of rosbag2's recorder."""
+
+    class Controls:
+        is_paused = False
+        asked: ClassVar[list[str]] = []
+
+        def pause(self) -> None:
+            self.is_paused = True
+
+        def resume(self) -> None:
+            self.is_paused = False
+
+        def split(self) -> None:
+            self.asked.append("split")
+
+        def stop(self) -> None:
+            self.asked.append("stop")
+
+    controls = Controls()
+    source = open_source("ros2", SourceOptions("rosbag2_recorder"))
+    source.serve(controls)
+    source.start(Wanted(), Heard().take)
+
+    def call(name: str, kind: str) -> dict[str, Any]:
+        return side.peer.call(f"/rosbag2_recorder/{name}", kind, {})
+
+    assert call("is_paused", "IsPaused") == {"paused": False}
+    assert call("pause", "Pause") == {}
+    assert call("is_paused", "IsPaused") == {"paused": True}
+    assert call("resume", "Resume") == {}
+    assert call("split_bagfile", "SplitBagfile") == {}
+    assert call("stop", "Stop") == {}
+    source.close()
+    assert (controls.is_paused, controls.asked) == (False, ["split", "stop"])
 
 
 def test_hidden_topics_are_left_out(side: Side) -> None:

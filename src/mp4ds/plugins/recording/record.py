@@ -44,6 +44,8 @@ UNFINISHED = ".recording"
 
 _NS = 1_000_000_000
 _REPORT_S = 0.2
+_NODES = {"ros1": "record", "ros2": "rosbag2_recorder"}
+"""Names of the nodes of ROS's own recorders."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,9 @@ class RecordOptions(Options):
     )
     start_paused: bool = option("Start paused.", False, "--start-paused", "--pause")
     use_sim_time: bool = option("Take log times from /clock.", False)
-    node: str = option("Name of the node.", "mp4ds_recorder", "--node-name")
+    node: str | None = option(
+        "Name of the node; that of ROS's own recorder by default.", None, "--node-name"
+    )
     discover: bool = option("Look for new topics.", True, "--discovery/--no-discovery")
     polling_interval: float = option(
         "Milliseconds between checks for new topics.", 100.0, "--polling-interval", "-p"
@@ -229,10 +233,11 @@ def open_recorder(
     settings = _settings(chosen)
     about = load_about(chosen.about) if chosen.about is not None else None
     if source is None:
+        kind = chosen.to or sourced()
         source = open_source(
-            chosen.to or sourced(),
+            kind,
             SourceOptions(
-                chosen.node,
+                chosen.node or _NODES[kind],
                 use_sim_time=chosen.use_sim_time,
                 poll_s=chosen.polling_interval / 1000 if chosen.discover else None,
                 hidden=chosen.hidden,
@@ -354,6 +359,7 @@ class Recorder:
         begun = time.monotonic()
         self._begin_split()
         try:
+            self._source.serve(self)
             self._source.start(self._wanted, self._take)
             while not self._is_stopped:
                 self._changed.wait(_REPORT_S)
