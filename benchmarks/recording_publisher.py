@@ -80,7 +80,9 @@ def main() -> None:
     tasks, counts, publishers = [], {}, []
 
     def advertise(topic: str, kind: Any) -> Any:
-        publishers.append(rospy.Publisher(topic, kind, queue_size=int(queue) or None, tcp_nodelay=True))
+        publishers.append(
+            rospy.Publisher(topic, kind, queue_size=int(queue) or None, tcp_nodelay=True)
+        )
         return publishers[-1]
 
     def camera(name: str) -> Any:

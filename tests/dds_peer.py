@@ -11,7 +11,11 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+from cyclonedds.builtin import (
+    BuiltinDataReader,
+    BuiltinTopicDcpsPublication,
+    BuiltinTopicDcpsSubscription,
+)
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import IdlStruct
@@ -39,6 +43,12 @@ def raw(kind: Any) -> Any:
 
 @dataclass
 class Time(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
+    sec: int32
+    nanosec: uint32
+
+
+@dataclass
+class Duration(IdlStruct, typename="builtin_interfaces.msg.dds_.Duration_"):
     sec: int32
     nanosec: uint32
 
@@ -143,6 +153,10 @@ SERVICES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "SetRate": ({"rate": float64}, _FIELDS["success"]),
     "PlayNext": (_FIELDS["Empty"], _FIELDS["success"]),
     "Burst": ({"num_messages": uint64}, {"actually_burst": uint64}),
+    "Play": (
+        {"start_offset": Time, "playback_duration": Duration, "playback_until_timestamp": Time},
+        _FIELDS["success"],
+    ),
     "Seek": ({"time": Time}, _FIELDS["success"]),
     "Stop": (_FIELDS["Empty"], _FIELDS["Empty"]),
 }
@@ -155,6 +169,7 @@ class Peer:
         self._writers: dict[str, Any] = {}
         self._seen: dict[str, list[Any]] = {}
         self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        self._subscriptions = BuiltinDataReader(self._participant, BuiltinTopicDcpsSubscription)
 
     def subscribe(self, topic: str, kind: str, *, parsed: bool = True, **qos: Any) -> bool:
         """Subscribe with a type that was declared by hand; large ones are slow to parse."""
@@ -202,9 +217,16 @@ class Peer:
 
     def publications(self, topic: str, seconds: float = WATCHDOG_S) -> list[Any]:
         """What a publisher tells of itself."""
+        return self._endpoints(self._publications, topic, seconds)
+
+    def subscriptions(self, topic: str, seconds: float = WATCHDOG_S) -> list[Any]:
+        """What a subscriber tells of itself."""
+        return self._endpoints(self._subscriptions, topic, seconds)
+
+    def _endpoints(self, reader: Any, topic: str, seconds: float) -> list[Any]:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            found = [one for one in self._publications.read(1000) if one.topic_name == topic]
+            found = [one for one in reader.read(1000) if one.topic_name == topic]
             if found:
                 return [_told(one) for one in found]
             time.sleep(0.005)
@@ -241,7 +263,10 @@ class Peer:
             if writer.get_matched_subscriptions() and reader.get_matched_publications():
                 break
             time.sleep(0.005)
-        fields = [Time(*value) if isinstance(value, list) else value for value in request]
+        fields = [
+            field(*value) if isinstance(value, list) else value
+            for field, value in zip(asked.values(), request, strict=False)
+        ]
         writer.write(out(0x1234, 77, *(fields or [0])))
         while time.monotonic() < end:
             for reply in reader.take(10):

@@ -1,7 +1,8 @@
 """What the package uses of rclpy, with its signatures, on a bus within the process.
 
 `install` puts it where `import rclpy` finds it. Publishers and subscriptions meet as in ROS 2:
-by topic, type and quality of service.
+by topic, type and quality of service. As with rmw_cyclonedds, raw messages arrive padded to a
+multiple of 4 bytes, and each publisher keeps as many for late subscribers as its own depth says.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.machinery import ModuleSpec
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -84,6 +86,11 @@ class ExternalShutdownException(Exception):  # noqa: N818 (rclpy's name)
     pass
 
 
+class UnsupportedTypeSupport(Exception):  # noqa: N818 (rosidl_generator_py's name)
+    def __init__(self, pkg_name: str) -> None:
+        super().__init__(f"Could not import 'rosidl_typesupport_c' for package '{pkg_name}'")
+
+
 class Bus:
     def __init__(self) -> None:
         self.publishers: list[Publisher] = []
@@ -91,6 +98,13 @@ class Bus:
         self.services: dict[str, tuple[Any, Callable[[Any, Any], Any], Node]] = {}
         self.errors: list[str] = []
         self.kinds: dict[str, Any] = {}
+        self.halves: set[str] = set()  # types of which only the Python half is installed
+        self.share: Path | None = None  # where the definitions of types are installed
+
+    def share_of(self, package: str) -> str:
+        if self.share is None or not (self.share / package).is_dir():
+            raise KeyError(f"package '{package}' not found")  # PackageNotFoundError is a KeyError
+        return str(self.share / package)
 
 
 class Publisher:
@@ -101,8 +115,10 @@ class Publisher:
     def publish(self, msg: Any) -> None:
         if not isinstance(msg, bytes):
             raise TypeError(f"Expected {self.kind}, got {type(msg)}")
-        if self.qos.history == HistoryPolicy.KEEP_LAST:
-            self.kept = [*self.kept, msg][-self.qos.depth :]
+        msg = msg.ljust((len(msg) + 3) // 4 * 4, b"\0")
+        self.kept.append(msg)
+        if self.qos.history != HistoryPolicy.KEEP_ALL:
+            self.kept = self.kept[-self.qos.depth :]
         for subscription in self.node.bus.subscriptions:
             if subscription.matches(self):
                 subscription.deliver(msg)
@@ -142,8 +158,9 @@ class Subscription:
 
 
 class Node:
-    def __init__(self, name: str, context: Context, bus: Bus) -> None:
+    def __init__(self, name: str, context: Context, bus: Bus, namespace: str = "") -> None:
         self.name, self.context, self.bus = name, context, bus
+        self.namespace = f"/{namespace.strip('/')}" if namespace else ""
         self.inbox: queue.Queue[Callable[[], None]] = queue.Queue()
 
     def get_name(self) -> str:
@@ -155,6 +172,8 @@ class Node:
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: QoSProfile) -> Publisher:
         if not topic.replace("/", "").replace("_", "").isalnum():
             raise InvalidTopicNameException(topic)
+        if msg_type.type_name in self.bus.halves:
+            raise UnsupportedTypeSupport(msg_type.type_name.partition("/")[0])
         self.bus.publishers.append(Publisher(self, msg_type, topic, qos_profile))
         return self.bus.publishers[-1]
 
@@ -177,7 +196,7 @@ class Node:
         return subscription
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Any) -> None:
-        full = srv_name.replace("~", f"/{self.name}")
+        full = srv_name.replace("~", f"{self.namespace}/{self.name}")
         self.bus.services[full] = (srv_type, callback, self)
 
     def get_publishers_info_by_topic(self, topic_name: str) -> list[Any]:
@@ -258,14 +277,14 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Bus:
     def init(*, args: Any = None, context: Context) -> None:
         context.init()
 
-    def create_node(node_name: str, *, context: Context) -> Node:
-        return Node(node_name, context, bus)
+    def create_node(node_name: str, *, context: Context, namespace: str | None = None) -> Node:
+        return Node(node_name, context, bus, namespace or "")
 
     bus.kinds = {
         name: SimpleNamespace(type_name=name, type_hash=_type_hash(name)) for name in INSTALLED
     }
     services = ("Pause", "Resume", "TogglePaused", "IsPaused", "GetRate", "SetRate")
-    services += ("PlayNext", "Burst", "Seek", "Stop")
+    services += ("Play", "PlayNext", "Burst", "Seek", "Stop")
     modules: dict[str, dict[str, Any]] = {
         "rclpy": {"init": init, "create_node": create_node},
         "rclpy.context": {"Context": Context},
@@ -284,6 +303,8 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Bus:
         },
         "rosidl_runtime_py": {},
         "rosidl_runtime_py.utilities": {"get_message": _get_message(bus.kinds)},
+        "ament_index_python": {},
+        "ament_index_python.packages": {"get_package_share_directory": bus.share_of},
         "rosbag2_interfaces": {},
         "rosbag2_interfaces.srv": {name: SimpleNamespace(name=name) for name in services},
     }

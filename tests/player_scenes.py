@@ -10,12 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rosbags.convert.converter import default_message
+from rosbags.typesys import Stores, get_typestore
 
 from mp4ds.bags.convert import ros1_channel
 from mp4ds.bags.formats import open_reader, open_writer
+from mp4ds.errors import Refused
 from mp4ds.messages.serializations import form_of
 from mp4ds.messages.wire import ImageFields, Slots
-from mp4ds.records import Channel, Message
+from mp4ds.records import Channel, Message, Schema
+
+ROS2 = get_typestore(Stores.ROS2_JAZZY)
 
 
 @dataclass
@@ -42,12 +47,15 @@ class RecordingPublisher:
     sent: list[Sent] = field(default_factory=list)
     clocks: list[Sent] = field(default_factory=list)
     on_time: Callable[[int], None] | None = None
-    on_message: Callable[[], None] | None = None
+    on_message: Callable[[int | None], None] | None = None
     controls: Any = None
     subscriber_count: int = 1
     on_sent: Callable[[Sent], None] | None = None
+    not_installed: frozenset[str] = frozenset()
 
     def advertise(self, channel: Channel) -> None:
+        if channel.type_name in self.not_installed:
+            raise Refused("it is not installed")
         self.advertised.append(channel)
 
     def publish(self, channel: Channel, payload: bytes | memoryview, time_ns: int) -> None:
@@ -69,7 +77,7 @@ class RecordingPublisher:
     def follow_clock(self, on_time: Callable[[int], None]) -> None:
         self.on_time = on_time
 
-    def listen(self, _: str, on_message: Callable[[], None]) -> None:
+    def listen(self, _: str, on_message: Callable[[int | None], None]) -> None:
         self.on_message = on_message
 
     def serve(self, controls: Any) -> None:
@@ -155,3 +163,68 @@ def recorded(path: Path) -> list[Recorded]:
             for record in reader.records()
             if isinstance(record, Message)
         ]
+
+
+STATIC = ("base", "lidar", "camera", "imu")
+"""Child frames of /tf_static, of a publisher each."""
+
+
+def profiles(*depths: int, durability: str = "transient_local") -> str:
+    """QoS profiles as rosbag2 records them, of publishers that keep so many; 0: it is not told."""
+    return "\n".join(
+        f"- history: {'keep_last' if depth else 'unknown'}\n  depth: {depth}\n"
+        f"  reliability: reliable\n  durability: {durability}\n  liveliness: automatic"
+        for depth in depths
+    )
+
+
+def static_channel(*depths: int) -> Channel:
+    """/tf_static in ROS 2: rosbag2 makes one channel of all its publishers."""
+    return ros2_channel(1, "/tf_static", "tf2_msgs/msg/TFMessage", profiles(*depths))
+
+
+def ros2_channel(number: int, topic: str, kind: str, qos: str = "") -> Channel:
+    """A channel of rosbag2, with the definition of its type."""
+    definition = ROS2.generate_msgdef(kind, ros_version=2)[0].encode()
+    return Channel(
+        number, topic, "cdr", Schema(kind, "ros2msg", definition), {"offered_qos_profiles": qos}
+    )
+
+
+def static_transform(child: str, second: int = 0) -> bytes:
+    """A TFMessage of one transform in CDR."""
+    made = default_message(ROS2, "tf2_msgs/msg/TFMessage")
+    part = default_message(ROS2, "geometry_msgs/msg/TransformStamped")
+    part.header.frame_id, part.child_frame_id = "map", child
+    part.header.stamp.sec, part.transform.rotation.w = second, 1.0
+    made.transforms = [part]
+    return bytes(ROS2.serialize_cdr(made, "tf2_msgs/msg/TFMessage"))
+
+
+def text(said: str) -> bytes:
+    """A std_msgs/String in CDR."""
+    data = said.encode() + b"\0"
+    return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
+
+
+def make_ros2(path: Path, *, seconds: float = 1.0) -> Path:
+    """An MCAP of ROS 2 without a camera: /chatter at 20 Hz, /tf_static of four publishers, /map."""
+    channels = {
+        "/chatter": ros2_channel(0, "/chatter", "std_msgs/msg/String"),
+        "/tf_static": static_channel(1, 1, 1, 1),
+        "/map": ros2_channel(2, "/map", "std_msgs/msg/String", profiles(0)),
+    }
+    rows = [(START + n * STEP, "/chatter", text(f"{n}")) for n in range(round(seconds * 20))]
+    rows += [
+        (START + (n + 1) * MS, "/tf_static", static_transform(child))
+        for n, child in enumerate(STATIC)
+    ]
+    rows += [(START + (20 + n) * MS, "/map", text(f"map {n}")) for n in range(2)]
+    with open_writer(
+        path, "mcap", name=path.name, profile="ros2", library="", storage="mcap"
+    ) as writer:
+        for channel in channels.values():
+            writer.add_channel(channel)
+        for log_time, topic, payload in sorted(rows):
+            writer.write(Message(channels[topic], log_time, log_time, 0, payload))
+    return path

@@ -109,7 +109,7 @@ class Driver:
         self.publisher.follow_clock(lambda time_ns: say(["clock", time_ns]))
 
     def listen(self, topic: str) -> None:
-        self.publisher.listen(topic, lambda: say(["heard", topic]))
+        self.publisher.listen(topic, lambda stamp: say(["heard", topic, stamp]))
 
     def serve(self) -> None:
         self.publisher.serve(self.player)  # type: ignore[arg-type]

@@ -23,6 +23,7 @@ from typing import Any
 
 import pytest
 
+import mp4ds
 from waiting import WATCHDOG_S
 
 HERE = Path(__file__).parent
@@ -31,9 +32,11 @@ RECORD = "/usr/lib/rosbag/record"
 PLAY = "/usr/lib/rosbag/play"
 
 _PACKAGES = "/usr/lib/python3/dist-packages"
-# What pip installed goes before what Debian did, numpy and yaml above all.
+# What pip installed goes before what Debian did, numpy and yaml above all; what the tests import,
+# before both.
 _PYTHON = f"""
 import runpy, sys
+sys.path.insert(0, {str(Path(mp4ds.__file__).parents[1])!r})
 sys.path.append({_PACKAGES!r})
 del sys.argv[0]
 if sys.argv[0].endswith(".py"):

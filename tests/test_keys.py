@@ -57,8 +57,18 @@ class RecordedControls:
     def burst(self, messages: int) -> int:
         raise NotImplementedError
 
-    def seek(self, time_ns: int) -> bool:
+    def seek(self, time_ns: int) -> int:
         raise NotImplementedError
+
+    def play(self, start_ns: int, end_ns: int | None) -> bool:
+        raise NotImplementedError
+
+    def toggle_topic_pauses(self) -> None:
+        self.calls.append("toggle_topic_pauses")
+
+    @property
+    def start_ns(self) -> int:
+        return 0
 
     def stop(self) -> None:
         raise NotImplementedError
@@ -103,9 +113,10 @@ KEYS = {
     "b": (b"b", "step_back", 1.0),
     "up": (ESC + b"[A", "set_rate", 1.1),
     "down": (ESC + b"[B", "set_rate", 0.909090909),
+    "t": (b"t", "toggle_topic_pauses", 1.0),
 }
 IGNORED = {
-    "letters": b"xqt\n\t",
+    "letters": b"xqm\n\t",
     "shifted": b"SB",
     "function": ESC + b"OP" + ESC + b"[15~",
     "home": ESC + b"[H",
@@ -267,6 +278,7 @@ class Player:
     rate = 1.0
     def toggle_paused(self): print("toggled", flush=True)
     def play_next(self): return True
+    def toggle_topic_pauses(self): pass
     def step_back(self): return True
     def set_rate(self, rate): return True
 with Keyboard(player_keys(Player())):

@@ -18,7 +18,6 @@ import pytest
 
 import mp4ds
 from each import each
-from mp4ds.cli.options import spelled
 from mp4ds.plugins.playing.play import PlayOptions, open_player
 from player_scenes import RecordingPublisher, make_drive, recorded
 from test_bad_input import call
@@ -146,21 +145,22 @@ def test_signals(drive: Path, number: signal.Signals) -> None:
         assert "Traceback" not in shown.text
 
 
-def test_the_clock_rate_may_follow_the_option() -> None:
-    assert spelled(["play", "--clock", "50", "drive"]) == ["play", "--clock", "--hz", "50", "drive"]
-    assert spelled(["play", "--clock=50"]) == ["play", "--clock", "--hz", "50"]
-    assert spelled(["play", "--clock", "drive"]) == ["play", "--clock", "drive"]
-    assert spelled(["pack", "--clock", "50"]) == ["pack", "--clock", "50"]
-
-
 @each(
     ("arguments", "code", "words"),
     [
         (["{}", "--ros1", "--ros2"], 2, "--ros1 contradicts --ros2"),
+        (["{}", "--ros2", "-s", "3"], 2, "seconds to leave out are --start-offset"),
+        (["{}", "--foxglove", "--log-level", "loud"], 2, "--log-level 'loud'"),
+        (["{}", "--foxglove", "--publish-service-requests"], 2, "services are not called"),
+        (["{}", "--foxglove", "--wait-for-all-acked", "5"], 2, "goes with --ros2"),
+        (["{}", "--foxglove", "--queue", "5"], 2, "goes with --ros1"),
+        (["{}", "--foxglove", "--rate-control-topic", "/a"], 2, "goes with --ros1"),
+        (["{}", "--foxglove", "--topics"], 2, "--topics requires an argument"),
+        (["{}", "--foxglove", "--ros-args", "-r", "__node:=a/b"], 2, "cannot be called 'a/b'"),
         (["{}", "--foxglove", "--rate", "0"], 2, "--rate 0 is not above 0"),
         (["{}", "--foxglove", "--topics", "/none"], 2, "matches no topic"),
         (["{}", "--foxglove", "--qos-profile-overrides-path", "x"], 2, "goes with --ros2"),
-        (["{}", "--foxglove", "--resize", "big"], 2, "--resize 'big' is no size"),
+        (["{}", "--foxglove", "--resize", "big"], 2, "--resize 'big' is not a size"),
         (["{}/none", "--foxglove"], 2, "none"),
         (["{}", "--foxglove", "--lock-step", "/odom"], 2, "--foxglove"),
         (["{}", "--foxglove", "--follow-clock"], 2, "--foxglove"),

@@ -232,6 +232,21 @@ def test_signals(roscore: Core, drive: Path, number: signal.Signals) -> None:
     assert node not in roscore.nodes()  # it has signed off
 
 
+def test_ros_names_the_node_and_its_topics(roscore: Core, drive: Path) -> None:
+    """As roslaunch gives them; rosbag play takes the same."""
+    told = ("__name:=player", "__ns:=/robot", "/tf:=/moved", "_rate:=3", "__log:=/none")
+    receiver = roscore.receiver("/moved")
+    player = roscore.start(*mp4ds_play(drive, "--loop", *told))
+    try:
+        receiver.next()
+        assert "/robot/player" in roscore.nodes()
+        assert "/robot/player/pause_playback" in roscore.run("rosservice", "list")[1].split()
+    finally:
+        player.send_signal(signal.SIGINT)
+        assert player.wait(WATCHDOG_S) == 130
+        receiver.end()
+
+
 def test_no_master(roscore: Core, drive: Path) -> None:
     before = time.monotonic()
     uri = "http://127.0.0.1:9/"

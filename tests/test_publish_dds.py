@@ -55,6 +55,18 @@ def test_others_are_told_type_hash_and_qos(side: Side) -> None:
     assert (other["reliable"], other["latched"], other["deadline"]) == (False, True, 10**9)
 
 
+def test_subscribers_tell_the_type_hash(side: Side) -> None:
+    """Nodes look for it, and complain where there is none."""
+    clock = STORE.hash_rihs01("rosgraph_msgs/msg/Clock")
+    with side.open() as listener, side.open() as publisher:
+        listener.follow_clock(lambda _: None)
+        listener.listen("/a", lambda _: None)
+        publisher.advertise(channel("/a", STRING))
+        for topic, expected in (("rt/clock", clock), ("rt/a", STRING_HASH)):
+            (told,) = side.peer.ask("subscriptions", topic)
+            assert told["user_data"] == f"typehash={expected};"
+
+
 def test_the_recorded_type_hash_is_told(side: Side) -> None:
     recorded = replace(channel("/a", STRING), metadata={"topic_type_hash": "RIHS01_" + "5" * 64})
     with side.open() as publisher:
@@ -158,11 +170,11 @@ def test_its_own_clock_is_none_of_others(side: Side) -> None:
 
 def test_publishers_may_leave_while_they_are_heard(side: Side) -> None:
     times: list[int] = []
-    messages: list[None] = []
+    messages: list[int | None] = []
     recorded = channel("/a", STRING)
     with side.open() as listener:
         listener.follow_clock(times.append)
-        listener.listen("/a", lambda: messages.append(None))
+        listener.listen("/a", messages.append)
         for number in (1, 2, 3):
             with side.open() as publisher:
                 publisher.advertise(recorded)
@@ -177,7 +189,7 @@ def test_publishers_may_leave_while_they_are_heard(side: Side) -> None:
 def test_no_thread_is_left(side: Side) -> None:
     before = threading.active_count()
     with side.open() as publisher:
-        publisher.listen("/a", lambda: None)
+        publisher.listen("/a", lambda _: None)
         assert threading.active_count() == before + 1
     assert threading.active_count() == before
 
@@ -234,7 +246,7 @@ def test_messages_of_a_type_that_dds_cannot_have_are_published(
     heard = threading.Semaphore(0)
     assert not message_type(recorded, WORLD).is_real
     with side.open() as listener, side.open() as publisher:
-        listener.listen("/own", heard.release)
+        listener.listen("/own", lambda _: heard.release())
         publisher.advertise(recorded)
         (told,) = side.peer.ask("publications", "rt/own")
         assert told["type"] == "pkg::msg::dds_::Own_"
@@ -251,7 +263,7 @@ def test_empty_messages_of_ros1_are_published(side: Side) -> None:
     recorded = converter.channel(source)
     heard = threading.Semaphore(0)
     with side.open() as listener, side.open() as publisher:
-        listener.listen("/own", heard.release)
+        listener.listen("/own", lambda _: heard.release())
         publisher.advertise(recorded)
         until(lambda: publisher.subscribers(recorded))
         publisher.publish(recorded, converter.payload(source, b""), 0)
@@ -274,7 +286,7 @@ def test_a_topic_may_have_two_types(side: Side) -> None:
     heard = threading.Semaphore(0)
     both = channel("/a", STRING), channel("/a", "std_msgs/msg/Header")
     with side.open() as listener, side.open() as publisher:
-        listener.listen("/a", heard.release)
+        listener.listen("/a", lambda _: heard.release())
         for recorded in both:
             publisher.advertise(recorded)
             until(lambda: publisher.subscribers(recorded))  # noqa: B023 (called at once)

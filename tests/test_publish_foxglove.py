@@ -30,6 +30,7 @@ from mp4ds.plugins.publishing.foxglove import FoxglovePublisher
 from mp4ds.plugins.publishing.publisher import Publisher
 from mp4ds.plugins.reporting.server import ReportServer
 from mp4ds.records import Channel, Message, Schema
+from player_scenes import STATIC, static_channel, static_transform
 from sources import SOURCES, scene
 from waiting import WATCHDOG_S
 
@@ -96,9 +97,19 @@ class RecordedControls:
     def burst(self, messages: int) -> int:
         raise NotImplementedError
 
-    def seek(self, time_ns: int) -> bool:
+    def seek(self, time_ns: int) -> int:
         self.calls.append(("seek", time_ns))
-        return self._span[0] <= time_ns <= self._span[1]
+        return min(max(time_ns, self._span[0]), self._span[1])
+
+    def play(self, start_ns: int, end_ns: int | None) -> bool:
+        raise NotImplementedError
+
+    def toggle_topic_pauses(self) -> None:
+        raise NotImplementedError
+
+    @property
+    def start_ns(self) -> int:
+        return self._span[0]
 
     def stop(self) -> None:
         raise NotImplementedError
@@ -277,9 +288,9 @@ def test_what_waits_is_sent_before_it_closes() -> None:
 # ---------------------------------------------------------------- latched
 
 
-@pytest.mark.parametrize("how", LATCHED)
-def test_the_last_latched_message_reaches_late_subscribers(
-    how: str, publisher: FoxglovePublisher
+@pytest.mark.parametrize(("how", "kept"), {"ros1": 1, "ros2-old": 3, "ros2-new": 3}.items())
+def test_latched_messages_reach_late_subscribers(
+    how: str, kept: int, publisher: FoxglovePublisher
 ) -> None:
     latched = string_channel("/map", LATCHED[how])
     other = string_channel("/map", {**LATCHED[how], "callerid": "/other"})
@@ -291,14 +302,27 @@ def test_the_last_latched_message_reaches_late_subscribers(
     publisher.publish(other, memoryview(b"another"), 7)
     with Client(publisher.address) as client:
         ids = subscribe(client, publisher, latched, other, silent)
-        client.wait(lambda: len(client.messages) == 2)
+        client.wait(lambda: len(client.messages) == kept + 1)
         publisher.publish(latched, b"map 3", 9)
-        client.wait(lambda: len(client.messages) == 3)
-        assert sorted(client.messages[:2], key=lambda m: m[1]) == [
-            (ids[id(latched)], 2, b"map 2"),
+        client.wait(lambda: len(client.messages) == kept + 2)
+        expected = [(ids[id(latched)], n, b"map %d" % n) for n in range(3)][-kept:]
+        assert sorted(client.messages[:-1], key=lambda m: m[1]) == [
+            *expected,
             (ids[id(other)], 7, b"another"),
         ]
-        assert client.messages[2] == (ids[id(latched)], 9, b"map 3")
+        assert client.messages[-1] == (ids[id(latched)], 9, b"map 3")
+
+
+def test_late_subscribers_get_all_static_transforms(publisher: FoxglovePublisher) -> None:
+    channel = static_channel(1, 1, 1, 1)
+    publisher.advertise(channel)
+    sent = [static_transform(child) for child in STATIC]
+    for n, payload in enumerate(sent):
+        publisher.publish(channel, payload, n)
+    with Client(publisher.address) as client:
+        subscribe(client, publisher, channel)
+        client.wait(lambda: len(client.messages) == len(sent))
+        assert [data for _, _, data in client.messages] == sent
 
 
 def test_each_of_two_that_cannot_be_told_apart_is_latched(publisher: FoxglovePublisher) -> None:
@@ -382,7 +406,7 @@ def test_clients_control_the_player() -> None:
 
         client.request(PAUSE, 1.1, seek=1, name="before the begin")
         state = client.state("before the begin")
-        assert (state.did_seek, state.time, state.is_paused) == (False, 7_000_000_000, True)
+        assert (state.did_seek, state.time, state.is_paused) == (True, span[0], True)
 
         client.request(PLAY, 0.0, name="no rate")
         assert client.state("no rate").speed == pytest.approx(1.1)
@@ -612,7 +636,7 @@ def test_what_foxglove_has_not(publisher: FoxglovePublisher) -> None:
     with pytest.raises(OptionError, match="`foxglove`"):
         publisher.follow_clock(lambda time_ns: None)
     with pytest.raises(OptionError, match=r"/next.*`foxglove`"):
-        publisher.listen("/next", lambda: None)
+        publisher.listen("/next", lambda _: None)
     assert publisher.world is None
     assert not publisher.wants_clock
     assert publisher.is_alive

@@ -245,7 +245,15 @@ def test_listen(roscore: Core, recording: Path) -> None:
     wait_until(lambda: published.ask("subscribers")[index] == 1)
     published.ask("publish")
     count = len(payloads(recording)[CAMERA[0]])
-    assert listener.take(count) == [["heard", CAMERA[0]]] * count
+    heard = listener.take(count)
+    assert [one[:2] for one in heard] == [["heard", CAMERA[0]]] * count
+    expected = [
+        int(seconds) * 10**9 + nanoseconds
+        for _, seconds, nanoseconds in (
+            struct.unpack_from("<III", payload) for payload in payloads(recording)[CAMERA[0]]
+        )
+    ]
+    assert [stamp for _, _, stamp in heard] == expected
     assert listener.silence() == []
 
 

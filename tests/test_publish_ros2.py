@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +17,12 @@ import pytest
 
 import fake_rclpy
 from mp4ds.bags.convert import LATCHED_QOS
-from mp4ds.errors import ConversionError, OptionError, PublishError
+from mp4ds.errors import ConversionError, OptionError, PublishError, Refused
+from mp4ds.plugins.publishing.names import NodeNames
 from mp4ds.plugins.publishing.ros2 import RclpyPublisher
 from mp4ds.plugins.publishing.ros2_writers import Qos, load_overrides, offered_qos, recorded_qos
 from mp4ds.records import Channel, Schema
-from ros2_sides import KINDS, SIDES, Side, channel, connect, message, padded, until
+from ros2_sides import KINDS, SIDES, STORE, Side, channel, connect, message, padded, until
 from waiting import WATCHDOG_S
 
 STRING = "std_msgs/msg/String"
@@ -38,6 +41,7 @@ class Player:
         self.asked: list[tuple[Any, ...]] = []
         self.is_paused = True
         self.rate = 2.5
+        self.start_ns = 100 * 10**9
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         def noted(*arguments: Any) -> Any:
@@ -158,7 +162,7 @@ def test_topics_of_others_are_heard_whatever_their_type(
 ) -> None:
     count = threading.Semaphore(0)
     with side.open() as publisher:
-        publisher.listen("/trigger", count.release)
+        publisher.listen("/trigger", lambda _: count.release())
         for number in range(3):
             side.peer.publish("/trigger", kind, message(kind, number), reliable=reliable)
         for _ in range(3):
@@ -168,7 +172,7 @@ def test_topics_of_others_are_heard_whatever_their_type(
 
 def test_a_topic_to_listen_to_has_to_have_a_name(side: Side) -> None:
     with side.open() as publisher, pytest.raises(OptionError, match="no topic name"):
-        publisher.listen("/no topic", lambda: None)
+        publisher.listen("/no topic", lambda _: None)
 
 
 CALLS: dict[str, tuple[str, dict[str, Any], tuple[Any, ...] | None, dict[str, Any]]] = {
@@ -180,6 +184,16 @@ CALLS: dict[str, tuple[str, dict[str, Any], tuple[Any, ...] | None, dict[str, An
     "set_rate": ("SetRate", {"rate": 0.5}, ("set_rate", 0.5), {"success": True}),
     "play_next": ("PlayNext", {}, ("play_next",), {"success": True}),
     "burst": ("Burst", {"num_messages": 9}, ("burst", 9), {"actually_burst": 3}),
+    "play": (
+        "Play",
+        {
+            "start_offset": SimpleNamespace(sec=2, nanosec=3),
+            "playback_duration": SimpleNamespace(sec=4, nanosec=0),
+            "playback_until_timestamp": SimpleNamespace(sec=5, nanosec=0),
+        },
+        ("play", 102_000_000_003, 106_000_000_003),
+        {"success": True},
+    ),
     "seek": (
         "Seek",
         {"time": SimpleNamespace(sec=5, nanosec=6)},
@@ -205,11 +219,30 @@ def test_services_belong_to_the_node(side: Side) -> None:
         assert side.peer.call("/other/get_rate", "GetRate", {}) == {"rate": 2.5}
 
 
+def test_ros_names_the_node_and_its_clock(side: Side) -> None:
+    names = NodeNames("player", "/robot", (("/clock", "/sim"),))
+    with side.open(names=names) as publisher:
+        publisher.serve(Player())
+        publisher.clock(0)
+        assert side.peer.call("/robot/player/get_rate", "GetRate", {}) == {"rate": 2.5}
+        side.peer.subscribe("/sim", "rosgraph_msgs/msg/Clock", reliable=False)
+        assert side.peer.connected("/sim", 1) == 1
+
+
+@pytest.mark.parametrize("seconds", [0.5, float("inf")])
+def test_subscribers_have_as_long_as_they_are_given(side: Side, seconds: float) -> None:
+    recorded = channel("/robot/topic", STRING)
+    with side.open(parting_s=seconds) as publisher:
+        connect(side, publisher, recorded)
+        publisher.publish(recorded, message(STRING, 1), 0)
+    assert len(side.peer.received("/robot/topic", 1)) == 1
+
+
 def test_who_is_closed_is_gone(side: Side) -> None:
     recorded = channel("/topic", STRING)
     with side.open() as publisher:
         publisher.advertise(recorded)
-        publisher.listen("/silent", lambda: None)
+        publisher.listen("/silent", lambda _: None)
         side.peer.subscribe("/topic", STRING)
         assert side.peer.connected("/topic", 1) == 1
         assert publisher.is_alive
@@ -240,9 +273,37 @@ def bus(monkeypatch: pytest.MonkeyPatch) -> fake_rclpy.Bus:
     return fake_rclpy.install(monkeypatch)
 
 
-def test_rclpy_has_to_have_the_type(bus: fake_rclpy.Bus) -> None:
-    with RclpyPublisher() as publisher, pytest.raises(ConversionError, match="not installed"):
-        publisher.advertise(channel("/x", "sensor_msgs/msg/JointState"))
+def test_rclpy_has_to_have_the_whole_type(bus: fake_rclpy.Bus) -> None:
+    bus.halves.add("sensor_msgs/msg/Imu")
+    with RclpyPublisher() as publisher:
+        for kind, says in (("JointState", "not installed"), ("Imu", "typesupport_c")):
+            with pytest.raises(Refused, match=says):
+                publisher.advertise(channel("/x", f"sensor_msgs/msg/{kind}"))
+
+
+def test_an_installed_type_that_is_not_the_recorded_one_is_told(
+    bus: fake_rclpy.Bus, tmp_path: Path
+) -> None:
+    bus.share = tmp_path
+    (tmp_path / "std_msgs" / "msg").mkdir(parents=True)
+    described = tmp_path / "std_msgs" / "msg" / "String.json"
+    recorded, other = STORE.hash_rihs01(STRING), "RIHS01_" + "5" * 64
+    told = replace(channel("/x", STRING), metadata={"topic_type_hash": other})
+    for one, installed, is_same in (
+        (channel("/x", STRING), recorded, True),
+        (channel("/x", STRING), other, False),
+        (told, other, True),
+        (told, recorded, False),
+    ):
+        hashes = [{"type_name": STRING, "hash_string": installed}]
+        described.write_text(json.dumps({"type_hashes": hashes}))
+        with RclpyPublisher() as publisher, warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            publisher.advertise(one)
+            publisher.advertise(channel("/y", STRING))  # it is told once
+        assert [str(warning.message).split(",")[0] for warning in said] == (
+            [] if is_same else [f"/x: the installed type {STRING} differs from the recorded one"]
+        )
 
 
 def test_rclpy_tells_of_a_topic_whose_type_it_has_not(bus: fake_rclpy.Bus) -> None:
@@ -251,7 +312,7 @@ def test_rclpy_tells_of_a_topic_whose_type_it_has_not(bus: fake_rclpy.Bus) -> No
     peer.advertise("/own", "own/msg/Own")
     del bus.kinds["own/msg/Own"]
     with RclpyPublisher() as publisher:
-        publisher.listen("/own", lambda: None)
+        publisher.listen("/own", lambda _: None)
         assert until(lambda: bus.errors)
     assert "'own/msg/Own' is not installed" in bus.errors[0]
 
@@ -297,7 +358,7 @@ def test_rclpy_passes_messages_on_as_they_are(bus: fake_rclpy.Bus) -> None:
         publisher.advertise(recorded)
         peer.subscribe("/x", STRING)
         publisher.publish(recorded, payload, 0)
-    assert peer.received("/x", 1) == [payload]
+    assert peer.received("/x", 1) == [padded(payload)]
 
 
 def test_rclpy_may_be_shut_down_from_outside(bus: fake_rclpy.Bus) -> None:
@@ -400,11 +461,11 @@ def test_profiles_that_say_nothing_are_the_default(text: str) -> None:
         ([{"history": "keep_all"}], Qos(reliability="best_effort")),
         (
             [{"history": "keep_last", "depth": 2, "durability": "transient_local"}],
-            Qos(reliability="best_effort", durability="transient_local", depth=2),
+            Qos(reliability="best_effort", durability="transient_local"),
         ),
         (
-            [{"history": "keep_last", "depth": 10**30, "durability": "transient_local"}],
-            Qos(reliability="best_effort", durability="transient_local"),
+            [{"history": "keep_last", "depth": 12, "durability": "transient_local"}] * 2,
+            Qos(reliability="best_effort", durability="transient_local", depth=24),
         ),
     ],
 )

@@ -27,7 +27,6 @@ import typer
 
 from each import each
 from mp4ds.cli import app_for
-from mp4ds.cli.options import spelled
 from test_examples import ROOT
 from waiting import WATCHDOG_S
 
@@ -78,7 +77,7 @@ def run_command(command: str, folder: Path) -> Done:
     words = shlex.split(command)
     needs_shell = set(re.sub("'[^']*'", "", command)) & set("*|;&$<>")
     if words[0] == "mp4ds" and not needs_shell:
-        return call(spelled(words[1:]))
+        return call(words[1:])
     bin_folder = str(Path(sys.executable).parent)
     done = subprocess.run(
         ["bash", "-c", command],

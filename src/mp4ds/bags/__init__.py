@@ -1,4 +1,4 @@
-"""Recordings that others made: readers and writers behind two protocols and one table.
+"""Recordings: readers and writers behind two protocols and one table of formats.
 
 The only package that imports rosbags and mcap.
 """

@@ -1,4 +1,4 @@
-"""Converts channels and messages between ROS 1 and ROS 2; standard definitions of either."""
+"""Converts channels and messages between ROS 1 and ROS 2; standard definitions of both."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, is_dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -20,12 +20,14 @@ from mp4ds.bags.types import (
     BUILTIN,
     HEADER,
     MAX_TAIL,
+    World,
     by_library,
     field_shape,
     fields_of,
     incomprehensible,
     make_store,
     ros1_world,
+    ros2_store,
     ros2_world,
     same_wire,
     translate,
@@ -54,7 +56,7 @@ def where_times_are(types: Typesdict, name: str) -> Where:
 
 
 def _parts(types: Typesdict, name: str) -> list[tuple[int, str, bool]]:
-    """Of the fields that are messages: place, type, and whether they are several."""
+    """The fields that are messages: place, type, and whether there are several."""
     shapes = [field_shape(desc) for _, desc in fields_of(types, name)]
     return [
         (place, shape.message, shape.length is not None or shape.bound is not None)
@@ -83,7 +85,7 @@ LATCHED_QOS = """\
   avoid_ros_namespace_conventions: false"""
 """Keep the last one, reliable, transient local: what ROS 1 calls latching."""
 
-_ROS1 = "ros1:"  # begins the keys that keep a ROS 1 connection header in ROS 2 metadata
+_ROS1 = "ros1:"  # prefix of the keys that keep a ROS 1 connection header in ROS 2 metadata
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 _REMEDY = "Exclude the topic with `exclude`, or unpack to mcap, which keeps it as it is."
 
@@ -94,12 +96,12 @@ class _Plan:
 
     Attributes:
         name: The type as rosbags spells it.
-        types: Its own definition, and those that it refers to.
-        store: The same with the header of ROS 2, which is what rosbags converts bytes by.
+        types: Its own definition and those it refers to.
+        store: The same with the header of ROS 2, which rosbags uses to convert bytes.
         schema: Definition for the target.
         digest: md5sum for ROS 1, type hash for ROS 2.
         times: Where its messages have times.
-        no_message: What is said of a payload that is not a message of the type.
+        no_message: The error for a payload that is not a message of the type.
     """
 
     name: str
@@ -125,32 +127,44 @@ class Converter:
     def __init__(self, target: str | None, *, distribution: str = "humble") -> None:
         if target not in ("ros1", "ros2", None):
             raise OptionError(f"Messages cannot be converted to {target!r}. Use ros1 or ros2.")
-        self._ros1, self._ros2 = ros1_world(), ros2_world(distribution)
-        self._target = {"ros1": self._ros1, "ros2": self._ros2}.get(target or "")
-        self._source = self._ros1 if self._target is self._ros2 else self._ros2
+        ros2_store(distribution)  # is known
+        self._to, self._distribution = target, distribution
         self._plans: dict[Schema, _Plan] = {}
         self._omitted: Counter[str] = Counter()
 
+    # standard types take a while to load, and most recordings are in their target already
+    @cached_property
+    def _ros1(self) -> World:
+        return ros1_world()
+
+    @cached_property
+    def _ros2(self) -> World:
+        return ros2_world(self._distribution)
+
+    @property
+    def _source(self) -> World:
+        return self._ros1 if self._to == "ros2" else self._ros2
+
     @property
     def omitted(self) -> Mapping[str, int]:
-        """What the target has no place for and was left out: a phrase -> how many."""
+        """What was left out because the target cannot hold it: a phrase -> how many."""
         return dict(self._omitted)
 
     def channel(self, channel: Channel) -> Channel:
-        """The channel as it is in the target; the same object if it is there already.
+        """The channel for the target; the same object if nothing changes.
 
         Raises:
-            ConversionError: It is not of ROS, or its definition is missing or damaged.
+            ConversionError: It is not a ROS channel, or its definition is missing or damaged.
         """
         if self._is_done(channel):
-            return self._completed(channel) if self._target is self._ros1 else channel
+            return self._completed(channel) if self._to == "ros1" else channel
         plan = self._plan(channel)
-        if self._target is self._ros1:
+        if self._to == "ros1":
             return self._remembered(channel, plan) or self._ros1_channel(channel, plan)
         return _ros2_channel(channel, plan)
 
     def payload(self, channel: Channel, data: bytes | memoryview) -> bytes | memoryview:
-        """A message of a source channel as it is in the target.
+        """A message of a source channel, converted for the target.
 
         Raises:
             ConversionError: It does not parse as the channel's type.
@@ -164,10 +178,10 @@ class Converter:
             raise ConversionError(channel.topic, str(reason), _REMEDY) from None
 
     def _completed(self, channel: Channel) -> Channel:
-        """A ROS 1 channel with the md5sum without which ROS 1 opens no bag.
+        """A ROS 1 channel with its md5sum, without which ROS 1 cannot open a bag.
 
-        Only where the source tells none (an MCAP file may not); a known standard type then
-        gets its definition too, if it has none.
+        Only if the source has none (as in some MCAP files); a known standard type then also gets
+        its definition, if it has none.
         """
         schema = channel.schema
         if schema is None or not schema.name or "md5sum" in channel.metadata:
@@ -184,7 +198,9 @@ class Converter:
         return replace(channel, schema=schema, metadata={"md5sum": digest, **channel.metadata})
 
     def _is_done(self, channel: Channel) -> bool:
-        return self._target is None or channel.message_encoding == self._target.encoding
+        return channel.message_encoding == {"ros1": "ros1", "ros2": "cdr"}.get(
+            self._to or "", channel.message_encoding
+        )
 
     def _plan(self, channel: Channel) -> _Plan:
         schema = channel.schema
@@ -202,7 +218,7 @@ class Converter:
         return self._plans[schema]
 
     def _make_plan(self, schema: Schema) -> _Plan:
-        target = self._target or self._source
+        target = self._ros2 if self._to == "ros2" else self._ros1
         problem = incomprehensible(schema.name)
         types = types_of(schema, self._source)
         name = normalize_msgtype(schema.name)
@@ -222,11 +238,11 @@ class Converter:
         return _Plan(name, types, store, made_schema, digest, times, no_message)
 
     def _convert(self, plan: _Plan, raw: memoryview) -> memoryview:
-        to_ros1 = self._target is self._ros1
+        to_ros1 = self._to == "ros1"
         store, name = plan.store, plan.name
         problem = plan.no_message
         if to_ros1 and bytes(raw[:2]) == b"\0\0":
-            # rosbags converts bytes of little-endian CDR only.
+            # rosbags only converts little-endian CDR.
             message = by_library(problem, store.deserialize_cdr, raw, name)
             little_endian = partial(store.serialize_cdr, little_endian=True)
             raw = by_library(problem, little_endian, message, name)
@@ -234,7 +250,7 @@ class Converter:
         try:
             converted = by_library(problem, convert, raw, name)
         except Refused:
-            # ROS itself overlooks bytes after a message, such as RealSense cameras' bags hold.
+            # ROS itself ignores bytes after a message, which bags of RealSense cameras have.
             end = _end(plan, raw, to_ros1=to_ros1)
             if not (0 < len(raw) - end <= MAX_TAIL and fields_of(plan.types, name)):
                 raise
@@ -252,7 +268,7 @@ class Converter:
         return converted
 
     def _remembered(self, channel: Channel, plan: _Plan) -> Channel | None:
-        """The ROS 1 channel that this one was made from, if it tells and still fits."""
+        """The ROS 1 channel that this one was made from, if recorded and still valid."""
         known = {
             key[len(_ROS1) :]: value
             for key, value in channel.metadata.items()
@@ -301,7 +317,7 @@ def _ros2_channel(channel: Channel, plan: _Plan) -> Channel:
 
 
 def is_latched(channel: Channel) -> bool:
-    """Whether those that subscribe late get the last message: latching, or transient local."""
+    """Whether late subscribers get the last message: latching, or transient local."""
     if channel.metadata.get("latching", "").lower() in ("1", "true"):
         return True
     qos = channel.metadata.get(QOS_KEY, "")
@@ -324,7 +340,7 @@ def _end(plan: _Plan, raw: memoryview, *, to_ros1: bool) -> int:
 
 
 def _time_beyond(plan: _Plan, data: bytes | memoryview) -> int | None:
-    """Seconds of a time in a message that only ROS 2 takes for negative; None if there is none.
+    """Seconds of a time in a message that is negative in ROS 2 only, or None.
 
     Args:
         plan: Of its type.
@@ -396,7 +412,7 @@ def ros2_channel(channel_id: int, topic: str, type_name: str) -> Channel:
 
 
 def latched(channel: Channel) -> Channel:
-    """The same ROS 2 channel, which gives those that subscribe late its last message."""
+    """The same ROS 2 channel, latched: late subscribers get the last message."""
     return replace(channel, metadata={**channel.metadata, QOS_KEY: LATCHED_QOS})
 
 

@@ -1,4 +1,4 @@
-"""Messages as objects with fields, by the definitions that were recorded with them."""
+"""Messages as objects with fields, decoded by their recorded definitions."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from mp4ds.messages.wire import WireError
 from mp4ds.records import Channel
 
 Decoder = Callable[[memoryview], Any]
-"""Makes an object of a payload.
+"""Makes an object from a payload.
 
 Raises:
-    WireError: The payload is not of the type that its channel tells.
+    WireError: The payload is not of its channel's type.
 """
 
-_DISTRIBUTION = "humble"  # whose standard types stand in for definitions that were not recorded
+_DISTRIBUTION = "humble"  # its standard types replace definitions that were not recorded
 _ADVICE = "use its raw bytes instead, `RecordedMessage.raw`"
 
 
 def decoder_of(channel: Channel) -> Decoder:
-    """What makes objects of a channel's messages.
+    """The decoder for a channel's messages.
 
     ROS 1 and ROS 2 give rosbags' objects, whose attributes are the fields; protobuf its own
     messages; JSON what `json.loads` gives.
@@ -121,16 +121,16 @@ _DECODERS: Mapping[str, Callable[[Channel], Decoder]] = {
 
 
 def protobuf_decoder(type_name: str, schema: bytes) -> Callable[[bytes], Any]:
-    """What makes an object of a serialized message; it raises WireError for what is none.
+    """A decoder of serialized messages; it raises WireError for invalid ones.
 
     Args:
         type_name: Full name of the message's type.
-        schema: A serialized FileDescriptorSet that declares it and all that it refers to.
+        schema: A serialized FileDescriptorSet that declares it and everything it refers to.
 
     Raises:
         WireError: It does not.
     """
-    # only recordings with protobuf need it
+    # needed for recordings with protobuf only
     from google.protobuf.message import DecodeError
 
     try:
@@ -156,7 +156,7 @@ def _message_class(type_name: str, schema: bytes) -> Any:
     pool = DescriptorPool()
 
     def add(name: str) -> None:
-        """A file after those that it imports."""
+        """Add a file, after those it imports."""
         file = waiting.pop(name, None)
         if file is not None:
             for dependency in file.dependency:

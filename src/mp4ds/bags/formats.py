@@ -33,10 +33,10 @@ _BLOCK = 2**20
 
 
 class SourceHasher:
-    """SHA-256 of the source files, taken while they are read, behind the reader.
+    """SHA-256 of the source files, computed just behind the reader.
 
-    The bytes are then still in the system's cache: the disk is read once. A folder is hashed when
-    the reader is past its bytes. A context manager.
+    The bytes are still in the system's cache then, so the disk is read once. A folder is hashed
+    when the reader is past its bytes. A context manager.
 
     Args:
         files: All files, in reading order.
@@ -49,7 +49,7 @@ class SourceHasher:
         self._number = 0
         self._offset = 0
         self._hash = hashlib.sha256()
-        self._stream: BinaryIO | None = None  # held, as another file may take the name
+        self._stream: BinaryIO | None = None  # kept open, since another file may get the name
         self._digests: list[tuple[int, str]] = []
 
     def advance(self, position: int | None) -> None:
@@ -77,7 +77,7 @@ class SourceHasher:
                 self._finish(self._offset, self._hash.hexdigest())
 
     def digest(self, number: int) -> tuple[int, str]:
-        """Size in bytes and SHA-256 of a file by its number; all are read to their ends first.
+        """Size in bytes and SHA-256 of a file by its number; reads all files to the end first.
 
         Raises:
             SourceError: It cannot be read.
@@ -123,8 +123,8 @@ _NO_STATS = ChannelStats(0, 0, 0)
 class MultiReader:
     """A split recording, or recordings made side by side.
 
-    Parts that follow each other in time are read one after another, parts that overlap are
-    merged by log time. Channels equal in all fields are one channel.
+    Consecutive parts are read one after another; overlapping parts are merged by log time. Channels
+    equal in all fields are one channel.
 
     Args:
         openers: Each opens one part; a part is open only while it is read.
@@ -203,7 +203,7 @@ class MultiReader:
         self._skipped.clear()
         if self.is_indexed:
             return self._merged(excerpt)
-        # What is out of order would be merged otherwise without what is not wanted.
+        # Otherwise, out-of-order messages would be merged differently in an excerpt.
         return filter(excerpt.has, self._merged(EVERYTHING if excerpt.has_messages else excerpt))
 
     def _merged(self, excerpt: Excerpt) -> Iterator[Record]:
@@ -271,7 +271,7 @@ class MultiReader:
 
 # ---------------------------------------------------------------- formats
 
-# each imports its library when it is needed: a recording is of one format
+# each imports its library when needed: a recording has one format
 
 
 def _read_bag(path: Path) -> BagReader:
@@ -326,11 +326,11 @@ _SALVAGERS: dict[str, Callable[[Path], Salvage]] = {
 _MAGIC = {b"#ROSBAG V": "bag", b"\x89MCAP0\r\n": "mcap", b"SQLite format 3\0": "rosbag2"}
 _FILE_MAGIC = [magic for magic, name in _MAGIC.items() if name != "rosbag2"]
 RECORDING_SUFFIXES = {".bag": "bag", ".mcap": "mcap", ".db3": "rosbag2"}
-"""Ending of a file's name -> format."""
+"""File suffix -> format."""
 
 
 def format_of(path: Path) -> str:
-    """The format of a recording, by its first bytes; by its name where these are damaged.
+    """The format of a recording, by its first bytes, or by its name if these are damaged.
 
     Raises:
         SourceNotFoundError: It does not exist.
@@ -381,7 +381,7 @@ def open_reader(path: Path) -> BagReader:
     """Open one recording of any format.
 
     Raises:
-        SourceError: It cannot be read; says why and what to do.
+        SourceError: It cannot be read; says why, and what to do.
     """
     return _READERS[format_of(path)](path)
 
@@ -401,12 +401,12 @@ def open_sources(
 def open_sources(
     paths: Sequence[Path], *, salvage: bool = False, opener: Opener = open_reader
 ) -> BagReader:
-    """Open recordings that belong together, such as a split bag, as one.
+    """Open recordings that belong together, such as a split bag, as one recording.
 
     Args:
         paths: The recordings.
-        salvage: Read what can be read of damaged ones, with a `SalvageReader`.
-        opener: Opens one of them, where they are not salvaged.
+        salvage: Read what is readable of damaged ones, with a `SalvageReader`.
+        opener: Opens one of them, unless they are salvaged.
 
     Raises:
         SourceError: One of them cannot be read, or is given twice.
@@ -440,7 +440,7 @@ def _open_salvaged(paths: Sequence[Path]) -> SalvageReader:
 def limits_of(
     target: str, storage: str
 ) -> tuple[Callable[[Channel], None], Callable[[Message], None]]:
-    """What refuses channels, and what messages, that a format cannot hold, as its writer does.
+    """The writer's checks that a format can hold a channel, and a message.
 
     Args:
         target: ``bag``, ``rosbag2`` or ``mcap``.
@@ -467,7 +467,7 @@ def open_writer(
     Args:
         path: Where to write; does not exist yet.
         target: ``bag``, ``rosbag2`` or ``mcap``.
-        name: Final name, which a rosbag2 folder gives to its files.
+        name: Final name, used for the files in a rosbag2 folder.
         profile: MCAP profile, for ``mcap``.
         library: MCAP library string, for ``mcap``.
         storage: ``sqlite3`` or ``mcap``, for ``rosbag2``.

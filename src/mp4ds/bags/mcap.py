@@ -64,7 +64,7 @@ _OTHERS = (Opcode.ATTACHMENT, Opcode.METADATA)
 
 
 def read_others(stream: RecordStream, declared: Declared) -> Iterator[Record]:
-    """The attachments and metadata records of a file, seeking over all else.
+    """The attachments and metadata records of a file, skipping everything else.
 
     Raises:
         SourceError: The file is damaged or cut short.
@@ -94,21 +94,21 @@ def read_chunks(
     between: Between,
     declared: Declared,
 ) -> Iterator[Record]:
-    """Read an excerpt from the chunks that it needs, by their starts, whatever their order.
+    """Read an excerpt from the chunks that it needs, by their start times, in any file order.
 
     Args:
         stream: A stream of known size.
         excerpt: What to read.
         summary: The file's summary.
-        between: What is between its chunks.
-        declared: What the file declares, from its summary on.
+        between: The records between its chunks.
+        declared: What the file declares, starting with its summary.
 
     Yields:
-        Messages by log time, ties in file order, payloads as the file holds them; attachments
-        and metadata records as they stand among the chunks.
+        Messages by log time, ties in file order, payloads as stored; attachments and metadata
+        records at their places among the chunks.
 
     Raises:
-        SourceError: The file is damaged, or holds other messages than its index tells.
+        SourceError: The file is damaged, or its messages differ from its index.
     """
     others = deque(between.others if excerpt.others else ())
     if excerpt.others:
@@ -155,7 +155,7 @@ def _records(stream: RecordStream, chunk: ChunkEntry) -> Iterator[tuple[int, mem
 
 
 def _check(head: MessageHead, chunk: ChunkEntry, summary: McapSummary) -> None:
-    """Refuse a message that an excerpt without this chunk would have lost."""
+    """Refuse a message that would be missing from an excerpt without this chunk."""
     if not chunk.start <= head.log_time <= chunk.end:
         problem = f"of log time {head.log_time}"
     elif head.channel_id not in summary.channels or (
@@ -178,13 +178,13 @@ class McapReader:
 
     Args:
         path: The file.
-        open_stream: Opens what to read instead of the file itself: its content decompressed,
-            not seekable, whose ``tell()`` counts bytes of the file.
-        message_decompress: Makes the payload of a message from what the file holds; raises
-            `DamageError` for what it cannot read.
+        open_stream: Opens a stream to read instead of the file: its decompressed content, not
+            seekable, whose ``tell()`` counts bytes of the file.
+        message_decompress: Decompresses the payload of a message; raises `DamageError` if it
+            cannot.
 
     Raises:
-        SourceError: The file is missing, no MCAP file, or cut short.
+        SourceError: The file is missing, not an MCAP file, or cut short.
     """
 
     format: Format = "mcap"
@@ -225,7 +225,7 @@ class McapReader:
                 self._declared.add_schema(schema)
             for channel in self._summary.channels.values():
                 if not channel.schema_id or channel.schema_id in schemas:
-                    self._declared.add_channel(channel)  # else its schema is in the data alone
+                    self._declared.add_channel(channel)  # otherwise its schema is only in the data
 
     def _start_pass(self) -> RecordStream:
         if self._open_stream:
@@ -244,7 +244,7 @@ class McapReader:
 
     @property
     def channels(self) -> Sequence[Channel]:
-        """All channels known so far: those of the summary, then those met while reading."""
+        """All channels known so far: those of the summary, then those found while reading."""
         return list(self._declared.channels.values())
 
     @property
@@ -259,12 +259,12 @@ class McapReader:
 
     @property
     def has_statistics(self) -> bool:
-        """Whether the file tells how many messages it has."""
+        """Whether the file states how many messages it has."""
         return self._summary is not None and self._summary.statistics is not None
 
     @property
     def start(self) -> int | None:
-        """The earliest log time in nanoseconds as the summary tells; None if it does not."""
+        """The earliest log time in nanoseconds, from the summary; None if not stated."""
         return self._summary.start if self._summary else None
 
     @property
@@ -274,12 +274,12 @@ class McapReader:
 
     @property
     def is_indexed(self) -> bool:
-        """See `BagReader.is_indexed`; so it is where all that the summary tells fits together."""
+        """See `BagReader.is_indexed`: whether the summary is complete and consistent."""
         return self._between is not None
 
     @cached_property
     def _between(self) -> Between | None:
-        """What is between the chunks, where excerpts can be read from these alone."""
+        """The records between the chunks, if excerpts can be read from chunks alone."""
         summary = self._summary
         if summary is None:
             return None
@@ -289,7 +289,7 @@ class McapReader:
 
     @cached_property
     def _found_between(self) -> Between | None:
-        """What is between the chunks, where all fits together; None else."""
+        """The records between the chunks if everything is consistent, otherwise None."""
         summary = self._summary
         if summary is None or not summary.is_consistent:
             return None
@@ -307,7 +307,7 @@ class McapReader:
         return self._one_pass(lambda stream: self._read(stream, excerpt))
 
     def as_it_stands(self) -> Iterator[Record]:
-        """Read everything once, messages in the order of the file, whatever their log times."""
+        """Read everything once, messages in file order, whatever their log times."""
         return self._one_pass(lambda stream: self._read_through(stream, None))
 
     def _one_pass(self, read: Callable[[RecordStream], Iterator[Record]]) -> Iterator[Record]:
@@ -331,7 +331,7 @@ class McapReader:
 
     @staticmethod
     def _needs_chunks_alone(summary: McapSummary, excerpt: Excerpt) -> bool:
-        # The whole is read as it lies, unless it is too much out of order.
+        # The whole is read in file order, unless that is too far from log-time order.
         return excerpt != EVERYTHING or summary.chunks.held_in_file_order() > protocols.HOLD_BYTES
 
     def _read_chunks(
@@ -352,7 +352,7 @@ class McapReader:
             )
 
     def _hold_back(self) -> HoldBack | None:
-        """What puts messages in order, where the file tells its chunks' times."""
+        """A buffer that sorts messages, if the file states its chunks' times."""
         return HoldBack() if self._summary and self._summary.chunks.has_messages else None
 
     def _read_through(self, stream: RecordStream, held: HoldBack | None) -> Iterator[Record]:
@@ -385,7 +385,7 @@ class McapReader:
             yield from map(self._unpacked, held.release(None))
 
     def _messages(self, opcode: int, body: bytes) -> Iterator[MessageHead]:
-        """The messages of a top-level record, declaring what is between them."""
+        """The messages of a top-level record; schemas and channels are declared on the way."""
         if opcode == Opcode.MESSAGE:
             yield parse_message(body)
         elif opcode == Opcode.CHUNK:
@@ -396,7 +396,7 @@ class McapReader:
                     self._declared.take(kind, part)
 
     def _unpacked(self, message: Message) -> Message:
-        """A message with its payload as it was before it was compressed by itself."""
+        """A message with its individually compressed payload decompressed."""
         if self._decompress is None:
             return message
         try:
@@ -409,13 +409,13 @@ class McapReader:
         )
 
     def stats(self) -> Mapping[int, ChannelStats]:
-        """Counts by the statistics record, spans by the chunks that hold the channel."""
+        """Counts from the statistics record, spans from the chunks that hold the channel."""
         return self._summary.stats() if self._summary else {}
 
     def times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times by channel id. See `BagReader.times`.
 
-        Times past the year 2262 do not fit and are given as the last one that does.
+        Times past the year 2262 do not fit and are clamped.
         """
         pieces: dict[int, list[NDArray[np.uint64]]] = {}
         if self._summary and self._summary.chunks.has_messages:
@@ -490,11 +490,11 @@ class McapReader:
 
 
 def is_mcap(path: Path, is_compressed: bool) -> bool:
-    """Whether a storage file of rosbag2 is one of MCAP.
+    """Whether a storage file of rosbag2 is an MCAP file.
 
     Args:
         path: The file.
-        is_compressed: Whether it is as a whole, so that its name must tell.
+        is_compressed: Whether it is compressed as a whole, so that only its name can tell.
 
     Raises:
         SourceError: It cannot be read.

@@ -1,4 +1,4 @@
-"""What the summary of an MCAP file tells, and its chunks, without reading its messages."""
+"""The summary of an MCAP file and the places of its chunks, without reading messages."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _MAX_OFFSET = 2**62  # sums of three do not wrap
 
 
 class ChunkEntry(NamedTuple):
-    """A chunk that the summary lists.
+    """A chunk listed in the summary.
 
     Attributes:
         offset: Byte offset of its record in the file.
@@ -43,8 +43,7 @@ class ChunkEntry(NamedTuple):
         start: Earliest log time of its messages, nanoseconds; 0 without messages.
         end: Latest log time of its messages, nanoseconds; 0 without messages.
         size: Bytes of its content, decompressed.
-        channels: Ids of the channels that it holds messages of; empty if the file does
-            not tell, or without messages.
+        channels: Ids of the channels with messages in it; empty if not stated, or without messages.
     """
 
     offset: int
@@ -56,9 +55,9 @@ class ChunkEntry(NamedTuple):
 
 
 class ChunkTable:
-    """All chunks that a summary lists, in arrays: a long recording has many of them.
+    """All chunks listed in a summary, in arrays: a long recording has many.
 
-    It is filled by `add`, and may be asked after `finish`.
+    Fill it with `add`, then call `finish` before any query.
     """
 
     def __init__(self) -> None:
@@ -70,7 +69,7 @@ class ChunkTable:
         return len(self._counts)
 
     def add(self, body: bytes) -> None:
-        """Take in a chunk index record.
+        """Add a chunk index record.
 
         Raises:
             DamageError: It does not hold what it must.
@@ -88,7 +87,7 @@ class ChunkTable:
         self._counts.append(len(channels))
 
     def finish(self) -> None:
-        """Order the chunks as they lie in the file."""
+        """Sort the chunks by their place in the file."""
         columns = np.array(self._added, np.uint64).reshape(-1, 6)
         del self._added
         order = np.argsort(columns[:, 0], kind="stable")
@@ -100,7 +99,7 @@ class ChunkTable:
         self._first = (np.cumsum(counts) - counts)[order]
         self._channels = np.array(self._ids, np.uint16)
         self._owners = np.repeat(np.argsort(order).astype(np.int32), counts)
-        # A chunk without messages has the start 0, which would hold back everything before it.
+        # A chunk without messages has start 0, which would hold back everything before it.
         self._empty = (self._held == 0) & (self._starts == 0) & (self._ends == 0)
         self._later_starts = _later_starts(self._known_starts())
         self._places = array("Q", self._offsets.tobytes())
@@ -117,7 +116,7 @@ class ChunkTable:
 
     @property
     def is_sound(self) -> bool:
-        """Whether the chunks can lie and follow each other as it tells."""
+        """Whether the stated places of the chunks are possible."""
         places = self._offsets, self._lengths, self._index_lengths
         if any(column.max(initial=0) > _MAX_OFFSET for column in places):
             return False
@@ -140,7 +139,7 @@ class ChunkTable:
     def spans(self) -> dict[int, tuple[int, int]]:
         """Earliest and latest log time of the chunks that hold a channel, by its id.
 
-        It is empty if a chunk does not tell which channels it holds.
+        Empty if a chunk does not state which channels it holds.
         """
         if ((self._held == 0) & ~self._empty).any():
             return {}
@@ -157,11 +156,11 @@ class ChunkTable:
             yield offset, offset + length, offset + length + index_length
 
     def held_in_file_order(self) -> int:
-        """Bytes that wait at most for earlier messages, if chunks are read as they lie."""
+        """Maximum bytes held back for earlier messages if chunks are read in file order."""
         return self._most_held(np.arange(len(self)))
 
     def held_in_time_order(self) -> int:
-        """Bytes that wait at most for earlier messages, if chunks are read by their starts."""
+        """Maximum bytes held back for earlier messages if chunks are read by start time."""
         return self._most_held(self._by_start(np.arange(len(self))))
 
     def _by_start(self, numbers: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -180,13 +179,12 @@ class ChunkTable:
     def select(
         self, excerpt: Excerpt, unwanted: Collection[int]
     ) -> Iterator[tuple[ChunkEntry, int | None]]:
-        """The chunks that may hold messages of an excerpt, by their starts.
+        """The chunks that may hold messages of an excerpt, by start time.
 
-        Chunks that tell of no messages are among them: whether that is true shows when they
-        are read.
+        Chunks listed without messages are included: whether that is true shows when they are read.
 
         Args:
-            excerpt: Its span counts.
+            excerpt: The excerpt, of which the span is used.
             unwanted: Ids of the channels that are not part of it.
 
         Yields:
@@ -228,7 +226,7 @@ class ChunkTable:
 
 
 def _later_starts(starts: NDArray[np.uint64]) -> array[int]:
-    """The least of each start and those after it."""
+    """The minimum of each start and those after it."""
     return array("Q", np.minimum.accumulate(starts[::-1])[::-1].tobytes())
 
 
@@ -273,12 +271,12 @@ class McapSummary:
 
     @property
     def start(self) -> int | None:
-        """The earliest log time, or None without messages or without knowing."""
+        """The earliest log time; None without messages, or if unknown."""
         span = self._span()
         return span[0] if span else None
 
     def _span(self) -> tuple[int, int] | None:
-        """The earliest and latest log time that anything tells of."""
+        """The earliest and latest log time stated anywhere."""
         statistics, listed = self.statistics, self.chunks.span()
         if not statistics or not statistics.message_count:
             return listed
@@ -335,7 +333,7 @@ class McapSummary:
                 yield _parse_entries(chunk, body)
 
     def covers(self, count: int) -> bool:
-        """Whether so many messages are all that the file has."""
+        """Whether this count is all messages of the file."""
         return self.statistics is not None and self.statistics.message_count == count
 
     def first_places(self, stream: RecordStream) -> dict[int, tuple[int, int, int]] | None:
@@ -369,7 +367,7 @@ def _parse_entries(chunk: int, body: bytes) -> IndexEntries:
 
 
 def read_summary(stream: RecordStream) -> McapSummary | None:
-    """Read the summary section of a file, leaving the stream anywhere.
+    """Read the summary section of a file; the stream's position is undefined afterwards.
 
     Returns:
         The summary, or None if the file has none, or it does not begin where the footer says.
@@ -384,7 +382,7 @@ def read_summary(stream: RecordStream) -> McapSummary | None:
     if size < 2 * len(MAGIC) + FOOTER_BYTES - len(MAGIC):
         raise stream.cut_short()
     stream.seek(size - FOOTER_BYTES)
-    # Read apart from its record: what is there in a file cut short is not a length.
+    # Read separately from its record: in a file cut short, it is not a length.
     tail = stream.read(FOOTER_BYTES)
     if tail[-len(MAGIC) :] != MAGIC or tail[0] != Opcode.FOOTER:
         raise stream.cut_short()
@@ -398,7 +396,7 @@ def read_summary(stream: RecordStream) -> McapSummary | None:
         if opcode == Opcode.FOOTER:
             break
         if opcode not in OF_SUMMARY and opcode < PRIVATE_OPCODE:
-            return None  # what is between records of the data tells of no whole file
+            return None  # bytes between records of the data do not make a complete file
         _add(summary, opcode, body)
     summary.chunks.finish()
     return summary
@@ -427,10 +425,10 @@ _OTHERS = (Opcode.ATTACHMENT, Opcode.METADATA)
 
 @dataclass
 class Between:
-    """What is between the chunks that a summary lists.
+    """The records between the chunks that a summary lists.
 
     Attributes:
-        is_sound: Whether the chunks are where the summary says, and no messages beside them.
+        is_sound: Whether the chunks are where the summary says, with no messages outside them.
         others: Byte offsets of the attachments and metadata records.
         private: How many records of each private opcode there are.
     """
@@ -441,7 +439,7 @@ class Between:
 
 
 def look_between(stream: RecordStream, summary: McapSummary) -> Between:
-    """Look at the records between the chunks, leaving the stream anywhere.
+    """Inspect the records between the chunks; the stream's position is undefined afterwards.
 
     Args:
         stream: A stream of known size.
@@ -471,7 +469,7 @@ def _look(stream: RecordStream, place: int, end: int, found: Between) -> None:
                 found.is_sound = False
             place = following
     except (DamageError, SourceError):
-        found.is_sound = False  # reading it all tells what is wrong
+        found.is_sound = False  # reading everything will show what is wrong
     found.is_sound &= place == end
 
 
@@ -491,7 +489,7 @@ def read_frame(stream: RecordStream, place: int) -> tuple[int, int]:
 
 
 def read_frames(stream: RecordStream) -> Iterator[tuple[int, int]]:
-    """Seek over all records of a file up to its footer.
+    """Walk all records of a file up to its footer, seeking over their bodies.
 
     Args:
         stream: A stream of known size; it may be moved between the frames.

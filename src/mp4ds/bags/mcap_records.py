@@ -55,7 +55,7 @@ _RecordT = TypeVar("_RecordT", covariant=True)
 
 
 class DamageError(ValueError):
-    """What is wrong inside a record; the reader adds where."""
+    """Damage inside a record; the reader adds where it is."""
 
 
 class MessageHead(NamedTuple):
@@ -69,7 +69,7 @@ class MessageHead(NamedTuple):
 
 
 class ByteStream(Protocol):
-    """What is read: a file, or the decompressed content of one."""
+    """A file to read, or its decompressed content."""
 
     def read(self, length: int, /) -> bytes:
         """Read that many bytes; fewer at the end only."""
@@ -94,19 +94,19 @@ class _Parsed(Protocol[_RecordT]):
 
 
 def open_source(path: Path, shown: Path | None = None) -> BinaryIO:
-    """Open a file of a recording, refusing what is none.
+    """Open a file of a recording, refusing anything else.
 
     Args:
         path: The file.
-        shown: Its name in errors, where it is a decompressed copy.
+        shown: Its name in errors, if it is a decompressed copy.
 
     Raises:
-        SourceError: It is missing, unreadable, no regular file, empty, or a git-lfs pointer.
+        SourceError: It is missing, unreadable, not a regular file, empty, or a git-lfs pointer.
     """
     shown = shown or path
     try:
         if not path.is_file() and not path.is_dir() and path.exists():
-            raise SourceError(shown, "is not a regular file")  # to open a pipe could wait forever
+            raise SourceError(shown, "is not a regular file")  # opening a pipe could block forever
         stream = path.open("rb")
     except FileNotFoundError:
         raise SourceNotFoundError(shown) from None
@@ -137,7 +137,7 @@ class RecordStream:
     Args:
         stream: A binary stream at the start of the file.
         path: The file's name, for errors.
-        size: Bytes in the stream; None if it can neither be known nor sought in.
+        size: Bytes in the stream; None if unknown and not seekable.
 
     Attributes:
         start: Byte offset of the record that was read last.
@@ -166,11 +166,11 @@ class RecordStream:
         self._offset = offset
 
     def expect(self, ranges: Iterable[tuple[int, int]]) -> None:
-        """Tell which bytes will be read, first and end of each, in that order."""
+        """Announce which byte ranges will be read, and in which order."""
         expect(self._stream, ranges)
 
     def read_magic(self) -> None:
-        """Read the magic bytes that begin and end a file."""
+        """Read the magic bytes at the beginning and end of a file."""
         at_start = self._offset == 0
         found = self.read(len(MAGIC))
         if found != MAGIC and at_start:
@@ -195,7 +195,7 @@ class RecordStream:
         return data
 
     def _read_in_pieces(self, length: int) -> bytes:
-        # A stream of unknown size may promise anything: allocate what really comes.
+        # A stream of unknown size may state any length: allocate only what is there.
         pieces = bytearray()
         while len(pieces) < length:
             piece = self._stream.read(min(_PIECE_BYTES, length - len(pieces)))
@@ -235,7 +235,7 @@ class _ExactStream(ReadDataStream):
     def read(self, length: int) -> bytes:
         try:
             data = super().read(length)
-        except OverflowError:  # no file is as long as that
+        except OverflowError:  # no file is that long
             raise EndOfFile from None
         if len(data) != length:
             raise EndOfFile
@@ -243,10 +243,10 @@ class _ExactStream(ReadDataStream):
 
 
 def parse(kind: type[_Parsed[_RecordT]], body: bytes | memoryview) -> _RecordT:
-    """Parse a small record by the mcap library, never beyond its end.
+    """Parse a small record with the mcap library, never beyond its end.
 
     Raises:
-        DamageError: It does not hold what its kind must.
+        DamageError: It lacks what its kind must hold.
     """
     return _parse(kind, body)[0]
 
@@ -334,7 +334,7 @@ def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
 
     Args:
         data: The frame.
-        size: Size of the content where known, else the frame must tell it.
+        size: Size of the content if known; otherwise the frame must state it.
 
     Raises:
         DamageError: It is not a zstd frame, damaged, or of another size.
@@ -405,7 +405,7 @@ class Declared:
     """Schemas and channels of one file.
 
     Attributes:
-        channels: By their id in the file, in the order in which they were met.
+        channels: By their id in the file, in order of appearance.
         skipped: Records that only the application that wrote them understands: name -> count.
     """
 
@@ -423,7 +423,7 @@ class Declared:
         return list(dict.fromkeys(schema for schema in unused if schema not in used))
 
     def take(self, opcode: int, body: bytes | memoryview) -> None:
-        """Take in a schema or channel, count a private record, pass over any other.
+        """Add a schema or channel, count a private record, ignore any other.
 
         Raises:
             DamageError: It is damaged, or contradicts what was declared before.
@@ -436,12 +436,12 @@ class Declared:
             self.skip(opcode)
 
     def add_schema(self, schema: mcap_records.Schema) -> None:
-        """Take in a schema. See `take`."""
+        """Add a schema. See `take`."""
         if self._schemas.setdefault(schema.id, schema) != schema:
             raise DamageError(f"schema {schema.id} is defined twice and differently")
 
     def add_channel(self, record: mcap_records.Channel) -> None:
-        """Take in a channel. See `take`."""
+        """Add a channel. See `take`."""
         if self._records.setdefault(record.id, record) != record:
             raise DamageError(
                 f"channel {record.id} ({record.topic}) is defined twice and differently"
@@ -461,11 +461,11 @@ class Declared:
         self.skipped[f"private MCAP records (opcode 0x{opcode:02x})"] += count
 
     def message(self, head: MessageHead, place: str) -> Message:
-        """A message, its payload as the file holds it.
+        """A message, with its payload as stored.
 
         Args:
             head: What the file holds.
-            place: Which one it is, for errors.
+            place: Which message it is, for errors.
 
         Raises:
             DamageError: Its channel is not defined.

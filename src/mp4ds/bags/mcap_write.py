@@ -41,12 +41,12 @@ def check_message(message: Message) -> None:
 class McapWriter:
     """Writes an MCAP file with chunks, indexes and checksums. See `BagWriter`.
 
-    Memory is bounded by one chunk, or one message where that is larger.
+    Memory is bounded by one chunk, or by one message if that is larger.
 
     Args:
         path: The file, which is replaced.
         profile: Profile of the header.
-        library: Library string of the header; this library's own where empty.
+        library: Library string of the header; if empty, this library's own.
         compression: Of the chunks: ``zstd``, ``lz4`` or ``none``.
         chunk_size: Bytes of messages after which a chunk is closed.
 
@@ -89,7 +89,7 @@ class McapWriter:
         return {}
 
     def add_schema(self, schema: Schema) -> None:
-        """Keep a definition, whether a channel will refer to it or not."""
+        """Write a definition, whether a channel refers to it or not."""
         self._schema_id(schema)
 
     def _schema_id(self, schema: Schema) -> int:
@@ -129,12 +129,12 @@ class McapWriter:
 
     @staticmethod
     def _compresses_too_well(data: bytes | memoryview) -> bool:
-        """Whether readers could take its chunk for one that claims more than it holds."""
+        """Whether readers could suspect its chunk of claiming more than it holds."""
         return 2 * len(data) > most_unpacked(compressed_size([data]))
 
     @contextmanager
     def _uncompressed(self) -> Iterator[None]:
-        """The chunk that a message larger than it ends."""
+        """Turn compression off for the chunk that a message larger than a chunk completes."""
         name = "_Writer__compression"
         before = getattr(self._writer, name)
         setattr(self._writer, name, CompressionType.NONE)
@@ -191,7 +191,7 @@ class McapWriter:
 
 
 def compressed_size(payloads: Iterable[bytes | memoryview]) -> int:
-    """About how many bytes messages take in the chunks of an MCAP file.
+    """Approximate size of messages in the chunks of an MCAP file, in bytes.
 
     Args:
         payloads: Of the messages, each as large as a chunk or nearly so.

@@ -1,4 +1,4 @@
-"""What a reader and a writer of recordings can do, and what readers share."""
+"""The interfaces of readers and writers of recordings, and what readers share."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class BagReader(Protocol):
     """One recording, opened for reading. A context manager; the file is never changed.
 
     Attributes:
-        path: What was opened, a file or a folder.
+        path: The file or folder that was opened.
         profile: ``ros1``, ``ros2`` or any other MCAP profile; empty for none.
         library: The MCAP header's library string; empty for other formats.
-        files: All files that the recording consists of, in reading order.
+        files: All files of the recording, in reading order.
     """
 
     path: Path
@@ -50,7 +50,7 @@ class BagReader(Protocol):
     def channels(self) -> Sequence[Channel]:
         """All channels known so far.
 
-        Complete once `records` of everything is exhausted, or where the recording `is_indexed`.
+        Complete once `records` of everything is exhausted, or if the recording `is_indexed`.
         """
         ...
 
@@ -58,15 +58,15 @@ class BagReader(Protocol):
     def unused_schemas(self) -> Sequence[Schema]:
         """Definitions that no channel refers to.
 
-        Complete once `records` of everything is exhausted, or where the recording `is_indexed`.
+        Complete once `records` of everything is exhausted, or if the recording `is_indexed`.
         """
         ...
 
     @property
     def skipped(self) -> Mapping[str, int]:
-        """What the source holds and no dataset can: a phrase -> how many; to be reported.
+        """What the source holds but no dataset can: a phrase -> how many; to be reported.
 
-        Of what the last `records` came across.
+        As found by the last `records`.
         """
         ...
 
@@ -77,38 +77,38 @@ class BagReader(Protocol):
 
     @property
     def is_indexed(self) -> bool:
-        """Whether an excerpt is read, in log-time order, without reading the rest."""
+        """Whether an excerpt can be read, in log-time order, without reading the rest."""
         ...
 
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """Read everything once, or a part of it.
 
-        Messages of one channel come in log-time order, ties in source order; where a file
-        has no index (some MCAP files) they come in file order. Attachments and metadata
-        records come where the file holds them.
+        Messages of one channel come in log-time order, ties in source order; without an index (some
+        MCAP files), they come in file order. Attachments and metadata records come where they are
+        in the file.
 
-        An excerpt has what is part of it, in the order of the whole. Where the recording
+        An excerpt comes in the order of the whole. Where the recording
         `is_indexed`, the messages of consecutive spans are, for each channel, those of the whole
-        one after another. What a damaged index hides is told by the counts of `stats` alone:
-        let the spans be open at both ends, and count their messages.
+        one after another. Only the counts of `stats` reveal what a damaged index hides:
+        use spans that are open at both ends, and count their messages.
 
         Args:
-            excerpt: What to read. Where the recording `is_indexed`, little else is read;
-                else all is, and what is not part of it left out.
+            excerpt: What to read. If the recording `is_indexed`, little else is read; otherwise
+                everything is read, and the rest dropped.
 
         Raises:
-            SourceError: The file is damaged; names the file and, where known, the topic.
+            SourceError: The file is damaged; names the file and, if known, the topic.
         """
         ...
 
     def stats(self) -> Mapping[int, ChannelStats]:
-        """Counts and time spans by channel id as far as an index tells, without reading on."""
+        """Counts and time spans by channel id, as far as known from an index, without reading."""
         ...
 
     def times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times of every message, nanoseconds, sorted, by channel id.
 
-        Uses the index where there is one, else reads the file.
+        Uses the index if there is one, otherwise reads the file.
         """
         ...
 
@@ -124,14 +124,14 @@ class BagReader(Protocol):
 class BagWriter(Protocol):
     """One recording, opened for writing under a temporary name by the caller.
 
-    A context manager: leaving it normally completes the file, leaving it with an exception
-    abandons it (the caller removes what is left).
+    A context manager: leaving it normally completes the file; an exception abandons it, and the
+    caller removes what is left.
     """
 
     format: str
 
     def add_channel(self, channel: Channel) -> None:
-        """Declare a channel; every message's channel must have been declared.
+        """Declare a channel; required before its messages.
 
         Raises:
             ConversionError: The format cannot hold the channel.
@@ -139,7 +139,7 @@ class BagWriter(Protocol):
         ...
 
     def add_schema(self, schema: Schema) -> None:
-        """Keep a definition that no channel refers to; formats without such count it."""
+        """Keep a definition that no channel refers to, or count it in `omitted`."""
         ...
 
     def write(self, message: Message) -> None:
@@ -156,7 +156,7 @@ class BagWriter(Protocol):
 
     @property
     def omitted(self) -> Mapping[str, int]:
-        """What the format cannot hold and was left out: a phrase -> how many."""
+        """What was left out because the format cannot hold it: a phrase -> how many."""
         ...
 
     def __enter__(self) -> BagWriter: ...
@@ -165,7 +165,7 @@ class BagWriter(Protocol):
 
 
 def write_record(writer: BagWriter, record: Record) -> None:
-    """Append a record, its channel declared first where that is not done."""
+    """Append a record, declaring its channel first if necessary."""
     if isinstance(record, Message):
         writer.add_channel(record.channel)
         writer.write(record)
@@ -178,11 +178,11 @@ def write_record(writer: BagWriter, record: Record) -> None:
 # ---------------------------------------------------------------- ordering
 
 HOLD_BYTES = 256 * 2**20
-"""Payload bytes held back at most; what is out of order by more comes as early as it can."""
+"""Maximum payload bytes held back; messages further out of order come as early as possible."""
 
 
 class HoldBack:
-    """Sorts messages by log time, ties in source order, holding back only what it must."""
+    """Sorts messages by log time, ties in source order, holding back no more than necessary."""
 
     def __init__(self) -> None:
         self._heap: list[tuple[int, int, int, Message]] = []
@@ -193,23 +193,23 @@ class HoldBack:
         return len(self._heap)
 
     def add(self, message: Message, place: int = 0) -> None:
-        """Take a message in.
+        """Add a message.
 
         Args:
             message: The message.
-            place: Where it is in the source, if messages are not added in source order;
-                ties of one place come in the order in which they were added.
+            place: Its place in the source, if messages are not added in source order; ties of one
+                place come in the order of adding.
         """
         self._added += 1
         self._bytes += len(message.data)
         heapq.heappush(self._heap, (message.log_time, place, self._added, message))
 
     def release(self, until: int | None) -> Iterator[Message]:
-        """Give out, in order, what no later message can precede.
+        """Yield, in order, the messages that no later one can precede.
 
         Args:
-            until: No message added later precedes one of this log time, in nanoseconds; None
-                when no message follows at all.
+            until: No message added later is earlier than this log time, in nanoseconds; None if no
+                message follows.
         """
         while self._heap and (
             until is None or self._heap[0][0] <= until or self._bytes > HOLD_BYTES
@@ -220,11 +220,11 @@ class HoldBack:
 
 
 class SourcePart(NamedTuple):
-    """One of several sources that are read as one.
+    """One of several sources read as one.
 
     Attributes:
-        start: None of its messages has an earlier log time, nanoseconds.
-        records: Begins to read it.
+        start: A lower bound of its messages' log times, nanoseconds.
+        records: Starts reading it.
     """
 
     start: int
@@ -232,12 +232,12 @@ class SourcePart(NamedTuple):
 
 
 def merged(parts: Sequence[SourcePart]) -> Iterator[Record]:
-    """Several sources in log-time order, each being read from when its time has come.
+    """Several sources merged in log-time order, each opened when it is needed.
 
     Ties come in the order of `parts`. Attachments and metadata records do not wait.
 
     Args:
-        parts: Each in log-time order; one that is not comes as it is.
+        parts: Each in log-time order; a part that is not is passed on in its own order.
     """
     waiting = sorted(
         range(len(parts)), key=lambda number: (parts[number].start, number), reverse=True
@@ -266,21 +266,21 @@ def merged(parts: Sequence[SourcePart]) -> Iterator[Record]:
 # ---------------------------------------------------------------- bounds
 
 CHUNK_RATIO = 256  # of lz4 it is 255
-"""Times smaller than its content the data of a large chunk or message is at most."""
+"""Maximum compression ratio of a large chunk or message."""
 
 FILE_RATIO = 1024
-"""The same of a whole file, which is not held in memory."""
+"""The same for a whole file, which is not held in memory."""
 
 ZSTD_PIECE = 2**11
-"""Bytes of zstd that are unpacked at a time: they give 64 MiB at most."""
+"""Bytes of zstd decompressed at a time, which give 64 MiB at most."""
 
 _ALWAYS = 128 * 2**20
 
 
 def most_unpacked(packed: int, ratio: int = CHUNK_RATIO) -> int:
-    """Bytes that so many compressed ones may unpack to.
+    """Maximum decompressed size of so many bytes.
 
-    Small ones may hold anything, such as a black picture.
+    Small ones are not limited: they may hold a black picture.
     """
     return max(_ALWAYS, ratio * packed)
 
@@ -300,7 +300,7 @@ def times_of(records: Iterable[Record]) -> dict[int, NDArray[np.int64]]:
 
 
 def sorted_times(times: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """Log times, sorted; those past the year 2262 as the last one that fits."""
+    """Log times, sorted; those past the year 2262 are clamped."""
     return np.sort(np.minimum(times, _INT64_MAX)).astype(np.int64)
 
 
@@ -316,5 +316,5 @@ def first_of(records: Iterable[Record]) -> dict[int, Message]:
 
 
 def with_own_payload(message: Message) -> Message:
-    """A message to be kept: a view would keep the whole chunk in memory."""
+    """A message with a copied payload, to keep: a view would keep the whole chunk in memory."""
     return replace(message, data=bytes(message.data))

@@ -1,7 +1,7 @@
 """Reads ROS 1 bags of format 2.0 (wiki.ros.org/Bags/Format/2.0).
 
-Connection headers stay as recorded, the index is kept in arrays, chunks unpack to their declared
-size and no further.
+Connection headers stay as recorded, the index is kept in arrays, and chunks are never decompressed
+beyond their declared size.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, R
 
 CACHED_CHUNKS = 8
 CACHED_BYTES = 64 * 2**20
-"""Unpacked chunks are kept up to both limits, but always two: chunks may overlap in time."""
+"""Decompressed chunks are cached up to both limits, but always two: chunks may overlap in time."""
 
 _LATEST = 2**63 - 1  # more than any time of a bag
-_CHUNK_HEAD, _INDEX_HEAD = 96, 64  # bytes at most, of the records as everybody writes them
+_CHUNK_HEAD, _INDEX_HEAD = 96, 64  # maximum bytes of the records as usually written
 _COUNT = struct.Struct("<II")  # of a chunk: connection, messages
 _INDEX_ENTRY = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
 
@@ -70,14 +70,14 @@ class _Index(NamedTuple):
 class Ros1Reader:
     """Reads a ROS 1 bag. See `BagReader`.
 
-    Messages come in log-time order, ties in file order. Payloads are slices of their
-    unpacked chunk, which they keep in memory for as long as they live.
+    Messages come in log-time order, ties in file order. Payloads are slices of their decompressed
+    chunk, which they keep in memory.
 
     Args:
         path: The file.
 
     Raises:
-        SourceError: The file is missing, no bag, not indexed, encrypted, or damaged.
+        SourceError: The file is missing, not a bag, not indexed, encrypted, or damaged.
     """
 
     format: Format = "bag"
@@ -100,7 +100,7 @@ class Ros1Reader:
             self._index = self._bag.take_index()
             for number, chunk in enumerate(self._bag.chunks):
                 if not any(chunk.counts.values()):
-                    self._chunk(number)  # nobody else will see whether it holds messages
+                    self._chunk(number)  # otherwise nothing would check whether it holds messages
         except DAMAGE as error:
             self._close()
             raise SourceError(path, f"is damaged: {reason(error)}", COPY_AGAIN) from None
@@ -112,12 +112,12 @@ class Ros1Reader:
 
     @property
     def position(self) -> int:
-        """Bytes of the chunks that `records` has come to; the file's size at its end."""
+        """Bytes of the chunks that `records` has reached; the file's size at the end."""
         return self._position
 
     @property
     def is_indexed(self) -> bool:
-        """See `BagReader.is_indexed`: a bag without an index is not read at all."""
+        """See `BagReader.is_indexed`: bags without an index are refused."""
         return True
 
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
@@ -134,7 +134,7 @@ class Ros1Reader:
         self._position = self._size
 
     def _entries(self, excerpt: Excerpt) -> Iterator[tuple[Channel, int, int, int, bool]]:
-        """Of every message: channel, log time, chunk number, offset, if it ends its chunk's use."""
+        """Per message: channel, log time, chunk number, offset, whether it is the chunk's last."""
         channels = [channel for channel in self.channels if excerpt.has_topic(channel.topic)]
         parts = [self._index[channel.id].within(excerpt) for channel in channels]
         if not parts:
@@ -163,7 +163,7 @@ class Ros1Reader:
         return Message(channel, time, time, 0, data)
 
     def _chunk(self, number: int) -> memoryview:
-        """An unpacked chunk, from the cache where it is there."""
+        """A decompressed chunk, from the cache if possible."""
         if number in self._chunks:
             self._chunks.move_to_end(number)
             return self._chunks[number]
@@ -175,14 +175,14 @@ class Ros1Reader:
         return unpacked
 
     def stats(self) -> Mapping[int, ChannelStats]:
-        """Counts and spans by the index; a channel without messages has times of 0."""
+        """Counts and spans from the index; a channel without messages has times of 0."""
         return {
             key: ChannelStats(len(times), *(map(int, times[[0, -1]]) if len(times) else (0, 0)))
             for key, times in self.times().items()
         }
 
     def times(self) -> Mapping[int, NDArray[np.int64]]:
-        """Log times by the index."""
+        """Log times from the index."""
         return {key: index.times for key, index in self._index.items()}
 
     def first(self, channel: Channel) -> Message | None:
@@ -205,14 +205,14 @@ class Ros1Reader:
 
 
 def _first_seen(numbers: NDArray[np.int32]) -> list[int]:
-    """Each number once, where it comes first."""
+    """The distinct numbers, in order of first appearance."""
     found, places = np.unique(numbers, return_index=True)
     ordered: list[int] = found[np.argsort(places)].tolist()
     return ordered
 
 
 class _Chunk(NamedTuple):
-    """A chunk as the index of the bag and its own header tell it.
+    """A chunk, from the bag's index and its own header.
 
     Attributes:
         start: Byte where its record begins.
@@ -236,10 +236,10 @@ class _Bag:
 
     Attributes:
         channels: By connection number, in the order of the bag's index.
-        chunks: In that order, too.
+        chunks: In the order of the index.
 
     Raises:
-        DamageError: The index is damaged, or does not list all that there is.
+        DamageError: The index is damaged or incomplete.
     """
 
     def __init__(self, path: Path) -> None:
@@ -281,7 +281,7 @@ class _Bag:
         for chunk_start in sorted(ends):
             check_between(file, first, chunk_start)
             first = ends[chunk_start]
-        # a bag without chunks is read to its end: nothing else tells where its index is
+        # a bag without chunks is read to its end: there is no other way to find its index
         check_between(file, first, index if listed else file.size)
 
     def _goes_on(self) -> bool:
@@ -298,7 +298,7 @@ class _Bag:
         number = record.number(b"conn")
         header = Fields(split_header(self.file.take(self.file.length())))
         channel = make_channel(number, record.get(b"topic", header.get(b"topic", b"")), header)
-        self.channels.setdefault(number, channel)  # the first of a number counts, as in ROS
+        self.channels.setdefault(number, channel)  # the first with a number counts, as in ROS
 
     def _read_chunk_info(self) -> _Chunk:
         header = self.file.header(Op.CHUNK_INFO)
@@ -308,7 +308,7 @@ class _Bag:
         return _Chunk(header.number(b"chunk_pos", 8), dict(_COUNT.iter_unpack(counts)))
 
     def _read_chunk(self, chunk: _Chunk) -> _Chunk:
-        """A chunk with what its header tells; it will unpack to that size."""
+        """A chunk with its header's fields; it will be decompressed to that size."""
         self.file.seek(chunk.start)
         header = self.file.header(Op.CHUNK)
         compression = header.get(b"compression", b"").decode(errors="replace")
@@ -317,7 +317,7 @@ class _Bag:
         return _Chunk(chunk.start, chunk.counts, compression, header.number(b"size"), place, packed)
 
     def _read_index(self) -> None:
-        """Read what the last chunk holds of one connection."""
+        """Read the index of one connection in the last chunk."""
         header = self.file.header(Op.INDEX)
         _check_version(header)
         number, count = header.number(b"conn"), header.number(b"count")
@@ -335,7 +335,7 @@ class _Bag:
 
     @staticmethod
     def _index_ranges(chunks: Sequence[_Chunk], end: int) -> Iterator[tuple[int, int]]:
-        """Where the index lies: between the data of the chunks."""
+        """The byte ranges of the index: between the data of the chunks."""
         ends = [chunk.start for chunk in chunks[1:]] + [end]
         for chunk, next_start in zip(chunks, ends, strict=True):
             head = chunk.start + _CHUNK_HEAD
@@ -345,15 +345,15 @@ class _Bag:
                 yield max(head, next_start - sum(entries)), next_start
 
     def expect(self, chunks: Iterable[int]) -> None:
-        """Tell which chunks will be read, by their numbers, in that order."""
+        """Announce which chunks will be read, by number, in order."""
         found = map(self.chunks.__getitem__, chunks)
         expect(self.file.stream, ((one.place, one.place + one.packed) for one in found))
 
     def content(self, number: int) -> memoryview:
-        """An unpacked chunk.
+        """A decompressed chunk.
 
         Raises:
-            DamageError: It is damaged, or holds another number of messages than the index lists.
+            DamageError: It is damaged, or its number of messages differs from the index.
         """
         chunk = self.chunks[number]
         self.file.seek(chunk.place)
@@ -365,7 +365,7 @@ class _Bag:
         return unpacked
 
     def take_index(self) -> dict[int, _Index]:
-        """The index by connection number; drops what it was made from."""
+        """The index by connection number; frees the raw entries."""
         return {number: self._sorted_index(number) for number in self.channels}
 
     def _sorted_index(self, number: int) -> _Index:

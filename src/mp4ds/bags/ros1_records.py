@@ -22,11 +22,11 @@ from mp4ds.records import Channel, Schema
 
 MAGIC = b"#ROSBAG V2.0\n"
 MAX_TIME = 2**32 * 10**9
-"""A ROS 1 time is two uint32, seconds and nanoseconds: from here on there are no times."""
+"""A ROS 1 time is two uint32, seconds and nanoseconds: times must be below this."""
 UINT32 = struct.Struct("<I")
 COPY_AGAIN = f"Copy it again, repair it with `rosbag reindex`, or {SALVAGE}"
 DAMAGE = (DamageError, OSError)
-"""What reading a damaged bag raises, or one on a damaged disk."""
+"""Errors raised while reading a damaged bag, or from a damaged disk."""
 
 _TIME = struct.Struct("<II")
 _BASE64 = ";base64"  # marks a connection header field that is not UTF-8, as metadata must be
@@ -53,7 +53,7 @@ class Fields(dict[bytes, bytes]):
         """A field that is an unsigned number.
 
         Raises:
-            DamageError: It is not there, or not of that size.
+            DamageError: It is missing, or has another size.
         """
         value = self.get(name, b"")
         if len(value) != size:
@@ -62,12 +62,12 @@ class Fields(dict[bytes, bytes]):
 
     @property
     def op(self) -> int:
-        """The kind of the record."""
+        """The record's kind."""
         return self.number(b"op", 1)
 
 
 class BagFile:
-    """A bag that is read record by record.
+    """A bag being read record by record.
 
     Args:
         path: The file.
@@ -78,7 +78,7 @@ class BagFile:
         self.size = path.stat().st_size
 
     def seek(self, place: int) -> None:
-        """Go to a byte.
+        """Seek to a byte.
 
         Raises:
             DamageError: The file ends before.
@@ -88,7 +88,7 @@ class BagFile:
         self.stream.seek(place)
 
     def tell(self) -> int:
-        """The byte that is read next."""
+        """The position of the next byte to read."""
         return self.stream.tell()
 
     def take(self, size: int) -> bytes:
@@ -110,10 +110,10 @@ class BagFile:
         """The header of the next record.
 
         Args:
-            op: What it should be; None for any.
+            op: Expected kind; None for any.
 
         Raises:
-            DamageError: It is not, or is cut short.
+            DamageError: It is of another kind, or cut short.
         """
         fields = Fields(split_header(self.take(self.length())))
         if op is not None and fields.op != op:
@@ -139,7 +139,7 @@ def check_bag(path: Path) -> int:
         The file's size, bytes.
 
     Raises:
-        SourceError: It is missing, empty, no bag, an old or encrypted one, or not indexed.
+        SourceError: It is missing, empty, not a bag, an old or encrypted one, or not indexed.
     """
     with closing(BagFile(path)) as file:
         size = file.size
@@ -184,7 +184,7 @@ def other_format(path: Path, start: bytes) -> SourceError:
 
 
 def reason(error: DamageError | OSError) -> str:
-    """What an error of `DAMAGE` means, as the end of a sentence."""
+    """An error of `DAMAGE` in words, as the end of a sentence."""
     if isinstance(error, OSError) and error.strerror:
         return f"it cannot be read: {error.strerror}"
     return str(error)
@@ -208,23 +208,23 @@ def split_header(raw: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def join_header(fields: Iterable[tuple[bytes, bytes]]) -> bytes:
-    """A record's header, with its length, of fields in order."""
+    """A record's header with its length, from its fields in order."""
     pieces = [name + b"=" + value for name, value in fields]
     body = b"".join(UINT32.pack(len(piece)) + piece for piece in pieces)
     return UINT32.pack(len(body)) + body
 
 
 def payload(chunk: memoryview, offset: int, number: int, time: int) -> memoryview:
-    """The message at an offset of an unpacked chunk.
+    """The message at an offset in a decompressed chunk.
 
     Args:
         chunk: The chunk.
         offset: Where the index says that the message is.
-        number: Number of the connection that it should be of.
-        time: Log time that it should have, nanoseconds.
+        number: Expected connection number.
+        time: Expected log time, nanoseconds.
 
     Raises:
-        DamageError: Another message is there, or none.
+        DamageError: There is another message, or none.
     """
     while True:
         size = _number(chunk, offset)
@@ -246,7 +246,7 @@ def payload(chunk: memoryview, offset: int, number: int, time: int) -> memoryvie
 
 
 def count_messages(chunk: memoryview) -> int:
-    """How many messages an unpacked chunk holds, whatever the index says.
+    """Number of messages in a decompressed chunk, whatever the index says.
 
     Raises:
         DamageError: It ends within a record.
@@ -261,7 +261,7 @@ def count_messages(chunk: memoryview) -> int:
 
 
 def check_between(file: BagFile, place: int, end: int) -> None:
-    """Refuse messages between two bytes of a bag, where the index lists none.
+    """Refuse messages in a range of bytes where the index lists none.
 
     Raises:
         DamageError: There are some, or something that is not a record.
@@ -278,8 +278,8 @@ def unpack_chunk(compression: str, size: int, data: bytes) -> bytes:
 
     Args:
         compression: ``none``, ``bz2`` or ``lz4``.
-        size: What it must unpack to; no more is unpacked, whatever it holds.
-        data: As it is in the file.
+        size: Its decompressed size; decompression never goes beyond it.
+        data: The data, as stored.
 
     Raises:
         DamageError: The data is damaged, or the compression is not known.
@@ -306,8 +306,8 @@ def unpack_chunk(compression: str, size: int, data: bytes) -> bytes:
 def make_channel(number: int, topic: bytes, header: Mapping[bytes, bytes]) -> Channel:
     """A connection as a channel.
 
-    Its metadata holds ``topic`` only where that is not the record's: empty if the header
-    has none, as in bags of RealSense cameras.
+    Its metadata holds ``topic`` only if that differs from the record's: empty if the header has
+    none, as in bags of RealSense cameras.
 
     Args:
         number: The connection's number.
@@ -337,7 +337,7 @@ def make_header(channel: Channel) -> tuple[bytes, list[tuple[bytes, bytes]]]:
     topic = channel.topic.encode(errors="surrogateescape")
     inner = others.pop(b"topic", topic)
     if _text(inner) == channel.topic:
-        topic = inner  # both are not UTF-8, and only the inner one was kept byte for byte
+        topic = inner  # neither is UTF-8, and only the inner one was kept byte for byte
     header = {b"topic": inner} if inner else {}
     if channel.schema:
         name = channel.schema.name.encode(errors="surrogateescape")
@@ -359,5 +359,5 @@ def _restored(key: str, value: str) -> tuple[bytes, bytes]:
         try:
             return with_name, base64.b64decode(value, validate=True)
         except binascii.Error:
-            pass  # a field that happens to be named so
+            pass  # a field that happens to have that name
     return key.encode(errors="surrogateescape"), value.encode(errors="surrogateescape")

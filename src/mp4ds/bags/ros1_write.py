@@ -19,7 +19,7 @@ from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
 
 _MAX_PAYLOAD = 2**32 - 2**24  # lengths are uint32; leaves room for the rest of the chunk
 _CHUNK_BYTES = 2**20
-_BAG_HEADER_BYTES = 4096  # padded, so that it can be written again at the end
+_BAG_HEADER_BYTES = 4096  # padded, so that it can be rewritten at the end
 _PAIR = struct.Struct("<II")
 _ENTRY = struct.Struct("<III")  # seconds, nanoseconds, offset in the chunk
 _MESSAGE_HEAD = struct.Struct("<II3sBI5sII5sIII")  # op, conn, time, and the payload's length
@@ -29,7 +29,7 @@ def check_channel(channel: Channel) -> None:
     """Refuse a channel that a bag cannot hold.
 
     Raises:
-        ConversionError: It is not of ROS 1.
+        ConversionError: It is not a ROS 1 channel.
     """
     if channel.message_encoding != "ros1":
         raise ConversionError(
@@ -44,7 +44,7 @@ def check_message(message: Message) -> None:
     """Refuse a message that a bag cannot hold.
 
     Raises:
-        ConversionError: It is too long, or of a time that ROS 1 does not have.
+        ConversionError: It is too long, or its time is outside the range of ROS 1.
     """
     topic = message.channel.topic
     if not 0 <= message.log_time < MAX_TIME:
@@ -83,7 +83,7 @@ class Ros1Writer:
 
     @property
     def omitted(self) -> Mapping[str, int]:
-        """What a bag has no place for. See `BagWriter.omitted`."""
+        """What a bag cannot hold. See `BagWriter.omitted`."""
         return dict(self._omitted)
 
     def add_channel(self, channel: Channel) -> None:
@@ -126,7 +126,7 @@ class Ros1Writer:
 
 
 class _BagFile:
-    """A bag being written: chunks with the index of each, then all connections and chunks.
+    """A bag being written: chunks, each with its index, then all connections and chunk infos.
 
     Args:
         path: The file, which must not exist.
@@ -157,7 +157,7 @@ class _BagFile:
         self.file.write(header + _uint32(padding) + b" " * padding)
 
     def connect(self, topic: bytes, header: Iterable[tuple[bytes, bytes]]) -> int:
-        """Add a connection with a header of its own, and return its number."""
+        """Add a connection with its own header, and return its number."""
         number = len(self._connections)
         record = _header(Op.CONNECTION, (b"conn", _uint32(number)), (b"topic", topic))
         self._connections.append(record + join_header(header))
@@ -203,7 +203,7 @@ class _BagFile:
         self._chunk_infos.append(header + _uint32(len(counts)) + counts)
 
     def finish(self) -> None:
-        """Write what is left and the index, and close the file."""
+        """Write the last chunk and the index, and close the file."""
         self._end_chunk()
         place = self.file.tell()
         self.file.writelines(self._connections)

@@ -54,13 +54,13 @@ class Rosbag2Reader:
     """Reads a rosbag2 recording of sqlite3 or MCAP storage. See `BagReader`.
 
     The first record is a metadata record ``mp4ds:rosbag2`` that holds the metadata.yaml and
-    the small tables of the storage files, verbatim. Payloads that were compressed one by one
-    are given out decompressed.
+    the small tables of the storage files, verbatim. Individually compressed payloads are
+    decompressed.
 
     Args:
         path: A folder, or one ``.db3`` or ``.mcap`` file.
-        workdir: Where an sqlite3 file that is compressed as a whole is decompressed, and a
-            remote one copied, for as long as it is read; the system's temporary folder by default.
+        workdir: Where an sqlite3 file that is compressed as a whole is decompressed, or a remote
+            one copied, while it is read; by default, the system's temporary folder.
 
     Raises:
         SourceError: The recording is incomplete, damaged, or of an unknown kind.
@@ -122,7 +122,7 @@ class Rosbag2Reader:
         return reader
 
     def _unpack_first(self) -> None:
-        # Its channels are wanted before anything is read: keep it until it was.
+        # Its channels are needed before anything is read: keep it until then.
         with ExitStack() as stack:
             reader = stack.enter_context(self._opened(0))
             self._readers[0] = reader
@@ -131,7 +131,7 @@ class Rosbag2Reader:
 
     @contextmanager
     def _opened(self, number: int) -> Iterator[StorageReader]:
-        """The reader of a storage file, decompressed for as long as it is needed."""
+        """The reader of a storage file, which is decompressed while it is needed."""
         reader = self._readers[number]
         if reader:
             yield reader
@@ -186,7 +186,7 @@ class Rosbag2Reader:
 
     @property
     def _gives_excerpts(self) -> bool:
-        """Whether each storage file gives excerpts in log-time order, if not always fast."""
+        """Whether each storage file gives excerpts in log-time order, though perhaps slowly."""
         return not any(self._is_packed) and all(
             isinstance(reader, SqliteReader) or (reader is not None and reader.is_indexed)
             for reader in self._readers
@@ -212,7 +212,7 @@ class Rosbag2Reader:
         self._channels.add_listed()
 
     def _consecutive_records(self, excerpt: Excerpt) -> Iterator[Record]:
-        """What an excerpt needs at least, file by file."""
+        """The minimum to read for an excerpt, file by file."""
         part = EVERYTHING if excerpt.has_messages else excerpt
         return consecutive(self._readers, lambda number: self._file_records(number, part))
 
@@ -247,7 +247,7 @@ class Rosbag2Reader:
         return MetadataRecord(RECORD, content)
 
     def stats(self) -> Mapping[int, ChannelStats]:
-        """See `BagReader.stats`; empty if one of the files does not tell."""
+        """See `BagReader.stats`; empty if it is unknown for one of the files."""
         total: dict[int, ChannelStats] = {}
         for number, reader in enumerate(self._readers):
             stats = reader.stats() if reader and _is_complete(reader) else {}
@@ -273,7 +273,7 @@ class Rosbag2Reader:
         return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items()}
 
     def first(self, channel: Channel) -> Message | None:
-        """See `BagReader.first`; files that must be decompressed are taken to follow in time."""
+        """See `BagReader.first`; files to be decompressed are assumed to be consecutive in time."""
         best: Message | None = None
         for number, known in enumerate(self._readers):
             if best and (not known or (known.start or 0) > best.log_time):
@@ -325,7 +325,7 @@ def _folder_info(path: Path) -> BagInfo:
 
 
 def _sibling_info(path: Path) -> BagInfo | None:
-    """What a metadata.yaml beside a storage file says of it, if it says anything."""
+    """The metadata.yaml beside a storage file, if it lists that file."""
     sibling = path.parent / METADATA_FILE
     if not sibling.exists():
         return None

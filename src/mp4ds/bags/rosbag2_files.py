@@ -1,4 +1,4 @@
-"""The storage files of a rosbag2 folder: what makes one recording of them, and zstd."""
+"""The storage files of a rosbag2 folder: reading them as one recording, and zstd."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def is_zstd(path: Path) -> bool:
 
 
 class ZstdStream:
-    """The content of a compressed file, read once from its start, up to where it is damaged.
+    """The content of a compressed file, read once from its start, up to any damage.
 
     Args:
         path: The compressed file.
@@ -60,7 +60,7 @@ class ZstdStream:
         self.problem = ""
 
     def read(self, length: int, /) -> bytes:
-        """Read so many decompressed bytes; fewer at the end, or before damage."""
+        """Read that many decompressed bytes; fewer at the end, or before damage."""
         while len(self._left) < length and not self._ended:
             piece = self._file.read(ZSTD_PIECE)
             if not piece:
@@ -96,7 +96,7 @@ class ZstdStream:
 
 
 class ZstdFile(ZstdStream):
-    """The content of a compressed file that is sound.
+    """The content of an undamaged compressed file.
 
     Args:
         path: The compressed file.
@@ -107,10 +107,10 @@ class ZstdFile(ZstdStream):
         self._path = path
 
     def read(self, length: int, /) -> bytes:
-        """Read so many decompressed bytes; fewer at the end only.
+        """Read that many decompressed bytes; fewer at the end only.
 
         Raises:
-            SourceError: It is damaged, cut short, or unpacks to too much.
+            SourceError: It is damaged, cut short, or decompresses to too much.
         """
         data = super().read(length)
         if self.problem and len(data) < length:
@@ -127,10 +127,10 @@ class ZstdFile(ZstdStream):
 
 
 def copy_file(path: Path, target: Path) -> None:
-    """Bring a remote file here, with what is beside it of a database that was not closed.
+    """Download a remote file, with the -wal or -journal beside a database that was not closed.
 
     Raises:
-        SourceError: There is no room for it.
+        SourceError: There is not enough space for it.
         RemoteError: It cannot be read.
         OSError: The target cannot be written.
     """
@@ -154,7 +154,7 @@ def decompress_file(path: Path, target: Path) -> None:
     """Decompress a file into another one.
 
     Raises:
-        SourceError: The file is damaged, cut short, or unpacks to too much.
+        SourceError: The file is damaged, cut short, or decompresses to too much.
         OSError: The target cannot be written.
     """
     with closing(ZstdFile(path)) as stream, target.open("wb") as output:
@@ -165,7 +165,7 @@ def decompress_file(path: Path, target: Path) -> None:
 # ---------------------------------------------------------------- parts
 
 STORAGE_NAME = re.compile(r"(?P<stem>.*?)(?:_(?P<number>\d+))?\.(?:db3|mcap)(?:\.zstd)?")
-"""How storage files are named: after the recording, with a number."""
+"""Names of storage files: the recording's name with a number."""
 
 
 def unlisted_storage(folder: Path, listed: Collection[str]) -> list[str]:
@@ -187,7 +187,7 @@ def unlisted_storage(folder: Path, listed: Collection[str]) -> list[str]:
         for name in there
         if STORAGE_NAME.fullmatch(name)
         and name not in listed
-        and f"{name}.zstd" not in listed  # ROS 2 leaves what it decompressed to play it
+        and f"{name}.zstd" not in listed  # ROS 2 leaves behind the files it decompressed to play
         and (not stems or stem(name) in stems)
     ]
 
@@ -209,12 +209,12 @@ class StorageReader(Protocol):
 
 
 class SharedChannels:
-    """Channels of the storage files, made those of the recording.
+    """Channels of the storage files, mapped to those of the recording.
 
     Args:
-        info: What the metadata.yaml tells, if there is one.
+        info: The metadata.yaml, if there is one.
         storage: ``sqlite3`` or ``mcap``.
-        is_folder: Whether all that the metadata.yaml lists belongs to the recording.
+        is_folder: Whether everything listed in metadata.yaml belongs to the recording.
     """
 
     def __init__(self, info: BagInfo | None, storage: str, *, is_folder: bool) -> None:
@@ -227,7 +227,7 @@ class SharedChannels:
         self._schemas: dict[Schema, None] = {}
 
     def take_over(self, number: int, reader: StorageReader) -> None:
-        """Make all that a storage file declares part of the recording."""
+        """Add everything a storage file declares to the recording."""
         for channel in reader.channels:
             self.share(number, channel)
         self._schemas.update(dict.fromkeys(reader.unused_schemas))
@@ -238,7 +238,7 @@ class SharedChannels:
         if known:
             return known
         channel = self._with_listed_qos(channel)
-        # Equal channels of one file stay apart; those of several files are one.
+        # Equal channels of one file stay separate; those of several files are merged.
         place = number, channel.identity
         key = channel.identity, self._seen[place]
         self._seen[place] += 1
@@ -247,7 +247,7 @@ class SharedChannels:
         return shared
 
     def _with_listed_qos(self, channel: Channel) -> Channel:
-        """A topic of a database without a column for QoS, with what metadata.yaml tells."""
+        """A topic of a database without a QoS column, with the QoS of metadata.yaml."""
         if self._storage == "mcap" or not self._info or QOS_KEY in channel.metadata:
             return channel
         for topic in self._info.topics:
@@ -256,7 +256,7 @@ class SharedChannels:
         return channel
 
     def add_listed(self) -> None:
-        """Topics without messages may be in metadata.yaml alone."""
+        """Topics without messages may be in metadata.yaml only."""
         if not self._info or not self._is_folder:
             return
         known = {(channel.topic, channel.type_name) for channel in self._channels.values()}
@@ -280,11 +280,11 @@ class SharedChannels:
 def consecutive(
     readers: Sequence[StorageReader | None], records: Callable[[int], Iterator[Record]]
 ) -> Iterator[Record]:
-    """Storage files one after another, with what overlaps in log-time order.
+    """Storage files one after another; overlapping ones are merged in log-time order.
 
     Args:
-        readers: Of the files; None for one that is not open yet.
-        records: Reads the file of a number.
+        readers: The files' readers; None for one that is not open yet.
+        records: Reads the file with a number.
     """
     held = HoldBack()
     for number in range(len(readers)):

@@ -18,13 +18,13 @@ from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 METADATA_FILE = "metadata.yaml"
 NEWEST_VERSION = 9
 NATIVE_QOS_VERSION = 9
-"""From this version on QoS profiles are YAML; before, a string of YAML with other enums."""
+"""From this version on, QoS profiles are YAML; before, a string of YAML with other enums."""
 
 RECORD = "mp4ds:rosbag2"
-"""Metadata record with what a rosbag2 recording holds besides topics and messages."""
+"""Metadata record with the content of a rosbag2 recording besides topics and messages."""
 
 TABLES_RECORD = "mp4ds:rosbag2:tables"
-"""Metadata record with the small tables of a storage file that is not open beforehand."""
+"""Metadata record with the small tables of a storage file that is not open at first."""
 
 _TOP_KEY = "rosbag2_bagfile_information"
 _MAX_BYTES = 64 * 2**20
@@ -54,7 +54,7 @@ class TopicMetadata:
     Attributes:
         name: Topic name.
         type_name: Type name.
-        serialization_format: Mostly ``cdr``.
+        serialization_format: Usually ``cdr``.
         qos: Offered QoS profiles as YAML text, None if the version has none.
         type_hash: Type description hash, None if the version has none.
         count: Number of messages.
@@ -68,7 +68,7 @@ class TopicMetadata:
     count: int
 
     def to_channel(self, channel_id: int) -> Channel:
-        """The channel of a topic that the storage does not have."""
+        """The channel of a topic that is not in the storage."""
         metadata = {QOS_KEY: self.qos, HASH_KEY: self.type_hash}
         return Channel(
             channel_id,
@@ -81,7 +81,7 @@ class TopicMetadata:
 
 @dataclass(frozen=True)
 class BagInfo:
-    """What mp4ds needs of a metadata.yaml.
+    """The parts of a metadata.yaml that mp4ds needs.
 
     Attributes:
         text: The file, verbatim.
@@ -89,10 +89,10 @@ class BagInfo:
         storage: ``sqlite3`` or ``mcap``; empty without files.
         file_names: Names of the storage files within the folder, in reading order.
         compression: ``file``, ``message`` or empty.
-        ros_distro: Name of the ROS distribution, empty if not told.
+        ros_distro: Name of the ROS distribution; empty if not stated.
         custom_data: The user's own entries.
         topics: All topics.
-        counts: How many messages each storage file has, by its name; empty if not told.
+        counts: Number of messages of each storage file, by its name; empty if not stated.
     """
 
     text: str
@@ -129,11 +129,11 @@ def read_bag_info(path: Path) -> BagInfo:
 
 
 def parse_bag_info(text: str, path: Path) -> BagInfo:
-    """Parse a metadata.yaml, or the same without its top key as storage files hold it.
+    """Parse a metadata.yaml, or its form without the top key in storage files.
 
     Args:
         text: The YAML.
-        path: Where it stands, for errors.
+        path: Its place, for errors.
 
     Raises:
         SourceError: It cannot be understood.
@@ -182,7 +182,7 @@ def _load(text: str, path: Path) -> Any:
 
 
 def _scalar(event: Any) -> Any:
-    """Takes scalars as rosbag2 does: a topic named ``on`` or ``12:30`` stays a string."""
+    """Reads scalars as rosbag2 does: a topic named ``on`` or ``12:30`` stays a string."""
     text: str = event.value
     if event.style not in (None, ""):
         return text
@@ -198,7 +198,7 @@ def _text(value: Any) -> str:
 
 
 def _base_name(name: Any, path: Path) -> str:
-    # Before version 4 the bag's folder is before the name; nothing outside of it is read.
+    # Before version 4, names include the bag's folder; nothing outside it is read.
     base = PureWindowsPath(_text(name)).name
     if base in ("", ".", ".."):
         raise SourceError(path, f"lists {name!r} as a file of the recording")

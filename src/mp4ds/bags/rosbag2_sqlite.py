@@ -1,4 +1,4 @@
-"""Reads the sqlite3 storage files of rosbag2, which a stranger may have made."""
+"""Reads the sqlite3 storage files of rosbag2, which are not trusted."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from mp4ds.errors import SourceError
 from mp4ds.records import EVERYTHING, HASH_KEY, Channel, ChannelStats, Excerpt, Message, Schema
 
 _PLAIN = re.compile(rb"\s*CREATE\s+(TABLE|INDEX|UNIQUE\s+INDEX|TRIGGER)\b", re.IGNORECASE)
-_LOOK_STEPS = 10**4  # of sqlite's machine, well below a millisecond
-_STEPS_A_BYTE, _LEAST_STEPS = 100, 10**6  # all queries of a pass need about 3 for each byte
+_LOOK_STEPS = 10**4  # steps of sqlite's virtual machine, well below a millisecond
+_STEPS_A_BYTE, _LEAST_STEPS = 100, 10**6  # all queries of a pass need about 3 per byte
 _LEAST_LENGTH = 10**6  # sqlite's default for the text of a query
 
 
 class Tables:
-    """The tables of an open file, for one pass: more would use up what it may cost.
+    """The tables of an open file, for one pass: more would exceed its budget of steps.
 
     Args:
         connection: To the file.
-        size: Its bytes, with what is beside it.
+        size: Its size in bytes, including the files beside it.
         shown: Its name in errors.
     """
 
@@ -41,7 +41,7 @@ class Tables:
         self.raised: BaseException | None = None
         looks = self._looks()
         next(looks)
-        # A handler that raises is taken as one that says 1: this one keeps what a signal raises.
+        # A handler that raises counts as one that returns 1: this one keeps the signal's exception.
         connection.set_progress_handler(partial(next, looks, 1), _LOOK_STEPS)
 
     def _looks(self) -> Iterator[int]:
@@ -53,7 +53,7 @@ class Tables:
             self.raised = error
 
     def check_plain(self) -> None:
-        """Refuse what computes rows or values instead of holding them.
+        """Refuse anything that computes rows or values instead of storing them.
 
         Raises:
             SourceError: There is a view or a virtual table.
@@ -77,10 +77,10 @@ class Tables:
         return self._connection.execute(query, values)
 
     def rows(self, query: str, values: Any = ()) -> Iterator[tuple[Any, ...]]:
-        """Rows with texts or blobs, which all together are no longer than the file.
+        """Rows with texts or blobs, whose total size must not exceed the file's.
 
         Raises:
-            SourceError: They are: pages belong to several rows.
+            SourceError: It does: pages belong to several rows.
         """
         for row in self._connection.execute(query, values):
             self._left -= sum(len(value) for value in row if isinstance(value, bytes))
@@ -103,12 +103,12 @@ def open_tables(path: Path, shown: Path) -> Iterator[Tables]:
         shown: Its name in errors, where it is a decompressed copy.
 
     Raises:
-        SourceError: It cannot be read, also for whatever is done within.
+        SourceError: It cannot be read; also for errors within the block.
     """
     sides = [Path(f"{path}{suffix}") for suffix in ("-wal", "-journal")]
     beside = sum(side.stat().st_size for side in sides if side.exists())
     options = "mode=ro" if beside else "mode=ro&immutable=1"
-    index = Path(f"{path}-shm")  # sqlite makes one to read a -wal, and leaves it
+    index = Path(f"{path}-shm")  # sqlite creates one to read a -wal, and leaves it behind
     had_index = index.exists()
     connection = tables = None
     try:
@@ -158,7 +158,7 @@ _INT64 = -(2**63), 2**63 - 1
 class SqliteReader:
     """Reads one ``.db3`` file. Channel ids are the ids of the topic rows.
 
-    Every pass has its own connection, so that several may run.
+    Every pass has its own connection, so that several can run.
 
     Args:
         path: The database.
@@ -168,10 +168,10 @@ class SqliteReader:
 
     Attributes:
         tables: Content of the small tables by ``db3:<file>:<column>``, verbatim.
-        is_indexed: Whether a span of log time is found without looking at all messages.
+        is_indexed: Whether a span of log time can be found without scanning all messages.
 
     Raises:
-        SourceError: The file is missing, damaged, or no database of rosbag2.
+        SourceError: The file is missing, damaged, or not a rosbag2 database.
     """
 
     def __init__(
@@ -312,11 +312,11 @@ class SqliteReader:
 
     @property
     def fraction(self) -> float:
-        """Part of the messages that `records` has read."""
+        """Fraction of the messages that `records` has read."""
         return min(1.0, self._rows_read / self._rows) if self._rows else 0.0
 
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Message]:
-        """Read all messages or an excerpt by log time, ties as the file numbers them."""
+        """Read all messages or an excerpt by log time, ties by row id."""
         if excerpt == EVERYTHING:
             yield from self._all_records()
         elif excerpt.has_messages:
@@ -329,7 +329,7 @@ class SqliteReader:
             # COUNT(*) would continue without a look at signals.
             query = "SELECT COUNT(1) FROM messages NOT INDEXED"
             (self._rows,) = tables.select(query).fetchone()
-            # Ids first: sorting whole rows would copy the recording where no index helps.
+            # Ids first: without an index, sorting whole rows would copy the recording.
             query = "SELECT id, timestamp FROM messages ORDER BY timestamp, id"
             before = None
             for row in tables.select(query):
@@ -345,7 +345,7 @@ class SqliteReader:
     def _excerpt_records(self, excerpt: Excerpt) -> Iterator[Message]:
         channels = self._channels.values()
         unwanted = {channel.id for channel in channels if not excerpt.has_topic(channel.topic)}
-        # A message of a topic id that is in no table is nobody's: everybody refuses it.
+        # A message with an unknown topic id belongs to no topic: all readers refuse it.
         column = "topic_id" if unwanted else "NULL"
         with self._opened() as tables:
             for where, times in _conditions(excerpt):
@@ -421,10 +421,10 @@ class SqliteReader:
 
 
 def _conditions(excerpt: Excerpt) -> Iterator[tuple[str, list[int]]]:
-    """For each query of an excerpt's span, its condition and the times that this names.
+    """The condition of each query for an excerpt's span, and its parameters.
 
-    Sqlite sorts null before all numbers, and text and blobs behind them: as nothing of that is
-    a time, the spans that are open at the start or the end refuse it.
+    sqlite sorts null before all numbers, and texts and blobs after them: none of these is a time,
+    so spans open at the start or the end find and refuse them.
     """
     first, last = _INT64
     start, end = excerpt.start, excerpt.end

@@ -110,7 +110,7 @@ class SqliteWriter:
             self._connection = sqlite3.connect(path, isolation_level=None)
         try:
             with self._disk_errors():
-                # An unfinished file is thrown away, so nothing guards it against a crash.
+                # An unfinished file is deleted, so it needs no protection against a crash.
                 for pragma in ("journal_mode = OFF", "synchronous = OFF"):
                     self._connection.execute(f"PRAGMA {pragma}")
                 self._connection.executescript(f"BEGIN;{_MESSAGES}")
@@ -120,7 +120,7 @@ class SqliteWriter:
 
     @contextmanager
     def _disk_errors(self) -> Iterator[None]:
-        """Report what the disk refused as every other writer does."""
+        """Report disk errors as every other writer does."""
         try:
             yield
         except sqlite3.DataError:
@@ -136,7 +136,7 @@ class SqliteWriter:
         return self._left_out
 
     def add_channel(self, channel: Channel) -> None:
-        """Add a topic; channels that its row cannot tell apart share one."""
+        """Add a topic; channels with identical rows share one."""
         schema = _schema_of(channel)
         qos, type_hash = channel.metadata.get(QOS_KEY, ""), channel.metadata.get(HASH_KEY, "")
         self._add_definition(schema, type_hash)
@@ -180,7 +180,7 @@ class SqliteWriter:
             ) from None
 
     def add_bag_info(self, version: int, text: str, ros_distro: str) -> None:
-        """Write the topics, and what the storage file itself tells of the recording."""
+        """Write the topics, and the storage file's own description of the recording."""
         schema = _WITHOUT_QOS
         if self._definitions or HASH_KEY in self._keys:
             schema = _NEWEST
@@ -239,7 +239,7 @@ def _text_or_blob(data: bytes) -> str | bytes:
 
 # ---------------------------------------------------------------- the writer
 
-_EMPTY_START = 2**63 - 1  # what rosbag2 writes where there is no message
+_EMPTY_START = 2**63 - 1  # what rosbag2 writes without messages
 _SUFFIXES = {"sqlite3": "db3", "mcap": "mcap"}
 _MCAP_RECORD = "rosbag2"
 
@@ -265,9 +265,8 @@ class Rosbag2Writer:
     Args:
         folder: Does not exist yet.
         storage: ``sqlite3`` or ``mcap``.
-        name: The recording's name, which its storage file begins with; by default the
-            folder's.
-        library: Library string of an MCAP storage; this library's own where empty.
+        name: The recording's name, used as the prefix of its storage file; by default the folder's.
+        library: Library string of an MCAP storage; if empty, this library's own.
         compression: Of the chunks of an MCAP storage: ``zstd``, ``lz4`` or ``none``.
 
     Raises:
@@ -347,7 +346,7 @@ class Rosbag2Writer:
             self._left_out["attachments (sqlite3 storage cannot hold any)"] += 1
 
     def add_metadata(self, record: MetadataRecord) -> None:
-        """Take in what is known of the source, or append a metadata record."""
+        """Take over the metadata of the source recording, or append a metadata record."""
         if record.name == RECORD:
             self._take_source(record.metadata)
         elif record.name == TABLES_RECORD:
@@ -361,7 +360,7 @@ class Rosbag2Writer:
         if isinstance(self._writer, McapWriter):
             self._source_has_record |= record.name == _MCAP_RECORD
             self._writer.add_metadata(record)
-        elif record.name != _MCAP_RECORD:  # sqlite3 keeps its like in a table of its own
+        elif record.name != _MCAP_RECORD:  # sqlite3 has its own table for that
             self._left_out["metadata records (sqlite3 storage cannot hold any)"] += 1
 
     def _take_source(self, content: Mapping[str, str]) -> None:
@@ -385,7 +384,7 @@ class Rosbag2Writer:
         return NATIVE_QOS_VERSION - 1 if old_style else NEWEST_VERSION
 
     def _info(self) -> dict[str, Any]:
-        """The content of metadata.yaml as its version lays it out."""
+        """The content of metadata.yaml in the layout of its version."""
         version = self._version()
         count = sum(topic.count for topic in self._topics.values())
         span = {
@@ -421,7 +420,7 @@ class Rosbag2Writer:
         return info
 
     def _as_listed(self, topic: _Topic) -> _Topic:
-        """The topic as the source's metadata.yaml listed it, which may differ from its files."""
+        """The topic as listed in the source's metadata.yaml, which may differ from its files."""
         found = [
             listed
             for listed in (self._source.topics if self._source else ())

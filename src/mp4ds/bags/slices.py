@@ -1,4 +1,4 @@
-"""A slice of time of a recording, read as a recording."""
+"""A time slice of a recording, read as a recording."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Loss, Mess
 
 
 class SliceReader:
-    """The messages of a recording that were logged in a slice of time. See `BagReader`.
+    """The messages of a recording logged within a time slice. See `BagReader`.
 
     Attachments, metadata records, channels and definitions are those of the whole recording.
 
     Args:
-        reader: The recording, which is closed with this.
-        asked: The slice.
+        reader: The recording, closed together with this reader.
+        asked: The requested slice.
 
     Attributes:
         span: The slice, as times of the recording.
 
     Raises:
-        OptionError: There is nothing in it, or a time is none.
+        OptionError: It is empty, or a time is not valid.
         SourceError: The recording is damaged, or without messages.
     """
 
@@ -67,7 +67,7 @@ class SliceReader:
 
     @property
     def losses(self) -> Sequence[Loss]:
-        """What of the whole recording could not be read."""
+        """The losses of the whole recording."""
         return losses_of(self._reader)
 
     @property
@@ -118,7 +118,7 @@ class SliceReader:
 
 
 def in_span(times: NDArray[np.int64], span: Excerpt) -> NDArray[np.int64]:
-    """Those of sorted log times, nanoseconds, that lie in the span of an excerpt; a view."""
+    """The part of sorted log times, nanoseconds, within the span of an excerpt; a view."""
     first = 0 if span.start is None else int(np.searchsorted(times, span.start))
     end = len(times) if span.end is None else int(np.searchsorted(times, span.end))
     return times[first:end]

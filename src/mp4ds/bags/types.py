@@ -1,4 +1,4 @@
-"""Message definitions of ROS 1 and ROS 2: parsed, compared, chosen, bounded; where stamps are."""
+"""Message definitions of ROS 1 and ROS 2: parsing, comparing and bounding them; stamps."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ _Made = TypeVar("_Made")
 
 
 def by_library(problem: str, call: Callable[..., _Made], *args: Any) -> _Made:
-    """What rosbags, or a library like it, makes of a definition or a message.
+    """The result of rosbags, or a library like it, for a definition or a message.
 
-    It raises errors of all kinds where it cannot use one. No code of ours may run in `call`, or a
-    bug of ours would be taken for a damaged message.
+    It raises all kinds of errors for invalid input. None of our own code may run in `call`, or our
+    bugs would be mistaken for damaged messages.
 
     Raises:
         Refused: The library cannot use it; says `problem`.
@@ -71,17 +71,17 @@ def by_library(problem: str, call: Callable[..., _Made], *args: Any) -> _Made:
 
 
 def incomprehensible(name: str) -> str:
-    """What is said of a type whose definition a library cannot use."""
+    """The error for a type whose definition a library cannot use."""
     return f"the definition of type {name} cannot be parsed"
 
 
 class Size(NamedTuple):
-    """What a message of a type has at least, its sequences being empty.
+    """Minimum size of a message of a type, with empty sequences.
 
     Attributes:
         least: Bytes, in any serialization.
-        steps: Fields, with those of its parts, and of one item of each sequence.
-        depth: Levels of messages within messages, those in sequences too.
+        steps: Fields, including those of its parts and of one item per sequence.
+        depth: Levels of nested messages, including those in sequences.
     """
 
     least: int
@@ -96,7 +96,7 @@ def sizes_of(types: Typesdict) -> dict[str, Size]:
         types: Definitions, complete.
 
     Raises:
-        Refused: A type holds itself, or more than any message has.
+        Refused: A type contains itself, or is larger than any real message.
     """
     sizes: dict[str, Size] = {}
     parts = 0
@@ -118,7 +118,7 @@ def sizes_of(types: Typesdict) -> dict[str, Size]:
 
 
 def has_empty_items(types: Typesdict, sizes: dict[str, Size]) -> bool:
-    """Whether there are arrays of messages without any byte."""
+    """Whether there are arrays of messages of zero bytes."""
     return any(
         desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE)
         and desc[1][0][0] == Nodetype.NAME
@@ -129,10 +129,10 @@ def has_empty_items(types: Typesdict, sizes: dict[str, Size]) -> bool:
 
 
 class BoundedStore(Typestore):
-    """A store whose types read no message of which the least bytes are not there.
+    """A store whose types refuse messages shorter than their minimum size.
 
-    So the items of a sequence are bounded by the bytes that are left, before they are read;
-    those that have no bytes are counted.
+    This bounds the items of a sequence by the bytes left, before they are read; items of zero bytes
+    are counted.
 
     Args:
         types: Definitions, complete except for time and duration.
@@ -223,12 +223,12 @@ def _size(types: Typesdict, name: str, sizes: dict[str, Size]) -> Size:
 HEADER = "std_msgs/msg/Header"
 
 MAX_TAIL = 8
-"""Bytes after a message that ROS overlooks; after more, the definition is that of another type."""
+"""Trailing bytes after a message that ROS ignores; with more, the definition must be wrong."""
 BUILTIN = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 _MAX_TEXT, _MAX_IDL, _MAX_LINES = 2**19, 2**17, 2**14
 _NO_CODE = re.compile(r'"(?:\\.|[^"\\])*"?|//.*|/[*](?:(?s:.*?)[*]/|(?s:.*))|\'\\?.\'')
-# rosbags' parser reads what is in brackets a hundred times, and multiplies without a bound
+# rosbags' parser re-reads what is in brackets a hundred times, and multiplies without bounds
 _SLOW_IDL = re.compile(r"[(][^()]*[(]|<[^<>;]*<[^<>;]*<|[*]|<<(?!\s*\d{1,2}\b)")
 _BRACKET = re.compile(r"[^\w\s]\s*[(]")
 _MAX_BRACKETS = 8
@@ -243,8 +243,8 @@ class World:
     Attributes:
         name: ``ROS 1`` or ``ROS 2``.
         encoding: Message encoding of its channels.
-        schema_encoding: Encoding of the definitions that are made for it.
-        standard: The types that it ships.
+        schema_encoding: Encoding of the definitions generated for it.
+        standard: Its standard types.
     """
 
     name: str
@@ -254,7 +254,7 @@ class World:
 
 
 def ros1_world() -> World:
-    """ROS 1 with the types of Noetic, of which rosbags has all except those of tf2."""
+    """ROS 1 with the types of Noetic; rosbags has all except tf2's."""
     tf2 = "tf2_msgs/msg/TFMessage"
     standard = {tf2: get_typestore(Stores.ROS2_HUMBLE).fielddefs[tf2]}
     standard.update(get_typestore(Stores.ROS1_NOETIC).fielddefs)
@@ -267,35 +267,45 @@ def ros2_world(distribution: str) -> World:
     Raises:
         OptionError: The distribution is not known.
     """
+    store = ros2_store(distribution)
+    # including later types: a recording without definitions may have them
+    latest = get_typestore(Stores.LATEST).fielddefs
+    standard = {**latest, **get_typestore(store).fielddefs}
+    return World("ROS 2", "cdr", "ros2msg", standard)
+
+
+def ros2_store(distribution: str) -> Stores:
+    """What rosbags calls a distribution of ROS 2.
+
+    Raises:
+        OptionError: It is not known.
+    """
     known = {store.value[5:]: store for store in Stores if store.value.startswith("ros2_")}
     if distribution not in known:
         names = ", ".join(known)
         raise OptionError(f"ROS 2 distribution {distribution!r} is not known. Use {names}.")
-    # types that came later, too: a recording without definitions may have them
-    latest = get_typestore(Stores.LATEST).fielddefs
-    standard = {**latest, **get_typestore(known[distribution]).fielddefs}
-    return World("ROS 2", "cdr", "ros2msg", standard)
+    return known[distribution]
 
 
 def types_of(schema: Schema, world: World) -> Typesdict:
-    """The type of a schema, and all that it refers to; standard ones where it lacks them.
+    """The type of a schema and everything it refers to; missing ones are taken from the standard.
 
     Raises:
-        Refused: A type is defined nowhere, the definition does not parse, or it is larger than
-            those of messages.
+        Refused: A type is not defined, the definition does not parse, or it is larger than any real
+            one.
     """
     problem = incomprehensible(schema.name)
     name = by_library(problem, normalize_msgtype, schema.name)
     found = _parse(schema, name, problem)
     if not fields_of(found, name) and name in world.standard:
         found.pop(name, None)  # the definition is empty, but perhaps not the type
-    # Time, duration and header are the world's own, whatever their definition is called.
+    # Time, duration and header are the world's own, whatever their definitions are called.
     for builtin in (*BUILTIN, HEADER):
         found.pop(builtin, None)
     if name not in found and name not in world.standard:
         raise Refused(f"no definition of type {schema.name} is known")
     types = closure(found, name, world.standard)
-    sizes_of(types)  # refuses what no message can follow
+    sizes_of(types)  # refuses definitions that no message can match
     return types
 
 
@@ -306,7 +316,7 @@ def _parse(schema: Schema, name: str, problem: str) -> Typesdict:
     if not schema.encoding:
         return {}
     if schema.encoding in ("ros2idl", "omgidl") or re.match(r"=+\nIDL: ", text):
-        text = re.sub(r"(?m)^[ \t]*#.*$", "", text)  # what it includes is beside it
+        text = re.sub(r"(?m)^[ \t]*#.*$", "", text)  # included definitions are beside it
         code = _NO_CODE.sub("", text)
         brackets = len(_BRACKET.findall(code))
         if len(text) > _MAX_IDL or brackets > _MAX_BRACKETS or _SLOW_IDL.search(code):
@@ -321,10 +331,10 @@ def _parse(schema: Schema, name: str, problem: str) -> Typesdict:
 
 
 def closure(types: Typesdict, root: str, standard: Typesdict) -> Typesdict:
-    """A type and all that it refers to, each from the first that has it.
+    """A type and everything it refers to, each from the first collection that has it.
 
     Raises:
-        Refused: One is in neither.
+        Refused: One is in neither collection.
     """
     found: Typesdict = {}
     todo = [root]
@@ -339,15 +349,15 @@ def closure(types: Typesdict, root: str, standard: Typesdict) -> Typesdict:
 
 
 def fields_of(types: Typesdict, name: str) -> Fielddefs:
-    """A type's fields, none for a type that is not known."""
+    """A type's fields; none for an unknown type."""
     fields = types[name][1] if name in types else []
     return [field for field in fields if field[0] != FILLER]
 
 
 def same_wire(left: Typesdict, left_name: str, right: Typesdict, right_name: str) -> bool:
-    """Whether two types serialise alike, whatever their fields are called.
+    """Whether two types serialise identically, whatever their fields are called.
 
-    Headers count as alike: only that of ROS 1 has a sequence number, which conversion knows.
+    Headers count as identical: only that of ROS 1 has a sequence number, which conversion handles.
     """
     if left_name == right_name == HEADER:
         return True
@@ -366,14 +376,14 @@ def same_wire(left: Typesdict, left_name: str, right: Typesdict, right_name: str
 
 @dataclass(frozen=True, slots=True)
 class FieldShape:
-    """What a field holds.
+    """The type of a field.
 
     Attributes:
         base: A basic type such as ``uint8`` or ``string``; empty for a message.
         message: Name of the message type; empty for a basic type.
-        text_bound: Most characters of a string; 0 for any number.
+        text_bound: Maximum number of characters of a string; 0 for no limit.
         length: Elements of an array of fixed length; None for anything else.
-        bound: Most elements of a sequence, 0 for any number; None for anything else.
+        bound: Maximum number of elements of a sequence, 0 for no limit; None for anything else.
     """
 
     base: str
@@ -384,7 +394,7 @@ class FieldShape:
 
 
 def field_shape(desc: FieldDesc) -> FieldShape:
-    """What a field of `fields_of` holds."""
+    """The shape of a field of `fields_of`."""
     length, bound = None, None
     if desc[0] == Nodetype.ARRAY:
         desc, length = desc[1]
@@ -398,7 +408,7 @@ def field_shape(desc: FieldDesc) -> FieldShape:
 
 
 def _shape(desc: FieldDesc) -> tuple[int, int, str, str]:
-    """Kind, length of an array, base type, name of a message type; bounds do not matter."""
+    """Kind, array length, base type and name of a message type; bounds are ignored."""
     kind, count = Nodetype.BASE, 0
     if desc[0] == Nodetype.ARRAY or desc[0] == Nodetype.SEQUENCE:
         kind = desc[0]
@@ -411,7 +421,7 @@ def _shape(desc: FieldDesc) -> tuple[int, int, str, str]:
 
 
 def translate(types: Typesdict, root: str, new_root: str, world: World) -> Typesdict:
-    """Definitions for another world: its standard ones where they serialise alike.
+    """Definitions for another world; standard ones where they serialise identically.
 
     Args:
         types: The definitions, complete.
@@ -432,7 +442,7 @@ def translate(types: Typesdict, root: str, new_root: str, world: World) -> Types
 
 
 def _without_bounds(fields: Fielddefs) -> Fielddefs:
-    """Fields without bounds of strings and sequences, which do not show on the wire."""
+    """Fields without bounds of strings and sequences, which are not visible on the wire."""
     return [(name, _unbounded(desc)) for name, desc in fields]
 
 
@@ -448,7 +458,7 @@ def _unbounded(desc: FieldDesc) -> FieldDesc:
 
 
 def make_store(types: Typesdict, world: World) -> Typestore:
-    """A store of definitions with the header of a world."""
+    """A type store of definitions with a world's header."""
     own = {name: found for name, found in types.items() if name not in (*BUILTIN, HEADER)}
     return BoundedStore({HEADER: world.standard[HEADER], **own})
 
@@ -463,10 +473,10 @@ _ENCAPSULATION = 4
 
 
 class HeaderStamps:
-    """The stamps in messages of one channel: of their header, or of those of transforms.
+    """The stamps in messages of one channel: of their header, or of their transforms' headers.
 
     Args:
-        channel: Any; one that is not of ROS, or has no header, has no stamps.
+        channel: Any; without ROS or a header, there are no stamps.
     """
 
     def __init__(self, channel: Channel) -> None:
@@ -479,14 +489,14 @@ class HeaderStamps:
         return self._places is not None
 
     def moved(self, payload: bytes | memoryview, move: Callable[[int], int]) -> bytes | bytearray:
-        """A copy of a message with other stamps.
+        """A copy of a message with changed stamps.
 
         Args:
             payload: Of the channel.
-            move: Gives the new stamp of one, nanoseconds. Zero stays zero.
+            move: Maps a stamp to its new value, nanoseconds. Zero stays zero.
 
         Raises:
-            ValueError: It is not of the channel's type, or a stamp has no place in it.
+            ValueError: It is not of the channel's type, or a stamp is out of range.
         """
         made = bytearray(payload)
         if self._places is None:

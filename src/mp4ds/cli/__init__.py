@@ -13,7 +13,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from mp4ds._version import __version__
-from mp4ds.cli.options import Command, spelled
+from mp4ds.cli.options import Command
 from mp4ds.cli.output import be_quiet, say
 from mp4ds.cli.process import DEBUG, exit_code_of, prepare_process
 
@@ -95,7 +95,8 @@ def app_for(*names: str, is_completing: bool = False) -> typer.Typer:
             app.add_typer(module.imports, short_help=does)
         else:
             made = getattr(module, name.replace("-", "_"))
-            app.command(name, short_help=does, cls=Command)(made)
+            kind = getattr(module, "COMMAND", Command)
+            app.command(name, short_help=does, cls=kind)(made)
     return app
 
 
@@ -123,7 +124,7 @@ def _listed() -> None:
 
 def main() -> NoReturn:
     """Run the command line and exit."""
-    arguments = spelled(sys.argv[1:])
+    arguments = sys.argv[1:]
     prepare_process()
     command = next((word for word in arguments if not word.startswith("-")), "")
     # completion is not built for a command that runs

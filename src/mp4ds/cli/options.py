@@ -48,7 +48,8 @@ def in_flags(text: str) -> str:
 
 _PANELS = {
     "What": (
-        *("topics", "exclude", "regex", "start", "end", "duration", "start_offset", "topic", "at"),
+        *("topics", "exclude", "regex", "exclude_regex", "start", "end", "duration"),
+        *("start_offset", "until_sec", "until_nsec", "skip_empty", "topic", "at"),
         *("sheet", "every", "max_rate", "sync", "tolerance_ns", "camera_info", "salvage", "poses"),
         *("all", "exclude_regex", "hidden", "max_duration", "max_size", "start_paused"),
         *("state", "action", "task", "cameras", "frames", "clips"),
@@ -57,7 +58,9 @@ _PANELS = {
         *("quality", "codec", "preset", "transcode", "purpose", "gop", "images", "image_format"),
         *("jpeg_quality", "resize", "pixels", "fps", "crf", "proxies", "proxy_width", "scores"),
         *("publish_as", "storage", "exact", "about", "skip_unconvertible", "rate", "loop"),
-        *("delay", "paused", "immediate", "drop", "restamp", "lock_step", "clock", "hz"),
+        *("keep_alive", "clock_topics", "clock_topics_all", "pause_topics", "rate_control_topic"),
+        *("rate_control_max_delay", "wait_for_all_acked", "queue"),
+        *("delay", "paused", "immediate", "drop", "restamp", "lock_step", "clock", "clock_hz"),
         *("follow_clock", "wait_for_subscribers", "qos_overrides", "read_ahead", "deep"),
         *(
             "intrinsics",
@@ -172,7 +175,10 @@ def takes(
         for parameter in own:
             for info in get_args(parameter.annotation)[1:]:
                 if isinstance(info, OptionInfo):
-                    _FLAGS[parameter.name] = (info.param_decls or [f"--{parameter.name}"])[0]
+                    # typer takes the first one for the default, where it is to be a hint
+                    told = (info.default, *(info.param_decls or ()), f"--{parameter.name}")
+                    flag = next(str(one) for one in told if str(one).startswith("--"))
+                    _FLAGS[parameter.name] = flag.partition("/")[0]
         for kind in kinds:
             for name, item in shown_of(kind).items():
                 _FLAGS[name] = flags_of(name, item)[0].partition("/")[0]
@@ -281,23 +287,3 @@ def parse_share(text: str) -> tuple[int, int]:
     if not match or not 1 <= int(match[1]) <= int(match[2]):
         raise OptionError(f"`shard` {text!r} is not I/N with I from 1 to N, such as 3/16.")
     return int(match[1]), int(match[2])
-
-
-def spelled(arguments: Sequence[str]) -> list[str]:
-    """Command-line arguments, with the rate of ``play --clock 50`` turned into a separate option.
-
-    ``--clock`` is a flag of `rosbag play` and takes a number, if there is one, from users of
-    ``ros2 bag play``.
-    """
-    if arguments[:1] != ["play"]:
-        return [*arguments]
-    made: list[str] = []
-    for argument in arguments:
-        name, has_value, value = argument.partition("=")
-        if name == "--clock" and has_value:
-            made += ["--clock", "--hz", value]
-        elif made[-1:] == ["--clock"] and re.fullmatch(r"[0-9]+(\.[0-9]+)?", argument):
-            made += ["--hz", argument]
-        else:
-            made.append(argument)
-    return made

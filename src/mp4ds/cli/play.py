@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import os
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from mp4ds.cli.keyboard import Keyboard
-from mp4ds.cli.options import JsonFlag, takes
-from mp4ds.cli.output import complain, print_json, say, shown
-from mp4ds.cli.process import caught_signals, told_errors
+from mp4ds.cli.options import Command, JsonFlag, takes
+from mp4ds.cli.output import be_quiet, complain, is_quiet, print_json, say, shown
+from mp4ds.cli.play_words import STORAGES, spelled
+from mp4ds.cli.process import DEBUG, caught_signals, told_errors
 from mp4ds.errors import OptionError
 from mp4ds.plugins.playing.play import PlayOptions, open_player
+from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import Controls
 
 if TYPE_CHECKING:
@@ -27,7 +31,7 @@ def player_keys(controls: Controls) -> Mapping[str, Callable[[], object]]:
     """What each key does to a player.
 
     Space: pause or resume; right or ``s``: one message; left or ``b``: one back; up and down: 10 %
-    faster and slower.
+    faster and slower; ``t``: pause for topics or not.
     """
     return {
         " ": controls.toggle_paused,
@@ -35,6 +39,7 @@ def player_keys(controls: Controls) -> Mapping[str, Callable[[], object]]:
         "s": controls.play_next,
         "left": controls.step_back,
         "b": controls.step_back,
+        "t": controls.toggle_topic_pauses,
         "up": lambda: controls.set_rate(_rounded(controls.rate * _FASTER)),
         "down": lambda: controls.set_rate(_rounded(controls.rate / _FASTER)),
     }
@@ -67,7 +72,7 @@ def play_progress(*, is_quiet: bool) -> Iterator[Callable[[PlayProgress], None]]
     def warn(state: PlayProgress) -> None:
         if state.slowed_s >= _SLOW_S and "slow" not in told:
             told.add("slow")
-            tell("frames are not made in time: the clock waits for them (--drop leaves them out)")
+            tell("messages are not ready in time: the clock waits (--drop leaves out frames)")
         if state.dropped and "dropped" not in told:
             told.add("dropped")
             tell("frames are not made in time: late ones are left out")
@@ -86,7 +91,8 @@ def play_progress(*, is_quiet: bool) -> Iterator[Callable[[PlayProgress], None]]
 
 def tell(text: str) -> None:
     """Say something beside the result."""
-    complain(text)
+    if not is_quiet():
+        complain(text)
 
 
 def _standing(state: PlayProgress) -> str:
@@ -110,29 +116,53 @@ def print_play(summary: PlaySummary) -> None:
     for topic, reasons in summary.as_recorded.items():
         for reason, count in reasons.items():
             say(f"{topic}: {count} as recorded: {reason}")
+    for topic, count in summary.not_installed.items():
+        say(f"{topic}: {count} left out, of a type that is not installed")
     for topic, count in summary.thinned.items():
         say(f"{topic}: {count} frames left out on request")
     total = sum(summary.messages.values())
     text = f"{total} messages in {summary.seconds:.1f} s"
     if summary.loops:
-        text += f", begun again {summary.loops} times"
+        text += f", started over {summary.loops} times"
     if summary.stopped:
         text += ", stopped before the end"
     say(text)
     if summary.slowed_s >= 0.1:
-        say(f"{summary.slowed_s:.1f} s longer than recorded, since frames were not made in time")
+        say(f"{summary.slowed_s:.1f} s longer than recorded: messages were not ready in time")
     if summary.dropped:
         say(f"{summary.dropped} frames left out, since they were late")
 
 
 # ---------------------------------------------------------------- play
 
-_DEFAULT_CLOCK_HZ = 100.0
+_NAMES = "mp4ds.names"  # what ROS told, in click's context
+
+
+class PlayCommand(Command):
+    """The command, which understands how the options of other players are typed."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse arguments, in the words of `rosbag play` and `ros2 bag play`."""
+        valued = {
+            name
+            for option in self.get_params(ctx)
+            if option.param_type_name == "option" and not getattr(option, "is_flag", False)
+            for name in option.opts
+        }
+        with told_errors("--json" in args):
+            words, ctx.meta[_NAMES] = spelled(args, valued.__contains__)
+        parsed: list[str] = super().parse_args(ctx, words)
+        return parsed
+
+
+COMMAND = PlayCommand
+_QUIET = {"error", "fatal"}
 
 
 @takes(PlayOptions, without=("to", "clock"))
 def play(
     options: Callable[[], PlayOptions],
+    context: typer.Context,
     datasets: Annotated[
         list[str], typer.Argument(metavar="DATASET...", help="Datasets; several are merged.")
     ],
@@ -151,8 +181,16 @@ def play(
         ),
     ] = False,
     clock_hz: Annotated[
-        float, typer.Option("--hz", help="The rate of --clock, besides with each message.")
-    ] = _DEFAULT_CLOCK_HZ,
+        float, typer.Option("--hz", help="The rate of --clock; 40 with --ros2.")
+    ] = 100.0,
+    storage: Annotated[
+        str, typer.Option("--storage", help="sqlite3 or mcap: of no meaning for datasets.")
+    ] = "",
+    log_level: Annotated[
+        str,
+        typer.Option("--log-level", help="debug, info, warn, error or fatal: what is told."),
+    ] = "",
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
     no_keyboard: Annotated[
         bool, typer.Option("--disable-keyboard-controls", help="Leave the keyboard alone.")
     ] = False,
@@ -164,16 +202,30 @@ def play(
     """Publish datasets as if they were the recording: into ROS 1, ROS 2 or Foxglove.
 
     Keys: space pauses; right: one message; left: one back; up and down: faster and slower.
+
+    With --ros2, -x is --exclude-regex, -s is --storage and -i a dataset, as in `ros2 bag play`;
+    with --ros1, -p is --prefix, as in `rosbag play`. Lists such as --topics /a /b are understood.
     """
     with told_errors(as_json), ExitStack() as stack:
+        names: NodeNames = context.meta.get(_NAMES, PLAIN)
+        _say_as_much(log_level or names.log_level, quiet)
+        if storage not in ("", *STORAGES):
+            raise OptionError(
+                f"`storage` {storage!r} is none of {', '.join(STORAGES)}. With --ros2, -s is "
+                "--storage; seconds to leave out are --start-offset."
+            )
         kinds = {"ros1": ros1, "ros2": ros2, "foxglove": foxglove}
         chosen = [name for name, on in kinds.items() if on]
         if len(chosen) > 1:
             raise OptionError(f"--{chosen[0]} contradicts --{chosen[1]}.")
         told = replace(
-            options(), to=chosen[0] if chosen else None, clock=clock_hz if clock else None
+            options(),
+            to=chosen[0] if chosen else None,
+            clock=clock_hz if clock else None,
+            names=names,
         )
-        report = stack.enter_context(play_progress(is_quiet=as_json or not progress))
+        is_silent = as_json or not progress or is_quiet()
+        report = stack.enter_context(play_progress(is_quiet=is_silent))
         player = stack.enter_context(open_player(datasets, told, progress=report))
         tell(f"publishing to {player.address}")
         if player.follows_clock:
@@ -188,3 +240,15 @@ def play(
         print_play(summary)
     if caught:
         raise typer.Exit(128 + caught[0])
+
+
+def _say_as_much(level: str, quiet: bool) -> None:
+    """Tell as much as was asked for."""
+    if level not in ("", "debug", "info", "warn", *_QUIET):
+        raise OptionError(f"`log_level` {level!r} is not debug, info, warn, error or fatal.")
+    if level == "debug":
+        os.environ[DEBUG] = "1"
+    if quiet or level in ("warn", *_QUIET):
+        be_quiet()
+    if level in _QUIET:
+        warnings.simplefilter("ignore")

@@ -30,7 +30,7 @@ def record(
     options: Callable[[], RecordOptions],
     topics: Annotated[
         Optional[list[str]],  # noqa: UP045 - read at run time by typer
-        typer.Argument(metavar="TOPIC...", help="Names, or globs in quotes; or -a for all."),
+        typer.Argument(metavar="TOPIC...", help="Topic names or quoted globs; -a records all."),
     ] = None,
     output: Annotated[
         Optional[str],  # noqa: UP045 - read at run time by typer
@@ -38,22 +38,22 @@ def record(
             "--output",
             "-o",
             metavar="DATASET",
-            help="The folder to make; named by the time by default.",
+            help="Folder to create; by default named after the time.",
         ),
     ] = None,
-    ros1: Annotated[bool, typer.Option("--ros1", help="From ROS 1.")] = False,
+    ros1: Annotated[bool, typer.Option("--ros1", help="Record from ROS 1.")] = False,
     ros2: Annotated[
-        bool, typer.Option("--ros2", help="From ROS 2, by rclpy or else by Cyclone DDS.")
+        bool, typer.Option("--ros2", help="Record from ROS 2, with rclpy or else Cyclone DDS.")
     ] = False,
     no_keyboard: Annotated[
-        bool, typer.Option("--disable-keyboard-controls", help="Leave the keyboard alone.")
+        bool, typer.Option("--disable-keyboard-controls", help="Disable the keyboard controls.")
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Record topics of a live robot into a dataset, until Ctrl-C.
 
-    Lossless by default, by what encodes in the least time. What cannot be encoded in time is kept
-    as it came. Keys: space pauses, q stops.
+    Lossless by default, with the fastest encoder settings. Images that cannot be encoded in
+    time are stored as received. Keys: space pauses, q stops.
     """
     with told_errors(as_json), ExitStack() as stack:
         if ros1 and ros2:
@@ -97,9 +97,12 @@ def record_progress(*, is_quiet: bool) -> Iterator[Callable[[RecordProgress], No
                 complain(warning)
         for topic, item in state.topics.items():
             for count, what in (
-                (item.dropped, "messages are dropped: the buffer is full (--buffsize)"),
-                (item.verbatim, "images come faster than they can be encoded: kept as they come"),
-                (item.lost, "the middleware loses messages"),
+                (item.dropped, "dropping messages: the buffer is full (--buffsize)"),
+                (
+                    item.verbatim,
+                    "images arrive faster than they can be encoded: storing them as received",
+                ),
+                (item.lost, "the middleware is losing messages"),
             ):
                 if count and (line := f"{topic}: {what}") not in told:
                     told.add(line)
@@ -165,7 +168,7 @@ def _table(state: RecordProgress) -> Table:
 def print_record(summary: RecordSummary) -> None:
     """Tell what was recorded."""
     for path in summary.recovered:
-        say(f"{path}: made of a recording that was cut off earlier")
+        say(f"{path}: recovered from an interrupted recording")
     for made in summary.datasets:
         print_pack(made)
     for topic, count in summary.dropped.items():

@@ -308,24 +308,20 @@ class Dataset:
         channels = (self._group_messages(group, reading) for group in groups)
         return heapq.merge(ahead(self._verbatim_records(topics)), *channels, key=_time_of)
 
-    def last_before(self, time_ns: int, channels: Collection[Channel]) -> list[Message]:
-        """The last message before a log time of each channel that has one.
+    def before(self, time_ns: int, topics: Collection[str], frames: int) -> Iterator[Message]:
+        """Messages of some topics before a log time, in its order; of a video the last few.
 
         Args:
             time_ns: Nanoseconds.
-            channels: Of `channels`.
+            topics: Which topics.
+            frames: How many of each video at most.
         """
-        found: dict[int, Message] = {}
-        topics = frozenset(channel.topic for channel in channels)
-        for message in self.recorded_messages(Excerpt(end=time_ns, topics=topics)):
-            found[message.channel.id] = message
-        reading = Reading(choice=last_of(time_ns))
-        for group in self._groups:
-            for message in group.messages(reading) if group.channel.topic in topics else ():
-                other = found.get(message.channel.id)
-                if other is None or other.log_time <= message.log_time:
-                    found[message.channel.id] = message
-        return [found[channel.id] for channel in channels if channel.id in found]
+        wanted = frozenset(topics)
+        reading = Reading(choice=last_of(time_ns, frames))
+        groups = [group for group in self._groups if group.channel.topic in wanted]
+        recorded = self.recorded_messages(Excerpt(end=time_ns, topics=wanted))
+        parts = [part for group in groups for part in group.parts_of(reading)]
+        return heapq.merge(recorded, *parts, key=_time_of)
 
     def times(self) -> dict[int, NDArray[np.int64]]:
         """Sorted log times of every message, nanoseconds, by channel id; decodes no frame."""

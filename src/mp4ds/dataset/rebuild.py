@@ -532,11 +532,11 @@ def within(excerpt: Excerpt, choice: Choice = everything) -> Choice:
     return choose
 
 
-def last_of(end: int) -> Choice:
-    """The last message before a log time, nanoseconds, if there is one."""
+def last_of(end: int, count: int) -> Choice:
+    """The last messages before a log time, nanoseconds, as many as there are."""
 
     def choose(columns: DecodedColumns) -> Iterator[int]:
-        return iter(np.flatnonzero(columns.log_time < end)[-1:].tolist())
+        return iter(np.flatnonzero(columns.log_time < end)[-count:].tolist())
 
     return choose
 

@@ -2,7 +2,7 @@
 
 Nothing waits: an image that its encoder has no time for is kept verbatim, what there is no memory
 for is dropped and counted. What came is on the disk within `DURABLE_S`, but for the frames that an
-encoder holds (spec/index.md, "Recordings that are being made").
+encoder holds (spec/index.md, "Unfinished recordings").
 """
 
 from __future__ import annotations

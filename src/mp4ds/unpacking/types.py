@@ -117,7 +117,7 @@ def _begun(encoding: str, slots: Slots, *, has_seq: bool = False) -> PrimitiveWr
     is_cdr = encoding == "cdr"
     seconds, nanoseconds = divmod(slots.stamp, NS)
     if not (-(2**31) if is_cdr else 0) <= seconds < (2**31 if is_cdr else 2**32):
-        raise WireError("its stamp is beyond what ROS has bits for")
+        raise WireError("its stamp is outside the range of ROS")
     writer = PrimitiveWriter(b"\0\1\0\0" if is_cdr else b"", "<", aligned=is_cdr)
     if has_seq:
         writer.put("I", slots.seq or 0)

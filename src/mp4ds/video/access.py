@@ -1,4 +1,4 @@
-"""Frames of a video by number: a decoder is given only what they need."""
+"""Frames of a video by number, decoding only what they depend on."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class VideoDigest:
     Attributes:
         size: Bytes.
         sha256: Hexadecimal.
-        structures: What its frames refer to, where that is known.
+        structures: What its frames refer to, if known.
     """
 
     size: int
@@ -101,7 +101,7 @@ def packets_of_groups(table: SampleTable) -> NDArray[np.int64]:
 
 
 def _table(path: Path) -> SampleTable | None:
-    """The index of a video whose packets follow each other; None if that is not known."""
+    """The index of a video whose packets are contiguous; None if that is unknown."""
     try:
         with path.open("rb") as file:
             table = read_sample_table(file, path.stat().st_size, str(path))
@@ -134,12 +134,12 @@ _KEPT_FRAMES = 50_000  # coded frames whose references are kept in memory
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A coded frame: a part of a packet that a decoder is to be given.
+    """A coded frame: the part of a packet to pass to a decoder.
 
     Attributes:
         sample: Number of the packet.
         part: Number of the coded frame in it.
-        needs: Numbers in its group of the pieces that it refers to.
+        needs: Numbers, within its group, of the pieces that it refers to.
         span: Its first byte in the packet and the one after its last; None until it is read.
     """
 
@@ -151,14 +151,14 @@ class Piece:
 
 @dataclass(slots=True)
 class Group:
-    """The coded frames from a key frame to the next, as far as they are known.
+    """The coded frames from one key frame to the next, as far as known.
 
     Attributes:
         first: Number of the key frame's packet.
         end: Number of the next group's.
-        parser: Of its packets; None if all is known without.
+        parser: Of its packets; None if nothing needs to be parsed.
         pieces: In the order coded.
-        shows: For each packet known the number of the piece that makes its picture come out.
+        shows: For each known packet, the number of the piece that outputs its picture.
     """
 
     first: int
@@ -168,7 +168,7 @@ class Group:
     shows: list[int] = field(default_factory=list)
 
     def chain(self, samples: Iterable[int]) -> list[int]:
-        """Numbers of the pieces that show the pictures of packets, and of all that these need."""
+        """Numbers of the pieces that output the pictures of packets, and of what they depend on."""
         pending = [self.shows[sample - self.first] for sample in samples]
         found = set(pending)
         while pending:
@@ -180,16 +180,16 @@ class Group:
 
 
 class Chains:
-    """The groups of a video; what is in one is found out when it is first needed.
+    """The groups of a video; each is analysed when it is first needed.
 
     Args:
         table: The video's index.
         codec: Name in the registry.
         read: Gives a packet by its number.
-        recorded: What the frames refer to, where that was written down; it fits the index.
+        recorded: What the frames refer to, if that was recorded; it matches the index.
 
     Raises:
-        UnknownStructure: Nothing is known of the references of the codec.
+        UnknownStructure: The codec's references are not known.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ class Chains:
 
         Raises:
             UnknownStructure: What its frames refer to is not known.
-            StructureError: What was written down of it contradicts itself.
+            StructureError: The recorded structure contradicts itself.
         """
         place = self._place(sample)
         group = self._groups.pop(place, None)
@@ -231,10 +231,10 @@ class Chains:
         return group
 
     def cut(self, group: Group, piece: Piece, packet: bytes) -> bytes:
-        """The bytes of a piece out of its packet.
+        """Extract the bytes of a piece from its packet.
 
         Raises:
-            Refused: It does not hold the coded frames that were written down of it.
+            Refused: It does not hold the coded frames recorded for it.
         """
         if piece.span is not None:
             start, end = piece.span
@@ -260,7 +260,7 @@ class Chains:
         return int(self._keys[place]) if place >= 0 else 0
 
     def split(self, samples: list[int]) -> Iterator[list[int]]:
-        """Packets by the groups that they are in; those of a group must follow each other."""
+        """Packets by group; those of a group must be consecutive."""
         places = np.searchsorted(self._keys, np.array(samples, np.int64), side="right")
         bounds = [0, *(np.flatnonzero(np.diff(places)) + 1).tolist(), len(samples)]
         for start, end in pairwise(bounds):
@@ -299,18 +299,18 @@ class Chains:
 class FrameAccess:
     """Random access to the frames of one mp4. A context manager.
 
-    Not to be shared between threads or over a fork.
+    Do not share it between threads or across a fork.
 
     Args:
         path: The video.
         codec: Name in the registry.
-        frames: Number of frames that are due; None if only the video tells.
+        frames: Expected number of frames; None to take it from the video.
         maker: Makes pictures of its frames.
         threads: Of the decoder. One takes the least CPU time; with more, one frame comes sooner.
-        references: What the sidecar says of them, so that no packets are read to find out.
+        references: What the sidecar says about them, which saves reading packets to find out.
 
     Raises:
-        UnknownStructure: Its frames cannot be had one by one.
+        UnknownStructure: Its frames cannot be decoded one by one.
         VideoError: ``video-unreadable`` or ``frame-count``.
         FormatError: ``references-invalid``: what the sidecar says does not fit the video.
     """
@@ -390,11 +390,11 @@ class FrameAccess:
             outs: Its `out`, by frame.
 
         Yields:
-            Views that hold until the next one is asked for.
+            Views that are valid until the next one is requested.
 
         Raises:
-            UnknownStructure: What the frames refer to is not known; nothing was given of those that
-                follow.
+            UnknownStructure: What the frames refer to is not known; the remaining frames were not
+                yielded.
             VideoError: ``decode-failed``, naming the frame.
             FormatError: ``references-invalid``.
         """
@@ -492,7 +492,7 @@ class FrameAccess:
         return context
 
     def _announce(self, samples: Iterable[int]) -> None:
-        """Tell a remote file which packets are read next, and that no others are."""
+        """Tell a remote file exactly which packets will be read next."""
         places, sizes = self.table.places, self.table.sizes
         ranges = [(int(places[s]), int(places[s] + sizes[s])) for s in samples]
         if ranges:
@@ -521,11 +521,11 @@ class FrameAccess:
 
 @dataclass(slots=True)
 class _Session:
-    """A decoder's way through a group.
+    """A decoder's progress through a group.
 
     Attributes:
         group: Which it is.
-        fed: Numbers of the pieces that it was given.
+        fed: Numbers of the pieces it has received.
         last: The last of them.
     """
 

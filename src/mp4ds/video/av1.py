@@ -20,7 +20,7 @@ DELIMITER = b"\x12\0"
 """A temporal delimiter OBU."""
 
 DELIMITED = "td"
-"""Framing of a temporal unit that begins with a delimiter; of others it is empty."""
+"""Framing of a temporal unit that begins with a delimiter; empty for others."""
 
 _SEQUENCE_HEADER, _DELIMITER, _FRAME_HEADER, _TILE_GROUP, _METADATA, _FRAME = 1, 2, 3, 4, 5, 6
 _KEPT = frozenset((_SEQUENCE_HEADER, _FRAME_HEADER, _TILE_GROUP, _METADATA, _FRAME))
@@ -55,7 +55,7 @@ def obus(data: bytes | memoryview) -> Iterator[Obu]:
     """Walk the OBUs of a temporal unit.
 
     Raises:
-        Refused: They do not fill it, or one does not tell its size.
+        Refused: They do not fill it, or one does not state its size.
     """
     data = memoryview(data)
     offset = 0
@@ -95,10 +95,10 @@ def strip(data: bytes | memoryview) -> tuple[memoryview, str]:
 
 
 def join(packet: bytes, framing: str) -> bytes:
-    """The temporal unit as it was before it went into an mp4.
+    """The temporal unit as it was before it was stored in an mp4.
 
     Raises:
-        Refused: The framing is none.
+        Refused: The framing is not valid.
     """
     if framing not in ("", DELIMITED):
         raise Refused(f"{framing[:40]!r} is no framing of AV1")
@@ -131,7 +131,7 @@ class Av1Pictures:
         return self._parameters
 
     def picture(self, data: memoryview) -> Picture:
-        """The picture in a temporal unit whose delimiter is taken off.
+        """The picture in a temporal unit without its delimiter.
 
         Raises:
             NoPicture: There is none.
@@ -224,7 +224,7 @@ _SEQUENCE_BYTES = 512
 
 @dataclass(frozen=True, slots=True)
 class _Sequence:
-    """What of a sequence header tells how frame headers are read (5.5.1)."""
+    """The part of a sequence header that determines how frame headers are read (5.5.1)."""
 
     still: bool
     layers: int
@@ -268,7 +268,7 @@ def _parse_sequence(payload: bytes) -> _Sequence:
 
 
 def _parse_operating_points(reader: BitReader) -> int:
-    """The layers that decoders take, those of the first operating point; 0: all there are.
+    """The layers that decoders use, those of the first operating point; 0: all.
 
     Raises:
         UnknownStructure: There is a model of the decoder, or several pictures at one time.
@@ -293,12 +293,12 @@ def _parse_operating_points(reader: BitReader) -> int:
 
 
 class _Header(NamedTuple):
-    """What of a frame header tells of references.
+    """The part of a frame header that concerns references.
 
     Attributes:
         kind: `frame_type`; None if it only shows a frame.
         shown: Whether a picture comes out.
-        used: Slots of the frames that it needs.
+        used: Slots of the frames it needs.
         filled: Slots that hold it afterwards, as bits.
     """
 
@@ -473,7 +473,7 @@ def split_temporal_unit(data: bytes | memoryview) -> list[tuple[int, int, int]]:
 
 
 def _check_layer(extension: int, layers: int) -> None:
-    """Refuse a frame that decoders leave out, or show with another (5.3.3)."""
+    """Refuse a frame that decoders skip, or show together with another (5.3.3)."""
     temporal, spatial = extension >> 5, extension >> 3 & 3
     if spatial or (layers and not layers >> temporal & 1):
         raise UnknownStructure("its AV1 has layers that decoders leave out")

@@ -1,6 +1,6 @@
-"""The table of codecs, and which encoder, pixel format and options make which stream.
+"""The table of codecs, and the encoder, pixel format and options for each kind of stream.
 
-A codec is added by an entry of `CODECS`, and of the tables of encodings below for what encodes it.
+To add a codec, add an entry to `CODECS`, and to the tables of encodings below if it is encoded.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ TEN_BITS = "yuv420p10le"
 
 @dataclass(frozen=True, slots=True)
 class Codec:
-    """What is known of a codec of the registry, whatever encodes it.
+    """Properties of a codec in the registry, whatever the encoder.
 
     Attributes:
-        ffmpeg: ffmpeg's name of it.
+        ffmpeg: Its name in ffmpeg.
         decoder: ffmpeg's name of the decoder for single frames; empty: it has no references.
         names: In messages: of the codec, or of an encoder that makes it.
         entries: Four letters of the sample entries of an mp4.
-        pictures: What parses packets of messages, as ``module:name``; empty: none are taken.
+        pictures: The parser of message packets, as ``module:name``; empty: not supported.
         framing: How packets are framed: ``units`` (NAL), ``obus`` (AV1), or not at all.
-        references: What tells the references of frames, as ``module:name``.
-        is_free: Whether a frame may do without the one before it, which is worth recording.
+        references: The parser of frame references, as ``module:name``.
+        is_free: Whether a frame may be independent of the one before it, which is worth recording.
         is_split: Whether packets may hold several coded frames.
     """
 
@@ -72,11 +72,11 @@ CODECS: Mapping[str, Codec] = {
     ),
     "png": Codec("png", "references:Intra", pictures="coded_messages:Pngs"),
 }  # fmt: skip
-"""By the name in the registry; PNG only as packets that are looked at, no mp4 has them."""
+"""By the name in the registry; PNG only for packets that are inspected, never in an mp4."""
 
 
 def part_of(place: str) -> Any:
-    """What a `Codec` names as ``module:name``; imported when needed: a video is of one codec."""
+    """What a `Codec` names as ``module:name``, imported when needed: a video has one codec."""
     module, _, name = place.partition(":")
     return getattr(import_module(f"mp4ds.video.{module}"), name)
 
@@ -84,28 +84,27 @@ def part_of(place: str) -> Any:
 # ---------------------------------------------------------------- encoders
 
 CHROMA_PLACE = "chroma_sample_location"
-"""Option that tags where the chroma is; of these encoders, those of VAAPI go by it."""
+"""Option that tags the chroma location; of these encoders, those of VAAPI use it."""
 
 _LAMBDA = 118  # FF_QP2LAMBDA, the unit of ffmpeg's -q:v
 
 
 @dataclass(frozen=True, slots=True)
 class HardwareEncoder:
-    """An encoder of the hardware.
+    """A hardware encoder.
 
     Attributes:
-        codec: What a reader needs.
+        codec: What a reader must support.
         encoder: ffmpeg's name.
-        needs: What it needs on the machine; a phrase.
+        needs: What it needs on the machine, in words.
         given: Options for every stream.
-        scale: Its option for the quality.
-        first: What a crf of 0 would be in that option.
-        step: What a crf of one more adds to it.
+        scale: Its option for quality.
+        first: The value of that option for a crf of 0.
+        step: How much it changes per unit of crf.
         most: The largest crf; the smallest is 1, since 0 leaves the choice to most of them.
         presets: That it has.
         default_preset: One of them, or empty.
-        device: Kind of device whose memory must hold the pictures; empty: it takes them as
-            they are.
+        device: Kind of device whose memory must hold the pictures; empty: ordinary memory.
     """
 
     codec: str
@@ -174,11 +173,11 @@ HARDWARE: Mapping[str, HardwareEncoder] = MappingProxyType(
 """Name of ``--codec`` -> encoder."""
 
 
-# most frames between key frames, chosen by what they cost (spec/notes.md)
+# maximum distance of key frames, chosen by cost (spec/notes.md)
 LOSSLESS_GOP, LOSSY_GOP = 10, 30
 ARCHIVE_GOP, LOSSY_TRAINING_GOP = 120, 15
 PURPOSE_PRESET = "4"
-"""Of SVT-AV1 where it is known what a dataset is for."""
+"""Preset of SVT-AV1 when the purpose of a dataset is known."""
 
 _X264 = MappingProxyType({"bf": "0"})  # without B-frames, frames are coded in the order shown
 _X265 = "bframes=0:open-gop=0"  # an open GOP cannot be sought exactly
@@ -193,11 +192,11 @@ class Recipe:
         codec: Name in the registry: what a reader needs.
         encoder: ffmpeg's name of the encoder.
         pixel_format: Pixel format given to the encoder.
-        lossless: Whether every sample returns as it was.
+        lossless: Whether every sample is restored exactly.
         options: Options of the encoder.
         matrix: Matrix coefficients to tag, by ffmpeg's name: bt709, gbr or smpte170m.
         full_range: Whether to tag the samples as using their full range.
-        hardware: Its name among `HARDWARE`, or empty for an encoder that runs on processors.
+        hardware: Its name in `HARDWARE`, or empty for a software encoder.
     """
 
     codec: str
@@ -307,13 +306,13 @@ _AV1_PRESETS = tuple(str(number) for number in range(14))
 
 @dataclass(frozen=True, slots=True)
 class _Lossy:
-    """An encoder that loses, as ``--codec`` names it.
+    """A lossy encoder, as ``--codec`` names it.
 
     Attributes:
         coding: What it is given.
         presets: That it has.
         most: The largest crf.
-        least: The smallest crf that is chosen without being asked for.
+        least: The smallest crf chosen automatically.
     """
 
     coding: _Coding
@@ -356,10 +355,10 @@ MAX_CRF = {
     **{name: found.most for name, found in _LOSSY.items()},
     **{name: found.most for name, found in HARDWARE.items()},
 }
-"""The largest crf of each lossy codec, and of each encoder of the hardware."""
+"""The largest crf of each lossy codec, and of each hardware encoder."""
 
 LEAST_CRF = {found.coding.codec or name: found.least for name, found in _LOSSY.items()}
-"""The smallest crf that is chosen for each codec without being asked for."""
+"""The smallest crf chosen automatically for each codec."""
 
 
 def lossless_codecs(pixel_format: str) -> Sequence[str]:
@@ -368,7 +367,7 @@ def lossless_codecs(pixel_format: str) -> Sequence[str]:
 
 
 def codecs_to_try(pixel_format: str) -> Sequence[str]:
-    """Those of `lossless_codecs` that are worth their time."""
+    """Those of `lossless_codecs` that are worth trying."""
     return tuple(name for name, coding in _LOSSLESS[pixel_format].items() if coding.tried)
 
 
@@ -380,14 +379,14 @@ def check_codec(
     crf: int | None = None,
     varied: bool = False,
 ) -> None:
-    """Refuse a codec that could make no stream of a profile, or what it does not have.
+    """Refuse a codec that cannot encode any stream of a profile, or options it does not have.
 
     Args:
         codec: As given to ``--codec``, or None for the default.
         preset: The encoder's preset, or None for the default.
-        lossless: Whether every sample must return as it was.
+        lossless: Whether every sample must be restored exactly.
         crf: Constant rate factor, where there is one.
-        varied: Whether videos with several crf are to be joined to one.
+        varied: Whether videos with several crf will be joined into one.
 
     Raises:
         OptionError: Names those that can.
@@ -444,14 +443,14 @@ def recipe_for(
 
     Args:
         pixel_format: Of the pictures, as a layout gives them.
-        lossless: Whether every sample must return as it was.
+        lossless: Whether every sample must be restored exactly.
         codec: ``h264``, ``h265``, ``av1``, ``av1-10bit``, ``ffv1``, a name among `HARDWARE`, or
             None for the default.
         crf: Constant rate factor of a lossy recipe.
         preset: The encoder's preset, or None for the default; encoders without ignore it.
-        varied: Whether videos with several crf are to be joined to one.
-        fast: Of a lossless recipe, the form that decodes in less time and is larger.
-        live: By default the preset that encodes in the least time; few frames wait for later ones.
+        varied: Whether videos with several crf will be joined into one.
+        fast: For a lossless recipe, the variant that decodes faster and is larger.
+        live: By default, the fastest preset; few frames wait for later ones.
 
     Raises:
         OptionError: The codec is unknown or cannot do it; names those that can.
@@ -504,14 +503,14 @@ def recipe_for(
 
 
 def remade(pixel_format: str, values: Mapping[str, Any]) -> Recipe:
-    """The recipe that a file tells, made again: an encoder's options may write files, too.
+    """Rebuild the recipe stated in a file, rather than trust it: encoder options may write files.
 
     Args:
         pixel_format: Of the pictures.
         values: The fields of a `Recipe`.
 
     Raises:
-        ValueError: This version makes none that is the same.
+        ValueError: This version makes no such recipe.
     """
     lossless = bool(values["lossless"])
     preset, crf = (values["options"].get(name) for name in ("preset", "crf"))
@@ -539,7 +538,7 @@ def remade(pixel_format: str, values: Mapping[str, Any]) -> Recipe:
 
 
 def _lossy(name: str, crf: int | None) -> tuple[_Coding, dict[str, str]]:
-    """How pictures are coded with a crf, and all options but the preset."""
+    """How pictures are coded at a crf, and all options but the preset."""
     if name in HARDWARE:
         device = HARDWARE[name]
         options = device.options(crf or 1)
@@ -553,7 +552,7 @@ def _lossy(name: str, crf: int | None) -> tuple[_Coding, dict[str, str]]:
 
 
 def _sited_left(options: Mapping[str, str]) -> dict[str, str]:
-    """Options that leave the chroma where cameras and decoders take it to be."""
+    """Options that keep the chroma location that cameras and decoders assume."""
     parts = {
         key: ":".join(part for part in value.split(":") if part != _CENTRED)
         for key, value in options.items()

@@ -1,4 +1,4 @@
-"""Coded messages as the packets of a video track, and back."""
+"""Coded messages to packets of a video track, and back."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def packet_codec(message_format: str) -> str:
 # ---------------------------------------------------------------- packets
 
 PACKET_CODECS = tuple(name for name, codec in CODECS.items() if codec.pictures)
-"""Codecs whose packets a video track takes as they are."""
+"""Codecs whose packets are stored in a video track as they are."""
 
 _MAX_BODY = 2**30  # what an mp4 and its readers take for one packet
 
@@ -53,7 +53,7 @@ class CodedPicture:
         width: Columns.
         height: Rows.
         keyframe: Whether decoding can begin here.
-        framing: What an mp4 does not keep of the body, see `body_of`.
+        framing: What an mp4 does not keep of the body; see `body_of`.
     """
 
     width: int
@@ -63,7 +63,7 @@ class CodedPicture:
 
 
 class PictureParser:
-    """Looks at the bodies of one topic in the order they go into a video.
+    """Inspects the bodies of one topic in the order they go into a video.
 
     A video that begins in the middle, or lacks a packet, decodes to garbage until the next key
     frame. So bodies are refused up to the first key frame whose parameters are known, and again
@@ -88,7 +88,7 @@ class PictureParser:
         return self._pictures.parameters
 
     def parse(self, body: bytes | memoryview) -> CodedPicture:
-        """Check that an mp4 carries a body, and find what is needed to get it back.
+        """Check that an mp4 can carry a body, and find what is needed to restore it.
 
         Raises:
             Refused: It does not; says why. A packet of parameters alone is refused too, but
@@ -109,7 +109,7 @@ class PictureParser:
         return picture
 
     def leave_out(self) -> None:
-        """Tell that the picture parsed last does not go into the video after all."""
+        """Take back the picture parsed last: it does not go into the video after all."""
         self._whole = False
 
 
@@ -121,7 +121,7 @@ class _Pictures(Protocol):
 
 
 class Jpegs:
-    """JPEG files, of which none needs another."""
+    """JPEG files, which are independent."""
 
     parameters = b""
 
@@ -132,7 +132,7 @@ class Jpegs:
 
 
 class Pngs:
-    """PNG files, of which none needs another."""
+    """PNG files, which are independent."""
 
     parameters = b""
 
@@ -192,7 +192,7 @@ def _pictures_of(codec: str) -> _Pictures:
 
 
 def plain_body(codec: str, body: bytes | memoryview) -> bytes:
-    """A body as a muxer is given it, with the framing that all muxers read alike.
+    """A body as passed to a muxer, with the framing that every muxer understands.
 
     Its length is that of the packet in the mp4: a start code of four bytes becomes a length of
     four bytes.
@@ -214,7 +214,7 @@ def body_of(codec: str, packet: bytes, framing: str) -> bytes:
     Args:
         codec: One of `PACKET_CODECS`.
         packet: As the mp4 holds it.
-        framing: As `CodedPicture` has it.
+        framing: As in `CodedPicture`.
 
     Raises:
         Refused: The framing does not belong to the packet.

@@ -1,4 +1,4 @@
-"""RGB of luma and halved chroma, in integers: the same bits on every machine.
+"""RGB from luma and halved chroma, in integers: bit-identical on every machine.
 
 See spec/index.md, "Colours". Where `colour.c` was compiled it takes a third to a sixth of
 the time that libswscale would; elsewhere numpy takes several times as long.
@@ -46,7 +46,7 @@ class Factors(NamedTuple):
 
 @cache
 def factors(matrix: str, full_range: bool, bits: int) -> Factors:
-    """The factors of a kind of video.
+    """The conversion factors for a kind of video.
 
     Args:
         matrix: One of `MATRICES`.

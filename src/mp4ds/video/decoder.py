@@ -1,4 +1,4 @@
-"""Decoding a stream's pictures out of its mp4."""
+"""Decoding a stream's pictures from its mp4."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FORMATS = {"mono8": "gray", "rgb8": "rgb24"}
 
 
 def jpeg_pixels(data: bytes | memoryview, size: tuple[int, int]) -> tuple[str, NDArray[np.uint8]]:
-    """The pixels of a file, turned by no tag and converted by no profile.
+    """The pixels of a file, ignoring orientation tags and colour profiles.
 
     Args:
         data: The file.
@@ -54,7 +54,7 @@ def jpeg_pixels(data: bytes | memoryview, size: tuple[int, int]) -> tuple[str, N
 
 
 class JpegDecoder:
-    """Takes the place of ffmpeg's decoder of JPEG files, as much of it as is used.
+    """Replaces ffmpeg's decoder for JPEG files, as far as it is used here.
 
     Args:
         size: Width and height of the frames.
@@ -64,7 +64,7 @@ class JpegDecoder:
         self._size = size
 
     def decode(self, packet: Any) -> list[av.VideoFrame]:
-        """The frame of a packet; none of the empty one that ends a video.
+        """The frame of a packet; none for the empty packet that ends a video.
 
         Raises:
             InvalidDataError: It cannot be decoded.
@@ -105,11 +105,11 @@ class VideoDecoder:
         path: The video.
         codec: Name in the registry.
         coded_size: Width and height of the coded pictures.
-        frames: Number of frames that are due.
+        frames: Expected number of frames.
         picture_format: Pixel format of the pictures wanted.
         picture_size: Width and height of the pictures wanted.
-        matrix: Matrix coefficients of the video's colours; None if the video itself tells.
-        full_range: Whether its samples use their full range, unless the video itself tells.
+        matrix: Matrix coefficients of the video's colours; None to use the video's own tags.
+        full_range: Whether its samples use their full range, unless the video is tagged.
         sequential: Decode with all cores, for reading in order.
 
     Raises:
@@ -155,11 +155,11 @@ class VideoDecoder:
 
     @property
     def coded_frames(self) -> int:
-        """Frames that the file's index lists, and no edit list hides at the beginning."""
+        """Frames in the file's index, without those hidden by an edit list at the beginning."""
         return len(self._stream.index_entries) - self._media.hidden
 
     def pictures(self, scale: Scale | None = None) -> Iterator[Picture]:
-        """All pictures in order, as views that hold until the next one is asked for.
+        """All pictures in order, as views that are valid until the next one is requested.
 
         Args:
             scale: See `PictureMaker.make`.
@@ -204,7 +204,7 @@ class VideoDecoder:
     def decodable_pictures(
         self, indices: Iterable[int], scale: Scale | None = None
     ) -> Iterator[tuple[int, Picture | None]]:
-        """Like `pictures_at`, for what others encoded: None for a picture that cannot be decoded.
+        """Like `pictures_at`, for third-party streams: None for a picture that cannot be decoded.
 
         Where a packet was lost before it was recorded, those that refer to it cannot be decoded.
         """
@@ -214,7 +214,7 @@ class VideoDecoder:
     def _chosen(
         self, indices: Iterable[int], decode: Callable[[int], Iterator[av.VideoFrame]]
     ) -> Iterator[tuple[int, av.VideoFrame | None]]:
-        """The frames of some numbers; None for one that does not come out."""
+        """The frames with some numbers; None for one that the decoder does not output."""
         ticks, keys = self._presentation_ticks(), self._key_numbers
         in_flight = min(os.cpu_count() or 1, _MOST_THREADS) + 1
         frames: Iterator[av.VideoFrame] = iter(())

@@ -23,7 +23,7 @@ class Line:
         points: At least two.
         color: As ``#rrggbb``.
         width: Pixels.
-        dashed: Whether it is interrupted.
+        dashed: Whether the line is dashed.
     """
 
     points: Sequence[tuple[float, float]]
@@ -40,7 +40,7 @@ class Dot:
         place: Of its middle, pixels.
         color: As ``#rrggbb``.
         radius: Pixels.
-        tip: What an SVG tells of it.
+        tip: Tooltip in an SVG.
     """
 
     place: tuple[float, float]
@@ -73,7 +73,7 @@ def svg_of(shapes: Sequence[Shape], size: tuple[int, int]) -> str:
     """The drawing as an SVG element.
 
     Args:
-        shapes: What is drawn later covers what is drawn before.
+        shapes: Later shapes cover earlier ones.
         size: Width and height, pixels.
     """
     width, height = size
@@ -110,7 +110,7 @@ def png_of(shapes: Sequence[Shape], size: tuple[int, int]) -> bytes:
     """The drawing as a PNG file of twice its size.
 
     Args:
-        shapes: What is drawn later covers what is drawn before.
+        shapes: Later shapes cover earlier ones.
         size: Width and height, pixels.
     """
     from PIL import Image, ImageDraw, ImageFont

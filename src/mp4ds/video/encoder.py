@@ -1,4 +1,4 @@
-"""Encoding a stream's pictures into one mp4."""
+"""Encoding a stream's pictures to one mp4."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _THREADS = Path("/proc/self/task")
 
 @contextmanager
 def ordinary_scheduling() -> Iterator[None]:
-    """Give threads that are made or changed in here the scheduling that the caller has.
+    """Give threads created or changed in this block the caller's scheduling.
 
     SVT-AV1, where it may, puts its threads and the one that opens it above everything else on the
     machine (SCHED_FIFO). On a robot, or with other work beside it, that stops the others; and what
@@ -77,7 +77,7 @@ class VideoEncoder:
         picture_format: Pixel format of the pictures.
         width: Columns of a picture.
         height: Rows of a picture.
-        gop: Most frames from one key frame to the next.
+        gop: Maximum distance of key frames, in frames.
         threads: Threads of the encoder.
         rate: Frames per second, if known; a hint for the encoder's look-ahead.
         on_packet: Called with each packet before it is written. What was written can then be read
@@ -146,7 +146,7 @@ class VideoEncoder:
         """Encode the next picture.
 
         Args:
-            picture: Of the size and format promised; must not be changed afterwards.
+            picture: Of the size and format given above; must not be changed afterwards.
             tick: Presentation time in ticks, greater than the last.
 
         Raises:
@@ -198,7 +198,7 @@ class VideoEncoder:
             self._container.close()
 
     def abandon(self) -> None:
-        """Close the file as it is; the caller removes it."""
+        """Close the unfinished file; the caller removes it."""
         try:
             self._container.close()
         except (FFmpegError, OSError):
@@ -213,7 +213,7 @@ def coded_size(recipe: Recipe, width: int, height: int) -> tuple[int, int]:
 
 
 def _options(recipe: Recipe, width: int, height: int) -> Mapping[str, str]:
-    """The options of a recipe; FFV1 refuses large slices, and so gets as many as it takes."""
+    """The options of a recipe; FFV1 refuses large slices, so it gets enough of them."""
     if recipe.encoder != "ffv1":
         return recipe.options
     components = av.VideoFormat(recipe.pixel_format, width, height).components
@@ -224,12 +224,12 @@ def _options(recipe: Recipe, width: int, height: int) -> Mapping[str, str]:
 
 
 def color_range(recipe: Recipe) -> int:
-    """Number in ffmpeg of the range of the samples."""
+    """The number of the range of the samples, in ffmpeg."""
     return 2 if recipe.full_range else 1
 
 
 def open_encoder(context: Any, recipe: Recipe, width: int, height: int, *, threads: int) -> None:
-    """Tell an encoder what it is to make, and open it; its options were given before.
+    """Configure an encoder, whose options are already set, and open it.
 
     Args:
         context: PyAV's context of the encoder, not open yet.
@@ -254,7 +254,7 @@ def open_encoder(context: Any, recipe: Recipe, width: int, height: int, *, threa
     context.color_trc = _BT709
     context.color_range = color_range(recipe)
     if recipe.encoder == "libsvtav1":
-        # it prints to stderr on its own; errors reach us as return codes
+        # it prints to stderr by itself; errors reach us as return codes
         os.environ.setdefault("SVT_LOG", "0")
         given = context.options.get("svtav1-params")
         parameters = f"{given}:lp={threads}" if given else f"lp={threads}"
@@ -268,7 +268,7 @@ def open_encoder(context: Any, recipe: Recipe, width: int, height: int, *, threa
 
 
 def tool_versions() -> Mapping[str, str]:
-    """Versions of what makes and reads the videos."""
+    """Versions of the tools that write and read the videos."""
     return {
         "av": av.__version__,
         "libavcodec": ".".join(map(str, av.library_versions["libavcodec"])),
@@ -282,13 +282,13 @@ _UPLOADS_SINCE = 18  # PyAV that brings pictures to a device on its own
 
 
 def hardware_error(codec: str, problem: str, remedy: str = "") -> HardwareError:
-    """What to raise where the hardware of a codec cannot be used; see `HardwareError`."""
+    """The error to raise if the hardware of a codec cannot be used; see `HardwareError`."""
     found = HARDWARE[codec]
     return HardwareError(codec, problem, remedy or f"It needs {found.needs}", found.codec)
 
 
 def check_hardware(codec: str | None) -> None:
-    """Open an encoder for a moment, if it is one of the hardware.
+    """Open an encoder briefly, if it is a hardware one, to see that it works.
 
     Args:
         codec: As given to ``--codec``.
@@ -301,9 +301,9 @@ def check_hardware(codec: str | None) -> None:
 
 
 def refuse_if_unusable(codec: str, width: int, height: int) -> None:
-    """Tell a device that fails from one that does not take pictures of a size.
+    """Distinguish a failing device from one that does not support a picture size.
 
-    To be called after an encoder of the hardware could not be opened.
+    Call it after a hardware encoder could not be opened.
 
     Args:
         codec: As given to ``--codec``.
@@ -327,7 +327,7 @@ def refuse_if_unusable(codec: str, width: int, height: int) -> None:
 
 
 def device_for(codec: str) -> HWAccel | None:
-    """The device that an encoder's pictures have to be on, for PyAV to bring them there.
+    """The device that must hold an encoder's pictures; PyAV uploads them.
 
     Args:
         codec: As given to ``--codec``.
@@ -337,7 +337,7 @@ def device_for(codec: str) -> HWAccel | None:
 
 
 def surface_format(codec: str) -> str:
-    """The pixel format of pictures on an encoder's device; empty: it takes them as they are.
+    """The pixel format of pictures on an encoder's device; empty: no upload is needed.
 
     Args:
         codec: As given to ``--codec``.

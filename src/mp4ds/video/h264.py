@@ -26,24 +26,24 @@ def unit_type(unit: bytes) -> int:
 
 
 def has_parameters(units: Sequence[bytes]) -> bool:
-    """Whether NAL units have both kinds of parameter sets among them."""
+    """Whether NAL units include both kinds of parameter sets."""
     return {SPS, PPS} <= set(map(unit_type, units))
 
 
 @dataclass(frozen=True, slots=True)
 class Sps:
-    """What is needed of a sequence parameter set.
+    """The fields of a sequence parameter set that are needed.
 
     Attributes:
         number: Its id.
         width: Columns shown.
         height: Rows shown.
-        planes: Whether the colour planes are coded apart.
+        planes: Whether the colour planes are coded separately.
         frames_only: Whether no picture is a field.
         frame_num_bits: Bits of `frame_num`.
         poc_type: How the picture order is coded, 0 to 2.
         poc_bits: Bits of the picture order count, for type 0.
-        reorder: Most pictures sent before one shown earlier; None if it does not tell.
+        reorder: Maximum number of pictures sent before one shown earlier; None if not stated.
     """
 
     number: int

@@ -28,21 +28,21 @@ def unit_type(unit: bytes) -> int:
 
 
 def has_parameters(units: Sequence[bytes]) -> bool:
-    """Whether NAL units have all kinds of parameter sets among them."""
+    """Whether NAL units include all kinds of parameter sets."""
     return {VPS, SPS, PPS} <= set(map(unit_type, units))
 
 
 @dataclass(frozen=True, slots=True)
 class Sps:
-    """What is needed of a sequence parameter set.
+    """The fields of a sequence parameter set that are needed.
 
     Attributes:
         number: Its id.
         width: Columns shown.
         height: Rows shown.
-        planes: Whether the colour planes are coded apart.
+        planes: Whether the colour planes are coded separately.
         poc_bits: Bits of the picture order count.
-        reorder: Most pictures sent before one shown earlier.
+        reorder: Maximum number of pictures sent before one shown earlier.
     """
 
     number: int

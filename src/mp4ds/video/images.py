@@ -1,4 +1,4 @@
-"""Single images: files read to the bit and written, and pixels as RGB, BGR or grey in any size."""
+"""Single images: reading and writing files exactly, and pixels as RGB, BGR or grey in any size."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from mp4ds.messages.layouts import Layout, bind
 from mp4ds.video.pixels import PictureConverter, plain_frame, scaling
 
 STILL_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".webp")
-"""Endings of the image files that are read."""
+"""Suffixes of the image files that are read."""
 
 STILL_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM", "WEBP")
-"""What may be in them, as Pillow calls it: it knows others, of which some run programs."""
+"""Pillow's names of the formats allowed: some of its others run programs."""
 
 _GREY = ("1", "L", "LA")
 _COLOURS = ("RGB", "RGBA", "P", "CMYK", "YCbCr")
 
 
 def read_still(path: Path) -> tuple[str, NDArray[np.uint8]]:
-    """The pixels of an image file; alpha is left out.
+    """The pixels of an image file, without alpha.
 
     Returns:
         The ROS encoding, ``mono8`` or ``rgb8``, and pixels of shape (H, W) or (H, W, 3).
@@ -73,7 +73,7 @@ def png_file(rgb: NDArray[np.uint8]) -> bytes:
 
 
 def jpeg_bytes(rgb: NDArray[np.uint8], quality: int, *, is_grey: bool = False) -> int:
-    """Bytes of the JPEG file that ROS's image transport and OpenCV make: of halved chroma.
+    """A JPEG file as ROS's image transport and OpenCV write it: with halved chroma.
 
     Args:
         rgb: Shape (H, W, 3).
@@ -118,7 +118,7 @@ _DEEP = {
 
 
 def read_image(path: Path) -> tuple[str, Pixels]:
-    """The pixels of an image file, as they are in it.
+    """The pixels of an image file, exactly as stored.
 
     PNG, TIFF, BMP and PGM or PPM with 8 and 16 bits, TIFF with floats, too. One bit becomes 0 and
     255; a picture is not turned by what its metadata say.
@@ -127,7 +127,7 @@ def read_image(path: Path) -> tuple[str, Pixels]:
         The ROS encoding, and pixels of shape (H, W) or (H, W, C), little-endian.
 
     Raises:
-        SourceError: It is not an image, or its values cannot be had as they are.
+        SourceError: It is not an image, or its exact values cannot be read.
     """
     try:
         with path.open("rb") as file:
@@ -143,7 +143,7 @@ def read_image(path: Path) -> tuple[str, Pixels]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file, by its header.
+    """Width and height of an image file, from its header.
 
     Raises:
         SourceError: It is not an image.
@@ -152,7 +152,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def image_kind(path: Path) -> str:
-    """Size and kind of pixels of an image file, in words, by its header.
+    """Size and pixel type of an image file, in words, from its header.
 
     Raises:
         SourceError: It is not an image.
@@ -226,7 +226,7 @@ def _deep_colour(path: Path, codec: str) -> tuple[str, Pixels]:
 
 
 def _netpbm(path: Path) -> tuple[str, Pixels]:
-    """A binary PGM or PPM, with its values as they are: Pillow scales them to 8 or 16 bits."""
+    """A binary PGM or PPM with its exact values: Pillow scales them to 8 or 16 bits."""
     data = path.read_bytes()
     match = _NETPBM.match(data)
     if not match:
@@ -273,10 +273,10 @@ class ImageFile:
     Args:
         encoding: ROS image encoding.
         image_format: ``png`` or ``jpeg``.
-        quality: Of JPEG, 1 to 100, as libjpeg has it.
+        quality: Of JPEG, 1 to 100, libjpeg's scale.
 
     Raises:
-        OptionError: The format cannot hold the encoding, or there is no such quality.
+        OptionError: The format cannot hold the encoding, or the quality is out of range.
     """
 
     def __init__(self, encoding: str, image_format: str, *, quality: int = 95) -> None:
@@ -337,7 +337,7 @@ def _png_file(frame: av.VideoFrame) -> bytes:
 
 
 def _layout(encoding: Encoding, *, demosaic: bool) -> Layout:
-    """A layout whose pictures look like the images, or like their mosaic."""
+    """A layout whose pictures look like the images, or their mosaic."""
     if not encoding.mosaic:
         return bind(encoding.general, encoding)
     if demosaic and encoding.lossy:
@@ -379,7 +379,7 @@ _ENCODING_OF = {
 
 
 def shown_format(encoding: Encoding) -> str | None:
-    """Name in ffmpeg of what the pixels look like, or None if they cannot be displayed.
+    """The pixel format for display, in ffmpeg; None if the pixels cannot be displayed.
 
     Depths, signed numbers, floats, and pairs of channels are data. A Bayer mosaic is its own
     format, and YUV its planes.
@@ -400,7 +400,7 @@ def shown_format(encoding: Encoding) -> str | None:
 
 
 def encoding_as(encoding: Encoding, colours: str) -> str | None:
-    """The ROS encoding of pixels made into ``rgb``, ``bgr`` or ``gray``; 16 bits stay 16 bits.
+    """The ROS encoding of pixels converted to ``rgb``, ``bgr`` or ``gray``; 16 bits stay 16 bits.
 
     Returns:
         None if the pixels cannot be displayed.
@@ -411,7 +411,7 @@ def encoding_as(encoding: Encoding, colours: str) -> str | None:
 
 
 class Renderer:
-    """Makes pixels of one encoding into another, of another size; not for several threads.
+    """Converts pixels to another encoding and size; not thread-safe.
 
     Mosaics are interpolated, camera YUV is BT.601 of limited range, alpha is left out, and grey is
     the luma of BT.601. Sizes are reduced by area and enlarged by bicubic interpolation.
@@ -421,7 +421,7 @@ class Renderer:
         target: ROS encoding to make: one of `encoding_as`, or the same encoding where it is
             neither a mosaic nor YUV.
         crop: x, y, width and height of the part to take first, or None for all of it.
-        size: Width and height of what is made.
+        size: Width and height of the result.
     """
 
     def __init__(
@@ -446,7 +446,7 @@ class Renderer:
         self._reformatter = VideoReformatter()
 
     def render(self, pixels: Pixels, out: Pixels) -> None:
-        """Write what the pixels become.
+        """Write the converted pixels.
 
         Args:
             pixels: Of the encoding, native byte order.

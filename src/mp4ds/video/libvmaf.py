@@ -1,4 +1,4 @@
-"""The ffmpeg that computes VMAF: finding one that can, and running it."""
+"""Finding and running an ffmpeg that computes VMAF."""
 
 from __future__ import annotations
 
@@ -59,14 +59,14 @@ class Ffmpeg:
 
     @cached_property
     def version(self) -> str:
-        """What it calls its version."""
+        """Its version, as it reports it."""
         first = _ask(self.path, "-version").partition("\n")[0]
         found = re.match(r"ffmpeg version (\S+)", first)
         return found[1] if found else first
 
 
 def find_ffmpeg() -> Ffmpeg:
-    """An ffmpeg with libvmaf: that of the package imageio-ffmpeg, else one on the PATH.
+    """Find an ffmpeg with libvmaf: the one of the package imageio-ffmpeg, or one on the PATH.
 
     Raises:
         ScoringError: There is none; says how to get one.
@@ -109,7 +109,7 @@ def _ask(path: str, *arguments: str) -> str:
 def scoring_process(
     ffmpeg: Ffmpeg, *, width: int, height: int, pixel_format: str, threads: int
 ) -> Iterator[VmafProcess]:
-    """An ffmpeg that scores the frames that it is given; it is ended with the block.
+    """An ffmpeg that scores the frames written to it; it ends with the block.
 
     Args:
         ffmpeg: The program.
@@ -159,7 +159,7 @@ def _command(path: str, width: int, height: int, pixel_format: str, threads: int
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End it, if it still runs."""
+    """End it if it is still running."""
     with suppress(OSError):
         _input(process).close()
     if process.poll() is None:
@@ -185,7 +185,7 @@ class VmafProcess:
         self._folder = folder
 
     def write(self, reference: tuple[NDArray[Any], ...], decoded: tuple[NDArray[Any], ...]) -> None:
-        """Give it the next frame and its original.
+        """Write the next frame and its original.
 
         Raises:
             ScoringError: It has ended; says with what.

@@ -1,4 +1,4 @@
-"""An mp4 opened by PyAV, and what the system refuses to ffmpeg."""
+"""An mp4 opened with PyAV, and shortages of resources that ffmpeg reports badly."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ENOUGH_BYTES = 32 * 2**20
 
 
 def raise_if_scarce(error: BaseException | None = None) -> None:
-    """Raise for what the system lacks, where that may be why ffmpeg failed, or damaged a frame.
+    """Raise if the system lacks a resource, which may be why ffmpeg failed or damaged a frame.
 
     Ffmpeg says that it has no memory of forged sizes, too, and of memory that is short it says all
     kinds of things. So it is tried.
@@ -50,14 +50,14 @@ _ANY_METADATA: dict[str, Any] = (
 
 
 class Media:
-    """An mp4 being read: its one video track; `close` closes its file, too.
+    """An mp4 open for reading, with its one video track; `close` also closes its file.
 
     Args:
         path: The video.
 
     Attributes:
         container: PyAV's.
-        track: The video track, of a codec that ffmpeg knows.
+        track: The video track, with a codec that ffmpeg knows.
 
     Raises:
         VideoError: ``file-missing`` or ``video-unreadable``.
@@ -106,11 +106,11 @@ class Media:
         return next((n for n, item in enumerate(entries) if not item.is_discard), len(entries))
 
     def check(self, codec: str, coded_size: tuple[int, int] | None) -> None:
-        """Compare what the header promises with what a sidecar says.
+        """Compare the header with what a sidecar says.
 
         Args:
             codec: Name in the registry, or ffmpeg's.
-            coded_size: Width and height that are due, if known.
+            coded_size: Expected width and height, if known.
 
         Raises:
             VideoError: ``codec-mismatch`` or ``geometry-mismatch``.
@@ -140,11 +140,11 @@ class Media:
 
 
 def open_input(source: Any, container: str = "mp4") -> Any:
-    """Open a video to read by PyAV.
+    """Open a video for reading with PyAV.
 
     Args:
         source: Path, absolute: ffmpeg takes a relative name with a colon for an address; or a file.
-        container: Ffmpeg's name of the demuxer. No other is tried, whatever the bytes look like.
+        container: ffmpeg's name of the demuxer. No other is tried, whatever the bytes look like.
 
     Raises:
         FFmpegError, OSError: It cannot be read as that.
@@ -153,7 +153,7 @@ def open_input(source: Any, container: str = "mp4") -> Any:
 
 
 def pixel_format_of(context: Any) -> str:
-    """Ffmpeg's name of the pixel format of a video's codec context; empty if none is told.
+    """The pixel format of a video's codec context, in ffmpeg; empty if unknown.
 
     PyAV 17, which Python 3.10 has, crashes where it is asked for `pix_fmt` then.
     """
@@ -161,7 +161,7 @@ def pixel_format_of(context: Any) -> str:
 
 
 class _Source:
-    """A remote file for PyAV, which raises the first error of a file and prints the others."""
+    """A remote file for PyAV, which raises the first error of a file and prints later ones."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -171,7 +171,7 @@ class _Source:
         self.close = stream.close
 
     def read(self, size: int = -1) -> bytes:
-        """Read that many bytes; after an error, none."""
+        """Read up to `size` bytes; none after an error."""
         if self._has_failed:
             return b""
         try:

@@ -1,4 +1,4 @@
-"""The index of an mp4: its boxes, its track, and where each coded frame lies (ISO/IEC 14496-12)."""
+"""The index of an mp4: its boxes, its track and the places of coded frames (ISO/IEC 14496-12)."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from mp4ds.errors import Refused, VideoError
 
 _HEADER, _LONG_HEADER = 8, 16
-_MOST_BOXES = 1_000  # beside each other; no video has a tenth of that
+_MOST_BOXES = 1_000  # siblings; no video has a tenth of that
 
 
 class DamagedBoxError(ValueError):
-    """A box is missing or contradicts what is around it; the text says which."""
+    """A box is missing or contradicts those around it; the text says which."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,16 +44,16 @@ class Box:
 
 
 def boxes(file: BinaryIO, start: int, end: int, *, outermost: bool = False) -> Iterator[Box]:
-    """The boxes that lie beside each other; only their headers are read.
+    """The boxes in a range, one after another; only their headers are read.
 
     Args:
-        file: Where they are.
+        file: The file.
         start: Byte where the first begins.
         end: Byte after the last. Fewer than 8 bytes before it are not a box, as in QuickTime.
-        outermost: Whether they are in no other box, so that the last may have no size.
+        outermost: Whether they are top-level, so that the last may have no size.
 
     Raises:
-        DamagedBoxError: One does not lie within `start` and `end`, or they are too many.
+        DamagedBoxError: One is not within `start` and `end`, or there are too many.
     """
     for _ in range(_MOST_BOXES):
         if end - start < _HEADER:
@@ -103,7 +103,7 @@ class SampleEntry:
 
     Attributes:
         codec: Its four letters.
-        values: Size, resolution and depth as they stand.
+        values: Size, resolution and depth, as stored.
         boxes: What follows: parameter sets, colour, aspect ratio, ...
     """
 
@@ -113,7 +113,7 @@ class SampleEntry:
 
     @property
     def aspect_ratio(self) -> Fraction:
-        """Width to height of a pixel; 0 if nothing is said."""
+        """Width to height of a pixel; 0 if not stated."""
         pasp = dict(self.boxes).get("pasp", b"")
         across, down = struct.unpack(">II", pasp) if len(pasp) == 8 else (0, 1)
         return Fraction(across, down) if down else Fraction(0)
@@ -149,7 +149,7 @@ def read_sample_entry(path: Path) -> SampleEntry:
     """The description of the first track's packets.
 
     Args:
-        path: An mp4 of which nothing needs to be true; at most 1 MiB of it is held.
+        path: An mp4, not trusted; at most 1 MiB of it is held.
 
     Raises:
         VideoError: ``file-missing``, or ``video-unreadable`` where there is not just one
@@ -230,7 +230,7 @@ class TrackColour:
         primaries: Colour primaries.
         transfer: Transfer characteristics.
         matrix: Matrix coefficients.
-        full_range: Whether samples use their full range; None if nothing is said of it.
+        full_range: Whether samples use their full range; None if not stated.
     """
 
     primaries: int
@@ -239,7 +239,7 @@ class TrackColour:
     full_range: bool | None
 
     def apply(self, context: Any) -> None:
-        """Tell PyAV's context of a decoder; what the packets say outweighs it."""
+        """Set them on PyAV's decoder context; the packets' own values take precedence."""
         context.color_primaries = self.primaries
         context.color_trc = self.transfer
         context.colorspace = self.matrix
@@ -248,10 +248,9 @@ class TrackColour:
 
 
 def track_colour(entry: SampleEntry) -> TrackColour | None:
-    """The colours of a track, as ffmpeg reads them; None if it says nothing of them.
+    """The colours of a track, as ffmpeg reads them; None if not stated.
 
-    QuickTime's ``nclc`` has no range. What nobody defined is unspecified, and profiles are not
-    looked at.
+    QuickTime's ``nclc`` has no range. Undefined values count as unspecified; profiles are ignored.
     """
     found = None
     for kind, body in entry.boxes:
@@ -295,23 +294,23 @@ _LONG_EDITS = np.dtype([("duration", ">u8"), ("start", ">i8"), ("speed", ">i4")]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SampleTable:
-    """What the index says of a video track's samples, which are its coded frames.
+    """The index of a video track's samples, which are its coded frames.
 
     Attributes:
         codec: Four letters of the sample entry: ``avc1``, ``hev1``, ``hvc1``, ``av01``,
             ``vp09``, ``FFV1``, ``mp4v``, ...
-        width: Columns, as the sample entry says.
-        height: Rows, as the sample entry says.
-        colour: What the track says of its colours, if anything.
+        width: Columns, from the sample entry.
+        height: Rows, from the sample entry.
+        colour: The track's colours, if stated.
         configuration: Contents of avcC, hvcC, av1C, vpcC or glbl; empty if there is none.
         timescale: Ticks per second.
         places: Byte of the file where each sample begins, in decoding order. All arrays but
             `sync` are int64.
         sizes: Bytes of each.
-        decoding: Ticks at which each is decoded, none later than it is shown.
-        presentation: Ticks at which each is shown, the edit list applied.
-        sync: For each whether it is a sync sample, at which decoding can begin; bool.
-        order: Numbers of the samples that the edit list shows, in the order of their showing:
+        decoding: Ticks at which each is decoded, never later than it is shown.
+        presentation: Ticks at which each is shown, with the edit list applied.
+        sync: Whether each is a sync sample, at which decoding can begin; bool.
+        order: Numbers of the samples that the edit list shows, in presentation order:
             frame ``n`` of the video is sample ``order[n]``.
     """
 
@@ -331,7 +330,7 @@ class SampleTable:
 
 @dataclass(frozen=True, slots=True)
 class _Edit:
-    """What is shown of a track, in ticks of the track."""
+    """The part of a track that is shown, in ticks of the track."""
 
     delay: int
     start: int
@@ -354,7 +353,7 @@ class _Movie:
         return found
 
     def path(self, box: Box, *kinds: bytes) -> Box:
-        """A box by the kinds of those that it is in, and its own."""
+        """A box by its path of kinds."""
         for kind in kinds:
             box = _required(self.inside(box), kind)
         return box
@@ -485,7 +484,7 @@ def _required(found: dict[bytes, Box], kind: bytes) -> Box:
 
 
 def _check_references(movie: _Movie, information: Box) -> None:
-    """Refuse frames that are in other files, as QuickTime may have them."""
+    """Refuse frames that are in other files, which QuickTime allows."""
     references = movie.inside(information).get(b"dinf")
     dref = movie.inside(references).get(b"dref") if references else None
     if dref is None:
@@ -522,7 +521,7 @@ def _sizes(movie: _Movie, tables: dict[bytes, Box], file_size: int) -> Integers:
 
 
 def _places(movie: _Movie, tables: dict[bytes, Box], sizes: Integers, file_size: int) -> Integers:
-    """Samples lie in chunks, one after another; what a chunk holds is told where it changes."""
+    """Samples are stored in chunks, one after another, described only where chunks change."""
     if b"co64" in tables:
         chunks = movie.table(tables[b"co64"], _LONG_NUMBER)
     else:
@@ -547,7 +546,7 @@ def _places(movie: _Movie, tables: dict[bytes, Box], sizes: Integers, file_size:
 
 
 def _times(movie: _Movie, tables: dict[bytes, Box], count: int) -> tuple[Integers, Integers]:
-    """Ticks of decoding and of showing, without the edit list; two arrays."""
+    """Ticks of decoding and of presentation, without the edit list; two arrays."""
     steps = _repeated(movie.table(_required(tables, b"stts"), _STEPS), count, "stts")
     if np.any(steps >= _LONGEST_STEP):
         raise Refused("a frame lasts too long")
@@ -581,10 +580,10 @@ def _sync(movie: _Movie, tables: dict[bytes, Box], count: int) -> NDArray[np.boo
 
 
 def _edit(movie: _Movie, track: Box, timescale: int) -> _Edit | None:
-    """The edit list, where it only delays the track and cuts its ends; None without one.
+    """The edit list, if it only delays the track and trims its ends; None without one.
 
     Raises:
-        Refused: It says more.
+        Refused: It does more than that.
     """
     parts = movie.inside(track)
     elst = movie.inside(parts[b"edts"]).get(b"elst") if b"edts" in parts else None

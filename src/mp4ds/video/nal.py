@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from mp4ds.errors import Refused
 
 MAX_UNITS = 512
-"""Most NAL units in one packet."""
+"""Maximum number of NAL units in one packet."""
 
 MAX_ZEROS = 4096
-"""Most zero bytes in a row between NAL units."""
+"""Maximum number of consecutive zero bytes between NAL units."""
 
 START_CODE = b"\0\0\0\1"
 _START = b"\0\0\1"
@@ -25,11 +25,11 @@ def split(data: bytes | memoryview) -> tuple[list[bytes], str]:
         data: One access unit.
 
     Returns:
-        The NAL units, none of which is empty or ends in a zero byte, and the framing.
+        The NAL units, none empty or ending in a zero byte, and the framing.
 
     Raises:
-        Refused: It does not begin with a start code, a NAL unit is empty, or there are more of
-            them, or of zero bytes, than a packet of a camera has.
+        Refused: It does not begin with a start code, a NAL unit is empty, or there are more NAL
+            units or zero bytes than in any camera's packet.
     """
     data = bytes(data)
     start = data.find(_START)
@@ -57,10 +57,10 @@ def split(data: bytes | memoryview) -> tuple[list[bytes], str]:
 
 
 def join(units: Sequence[bytes], framing: str) -> bytes:
-    """Put start codes before NAL units as a framing says.
+    """Put start codes before NAL units according to a framing.
 
     Raises:
-        Refused: The framing is none, or is of another number of NAL units.
+        Refused: The framing is not valid, or is for another number of NAL units.
     """
     lengths, trailing = _lengths(framing)
     if len(lengths) != len(units):
@@ -72,7 +72,7 @@ def join(units: Sequence[bytes], framing: str) -> bytes:
 
 
 def join_plain(units: Sequence[bytes]) -> bytes:
-    """NAL units behind start codes of four bytes each."""
+    """NAL units, each after a start code of four bytes."""
     return b"".join(part for unit in units for part in (START_CODE, unit))
 
 
@@ -98,7 +98,7 @@ def split_length_prefixed(packet: bytes | memoryview) -> list[bytes]:
 
 
 def join_length_prefixed(packet: bytes | memoryview, framing: str) -> bytes:
-    """The packet as it was before it went into an mp4.
+    """The packet as it was before it was stored in an mp4.
 
     Args:
         packet: As the mp4 holds it.
@@ -193,7 +193,7 @@ def _sized(configuration: bytes, at: int, count: int) -> tuple[list[bytes], int]
 class PictureOrder:
     """Whether pictures are sent in the order shown, by their picture order counts.
 
-    Of these, slices tell the low bits; the high ones are counted (H.264, 8.2.1.1; H.265, 8.3.1).
+    Slices state their low bits; the high ones are counted (H.264, 8.2.1.1; H.265, 8.3.1).
 
     Attributes:
         is_broken: Whether one was sent after another that is shown later.
@@ -210,7 +210,7 @@ class PictureOrder:
         return self._last is not None
 
     def restart(self, lsb: int = 0) -> None:
-        """Begin again, from low bits."""
+        """Start over, from low bits."""
         self._msb, self._lsb, self._last = 0, lsb, None
 
     def take(self, lsb: int, bits: int, *, counts: bool = True) -> None:
@@ -218,7 +218,7 @@ class PictureOrder:
 
         Args:
             lsb: Its low bits.
-            bits: How many they are.
+            bits: How many there are.
             counts: Whether the high bits of later pictures are counted from it.
         """
         msb, half = self._msb, 1 << (bits - 1)

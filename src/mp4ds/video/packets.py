@@ -1,4 +1,4 @@
-"""Packets of video codecs into an mp4, out of it, and joined: nothing is encoded or decoded."""
+"""Write, read, cut and join packets in mp4 files; nothing is encoded or decoded."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ _IVF = {"av1": b"AV01", "vp9": b"VP90"}
 class PacketWriter:
     """One mp4 of coded packets being written. A context manager; leaving it completes the file.
 
-    The first body must be a key frame that `mp4ds.video.coded_messages.PictureParser` takes.
+    The first body must be a key frame that `mp4ds.video.coded_messages.PictureParser` accepts.
 
     Args:
         path: The file to make, by the first body.
         codec: One of `mp4ds.video.coded_messages.PACKET_CODECS`.
         width: Columns of the pictures.
         height: Rows of the pictures.
-        parameters: Parameter sets or sequence header, as `PictureParser.parameters` has them;
-            used if the first body is without.
+        parameters: Parameter sets or sequence header, as in `PictureParser.parameters`; used if the
+            first body has none.
         rate: Frames per second, if known: it gives the last frame its duration.
         on_packet: Called with each packet before it is written. What was written can then be read
             at any time; see `new_mp4`.
@@ -113,7 +113,7 @@ class PacketWriter:
         self._last = plain
 
     def begin(self, body: bytes | memoryview) -> None:
-        """Make the file, for a first body that is yet to be written.
+        """Create the file for a first body, which is not written yet.
 
         Args:
             body: As the message holds it.
@@ -138,7 +138,7 @@ class PacketWriter:
         self._stream.time_base = _TIME_BASE
 
     def close(self) -> None:
-        """Finish the file and compare what its index says with what was written.
+        """Finish the file and compare its index with what was written.
 
         Raises:
             VideoError: The file does not hold every packet as it was written.
@@ -160,7 +160,7 @@ class PacketWriter:
                     )
 
     def abandon(self) -> None:
-        """Close the file as it is; the caller removes it."""
+        """Close the unfinished file; the caller removes it."""
         if self._container is None:
             return
         try:
@@ -179,7 +179,7 @@ class PacketWriter:
 
 
 def _probe(codec: str, parameters: bytes, plain: bytes) -> Any:
-    """The first body opened as a video of its own, for what an mp4 says about its track."""
+    """The first body opened as a video, for what an mp4 says about its track."""
     if codec in _UNITS:
         has_parameters = _UNITS[codec].has_parameters(nal.split(plain)[0])
     else:
@@ -217,16 +217,16 @@ class PacketReader:
     Args:
         path: The video.
         codec: Name in the registry.
-        frames: Number of packets that are due, if known.
-        coded_size: Width and height that are due, if known.
+        frames: Expected number of packets, if known.
+        coded_size: Expected width and height, if known.
 
     Attributes:
         hidden: How many packets are hidden, to which the first that are shown refer.
         ticks: Decoding times of the shown packets in ticks of the track.
         sizes: Bytes of each shown packet.
-        keyframes: For each shown packet whether decoding can begin there, as 0 or 1.
-        extradata: What the track says about the codec: avcC, hvcC or av1C.
-        pixel_format: Of its pictures as ffmpeg calls it; empty if unknown.
+        keyframes: Whether decoding can begin at each shown packet, as 0 or 1.
+        extradata: The track's codec configuration: avcC, hvcC or av1C.
+        pixel_format: Of its pictures, by ffmpeg's name; empty if unknown.
 
     Raises:
         VideoError: ``file-missing``, ``video-unreadable``, ``codec-mismatch``,
@@ -284,7 +284,7 @@ class PacketReader:
         return [number for number, is_key in enumerate(self.keyframes) if is_key]
 
     def key_before(self, index: int) -> int:
-        """Number of the packet at which decoding begins for a shown one to be had.
+        """Number of the packet at which decoding must begin to get a shown one.
 
         Raises:
             VideoError: ``video-unreadable``: there is none.
@@ -335,15 +335,15 @@ class PacketReader:
 def cut_segment(
     source: Path, codec: str, numbers: range, ticks: Sequence[int], target: Path
 ) -> None:
-    """Write consecutive frames of a video into a file of their own.
+    """Write consecutive frames of a video to a separate file.
 
-    What is between the first of them and the key frame before it comes, too, since they refer
-    to it; an edit list hides it.
+    The frames from the preceding key frame on are included, since they are referred to; an edit
+    list hides them.
 
     Args:
         source: A file of `VideoEncoder` or `PacketWriter`, of which frames may be cut off already.
         codec: Name in the registry.
-        numbers: Of the frames, at least one.
+        numbers: Numbers of the frames, at least one.
         ticks: Their presentation times, in ticks of 1 / `TIMESCALE` s, strictly increasing from 0.
         target: The file to make. It is removed if it cannot be finished.
 
@@ -449,19 +449,19 @@ def copy_fragments(
 
 
 def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) -> int:
-    """Write the packets of videos one after another into one file.
+    """Concatenate the packets of videos into one file.
 
     The file is as one `VideoEncoder` or `PacketWriter` would have made it of the same packets:
-    its track describes them in the same words, and its last frame lasts as long as that of the
-    last segment. Of the segments' own times nothing else is used. Memory is one packet, and the
-    indexes of a segment and of the result.
+    its track has the same description, and its last frame lasts as long as that of the last
+    segment. The segments' own times are otherwise ignored. Memory is one packet, and the indexes of
+    a segment and of the result.
 
     Args:
         segments: Files of `VideoEncoder` or `PacketWriter`, at least one, in order. Those of an
             encoder need the same recipe, gop and rate, while threads and machine may differ.
         ticks: Presentation times of all frames, in ticks of 1 / `TIMESCALE` s, strictly
             increasing.
-        target: The file to make, none of the segments. It is removed if it cannot be finished.
+        target: The file to make, not one of the segments. It is removed if it cannot be finished.
 
     Returns:
         The number of packets written.
@@ -487,7 +487,7 @@ def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) 
 
 
 class _Written:
-    """What the index of the new file must say."""
+    """The expected index of the new file."""
 
     def __init__(self, codec: str) -> None:
         self.codec = codec
@@ -495,16 +495,16 @@ class _Written:
         self.keyframes = bytearray()
 
     def add(self, tick: int, size: int, *, is_key: bool) -> None:
-        """Take a packet."""
+        """Add a packet."""
         self.ticks.append(tick)
         self.sizes.append(size)
         self.keyframes.append(is_key)
 
     def check(self, path: Path, entry: SampleEntry) -> None:
-        """Compare it with what it says.
+        """Compare it with the file.
 
         Raises:
-            VideoError: It says something else.
+            VideoError: They differ.
         """
         if not self._is_in(path):
             raise VideoError(
@@ -550,8 +550,8 @@ def _copy(
 def _new_stream(container: Any, template: Any, entry: SampleEntry) -> Any:
     """A track described as the segments' tracks are.
 
-    The template has bit rates of its segment, and from its first packets ffmpeg may have found
-    an aspect ratio of which the segment's track says nothing.
+    The template has its segment's bit rates, and ffmpeg may have found an aspect ratio in its first
+    packets that the segment's track does not state.
     """
     stream = container.add_stream_from_template(template, opaque=True)
     stream.time_base = _TIME_BASE
@@ -595,7 +595,7 @@ def _copy_segment(
 
 
 def _packet_at(data: bytes, stream: Any, tick: int, duration: int, *, is_key: bool) -> Any:
-    """A packet to be muxed, shown from a tick on."""
+    """A packet to mux, shown from a tick on."""
     packet = av.Packet(data)
     packet.stream = stream
     packet.time_base = _TIME_BASE
@@ -612,7 +612,7 @@ def _finish(container: Any, target: Path) -> None:
 
 @contextmanager
 def _damage_told(path: Path, problem: str) -> Iterator[None]:
-    """Turns what the muxer refuses into a `VideoError`, but not what the disk refuses."""
+    """Turns the muxer's errors into a `VideoError`, but not those of the disk."""
     try:
         yield
     except FFmpegError as error:
@@ -633,7 +633,7 @@ def _common_entry(segments: Sequence[Path]) -> SampleEntry:
 
 
 class StandAlonePackets(PacketReader):
-    """The packets of a video as they stand alone, for anyone who decodes without the mp4.
+    """The packets of a video in self-contained form, for decoding without the mp4.
 
     H.264 and H.265 come as Annex B with start codes of four bytes, AV1 as temporal units that
     begin with a delimiter; all with the parameters of the stream before each key frame. VP9
@@ -642,7 +642,7 @@ class StandAlonePackets(PacketReader):
     Args:
         path: A video without B-frames, such as all that mp4ds writes.
         codec: Name in the registry.
-        frames: Number of packets that are due, if known.
+        frames: Expected number of packets, if known.
 
     Raises:
         VideoError: As for `PacketReader`, or the codec's parameters are damaged.

@@ -24,7 +24,7 @@ _LUMA, _CHROMA = 0, 1
 
 
 def _tables(full_range: bool) -> tuple[list[NDArray[np.uint16]], list[NDArray[np.uint8]]]:
-    """Level of 8 bits -> of 10, and back, each of luma and of chroma."""
+    """Tables from levels of 8 bits to 10 and back, each for luma and chroma."""
     eight, ten = np.arange(256), np.arange(1024)
     factor = 1023 / 255 if full_range else 4  # the limited range is 16 to 235, and 64 to 940
     there, back = [], []
@@ -40,7 +40,7 @@ _WIDER, _NARROWER = zip(*(_tables(full_range) for full_range in (False, True)), 
 
 
 def widened(frame: av.VideoFrame, *, full_range: bool) -> av.VideoFrame:
-    """The picture of 4:2:0 and 8 bits in 10.
+    """A 4:2:0 picture of 8 bits, converted to 10.
 
     Args:
         frame: Of ``yuv420p``.
@@ -54,7 +54,7 @@ def widened(frame: av.VideoFrame, *, full_range: bool) -> av.VideoFrame:
 
 
 def narrowed(frame: av.VideoFrame) -> av.VideoFrame:
-    """The picture of 4:2:0 and 10 bits in 8, rounded; its tag tells the range."""
+    """A 4:2:0 picture of 10 bits, rounded to 8; its tag states the range."""
     made = av.VideoFrame(frame.width, frame.height, _EIGHT_BITS)
     is_full = frame.color_range == _FULL_RANGE
     for index in range(3):
@@ -65,11 +65,11 @@ def narrowed(frame: av.VideoFrame) -> av.VideoFrame:
 
 
 def rounded(frame: av.VideoFrame, pixel_format: str) -> av.VideoFrame:
-    """4:2:0 of 16 bits and full range, which are lost, rounded to 8 or 10.
+    """Full-range 4:2:0 of 16 bits, rounded to 8 or 10; the frame is overwritten.
 
-    libswscale puts the middle of chroma that uses the full range between two values. In 8 bits
-    that makes all chroma half a level low, a tint of -0.8 levels of red, 0.3 of green, -0.9 of
-    blue; in 16 bits it is nothing.
+    libswscale puts the middle of full-range chroma between two values. In 8 bits, that makes all
+    chroma half a level low, a tint of -0.8 levels of red, 0.3 of green, -0.9 of blue; in 16 bits it
+    is negligible.
 
     Args:
         frame: Of ``yuv420p16le``.
@@ -119,12 +119,12 @@ _DECODED_AS = {
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Colours and size of pictures that are made from the video's own samples at once.
+    """Colours and size of pictures made directly from the video's samples.
 
     Attributes:
         pixel_format: ``rgb24`` or ``bgr24``.
-        width: Columns to make.
-        height: Rows to make.
+        width: Columns of the result.
+        height: Rows of the result.
     """
 
     pixel_format: str
@@ -135,12 +135,12 @@ class Scale:
 def shows_colours(
     picture_format: str, picture_size: tuple[int, int], coded_size: tuple[int, int]
 ) -> bool:
-    """Whether pictures are what their video shows: colours of 8 bits, no mosaic, of its size."""
+    """Whether pictures are what the video shows: 8-bit colours, no mosaic, same size."""
     return picture_format in _CHANNELS and picture_size == coded_size
 
 
 def scaling(size: tuple[int, int], made: tuple[int, int]) -> int:
-    """Libswscale's flags to scale a size: what is smaller by area, what is larger bicubic."""
+    """Flags of libswscale for scaling: by area to reduce, bicubic to enlarge."""
     is_smaller = made[0] * made[1] < size[0] * size[1]
     return (_BY_AREA if is_smaller else _BICUBIC) | _CARE
 
@@ -152,7 +152,7 @@ class PictureConverter:
         matrix: Between RGB and YUV, by ffmpeg's name: ours is bt709, JPEG files have smpte170m.
             None: what each frame is tagged with.
         source_full_range: Whether the frames to convert use the full range.
-        full_range: Whether YUV that is made is to use it.
+        full_range: Whether the YUV it makes uses it.
     """
 
     def __init__(
@@ -170,7 +170,7 @@ class PictureConverter:
         self._to_planes = VideoReformatter()
 
     def convert(self, frame: av.VideoFrame, pixel_format: str) -> av.VideoFrame:
-        """The frame in another pixel format, the colours kept."""
+        """The frame in another pixel format, with the same colours."""
         self._look_at_tags(frame)
         if pixel_format in _VIA_PLANES and self._is_defined(frame):
             pixels = self._rgb(frame, pixel_format)
@@ -187,7 +187,7 @@ class PictureConverter:
     def scale(
         self, frame: av.VideoFrame, scale: Scale, out: NDArray[np.uint8] | None = None
     ) -> NDArray[np.uint8]:
-        """The frame in another size, or its own.
+        """The frame in another size, or in its own.
 
         Args:
             frame: As decoded.
@@ -209,7 +209,7 @@ class PictureConverter:
     def _is_defined(self, frame: av.VideoFrame) -> bool:
         """Whether spec/index.md, "Colours", says how the frame's colours are made.
 
-        Where others tag their videos with a place of the chroma, libswscale knows of it.
+        If third-party videos are tagged with a chroma location, libswscale uses it.
         """
         return frame.format.name in colour.BITS and not self._is_tagged
 
@@ -263,7 +263,7 @@ def picture_to_frame(
     *,
     full_range: bool = True,
 ) -> av.VideoFrame:
-    """A frame for the encoder; a view of the picture where formats and rows allow it.
+    """A frame for the encoder; a view of the picture if formats and rows allow.
 
     Args:
         picture: One array of shape (H, W) or (H, W, C), or one per plane.
@@ -288,7 +288,7 @@ def picture_to_frame(
 
 
 def plain_frame(picture: Picture, picture_format: str) -> av.VideoFrame:
-    """A frame of the picture's own format; a view of it where PyAV makes one."""
+    """A frame of the picture's own format; a view of it if PyAV can make one."""
     if picture_format in _VIEWED or picture_format.startswith("bayer_"):
         array = picture[0]
         row = np.empty_like(array[:1], order="C")  # where samples follow each other
@@ -335,7 +335,7 @@ def frame_to_picture(
     Args:
         frame: As decoded.
         picture_format: Of the picture wanted.
-        width: Columns of the picture; padding of the video beyond is cut off.
+        width: Columns of the picture; the video's padding is cut off.
         height: Rows of the picture.
         converter: The stream's own.
         place: The video, for errors.
@@ -412,15 +412,15 @@ def _sample_mosaic(
 
 
 class PictureMaker:
-    """Makes pictures of decoded frames; not to be shared between threads.
+    """Makes pictures from decoded frames; not thread-safe.
 
     Args:
         path: The video, for errors.
         coded_size: Width and height of its frames.
         picture_format: Pixel format of the pictures wanted.
         picture_size: Width and height of the pictures wanted.
-        matrix: Matrix coefficients of the video's colours; None if the video itself tells.
-        full_range: Whether its samples use their full range, unless the video itself tells.
+        matrix: Matrix coefficients of the video's colours; None to use the video's own tags.
+        full_range: Whether its samples use their full range, unless the video is tagged.
     """
 
     def __init__(
@@ -451,7 +451,7 @@ class PictureMaker:
         Args:
             frame: As decoded.
             number: Of the frame, for errors.
-            scale: Give it so, in an array of its own; where `shows_colours` only.
+            scale: Convert it so, into a new array; only if `shows_colours`.
             out: That array; a new one if None.
 
         Raises:

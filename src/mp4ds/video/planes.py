@@ -1,4 +1,4 @@
-"""Pictures and videos as planes of luma and chroma: what a lossy encoder is given, and gives."""
+"""Pictures and videos as planes of luma and chroma: the input and output of lossy encoders."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ PLANES_FORMAT = "yuv420p"
 """Pixel format of the planes."""
 
 Planes = tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]
-"""Luma, and chroma of half its sides."""
+"""Luma, and chroma of half the width and height."""
 
 
 class PlaneMaker:
-    """Makes of pictures what the encoder of a lossy recipe is given; not for several threads.
+    """Converts pictures to a lossy encoder's input; not thread-safe.
 
     Args:
         picture_format: Pixel format of the pictures.
@@ -39,7 +39,7 @@ class PlaneMaker:
         self._converter = PictureConverter()
 
     def make(self, picture: Picture) -> Planes:
-        """The planes of a picture, of their own memory; sides that are odd are padded."""
+        """The planes of a picture, in new memory; odd sides are padded."""
         frame = picture_to_frame(picture, self._picture_format, PLANES_FORMAT, self._converter)
         y, u, v = (plane.copy() for plane in planes_of(frame))
         rows, columns = y.shape
@@ -55,7 +55,7 @@ def planes_of(frame: av.VideoFrame) -> Planes:
 
 
 def planes_in(frame: NDArray[np.uint8], width: int, height: int) -> Planes:
-    """The planes of a frame that stand one after another, as views.
+    """The planes of a frame, stored one after another, as views.
 
     Args:
         frame: uint8, shape (width * height * 3 / 2,).
@@ -77,10 +77,10 @@ def decoded_planes(path: Path) -> Iterator[Planes]:
         path: A video with halved chroma, of 8 bits, or of 10, which are rounded.
 
     Yields:
-        Views that hold until the next one is asked for.
+        Views that are valid until the next one is requested.
 
     Raises:
-        VideoError: It cannot be decoded, or to something else.
+        VideoError: It cannot be decoded, or has another format.
     """
     media = Media(path)
     try:
@@ -101,11 +101,11 @@ def decoded_planes(path: Path) -> Iterator[Planes]:
 
 
 def rgb_of(planes: Planes, recipe: Recipe) -> NDArray[np.uint8]:
-    """The colours that planes are shown in, shape (H, W, 3).
+    """The colours in which planes are displayed, shape (H, W, 3).
 
     Args:
         planes: Of a picture, or of a part of it that begins at an even place.
-        recipe: Tells how its colours are coded.
+        recipe: States how its colours are coded.
     """
     rows, columns = planes[0].shape
     frame = av.VideoFrame(columns, rows, PLANES_FORMAT)
@@ -117,11 +117,11 @@ def rgb_of(planes: Planes, recipe: Recipe) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True, slots=True)
 class PacketSizes:
-    """How the packets of a video share its bytes.
+    """The sizes of the packets of a video.
 
     Attributes:
-        keys: Bytes of each frame at which decoding can begin.
-        others: Bytes of each of the other ones.
+        keys: Bytes of each key frame.
+        others: Bytes of each other frame.
     """
 
     keys: tuple[int, ...]
@@ -133,7 +133,7 @@ class PacketSizes:
         return sum(self.keys) + sum(self.others)
 
     def frame_bytes(self, gop: int) -> float:
-        """Bytes of a frame of a long video: a clip has more key frames than its share.
+        """Mean bytes per frame of a long video: a short clip has a larger share of key frames.
 
         Args:
             gop: Frames from one key frame to the next.
@@ -167,7 +167,7 @@ def packet_sizes(path: Path) -> PacketSizes:
 
 
 class PlaneSpool:
-    """The planes of a few frames, in a file; one of them is in memory at a time.
+    """The planes of a few frames, in a file; only one is in memory at a time.
 
     Args:
         path: The file to make; the caller removes it.
@@ -185,7 +185,7 @@ class PlaneSpool:
         return self._count
 
     def append(self, planes: Planes) -> None:
-        """Keep one more frame.
+        """Add a frame.
 
         Raises:
             OSError: It cannot be written.
@@ -201,7 +201,7 @@ class PlaneSpool:
         return map(self.frame, range(self._count))
 
     def frame(self, number: int) -> Planes:
-        """The planes of one frame, of their own memory.
+        """The planes of one frame, in new memory.
 
         Raises:
             OSError: The file cannot be read.
@@ -217,7 +217,7 @@ class PlaneSpool:
         return planes_in(data, self.width, self.height)
 
     def clear(self) -> None:
-        """Forget all frames."""
+        """Drop all frames."""
         self._count = 0
 
     def close(self) -> None:
@@ -257,15 +257,14 @@ class RawPicture:
 
 
 def raw_pictures(path: Path, *, is_gray: bool) -> Iterator[RawPicture]:
-    """Every picture of a video, in order; memory is that of one.
+    """Every picture of a video, in order; one is in memory at a time.
 
     Args:
         path: An mp4 with one video track.
-        is_gray: Whether it has no chroma: decoders make it up for a grey video, or do
-            not.
+        is_gray: Whether to leave out chroma: for a grey video, some decoders make it up.
 
     Yields:
-        Views that hold until the next one is asked for.
+        Views that are valid until the next one is requested.
 
     Raises:
         VideoError: ``file-missing``, ``video-unreadable`` or ``decode-failed``.

@@ -1,4 +1,4 @@
-"""Frames of a video by number, at the least cost that its codec allows; third-party videos."""
+"""Frames of a video by number, as cheaply as its codec allows; third-party videos."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from mp4ds.video.references import RecordedReferences
 
 
 class Seeking(Protocol):
-    """A decoder that gets at a frame by decoding from the key frame before it."""
+    """A decoder that reaches a frame by decoding from the key frame before it."""
 
     def picture(self, index: int, scale: Scale | None = None) -> Picture:
         """The picture of a frame; see `PictureMaker.make`."""
@@ -35,16 +35,16 @@ class Seeking(Protocol):
 
 
 class FrameReader:
-    """Gives frames by number; those that are not needed for them are decoded only if they must.
+    """Gives frames by number; others are decoded only if necessary.
 
     A context manager. Not to be shared between threads or over a fork.
 
     Args:
-        open_access: Opens what decodes the chains of frames.
-        open_decoder: Opens what decodes from key frames, for where that cannot be done.
+        open_access: Opens the decoder of single frames and their references.
+        open_decoder: Opens the decoder from key frames, used where that is impossible.
 
     Raises:
-        VideoError: Neither can be opened; what the latter says.
+        VideoError: Neither can be opened; the error of the latter.
     """
 
     def __init__(
@@ -69,10 +69,10 @@ class FrameReader:
         Args:
             numbers: 0 <= number < frames, increasing.
             scale: See `PictureMaker.make`.
-            outs: Its `out`, by frame, which may be left unused.
+            outs: Its `out`, by frame; it may stay unused.
 
         Yields:
-            Views that hold until the next one is asked for.
+            Views that are valid until the next one is requested.
 
         Raises:
             VideoError: One cannot be decoded.
@@ -117,9 +117,9 @@ def open_frames(
     full_range: bool,
     references: RecordedReferences | None = None,
 ) -> FrameReader:
-    """The frames of a video of which all is known that `VideoDecoder` asks for.
+    """The frames of a video for which all arguments of `VideoDecoder` are known.
 
-    `references` is what its sidecar tells of what its frames refer to.
+    `references` is what the sidecar says about the references of its frames.
 
     Raises:
         VideoError: As for `VideoDecoder`.
@@ -161,7 +161,7 @@ _TRIES = 3
 
 
 class VideoFile:
-    """One mp4 with one video track, of any codec that is known here. A context manager.
+    """An mp4 with one video track, of any known codec. A context manager.
 
     Args:
         path: The video.
@@ -172,7 +172,7 @@ class VideoFile:
         times: Presentation times, nanoseconds, rounded down, int64, shape (frames,), in order.
 
     Raises:
-        VideoError: It cannot be read, or is no such video.
+        VideoError: It cannot be read, or is not such a video.
     """
 
     def __init__(self, path: Path) -> None:
@@ -200,7 +200,7 @@ class VideoFile:
             raise
 
     def _read_ticks(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Ticks at which frames are shown, and those of frames at which decoding can begin."""
+        """Presentation ticks of the frames, and those of the key frames."""
         try:
             with self._path.open("rb") as file:
                 table = read_sample_table(file, self._path.stat().st_size, str(self._path))
@@ -237,14 +237,14 @@ class VideoFile:
         return times
 
     def picture(self, index: int, scale: Scale | None = None) -> Picture:
-        """One frame as RGB, 8 bits; the next ones are decoded on, others from their key frame.
+        """One frame as 8-bit RGB; the next ones continue decoding, others seek to their key frame.
 
         Args:
             index: 0 <= index < frames.
             scale: See `PictureMaker.make`.
 
         Returns:
-            One array of shape (H, W, 3), which holds until the next one is asked for.
+            One array of shape (H, W, 3), valid until the next one is requested.
 
         Raises:
             VideoError: It cannot be decoded.
@@ -276,7 +276,7 @@ class VideoFile:
         return int(self._ticks[index])
 
     def _group(self, tick: int) -> int:
-        """Number of the last key frame that is shown by then; -1 if none is."""
+        """Number of the last key frame shown by then, or -1."""
         return int(np.searchsorted(self._keys, tick, side="right")) - 1
 
     def _seek(self, group: int, index: int) -> None:
@@ -319,12 +319,12 @@ class VideoFile:
 
 
 def open_file_frames(path: Path, *, codec: str, size: tuple[int, int], frames: int) -> FrameReader:
-    """The frames of a video of others by number, as RGB of 8 bits.
+    """The frames of a third-party video by number, as 8-bit RGB.
 
     Args:
         path: The video.
-        codec: As `VideoFile` tells it.
-        size: As `VideoFile` tells it.
+        codec: As in `VideoFile`.
+        size: As in `VideoFile`.
         frames: How many there are.
 
     Raises:

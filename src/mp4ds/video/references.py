@@ -1,4 +1,4 @@
-"""What the coded frames of a stream refer to, so that one can be decoded without its neighbours."""
+"""What the coded frames of a stream refer to, so that one can be decoded without the others."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _units(data: memoryview) -> Iterator[memoryview]:
 
 
 class _Chain(ABC):
-    """Each picture refers to the last one before it that any may refer to."""
+    """Each picture refers to the last reference picture before it."""
 
     def __init__(self) -> None:
         self._back = 0  # from the next picture; 0: decoding has not begun
@@ -53,7 +53,7 @@ class _Chain(ABC):
 
         Args:
             size: Of the packet.
-            begins: Whether nothing from here on refers to anything before.
+            begins: Whether nothing from here on refers to anything earlier.
             kept: Whether later pictures may need something of the packet.
             key: Whether the file says that decoding can begin here.
         """
@@ -181,17 +181,17 @@ class _Parser(Protocol):
 
 
 class ReferenceParser:
-    """Tells what the coded frames of one stream refer to, packet by packet.
+    """Finds what the coded frames of one stream refer to, packet by packet.
 
-    It may begin at any key packet. After a refusal packets are refused up to the next key packet.
+    It may begin at any key packet. After a refusal, packets are refused up to the next key packet.
 
     Args:
         codec: Name in the registry (``h264``), or of a sample entry (``avc1``).
-        configuration: What the track says of the codec: the payload of ``avcC``, ``hvcC`` or
-            ``av1C``; of other codecs it is not looked at.
+        configuration: The track's codec configuration: the payload of ``avcC``, ``hvcC`` or
+            ``av1C``; ignored for other codecs.
 
     Raises:
-        UnknownStructure: Nothing is known of the references of that codec, or the configuration is
+        UnknownStructure: The references of that codec are not known, or the configuration is
             malformed.
     """
 
@@ -221,8 +221,8 @@ class ReferenceParser:
             not needed to decode; of other codecs there is one frame, the whole packet.
 
         Raises:
-            UnknownStructure: The references cannot be told, they reach across the key packet, or
-                decoding cannot begin where `key` says so.
+            UnknownStructure: The references cannot be determined, they reach across the key packet,
+                or decoding cannot begin where `key` says it can.
         """
         try:
             return self._parser.packet(memoryview(data), key=key)
@@ -246,7 +246,7 @@ class Intra:
 
 
 class _Chained(ABC):
-    """Codecs whose frames take over what the last one left in the decoder, shown or not."""
+    """Codecs whose frames depend on the state that the last one left in the decoder."""
 
     def __init__(self, configuration: bytes) -> None:
         del configuration
@@ -296,7 +296,7 @@ class Vp9References(_Chained):
 
 
 class Ffv1References(_Chained):
-    """FFV1 keeps the states of its contexts."""
+    """FFV1 keeps its context states."""
 
     def is_key(self, data: memoryview) -> bool:
         """By the first value that a frame codes, its `keyframe` (RFC 9043, 4.3).
@@ -312,11 +312,11 @@ class Ffv1References(_Chained):
 # ---------------------------------------------------------------- structure
 
 MAX_STRUCTURES = 256
-"""Distinct ones of a video: one that has more is not described."""
+"""Maximum number of distinct ones in a video; one that has more is not described."""
 
 MAX_STRUCTURE_CHARS = 2**16
 MAX_CHARS = 2**20
-"""Of all structures of a video together."""
+"""Maximum total length of all structures of a video."""
 
 _FRAME = r"(k|[1-9][0-9]{0,5}(,[1-9][0-9]{0,5})*)"
 _PACKET = rf"{_FRAME}(\+{_FRAME})*"
@@ -325,7 +325,7 @@ STRUCTURE_PATTERN = rf"^k(\+{_FRAME})*( {_PACKET})*$"
 _KEY = "k"
 
 Needs = tuple[int, ...]
-"""Numbers of the coded frames that one refers to, counted from its key frame."""
+"""Numbers of the coded frames that a frame refers to, counted from its key frame."""
 
 
 class StructureError(ValueError):
@@ -337,8 +337,8 @@ class Structures:
     """The structures of a video's groups of pictures.
 
     Attributes:
-        texts: Those that occur.
-        groups: For each group of pictures the number of its own, int64, shape (groups,).
+        texts: The distinct structures.
+        groups: Number of each group's structure, int64, shape (groups,).
     """
 
     texts: Sequence[str]
@@ -346,7 +346,7 @@ class Structures:
 
     @property
     def is_plain(self) -> bool:
-        """Whether every frame needs the one before it, so that none can be left out."""
+        """Whether every frame needs the one before it, so that none can be skipped."""
         return all(
             frame.startswith("1,") or frame == "1"
             for text in self.texts
@@ -363,7 +363,7 @@ class Structures:
             read_structure(text)
 
     def mismatch(self, packets: NDArray[np.int64]) -> str:
-        """Why these are not the structures of a video, in words; empty if they may be.
+        """Why these cannot be the structures of a video, in words; empty if they can.
 
         Args:
             packets: Of each group, shape (groups,).
@@ -422,10 +422,10 @@ def read_structure(text: str) -> list[list[Needs]]:
 
 
 def write_packet(frames: Sequence[CodedFrame]) -> str:
-    """The part of a structure that is of one packet.
+    """The part of a structure that describes one packet.
 
     Raises:
-        UnknownStructure: It is not the last frame alone that is shown.
+        UnknownStructure: Not exactly the last frame is shown.
     """
     if [frame.shown for frame in frames] != [False] * (len(frames) - 1) + [True]:
         raise UnknownStructure("it does not end with the only picture that it shows")
@@ -435,7 +435,7 @@ def write_packet(frames: Sequence[CodedFrame]) -> str:
 class StructureRecorder:
     """Finds the structures of a video from its packets, in the order coded.
 
-    Memory is bounded by `MAX_CHARS` and eight bytes a group of pictures.
+    Memory is bounded by `MAX_CHARS` and eight bytes per group of pictures.
 
     Args:
         codec: Name in the registry.
@@ -453,7 +453,7 @@ class StructureRecorder:
         self._groups = array("q")
 
     def add(self, packet: bytes | memoryview, *, key: bool) -> None:
-        """Take the next packet.
+        """Add the next packet.
 
         Args:
             packet: As the mp4 holds it.
@@ -491,11 +491,11 @@ class StructureRecorder:
         self._packets, self._numbers, self._groups = [], {}, array("q")
 
     def finish(self) -> Structures | None:
-        """What was found.
+        """The structures found.
 
         Returns:
-            None if the references of a frame are not known, or the structures are too many or
-            too long.
+            None if the references of a frame are not known, or there are too many structures, or
+            they are too long.
         """
         try:
             self._end_group()
@@ -507,14 +507,14 @@ class StructureRecorder:
 
 
 def frame_bytes(codec: str, packet: bytes, *, part: int, parts: int, key: bool) -> bytes:
-    """A coded frame out of its packet, as `ReferenceParser` finds it there.
+    """Extract a coded frame from its packet, as `ReferenceParser` finds it.
 
     Args:
         codec: Name in the registry.
         packet: As the mp4 holds it.
         part: Number of the frame in the packet.
-        parts: How many frames there are due to be.
-        key: Whether it needs no other, and so takes the sequence header before it along.
+        parts: Expected number of frames.
+        key: Whether it is a key frame, which includes the sequence header before it.
 
     Raises:
         UnknownStructure: There are more or fewer.

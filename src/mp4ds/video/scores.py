@@ -1,7 +1,7 @@
 """How much decoded frames differ from their originals: VMAF, PSNR and SSIM of each frame.
 
-PSNR and SSIM are computed here. VMAF is computed by libvmaf within an ffmpeg, which is run as a
-process: the optional package imageio-ffmpeg brings one, or one on the PATH is taken.
+PSNR and SSIM are computed here. VMAF is computed by libvmaf in an ffmpeg process: that of the
+optional package imageio-ffmpeg, or one on the PATH.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def psnr(reference: Plane, decoded: Plane, *, bits: int = 8) -> float:
 def ssim(reference: Plane, decoded: Plane, *, bits: int = 8) -> float:
     """Structural similarity of a plane: 1 where both are the same.
 
-    The mean over windows of 8 x 8 samples, each 4 beside the last, as ffmpeg's ssim has it.
+    The mean over windows of 8 x 8 samples at steps of 4, as in ffmpeg's ssim.
 
     Args:
         reference: The original, at least 8 samples high and wide.
@@ -72,7 +72,7 @@ def ssim(reference: Plane, decoded: Plane, *, bits: int = 8) -> float:
 
 
 def _whole_blocks(plane: Plane) -> NDArray[np.int64]:
-    """As integers that hold squares, without what makes no block."""
+    """As integers wide enough for squares, without incomplete blocks."""
     rows, columns = (side // _BLOCK * _BLOCK for side in plane.shape)
     if min(rows, columns) < 2 * _BLOCK:
         raise ValueError(f"planes of {plane.shape[1]}x{plane.shape[0]} samples have no window")
@@ -95,12 +95,12 @@ METRICS = ("vmaf", "psnr_y", "psnr_cb", "psnr_cr", "ssim")
 
 @dataclass(frozen=True, slots=True)
 class ScoreSummary:
-    """What the scores of a clip's frames come to.
+    """A summary of the scores of a clip's frames.
 
     Attributes:
         mean: Arithmetic mean.
-        harmonic_mean: As libvmaf has it, of the scores plus 1, minus 1: bad frames count more.
-        percentile_5: 5 of 100 frames are worse.
+        harmonic_mean: As in libvmaf, of the scores plus 1, minus 1: bad frames weigh more.
+        percentile_5: 5 % of the frames are worse.
         minimum: Of the worst frame.
     """
 
@@ -132,16 +132,16 @@ class Scores:
         return len(self.psnr_y)
 
     def summaries(self) -> dict[str, ScoreSummary]:
-        """What each of `METRICS` comes to; VMAF is left out where there is none."""
+        """A summary of each of `METRICS`; without VMAF if it was not computed."""
         found = {name: getattr(self, name) for name in METRICS}
         return {name: summary_of(values) for name, values in found.items() if values is not None}
 
 
 def summary_of(values: NDArray[np.float64]) -> ScoreSummary:
-    """What the scores of frames come to.
+    """Summarise the scores of frames.
 
     Args:
-        values: One for each frame, at least one; none of them below -1.
+        values: One per frame, at least one; none below -1.
     """
     return ScoreSummary(
         mean=float(np.mean(values)),
@@ -154,18 +154,18 @@ def summary_of(values: NDArray[np.float64]) -> ScoreSummary:
 # ---------------------------------------------------------------- scorer
 
 YuvFrame = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
-"""Luma and the two chroma planes of half its sides: uint8, or uint16 of which 10 bits are used."""
+"""Luma and two chroma planes of half its width and height: uint8, or uint16 with 10 bits used."""
 
 _FORMATS = {np.dtype(np.uint8): ("yuv420p", 8), np.dtype(np.uint16): ("yuv420p10le", 10)}
 SMALLEST = 16
-"""Samples of a side: of less libvmaf and SSIM make nothing."""
+"""Samples of a side; libvmaf and SSIM cannot score less."""
 
 
 class Scorer:
-    """Scores clips; may be used for one after another.
+    """Scores clips; can be reused.
 
     Args:
-        ffmpeg: What computes VMAF, from `find_ffmpeg`; None: there is only PSNR and SSIM.
+        ffmpeg: The ffmpeg for VMAF, from `find_ffmpeg`; None: only PSNR and SSIM.
         threads: Of libvmaf.
     """
 
@@ -174,10 +174,10 @@ class Scorer:
         self._threads = threads
 
     def score(self, reference: Iterable[YuvFrame], decoded: Iterable[YuvFrame]) -> Scores:
-        """Compare each frame with its original; only a pair of them is in memory at a time.
+        """Compare each frame with its original; only one pair is in memory at a time.
 
         Args:
-            reference: The originals, all of one size, with even sides of at least 16 samples.
+            reference: The originals, all of one size, with even width and height of at least 16.
             decoded: As many frames, of the same size and type.
 
         Raises:
@@ -237,8 +237,8 @@ def vmaf_scores(
         decoded: As for `Scorer.score`.
         ffmpeg: From `find_ffmpeg`.
         threads: Of libvmaf.
-        before: An original that the first one is compared with, to tell how much moves: without,
-            libvmaf takes the first frame for a still one, and scores it less.
+        before: The original before the first one, for libvmaf's motion feature: without it, the
+            first frame counts as still and scores lower.
 
     Raises:
         ScoringError: As for `Scorer.score`.
@@ -290,7 +290,7 @@ def _measure(original: YuvFrame, made: YuvFrame, bits: int) -> tuple[float, ...]
 def _pairs(
     reference: Iterable[YuvFrame], decoded: Iterable[YuvFrame]
 ) -> Iterator[tuple[YuvFrame, YuvFrame]]:
-    """Each frame and its original, looked over.
+    """Each frame and its original, checked.
 
     Raises:
         ScoringError: They do not match.
@@ -316,7 +316,7 @@ def _kind(frame: YuvFrame) -> list[tuple[tuple[int, ...], np.dtype[Any]]]:
 
 
 def _check(frame: YuvFrame) -> None:
-    """Refuse frames that are not those of `YuvFrame`."""
+    """Refuse frames that are not a `YuvFrame`."""
     if len(frame) != 3 or frame[0].ndim != 2 or any(p.dtype not in _FORMATS for p in frame):
         raise ScoringError("A frame is three planes of uint8 or uint16.")
     rows, columns = frame[0].shape
@@ -343,25 +343,23 @@ def largest_crf(
     fall: float | None = None,
     most: int | None = None,
 ) -> tuple[int, bool, int]:
-    """Look for it between the smallest and the largest, where scores fall as it grows.
+    """Find the largest crf that reaches a target; scores fall as crf grows.
 
-    Between two crf that are known, the next one to try is where a straight line through their
-    scores meets the target; where that did not halve what is left, the middle.
+    Between two known crf, try where a straight line through their scores meets the target; if that
+    did not halve the interval, the middle.
 
     Args:
-        score: Encodes with a crf, and tells its score.
+        score: Encodes with a crf and returns its score.
         target: The score to reach.
         guess: The crf to begin with.
-        largest: That the codec has.
-        smallest: That is tried.
-        fall: About how much less the score is for each crf more, by which the first steps are
-            chosen; None: not known.
-        most: The search ends after so many were tried, with the best it has; None: when it is
-            sure.
+        largest: The largest crf of the codec.
+        smallest: The smallest crf to try.
+        fall: Approximate drop of the score per crf, which sets the first steps; None: unknown.
+        most: Maximum number of trials, after which the best so far is taken; None: no limit.
 
     Returns:
-        The crf, whether it reaches the target, and how many were tried. Where none reaches it,
-        the crf is the smallest one that was tried.
+        The crf, whether it reaches the target, and the number of trials. If none reaches it, the
+        crf is the smallest one tried.
     """
     known: dict[int, float] = {}
 

@@ -1,4 +1,4 @@
-"""Which layout and codec suit a stream best, and how much memory encoders take."""
+"""Choosing the best layout and codec for a stream, and estimating encoders' memory."""
 
 from __future__ import annotations
 
@@ -91,9 +91,9 @@ _FFV1_SAMPLE, _FFV1_BIT = 12.0, 2.3  # bytes of a sample, and more for each of i
 
 
 def encoder_bytes(recipe: Recipe, width: int, height: int, threads: int) -> int:
-    """Upper estimate of the peak of resident memory that a `VideoEncoder` takes.
+    """Upper estimate of the peak resident memory of a `VideoEncoder`.
 
-    Above the interpreter, with the pictures that are on their way into the encoder.
+    Without the interpreter, but with the pictures queued for the encoder.
 
     Args:
         recipe: Codec and options.
@@ -122,10 +122,9 @@ def encoder_bytes(recipe: Recipe, width: int, height: int, threads: int) -> int:
 
 
 def svt_level(threads: int) -> int:
-    """SVT-AV1's level of parallelism where so many threads are asked for, 1 to 6.
+    """SVT-AV1's level of parallelism for a number of threads, 1 to 6.
 
-    The encoder is given the number of threads, and takes what is above its highest level for
-    that one.
+    The encoder is given the number of threads, and clamps it to its highest level.
     """
     return min(max(1, threads), _SVT_LEVELS)
 
@@ -169,18 +168,18 @@ def _ffv1_bytes(recipe: Recipe, pixels: int) -> float:
 # ---------------------------------------------------------------- the trial
 
 NEAR = 1.02
-"""A candidate that stands earlier is taken if it is larger by no more than this."""
+"""An earlier candidate is preferred if it is larger by no more than this factor."""
 
 _LARGEST = 800 * 600  # pixels of an image that are tried; of a larger one its middle
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What was chosen for a stream.
+    """The choice for a stream.
 
     Attributes:
         layout: Name of the layout.
-        parameters: Of the layout; with them, it may refuse later images.
+        parameters: Of the layout, which may refuse later images because of them.
         recipe: Codec and options.
         bytes_per_frame: Estimated size of a coded image.
         gop: Frames from one key frame to the next.
@@ -195,15 +194,15 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class Coded:
-    """What a few consecutive pictures cost, of which the first is a key frame.
+    """The cost of a few consecutive pictures, the first of which is a key frame.
 
-    That the others are like all others of a group of pictures is what is assumed.
+    The others are assumed to represent all others of a group of pictures.
 
     Attributes:
         key: Bytes of the key frame.
         other: Mean bytes of the others.
-        key_seconds: CPU time of decoding the key frame; 0 if it was not measured.
-        other_seconds: Mean CPU time of decoding another.
+        key_seconds: CPU time of decoding the key frame; 0 if not measured.
+        other_seconds: Mean CPU time of decoding another one.
     """
 
     key: float
@@ -212,7 +211,7 @@ class Coded:
     other_seconds: float = 0.0
 
     def bytes_per_frame(self, gop: int) -> float:
-        """Bytes of a coded frame of a long video with a key frame every `gop` frames."""
+        """Mean bytes per frame of a long video with a key frame every `gop` frames."""
         return (self.key + (gop - 1) * self.other) / gop
 
     def random_seconds(self, gop: int) -> float:
@@ -228,14 +227,14 @@ def encode_on_trial(
     threads: int,
     timed: bool = False,
 ) -> Coded:
-    """What pictures cost.
+    """Measure the cost of pictures.
 
     Args:
         pictures: Consecutive ones, at least one, all of one size.
         recipe: Codec and options.
         picture_format: Pixel format of the pictures.
         threads: Threads of the encoder.
-        timed: Measure decoding, too.
+        timed: Also measure decoding.
 
     Raises:
         EncoderRefusedError: The codec does not take such pictures.
@@ -277,7 +276,7 @@ def _key_and_others(values: Sequence[float]) -> tuple[float, float]:
 
 
 def _decoding_seconds(encoder: Any, packets: Sequence[Any], codec: str) -> list[float]:
-    """CPU time of decoding each packet, the least of some turns."""
+    """CPU time of decoding each packet, the minimum of several runs."""
     turns = []
     for _ in range(_TURNS):
         decoder: Any = av.CodecContext.create(codec, "r")
@@ -309,22 +308,21 @@ def choose(
     threads: int,
     purpose: Purpose | None = None,
 ) -> Choice:
-    """The lossless layout, recipe and distance of key frames that suit best, by trying each.
+    """The best lossless layout, recipe and distance of key frames, found by trying each.
 
     Args:
-        samples: Pixels of consecutive images, at least one; about six tell enough.
+        samples: Pixels of consecutive images, at least one; about six are enough.
         encoding: Of the images.
         codec: The only codec to try, or None for all.
         preset: The encoder's preset, or None for the default.
-        gop: Frames from one key frame to the next, where the purpose leaves that alone.
+        gop: Frames from one key frame to the next, unless the purpose sets it.
         threads: Threads of the encoder.
         purpose: What the video is for.
 
     Returns:
-        The smallest or, of those within 2 % of it, the first in the order of the encoding's
-        layouts and their codecs. For ``archive`` the smallest; for ``training`` the one of which
-        a frame at random is decoded in the least time, among those that are not larger than
-        the smallest by more than the purpose allows.
+        The first, in the order of the encoding's layouts and their codecs, within 2 % of the
+        smallest. For ``archive``, the smallest; for ``training``, the one with the fastest decoding
+        of a random frame, among those not larger than the smallest by more than the purpose allows.
 
     Raises:
         OptionError: The codec has no form for any layout of the encoding.
@@ -366,12 +364,12 @@ def choose(
 
 
 def _fastest(tried: Sequence[tuple[Choice, Coded]], share: float, most: float) -> Choice:
-    """The choice, with its best distance of key frames, whose frames at random cost least time.
+    """The choice, with its best distance of key frames, whose random frames decode fastest.
 
     Args:
-        tried: All, with what they cost.
-        share: Of the images' pixels that were tried.
-        most: Bytes of a frame that are not too many; one of them has no more.
+        tried: All candidates, with their cost.
+        share: Share of the images' pixels that were tried.
+        most: Maximum bytes per frame; at least one candidate meets it.
     """
     found = [
         (coded.random_seconds(gop), replace(choice, bytes_per_frame=size, gop=gop))
@@ -383,7 +381,7 @@ def _fastest(tried: Sequence[tuple[Choice, Coded]], share: float, most: float) -
 
 
 def _candidates(samples: Sequence[Pixels], encoding: Encoding) -> list[Layout]:
-    """The layouts that suit the samples, but not byte planes where anything else does."""
+    """The layouts that can hold the samples; byte planes only if nothing else can."""
     fitted = [fit(name, encoding, samples) for name in encoding.exact]
     found = [layout for layout in fitted if layout and _is_in_bounds(layout, samples[0])]
     return [layout for layout in found if layout.name != "bytes"] or found
@@ -396,9 +394,9 @@ def _is_in_bounds(layout: Layout, pixels: Pixels) -> bool:
 
 
 def _crops(samples: Sequence[Pixels], encoding: Encoding) -> tuple[Sequence[Pixels], float]:
-    """The middle of large images, at even places, and its share of their pixels.
+    """The middle of large images, at even coordinates, and its share of their pixels.
 
-    Planes that stand one over the other are left whole.
+    Vertically stacked planes are left whole.
     """
     rows, columns = samples[0].shape[:2]
     if encoding.rows != 1 or rows * columns <= _LARGEST:

@@ -53,7 +53,7 @@ class Vp9Pictures:
         """The picture in a packet.
 
         Raises:
-            NoPicture: It shows none; a muxer would join it with the next packet.
+            NoPicture: It shows nothing; a muxer would join it with the next packet.
             Refused: It shows several, or is not VP9.
         """
         shown = 0

@@ -1,1 +1,1 @@
-"""Readers of damaged recordings: they give what is there, and list what is lost."""
+"""Readers of damaged recordings: they read what is left, and list what is lost."""

@@ -1,4 +1,4 @@
-"""What could not be read of a recording, and what all salvage readers have in common."""
+"""The losses of a recording, and what all salvage readers have in common."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MORE = " more places that could not be read"
 
 @dataclass(eq=False)
 class Draft:
-    """A loss that is not complete. See `Loss`."""
+    """A loss that is still being extended. See `Loss`."""
 
     offset: int | None
     size: int | None
@@ -67,7 +67,7 @@ class Draft:
 
 
 class LossLog:
-    """The losses of one file, in the order in which they were found.
+    """The losses of one file, in the order found.
 
     Args:
         file: The file's name.
@@ -76,14 +76,14 @@ class LossLog:
     def __init__(self, file: str) -> None:
         self._file = file
         self._drafts: list[Draft] = []
-        self._more: list[Draft] = []  # what all further ones were summed up in: none or one
+        self._more: list[Draft] = []  # the sum of all further ones: none or one
         self._number_more = 0
         self._kinds: dict[Hashable, Draft] = {}
         self._last_time: int | None = None
         self._open_ended: list[Draft] = []
 
     def gave(self, time: int) -> None:
-        """A message of a log time, ns, was read."""
+        """Record that a message with a log time, ns, was read."""
         self._last_time = time
         if self._open_ended:
             for draft in self._open_ended:
@@ -93,10 +93,10 @@ class LossLog:
     def lost(
         self, offset: int | None, size: int | None, problem: str, *, join: bool = True
     ) -> Draft:
-        """Bytes that could not be read; joined to the loss before where they follow it.
+        """Record bytes that could not be read; contiguous losses are joined.
 
         Returns:
-            The loss that they became part of, to be completed.
+            The loss they became part of, to be completed.
         """
         last = self._drafts[-1] if self._drafts and not self._more else None
         if (
@@ -117,10 +117,10 @@ class LossLog:
         return self._one_more(draft)
 
     def lost_of_kind(self, kind: Hashable, offset: int | None, problem: str) -> Draft:
-        """Like `lost`, for what is found again and again and is one loss.
+        """Like `lost`, for something found repeatedly that is one loss.
 
         Returns:
-            The loss of that kind, without a size: it may be scattered.
+            The loss of that kind, without a size, since it may be scattered.
         """
         if kind not in self._kinds:
             if len(self._kinds) >= MAX_LOSSES:
@@ -141,8 +141,8 @@ class LossLog:
         """The losses.
 
         Args:
-            messages: How many are lost in all, where something tells. The largest loss that
-                does not know its number then has what the others leave.
+            messages: How many are lost in total, if known. The largest loss without a count then
+                gets the remainder.
         """
         drafts = [*self._drafts, *self._more]
         if messages and not drafts:
@@ -158,7 +158,7 @@ class LossLog:
 
 
 def bounded(losses: Sequence[Loss]) -> list[Loss]:
-    """Losses of several files, of which the last sums up what is too much."""
+    """Losses of several files; the last one sums up those beyond the limit."""
     if len(losses) <= MAX_LOSSES:
         return list(losses)
     rest = losses[MAX_LOSSES - 1 :]
@@ -185,11 +185,10 @@ _MAX_TIMES = 10**6
 
 
 class Tally:
-    """Messages read of a stretch of a file, a chunk mostly, and those that an index lists.
+    """Messages read from a section of a file, usually a chunk, and those that an index lists.
 
-    Messages of a chunk whose content is in doubt are held until its index was read: only
-    those that it lists are given out, since what was unpacked of damaged data may look like
-    messages and be none.
+    Messages of a chunk with doubtful content are held until its index is read, and only those it
+    lists are returned: damaged data may decompress to something that only looks like messages.
 
     Args:
         log: Where losses are recorded.
@@ -225,26 +224,26 @@ class Tally:
         end: int,
         span: tuple[int, int] | None = None,
     ) -> None:
-        """A new stretch begins, the one before being settled.
+        """Begin a new section, once the previous one is settled.
 
         Args:
-            expected: Messages by channel that an index at the end of the file tells, if any.
-            end: Byte where it should end, and its own index begin.
-            span: Earliest and latest log time that its messages can have, ns, if known.
+            expected: Messages by channel from an index at the end of the file, if any.
+            end: Byte where it should end and its own index should begin.
+            span: Earliest and latest possible log time of its messages, ns, if known.
         """
         self.close()
         self._begin(expected)
         self._end, self._span = end, span
 
     def extend(self, expected: Mapping[int, int] | None) -> None:
-        """Another stretch begins within what is lost, and cannot be told from this one."""
+        """Another section begins within what is lost, and cannot be separated from this one."""
         if expected is None or self._expected is None:
             self._expected = None
         else:
             self._expected.update(expected)
 
     def verified(self) -> None:
-        """All of the stretch is there beyond doubt: an index that says otherwise is wrong."""
+        """The section is certainly complete: an index that says otherwise is wrong."""
         self._is_verified = True
 
     @property
@@ -253,16 +252,16 @@ class Tally:
         return bool(self._held)
 
     def gave(self, channel: int, time: int) -> None:
-        """A message was read, with its log time in ns."""
+        """Count a message that was read, with its log time in ns."""
         self._log.gave(time)
         self._met(channel, time)
 
     def hold(self, channel: int, message: Message) -> None:
-        """Keep a message that may be none."""
+        """Hold a message that may not be one."""
         self._held.append((channel, message))
 
     def settle(self) -> list[Message]:
-        """The messages held that are to be given out."""
+        """Decide which of the held messages to return."""
         if not self._held:
             return []
         held, self._held = self._held, []
@@ -290,11 +289,11 @@ class Tally:
 
     @property
     def has_losses(self) -> bool:
-        """Whether something of the stretch was passed over."""
+        """Whether part of the section was skipped."""
         return bool(self._losses)
 
     def stray(self, channel: int, time: int) -> None:
-        """A message is there of a channel that is not known: told apart from what is lost."""
+        """Count a message of an unknown channel, separately from lost ones."""
         if len(self._strays) < _MAX_TIMES:
             self._strays[channel, time] += 1
         self._met(channel, time)
@@ -307,22 +306,22 @@ class Tally:
             self._is_counted = False
 
     def lost(self, offset: int, size: int | None, problem: str) -> Draft:
-        """Bytes were passed over."""
+        """Record skipped bytes."""
         draft = self._log.lost(offset, size, problem)
         if all(draft is not known for known in self._losses):
             self._losses.append(draft)
         if size is None or self._end is None or offset + size > self._end:
-            self._index_is_whole = False  # some of it may be lost, and that of others follow
+            self._index_is_whole = False  # part of it may be lost, and that of others may follow
             self._end = None
         return draft
 
     def count_matches(self, channel: int, count: int, offset: int) -> bool:
-        """Whether an index at a byte, with so many messages of a channel, tells nothing new."""
+        """Whether an index at a byte, with a count of a channel's messages, adds nothing new."""
         self._index_is_whole |= offset == self._end
         return not self._losses and not self._held and count == self._read[channel]
 
     def listed(self, channel: int, times: Mapping[int, int]) -> None:
-        """An index lists messages: so many of each log time, ns."""
+        """Add an index's messages: how many at each log time, ns."""
         if self._held:
             self._listed.append((channel, times))
         else:
@@ -330,13 +329,13 @@ class Tally:
 
     def _compare(self, channel: int, times: Mapping[int, int]) -> None:
         for time, count in times.items():
-            self._strays.pop((channel, time), None)  # no other one is missing for it
+            self._strays.pop((channel, time), None)  # so it is not missing
             missing = count - self._times[channel, time]
             if missing > 0:
                 self._missing[channel] += missing
 
     def close(self) -> None:
-        """The stretch has ended: tell what is lost of it."""
+        """End the section, and record what is lost of it."""
         found = min((self._by_counts(), self._by_times()), key=_total)
         if found is None:
             return
@@ -353,14 +352,14 @@ class Tally:
         self._losses = []
 
     def _by_counts(self) -> tuple[int, Counter[int]] | None:
-        """How many messages are lost, in all and by channel, by the index at the end."""
+        """Number of lost messages, in total and by channel, by the index at the end."""
         if self._expected is None:
             return None
         missing = self._expected - self._read
         strays: Counter[int] = Counter()
         for (channel, _), count in self._strays.items():
             strays[channel] += count
-        # Those that are not listed stand for others that are.
+        # Unlisted messages make up for listed ones.
         excess = (self._read - self._expected) & strays
         return max(0, missing.total() - excess.total()), missing
 
@@ -379,12 +378,12 @@ def _total(found: tuple[int, Counter[int]] | None) -> float:
 
 
 class SalvageReader(BagReader, Protocol):
-    """Reads what can be read of a recording, in one pass, and knows what cannot.
+    """Reads what is readable of a recording, in one pass, and records what is not.
 
-    It never fails because of damage. Of an intact recording it gives what the usual reader
-    gives. Messages come in log-time order where the index at the end of the file can be read,
-    else in the order of the file. Some that are doubtful are given too: where a checksum shows
-    that something of a chunk is wrong and nothing tells what, the loss says so.
+    It never fails because of damage. For an intact recording, it gives the same as the usual
+    reader. Messages come in log-time order if the index at the end of the file is readable,
+    otherwise in file order. Some doubtful messages are included: if a checksum shows that a chunk
+    is damaged but not where, the loss says so.
     """
 
     @property
@@ -394,14 +393,14 @@ class SalvageReader(BagReader, Protocol):
 
 
 class Salvage(ABC):
-    """What all salvage readers do alike. See `SalvageReader`.
+    """What all salvage readers share. See `SalvageReader`.
 
     Args:
         path: What to read.
 
     Attributes:
-        when_read: Is given the losses when `records` is exhausted.
-        is_alone: Whether it is an error, and not only a loss, that nothing can be read.
+        when_read: Called with the losses when `records` is exhausted.
+        is_alone: Whether it is an error, not just a loss, if nothing can be read.
     """
 
     format: Format
@@ -419,7 +418,7 @@ class Salvage(ABC):
 
     @abstractmethod
     def _read(self, losses: list[Loss]) -> Iterator[Record]:
-        """Read everything once, and at the end tell what is lost."""
+        """Read everything once, and append what is lost at the end."""
 
     @property
     @abstractmethod
@@ -429,7 +428,7 @@ class Salvage(ABC):
     @property
     @abstractmethod
     def position(self) -> int:
-        """Bytes of the files that `records` has come to."""
+        """Bytes of the files that `records` has reached."""
 
     @property
     def unused_schemas(self) -> Sequence[Schema]:
@@ -447,7 +446,7 @@ class Salvage(ABC):
         return self._losses
 
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
-        """What can be read. See `BagReader.records`."""
+        """Everything readable. See `BagReader.records`."""
         self._losses = []
         losses: list[Loss] = []
         for record in self._read(losses):
@@ -458,11 +457,11 @@ class Salvage(ABC):
             self.when_read(losses)
 
     def stats(self) -> Mapping[int, ChannelStats]:
-        """Counts and spans as an index at the end tells, with what is lost; else empty."""
+        """Counts and spans from an index at the end, including lost messages; otherwise empty."""
         return {}
 
     def times(self) -> Mapping[int, NDArray[np.int64]]:
-        """Log times of what can be read, by reading it."""
+        """Log times of everything readable, by reading it."""
         return times_of(self._read([]))
 
     def first(self, channel: Channel) -> Message | None:
@@ -483,7 +482,7 @@ class FileSalvage(Salvage):
 
     Args:
         path: The file.
-        shown: Its name in losses, where it is a decompressed copy.
+        shown: Its name in losses, if it is a decompressed copy.
     """
 
     def __init__(self, path: Path, shown: Path | None = None) -> None:
@@ -497,19 +496,19 @@ class FileSalvage(Salvage):
 
     @property
     def _orderly(self) -> Callable[[], BagReader] | None:
-        """Opens the usual reader, where more of the file is out of order than is held back.
+        """Opens the usual reader, if the file is more out of order than can be held back.
 
-        If the file is intact, that one can put it in order all the same.
+        If the file is intact, that reader can still sort it.
         """
         return None
 
     def _lost_in_all(self) -> int | None:
-        """Messages lost by the last pass, where the file tells how many there were."""
+        """Messages lost in the last pass, if the file states how many there were."""
         return None
 
     @property
     def position(self) -> int:
-        """Bytes of the file that `records` has come to."""
+        """Bytes of the file that `records` has reached."""
         return self._position
 
     def _read(self, losses: list[Loss]) -> Iterator[Record]:
@@ -533,7 +532,7 @@ class FileSalvage(Salvage):
 
 
 def losses_of(reader: BagReader) -> Sequence[Loss]:
-    """What a reader could not read; empty for one that reads everything or fails."""
+    """The losses of a reader; empty for one that reads everything or fails."""
     losses: Sequence[Loss] = getattr(reader, "losses", ())
     return losses
 
@@ -542,7 +541,7 @@ def losses_of(reader: BagReader) -> Sequence[Loss]:
 
 
 class MultiSalvage(MultiReader):
-    """Like `MultiReader`, of what can be read of each part. See `SalvageReader`.
+    """Like `MultiReader`, for what is readable of each part. See `SalvageReader`.
 
     Args:
         openers: Each opens one part; a part is open only while it is read.
@@ -562,5 +561,5 @@ class MultiSalvage(MultiReader):
 
     @property
     def losses(self) -> Sequence[Loss]:
-        """What could not be read of all parts, in their order."""
+        """The losses of all parts, in order."""
         return bounded([loss for number in sorted(self._found) for loss in self._found[number]])

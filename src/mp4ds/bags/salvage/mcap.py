@@ -1,4 +1,4 @@
-"""Reads what is there of a damaged MCAP file."""
+"""Reads what is left of a damaged MCAP file."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRe
 
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _TIME_END = 14  # of the log time in a message
-_MARGIN = 600 * 10**9  # ns; the end of a damaged chunk may be that of the next one
+_MARGIN = 600 * 10**9  # ns; a damaged chunk may seem to end where the next one does
 Found = Message | Attachment | MetadataRecord | None
 
 
@@ -49,13 +49,13 @@ class McapPass:
         window: At its start.
         log: Where losses are recorded.
         declared: Schemas and channels, those of the summary at first.
-        summary: What could be read of it.
-        decompress: Makes the payload of a message from what the file holds, if anything does.
+        summary: Its readable part.
+        decompress: Decompresses the payload of a message, if necessary.
 
     Attributes:
         offset: Byte where the record being read begins.
-        found: Records of an MCAP file that were met.
-        count: Messages that the file has by its statistics; None if unknown.
+        found: Number of valid MCAP records found.
+        count: Number of messages by the file's statistics; None if unknown.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class McapPass:
             self._lose(offset, frame.size, str(error))
 
     def _other(self, opcode: int, body: bytes | memoryview) -> Found:
-        """Take a record that is neither message nor chunk.
+        """Process a record that is neither message nor chunk.
 
         Raises:
             DamageError: It is damaged, or contradicts another one.
@@ -186,7 +186,7 @@ class McapPass:
     def _take(
         self, body: bytes | memoryview, offset: int, *, is_doubtful: bool
     ) -> Iterator[Message]:
-        """Give out a message, or keep it until an index tells whether it is one.
+        """Yield a message, or hold it until an index confirms it.
 
         Raises:
             DamageError: It is shorter than its fields.
@@ -225,7 +225,7 @@ class McapPass:
         return Message(channel, head.log_time, head.publish_time, head.sequence, data)
 
     def _channel(self, channel_id: int) -> Channel | None:
-        """The channel of an id, by a summary that is in doubt where nothing else tells it."""
+        """The channel with an id; from a doubtful summary only as a last resort."""
         channels = self._declared.channels
         if channel_id not in channels and channel_id in self._summary.doubtful:
             record = self._summary.doubtful[channel_id]
@@ -243,7 +243,7 @@ class McapPass:
         return loss
 
     def _chunk(self, frame: RecordFrame[int]) -> Iterator[Found]:
-        """The messages of a chunk, as far as it can be unpacked."""
+        """The messages of a chunk, as far as it can be decompressed."""
         window, scan = self._window, self._scan
         offset = window.offset
         proven = scan.is_proven(frame)
@@ -251,7 +251,7 @@ class McapPass:
         chunk = _Chunk.unpacked(have[frame.head :])
         self._tally.open(None, offset + frame.size, chunk.span)
         if chunk.is_plain and chunk.problem:
-            # Its records are in the file like any other: what is wrong hides no others.
+            # Its records are in the file like any other: damage to one does not hide the others.
             if chunk.is_doubtful:
                 self._plain = _Plain(offset, offset + frame.size, chunk.problem)
             window.skip(frame.head + chunk.head)
@@ -262,7 +262,7 @@ class McapPass:
         if proven and (not problems or scan.is_followed(frame.size)):
             window.skip(frame.size)
         elif not problems and scan.is_followed(end):
-            window.skip(end)  # the content is whole: the length of the record is what is wrong
+            window.skip(end)  # the content is complete: the record's length is wrong
         else:
             problem = problems[0] if problems else scan.cut_or_damaged(frame)
             scan.resync(offset, problem, passed=frame.head, kinds=self._framing.outer)
@@ -273,7 +273,7 @@ class McapPass:
             self._tally.verified()
 
     def _leave_plain(self, kind: int) -> None:
-        """Where an uncompressed chunk that is damaged ends, tell so if nothing else did."""
+        """At the end of a damaged uncompressed chunk, record the damage if nothing else did."""
         if self._plain is None:
             return
         start, end, problem = self._plain
@@ -298,7 +298,7 @@ class McapPass:
     def _scanned(
         self, content: bytes | memoryview, problems: list[str]
     ) -> Iterator[tuple[int, bytes]]:
-        """Opcodes and bodies of a chunk that nothing vouches for."""
+        """Opcodes and bodies of an unverified chunk."""
         inner = Scan(
             Window.of_content(bytes(content), self._path),
             self._framing,
@@ -310,7 +310,7 @@ class McapPass:
                 yield frame.kind, body
 
     def _listed(self, body: bytes, offset: int) -> None:
-        """A message index: what it lists must have been read, or is lost."""
+        """Process a message index: what it lists was read, or is lost."""
         channel_id, length = struct.unpack_from("<HI", body)
         pairs = np.frombuffer(body, "<u8", count=min(length, len(body) - 6) // 8, offset=6)
         if not self._tally.count_matches(channel_id, len(pairs) // 2, offset):
@@ -326,7 +326,7 @@ class McapPass:
 
 
 class _Plain(NamedTuple):
-    """A damaged chunk that is not compressed: where it begins and ends, and what is wrong."""
+    """A damaged uncompressed chunk: where it begins and ends, and what is wrong."""
 
     start: int
     end: int
@@ -335,17 +335,17 @@ class _Plain(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Chunk:
-    """What came out of a chunk.
+    """The content recovered from a chunk.
 
     Attributes:
         content: Records.
         is_plain: Whether it is not compressed.
         head: Bytes of the chunk's body before its records.
-        used: Bytes of the chunk's body that it was made from, as far as that shows.
+        used: Bytes of the chunk's body that were used, as far as known.
         problem: What is wrong with it, a phrase; empty if nothing is.
-        is_doubtful: Whether the content may be something else than what was recorded.
+        is_doubtful: Whether the content may differ from what was recorded.
         span: Earliest and latest log time that its messages can have, ns.
-        records: Opcodes and bodies, where its checksum vouches for them; else empty.
+        records: Opcodes and bodies, if verified by its checksum; otherwise empty.
     """
 
     content: bytes | memoryview
@@ -359,7 +359,7 @@ class _Chunk:
 
     @classmethod
     def unpacked(cls, body: memoryview) -> _Chunk:
-        """Unpack the body of a chunk, perhaps cut short."""
+        """Decompress the body of a chunk, which may be cut short."""
         if len(body) < _CHUNK_HEAD.size + 8:
             return cls(b"", False, 0, 0, "a chunk is cut short", False, (0, 0))
         start, end, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
@@ -408,14 +408,14 @@ def _key(message: bytes | memoryview) -> tuple[int, int]:
 
 
 class McapSalvage(FileSalvage):
-    """Reads what is there of an MCAP file. See `SalvageReader`.
+    """Reads what is left of an MCAP file. See `SalvageReader`.
 
     Args:
         path: The file.
-        is_compressed: Whether it is compressed by zstd as a whole. Offsets of its losses
-            are then those in its content.
-        message_decompress: Makes the payload of a message from what the file holds; raises
-            `DamageError` for what it cannot read.
+        is_compressed: Whether it is compressed with zstd as a whole. Offsets of losses then refer
+            to its content.
+        message_decompress: Decompresses the payload of a message; raises `DamageError` if it
+            cannot.
 
     Raises:
         SourceError: The file is missing, empty, or unreadable.
@@ -473,7 +473,7 @@ class McapSalvage(FileSalvage):
 
     @property
     def channels(self) -> Sequence[Channel]:
-        """Channels of the summary, then those met while reading."""
+        """Channels of the summary, then those found while reading."""
         return list(self._declared.channels.values())
 
     @property
@@ -488,7 +488,7 @@ class McapSalvage(FileSalvage):
 
     @property
     def has_statistics(self) -> bool:
-        """Whether the file tells how many messages it has."""
+        """Whether the file states how many messages it has."""
         return self._summary.statistics is not None
 
     @property
@@ -498,12 +498,12 @@ class McapSalvage(FileSalvage):
 
     @property
     def start(self) -> int | None:
-        """The earliest log time by the summary, ns; None if unknown."""
+        """The earliest log time from the summary, ns; None if unknown."""
         span = self._summary.chunks.span()
         return span[0] if span else None
 
     def stats(self) -> Mapping[int, ChannelStats]:
-        """Counts and spans by the summary, with what is lost; else empty."""
+        """Counts and spans from the summary, including lost messages; otherwise empty."""
         return self._summary.stats()
 
     def _lost_in_all(self) -> int | None:

@@ -1,4 +1,4 @@
-"""What the summary of an MCAP file tells, as far as it can be read."""
+"""The summary of a damaged MCAP file, as far as it can be read."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ _COMPRESSIONS = (b"", b"lz4", b"zstd")
 
 
 class McapFraming:
-    """Records by opcode and length; MCAP has no marks to find them by.
+    """Finds records by opcode and length; MCAP has no sync markers.
 
-    In order, what the format allows is a record. After damage one must be of a kind whose
-    fields tell the same length as its frame, or a message of a channel that is known and that
-    another record follows.
+    In sequence, anything the format allows is a record. After damage, it must be of a kind whose
+    fields match the length of its frame, or a message of a known channel followed by another
+    record.
 
     Args:
-        channels: Ids of the channels known, which may become more.
+        channels: Ids of the known channels; may grow.
     """
 
     lookahead = 2**16
@@ -91,7 +91,7 @@ class McapFraming:
         return None
 
     def _candidates(self, view: memoryview, end: int) -> list[int]:
-        """Where an opcode is before a length that is not too long."""
+        """Places of an opcode followed by a plausible length."""
         data = np.frombuffer(view, np.uint8)[: end + _HEAD]
         if len(data) < _HEAD:
             return []
@@ -111,15 +111,15 @@ class McapFraming:
         return result
 
     def _is_known(self, data: NDArray[np.uint8], places: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Whether messages at these places are of channels that are known."""
+        """Whether messages at these places are of known channels."""
         low = np.minimum(places + _HEAD, len(data) - 1)
         high = np.minimum(places + _HEAD + 1, len(data) - 1)
         ids = data[low].astype(np.int64) | data[high].astype(np.int64) << 8
-        # the last few may lie beyond what was looked at: the strict check decides
+        # the last few may extend beyond the view: the strict check decides
         return np.isin(ids, list(self._channels)) | (places + _HEAD + 1 >= len(data))
 
     def _sure_size(self, view: memoryview) -> int | None:
-        """0 for a record beyond doubt, its size if another must follow, None for no record."""
+        """0 for a certain record, its size if another must follow, None for no record."""
         frame = self.frame(view)
         if frame is None:
             return None
@@ -139,12 +139,12 @@ class McapFraming:
 
 
 def _string(body: memoryview, offset: int) -> int:
-    """Where a string, or a map, that begins at an offset ends."""
+    """The end of a string or map that begins at an offset."""
     return offset + 4 + int(struct.unpack_from("<I", body, offset)[0])
 
 
 def _chunk_length(body: memoryview) -> int | None:
-    """Bytes of a chunk's body by its fields, None if they are not those of a chunk."""
+    """Length of a chunk's body by its fields; None if they are not those of a chunk."""
     if len(body) < _CHUNK_FIXED:
         return None
     (length,) = struct.unpack_from("<I", body, 28)
@@ -206,7 +206,7 @@ def _table(known: dict[int, int], other: int) -> NDArray[np.int64]:
     return table
 
 
-# Records that are not looked for have no possible length.
+# Records that are not searched for have no possible length.
 _SHORTEST_OF = _table(_SHORTEST, _MAX_LENGTH)
 _LONGEST_OF = _table(
     {**dict.fromkeys(_SHORTEST, _MAX_LENGTH), Opcode.DATA_END: 4, Opcode.FOOTER: 20}, 0
@@ -219,7 +219,7 @@ _MAX_SEARCHED = 256 * 2**20
 
 
 class SalvagedSummary:
-    """A summary section. What counts on its being whole is left out where it is not.
+    """A summary section. What depends on its being complete is dropped if it is not.
 
     Attributes:
         offset: Byte where it begins, None if there is none.
@@ -241,11 +241,11 @@ class SalvagedSummary:
 
     @property
     def doubtful(self) -> dict[int, mcap_records.Channel]:
-        """Channels by id, where the summary does not match its checksum."""
+        """Channels by id, if the summary does not match its checksum."""
         return {} if self.is_verified else {channel.id: channel for channel in self.channels}
 
     def add(self, opcode: int, body: bytes) -> None:
-        """Take a record in."""
+        """Add a record."""
         takers: dict[int, Callable[[], Any]] = {
             Opcode.CHUNK_INDEX: lambda: self.chunks.add(body),
             Opcode.SCHEMA: lambda: self.schemas.append(parse(mcap_records.Schema, body)),
@@ -261,18 +261,18 @@ class SalvagedSummary:
         self.statistics = statistics
 
     def damaged(self) -> None:
-        """A part of it cannot be read."""
+        """Note that part of it cannot be read."""
         self._is_whole = False
 
     def finish(self) -> None:
-        """All that there is was added."""
+        """Finish after everything was added."""
         if not self._is_whole or not self.is_verified:
             self.chunks = ChunkTable()
             self.statistics = None
         self.chunks.finish()
 
     def stats(self) -> dict[int, ChannelStats]:
-        """Counts and spans by channel id; empty if it does not tell."""
+        """Counts and spans by channel id; empty if unknown."""
         if self.statistics is None:
             return {}
         whole = self.statistics.message_start_time, self.statistics.message_end_time
@@ -286,7 +286,7 @@ class SalvagedSummary:
 
 
 def read_summary(path: Path) -> SalvagedSummary:
-    """The summary of a file, empty if it has none or its place is not known.
+    """Read the summary of a file; empty if it has none or its place is unknown.
 
     Raises:
         SourceError: It cannot be read.
@@ -307,7 +307,7 @@ def read_summary(path: Path) -> SalvagedSummary:
 def _matches(path: Path, start: int, end: int) -> bool:
     """Whether the bytes of a summary, up to its checksum, match that."""
     if end - start > _MAX_SEARCHED:
-        return True  # it would take long
+        return True  # checking would take long
     with Window.of_file(path, start) as window:
         covered = window.peek(end - start)
         (told,) = struct.unpack("<I", window.look(end - start, 4) or bytes(4))
@@ -319,7 +319,7 @@ def _read_from(path: Path, start: int, summary: SalvagedSummary) -> None:
     with Window.of_file(path, start) as window:
         is_there = framing.frame(window.peek(framing.lookahead)) is not None
         if not is_there and (window.left or 0) > _MAX_SEARCHED:
-            return  # what follows may be anything
+            return  # the rest may be anything
         summary.offset = start
         scan = Scan(window, framing, lambda *_: summary.damaged())
         while frame := scan.next():

@@ -1,4 +1,4 @@
-"""Reads what is there of a damaged ROS 1 bag."""
+"""Reads what is left of a damaged ROS 1 bag."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from mp4ds.errors import SourceError
 from mp4ds.records import Channel, ChannelStats, Message, Record
 
 MAX_HEADER = 2**16
-"""Bytes of a record's header: a few fields, and the topic of a connection."""
+"""Maximum size of a record's header: a few fields, and the topic of a connection."""
 
 _OP = re.compile(rb"\x04\x00\x00\x00op=[\x02\x04-\x07]")
 _MAX_BEFORE_OP = 512
@@ -49,10 +49,10 @@ _FIELDS: Mapping[int, Mapping[bytes, int]] = {
 
 
 class Ros1Framing:
-    """Records by the fields of their headers. See `Framing`.
+    """Finds records by the fields of their headers. See `Framing`.
 
-    A chunk that is not compressed is framed by its header alone, so that its records stand
-    in the file like any other: damage to one does not hide the others.
+    An uncompressed chunk is framed by its header alone, so that its records are read like any other
+    in the file: damage to one does not hide the others.
     """
 
     lookahead = MAX_HEADER + 8
@@ -91,7 +91,7 @@ class Ros1Framing:
         is_followed: Callable[[int], bool],
         kinds: Collection[int] | None = None,
     ) -> int | None:
-        """See `Framing.find`; a header with all its fields is beyond doubt by itself."""
+        """See `Framing.find`; a header with all its fields is proof enough."""
         for match in _OP.finditer(view):
             if kinds is None or view[match.end() - 1] in kinds:
                 start = self._start(view, match.start())
@@ -102,7 +102,7 @@ class Ros1Framing:
         return None
 
     def _start(self, view: memoryview, op: int) -> int | None:
-        """Where the record begins whose field ``op`` is there."""
+        """The start of the record whose field ``op`` is at a byte."""
         first = max(0, op - _MAX_BEFORE_OP)
         before = bytes(view[first:op])
         for start in range(len(before) - 4, -1, -1):
@@ -117,12 +117,12 @@ class Ros1Framing:
 
 
 def number(field: bytes) -> int:
-    """A field that is an unsigned number."""
+    """The value of an unsigned number field."""
     return int.from_bytes(field, "little")
 
 
 def time(field: bytes) -> int:
-    """A field that is a time, nanoseconds."""
+    """The value of a time field, nanoseconds."""
     seconds, nanoseconds = _TIME.unpack(field)
     return int(seconds) * 10**9 + int(nanoseconds)
 
@@ -140,8 +140,8 @@ class BagIndex:
     Attributes:
         channels: By connection number, in the order of the index.
         chunks: Byte offsets of the chunks, sorted.
-        due: Byte where the index should begin by the header of the bag, None if unknown.
-        offset: The same, where there is an index.
+        due: Byte where the index should begin according to the bag's header; None if unknown.
+        offset: Byte where the index was found.
     """
 
     def __init__(self) -> None:
@@ -154,7 +154,7 @@ class BagIndex:
         self._later: list[int] = []
 
     def add(self, frame: RecordFrame[int], body: bytes) -> None:
-        """Take a record of the index in."""
+        """Add a record of the index."""
         if frame.kind == Op.CHUNK_INFO:
             fields = frame.fields
             span = time(fields[b"start_time"]), time(fields[b"end_time"])
@@ -169,13 +169,13 @@ class BagIndex:
         self.channels.setdefault(connection, make_channel(connection, topic, header))
 
     def finish(self, *, chunks: int | None) -> bool:
-        """All that there is was added: where that is not all chunks, it tells of none.
+        """Finish after everything was added; an incomplete list of chunks is dropped.
 
         Args:
-            chunks: How many there are by the header of the bag, None if unknown.
+            chunks: Their number according to the bag's header; None if unknown.
 
         Returns:
-            Whether all chunks are there.
+            Whether all chunks are listed.
         """
         is_whole = chunks == len(self._infos) and self.offset is not None
         if not is_whole:
@@ -187,7 +187,7 @@ class BagIndex:
         return is_whole
 
     def counts(self, chunk: int) -> dict[int, int] | None:
-        """Messages by connection of the chunk at a byte; None if it is not listed."""
+        """Messages by connection in the chunk at a byte; None if it is not listed."""
         if chunk not in self._infos:
             return None
         found: dict[int, int] = {}
@@ -201,7 +201,7 @@ class BagIndex:
         return (info[0], info[1]) if info else None
 
     def held_in_file_order(self) -> int:
-        """Bytes of chunks, as they are in the file, that wait at most for earlier messages."""
+        """Maximum bytes of chunks, as stored, held back for earlier messages."""
         if not self._places:
             return 0
         ends = np.array([self._infos[chunk][1] for chunk in self._places])
@@ -217,7 +217,7 @@ class BagIndex:
         return self._later[position] if position < len(self._later) else None
 
     def stats(self, connections: Iterable[int]) -> dict[int, ChannelStats]:
-        """Counts and spans of the chunks by connection; empty if no chunk is listed."""
+        """Counts and spans by connection, from the chunks; empty if no chunk is listed."""
         total = {connection: ChannelStats(0, 0, 0) for connection in connections}
         for chunk in self.chunks:
             start, end, _ = self._infos[chunk]
@@ -233,7 +233,7 @@ class BagIndex:
 
 
 def read_index(path: Path) -> BagIndex:
-    """The index of a bag: all of it, or else what connections the end of the file tells.
+    """The index of a bag: all of it, or at least the connections found at the end of the file.
 
     Raises:
         SourceError: The bag is encrypted, or cannot be read.
@@ -258,7 +258,7 @@ def read_index(path: Path) -> BagIndex:
 
 
 def _read_records(path: Path, offset: int, index: BagIndex) -> None:
-    """Read an index that stands where it should."""
+    """Read an index at its expected place."""
     framing = Ros1Framing()
     with Window.of_file(path, offset) as window:
         if framing.frame(window.peek(framing.lookahead)) is None:
@@ -274,7 +274,7 @@ def _read_records(path: Path, offset: int, index: BagIndex) -> None:
 
 
 def _search_connections(path: Path, offset: int, index: BagIndex) -> None:
-    """Look for connections from a byte on, where the index may stand elsewhere."""
+    """Search for connections from a byte on, if the index is not at its expected place."""
     framing = Ros1Framing()
     with Window.of_file(path, offset) as window:
         scan = Scan(window, framing, lambda *_: None)
@@ -288,18 +288,18 @@ def _search_connections(path: Path, offset: int, index: BagIndex) -> None:
 
 # ---------------------------------------------------------------- the reader
 
-_MOST_PACKED = 16  # times smaller than its content a chunk is taken to be at most
+_MOST_PACKED = 16  # maximum assumed compression ratio of a chunk
 _INDEX_ENTRY = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
 
 
 class Ros1Salvage(FileSalvage):
-    """Reads what is there of a ROS 1 bag. See `SalvageReader`.
+    """Reads what is left of a ROS 1 bag. See `SalvageReader`.
 
     Args:
         path: The file.
 
     Raises:
-        SourceError: The file is missing, empty, encrypted, of another version, or no bag.
+        SourceError: The file is missing, empty, encrypted, of another version, or not a bag.
     """
 
     format: Format = "bag"
@@ -317,11 +317,11 @@ class Ros1Salvage(FileSalvage):
 
     @property
     def channels(self) -> Sequence[Channel]:
-        """Connections of the bag's index, then those met while reading."""
+        """Connections of the bag's index, then those found while reading."""
         return list(self._channels.values())
 
     def stats(self) -> Mapping[int, ChannelStats]:
-        """Counts and spans of the chunks by the bag's index, with what is lost; else empty."""
+        """Counts and spans from the bag's index, including lost messages; otherwise empty."""
         return self._index.stats(self._channels)
 
     @property
@@ -353,9 +353,9 @@ class _Pass:
     """One reading of a bag.
 
     Attributes:
-        found: Records of a bag that were met.
+        found: Number of valid records found.
         is_at_new_chunk: Whether a chunk began since this was last reset.
-        earliest: No message from here on has an earlier log time, ns, by the bag's index.
+        earliest: Earliest log time, ns, of messages from here on, by the bag's index.
     """
 
     def __init__(
@@ -462,7 +462,8 @@ class _Pass:
         topic = frame.fields.get(b"topic", header.get(b"topic", b""))
         channel = make_channel(connection, topic, header)
         if self._channels.setdefault(connection, channel).identity != channel.identity:
-            if is_sure:  # a channel of its own: messages may have been given of the other one
+            # a separate channel: messages of the other one may have been yielded already
+            if is_sure:
                 key = connection, channel.identity
                 other = replace(channel, id=2**32 + len(self._others))
                 self._channels[connection] = self._others.setdefault(key, other)
@@ -473,7 +474,7 @@ class _Pass:
         return True
 
     def _compressed(self, frame: RecordFrame[int]) -> Iterator[Message]:
-        """The messages of a compressed chunk, as far as it can be unpacked."""
+        """The messages of a compressed chunk, as far as it can be decompressed."""
         window, scan = self._window, self._scan
         offset = window.offset
         proven = scan.is_proven(frame)
@@ -502,7 +503,7 @@ class _Pass:
                 problems.append("a connection record is damaged")
         end = frame.head + unpacked.used
         if not unpacked.problem and end != frame.size and scan.is_followed(end):
-            window.skip(end)  # the content is whole: the length of the record is what is wrong
+            window.skip(end)  # the content is complete: the record's length is wrong
         elif proven and (not unpacked.problem or scan.is_followed(frame.size)):
             window.skip(frame.size)
         else:
@@ -529,7 +530,7 @@ class _Pass:
         self._tally.listed(connection, dict(zip(found.tolist(), counts.tolist(), strict=True)))
 
     def _enter(self, offset: int, end: int) -> None:
-        """A chunk begins that should end at a byte."""
+        """Begin a chunk that should end at a byte."""
         self._pass_listed(offset)
         starts = self._index.chunks
         if self._next_listed < len(starts) and starts[self._next_listed] == offset:
@@ -539,7 +540,7 @@ class _Pass:
         self.earliest = self._index.start_from(offset)
 
     def _pass_listed(self, end: int) -> None:
-        """Chunks that the index lists before a byte and that were not met are lost here."""
+        """Record as lost the chunks that the index lists before a byte but that were not found."""
         starts = self._index.chunks
         while self._next_listed < len(starts) and starts[self._next_listed] < end:
             self._tally.extend(self._index.counts(starts[self._next_listed]))

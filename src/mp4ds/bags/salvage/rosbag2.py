@@ -1,4 +1,4 @@
-"""Reads what is there of a damaged rosbag2 recording."""
+"""Reads what is left of a damaged rosbag2 recording."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class StorageFile:
     Attributes:
         path: The file.
         is_compressed: Whether it is compressed as a whole.
-        messages: How many messages it has by metadata.yaml, None if unknown.
+        messages: Number of messages according to metadata.yaml; None if unknown.
     """
 
     path: Path
@@ -47,17 +47,17 @@ class StorageFile:
 
 
 def find_storage(path: Path) -> tuple[BagInfo | None, list[StorageFile], list[Loss]]:
-    """What belongs to a recording.
+    """Find the parts of a recording.
 
     Args:
         path: A folder, or a storage file.
 
     Returns:
-        The metadata.yaml where it can be read, the storage files in reading order, and what
-        of the folder is missing or could not be read.
+        The metadata.yaml if readable, the storage files in reading order, and the losses: files
+        that are missing or unreadable.
 
     Raises:
-        SourceError: There is no storage file, or cannot be read.
+        SourceError: There is no storage file, or the folder cannot be read.
     """
     if not path.exists():
         raise SourceNotFoundError(path)
@@ -98,12 +98,12 @@ def _info(folder: Path, losses: list[Loss]) -> BagInfo | None:
 
 
 def unreadable(name: str, error: SourceError, messages: int | None) -> Loss:
-    """A file of which nothing can be read."""
+    """The loss of a completely unreadable file."""
     return Loss(name, None, None, error.problem, messages)
 
 
 def _names(folder: Path, info: BagInfo | None, losses: list[Loss]) -> Sequence[str]:
-    """Storage files in reading order: those that are listed, and those that should be."""
+    """Storage files in reading order: those listed, and those that should be."""
     listed = list(info.file_names) if info else []
     counts = _counts(info)
     for name in listed:
@@ -129,7 +129,7 @@ def _storage_file(path: Path, counts: Mapping[str, int]) -> StorageFile:
 
 
 def _counts(info: BagInfo | None) -> Mapping[str, int]:
-    """Messages of each storage file by metadata.yaml, as far as it tells."""
+    """Number of messages of each storage file, as far as metadata.yaml states it."""
     return info.counts if info else {}
 
 
@@ -139,18 +139,18 @@ Storage = McapSalvage | SqliteSalvage
 
 
 class Rosbag2Salvage(Salvage):
-    """Reads what is there of a rosbag2 recording. See `SalvageReader`.
+    """Reads what is left of a rosbag2 recording. See `SalvageReader`.
 
-    A folder need not have a metadata.yaml: its storage files are taken by their numbers, and
-    so are those that a metadata.yaml does not name.
+    A folder needs no metadata.yaml: storage files it does not list are read in the order of their
+    numbers.
 
     Args:
         path: A folder, or one ``.db3`` file.
-        workdir: Where an sqlite3 file that is compressed as a whole is decompressed for as
-            long as it is read; the system's temporary folder by default.
+        workdir: Where an sqlite3 file that is compressed as a whole is decompressed while it is
+            read; by default, the system's temporary folder.
 
     Raises:
-        SourceError: There is no storage file, or cannot be read.
+        SourceError: There is no storage file, or the folder cannot be read.
     """
 
     format: Format = "rosbag2"
@@ -178,7 +178,7 @@ class Rosbag2Salvage(Salvage):
             if reader:
                 self._channels.take_over(number, reader)
         if self._readers and self._readers[0] is None:
-            # Its channels are wanted before anything is read: keep it until it was.
+            # Its channels are needed before anything is read: keep it until then.
             with contextlib.suppress(SourceError):  # it is reported when it is read
                 self._first_copy = self._unpacked.enter_context(self._decompressed(0))
                 self._first_tables = self._first_copy.tables
@@ -187,7 +187,7 @@ class Rosbag2Salvage(Salvage):
             self._channels.add_listed()
 
     def _open_storage(self) -> list[Storage | None]:
-        """The readers of the storage files, of which those that cannot be opened are lost."""
+        """The readers of the storage files; files that cannot be opened are recorded as lost."""
         readers: list[Storage | None] = []
         files: list[StorageFile] = []
         for file in self._storage_files:
@@ -225,7 +225,7 @@ class Rosbag2Salvage(Salvage):
 
     @contextmanager
     def _opened(self, number: int) -> Iterator[Storage]:
-        """The reader of a storage file, decompressed for as long as it is needed."""
+        """The reader of a storage file, which is decompressed while it is needed."""
         reader = self._readers[number]
         if reader:
             yield reader
@@ -356,7 +356,7 @@ def _is_complete(reader: Storage) -> bool:
 
 
 def _holds_zstd(reader: Storage) -> bool:
-    """Whether its messages are compressed one by one, by the look of the first one."""
+    """Whether its messages are individually compressed, judging by the first one."""
     for record in reader.records():
         if isinstance(record, Message):
             return bytes(record.data[: len(ZSTD_MAGIC)]) == ZSTD_MAGIC
@@ -364,7 +364,7 @@ def _holds_zstd(reader: Storage) -> bool:
 
 
 def _decompress(path: Path, target: Path) -> None:
-    """Decompress a file into another one, as far as it goes."""
+    """Decompress a file into another one, as far as possible."""
     stream = ZstdStream(path)
     try:
         with target.open("wb") as output:

@@ -1,4 +1,4 @@
-"""A damaged file, read once: records, the next one after damage, and what chunks still hold."""
+"""A damaged file, read once: records, resuming after damage, and recovering chunks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MAX_AHEAD = 64 * 2**20
 
 
 class ByteStream(Protocol):
-    """What a window is over: a file, or the content of a compressed one."""
+    """The stream under a window: a file, or the content of a compressed one."""
 
     def read(self, length: int, /) -> bytes:
         """Read that many bytes; fewer at the end only."""
@@ -34,13 +34,13 @@ class ByteStream(Protocol):
 
 
 class Window:
-    """What of a file lies before the reader. A context manager.
+    """The part of a file ahead of the reader. A context manager.
 
     Args:
         source: A stream at byte `offset`.
         path: Its name, for errors.
-        size: Bytes of the whole file where that is known.
-        offset: Where the stream stands.
+        size: Bytes of the whole file, if known.
+        offset: Position of the stream.
 
     Attributes:
         offset: Byte at which the window begins.
@@ -72,14 +72,14 @@ class Window:
 
     @classmethod
     def of_content(cls, content: bytes, path: Path) -> Window:
-        """A window over what a chunk unpacked to."""
+        """A window over the decompressed content of a chunk."""
         window = cls(io.BytesIO(), path, size=len(content))
         window._data, window._ended = content, True
         return window
 
     @property
     def position(self) -> int:
-        """Bytes of the file that the reader has come to."""
+        """Bytes of the file that the reader has reached."""
         consumed = getattr(self._source, "consumed", None)
         return self.offset if consumed is None else int(consumed)
 
@@ -90,13 +90,13 @@ class Window:
 
     @property
     def left(self) -> int | None:
-        """Bytes before the reader, None if unknown."""
+        """Bytes ahead of the reader; None if unknown."""
         if self.size is not None:
             return max(0, self.size - self.offset)
         return len(self._data) - self._at if self._ended else None
 
     def peek(self, length: int) -> memoryview:
-        """The next bytes, fewer at the end only. Reads what is there, whatever is asked for.
+        """The next bytes; fewer at the end only. Memory is bounded by the file, not by `length`.
 
         Raises:
             SourceError: They cannot be read.
@@ -122,7 +122,7 @@ class Window:
         self._data, self._at = b"".join(pieces), 0
 
     def skip(self, length: int) -> None:
-        """Continue by that many bytes, which may be more than were looked at."""
+        """Advance by that many bytes, which may be more than were peeked."""
         while length > 0:
             step = min(length, len(self._data) - self._at) or len(self.peek(min(length, BLOCK)))
             if not step:
@@ -132,7 +132,7 @@ class Window:
             length -= step
 
     def look(self, distance: int, length: int) -> bytes | None:
-        """Bytes far ahead, without reading up to them; None if that cannot be done."""
+        """Bytes far ahead, without reading up to them; None if that is impossible."""
         if self._ended or distance + length <= len(self._data) - self._at:
             return bytes(self.peek(distance + length)[distance:])
         if self.size is None:
@@ -163,20 +163,20 @@ class Window:
 # ---------------------------------------------------------------- scan
 
 MAX_UNPROVEN = 64 * 2**20
-"""Bytes of a record that is taken as one though no other record follows it."""
+"""Maximum size of a record accepted although no other record follows it."""
 
 _KindT = TypeVar("_KindT")
 
 
 @dataclass(frozen=True, slots=True)
 class RecordFrame(Generic[_KindT]):
-    """Where a record begins and ends, by its first bytes.
+    """A record's extent, from its first bytes.
 
     Attributes:
-        kind: What its format calls it.
+        kind: Its kind in the format.
         head: Bytes before its body.
-        size: Bytes of all of it.
-        fields: What its head holds.
+        size: Total bytes.
+        fields: The fields in its head.
     """
 
     kind: _KindT
@@ -189,15 +189,15 @@ class Framing(Protocol):
     """How a format frames its records.
 
     Attributes:
-        lookahead: So many bytes are enough to tell a record.
-        outer: Kinds of records that are in no chunk.
+        lookahead: Number of bytes that suffice to recognise a record.
+        outer: Kinds of records that are outside chunks.
     """
 
     lookahead: int
     outer: Collection[int]
 
     def frame(self, view: memoryview) -> RecordFrame[int] | None:
-        """The record that these bytes begin with, if they look like one."""
+        """The record at the start of these bytes, if they look like one."""
         ...
 
     def find(
@@ -207,10 +207,10 @@ class Framing(Protocol):
         is_followed: Callable[[int], bool],
         kinds: Collection[int] | None = None,
     ) -> int | None:
-        """Where the first record begins that shows beyond doubt.
+        """The start of the first certain record.
 
         Args:
-            view: Where to look.
+            view: The bytes to search.
             end: Byte before which it must begin.
             is_followed: Whether a record, or the end, is at a byte of the view or past it.
             kinds: Only records of these kinds; None for all.
@@ -224,7 +224,7 @@ class Scan:
     Args:
         window: What to read.
         framing: How its records are framed.
-        lose: Is told of bytes that were passed over: offset, size, a phrase.
+        lose: Called with skipped bytes: offset, size, a phrase.
     """
 
     def __init__(
@@ -235,7 +235,7 @@ class Scan:
         self._lose = lose
 
     def next(self) -> RecordFrame[int] | None:
-        """The next record, not yet taken; None at the end."""
+        """The next record, without consuming it; None at the end."""
         while True:
             view = self._window.peek(self._framing.lookahead)
             if not view:
@@ -246,7 +246,7 @@ class Scan:
             self.resync(self._window.offset, "no valid record here")
 
     def body(self, frame: RecordFrame[int]) -> bytes | None:
-        """Take a record. None if it is damaged; the scan then has gone on."""
+        """Consume a record. None if it is damaged; the scan has then advanced past it."""
         if not self.is_proven(frame):
             self.resync(self._window.offset, self.cut_or_damaged(frame))
             return None
@@ -270,23 +270,23 @@ class Scan:
         return left < frame.size
 
     def is_proven(self, frame: RecordFrame[int]) -> bool:
-        """Whether a record is all there and, if it is large, another one follows it."""
+        """Whether a record is complete and, if it is large, followed by another one."""
         if self.is_cut(frame):
             return False
         return frame.size <= MAX_UNPROVEN or self.is_followed(frame.size)
 
     def is_followed(self, size: int) -> bool:
-        """Whether a record, or the end, is after that many bytes."""
+        """Whether a record, or the end, follows after that many bytes."""
         ahead = self._window.look(size, self._framing.lookahead)
         if ahead is None:
-            return size <= 2**30  # a stream: so much is believed
+            return size <= 2**30  # a stream: accepted up to this size
         return not ahead or self._framing.frame(memoryview(ahead)) is not None
 
     def _follows(self, start: int) -> Callable[[int], bool]:
         return lambda distance: self.is_followed(start + distance)
 
     def cut_or_damaged(self, frame: RecordFrame[int]) -> str:
-        """What is wrong with a record that is not proven."""
+        """What is wrong with an unproven record, in words."""
         if self.is_cut(frame):
             return "the file ends within a record"
         return "a record has an impossible length"
@@ -299,13 +299,13 @@ class Scan:
         passed: int = 1,
         kinds: Collection[int] | None = None,
     ) -> None:
-        """Continue to the next record that shows beyond doubt.
+        """Advance to the next certain record.
 
         Args:
             start: Where the damage begins.
             problem: What is wrong, a phrase.
-            passed: Bytes before the reader of which it is known that no record begins there.
-            kinds: Only to a record of these kinds; None for all.
+            passed: Bytes ahead of the reader in which no record begins, as is already known.
+            kinds: Stop only at a record of these kinds; None for all.
         """
         window, reach = self._window, self._framing.lookahead
         window.skip(passed)
@@ -328,13 +328,13 @@ class Scan:
 
 _UNPACKED_PIECE = 2**12
 _SMALL_PIECE = 64
-"""Bytes unpacked at a time from damaged data: the piece that shows the damage gives nothing."""
+"""Bytes decompressed at a time from damaged data: the piece with the damage yields nothing."""
 
 _CLOSE = 16
-"""Bytes at the end, of a mark and a checksum, that are unpacked one by one."""
+"""Bytes at the end, of a marker and a checksum, that are decompressed one by one."""
 
 _LZ4_RATIO = 255
-_LZ4_BLOCK = 2**23  # the largest is 4 MiB, and one may be waiting
+_LZ4_BLOCK = 2**23  # the largest is 4 MiB, and one may be pending
 
 _MAX_AT_ONCE = 64 * 2**20
 
@@ -345,10 +345,10 @@ class Unpacked(NamedTuple):
     """Content of a chunk.
 
     Attributes:
-        content: What came out, from its beginning.
-        used: Bytes of the data that belong to it, 0 if that does not show.
+        content: The recovered content, from the beginning.
+        used: Bytes of the data that belong to it; 0 if unknown.
         problem: What is wrong, a phrase; empty if nothing is.
-        is_sound: Whether what came out is what went in, though some of it may be missing.
+        is_sound: Whether the content is correct, though some of it may be missing.
     """
 
     content: bytes
@@ -358,14 +358,13 @@ class Unpacked(NamedTuple):
 
 
 def unpack(compression: str, data: memoryview, size: int) -> Unpacked:
-    """Unpack as much as there is.
+    """Decompress as much as possible.
 
     Args:
-        compression: Its name: ``none`` or empty, ``bz2``, ``lz4`` or ``zstd``; where that is
-            damaged, the data tells.
-        data: As it is in the file, perhaps cut short.
-        size: Bytes that it should give; no more are unpacked, and no more than data of its
-            length may hold.
+        compression: Its name: ``none`` or empty, ``bz2``, ``lz4`` or ``zstd``; if damaged, it is
+            inferred from the data.
+        data: As stored; may be cut short.
+        size: Expected size; no more is decompressed, and no more than data of this length can hold.
     """
     if compression in ("", "none"):
         content = bytes(data[:size])
@@ -397,7 +396,7 @@ def unpack(compression: str, data: memoryview, size: int) -> Unpacked:
     if not machine.eof:
         if left <= 0:
             problem = f"the {found} data of a chunk unpacks to more than {size} bytes"
-            # bz2 verifies a block at its end, which was not reached
+            # bz2 verifies a block at its end, which was not reached here
             return Unpacked(b"" if found == "bz2" else content[:size], 0, problem, False)
         return Unpacked(content, 0, f"the {found} data of a chunk is cut short")
     used = min(at, len(data)) - machine.unused
@@ -408,7 +407,7 @@ def unpack(compression: str, data: memoryview, size: int) -> Unpacked:
 
 
 def _by_pieces(compression: str, data: memoryview, size: int) -> tuple[list[bytes], int]:
-    """What comes out before the damage."""
+    """What can be decompressed before the damage."""
     machine = _MACHINES[compression]()
     pieces: list[bytes] = []
     left = size
@@ -466,7 +465,7 @@ class _Lz4:
         return len(self._machine.unused_data or b"")
 
     def decompress(self, data: memoryview, size: int) -> bytes:
-        # It allocates what it is allowed: more than this cannot come of the data at once.
+        # It allocates the given maximum: the data cannot yield more than this at once.
         room = min(size, _LZ4_RATIO * len(data) + _LZ4_BLOCK)
         pieces: list[bytes] = [self._machine.decompress(data, max_length=room)]
         size -= len(pieces[-1])
@@ -490,7 +489,7 @@ class _Zstd:
         return len(self._machine.unused_data) + self._not_fed
 
     def decompress(self, data: memoryview, size: int) -> bytes:
-        # It knows no limit: small pieces bound what comes of one.
+        # It has no limit: small pieces bound the output of each.
         pieces: list[bytes] = []
         for at in range(0, len(data), ZSTD_PIECE):
             if size < 0 or self._machine.eof:

@@ -1,4 +1,4 @@
-"""Reads what is there of a damaged sqlite3 storage file of rosbag2."""
+"""Reads what is left of a damaged sqlite3 storage file of rosbag2."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from mp4ds.errors import Refused, SourceError
 from mp4ds.records import Channel, Message, Record, Schema
 
 _MAX_SMALL_ROW = 2**24
-_MAX_ROWS = 10**5  # of a table other than that of messages
+_MAX_ROWS = 10**5  # of any table but that of messages
 _MAX_DEPTH = 32
 _CACHED_LEAVES = 32
 
@@ -48,7 +48,7 @@ class Tree:
     Attributes:
         leaves: Pages with rows, in the order of their keys.
         pages: All pages that were visited.
-        damaged: Pages of it that cannot be understood.
+        damaged: Its damaged pages.
     """
 
     leaves: array[int] = field(default_factory=lambda: array("I"))
@@ -57,7 +57,7 @@ class Tree:
 
 
 class MessageRow:
-    """Where the values of a message are in its row: times are ns."""
+    """The places of a message's values in its row; times in ns."""
 
     __slots__ = ("blob", "size", "time", "topic_id")
 
@@ -91,7 +91,7 @@ class Database:
         return self._leaves[number]
 
     def tree(self, root: int) -> Tree:
-        """The pages of the table whose root is a page."""
+        """The pages of the table with a root page."""
         tree = Tree()
         todo = [(root, 0)]
         while todo:
@@ -115,7 +115,7 @@ class Database:
         return tree
 
     def roots(self) -> dict[str, int]:
-        """Root page of each table by name, as far as the first page tells."""
+        """Root page of each table by name, as far as readable in the first page."""
         found: dict[str, int] = {}
         for row in self.rows(self.tree(1)):
             if len(row) == 6 and row[1] == "table":
@@ -125,7 +125,7 @@ class Database:
         return found
 
     def rows(self, tree: Tree) -> Iterator[list[Value]]:
-        """Key and values of the rows of a small table that can be read."""
+        """Key and values of the readable rows of a small table."""
         count, left = 0, self.pages.all_bytes
         for number in tree.leaves:
             page, rows, _ = self.leaf(number)
@@ -139,7 +139,7 @@ class Database:
                     yield [row.rowid, *found]
 
     def payload(self, page: bytes, row: Row) -> bytes | None:
-        """All bytes of a row; None if they are not all there."""
+        """All bytes of a row; None if some are missing."""
         if row.size > self.pages.all_bytes:
             return None
         pieces = [page[row.start : row.start + row.local]]
@@ -153,11 +153,11 @@ class Database:
             pieces.append(more[4 : 4 + min(left, room)])
             left -= room
             if (left > 0) != (number != 0):
-                return None  # the chain ends early, or continues after its end
+                return None  # the chain ends too early or too late
         return b"".join(pieces)
 
     def free_pages(self) -> set[int]:
-        """Pages that the database does not use, which may hold what was deleted."""
+        """Unused pages, which may hold deleted rows."""
         header = self.pages.read(1)
         trunk = int.from_bytes(header[32:36], "big")
         found: set[int] = set()
@@ -172,7 +172,7 @@ class Database:
 
 
 def message_row(page: bytes, row: Row) -> MessageRow | None:
-    """What a row tells if it is one of messages: no value, two integers, and a blob."""
+    """The row as a message, if it has the columns of one: null, two integers and a blob."""
     head = page[row.start : row.start + row.local]
     found = serial_types(head)
     if found is None or len(found[0]) != 4:
@@ -203,7 +203,7 @@ _CHUNK = 4096
 
 @dataclass
 class MessageIndex:
-    """Log times, ns, keys, pages and numbers within their pages of all messages."""
+    """For each message: log time in ns, key, page, and number within the page."""
 
     times: array[int] = field(default_factory=lambda: array("q"))
     keys: array[int] = field(default_factory=lambda: array("q"))
@@ -211,7 +211,7 @@ class MessageIndex:
     places: array[int] = field(default_factory=lambda: array("H"))
 
     def order(self) -> Iterator[int]:
-        """Positions by log time, then by key; of one key the first that was found."""
+        """Positions by log time, then by key; for each key, the first one found."""
         if not self.keys:
             return
         times, keys = np.frombuffer(self.times, np.int64), np.frombuffer(self.keys, np.int64)
@@ -221,7 +221,7 @@ class MessageIndex:
             yield from order[start : start + _CHUNK].tolist()
 
     def missing_keys(self) -> int:
-        """How many keys from 1 to the greatest, as rosbag2 gives them, no message has."""
+        """Number of missing keys from 1 to the greatest: rosbag2 leaves no gaps."""
         keys = self.distinct_keys()
         return max(0, int(keys[-1]) - int((keys > 0).sum())) if len(keys) else 0
 
@@ -231,12 +231,12 @@ class MessageIndex:
 
 
 def index_messages(database: Database, log: LossLog, expected: int | None) -> MessageIndex:
-    """Find all messages: by the tree of their table, and where it is damaged in all pages.
+    """Find all messages: by the tree of their table or, if it is damaged, in all pages.
 
     Args:
         database: The database.
-        log: Where pages that cannot be understood are recorded.
-        expected: How many messages there should be, where something else tells.
+        log: Records the damaged pages.
+        expected: Expected number of messages, if known from elsewhere.
     """
     pages = database.pages
     index = MessageIndex()
@@ -260,7 +260,7 @@ def index_messages(database: Database, log: LossLog, expected: int | None) -> Me
     if is_short or (damaged and max(damaged) > pages.count):
         problem = f"the file ends before its {pages.promised or 'last'} pages do"
         drafts.append(log.lost(pages.file_size, None, problem, join=False))
-    # The keys do not tell what is missing after the last one.
+    # The keys cannot reveal what is missing after the last one.
     is_open_ended = is_short or (damaged and tree.leaves and tree.leaves[-1] in damaged)
     if expected is None and not (root is None or is_open_ended):
         expected = len(index.keys) + index.missing_keys()
@@ -275,7 +275,7 @@ def index_messages(database: Database, log: LossLog, expected: int | None) -> Me
 
 
 def _add(database: Database, number: int, index: MessageIndex) -> bool:
-    """Index the messages of a page. Returns whether it is sound."""
+    """Index the messages of a page. Returns whether it is undamaged."""
     page, rows, is_damaged = database.leaf(number)
     for place, row in enumerate(rows):
         found = message_row(page, row)
@@ -290,7 +290,7 @@ def _add(database: Database, number: int, index: MessageIndex) -> bool:
 
 
 def _other_pages(database: Database, roots: dict[str, int], tree: Tree) -> Iterator[int]:
-    """Pages with rows that belong to no table that is known."""
+    """Pages of rows that belong to no known table."""
     known = set(tree.pages) | database.free_pages()
     for name, root in roots.items():
         if name != "messages":
@@ -302,7 +302,7 @@ def _other_pages(database: Database, roots: dict[str, int], tree: Tree) -> Itera
 
 # ---------------------------------------------------------------- topics
 
-# Columns of the tables as rosbag2 makes them; newer versions have more.
+# Columns of rosbag2's tables; newer versions have more.
 _COLUMNS: dict[str, Sequence[str]] = {
     "topics": (
         "id INTEGER PRIMARY KEY",
@@ -331,19 +331,19 @@ _MESSAGES = (
     "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL,"
     " timestamp INTEGER NOT NULL, data BLOB NOT NULL)"
 )
-_MAX_SEARCHED = 10**4  # pages at the start of a file, where rosbag2 has its small tables
+_MAX_SEARCHED = 10**4  # pages at the start of a file, where rosbag2's small tables are
 
 
 def open_small_tables(path: Path, shown: Path) -> tuple[SqliteReader, str]:
-    """The small tables, by sqlite3 where it opens the file, else by what their pages hold.
+    """The small tables, by sqlite3 if it can open the file, otherwise from their pages.
 
     Args:
         path: The database.
         shown: Its name in errors and tables.
 
     Returns:
-        A reader that knows topics, definitions and tables, and is not to be asked for
-        messages; and why sqlite3 does not open the file, a phrase, empty if it does.
+        A reader for topics, definitions and tables, not for messages; and why sqlite3 cannot open
+        the file, a phrase, empty if it can.
 
     Raises:
         SourceError: The file is missing, empty, or unreadable.
@@ -387,7 +387,7 @@ def _small_tables(database: Database) -> dict[str, list[list[Value]]]:
 
 
 def _by_look(database: Database, visited: set[int]) -> Iterator[tuple[str, list[list[Value]]]]:
-    """Rows that look like those of small tables, of pages that belong to no table."""
+    """Rows that look like those of small tables, in pages that belong to no table."""
     free = database.free_pages()
     for number in range(2, min(database.pages.count, _MAX_SEARCHED) + 1):
         if number in visited or number in free or database.pages.read(number)[:1] != bytes([LEAF]):
@@ -402,7 +402,7 @@ def _by_look(database: Database, visited: set[int]) -> Iterator[tuple[str, list[
 
 
 def _table_of(row: list[Value]) -> str | None:
-    """The table whose columns a row has; its values follow its key."""
+    """The table that a row seems to belong to; its values follow its key."""
     kinds = "".join("n" if v is None else "i" if isinstance(v, int) else "t" for v in row[1:])
     if kinds in ("nttt", "nttttt") or (kinds == "ntttt" and not _is_definition(row)):
         return "topics"
@@ -410,7 +410,7 @@ def _table_of(row: list[Value]) -> str | None:
 
 
 def _is_definition(row: list[Value]) -> bool:
-    """Of rows with four texts: a topic's third is a serialization, a definition's second."""
+    """For rows of four texts: a topic's third is a serialization, a definition's second is."""
     return row[3] in ("ros2msg", "ros2idl", "unknown", "")
 
 
@@ -432,7 +432,7 @@ def _write(path: Path, tables: dict[str, list[list[Value]]]) -> None:
 
 
 def _plain(value: Value) -> Value:
-    r"""A value as sqlite3 takes it, damaged bytes of a text as ``\xNN``."""
+    r"""A value for sqlite3, with damaged bytes of a text as ``\xNN``."""
     if isinstance(value, str):
         return value.encode(errors="surrogateescape").decode(errors="backslashreplace")
     return value
@@ -442,18 +442,18 @@ def _plain(value: Value) -> Value:
 
 
 class SqliteSalvage(FileSalvage):
-    """Reads what is there of one ``.db3`` file, page by page. See `SalvageReader`.
+    """Reads what is left of one ``.db3`` file, page by page. See `SalvageReader`.
 
-    A transaction that was not finished is left out, one that is in a write-ahead log is
-    read from there; the files are not changed and not copied. Messages come by log time. Their
-    places, 22 bytes each, are held in memory.
+    An unfinished transaction is ignored; one in a write-ahead log is read from there. The files are
+    neither changed nor copied. Messages come by log time. Their places, 22 bytes each, are held in
+    memory.
 
     Args:
         path: The database.
         shown: Its name in errors and tables, where it is a decompressed copy.
-        message_decompress: Makes the payload of a message from what the file holds; raises
-            `DamageError` for what it cannot read.
-        expected: How many messages it should have, where something else tells.
+        message_decompress: Decompresses the payload of a message; raises `DamageError` if it
+            cannot.
+        expected: Expected number of messages, if known from elsewhere.
 
     Attributes:
         tables: Content of the small tables by ``db3:<file>:<column>``, verbatim.
@@ -494,9 +494,9 @@ class SqliteSalvage(FileSalvage):
 
     @property
     def start(self) -> int | None:
-        """The earliest log time, ns, where sqlite3 can tell it; else None."""
+        """The earliest log time, ns, if sqlite3 can find it; otherwise None."""
         if self._small.path != self.path:
-            return None  # its tables were recreated, without messages
+            return None  # its tables were rebuilt, without messages
         try:
             return self._small.start
         except SourceError:
@@ -557,7 +557,7 @@ class SqliteSalvage(FileSalvage):
     def _payload(
         self, database: Database, page: bytes, row: Row, found: MessageRow, topic: str
     ) -> bytes:
-        """What a message of a topic holds.
+        """The payload of a message of a topic.
 
         Raises:
             Refused: It cannot be read.

@@ -1,4 +1,4 @@
-"""The pages of an sqlite3 file as they were last committed, and their rows.
+"""The last committed pages of an sqlite3 file, and their rows.
 
 Source: sqlite.org/fileformat2.html.
 """
@@ -21,14 +21,14 @@ Value = int | float | str | bytes | None
 
 
 class Row(NamedTuple):
-    """A row of a table, of which only the beginning is in its page.
+    """A row of a table; its page may hold only its beginning.
 
     Attributes:
         rowid: Its key.
         start: Byte of the page where its payload begins.
         size: Bytes of the payload.
         local: How many of these are in the page.
-        overflow: Number of the page where it continues, 0 if it does not.
+        overflow: Number of the page where it continues, or 0.
     """
 
     rowid: int
@@ -39,11 +39,11 @@ class Row(NamedTuple):
 
 
 class Leaf(NamedTuple):
-    """What a page of rows holds.
+    """The rows of a page.
 
     Attributes:
-        rows: Those that can be understood, in their order.
-        is_damaged: Whether there are others, or it is not a page of rows at all.
+        rows: The readable ones, in order.
+        is_damaged: Whether some are unreadable, or it is not a page of rows at all.
     """
 
     rows: list[Row]
@@ -51,10 +51,10 @@ class Leaf(NamedTuple):
 
 
 def varint(data: bytes, at: int) -> tuple[int, int]:
-    """A number of variable length, and where it ends.
+    """A variable-length number, and where it ends.
 
     Raises:
-        IndexError: The data ends before it does.
+        IndexError: The data ends too early.
     """
     value = 0
     for count in range(8):
@@ -119,7 +119,7 @@ def local_bytes(size: int, usable: int) -> int:
 
 
 def children(page: bytes, header: int) -> tuple[list[tuple[int, int | None]], bool]:
-    """The pages below one that holds no rows, with the greatest key below each but the last.
+    """The children of an inner page, with the greatest key below each but the last.
 
     Returns:
         The children, and whether all of them could be read.
@@ -155,7 +155,7 @@ def serial_types(payload: bytes) -> tuple[list[int], int] | None:
 
 
 def values(payload: bytes) -> list[Value] | None:
-    """All values of a row that is whole; None if it is not a row."""
+    """All values of a complete row; None if it is not a row."""
     found = serial_types(payload)
     if found is None:
         return None
@@ -171,7 +171,7 @@ def values(payload: bytes) -> list[Value] | None:
 
 
 def value_bytes(kind: int) -> int | None:
-    """Bytes of a value of a type, None for a type that there is not."""
+    """Size of a value of a type; None for an invalid type."""
     if kind >= 12:
         return (kind - 12) // 2
     if kind == 0:
@@ -221,9 +221,9 @@ class Pages:
         file_size: Bytes of the file.
         size: Bytes of a page.
         usable: Bytes of a page that hold data.
-        count: Pages that there are; the last may be cut short.
-        promised: Pages that there should be by the header; 0 if it does not tell.
-        pending: What a file beside the database holds of it, a phrase; empty for nothing.
+        count: Number of pages present; the last may be cut short.
+        promised: Number of pages according to the header; 0 if not stated.
+        pending: What a file beside the database holds for it, a phrase; empty for nothing.
 
     Raises:
         SourceError: The file is missing, empty, or unreadable.
@@ -268,7 +268,7 @@ class Pages:
         return max(_SIZES, key=lambda size: _number_of_rows(sample, size))
 
     def read(self, number: int) -> bytes:
-        """A page; shorter, or empty, where the file ends before it does."""
+        """A page; shorter or empty if the file ends too early."""
         place = self._overlay.get(number)
         if place is not None and self._beside is not None:
             self._beside.seek(place)
@@ -279,7 +279,7 @@ class Pages:
 
     @property
     def all_bytes(self) -> int:
-        """Bytes of all pages: rows that have more together claim the same ones."""
+        """Bytes of all pages: rows with more in total must share pages."""
         return self.count * self.size
 
     def offset(self, number: int) -> int:
@@ -287,7 +287,7 @@ class Pages:
         return (number - 1) * self.size
 
     def there(self, number: int) -> int:
-        """Bytes that the file has of a page."""
+        """Number of bytes of a page that are in the file."""
         return max(0, min(self.size, self.file_size - self.offset(number)))
 
     def _at(self, offset: int, length: int) -> bytes:
@@ -316,7 +316,7 @@ class Pages:
         return None
 
     def _read_wal(self, path: Path) -> bool:
-        """Look up the pages that a write-ahead log committed."""
+        """Find the pages committed in a write-ahead log."""
         stream = self._open_beside(path)
         if stream is None:
             return False
@@ -351,7 +351,7 @@ class Pages:
         return True
 
     def _read_journal(self, path: Path) -> None:
-        """Look up the pages as they were before a change that never ended."""
+        """Find the pages as they were before an unfinished transaction."""
         stream = self._open_beside(path)
         if stream is None:
             return
@@ -394,7 +394,7 @@ class Pages:
 
 
 def _number_of_rows(sample: bytes, size: int) -> int:
-    """How many rows are in pages that are sound, if these have a size."""
+    """Number of rows in undamaged pages, assuming a page size."""
     pages = (sample[start : start + size] for start in range(size, len(sample), size))
     leaves = (leaf_cells(page, 0, size) for page in pages)
     return sum(len(leaf.rows) for leaf in leaves if not leaf.is_damaged)

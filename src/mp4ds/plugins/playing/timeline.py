@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -21,6 +22,8 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import DecodedColumns, everything
 from mp4ds.errors import ConversionError, OptionError
 from mp4ds.plan import Selection
+from mp4ds.plugins.publishing.latching import Kept, kept_depth
+from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.records import Channel, Message
 from mp4ds.unpacking.pictures import Reduction
 from mp4ds.unpacking.republish import Republisher
@@ -32,12 +35,19 @@ class Names:
     Args:
         remap: ``old:=new``, each of one topic; a missing slash at the beginning does not count.
         prefix: Put before all names that are not remapped.
+        node: Rules of ROS, which apply to what comes of these; they may be about other topics.
 
     Raises:
         OptionError: A rule is none.
     """
 
-    def __init__(self, remap: Sequence[str] = (), prefix: str = "") -> None:
+    def __init__(
+        self,
+        remap: Sequence[str] = (),
+        prefix: str = "",
+        node: NodeNames = PLAIN,
+    ) -> None:
+        self._node = node
         self._rules: dict[str, str] = {}
         for rule in remap:
             old, found, new = rule.partition(":=")
@@ -62,22 +72,23 @@ class Names:
     def __call__(self, topic: str) -> str:
         """The name of a topic."""
         new = self._rules.get(_rooted(topic))
-        if new is not None:
-            return new
-        return f"{self._prefix}/{topic.lstrip('/')}" if self._prefix else topic
+        if new is None:
+            new = f"{self._prefix}/{topic.lstrip('/')}" if self._prefix else topic
+        return self._node.renamed(new)
 
 
 class Wanted:
     """Which topics are played.
 
     Args:
-        selection: By globs.
-        regex: Topics of which a part matches are played too, as with ``ros2 bag play``; with
-            neither globs nor this, all are.
+        topics: Globs; with neither these nor `regex`, all are.
+        exclude: Globs of those that are not.
+        regex: Topics that match it as a whole are played, too, as with ``ros2 bag play``.
+        exclude_regex: Topics that match it as a whole are not.
         without: Topics that are not, whatever the others say.
 
     Raises:
-        OptionError: The regular expression is none.
+        OptionError: A regular expression is none.
     """
 
     def __init__(
@@ -86,25 +97,26 @@ class Wanted:
         exclude: Sequence[str] = (),
         *,
         regex: str = "",
+        exclude_regex: str = "",
         without: frozenset[str] = frozenset(),
     ) -> None:
         self._by_glob = Selection(topics)
         self._has_globs = bool(topics)
         self._excluded = Selection((), exclude)
         self._globs = Selection(topics, exclude)
-        try:
-            self._regex = re.compile(regex) if regex else None
-        except re.error as error:
-            raise OptionError(f"`regex` {regex!r} is no regular expression: {error}") from None
+        self._regex = _expression("regex", regex)
+        self._exclude_regex = _expression("exclude_regex", exclude_regex)
         self._without = without
 
     def __call__(self, topic: str) -> bool:
         """Whether a topic is played."""
         if topic in self._without or not self._excluded(topic):
             return False
+        if self._exclude_regex and self._exclude_regex.fullmatch(topic):
+            return False
         if self._regex is None:
             return self._by_glob(topic)
-        return (self._has_globs and self._by_glob(topic)) or bool(self._regex.search(topic))
+        return (self._has_globs and self._by_glob(topic)) or bool(self._regex.fullmatch(topic))
 
     def check(self, topics: Iterable[str]) -> None:
         """Refuse what matches no topic.
@@ -114,8 +126,19 @@ class Wanted:
         """
         known = list(topics)
         self._globs.check(known)
-        if self._regex is not None and not any(self._regex.search(topic) for topic in known):
-            raise OptionError(f"`regex` {self._regex.pattern!r} matches no topic.")
+        for name, regex in (("regex", self._regex), ("exclude_regex", self._exclude_regex)):
+            if regex is not None and not any(regex.fullmatch(topic) for topic in known):
+                raise OptionError(
+                    f"`{name}` {regex.pattern!r} matches no topic as a whole; .* stands for any "
+                    "letters, such as in '.*camera.*'."
+                )
+
+
+def _expression(option: str, text: str) -> re.Pattern[str] | None:
+    try:
+        return re.compile(text) if text else None
+    except re.error as error:
+        raise OptionError(f"`{option}` {text!r} is no regular expression: {error}") from None
 
 
 def _rooted(topic: str) -> str:
@@ -165,19 +188,26 @@ _SWITCH_S = 0.001
 
 
 class ReadAhead(Generic[T]):
-    """An iterator whose items are made by a thread of its own, a bounded number ahead.
+    """An iterator whose items are made by a thread of its own, a bounded amount ahead.
 
     Args:
         items: What makes them; used by the thread alone.
-        depth: Most items that wait.
+        room: For items that wait; one always may.
+        size_of: The room that an item takes.
         on_ready: Called, by the thread, when an item can be had where there was none.
     """
 
     def __init__(
-        self, items: Iterator[T], depth: int, *, on_ready: Callable[[], None] | None = None
+        self,
+        items: Iterator[T],
+        room: int,
+        *,
+        size_of: Callable[[T], int] = lambda _: 1,
+        on_ready: Callable[[], None] | None = None,
     ) -> None:
         self._items = items
-        self._depth = depth
+        self._room = room
+        self._size_of = size_of
         self._on_ready = on_ready
         self._changed = threading.Condition()
         self._waiting: deque[T] = deque()
@@ -217,6 +247,7 @@ class ReadAhead(Generic[T]):
     def _take(self) -> T:
         if self._waiting:
             item = self._waiting.popleft()
+            self._room += self._size_of(item)
             self._changed.notify_all()
             return item
         if self._error is not None:
@@ -241,11 +272,13 @@ class ReadAhead(Generic[T]):
 
     def _put(self, item: T) -> bool:
         with self._changed:
-            while len(self._waiting) >= self._depth and not self._is_closed:
+            size = self._size_of(item)
+            while self._waiting and size > self._room and not self._is_closed:
                 self._changed.wait()
             if self._is_closed:
                 return False
             is_first = not self._waiting
+            self._room -= size
             self._waiting.append(item)
             self._changed.notify_all()
         if is_first:
@@ -285,8 +318,11 @@ def quick_switches() -> Iterator[None]:
 IsLate = Callable[[int], bool]
 """Asked with the log time of a frame before it is made; if it is late, it is left out."""
 
-_MERGED_AHEAD = 64
-"""Messages, all topics together, that wait to be published; frames wait where they are made."""
+_MERGED_AHEAD = 64 << 20
+"""Bytes, all topics together, that wait to be published; more frames wait where they are made."""
+
+_LEAST_SIZE = 64 << 10
+"""What a message counts at least: a thousand small ones wait, as with `ros2 bag play`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -345,6 +381,7 @@ class Timeline:
         wanted.check(topics)
         names.check(topic for topic in topics if wanted(topic))
         self._read_ahead = read_ahead
+        self._names = {_rooted(topic): names(topic) for topic in topics if wanted(topic)}
         self._parts = [
             _Part(dataset, world, wanted, names, kind, reduction, jpeg_quality)
             for dataset in datasets
@@ -392,8 +429,23 @@ class Timeline:
         """
         return Playback(self._parts, start_ns, self._read_ahead, is_late, on_ready)
 
+    def named(self, option: str, topics: Sequence[str]) -> frozenset[str]:
+        """What topics are called where they are published.
+
+        Args:
+            option: That names them, for errors.
+            topics: Their recorded names.
+
+        Raises:
+            OptionError: There is no such topic to be played.
+        """
+        for topic in topics:
+            if _rooted(topic) not in self._names:
+                raise OptionError(f"`{option}` {topic!r}: there is no such topic to be played.")
+        return frozenset(self._names[_rooted(topic)] for topic in topics)
+
     def latched(self, time_ns: int) -> list[Due]:
-        """The last message before a time of each latched channel."""
+        """What late subscribers get, by a time, of the latched channels."""
         return [due for part in self._parts for due in part.latched(time_ns)]
 
 
@@ -422,7 +474,7 @@ class Playback:
             *(part.messages(start_ns, is_late, ahead) for part in parts),
             key=lambda due: due.time_ns,
         )
-        self._merged = ReadAhead(merged, _MERGED_AHEAD, on_ready=on_ready)
+        self._merged = ReadAhead(merged, _MERGED_AHEAD, size_of=_size_of, on_ready=on_ready)
 
     def head(self) -> Due | None:
         """The next message, which stays; None while it is not made yet.
@@ -446,6 +498,10 @@ class Playback:
         self._merged.join()
         for source in self._sources:
             source.join()
+
+
+def _size_of(due: Due) -> int:
+    return max(len(due.payload), _LEAST_SIZE)
 
 
 class _Part:
@@ -540,8 +596,15 @@ class _Part:
         return Due(message.log_time, channel, payload, source.id in self._frames)
 
     def latched(self, time_ns: int) -> Iterator[Due]:
-        """The last message before a time, of each latched channel."""
+        """What is kept, by a time, of each latched channel."""
         channels = [item for item in self._dataset.channels if item.topic in self._topics]
-        for message in self._dataset.last_before(time_ns, [*filter(is_latched, channels)]):
+        kept = {item.id: Kept[Message](item) for item in filter(is_latched, channels)}
+        topics = {item.topic for item in channels if item.id in kept}
+        most = max((kept_depth(item) for item in channels if item.id in kept), default=1)
+        for message in self._dataset.before(time_ns, topics, most) if topics else ():
+            if message.channel.id in kept:
+                kept[message.channel.id].add(message.data, message)
+        messages = sorted(chain.from_iterable(kept.values()), key=lambda item: item.log_time)
+        for message in messages:
             if due := self._due(message):
                 yield due

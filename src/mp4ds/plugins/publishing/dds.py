@@ -19,6 +19,7 @@ from mp4ds.plugins.publishing.dds_domain import (
     message_type,
     open_participant,
 )
+from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import Controls
 from mp4ds.plugins.publishing.ros2_writers import (
     CLOCK,
@@ -37,6 +38,7 @@ _SECOND = 10**9
 _PATIENCE = 15.0  # seconds; a subscriber that is silent for 10 s is taken for gone
 _UNDER_WAY = 2**18  # bytes that may wait where all are kept; the library allows twice as many
 _HANDSHAKE = 0.2  # seconds
+_YEAR = 366 * 86400.0  # seconds, of which more cannot be told
 _FOREVER = 2**63 - 1
 
 
@@ -111,7 +113,7 @@ class DdsWriter:
         if not self._is_reliable:
             return True
         try:
-            done = bool(self._writer.wait_for_acks(int(seconds * _SECOND)))
+            done = bool(self._writer.wait_for_acks(int(min(seconds, _YEAR) * _SECOND)))
         except AttributeError:
             done = False  # how version 11 of the library tells that time is up
         if done:
@@ -324,7 +326,9 @@ class DdsPublisher:
     Args:
         domain: The DDS domain, 0 to 232; None for that of ROS_DOMAIN_ID, else 0.
         overrides: Topic -> quality of service to offer instead of the recorded one.
-        node: Name of the node that the services belong to.
+        node: Name of the node that the services belong to, where `names` has none.
+        names: What the node and /clock are called.
+        parting_s: How long subscribers have to acknowledge at the end; may be infinite.
 
     Raises:
         OptionError: There is no such domain.
@@ -339,9 +343,13 @@ class DdsPublisher:
         domain: int | None = None,
         overrides: Mapping[str, Qos] = {},
         node: str = "rosbag2_player",
+        names: NodeNames = PLAIN,
+        parting_s: float = PARTING_S,
     ) -> None:
         self._domain = domain_id(domain)
-        self._node = node
+        self._node = "/".join(filter(None, (names.namespace.strip("/"), names.node or node)))
+        self._clock_topic = names.renamed(CLOCK)
+        self._parting_s = parting_s
         self._types: World = ros2_world(_DISTRIBUTION)
         self._participant = open_participant(self._domain)
         self._ears = DdsListener(self._participant)
@@ -377,7 +385,7 @@ class DdsPublisher:
         """Publish the time of the recording as /clock."""
         if self._clock is None:
             kind = message_type(_clock_channel(), self._types)
-            self._clock = DdsWriter(self._participant, CLOCK, kind, CLOCK_QOS)
+            self._clock = DdsWriter(self._participant, self._clock_topic, kind, CLOCK_QOS)
         self._clock.write(clock_message(time_ns))
 
     def subscribers(self, channel: Channel) -> int:
@@ -390,17 +398,17 @@ class DdsPublisher:
         from cyclonedds.topic import Topic
 
         kind = message_type(_clock_channel(), self._types)
-        topic = Topic(self._participant, dds_topic(CLOCK), kind.writes)
-        qos = dds_qos(CLOCK_QOS, ignore_own=True)
+        topic = Topic(self._participant, dds_topic(self._clock_topic), kind.writes)
+        qos = dds_qos(CLOCK_QOS, user_data=_user_data(kind), ignore_own=True)
         reader = DataReader(self._participant, topic, qos=qos)
         self._ears.hear(reader, lambda sample: on_time(_time_of(sample.payload)))
 
-    def listen(self, topic: str, on_message: Callable[[], None]) -> None:
+    def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
         """Call for each message of others on a topic, from when somebody publishes it."""
         name = dds_topic(topic)
         if name is None:
             raise OptionError(f"{topic!r} is no topic name of ROS 2.")
-        self._ears.seek(name, on_message)
+        self._ears.seek(name, lambda: on_message(None))
 
     def serve(self, controls: Controls) -> None:
         """Offer the services of `ros2 bag play`, for clients that use rmw_cyclonedds."""
@@ -417,11 +425,11 @@ class DdsPublisher:
         return self._is_open
 
     def close(self) -> None:
-        """Wait until subscribers have what was sent, for 3 s at most, and leave."""
+        """Wait until subscribers have what was sent, as long as they may take, and leave."""
         if not self._is_open:
             return
         self._is_open = False
-        end = time.monotonic() + PARTING_S
+        end = time.monotonic() + self._parting_s
         for writer in self._writers:
             writer.wait(max(0.0, end - time.monotonic()))
         self._ears.close()

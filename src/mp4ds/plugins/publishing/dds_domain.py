@@ -11,7 +11,15 @@ from functools import partial
 from operator import getitem
 from typing import Any
 
-from mp4ds.bags.types import World, by_library, field_shape, incomprehensible, make_store, types_of
+from mp4ds.bags.types import (
+    World,
+    by_library,
+    field_shape,
+    incomprehensible,
+    make_store,
+    ros2_world,
+    types_of,
+)
 from mp4ds.errors import ConversionError, OptionError, PublishError, Refused
 from mp4ds.records import HASH_KEY, Channel
 
@@ -179,17 +187,36 @@ def message_type(channel: Channel, world: World) -> DdsType:
     if not _NAME.fullmatch(name):
         problem = f"{channel.type_name!r} is no message type of ROS 2"
         raise ConversionError(channel.topic, problem, "Leave the topic out.")
-    recorded = channel.metadata.get(HASH_KEY, "")
-    type_hash = recorded if _HASH.fullmatch(recorded) else ""
+    type_hash = _told_hash(channel)
     try:
         types = _known_types(channel, world)
-        hashed = make_store(types, world).hash_rihs01
-        type_hash = type_hash or by_library(incomprehensible(name), hashed, name)
+        type_hash = type_hash or _made_hash(types, name, world)
         real = as_is(make_struct(types, name))
     except Refused:
         return DdsType(opaque_type(dds_name(name)), type_hash, False, False)
     is_empty = types[name][1][0][0] == _FILLER
     return DdsType(real, type_hash, True, is_empty)
+
+
+def recorded_hash(channel: Channel) -> str:
+    """The hash of a channel's type, RIHS01_...: as recorded, else of its definition; or empty."""
+    if told := _told_hash(channel):
+        return told
+    try:
+        world = ros2_world("jazzy")
+        return _made_hash(_known_types(channel, world), _full_name(channel.type_name), world)
+    except (Refused, KeyError):
+        return ""
+
+
+def _told_hash(channel: Channel) -> str:
+    recorded = channel.metadata.get(HASH_KEY, "")
+    return recorded if _HASH.fullmatch(recorded) else ""
+
+
+def _made_hash(types: Types, name: str, world: World) -> str:
+    hashed = make_store(types, world).hash_rihs01
+    return by_library(incomprehensible(name), hashed, name)
 
 
 def _full_name(name: str) -> str:
@@ -406,10 +433,13 @@ class _Sought:
         from cyclonedds.topic import Topic
 
         best_effort = Policy.Reliability.BestEffort in endpoint.qos
+        hashed = _TYPE_HASH.search(_user_data(endpoint.qos))
         qos = Qos(
             Policy.Reliability.BestEffort if best_effort else Policy.Reliability.Reliable(0),
             Policy.History.KeepLast(_KEPT),
             Policy.IgnoreLocal.Participant,
+            # nodes look for it, and complain where there is none
+            *([Policy.Userdata(hashed[0])] if hashed else []),
         )
         try:
             topic = Topic(
@@ -436,3 +466,13 @@ def publisher_type(participant: Any, endpoint: Any) -> Any:
         except DDSException:
             pass  # ROS goes by the name alone
     return opaque_type(endpoint.type_name.replace("::", "."))
+
+
+_TYPE_HASH = re.compile(rb"typehash=RIHS\d\d_[0-9a-f]+;")
+
+
+def _user_data(qos: Any) -> bytes:
+    """What a participant tells of a reader or writer."""
+    from cyclonedds.core import Policy
+
+    return bytes(qos[Policy.Userdata].data) if Policy.Userdata in qos else b""

@@ -23,6 +23,7 @@ from urllib.parse import urlsplit
 
 from mp4ds.bags.convert import is_latched
 from mp4ds.errors import ConversionError, OptionError, PublishError
+from mp4ds.plugins.publishing.latching import Kept
 from mp4ds.plugins.publishing.publisher import Controls
 from mp4ds.records import Channel, Schema
 
@@ -283,10 +284,10 @@ class PlaybackReporter:
         controls = self._controls
         if controls is None:
             return None
-        did_seek = request.seek_time is not None and controls.seek(request.seek_time)
+        did_seek = request.seek_time is not None
         if did_seek:
             # the answer tells of this jump
-            self._time, self._published = request.seek_time, None
+            self._time, self._published = controls.seek(request.seek_time), None
         if request.playback_speed != _as_float32(controls.rate):
             # it comes as a float32: 1.1 is not to become 1.10000002384
             controls.set_rate(round(request.playback_speed, 6))
@@ -370,9 +371,9 @@ class FoxglovePublisher:
     connect again. Memory is bounded by `backlog` times the size of the messages, for each slow
     client.
 
-    The last message of each latched channel (ROS 1 latching, ROS 2 transient_local) is sent
+    What the publishers of a latched channel kept (ROS 1 latching, ROS 2 transient_local) is sent
     again when a client subscribes to it; other subscribers get it a second time, with the same
-    log time.
+    log times.
 
     Channels without a schema are announced with an empty one. Bytes of a definition that are no
     UTF-8 (in comments of old ROS 1 definitions) are announced as U+FFFD, since the protocol is
@@ -478,7 +479,7 @@ class FoxglovePublisher:
             context=self._context,
         )
         # channels that cannot be told apart are one to the SDK
-        outlet = _Outlet(channel, announced, is_latched(channel))
+        outlet = _Outlet(channel, announced)
         with self._sending:
             self._outlets[id(channel)] = outlet
             self._by_sdk_id.setdefault(announced.id(), []).append(outlet)
@@ -506,15 +507,15 @@ class FoxglovePublisher:
             )
         if self._is_closed:
             raise PublishError(self.address, "the server was closed")
-        if not outlet.is_latched:
+        if outlet.kept is None:
             # a latched message of the past does not bring the past back
             self._teller.reach(time_ns)
-        if not (outlet.is_latched or outlet.announced.has_sinks()):
+        if outlet.kept is None and not outlet.announced.has_sinks():
             return
         data = payload if isinstance(payload, bytes) else bytes(payload)
         with self._sending:
-            if outlet.is_latched:
-                outlet.last = (data, time_ns)
+            if outlet.kept is not None:
+                outlet.kept.add(data, (data, time_ns))
             outlet.announced.log(data, log_time=time_ns)
         self._sent_at = time.monotonic()
 
@@ -529,8 +530,7 @@ class FoxglovePublisher:
         with self._sending:
             self._subscribed.setdefault(channel, set()).add(client)
             for outlet in self._by_sdk_id.get(channel, ()):
-                if outlet.last is not None:
-                    data, time_ns = outlet.last
+                for data, time_ns in outlet.kept or ():
                     outlet.announced.log(data, log_time=time_ns)
                     self._sent_at = time.monotonic()
 
@@ -565,7 +565,7 @@ class FoxglovePublisher:
             "another clock cannot be followed with `foxglove`: its clients have none."
         )
 
-    def listen(self, topic: str, on_message: Callable[[], None]) -> None:
+    def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
         """See `Publisher`.
 
         Raises:
@@ -611,13 +611,12 @@ class FoxglovePublisher:
 
 
 class _Outlet:
-    """A channel as it is announced, and the last of its messages where it is latched."""
+    """A channel as it is announced, and what is kept of it where it is latched."""
 
-    def __init__(self, channel: Channel, announced: Any, is_latched: bool) -> None:
-        self.channel = channel  # kept, so that its id() stays its own
+    def __init__(self, channel: Channel, announced: Any) -> None:
+        self.channel = channel  # held, so that its id() stays its own
         self.announced = announced
-        self.is_latched = is_latched
-        self.last: tuple[bytes, int] | None = None
+        self.kept = Kept[tuple[bytes, int]](channel) if is_latched(channel) else None
 
 
 class _Listener:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from mp4ds.errors import OptionError, PublishError
+from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.records import Channel
 
 
@@ -36,19 +37,34 @@ class Controls(Protocol):
         """Play at another rate; returns whether there is such a rate: above 0."""
 
     def play_next(self) -> bool:
-        """While it stands still, publish one message; returns whether it does."""
+        """While it stands still, publish one message; returns, when it is out, whether it did."""
 
     def burst(self, messages: int) -> int:
         """While it stands still, publish messages as fast as can be; 0: all that are left.
 
-        Returns how many it will publish, as far as there are any.
+        Returns, when they are out, how many there were.
         """
 
     def step_back(self) -> bool:
-        """While it stands still, go back by one message; returns whether it does."""
+        """While it stands still, go back by one message; returns whether that is out."""
 
-    def seek(self, time_ns: int) -> bool:
-        """Go on at a time of the recording; returns whether it is within it."""
+    def seek(self, time_ns: int) -> int:
+        """Go on at a time of the recording, or at the nearest that is played; returns which."""
+
+    def play(self, start_ns: int, end_ns: int | None) -> bool:
+        """Play again from a time to another; returns whether it does, being at its end.
+
+        Args:
+            start_ns: The first time, of the recording.
+            end_ns: The last time; None for the end.
+        """
+
+    def toggle_topic_pauses(self) -> None:
+        """Pause before the messages of some topics or not, as was asked for at first."""
+
+    @property
+    def start_ns(self) -> int:
+        """Log time of the first message of the recording."""
 
     def stop(self) -> None:
         """End."""
@@ -73,6 +89,7 @@ class Publisher(Protocol):
         Latching (ROS 1) and QoS (ROS 2) are those of its metadata.
 
         Raises:
+            Refused: Its type is not installed there.
             ConversionError: It cannot be published there; names the topic.
             PublishError: The other side refuses.
         """
@@ -102,8 +119,13 @@ class Publisher(Protocol):
             OptionError: There is no such clock here.
         """
 
-    def listen(self, topic: str, on_message: Callable[[], None]) -> None:
+    def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
         """Call for each message on a topic of others, whatever its type, from any thread.
+
+        Args:
+            topic: The topic.
+            on_message: Called with the stamp, nanoseconds, of a message that begins with a header;
+                with None for others, and where it cannot be told.
 
         Raises:
             OptionError: That cannot be done here.
@@ -158,7 +180,10 @@ def sourced() -> str:
 def open_publisher(
     kind: str,
     *,
+    names: NodeNames = PLAIN,
     qos_overrides: Path | None = None,
+    parting_s: float | None = None,
+    queue_size: int = 0,
     host: str = "127.0.0.1",
     port: int = 8765,
     origins: Sequence[str] = (),
@@ -169,7 +194,11 @@ def open_publisher(
 
     Args:
         kind: One of `WORLDS`.
+        names: What the node and its topics are called, in ROS.
         qos_overrides: A YAML file of QoS profiles by topic, for ROS 2.
+        parting_s: How long subscribers have to acknowledge at the end, in ROS 2; None for 3 s.
+        queue_size: Messages that may wait for each subscriber of a topic, in ROS 1; 0 for any
+            number, as far as `MAX_BYTES` allows.
         host: Address to listen on, for Foxglove.
         port: Port to listen on, for Foxglove.
         origins: Web sites that may connect, for Foxglove.
@@ -189,18 +218,20 @@ def open_publisher(
         from mp4ds.plugins.publishing.ros1 import RospyPublisher
 
         # what waits is bounded by its bytes: a hundred small messages are a moment
-        return RospyPublisher(queue_size=0, wait_s=0.0 if is_paced else _PATIENCE_S)
+        wait_s = 0.0 if is_paced else _PATIENCE_S
+        return RospyPublisher(names=names, queue_size=queue_size, wait_s=wait_s)
     if kind == "foxglove":
         from mp4ds.plugins.publishing.foxglove import FoxglovePublisher
 
         return FoxglovePublisher(host=host, port=port, origins=origins, span=span)
-    from mp4ds.plugins.publishing.ros2_writers import load_overrides
+    from mp4ds.plugins.publishing.ros2_writers import PARTING_S, load_overrides
 
     overrides = load_overrides(qos_overrides) if qos_overrides is not None else {}
+    parting_s = PARTING_S if parting_s is None else parting_s
     if find_spec("rclpy") is not None:
         from mp4ds.plugins.publishing.ros2 import RclpyPublisher
 
-        return RclpyPublisher(overrides=overrides)
+        return RclpyPublisher(overrides=overrides, names=names, parting_s=parting_s)
     from mp4ds.plugins.publishing.dds import DdsPublisher
 
-    return DdsPublisher(overrides=overrides)
+    return DdsPublisher(overrides=overrides, names=names, parting_s=parting_s)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import socket
 import struct
 import tempfile
@@ -21,6 +22,8 @@ from typing import Any, TypeVar
 
 from mp4ds.bags.convert import Converter
 from mp4ds.errors import ConversionError, OptionError, PublishError
+from mp4ds.plugins.publishing.latching import is_ros1
+from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import Controls
 from mp4ds.records import Channel
 
@@ -255,8 +258,15 @@ _BACKLOG = 1024
 _LOGGING = "version: 1\nincremental: true\n"
 
 
-def start_node(node: str) -> tuple[Any, str]:
+def start_node(
+    node: str,
+    names: NodeNames = PLAIN,
+) -> tuple[Any, str]:
     """Make this process a node; returns rospy, and where its master is.
+
+    Args:
+        node: Its name, to which a number is added; where `names` has one, that is the whole name.
+        names: What it is called, and where it is.
 
     Raises:
         OptionError: The address of the master is none.
@@ -278,7 +288,7 @@ def start_node(node: str) -> tuple[Any, str]:
         with _own_logging():
             rospy.init_node(
                 node,
-                argv=[],
+                argv=[f"__{key}:={value}" for key, value in _told(names)],
                 anonymous=True,
                 disable_signals=True,
                 disable_rostime=True,  # this process tells the time, and waits for nobody's
@@ -288,6 +298,11 @@ def start_node(node: str) -> tuple[Any, str]:
     except (rospy.ROSException, ValueError, OSError) as error:
         raise PublishError(master, f"no node can be started ({error})") from None
     return rospy, master
+
+
+def _told(names: NodeNames) -> list[tuple[str, str]]:
+    told = (("name", names.node), ("ns", names.namespace))
+    return [(key, value) for key, value in told if value]
 
 
 def _receive_many() -> None:
@@ -411,7 +426,8 @@ class RospyPublisher:
     too slow loses the oldest messages, as with every publisher of ROS 1, and holds up nobody.
 
     Args:
-        node: Name of the node; a number is added to it.
+        node: Name of the node, where `names` has none; a number is added to it.
+        names: What the node and /clock are called.
         queue_size: Messages that may wait for each subscriber of a topic, as with
             ``rosbag play --queue``; 0 for any number. More than 128 MiB never wait.
         wait_s: How long a message waits for a subscriber that takes nothing and has a full queue,
@@ -427,11 +443,17 @@ class RospyPublisher:
     world: str | None = "ros1"
 
     def __init__(
-        self, *, node: str = "mp4ds_play", queue_size: int = 100, wait_s: float = 0.0
+        self,
+        *,
+        node: str = "mp4ds_play",
+        names: NodeNames = PLAIN,
+        queue_size: int = 100,
+        wait_s: float = 0.0,
     ) -> None:
         if queue_size < 0 or wait_s < 0:
             raise OptionError("A queue of ROS 1 cannot be shorter than 0. Use 100, or 0 for any.")
-        self._rospy, self._master = start_node(node)
+        self._rospy, self._master = start_node(node, names)
+        self._clock_topic = names.renamed("/clock")
         self._queue_size, self._wait_s = queue_size, wait_s
         self._topics: dict[str, AdvertisedTopic] = {}
         self._channels: dict[int, tuple[Channel, AdvertisedTopic, str | None]] = {}  # by id()
@@ -448,7 +470,7 @@ class RospyPublisher:
         self._check_alive()
         topic = self._topic(channel.topic, self._kind(channel), self._queue_size)
         caller = None
-        if channel.metadata.get("latching", "").lower() in ("1", "true"):
+        if is_ros1(channel):
             caller = channel.metadata.get("callerid", "")
             topic.mark_latched()
         self._channels[id(channel)] = channel, topic, caller
@@ -465,7 +487,8 @@ class RospyPublisher:
             problem = f"ROS 1 cannot tell the time {time_ns} ns, only those of 1970 to 2106"
             raise ConversionError("/clock", problem, "Play without a clock.")
         self._check_alive()
-        self._topic("/clock", _CLOCK, _CLOCK_QUEUE).publish(_TIME.pack(*divmod(time_ns, _NS)))
+        topic = self._topic(self._clock_topic, _CLOCK, _CLOCK_QUEUE)
+        topic.publish(_TIME.pack(*divmod(time_ns, _NS)))
 
     def subscribers(self, channel: Channel) -> int:
         """See `Publisher`."""
@@ -484,11 +507,11 @@ class RospyPublisher:
                 seconds, nanoseconds = _TIME.unpack(message._buff)
                 on_time(seconds * _NS + nanoseconds)
 
-        self._subscribe("/clock", on_message)
+        self._subscribe(self._clock_topic, on_message)
 
-    def listen(self, topic: str, on_message: Callable[[], None]) -> None:
+    def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
         """See `Publisher`."""
-        self._subscribe(topic, lambda _: on_message())
+        self._subscribe(topic, lambda message: on_message(_stamp_of(message)))
 
     def serve(self, controls: Controls) -> None:
         """Offer ``~pause_playback``, a std_srvs/SetBool, as rosbag play does."""
@@ -586,3 +609,15 @@ class RospyPublisher:
         if not is_name(topic):
             raise OptionError(f"ROS 1 has no topic named {topic!r}. Give one such as /reply.")
         self._rospy.Subscriber(topic, self._rospy.AnyMsg, on_message, tcp_nodelay=True)
+
+
+_HEADER = re.compile(r"(?:\s|#[^\n]*\n)*(?:std_msgs/)?Header\s")
+
+
+def _stamp_of(message: Any) -> int | None:
+    """The stamp of a message that begins with a header, nanoseconds."""
+    definition = (message._connection_header or {}).get("message_definition", "")
+    if not _HEADER.match(definition) or len(message._buff) < 12:
+        return None
+    _, seconds, nanoseconds = struct.unpack_from("<III", message._buff)
+    return int(seconds * _NS + nanoseconds)

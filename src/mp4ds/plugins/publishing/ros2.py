@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
+import math
 import struct
 import threading
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
-from mp4ds.errors import ConversionError, OptionError, PublishError
-from mp4ds.plugins.publishing.dds_domain import dds_topic
+from mp4ds.errors import ConversionError, OptionError, PublishError, Refused
+from mp4ds.plugins.publishing.dds_domain import dds_topic, recorded_hash
+from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import Controls
 from mp4ds.plugins.publishing.ros2_writers import (
     CLOCK,
@@ -27,6 +32,8 @@ from mp4ds.records import Channel
 
 _SECOND = 10**9
 _LOOK = 0.1  # seconds between two looks for who publishes a topic
+_NO_SUPPORT = ("UnsupportedTypeSupport", "NoTypeSupportImportedException")
+"""Errors of a type without its compiled half, by name: each distribution has them elsewhere."""
 
 
 class RclpyPublisher:
@@ -36,7 +43,9 @@ class RclpyPublisher:
 
     Args:
         overrides: Topic -> quality of service to offer instead of the recorded one.
-        node: Name of the node.
+        node: Name of the node, where `names` has none.
+        names: What the node and /clock are called.
+        parting_s: How long subscribers have to acknowledge at the end; may be infinite.
 
     Raises:
         PublishError: No ROS 2 is sourced.
@@ -44,7 +53,14 @@ class RclpyPublisher:
 
     world: str | None = "ros2"
 
-    def __init__(self, *, overrides: Mapping[str, Qos] = {}, node: str = "rosbag2_player") -> None:
+    def __init__(
+        self,
+        *,
+        overrides: Mapping[str, Qos] = {},
+        node: str = "rosbag2_player",
+        names: NodeNames = PLAIN,
+        parting_s: float = PARTING_S,
+    ) -> None:
         try:
             import rclpy
             from rclpy.context import Context
@@ -54,10 +70,15 @@ class RclpyPublisher:
             raise PublishError("ROS 2", problem) from None
         self._context = Context()
         rclpy.init(args=[], context=self._context)
-        self._node = rclpy.create_node(node, context=self._context)
+        self._node = rclpy.create_node(
+            names.node or node, context=self._context, namespace=names.namespace or None
+        )
+        self._clock_topic = names.renamed(CLOCK)
+        self._parting_s = parting_s
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._writers: Writers[Any] = Writers(overrides)
+        self._compared: set[str] = set()
         self._clock: Any = None
         self._ended = threading.Event()
         self._threads = [threading.Thread(target=self._spin, name="mp4ds-rclpy", daemon=True)]
@@ -72,21 +93,29 @@ class RclpyPublisher:
         """Announce a channel before its first message; see `Publisher`."""
         kind = channel.type_name
         self._writers.add(channel, kind, partial(self._create, channel.topic, kind))
+        if kind not in self._compared:
+            self._compared.add(kind)
+            _compare(channel)
 
     def _create(self, topic: str, type_name: str, qos: Qos) -> Any:
         """A publisher of rclpy.
 
         Raises:
-            ConversionError: The type is not installed, or the topic has no valid name.
+            Refused: The type is not installed.
+            ConversionError: The topic has no valid name, or the type none.
         """
         from rclpy.exceptions import InvalidTopicNameException
 
-        kind = message_class(topic, type_name)
+        kind = _installed_class(topic, type_name)
         try:
             return self._node.create_publisher(kind, topic, qos_profile(qos))
         except InvalidTopicNameException:
             remedy = "Play it under another name."
             raise ConversionError(topic, "ROS 2 has no topics of such names", remedy) from None
+        except Exception as error:  # rclpy's errors have no common base
+            if type(error).__name__ not in _NO_SUPPORT:
+                raise ConversionError(topic, f"ROS 2 does not take it: {error}") from None
+            raise Refused(f"the type {type_name!r} is not installed whole: {error}") from None
 
     def publish(self, channel: Channel, payload: bytes | memoryview, time_ns: int) -> None:
         """Publish one message of a channel that was advertised; see `Publisher`."""
@@ -101,8 +130,8 @@ class RclpyPublisher:
     def clock(self, time_ns: int) -> None:
         """Publish the time of the recording as /clock."""
         if self._clock is None:
-            self._clock = self._create(CLOCK, CLOCK_TYPE, CLOCK_QOS)
-        self._send(self._clock, CLOCK, clock_message(time_ns))
+            self._clock = self._create(self._clock_topic, CLOCK_TYPE, CLOCK_QOS)
+        self._send(self._clock, self._clock_topic, clock_message(time_ns))
 
     def subscribers(self, channel: Channel) -> int:
         """How many subscribers a channel's topic has now."""
@@ -110,9 +139,10 @@ class RclpyPublisher:
 
     def follow_clock(self, on_time: Callable[[int], None]) -> None:
         """Call with each time, nanoseconds, that others publish as /clock."""
-        self._subscribe(CLOCK, CLOCK_TYPE, CLOCK_QOS, lambda raw: on_time(_time_of(raw)))
+        topic = self._clock_topic
+        self._subscribe(topic, CLOCK_TYPE, CLOCK_QOS, lambda raw: on_time(_time_of(raw)))
 
-    def listen(self, topic: str, on_message: Callable[[], None]) -> None:
+    def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
         """Call for each message on a topic, from when somebody publishes it."""
         if dds_topic(topic) is None:
             raise OptionError(f"{topic!r} is no topic name of ROS 2.")
@@ -120,7 +150,7 @@ class RclpyPublisher:
         self._threads.append(thread)
         thread.start()
 
-    def _seek(self, topic: str, on_message: Callable[[], None]) -> None:
+    def _seek(self, topic: str, on_message: Callable[[int | None], None]) -> None:
         own = self._node.get_name()
         while not self._ended.wait(_LOOK):
             found = self._node.get_publishers_info_by_topic(topic)
@@ -129,7 +159,7 @@ class RclpyPublisher:
                 reliable = all(one.qos_profile.reliability.name == "RELIABLE" for one in others)
                 qos = Qos(reliability="reliable" if reliable else "best_effort")
                 try:
-                    self._subscribe(topic, others[0].topic_type, qos, lambda _: on_message())
+                    self._subscribe(topic, others[0].topic_type, qos, lambda _: on_message(None))
                 except ConversionError as error:
                     self._node.get_logger().error(str(error))
                 return
@@ -171,15 +201,16 @@ class RclpyPublisher:
         return not self._ended.is_set() and bool(self._context.ok())
 
     def close(self) -> None:
-        """Wait until subscribers have what was sent, for 3 s at most, and leave."""
+        """Wait until subscribers have what was sent, as long as they may take, and leave."""
         from rclpy.duration import Duration
 
         if self._ended.is_set():
             return
-        end = time.monotonic() + PARTING_S
+        end = time.monotonic() + self._parting_s
         if self._context.ok():
             for publisher in self._writers:
-                left = max(0.0, end - time.monotonic())
+                left = end - time.monotonic()  # infinite is told by a negative one
+                left = -1.0 if math.isinf(left) else max(0.0, left)
                 publisher.wait_for_all_acked(Duration(seconds=left))
         self._ended.set()
         for thread in self._threads:
@@ -200,15 +231,54 @@ def message_class(topic: str, type_name: str) -> Any:
     """The class of a topic's messages.
 
     Raises:
-        ConversionError: The type is not installed.
+        ConversionError: The type is not installed, or ROS 2 has no types of such names.
     """
+    try:
+        return _installed_class(topic, type_name)
+    except Refused as reason:
+        raise ConversionError(topic, str(reason), "Install and source its package.") from None
+
+
+def _installed_class(topic: str, type_name: str) -> Any:
     from rosidl_runtime_py.utilities import get_message
 
     try:
         return get_message(type_name)
-    except (AttributeError, ModuleNotFoundError, ValueError):
-        problem = f"the type {type_name!r} is not installed in this ROS 2"
-        raise ConversionError(topic, problem, "Install and source its package.") from None
+    except (AttributeError, ModuleNotFoundError):
+        raise Refused(f"the type {type_name!r} is not installed in this ROS 2") from None
+    except ValueError:
+        remedy = "Leave the topic out."
+        problem = f"{type_name!r} is no message type of ROS 2"
+        raise ConversionError(topic, problem, remedy) from None
+    except Exception as error:  # of the package itself, which cannot be imported
+        raise Refused(f"the type {type_name!r} is not installed whole: {error}") from None
+
+
+def _compare(channel: Channel) -> None:
+    """Warn where the installed type is not the recorded one: its name alone is no proof."""
+    installed = _installed_hash(channel.type_name)
+    recorded = recorded_hash(channel) if installed else ""
+    if recorded and recorded != installed:
+        warnings.warn(
+            f"{channel.topic}: the installed type {channel.type_name} differs from the recorded "
+            "one, so that subscribers may read nonsense; install the version of its package that "
+            "was recorded with.",
+            stacklevel=2,
+        )
+
+
+def _installed_hash(type_name: str) -> str:
+    """The hash of an installed type, RIHS01_...; empty where ROS 2 has none, as before Iron."""
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        package, *rooms = type_name.split("/")
+        path = Path(get_package_share_directory(package), *rooms).with_suffix(".json")
+        hashes = json.loads(path.read_bytes())["type_hashes"]
+        found = [one["hash_string"] for one in hashes if one["type_name"] == type_name]
+        return str(found[0])
+    except (ImportError, LookupError, OSError, TypeError, ValueError):
+        return ""
 
 
 def qos_profile(qos: Qos) -> Any:

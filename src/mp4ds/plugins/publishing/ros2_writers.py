@@ -12,11 +12,16 @@ import yaml
 
 from mp4ds.bags.rosbag2_metadata import native_qos
 from mp4ds.errors import ConversionError, OptionError
+from mp4ds.plugins.publishing.latching import PLAYER_DEPTH, kept_depth
 from mp4ds.plugins.publishing.publisher import Controls
 from mp4ds.records import QOS_KEY, Channel
 
 _NOTHING = "uint8 structure_needs_at_least_one_member"
 _SUCCESS = "bool success"
+_PLAY = (
+    "builtin_interfaces/Time start_offset\nbuiltin_interfaces/Duration playback_duration\n"
+    "builtin_interfaces/Time playback_until_timestamp"
+)
 _SECOND = 10**9
 
 
@@ -74,9 +79,21 @@ def _burst(controls: Controls, request: Any) -> Mapping[str, Any]:
     return {"actually_burst": controls.burst(request.num_messages)}
 
 
+def _play(controls: Controls, request: Any) -> Mapping[str, Any]:
+    start = controls.start_ns + _nanoseconds(request.start_offset)
+    length, until = map(_nanoseconds, (request.playback_duration, request.playback_until_timestamp))
+    # 0, which nobody plays, is what clients send who leave it out
+    ends = [time for time, is_told in ((start + length, length > 0), (until, until > 0)) if is_told]
+    return {"success": controls.play(start, max(ends, default=None))}
+
+
 def _seek(controls: Controls, request: Any) -> Mapping[str, Any]:
-    time_ns = request.time.sec * _SECOND + request.time.nanosec
-    return {"success": controls.seek(time_ns)}
+    controls.seek(_nanoseconds(request.time))
+    return {"success": True}
+
+
+def _nanoseconds(time: Any) -> int:
+    return int(time.sec * _SECOND + time.nanosec)
 
 
 def _stop(controls: Controls, _: Any) -> Mapping[str, Any]:
@@ -93,16 +110,14 @@ PLAYER_SERVICES = (
     Service("set_rate", "SetRate", "float64 rate", _SUCCESS, _set_rate),
     Service("play_next", "PlayNext", _NOTHING, _SUCCESS, _play_next),
     Service("burst", "Burst", "uint64 num_messages", "uint64 actually_burst", _burst),
+    Service("play", "Play", _PLAY, _SUCCESS, _play),
     Service("seek", "Seek", "builtin_interfaces/Time time", _SUCCESS, _seek),
     Service("stop", "Stop", _NOTHING, _NOTHING, _stop),
 )
-"""All but ``play``, which starts a playback where none is running."""
+"""Those of `ros2 bag play`, which are answered when what they ask for is done."""
 
 
 # ---------------------------------------------------------------- QoS
-
-PLAYER_DEPTH = 10
-"""What rosbag2 keeps of a topic: recordings do not know the depth of their publishers."""
 
 _MAX_BYTES = 2**20
 _MAX_DEPTH = 2**31 - 1
@@ -205,8 +220,8 @@ def offered_qos(channel: Channel, overrides: Mapping[str, Qos]) -> Qos:
     """What a player offers for a channel, chosen as `ros2 bag play` does.
 
     That of the overrides; else the recorded one where all recorded publishers agree on what
-    subscribers can tell; else the default. Of latched topics the depth is kept, up to the
-    player's own, since it is what late subscribers get.
+    subscribers can tell; else the default. Of latched topics the depth is the sum of what all
+    publishers kept, since it is what late subscribers get.
 
     Args:
         channel: The channel, with the recorded profiles in its metadata.
@@ -217,9 +232,8 @@ def offered_qos(channel: Channel, overrides: Mapping[str, Qos]) -> Qos:
     profiles = recorded_qos(channel.metadata.get(QOS_KEY, ""))
     if len({_as_subscribers_see(profile) for profile in profiles}) != 1:
         return Qos()
-    first = profiles[0]
-    depth = min(first.depth, PLAYER_DEPTH) if first.is_latched else PLAYER_DEPTH
-    return replace(first, history="keep_last", depth=depth)
+    depth = kept_depth(channel) if profiles[0].is_latched else PLAYER_DEPTH
+    return replace(profiles[0], history="keep_last", depth=depth)
 
 
 def _as_subscribers_see(qos: Qos) -> Qos:

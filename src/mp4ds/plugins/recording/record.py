@@ -50,28 +50,30 @@ _REPORT_S = 0.2
 class RecordOptions(Options):
     """How to record."""
 
-    to: str | None = option("ros1 or ros2; what is sourced by default.")
-    all: bool = option("Record all topics, also those that appear later.", False, "-a")
-    regex: str = option("Record topics that match, besides those named.", "", "-e")
+    to: str | None = option("ros1 or ros2; by default, the one that is sourced.")
+    all: bool = option("Record all topics, including new ones.", False, "-a")
+    regex: str = option("Also record topics that match a regular expression.", "", "-e")
     exclude: Sequence[str] = exclude("--exclude", "--exclude-topics")
-    exclude_regex: str = option("Leave out topics that match.", "", "--exclude-regex")
-    duration: float | None = option("Stop after so many seconds.", None, "--duration")
+    exclude_regex: str = option(
+        "Leave out topics that match a regular expression.", "", "--exclude-regex"
+    )
+    duration: float | None = option("Stop after N seconds.", None, "--duration")
     max_duration: float | None = option(
-        "Begin another dataset after so many seconds; 0: never.",
+        "Start a new dataset after this time; 0: never.",
         None,
         "--max-bag-duration",
         "-d",
         metavar="SECONDS",
     )
     max_size: int | None = option(
-        "Begin another dataset when this one is so large, such as 4G.",
+        "Start a new dataset at this size, such as 4G.",
         None,
         "--max-size",
         metavar="SIZE",
         parse=parse_size,
     )
     buffer: int = option(
-        "Messages that may wait, in MB; beyond, the oldest are dropped and counted.",
+        "Buffer in MB; when it is full, the oldest messages are dropped and counted.",
         256,
         "--buffsize",
         "-b",
@@ -79,23 +81,23 @@ class RecordOptions(Options):
         most=1_000_000,
     )
     quality: str = option("lossless, visual or crf=N.", LOSSLESS, "-q")
-    codec: str | None = option("As of pack; by default what encodes in the least time.")
-    preset: str | None = option("The encoder's preset; its fastest exact one by default.")
+    codec: str | None = option("As in pack; by default the fastest to encode.")
+    preset: str | None = option("The encoder's preset; by default the fastest.")
     gop: int | None = option(
-        "Most frames from a key frame to the next; 10 by default, 30 where lossy.",
+        "Maximum distance of key frames, in frames; 10 by default, 30 if lossy.",
         least=1,
         most=MAX_GOP,
     )
     start_paused: bool = option("Start paused.", False, "--start-paused", "--pause")
-    use_sim_time: bool = option("Log the times of /clock.", False)
+    use_sim_time: bool = option("Take log times from /clock.", False)
     node: str = option("Name of the node.", "mp4ds_recorder", "--node-name")
     discover: bool = option("Look for new topics.", True, "--discovery/--no-discovery")
     polling_interval: float = option(
-        "Milliseconds between looks for new topics.", 100.0, "--polling-interval", "-p"
+        "Milliseconds between checks for new topics.", 100.0, "--polling-interval", "-p"
     )
-    hidden: bool = option("Hidden topics too (ROS 2).", False, "--include-hidden-topics")
+    hidden: bool = option("Include hidden topics (ROS 2).", False, "--include-hidden-topics")
     qos_overrides: Path | None = option(
-        "QoS by topic, for ROS 2.", None, "--qos-profile-overrides-path", metavar="YAML"
+        "QoS profiles by topic (ROS 2).", None, "--qos-profile-overrides-path", metavar="YAML"
     )
     about: str | None = option(
         "YAML with title, description, authors, license, doi, links or keywords.", metavar="FILE"
@@ -105,15 +107,15 @@ class RecordOptions(Options):
 
 @dataclass(frozen=True)
 class TopicProgress:
-    """How a topic stands.
+    """State of a topic.
 
     Attributes:
         messages: Received.
-        hz: Messages a second, lately.
-        bytes_per_s: Received a second, lately.
-        verbatim: Camera messages that are kept as they came.
-        dropped: Messages for which there was no memory.
-        lost: Messages that the middleware says it lost.
+        hz: Recent messages per second.
+        bytes_per_s: Recently received per second.
+        verbatim: Camera messages stored as received, not encoded.
+        dropped: Messages dropped because the buffer was full.
+        lost: Messages lost according to the middleware.
     """
 
     messages: int

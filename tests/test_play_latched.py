@@ -1,0 +1,112 @@
+"""Latched topics of ROS 2, of which rosbag2 makes one channel for all publishers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import mp4ds
+from each import each
+from mp4ds.bags.convert import LATCHED_QOS
+from mp4ds.plugins.playing.play import PlayOptions, open_player
+from mp4ds.plugins.publishing.latching import Kept, kept_depth
+from mp4ds.plugins.publishing.ros2_writers import offered_qos
+from mp4ds.records import Channel
+from player_scenes import (
+    STATIC,
+    RecordingPublisher,
+    make_ros2,
+    profiles,
+    ros2_channel,
+    static_channel,
+    static_transform,
+    text,
+)
+from ros2_sides import SIDES, Side, padded
+
+STRING = "std_msgs/msg/String"
+
+
+def late(channel: Channel, *payloads: bytes) -> list[bytes]:
+    """What is kept of messages for those that come after them."""
+    kept = Kept[bytes](channel)
+    for payload in payloads:
+        kept.add(payload, payload)
+    return list(kept)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("ros2")
+    mp4ds.pack(make_ros2(folder / "drive.mcap"), folder / "drive")
+    return folder / "drive"
+
+
+def test_what_came_before_the_start_is_sent_at_first(drive: Path) -> None:
+    publisher = RecordingPublisher(world="ros2")
+    options = PlayOptions(start_offset=0.5, immediate=True)
+    with open_player(drive, options, publisher=publisher) as player:
+        player.run()
+    first = [(sent.topic, sent.payload) for sent in publisher.sent[:6]]
+    assert first == [
+        *(("/tf_static", static_transform(child)) for child in STATIC),
+        *(("/map", text(f"map {n}")) for n in range(2)),
+    ]
+    assert {sent.topic for sent in publisher.sent[6:]} == {"/chatter"}
+
+
+def test_of_tf_static_the_newest_of_each_child_frame_is_kept() -> None:
+    first = [static_transform(child) for child in STATIC]
+    again = static_transform("lidar", 7)
+    expected = [first[0], first[2], first[3], again]
+    assert late(static_channel(1), *first, again) == expected
+    assert late(static_channel(1), *first, again, *expected) == expected  # the player went back
+    many = [static_transform(f"{n}") for n in range(200)]
+    assert late(static_channel(1), *many) == many
+
+
+def test_a_message_of_tf_static_that_does_not_parse_is_kept() -> None:
+    assert late(static_channel(1), b"\0\1\0\0", static_transform("imu"))[0] == b"\0\1\0\0"
+
+
+@each(
+    ("channel", "depth"),
+    [
+        (ros2_channel(1, "/map", STRING, profiles(1, 1, 1, 1)), 10),
+        (ros2_channel(1, "/map", STRING, profiles(12, 5)), 17),
+        (ros2_channel(1, "/map", STRING, profiles(0, 0, 0)), 30),
+        (ros2_channel(1, "/map", STRING, profiles(10**30)), 1000),
+        (ros2_channel(1, "/map", STRING, profiles(1).replace("last", "all")), 1000),
+        (ros2_channel(1, "/map", STRING, LATCHED_QOS), 1),
+        (ros2_channel(1, "/tf_static", STRING, profiles(1)), 10),
+        (ros2_channel(1, "/robot/tf_static", "tf2_msgs/msg/TFMessage", profiles(1)), 100),
+    ],
+    ids=lambda value: str(value) if isinstance(value, int) else value.topic,
+)
+def test_as_many_are_offered_as_all_publishers_kept(channel: Channel, depth: int) -> None:
+    assert kept_depth(channel) == depth
+    offered = offered_qos(channel, {})
+    assert (offered.durability, offered.depth) == ("transient_local", depth)
+    if depth < 100:
+        messages = [text(f"{n}") for n in range(depth + 5)]
+        assert late(channel, *messages) == messages[5:]
+
+
+@pytest.fixture(params=SIDES)
+def side(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
+    with SIDES[request.param](monkeypatch) as found:
+        yield found
+
+
+def test_late_subscribers_of_ros2_get_all_static_transforms(side: Side) -> None:
+    recorded = static_channel(1, 1, 1, 1)
+    sent = [static_transform(child) for child in STATIC]
+    with side.open() as publisher:
+        publisher.advertise(recorded)
+        for payload in sent:
+            publisher.publish(recorded, payload, 0)
+        side.peer.subscribe("/tf_static", recorded.type_name, latched=True)
+        got = side.peer.received("/tf_static", len(sent))
+    assert [padded(payload) for payload in got] == [padded(payload) for payload in sent]

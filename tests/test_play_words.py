@@ -1,0 +1,187 @@
+"""`mp4ds play` as users of other players type it, and the table of their options."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from each import each
+from mp4ds.cli import app_for
+from mp4ds.cli.play_words import known_words, spelled
+from mp4ds.errors import OptionError
+from mp4ds.plugins.publishing.names import PLAIN, NodeNames, node_arguments
+from roscore import PLAY
+from test_examples import ROOT
+
+VALUED = {"--rate", "-r", "--topics", "-t", "--remap", "-m", "--exclude-regex", "-s", "--prefix"}
+
+
+def words(typed: str) -> str:
+    return " ".join(spelled(typed.split(), VALUED.__contains__)[0])
+
+
+@each(
+    ("typed", "expected"),
+    [
+        ("bag --topics /a /b -r 2", "bag --topics /a --topics /b -r 2"),
+        ("bag --topics /a {folder}", "bag --topics /a --topics {folder}"),
+        ("--topics /a /b {folder} -r 2", "--topics /a --topics /b {folder} -r 2"),
+        ("--topics /a /b --bags x {folder}", "--topics /a --topics /b x {folder}"),
+        ("-r 2 bag --topics /a {folder}", "-r 2 bag --topics /a --topics {folder}"),
+        ("--topics=/a /b", "--topics /a --topics /b"),
+        ("--topics /a s3://bucket/drive", "--topics /a s3://bucket/drive"),
+        ("-t /a bag", "-t /a bag"),
+        ("--remap a:=b /c:=d bag", "--remap a:=b --remap /c:=d bag"),
+        ("-m a:=b c:=d", "--remap a:=b --remap c:=d"),
+        ("--exclude-topics /a /b", "--exclude-topics /a --exclude-topics /b"),
+        ("bag --services /a --exclude-services /b",
+         "bag --topics /a/_service_event --exclude-topics /b/_service_event"),
+        ("--clock 50 bag", "--clock --hz 50 bag"),
+        ("--clock=50", "--clock --hz 50"),
+        ("--clock bag", "--clock bag"),
+        ("--ros2 --clock bag", "--ros2 --clock bag --hz 40"),
+        ("--ros2 bag --clock 7", "--ros2 bag --clock --hz 7"),
+        ("--ros2 bag -x a -s mcap", "--ros2 bag --exclude-regex a --storage mcap"),
+        ("--ros1 bag -p /a -s 3", "--ros1 bag --prefix /a -s 3"),
+        ("--ros1 bag -p/a", "--ros1 bag --prefix /a"),
+        ("bag -x a -p -s 3", "bag -x a -p -s 3"),
+        ("--ros2 -i one mcap -i two", "--ros2 one two"),
+        ("bag --progress-bar-update-rate 0", "bag --no-progress"),
+        ("bag --progress-bar-update-rate 3", "bag"),
+        ("bag --storage-config-file x --disable-loan-message --message-order received", "bag"),
+        ("bag --ros-args -r /a:=/b -- -l", "bag -l"),
+        ("bag -- --topics", "bag -- --topics"),
+    ],
+    ids=lambda value: value,
+)  # fmt: skip
+def test_words_of_other_players(typed: str, expected: str, tmp_path: Path) -> None:
+    assert words(typed.format(folder=tmp_path)) == expected.format(folder=tmp_path)
+
+
+@each(
+    ("typed", "says"),
+    [
+        ("--publish-service-requests", "services are not called"),
+        ("--message-order sent", "as they were received"),
+        ("--topics", "--topics requires an argument"),
+        ("--ros-args --nonsense", "--nonsense is not known"),
+        ("--ros-args -r nonsense", "no rule of ROS"),
+        ("__ns:=/1", "no namespace"),
+    ],
+)
+def test_what_has_no_counterpart_is_told(typed: str, says: str) -> None:
+    with pytest.raises(OptionError, match=says):
+        words(typed)
+
+
+@each(
+    ("typed", "names"),
+    [
+        ("", PLAIN),
+        ("--ros-args -r __node:=x -p use_sim_time:=true -p a:=b", NodeNames("x")),
+        ("--ros-args --remap __ns:=/robot --log-level warn", NodeNames("", "/robot", (), "warn")),
+        ("--ros-args -r player:__node:=x -r /a:=/b --params-file f.yaml",
+         NodeNames("x", "", (("/a", "/b"),))),
+        ("--ros-args --log-level rcl:=debug --disable-rosout-logs --", PLAIN),
+        ("__name:=x __ns:=/y __log:=/tmp/x.log _rate:=3 /a:=/b",
+         NodeNames("x", "/y", (("/a", "/b"),))),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)  # fmt: skip
+def test_ros_tells_names(typed: str, names: NodeNames) -> None:
+    assert node_arguments(["drive", *typed.split()]) == (["drive"], names)
+
+
+def test_rules_go_by_full_names() -> None:
+    names = NodeNames("player", "/robot", (("scan", "/a"), ("~/b", "c"), ("/clock", "/sim")))
+    assert [
+        names.renamed(one) for one in ("/robot/scan", "/robot/player/b", "/clock", "/scan")
+    ] == [*("/a", "/robot/c", "/sim", "/scan")]
+
+
+# ---------------------------------------------------------------- the table of docs/playing.md
+
+ROS2_OPTIONS = [
+    "--storage",
+    "--storage-config-file",
+    "--read-ahead-queue-size",
+    "--rate",
+    "--topics",
+    "--services",
+    "--regex",
+    "--exclude-regex",
+    "--exclude-topics",
+    "--exclude-services",
+    "--qos-profile-overrides-path",
+    "--loop",
+    "--remap",
+    "--clock",
+    "--clock-topics",
+    "--clock-topics-all",
+    "--delay",
+    "--playback-duration",
+    "--playback-until-sec",
+    "--playback-until-nsec",
+    "--disable-keyboard-controls",
+    "--start-paused",
+    "--start-offset",
+    "--wait-for-all-acked",
+    "--disable-loan-message",
+    "--publish-service-requests",
+    "--service-requests-source",
+    "--log-level",
+    "--input",
+    "--message-order",
+    "--progress-bar-update-rate",
+    "--progress-bar-separation-lines",
+]
+"""Of ros2bag's play verb, in Jazzy and later."""
+
+
+def rows() -> dict[str, tuple[str, str]]:
+    """Options of each player -> whose they are, and what is here."""
+    page = (ROOT / "docs" / "playing.md").read_text()
+    table = page[page.index("| rosbag play") :].partition("\n\n")[0]
+    found = {}
+    for line in table.splitlines()[2:]:
+        ros1, ros2, here = (cell.strip() for cell in line.strip("|").split("|"))
+        for player, cell in (("ros1", ros1), ("ros2", ros2)):
+            for name in re.findall(r"`(--[a-z0-9-]+)", cell):
+                found[f"{player} {name}"] = (name, here)
+    return found
+
+
+def ours() -> set[str]:
+    command: Any = typer.main.get_command(app_for("play"))
+    return {
+        name for one in command.commands["play"].params for name in (*one.opts, *one.secondary_opts)
+    }
+
+
+def test_the_table_has_every_option_of_ros2() -> None:
+    assert {key.partition(" ")[2] for key in rows() if key.startswith("ros2")} == set(ROS2_OPTIONS)
+
+
+def test_the_table_has_every_option_of_ros1() -> None:
+    if not Path(PLAY).exists():
+        pytest.skip("there is no rosbag")
+    told = subprocess.run([PLAY, "--help"], capture_output=True, text=True, check=False)
+    options = set(re.findall(r"(?<![\w<-])--[a-z][a-z-]+", told.stdout + told.stderr)) - {"--help"}
+    assert {key.partition(" ")[2] for key in rows() if key.startswith("ros1")} == options
+
+
+def test_the_table_says_what_is_here() -> None:
+    known = ours() | set(known_words())
+    for key, (name, here) in rows().items():
+        if here.startswith("no:"):
+            with pytest.raises(OptionError, match="no counterpart"):
+                words(name)
+        else:
+            assert name in known, key
+        for told in re.findall(r"`(-{1,2}[a-z0-9-]+)", here):
+            assert told in known, f"{key}: {told}"

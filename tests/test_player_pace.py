@@ -1,0 +1,325 @@
+"""The player's pace: /clock at its rate, stalls that are made up for, reading that is too slow."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mp4ds
+from each import each
+from mp4ds.bags.formats import open_writer
+from mp4ds.errors import PublishError
+from mp4ds.plugins.playing import pace, timeline
+from mp4ds.plugins.playing.pace import Lateness, Ticks
+from mp4ds.plugins.playing.play import PlayOptions, open_player
+from mp4ds.plugins.playing.player import Player, PlaySummary
+from mp4ds.records import Message
+from player_scenes import MS, START, STEP, RecordingPublisher, make_ros2, ros2_channel, text
+from waiting import WATCHDOG_S, until
+
+NS = 10**9
+CHATTER = "/chatter"
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A second of strings at 20 Hz, without a camera."""
+    folder = tmp_path_factory.mktemp("strings")
+    mp4ds.pack(make_ros2(folder / "drive.mcap"), folder / "drive")
+    return folder / "drive"
+
+
+def run(
+    drive: Path, publisher: RecordingPublisher | None = None, **options: Any
+) -> tuple[RecordingPublisher, PlaySummary]:
+    publisher = publisher or RecordingPublisher(world="ros2")
+    with open_player(drive, PlayOptions(**options), publisher=publisher) as player:
+        return publisher, player.run()
+
+
+# ---------------------------------------------------------------- /clock
+
+
+class Hand:
+    """A clock of the machine that is put forward by hand."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 100.0
+        monkeypatch.setattr(pace, "time", self)
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@each("hertz", [1.0, 40.0, 333.0])
+def test_ticks_are_as_many_as_asked_for(hertz: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    hand, ticks = Hand(monkeypatch), Ticks(hertz)
+    count = 0
+    for _ in range(20_000):  # 10 s, asked every 0.5 ms
+        count += ticks.is_due()
+        assert ticks.seconds_left <= 1 / hertz + 1e-9
+        hand.now += 0.0005
+    assert abs(count - 10 * hertz) <= 1
+    hand.now += 5  # a stall is not made up for
+    assert [ticks.is_due() for _ in range(3)] == [True, False, False]
+    assert not Ticks(None).is_due()
+
+
+def test_the_clock_has_its_rate_whatever_is_played(drive: Path) -> None:
+    """Messages at 200 Hz of this machine's time add nothing to a clock of 20 Hz."""
+    publisher, _ = run(drive, clock=20.0, rate=10.0)
+    most = (publisher.clocks[-1].at - publisher.clocks[0].at) * 20 + 2
+    assert len(publisher.clocks) <= most
+    assert len(publisher.sent) == 26
+    times = [one.time_ns for one in publisher.clocks]
+    assert times == sorted(times)
+
+
+def test_no_clock_is_ahead_of_a_message_that_is_still_to_come(drive: Path) -> None:
+    publisher = RecordingPublisher(world="ros2")
+    told: list[int] = []
+    publisher.on_sent = lambda sent: told.append(sent.time_ns - publisher.clocks[-1].time_ns)
+    run(drive, publisher, clock=200.0, rate=0.5)
+    assert len(publisher.clocks) > 26
+    assert all(ahead >= 0 for ahead in told)
+
+
+def test_the_clock_ticks_before_the_first_message(drive: Path) -> None:
+    publisher = RecordingPublisher(world="ros2")
+    before: list[int] = []
+    publisher.on_sent = lambda _: before.append(len(publisher.clocks))
+    run(drive, publisher, clock=100.0, delay=0.5, rate=10.0)
+    assert before[0] > 10
+    assert len({one.time_ns for one in publisher.clocks[: before[0]]}) == 1
+
+
+@each(
+    ("options", "topics"),
+    [
+        ({"clock_topics": ["/map"]}, ["/map"] * 2),
+        ({"clock_topics_all": True, "topics": ["/map", "/tf_static"]},
+         ["/tf_static"] * 4 + ["/map"] * 2),
+        ({"clock_topics": ["/map"], "remap": ["/map:=/other"]}, ["/other"] * 2),
+    ],
+)  # fmt: skip
+def test_the_clock_goes_with_messages_on_request(
+    options: dict[str, Any], topics: list[str], drive: Path
+) -> None:
+    publisher = RecordingPublisher(world="ros2")
+    heard: list[str] = []
+
+    def note(sent: Any) -> None:
+        if publisher.clocks and publisher.clocks[-1].time_ns == sent.time_ns:
+            heard.append(sent.topic)
+
+    publisher.on_sent = note
+    run(drive, publisher, rate=10.0, **options)
+    # one advertises it, before anything is sent
+    assert len(publisher.clocks) == len(topics) + 1
+    assert [topic for topic in heard if topic in topics] == topics
+
+
+# ---------------------------------------------------------------- late, and why
+
+
+def test_lateness_is_told_apart() -> None:
+    """In milliseconds: what it is late by, whether it was awaited, how long the clock waits."""
+    for steps in (
+        [(500, False, 0), (450, True, 0), (300, True, 0), (350, True, 0), (0, False, 0)],  # a stall
+        [(60, True, 0), (90, True, 0), (130, True, 130), (50, True, 0), (110, True, 110)],  # slow
+        [(-5, True, 0), (90, False, 0), (160, True, 0), (220, True, 130)],  # both
+    ):
+        late = Lateness()
+        for by, was_awaited, waits in steps:
+            assert late.met(by * MS, was_awaited=was_awaited) == waits * MS
+    late = Lateness()
+    late.met(9 * NS, was_awaited=False)
+    assert not late.suspended()
+    late.met(11 * NS, was_awaited=False)
+    assert late.suspended() == 11 * NS  # Ctrl-Z
+    assert late.met(0, was_awaited=False) == 0
+
+
+class Machine:
+    """A steady clock that jumps when the process is not scheduled for a while."""
+
+    def __init__(self) -> None:
+        self.gone = 0
+
+    def __call__(self) -> int:
+        return time.monotonic_ns() + self.gone
+
+
+def stalled(drive: Path, seconds: float) -> tuple[list[int], PlaySummary]:
+    """How late each message comes where the process stands at the fifth string."""
+    machine, publisher = Machine(), RecordingPublisher(world="ros2")
+    late: list[int] = []
+
+    def on_sent(sent: Any) -> None:
+        if sent.topic == CHATTER:
+            late.append(machine() - sent.time_ns)
+            machine.gone += round(seconds * NS) if len(late) == 5 else 0
+
+    publisher.on_sent = on_sent
+    with open_player(drive, PlayOptions(), publisher=publisher) as made:
+        player = Player(made._timeline, publisher, steady=machine)
+        summary = player.run()
+    return [one - min(late) for one in late], summary
+
+
+def test_a_stall_is_made_up_for(drive: Path) -> None:
+    late, summary = stalled(drive, 0.6)
+    # each is due 50 ms after the one before: they come at once until it has caught up
+    for number, by in enumerate(late[5:15], 1):
+        assert by >= 600 * MS - number * STEP - MS
+    assert summary.slowed_s == 0
+
+
+def test_a_suspended_player_goes_on_where_it_was(drive: Path) -> None:
+    late, summary = stalled(drive, 30.0)
+    assert late[5] >= 30 * NS - STEP - MS
+    assert all(by >= 29 * NS for by in late[5:]), "the rest is as much later"
+    assert summary.slowed_s == 0
+
+
+@pytest.fixture
+def slow_reading(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Strings that take 40 ms to read."""
+    due = timeline._Part._due
+
+    def slow(part: Any, message: Any) -> Any:
+        time.sleep(0.04)
+        return due(part, message)
+
+    monkeypatch.setattr(timeline._Part, "_due", slow)
+
+
+def test_the_clock_waits_for_what_is_not_read_in_time(drive: Path, slow_reading: None) -> None:
+    publisher, summary = run(drive, rate=10.0, clock=50.0)
+    assert len(publisher.sent) == 26
+    assert summary.slowed_s > 0.3
+    times = [one.time_ns for one in publisher.clocks]
+    assert times == sorted(times)
+
+
+# ---------------------------------------------------------------- pausing, skipping, the end
+
+
+@pytest.fixture
+def gap(tmp_path: Path) -> Path:
+    """Two strings, an hour apart."""
+    channel = ros2_channel(0, CHATTER, "std_msgs/msg/String")
+    with open_writer(
+        tmp_path / "gap.mcap", "mcap", name="gap", profile="ros2", library="", storage="mcap"
+    ) as writer:
+        writer.add_channel(channel)
+        for n in range(2):
+            time_ns = START + n * 3600 * NS
+            writer.write(Message(channel, time_ns, time_ns, 0, text(f"{n}")))
+    mp4ds.pack(tmp_path / "gap.mcap", tmp_path / "gap")
+    return tmp_path / "gap"
+
+
+def test_empty_times_are_skipped(gap: Path) -> None:
+    publisher, summary = run(gap, skip_empty=60.0, clock=20.0)
+    assert len(publisher.sent) == 2
+    assert summary.seconds < 3000
+    assert summary.slowed_s == 0
+
+
+@each(
+    ("options", "last"),
+    [
+        ({"until_nsec": START + 100 * MS}, 100),
+        ({"until_sec": (START + 125 * MS) / NS}, 100),
+        ({"until_nsec": START + 200 * MS, "duration": 0.1}, 200),
+        ({"until_nsec": START, "duration": 0.1}, 100),
+        ({"until_nsec": -1, "until_sec": -1.0}, 950),
+    ],
+)
+def test_the_last_time_that_is_played(drive: Path, options: dict[str, Any], last: int) -> None:
+    publisher, _ = run(drive, immediate=True, topics=[CHATTER], **options)
+    assert publisher.sent[-1].time_ns == START + last * MS
+
+
+@contextmanager
+def running(
+    drive: Path, publisher: RecordingPublisher, **options: Any
+) -> Iterator[tuple[Player, threading.Thread]]:
+    with open_player(drive, PlayOptions(**options), publisher=publisher) as player:
+        thread = threading.Thread(target=player.run)
+        thread.start()
+        try:
+            yield player, thread
+        finally:
+            player.stop()
+            thread.join(WATCHDOG_S)
+
+
+def test_it_pauses_before_messages_of_a_topic(drive: Path) -> None:
+    publisher = RecordingPublisher(world="ros2")
+    with running(drive, publisher, rate=10.0, pause_topics=["/map"]) as (player, thread):
+        until(lambda: player.is_paused)
+        assert "/map" not in {sent.topic for sent in publisher.sent}
+        assert player.play_next()
+        assert publisher.sent[-1].payload == text("map 0")
+        player.resume()  # as with rosbag play, also for the next one, which it stands before
+        until(lambda: not thread.is_alive())
+    assert len(publisher.sent) == 26
+    publisher = RecordingPublisher(world="ros2")
+    options = PlayOptions(rate=10.0, pause_topics=["/map"])
+    with open_player(drive, options, publisher=publisher) as player:
+        player.toggle_topic_pauses()
+        assert not player.run().stopped
+    assert len(publisher.sent) == 26
+
+
+def test_it_waits_for_the_stamps_that_control_its_rate(drive: Path) -> None:
+    publisher = RecordingPublisher(world="ros2")
+    options = {"rate_control_topic": "/odom", "rate_control_max_delay": 0.1}
+    with running(drive, publisher, topics=[CHATTER], rate=5.0, **options) as (player, thread):
+        until(lambda: len(publisher.sent) == 3)  # of 0, 50 and 100 ms
+        time.sleep(0.3)
+        assert len(publisher.sent) <= 3
+        assert publisher.on_message is not None
+        publisher.on_message(None)  # without a stamp
+        publisher.on_message(START + 500 * MS)
+        until(lambda: len(publisher.sent) >= 12)
+        time.sleep(0.3)
+        assert len(publisher.sent) <= 13
+        publisher.on_message(START + NS)
+        until(lambda: not thread.is_alive())
+        assert not player.is_paused
+    assert len(publisher.sent) == 20
+
+
+# ---------------------------------------------------------------- types that are not installed
+
+
+def test_what_is_not_installed_is_left_out_and_counted(drive: Path) -> None:
+    publisher = RecordingPublisher(
+        world="ros2", not_installed=frozenset({"tf2_msgs/msg/TFMessage"})
+    )
+    with pytest.warns(UserWarning, match=r"not installed there: /tf_static \(tf2_msgs") as told:
+        _, summary = run(drive, publisher, immediate=True)
+    assert len(told) == 1
+    assert summary.not_installed == {"/tf_static": 4}
+    assert summary.messages == {CHATTER: 20, "/map": 2}
+    assert not summary.stopped
+    with pytest.warns(UserWarning, match="not installed"):
+        _, summary = run(drive, publisher, immediate=True, start_offset=0.5)
+    assert "/tf_static" not in {sent.topic for sent in publisher.sent}
+
+
+def test_nothing_that_is_installed_is_an_error(drive: Path) -> None:
+    publisher = RecordingPublisher(
+        world="ros2", not_installed=frozenset({"tf2_msgs/msg/TFMessage", "std_msgs/msg/String"})
+    )
+    with pytest.raises(PublishError, match=r"/chatter \(std_msgs/msg/String\), /map.*, /tf_static"):
+        run(drive, publisher)

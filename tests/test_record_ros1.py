@@ -1,0 +1,131 @@
+"""`mp4ds record --ros1` from a real master, beside ROS 1's own recorder."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mp4ds
+from conftest import real
+from mp4ds.bags.formats import open_reader
+from mp4ds.packing.journal import JOURNAL_NAME
+from mp4ds.packing.options import PackOptions
+from mp4ds.records import Message
+from player_scenes import make_drive
+from roscore import PLAY, RECORD, Core, missing, python, wait_until
+from roscore import _core as _core
+from roscore import roscore as roscore
+from waiting import WATCHDOG_S
+
+NOT_OF_PLAYERS = "/rosout.*|/clock"
+
+
+def ours(target: Path, *options: str) -> list[str]:
+    return python("mp4ds", "record", "--ros1", "-o", str(target), *options)
+
+
+def contents(recording: Path) -> dict[Any, list[bytes]]:
+    """Payloads of each connection, by what its header says."""
+    found: dict[Any, list[bytes]] = defaultdict(list)
+    with open_reader(recording) as reader:
+        for record in reader.records():
+            if isinstance(record, Message):
+                channel = record.channel
+                key = (channel.topic, channel.schema, tuple(sorted(channel.metadata.items())))
+                found[key].append(bytes(record.data))
+    return dict(found)
+
+
+def recorded(core: Core, target: Path, recorders: Sequence[list[str]], play: list[str]) -> None:
+    """Record a player with several recorders, until all that it plays was received."""
+    processes = [core.start(*command) for command in recorders]
+    try:
+        wait_until(lambda: sum("record" in node for node in core.nodes()) == len(recorders))
+        code, _, errors = core.run(*play)
+        assert code == 0, errors
+        # a recorder takes what has come before it ends; what is on its way comes within a moment
+        core.run("rosnode", "list")
+    finally:
+        for process in processes:
+            process.send_signal(signal.SIGINT)
+        codes = [process.wait(WATCHDOG_S) for process in processes]
+    assert codes == [0] * len(recorders), (core.folder / "python.log").read_text()[-2000:]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["drive", "roboto_tiny_dvs", pytest.param("ecto_ros_camera_info", marks=pytest.mark.slow)],
+)
+def test_as_rosbag_record(roscore: Core, tmp_path: Path, name: str) -> None:
+    """The same messages, with the same connection headers; of several publishers, some latched."""
+    bag = make_drive(tmp_path / "drive.bag") if name == "drive" else real(f"bags/{name}.bag")
+    play = [PLAY, "--quiet", "--queue", "100000", "--delay", "4", str(bag)]
+    both = [
+        ours(tmp_path / "live", "-a", "--exclude-regex", NOT_OF_PLAYERS),
+        [RECORD, "-a", "-O", str(tmp_path / "theirs.bag"), "-x", NOT_OF_PLAYERS],
+    ]
+    recorded(roscore, tmp_path, both, play)
+    mp4ds.unpack(tmp_path / "live", None, tmp_path / "again.bag")
+    found, due = contents(tmp_path / "again.bag"), contents(tmp_path / "theirs.bag")
+    assert found.keys() == due.keys()
+    assert found == due
+    assert any(dict(metadata).get("latching") == "1" for _, _, metadata in found) == (
+        name == "drive"
+    )
+    assert mp4ds.validate(tmp_path / "live", deep=True) == []
+
+
+def test_topics_that_are_named(roscore: Core, tmp_path: Path) -> None:
+    bag = make_drive(tmp_path / "drive.bag")
+    command = ours(tmp_path / "live", "/camera/*", "-e", "^/tf$")
+    recorded(roscore, tmp_path, [command], [PLAY, "-q", "--delay", "4", str(bag)])
+    with mp4ds.open(tmp_path / "live") as dataset:
+        assert sorted({channel.topic for channel in dataset.channels}) == [
+            "/camera/image_raw",
+            "/tf",
+        ]
+
+
+def test_a_recorder_that_is_killed(roscore: Core, tmp_path: Path) -> None:
+    bag = make_drive(tmp_path / "drive.bag", frames=400)
+    recorder = roscore.start(*ours(tmp_path / "live", "-a"))
+    folder = tmp_path / "live.recording"
+    video = folder / "camera_image_raw.mp4"
+    player = roscore.start(PLAY, "-q", "--delay", "2", str(bag))
+    try:
+        wait_until(lambda: video.exists() and video.stat().st_size > 30_000)
+        recorder.kill()
+        recorder.wait(WATCHDOG_S)
+        assert (folder / JOURNAL_NAME).exists()
+    finally:
+        player.terminate()
+        player.wait(WATCHDOG_S)
+    mp4ds.pack(folder, tmp_path / "live", PackOptions(salvage=True))
+    assert mp4ds.validate(tmp_path / "live", deep=True) == []
+    mp4ds.unpack(tmp_path / "live", None, tmp_path / "again.bag")
+    due = {key[0]: found for key, found in contents(bag).items()}
+    for (topic, *_), found in contents(tmp_path / "again.bag").items():
+        if topic in ("/camera/image_raw", "/tf"):
+            assert found
+            assert found == due[topic][: len(found)]
+
+
+def test_without_a_master(tmp_path: Path) -> None:
+    if why := missing():
+        pytest.skip(why)
+    done = subprocess.run(
+        ours(tmp_path / "live", "-a"),
+        env={"PATH": "/usr/bin:/bin", "ROS_MASTER_URI": "http://127.0.0.1:1/"},
+        capture_output=True,
+        text=True,
+        stdin=subprocess.DEVNULL,
+    )
+    assert done.returncode == 1
+    assert "no ROS master answers there" in done.stderr
+    assert not list(tmp_path.iterdir())
