@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import ast
-import importlib.util
 import hashlib
+import importlib.util
 import json
 import re
 import subprocess
