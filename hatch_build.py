@@ -1,7 +1,11 @@
-"""Compiles src/mp4ds/video/colour.c where there is a C compiler; numpy does its work elsewhere."""
+"""Compiles src/mp4ds/video/colour.c where there is a C compiler; numpy does its work elsewhere.
+
+With MP4DS_PURE=1 in the environment nothing is compiled, and the wheel is for any platform.
+"""
 
 from __future__ import annotations
 
+import os
 import shlex
 import subprocess
 import sysconfig
@@ -27,9 +31,12 @@ class CompileColours(BuildHookInterface):  # type: ignore[type-arg]
             return
         source = Path(self.root, "src/mp4ds/video/colour.c")
         library = source.with_name("_colour.so")
+        if os.environ.get("MP4DS_PURE", "0") not in ("", "0"):
+            return
+        platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
         compiler = shlex.split(sysconfig.get_config_var("CC") or "cc")[:1]
         for processors in _PROCESSORS:
-            options = ["-O3", "-shared", "-fPIC", *processors]
+            options = ["-O3", "-shared", "-fPIC", *_architectures(platform), *processors]
             try:
                 done = subprocess.run(
                     [*compiler, *options, "-o", str(library), str(source)], capture_output=True
@@ -39,7 +46,6 @@ class CompileColours(BuildHookInterface):  # type: ignore[type-arg]
             if done.returncode == 0:
                 build_data["artifacts"].append("src/mp4ds/video/_colour.so")
                 build_data["pure_python"] = False
-                platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
                 build_data["tag"] = f"py3-none-{platform}"
                 return
         library.unlink(missing_ok=True)
@@ -47,3 +53,11 @@ class CompileColours(BuildHookInterface):  # type: ignore[type-arg]
             "mp4ds: colour.c could not be compiled (is there a C compiler?), so numpy makes the "
             "colours of lossy videos, the same ones in a multiple of the time"
         )
+
+
+def _architectures(platform: str) -> list[str]:
+    """What a Mac's compiler is to compile for: what the wheel's tag promises."""
+    if not platform.startswith("macosx"):
+        return []
+    machines = [one for one in ("arm64", "x86_64") if platform.endswith((one, "universal2"))]
+    return [word for machine in machines for word in ("-arch", machine)]

@@ -1,6 +1,6 @@
 """Read the topics that are not videos: messages.mcap of a dataset is an ordinary MCAP file.
 
-python examples/other_topics.py DATASET     (a dataset that was packed from ROS 2)
+python examples/other_topics.py DATASET     (packed from ROS 2)
 """
 
 from __future__ import annotations

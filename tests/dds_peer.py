@@ -159,6 +159,7 @@ SERVICES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     ),
     "Seek": ({"time": Time}, _FIELDS["success"]),
     "Stop": (_FIELDS["Empty"], _FIELDS["Empty"]),
+    "SplitBagfile": (_FIELDS["Empty"], _FIELDS["Empty"]),
 }
 
 

@@ -284,7 +284,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Bus:
         name: SimpleNamespace(type_name=name, type_hash=_type_hash(name)) for name in INSTALLED
     }
     services = ("Pause", "Resume", "TogglePaused", "IsPaused", "GetRate", "SetRate")
-    services += ("Play", "PlayNext", "Burst", "Seek", "Stop")
+    services += ("Play", "PlayNext", "Burst", "Seek", "Stop", "SplitBagfile")
     modules: dict[str, dict[str, Any]] = {
         "rclpy": {"init": init, "create_node": create_node},
         "rclpy.context": {"Context": Context},

@@ -17,7 +17,7 @@ from pathlib import Path
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.protocols import Format
 from mp4ds.plugins.recording.record import RecordOptions, open_recorder
-from mp4ds.plugins.recording.source import SourceState, Wanted
+from mp4ds.plugins.recording.source import RecorderControls, SourceState, Wanted
 from mp4ds.records import Message
 
 
@@ -65,6 +65,9 @@ class PlayedSource:
                 self.state.topics[record.channel.topic] = None
                 take(replace(record, data=bytes(record.data)))
         self.stop()
+
+    def serve(self, controls: RecorderControls) -> None:
+        pass
 
     def close(self) -> None:
         pass

@@ -1,4 +1,4 @@
-"""The examples and the README's commands run, on what a new user has."""
+"""The examples run, and the commands of the README and the first pages, as for a new user."""
 
 from __future__ import annotations
 
@@ -63,6 +63,33 @@ def test_other_topics(tmp_path: Path) -> None:
     assert "/cam/image_raw" not in out
 
 
+@each("kind", ["euroc", "kitti", "tum", "images", "mcap"], one_in=3)
+def test_public_data(kind: str, demo_dataset: Path, tmp_path: Path) -> None:
+    """The demonstration in the layout of each public data set."""
+    source = tmp_path / "source"
+    camera = {"topics": ["/right/image_raw"]}
+    if kind == "mcap":
+        source = source.with_suffix(".mcap")
+        mp4ds.unpack(demo_dataset, "mcap", source)
+    elif kind == "images":
+        mp4ds.unpack(demo_dataset, "images", source, mp4ds.UnpackOptions(**camera))
+        source = source / "right_image_raw"
+        (source / "stamps.csv").unlink()
+    else:
+        mp4ds.export(demo_dataset, kind, source, mp4ds.ExportOptions(**camera))
+    script = str(ROOT / "examples/public_data.py")
+    words = [kind, str(source), "out", "--frames", "4", "--crf", "30"]
+    words += ["--rate", "15"] if kind == "images" else []
+    out = run(sys.executable, script, *words, cwd=tmp_path)
+    told = dict(line.strip("| ").split(" | ") for line in out.splitlines())
+    assert told["validate lossless --deep"] == "0 problems"
+    assert any("rgb8 480x360" in result for result in told.values())
+    assert re.search(r"[1-9]\.\d times smaller", told["lossless"])
+    assert any(step.startswith("evaluate /") for step in told)
+    assert (tmp_path / told["report"].split(",")[0]).is_file()
+    assert any(re.match(r"[1-9]\d* messages held", result) for result in told.values())
+
+
 def test_quickstart(tmp_path: Path) -> None:
     """The README's first command, but for the installation, which CI does in a fresh clone."""
     script = (ROOT / "examples/quickstart.sh").read_text()
@@ -82,22 +109,25 @@ def test_quickstart_over_what_it_left(tmp_path: Path) -> None:
     test_quickstart(tmp_path)
 
 
-def test_readme_commands(demo_dataset: Path, tmp_path: Path) -> None:
-    """Each mp4ds line of the README's shell blocks, on the demo under the README's names."""
-    readme = (ROOT / "README.md").read_text()
+@each("page", ["README.md", "docs/commands.md", "docs/conversions.md"])
+def test_commands_of_a_page(page: str, demo_dataset: Path, tmp_path: Path) -> None:
+    """Each mp4ds line of its shell blocks, on the demo under the names that the page has."""
+    text = (ROOT / page).read_text()
     lines = [
         line.split("#")[0].strip()
-        for block in re.findall(r"```sh\n(.*?)```", readme, re.DOTALL)
+        for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
         for line in block.splitlines()
         if line.startswith("mp4ds ")
     ]
-    assert len(lines) >= 5
+    assert len(lines) >= 3
     (tmp_path / "source").mkdir()
     source = SOURCES["rosbag2-mcap-v9"](tmp_path / "source", scene("mono8"))[0]
     shutil.copytree(source, tmp_path / "rosbag2_drive")
     shutil.copy(demo_dataset.parent / "demo.bag", tmp_path / "drive_0.bag")
     (mcap,) = SOURCES["mcap-ros2-none"](tmp_path / "source", scene("rgb8"))
     shutil.copy(mcap, tmp_path / "drive.mcap")
+    if not any(re.search(r"-o drive( |$)", line) for line in lines):
+        shutil.copytree(demo_dataset, tmp_path / "drive")
     for line in lines:
         run("bash", "-c", line, cwd=tmp_path)
 
@@ -105,7 +135,7 @@ def test_readme_commands(demo_dataset: Path, tmp_path: Path) -> None:
 def test_readme_python(demo_dataset: Path, tmp_path: Path) -> None:
     readme = (ROOT / "README.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
-    shutil.copy(demo_dataset.parent / "demo.bag", tmp_path / "drive.bag")
+    shutil.copytree(demo_dataset, tmp_path / "drive")
     run(sys.executable, "-c", code, cwd=tmp_path)
 
 
@@ -118,10 +148,21 @@ def test_the_list_of_commands_says_what_each_says_of_itself(name: str) -> None:
 @each(
     "command",
     [
-        *("pack", "unpack", "export", "play", "evaluate", "report", "frames", "validate", "info"),
+        *(
+            "pack",
+            "unpack",
+            "export",
+            "play",
+            "record",
+            "evaluate",
+            "report",
+            "frames",
+            "validate",
+            "info",
+        ),
         *("conformance-dump", "demo", "import images", "import ros-mp4"),
     ],
 )
-def test_every_command_is_in_the_readme_and_helps(command: str) -> None:
-    assert f"`mp4ds {command}" in (ROOT / "README.md").read_text()
+def test_every_command_is_in_the_list_and_helps(command: str) -> None:
+    assert f"`mp4ds {command}" in (ROOT / "docs/commands.md").read_text()
     assert "Usage" in run(sys.executable, "-m", "mp4ds", *command.split(), "--help", cwd=ROOT)

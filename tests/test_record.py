@@ -229,10 +229,15 @@ def test_datasets_of_a_length(tmp_path: Path, compare: Compare) -> None:
     assert compare(paths, again(tmp_path / "whole", tmp_path)) == []
 
 
-def test_datasets_of_a_size(tmp_path: Path, compare: Compare, monkeypatch: Any) -> None:
-    monkeypatch.setattr("mp4ds.plugins.recording.record._REPORT_S", 0.0)
+def test_datasets_of_a_size(tmp_path: Path, compare: Compare) -> None:
     paths = write(tmp_path, of=scene("mono8", frames=60, width=320, height=240))
-    summary = recorded(PlayedSource(paths, rate=4.0), tmp_path / "live", max_size=1_000_000)
+
+    def wait(number: int) -> None:
+        if number == 200:
+            until(lambda: (tmp_path / "live_1.recording").exists())
+
+    source = PlayedSource(paths, before=wait)
+    summary = recorded(source, tmp_path / "live", max_size=500_000)
     made = [item.dataset for item in summary.datasets]
     assert len(made) > 1
     mp4ds.pack(made, tmp_path / "whole")

@@ -122,6 +122,26 @@ def test_a_recording_is_a_rosbag2(side: Side, tmp_path: Path) -> None:
     assert [*map(padded, found)] == [*map(padded, images)]
 
 
+class Controls:
+    """Of a recorder, that keeps what it is asked."""
+
+    def __init__(self) -> None:
+        self.is_paused = False
+        self.asked: list[str] = []
+
+    def pause(self) -> None:
+        self.is_paused = True
+
+    def resume(self) -> None:
+        self.is_paused = False
+
+    def split(self) -> None:
+        self.asked.append("split")
+
+    def stop(self) -> None:
+        self.asked.append("stop")
+
+
 def test_ros_renames_topics(side: Side) -> None:
     """And /clock; the recording has the names that were asked for."""
     names = NodeNames("bag", "/robot", (("name", "/front/name"), ("/clock", "/sim")))
@@ -132,6 +152,7 @@ def test_ros_renames_topics(side: Side) -> None:
         publisher.advertise(found)
         publisher.clock(clock)
         source = open_source("ros2", options)
+        source.serve(Controls())
         source.start(Wanted(("name",), names=names), heard.take)
 
         def arrives() -> bool:
@@ -140,9 +161,31 @@ def test_ros_renames_topics(side: Side) -> None:
             return any(log == clock for _, log in heard.times)
 
         assert until(arrives)
+        asked = side.peer.call("/robot/bag/is_paused", "IsPaused", {})
         source.close()
+    assert asked == {"paused": False}
     assert {*heard.payloads} == {*source.state.topics} == {"/robot/name"}
     assert source.address.endswith(("rclpy as bag", "Cyclone DDS"))
+
+
+def test_services(side: Side) -> None:
+    """Those of rosbag2's recorder."""
+    controls = Controls()
+    source = open_source("ros2", SourceOptions("rosbag2_recorder"))
+    source.serve(controls)
+    source.start(Wanted(), Heard().take)
+
+    def call(name: str, kind: str) -> dict[str, Any]:
+        return side.peer.call(f"/rosbag2_recorder/{name}", kind, {})
+
+    assert call("is_paused", "IsPaused") == {"paused": False}
+    assert call("pause", "Pause") == {}
+    assert call("is_paused", "IsPaused") == {"paused": True}
+    assert call("resume", "Resume") == {}
+    assert call("split_bagfile", "SplitBagfile") == {}
+    assert call("stop", "Stop") == {}
+    source.close()
+    assert (controls.is_paused, controls.asked) == (False, ["split", "stop"])
 
 
 def test_hidden_topics_are_left_out(side: Side) -> None:

@@ -349,7 +349,7 @@ def test_the_registry_lists_exactly_the_hardware() -> None:
 
 # ---------------------------------------------------------------- reasons for verbatim storage
 
-REFUSALS = {"Refused", "NoPicture", "WireError", "EncoderRefusedError"}
+REFUSALS = {"Refused", "NoPicture", "WireError", "EncoderRefusedError", "count_verbatim"}
 ROOMS = ("messages", "dataset", "video", "packing")
 NO_CAMERA_MESSAGES = ("transforms.py", "mp4.py", "slicing.py")
 OF_READING = {

@@ -618,7 +618,7 @@ def test_without_a_stores_package(
 
 
 def test_an_unknown_scheme() -> None:
-    with pytest.raises(OptionError, match=r"abc:// is not supported\. Use s3, gs, https"):
+    with pytest.raises(OptionError, match=r"abc:// is not supported\. Use s3, gs, hf, https"):
         info("abc://bucket/x.bag")
 
 

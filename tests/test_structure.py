@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import hashlib
 import importlib.util
 import json
 import re
@@ -86,8 +87,8 @@ HOMES = {
     "dask_jobqueue": ("plugins/cluster.py",),
     "distributed": ("plugins/cluster.py",),
     "rospy": ("plugins/publishing",),
-    "rclpy": ("plugins/publishing",),
-    "cyclonedds": ("plugins/publishing",),
+    "rclpy": ("plugins/publishing", "plugins/recording"),
+    "cyclonedds": ("plugins/publishing", "plugins/recording"),
     "foxglove": ("plugins/publishing",),
     "pyarrow": ("plugins/exporting",),
     "rerun": ("plugins/exporting",),
@@ -149,6 +150,27 @@ def test_a_released_schema_is_there(kind: str) -> None:
     schema = json.loads(path.read_text())
     assert schema["$id"] == f"urn:mp4ds:{FORMAT_VERSION}:{kind}"
     assert schema["additionalProperties"] is False
+
+
+def test_released_schemas_never_change() -> None:
+    found = {
+        path.relative_to(ROOT / "schemas").as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted((ROOT / "schemas").glob("v*/*"))
+    }
+    assert found == {
+        "v1.0/dataset.schema.json": (
+            "8f9128c4acd5ea3d026a65efc05e5d9a38e394ef3107f84f3fa8140d4b8bd5c4"
+        ),
+        "v1.0/stream.schema.json": (
+            "d3657b43413049016135e3f08a43f50d956b6414dbf4fcddd7be7847df2c4ade"
+        ),
+        "v1.1/dataset.schema.json": (
+            "ea4d66ff3ef33c17bb927390d261db84f3ea03fb69ad2dfba95a3f3186840cf1"
+        ),
+        "v1.1/stream.schema.json": (
+            "e40fa5bf1664205580d2c322030e157a5791db9eb91d34c52c7b323fd57dd34d"
+        ),
+    }
 
 
 @writes_schemas

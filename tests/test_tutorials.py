@@ -1,4 +1,4 @@
-"""The tutorials and exporting.md: each command and snippet in order, in one folder, and its output.
+"""Tutorials, exporting.md and hub.md: each command and snippet in order, and what it prints.
 
 A page has blocks. ``sh`` and ``python`` are run; a command that is to fail says so behind it
 (``# exit code 2``). ``text`` right after a block is what this prints, of which numbers may differ
@@ -32,6 +32,7 @@ from waiting import WATCHDOG_S
 
 DOCS = ROOT / "docs"
 PAGES = sorted((DOCS / "tutorials").glob("*.md"))
+OTHERS = [DOCS / "exporting.md", DOCS / "hub.md"]
 NEEDS = {"--foxglove": "foxglove", "mp4ds.torch": "torch"}
 """What a line needs beside the package -> the module of it; the page is skipped without."""
 
@@ -123,7 +124,7 @@ def assert_printed(said: str, printed: str) -> None:
         assert any(due in found for found in lines), f"{line}\n\n{printed}"
 
 
-@each("page", [*PAGES, DOCS / "exporting.md"], ids=lambda page: page.stem, one_in=3)
+@each("page", [*PAGES, *OTHERS], ids=lambda page: page.stem, one_in=3)
 def test_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     blocks = blocks_of(page)
@@ -195,15 +196,3 @@ def test_every_option_that_a_page_names_is_there(page: Path) -> None:
         known = options_of(command)
         unknown = [option for option in given if option not in known]
         assert not unknown, f"mp4ds {command} has no {', '.join(unknown)}"
-
-
-def test_every_option_is_told_on_some_page() -> None:
-    pages = [ROOT / "README.md", *DOCS.rglob("*.md")]
-    text = "\n".join(page.read_text() for page in pages)
-    group = typer.main.get_command(app_for())
-    assert hasattr(group, "commands")
-    for name, command in group.commands.items():
-        for option in command.params:
-            names = [word for word in (*option.opts, *option.secondary_opts) if word[:2] == "--"]
-            is_told = any(re.search(rf"{word}(?![\w-])", text) for word in names)
-            assert is_told or not names, f"mp4ds {name} {names}"

@@ -92,6 +92,15 @@ def play(dataset: str | Path) -> float:
     return summary.slowed_s
 
 
+def recorded(dataset: Path) -> list[Path]:
+    """Datasets that were recorded."""
+    options = mp4ds.RecordOptions(to="ros2", exclude=["/rosout"], max_duration=600.0)
+    summary: mp4ds.RecordSummary = mp4ds.record(["/cam*/*"], dataset, options, progress=use)
+    counts: dict[str, int] = summary.dropped
+    use(counts, summary.lost, summary.recovered)
+    return [made.dataset for made in summary.datasets]
+
+
 def problems(dataset: Path) -> list[str]:
     """Codes of all problems."""
     found: list[mp4ds.Problem] = mp4ds.validate(dataset, deep=True, progress=use)

@@ -1,6 +1,6 @@
-"""Make what is made from the code: schemas/, the field tables in spec/index.md, docs/options.md.
+"""Make what is made from the code: schemas/, tables of spec/index.md, the picture of the floors.
 
-    python tools/generate.py            write the draft schemas, the tables and the options
+    python tools/generate.py            write the draft schemas, the tables and the picture
     python tools/generate.py --check    fail where they differ from the models
     python tools/generate.py --release  also write the schemas of the released version
 
@@ -16,39 +16,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mp4ds.cli.options import flags_of
 from mp4ds.format.fields import FORMAT_VERSION
 from mp4ds.format.sidecars import generate_schema
-from mp4ds.options import Options, shown_of
-from mp4ds.packing.options import ImageFolder, PackOptions
-from mp4ds.plugins.evaluating.options import EvaluateOptions
-from mp4ds.plugins.exporting.job import ExportOptions
-from mp4ds.plugins.playing.play import PlayOptions
-from mp4ds.plugins.reporting.report import ReportOptions
-from mp4ds.plugins.reporting.stills import StillOptions
-from mp4ds.unpacking.unpack import UnpackOptions
 
 ROOT = Path(__file__).resolve().parents[1]
 KINDS = ("stream", "dataset")
-COMMANDS: dict[str, type[Options]] = {
-    "pack": PackOptions,
-    "unpack": UnpackOptions,
-    "import images": ImageFolder,
-    "export": ExportOptions,
-    "play": PlayOptions,
-    "evaluate": EvaluateOptions,
-    "report": ReportOptions,
-    "frames": StillOptions,
-}
-NOT_OF_THE_COMMAND = {("pack", "images"), ("play", "to"), ("play", "clock")}
-"""Options that the command line has in another form."""
-
-HEAD = """# All options
-
-On the command line, and in Python as fields of the dataclass of each command; made by
-`tools/generate.py` of where they are declared. `mp4ds COMMAND --help` shows them with what else a
-command takes.
-"""
+_WIDE, _HIGH, _GAP = 820, 40, 12  # of the picture and its boxes
 
 
 def outputs() -> dict[Path, str]:
@@ -64,31 +37,35 @@ def outputs() -> dict[Path, str]:
         for name, model in models.items():
             text = replace_table(text, name, model)
     texts[spec] = text
-    texts[ROOT / "docs" / "options.md"] = options_page()
+    texts[ROOT / "docs" / "architecture.svg"] = floors_picture(
+        (ROOT / "pyproject.toml").read_text()
+    )
     return texts
 
 
-def options_page() -> str:
-    """The options of all commands, as tables."""
-    parts = [HEAD]
-    for command, kind in COMMANDS.items():
-        parts.append(f"\n## {command}: `{kind.__name__}`\n\n{option_table(command, kind)}")
-    parts.append("\n`import images` also takes those of `pack` that are not about recordings.\n")
-    return "".join(parts)
+def floors_picture(text: str) -> str:
+    """The floors of the code as a picture (SVG).
 
-
-def option_table(command: str, kind: type[Options]) -> str:
-    """A Markdown table of a command's options."""
-    rows = ["| option | in Python | default | |", "| --- | --- | --- | --- |"]
-    for name, shown in shown_of(kind).items():
-        if (command, name) in NOT_OF_THE_COMMAND:
-            continue
-        flags = ", ".join(f"`{flag}`" for flag in flags_of(name, shown))
-        default = getattr(kind, name)
-        text = shown.default or ("" if default in (None, False, (), "") else str(default))
-        help_text = shown.help.replace("|", "\\|")
-        rows.append(f"| {flags} | `{name}` | {text} | {help_text} |")
-    return "\n".join(rows) + "\n"
+    Args:
+        text: Of pyproject.toml, whose contract import-linter checks.
+    """
+    layers = text.rpartition("layers = [")[2].partition("\n]")[0]
+    floors = [line.split(" | ") for line in re.findall(r'^  "([^"]*)"', layers, re.MULTILINE)]
+    parts = []
+    for row, names in enumerate(floors):
+        width = (_WIDE - _GAP * (len(names) - 1)) / len(names)
+        for place, name in enumerate(names):
+            left, top = place * (width + _GAP), row * (_HIGH + _GAP)
+            box = f'x="{left:.1f}" y="{top}" width="{width:.1f}" height="{_HIGH}" rx="6"'
+            at = f'x="{left + width / 2:.1f}" y="{top + _HIGH / 2 + 5:g}"'
+            parts.append(f"<rect {box}/><text {at}>{name}</text>")
+    size = f"{_WIDE + 2} {len(floors) * (_HIGH + _GAP) - _GAP + 2}"
+    style = (
+        "rect{fill:#e8f0fe;stroke:#1d6ff2}"
+        "text{font:15px system-ui,'DejaVu Sans',sans-serif;fill:#14233a;text-anchor:middle}"
+    )
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="-1 -1 {size}" role="img">'
+    return "\n".join([head, f"<style>{style}</style>", *parts, "</svg>", ""])
 
 
 def replace_table(text: str, name: str, model: dict[str, Any]) -> str:

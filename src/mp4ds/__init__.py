@@ -9,6 +9,7 @@ The public API, and nothing else::
     mp4ds.evaluate("drive.bag").recommended     encoder settings, tried on clips
     mp4ds.report("drive")                       a page with its cameras, timing and calibrations
     mp4ds.play("drive")                         publishes to ROS 1, ROS 2 or Foxglove
+    mp4ds.record(["/imu", "/cam*/*"], "drive")  a live robot -> dataset
     mp4ds.validate("drive", deep=True)          every problem, or an empty list
     mp4ds.open("drive")["/camera/image_raw"][7].data
     mp4ds.open("drive")["/camera/image_raw"].read([7, 3, 9], format="rgb", resize=0.5)
@@ -68,6 +69,7 @@ if TYPE_CHECKING:
     from mp4ds.plugins.importing.ros_mp4 import import_ros_mp4
     from mp4ds.plugins.playing.play import PlayOptions, play
     from mp4ds.plugins.playing.player import PlaySummary
+    from mp4ds.plugins.recording.record import RecordOptions, RecordSummary, record
     from mp4ds.plugins.reporting.report import ReportOptions, ReportSummary, report
     from mp4ds.times import Sync
     from mp4ds.unpacking.unpack import UnpackOptions, UnpackSummary, unpack
@@ -110,6 +112,7 @@ _HOMES = {
         "play",
     ),
     "plugins.playing.player": ("PlaySummary",),
+    "plugins.recording.record": ("RecordOptions", "RecordSummary", "record"),
     "plugins.reporting.report": ("ReportOptions", "ReportSummary", "report"),
     "times": ("Sync",),
     "unpacking.unpack": (
@@ -144,6 +147,9 @@ __all__ = [
     "PlaySummary",
     "Problem",
     "PublishError",
+    "RecordError",
+    "RecordOptions",
+    "RecordSummary",
     "RecordedMessage",
     "RemoteError",
     "ReportOptions",
@@ -173,6 +179,7 @@ __all__ = [
     "pack_each",
     "pack_share",
     "play",
+    "record",
     "report",
     "unpack",
     "validate",

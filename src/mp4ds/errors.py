@@ -14,6 +14,7 @@
     │   └── VideoError                 1  a video that cannot be decoded as its sidecar says
     ├── ConversionError (ValueError)   1  a message that the target cannot hold
     ├── WriteError (OSError)           1  an output could not be written
+    ├── RecordError (OSError)          1  a live recording could not be written, what came is kept
     ├── PartsFailedError               1  parts of a pack failed, the others are kept
     ├── EncoderRefusedError            1  pictures that an encoder does not support
     ├── HardwareError                  1  a hardware encoder that is missing or failed

@@ -100,7 +100,7 @@ def parse_size(text: str) -> int:
     match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) *([kmgt]?)(?:i?b)?", text.strip().lower())
     size = int(float(match[1]) * _UNITS[match[2]]) if match else 0
     if not size:
-        raise OptionError(f"`memory` {text!r} is not a size. Use a value such as 8G or 500M.")
+        raise OptionError(f"{text!r} is not a size. Use a value such as 8G or 500M.")
     return size
 
 

@@ -85,6 +85,10 @@ def info(
             "--checksums", help="Print the SHA-256 of a dataset's files in the format of sha256sum."
         ),
     ] = False,
+    card: Annotated[
+        bool,
+        typer.Option("--card", help="Print a dataset card for Hugging Face: README.md."),
+    ] = False,
     start: Annotated[
         Optional[str],  # noqa: UP045 - read at run time by typer
         typer.Option("--start", metavar="TIME", help="Show a slice only; times as for `pack`."),
@@ -111,6 +115,8 @@ def info(
         _print_speeds(paths[0], as_json)
     elif checksums:
         _print_checksums(found[0], as_json)
+    elif card:
+        _print_card(found, as_json)
     elif len(found) > 1:
         _print_overview(found, as_json)
     else:
@@ -153,6 +159,18 @@ def _print_checksums(path: Path, as_json: bool) -> None:
         return
     for name, sha256 in told.items():
         say(f"{sha256}  {name}")
+
+
+def _print_card(found: Sequence[Path], as_json: bool) -> None:
+    from mp4ds.plugins.reporting.card import card
+
+    with told_errors(as_json):
+        text = card(found)
+    if as_json:
+        print_json({"card": text})
+        return
+    for line in text.splitlines():
+        say(line)
 
 
 def _print_overview(found: Sequence[Path], as_json: bool) -> None:

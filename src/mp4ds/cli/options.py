@@ -66,6 +66,8 @@ _PANELS = {
             "intrinsics",
             "speed",
             "seconds",
+            "checksums",
+            "card",
             "buffer",
             "use_sim_time",
             "discover",
@@ -111,9 +113,9 @@ class Command(typer.core.TyperCommand):
         ]
         return ["[OPTIONS]", *names]
 
-    def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write arguments and options into their panels."""
-        panels: dict[str, list[tuple[str, str]]] = {
+    def panels(self, ctx: Any) -> dict[str, list[tuple[str, str, str]]]:
+        """Name, words and help of arguments and options, by what they are about."""
+        panels: dict[str, list[tuple[str, str, str]]] = {
             name: [] for name in ("Arguments", *_PANELS, "Options")
         }
         for parameter in self.get_params(ctx):
@@ -125,11 +127,15 @@ class Command(typer.core.TyperCommand):
             words = re.sub(
                 "<([a-z]+)(?: range)?>", lambda match: _TYPES.get(match[1], "TEXT"), record[0]
             )
-            panels[panel].append((name or words, _EXTRAS.sub(_without_bounds, record[1])))
-        for panel, rows in panels.items():
-            if rows:
-                with formatter.section(panel):
-                    formatter.write_dl(rows)
+            text = _EXTRAS.sub(_without_bounds, record[1])
+            panels[panel].append((parameter.name or "", name or words, text))
+        return {panel: rows for panel, rows in panels.items() if rows}
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write arguments and options into their panels."""
+        for panel, rows in self.panels(ctx).items():
+            with formatter.section(panel):
+                formatter.write_dl([row[1:] for row in rows])
 
 
 def _without_bounds(extras: re.Match[str]) -> str:
@@ -193,6 +199,7 @@ def takes(
 
         update_wrapper(call, command)
         del call.__dict__["__wrapped__"]  # typer would follow it
+        call.__dict__["kinds"] = kinds  # for the documentation
         call.__dict__["__signature__"] = inspect.Signature(
             [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in parameters]
         )

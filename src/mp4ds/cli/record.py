@@ -56,10 +56,10 @@ def record(
     ] = True,
     as_json: JsonFlag = False,
 ) -> None:
-    """Record topics of a live robot into a dataset, until Ctrl-C.
+    """Record topics of a live robot, ROS 1 or ROS 2, into a dataset.
 
-    Lossless by default, with the fastest encoder settings. Images that cannot be encoded in
-    time are stored as received. Keys: space pauses, q stops.
+    Ends at Ctrl-C. Lossless by default, with the fastest encoder settings. Images that cannot be
+    encoded in time are stored as received. Keys: space pauses, q stops.
     """
     with told_errors(as_json), ExitStack() as stack:
         if ros1 and ros2:

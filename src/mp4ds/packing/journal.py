@@ -128,16 +128,15 @@ class Journal:
         """Note which calibrations belong to which images, as far as stamps tell."""
         self._add("pairs", list(pairs.items()))
 
-    def verbatim(self, channel: Channel, ordinal: int, number: int, reason: str) -> None:
+    def verbatim(self, channel: Channel, ordinal: int, reason: str) -> None:
         """Note why a camera message is kept in `messages.mcap`.
 
         Args:
             channel: Its channel.
             ordinal: Its place among the channel's messages.
-            number: Its place among the topic's messages.
             reason: In words.
         """
-        self._add("verbatim", channel.id, ordinal, number, reason)
+        self._add("verbatim", channel.id, ordinal, reason)
 
     def close(self) -> None:
         """Let go of it."""
@@ -164,7 +163,7 @@ class Notes:
         frames: Of each stream, by its stem: an array for each of `FRAME_COLUMNS`.
         packets: Digests of the packets of each stream, by its stem.
         pairs: Id of a calibration channel -> that of the images.
-        verbatim: By channel: ordinal, number and reason of messages, as they came.
+        verbatim: By channel: ordinal and reason of messages, as they came.
     """
 
     path: Path
@@ -175,9 +174,7 @@ class Notes:
     frames: dict[str, list[array[int]]] = field(default_factory=dict)
     packets: dict[str, array[int]] = field(default_factory=dict)
     pairs: dict[int, int] = field(default_factory=dict)
-    verbatim: dict[int, list[tuple[int, int, str]]] = field(
-        default_factory=lambda: defaultdict(list)
-    )
+    verbatim: dict[int, list[tuple[int, str]]] = field(default_factory=lambda: defaultdict(list))
 
     @classmethod
     def read(cls, path: Path) -> Notes:
@@ -223,8 +220,8 @@ class Notes:
         elif kind == "header":
             self.headers[values[0]].append(Header.model_validate(values[1]))
         elif kind == "verbatim":
-            channel, ordinal, number, reason = values
-            self.verbatim[channel].append((ordinal, number, reason))
+            channel, ordinal, reason = values
+            self.verbatim[channel].append((ordinal, reason))
         elif kind == "channel":
             self.channels[values[0]] = ChannelModel.model_validate(values[1]).to_record(values[0])
         elif kind == "stream":

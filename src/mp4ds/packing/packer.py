@@ -193,10 +193,9 @@ class CameraRouter:
         reason = route.refusal
         for stream in self._candidates(state, route, item):
             number = self._streams.index(stream)
-            if workers.is_late(number):
-                reason = TOO_LATE
-                break
             try:
+                if workers.is_late(number):
+                    raise Refused(TOO_LATE)
                 job = stream.accept(item.message, item.seen, item.ordinal)
             except Refused as refusal:
                 reason = str(refusal)
@@ -253,7 +252,7 @@ class CameraRouter:
 
     def _keep_verbatim(self, message: Message, ordinal: int, number: int, reason: str) -> None:
         if self._journal is not None:
-            self._journal.verbatim(message.channel, ordinal, number, reason)
+            self._journal.verbatim(message.channel, ordinal, reason)
         self._topic_of(message.channel).count_verbatim(reason, number)
         self._keep(message, reason)
 

@@ -41,7 +41,7 @@ from mp4ds.records import Channel, Loss, Message
 from mp4ds.video.packets import copy_fragments
 
 CUT_OFF = "the recording was cut off; what came in its last two seconds may be missing"
-_UNKNOWN = "stored as it was when the recording was cut off"
+CUT_OFF_AS_IT_WAS = "stored as it was when the recording was cut off"
 
 
 def recover(
@@ -186,17 +186,19 @@ class _Recovery:
 
     def _number(self, streams: Sequence[_Stream], channel: Channel) -> None:
         """Number the messages of a camera channel that are there without gaps."""
-        kept = self._notes.verbatim[channel.id][: self._kept[channel.id]]
+        noted, count = self._notes.verbatim[channel.id], self._kept[channel.id]
         every = [item for note in self._notes.streams for item in self._ordinals(note, channel)]
-        next_one = max([-1, *every, *(item[0] for item in self._notes.verbatim[channel.id])]) + 1
-        for ordinal in range(next_one, next_one + self._kept[channel.id] - len(kept)):
-            kept.append((ordinal, ordinal, _UNKNOWN))  # its line did not reach the disk
-        there = [stream.columns["ordinal"] for stream in streams]
-        sorted_ = np.sort(np.concatenate([*there, np.array([item[0] for item in kept], np.int64)]))
+        end = max([-1, *every, *(ordinal for ordinal, _ in noted)]) + 1
+        unnoted = range(end, end + max(0, count - len(noted)))
+        kept = np.array([*(ordinal for ordinal, _ in noted[:count]), *unnoted], np.int64)
+        there = np.sort(np.concatenate([kept, *(one.columns["ordinal"] for one in streams)]))
         for stream in streams:
-            stream.columns["ordinal"] = np.searchsorted(sorted_, stream.columns["ordinal"])
-        for _, number, reason in kept:
-            self._part.topic(channel).count_verbatim(reason, number)
+            stream.columns["ordinal"] = np.searchsorted(there, stream.columns["ordinal"])
+        topic, places = self._part.topic(channel), np.searchsorted(there, kept).tolist()
+        for (_, reason), place in zip(noted, places, strict=False):
+            topic.count_verbatim(reason, place)
+        for place in places[len(noted) :]:
+            topic.count_verbatim(CUT_OFF_AS_IT_WAS, place)
 
     def _ordinals(self, note: StreamNote, channel: Channel) -> Sequence[int]:
         """Places of a stream's frames among all messages of a channel; none of another's."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import struct
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from mp4ds.bags.types import World, make_store, ros2_world, types_of
@@ -199,15 +199,21 @@ _CLIENT = re.compile(rb"(?:^|;)clientid=([^;]*);")
 
 
 def serve(
-    participant: Any, ears: DdsListener, node: str, controls: Controls, world: World
+    participant: Any,
+    ears: DdsListener,
+    node: str,
+    services: Sequence[Service],
+    controls: Any,
+    world: World,
 ) -> list[Any]:
-    """Offer the services of a player.
+    """Offer services.
 
     Args:
         participant: Who offers them.
         ears: Hears the requests; they are answered on its thread.
         node: Name of the node that they belong to.
-        controls: The player.
+        services: What they do.
+        controls: What they do it with.
         world: The types of ROS 2.
 
     Returns:
@@ -215,7 +221,7 @@ def serve(
     """
     return [
         _Server(participant, ears, f"/{node}/{service.name}", service, controls, number, world)
-        for number, service in enumerate(PLAYER_SERVICES, 1)
+        for number, service in enumerate(services, 1)
     ]
 
 
@@ -226,7 +232,7 @@ class _Server:
         ears: DdsListener,
         name: str,
         service: Service,
-        controls: Controls,
+        controls: Any,
         number: int,
         world: World,
     ) -> None:
@@ -347,7 +353,7 @@ class DdsPublisher:
         parting_s: float = PARTING_S,
     ) -> None:
         self._domain = domain_id(domain)
-        self._node = "/".join(filter(None, (names.namespace.strip("/"), names.node or node)))
+        self._node = names.of_node(node)
         self._clock_topic = names.renamed(CLOCK)
         self._parting_s = parting_s
         self._types: World = ros2_world(_DISTRIBUTION)
@@ -412,7 +418,9 @@ class DdsPublisher:
 
     def serve(self, controls: Controls) -> None:
         """Offer the services of `ros2 bag play`, for clients that use rmw_cyclonedds."""
-        self._services += serve(self._participant, self._ears, self._node, controls, self._types)
+        self._services += serve(
+            self._participant, self._ears, self._node, PLAYER_SERVICES, controls, self._types
+        )
 
     @property
     def wants_clock(self) -> bool:

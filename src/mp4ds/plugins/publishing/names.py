@@ -59,6 +59,10 @@ class NodeNames:
         told = os.environ.get("ROS_NAMESPACE", "") if world == "ros1" else ""
         return replace(self, namespace=told) if told and not self.namespace else self
 
+    def of_node(self, node: str) -> str:
+        """The node's name below the root, such as ``robot/player``, if it is `node` by itself."""
+        return "/".join(filter(None, (self.namespace.strip("/"), self.node or node)))
+
     def renamed(self, topic: str) -> str:
         """The name of a topic by the rules; itself where none is about it."""
         found = {self.resolved(old): new for old, new in self.rules}.get(self.resolved(topic))
@@ -152,7 +156,7 @@ def _with_file(names: NodeNames, path: Path) -> NodeNames:
     """With the parameters of a file that are for this node."""
     from mp4ds.plugins.publishing.ros2_writers import load_map  # which imports this module
 
-    own = f"{names.namespace}/{names.node}".strip("/")
+    own = names.of_node("")
     for node, parameters in _nodes(load_map(path, "nodes to parameters"), ""):
         if node in ("**", own) and _SIM_TIME in parameters:
             names = replace(names, use_sim_time=_truth(parameters[_SIM_TIME], str(path)))

@@ -8,7 +8,7 @@ import struct
 import threading
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -172,14 +172,7 @@ class RclpyPublisher:
 
     def serve(self, controls: Controls) -> None:
         """Offer the services of `ros2 bag play`, where rosbag2_interfaces is installed."""
-        try:
-            import rosbag2_interfaces.srv as kinds
-        except ImportError:
-            return
-        for service in PLAYER_SERVICES:
-            kind = getattr(kinds, service.kind)
-            answer = partial(_answer, service, controls)
-            self._node.create_service(kind, f"~/{service.name}", answer)
+        serve(self._node, PLAYER_SERVICES, controls)
 
     def _spin(self) -> None:
         from rclpy.executors import ExternalShutdownException
@@ -310,7 +303,25 @@ def qos_profile(qos: Qos) -> Any:
     )
 
 
-def _answer(service: Service, controls: Controls, request: Any, response: Any) -> Any:
+def serve(node: Any, services: Sequence[Service], controls: Any) -> None:
+    """Offer services of a node, where rosbag2_interfaces is installed.
+
+    Args:
+        node: The node of rclpy.
+        services: What they do.
+        controls: What they do it with.
+    """
+    try:
+        import rosbag2_interfaces.srv as kinds
+    except ImportError:
+        return
+    for service in services:
+        if kind := getattr(kinds, service.kind, None):  # older ones have fewer
+            answer = partial(_answer, service, controls)
+            node.create_service(kind, f"~/{service.name}", answer)
+
+
+def _answer(service: Service, controls: Any, request: Any, response: Any) -> Any:
     for key, value in service.answer(controls, request).items():
         setattr(response, key, value)
     return response

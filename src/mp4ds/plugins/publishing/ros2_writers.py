@@ -6,7 +6,7 @@ import struct
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import yaml
 
@@ -16,7 +16,7 @@ from mp4ds.plugins.publishing.latching import PLAYER_DEPTH, kept_depth
 from mp4ds.plugins.publishing.publisher import Controls
 from mp4ds.records import QOS_KEY, Channel
 
-_NOTHING = "uint8 structure_needs_at_least_one_member"
+NOTHING = "uint8 structure_needs_at_least_one_member"
 _SUCCESS = "bool success"
 _PLAY = (
     "builtin_interfaces/Time start_offset\nbuiltin_interfaces/Duration playback_duration\n"
@@ -27,29 +27,49 @@ _SECOND = 10**9
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """A service of the player.
+    """A service of a player or recorder.
 
     Attributes:
         name: Its name below the node.
         kind: Its type in ``rosbag2_interfaces/srv``.
         request: Definition of a request.
         response: Definition of a response.
-        answer: Does what a request asks; returns the fields of the response.
+        answer: Called with the controls and a request: does what that asks, and returns the fields
+            of the response.
     """
 
     name: str
     kind: str
     request: str
     response: str
-    answer: Callable[[Controls, Any], Mapping[str, Any]]
+    answer: Callable[[Any, Any], Mapping[str, Any]]
 
 
-def _pause(controls: Controls, _: Any) -> Mapping[str, Any]:
+class Pausable(Protocol):
+    """What can be paused, a player or a recorder."""
+
+    @property
+    def is_paused(self) -> bool:
+        """Whether it is."""
+        ...
+
+    def pause(self) -> object:
+        """Pause it."""
+        ...
+
+    def resume(self) -> object:
+        """Let it continue."""
+        ...
+
+
+def pause(controls: Pausable, _: Any) -> Mapping[str, Any]:
+    """Answer a request to pause."""
     controls.pause()
     return {}
 
 
-def _resume(controls: Controls, _: Any) -> Mapping[str, Any]:
+def resume(controls: Pausable, _: Any) -> Mapping[str, Any]:
+    """Answer a request to resume."""
     controls.resume()
     return {}
 
@@ -59,7 +79,8 @@ def _toggle_paused(controls: Controls, _: Any) -> Mapping[str, Any]:
     return {}
 
 
-def _is_paused(controls: Controls, _: Any) -> Mapping[str, Any]:
+def is_paused(controls: Pausable, _: Any) -> Mapping[str, Any]:
+    """Answer whether it is paused."""
     return {"paused": controls.is_paused}
 
 
@@ -102,17 +123,17 @@ def _stop(controls: Controls, _: Any) -> Mapping[str, Any]:
 
 
 PLAYER_SERVICES = (
-    Service("pause", "Pause", _NOTHING, _NOTHING, _pause),
-    Service("resume", "Resume", _NOTHING, _NOTHING, _resume),
-    Service("toggle_paused", "TogglePaused", _NOTHING, _NOTHING, _toggle_paused),
-    Service("is_paused", "IsPaused", _NOTHING, "bool paused", _is_paused),
-    Service("get_rate", "GetRate", _NOTHING, "float64 rate", _get_rate),
+    Service("pause", "Pause", NOTHING, NOTHING, pause),
+    Service("resume", "Resume", NOTHING, NOTHING, resume),
+    Service("toggle_paused", "TogglePaused", NOTHING, NOTHING, _toggle_paused),
+    Service("is_paused", "IsPaused", NOTHING, "bool paused", is_paused),
+    Service("get_rate", "GetRate", NOTHING, "float64 rate", _get_rate),
     Service("set_rate", "SetRate", "float64 rate", _SUCCESS, _set_rate),
-    Service("play_next", "PlayNext", _NOTHING, _SUCCESS, _play_next),
+    Service("play_next", "PlayNext", NOTHING, _SUCCESS, _play_next),
     Service("burst", "Burst", "uint64 num_messages", "uint64 actually_burst", _burst),
     Service("play", "Play", _PLAY, _SUCCESS, _play),
     Service("seek", "Seek", "builtin_interfaces/Time time", _SUCCESS, _seek),
-    Service("stop", "Stop", _NOTHING, _NOTHING, _stop),
+    Service("stop", "Stop", NOTHING, NOTHING, _stop),
 )
 """Those of `ros2 bag play`, which are answered when what they ask for is done."""
 

@@ -11,7 +11,8 @@ from functools import partial
 from typing import Any
 
 from mp4ds.bags.protocols import Format
-from mp4ds.plugins.publishing.dds import dds_qos
+from mp4ds.bags.types import ros2_world
+from mp4ds.plugins.publishing.dds import dds_qos, serve
 from mp4ds.plugins.publishing.dds_domain import (
     DdsListener,
     domain_id,
@@ -20,6 +21,8 @@ from mp4ds.plugins.publishing.dds_domain import (
 )
 from mp4ds.plugins.publishing.ros2_writers import Qos, load_overrides
 from mp4ds.plugins.recording.ros2_channels import (
+    DISTRIBUTION,
+    RECORDER_SERVICES,
     announced_definition,
     asked_qos,
     channel_of,
@@ -28,7 +31,7 @@ from mp4ds.plugins.recording.ros2_channels import (
     standard_definition,
     time_of,
 )
-from mp4ds.plugins.recording.source import SourceOptions, SourceState, Wanted
+from mp4ds.plugins.recording.source import RecorderControls, SourceOptions, SourceState, Wanted
 from mp4ds.records import Channel, Message
 
 _DEPTH = 100
@@ -80,6 +83,7 @@ class DdsSource:
         self._listener = DdsListener(self._participant)
         self._topics: dict[str, _Topic] = {}
         self._count = 0
+        self._services: list[Any] = []
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
         self._sim_time_ns: int | None = None
@@ -92,6 +96,18 @@ class DdsSource:
             target=self._look, args=(wanted, take), name="topics", daemon=True
         )
         self._thread.start()
+
+    def serve(self, controls: RecorderControls) -> None:
+        """See `Source.serve`."""
+        world = ros2_world(DISTRIBUTION)
+        self._services = serve(
+            self._participant,
+            self._listener,
+            self._options.names.of_node(self._options.node),
+            RECORDER_SERVICES,
+            controls,
+            world,
+        )
 
     def _look(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
         from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
@@ -177,6 +193,7 @@ class DdsSource:
         if self._thread is not None:
             self._thread.join()
         self._listener.close()
+        self._services.clear()
         self._topics.clear()
         self._participant = None
 

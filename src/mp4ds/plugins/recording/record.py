@@ -45,6 +45,8 @@ UNFINISHED = ".recording"
 
 _NS = 1_000_000_000
 _REPORT_S = 0.2
+_NODES = {"ros1": "record", "ros2": "rosbag2_recorder"}
+"""Names of the nodes of ROS's own recorders."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,9 @@ class RecordOptions(Options):
     )
     start_paused: bool = option("Start paused.", False, "--start-paused", "--pause")
     use_sim_time: bool = option("Take log times from /clock.", False)
-    node: str = option("Name of the node.", "mp4ds_recorder", "--node-name")
+    node: str | None = option(
+        "Name of the node; that of ROS's own recorder by default.", None, "--node-name"
+    )
     discover: bool = option("Look for new topics.", True, "--discovery/--no-discovery")
     polling_interval: float = option(
         "Milliseconds between checks for new topics.", 100.0, "--polling-interval", "-p"
@@ -221,10 +225,10 @@ def open_recorder(
         progress: See `record`.
     """
     chosen = options or RecordOptions()
-    world = source.profile if source else chosen.to or sourced()
-    names = chosen.names.in_world(world)
     if not (topics or chosen.all or chosen.regex):
         raise OptionError("Name topics, or give `all` or `regex`.")
+    kind = source.profile if source else chosen.to or sourced()
+    names = chosen.names.in_world(kind)
     wanted = Wanted(
         () if chosen.all else topics,
         regex="" if chosen.all else chosen.regex,
@@ -236,9 +240,9 @@ def open_recorder(
     about = load_about(chosen.about) if chosen.about is not None else None
     if source is None:
         source = open_source(
-            world,
+            kind,
             SourceOptions(
-                chosen.node,
+                chosen.node or _NODES[kind],
                 use_sim_time=chosen.use_sim_time or bool(names.use_sim_time),
                 poll_s=chosen.polling_interval / 1000 if chosen.discover else None,
                 hidden=chosen.hidden,
@@ -366,6 +370,7 @@ class Recorder:
         begun = time.monotonic()
         self._begin_split()
         try:
+            self._source.serve(self)
             self._source.start(self._wanted, self._take)
             while not self._is_stopped:
                 self._changed.wait(_REPORT_S)

@@ -13,7 +13,7 @@ from mp4ds.bags.protocols import Format
 from mp4ds.bags.ros1_records import make_channel
 from mp4ds.errors import PublishError
 from mp4ds.plugins.publishing.ros1 import ANSWER_S, answer, start_node
-from mp4ds.plugins.recording.source import SourceOptions, SourceState, Wanted
+from mp4ds.plugins.recording.source import RecorderControls, SourceOptions, SourceState, Wanted
 from mp4ds.records import Channel, Message
 
 _RECEIVED_BYTES = 2**18
@@ -66,6 +66,9 @@ class RospySource:
                 target=self._keep_looking, args=(wanted, take), name="topics", daemon=True
             )
             self._thread.start()
+
+    def serve(self, controls: RecorderControls) -> None:
+        """Nothing: `rosbag record` has no services."""
 
     def _follows_clock(self) -> bool:
         return bool(self._rospy.get_param("/use_sim_time", False))

@@ -12,9 +12,10 @@ from typing import Any
 
 from mp4ds.bags.protocols import Format
 from mp4ds.errors import ConversionError, PublishError
-from mp4ds.plugins.publishing.ros2 import message_class, qos_profile
+from mp4ds.plugins.publishing.ros2 import message_class, qos_profile, serve
 from mp4ds.plugins.publishing.ros2_writers import CLOCK, CLOCK_QOS, CLOCK_TYPE, Qos, load_overrides
 from mp4ds.plugins.recording.ros2_channels import (
+    RECORDER_SERVICES,
     asked_qos,
     channel_of,
     installed_definition,
@@ -22,7 +23,7 @@ from mp4ds.plugins.recording.ros2_channels import (
     standard_definition,
     time_of,
 )
-from mp4ds.plugins.recording.source import SourceOptions, SourceState, Wanted
+from mp4ds.plugins.recording.source import RecorderControls, SourceOptions, SourceState, Wanted
 from mp4ds.records import Channel, Message
 
 _DEPTH = 100
@@ -86,6 +87,10 @@ class RclpySource:
             target=self._spin, args=(wanted, take), name="mp4ds-rclpy", daemon=True
         )
         self._thread.start()
+
+    def serve(self, controls: RecorderControls) -> None:
+        """See `Source.serve`."""
+        serve(self._node, RECORDER_SERVICES, controls)
 
     def _spin(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
         from rclpy.executors import ExternalShutdownException

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
-from rosbags.typesys.store import Typestore
-
 from mp4ds.bags.rosbag2_metadata import dump_yaml
 from mp4ds.bags.types import World, by_library, make_store, ros2_world, types_of
 from mp4ds.errors import Refused
-from mp4ds.plugins.publishing.ros2_writers import Qos
+from mp4ds.plugins.publishing.ros2_writers import (
+    NOTHING,
+    Qos,
+    Service,
+    is_paused,
+    pause,
+    resume,
+)
+from mp4ds.plugins.recording.source import RecorderControls
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 
-_DISTRIBUTION = "jazzy"
+DISTRIBUTION = "jazzy"
 _ENCODING = "ros2msg"
 _SEPARATOR = "=" * 80
 _NS = 10**9
@@ -101,12 +107,35 @@ def time_of(clock: bytes | memoryview) -> int:
     return int(sec) * _NS + int(nanosec)
 
 
+# ---------------------------------------------------------------- services
+
+
+def _split(controls: RecorderControls, _: Any) -> Mapping[str, Any]:
+    controls.split()
+    return {}
+
+
+def _stop(controls: RecorderControls, _: Any) -> Mapping[str, Any]:
+    controls.stop()
+    return {}
+
+
+RECORDER_SERVICES = (
+    Service("pause", "Pause", NOTHING, NOTHING, pause),
+    Service("resume", "Resume", NOTHING, NOTHING, resume),
+    Service("is_paused", "IsPaused", NOTHING, "bool paused", is_paused),
+    Service("split_bagfile", "SplitBagfile", NOTHING, NOTHING, _split),
+    Service("stop", "Stop", NOTHING, NOTHING, _stop),
+)
+"""Those of `ros2 bag record`, but for snapshots."""
+
+
 # ---------------------------------------------------------------- definitions
 
 
 @cache
 def _world() -> World:
-    return ros2_world(_DISTRIBUTION)
+    return ros2_world(DISTRIBUTION)
 
 
 def standard_definition(type_name: str, type_hash: str) -> str:
@@ -124,7 +153,7 @@ def standard_definition(type_name: str, type_hash: str) -> str:
 def _proven(schema: Schema, type_hash: str) -> str:
     """A definition with those of its parts, if it has the hash that was announced."""
     try:
-        store: Typestore = make_store(types_of(schema, _world()), _world())
+        store: Any = make_store(types_of(schema, _world()), _world())
         if type_hash and by_library("", store.hash_rihs01, schema.name) != type_hash:
             return ""
         text: str = by_library("", store.generate_msgdef, schema.name)[0]

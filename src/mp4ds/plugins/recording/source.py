@@ -95,6 +95,31 @@ class SourceState:
     topics: dict[str, None] = field(default_factory=dict)
 
 
+class RecorderControls(Protocol):
+    """What others may ask of a recorder."""
+
+    @property
+    def is_paused(self) -> bool:
+        """Whether messages are left out."""
+        ...
+
+    def pause(self) -> None:
+        """Leave out what comes from now on."""
+        ...
+
+    def resume(self) -> None:
+        """Record again."""
+        ...
+
+    def split(self) -> None:
+        """Begin another dataset."""
+        ...
+
+    def stop(self) -> None:
+        """Stop, and finish what was recorded."""
+        ...
+
+
 class Source(Protocol):
     """Receives messages of the topics that are wanted, those that appear later too.
 
@@ -121,6 +146,10 @@ class Source(Protocol):
         Raises:
             PublishError: The middleware refuses.
         """
+        ...
+
+    def serve(self, controls: RecorderControls) -> None:
+        """Offer the services of `ros2 bag record`, in ROS 2."""
         ...
 
     def close(self) -> None:

@@ -1,0 +1,179 @@
+"""Datasets on the Hugging Face Hub: read where they are by hf://, with a card of what was told."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+import mp4ds
+from each import each
+from hub_server import REPOSITORY, Hub, hub_server
+from mp4ds.plugins.demo import demo
+from mp4ds.plugins.reporting.card import card
+from waiting import WATCHDOG_S
+
+HOME = f"hf://datasets/{REPOSITORY}"
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of two datasets, as it is pushed."""
+    folder = tmp_path_factory.mktemp("hub")
+    (folder / "drives").mkdir()
+    for name, seconds in (("first", 0.6), ("second", 0.4)):
+        demo(folder / f"{name}.bag", seconds=seconds)
+        options = mp4ds.PackOptions(quality="visual" if name == "second" else "lossless")
+        mp4ds.pack(folder / f"{name}.bag", folder / "drives" / name, options)
+    return folder / "drives"
+
+
+@pytest.fixture
+def hub(drives: Path) -> Iterator[Hub]:
+    pytest.importorskip("huggingface_hub")
+    with hub_server(drives) as running:
+        yield running
+
+
+def run(hub: Hub, *words: str, folder: Path) -> str:
+    """What a program prints that takes the stand-in for the hub."""
+    told = {"HF_ENDPOINT": hub.url, "HF_HUB_DISABLE_TELEMETRY": "1", "HF_HOME": str(folder)}
+    done = subprocess.run(
+        [sys.executable, *words],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=WATCHDOG_S,
+        check=False,
+        env={**os.environ, **told},
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_frames_are_fetched_by_ranges(hub: Hub, drives: Path, tmp_path: Path) -> None:
+    code = f"""
+import mp4ds, zlib
+with mp4ds.open("{HOME}/first") as dataset:
+    stream = dataset["/left/image_raw"]
+    print(len(stream), stream.stamps[4], zlib.crc32(stream.read([4, 2]).tobytes()))
+    print(zlib.crc32(stream[0].data.tobytes()), stream[0].intrinsics.k[0])
+"""
+    remote = run(hub, "-c", code, folder=tmp_path)
+    assert remote == run(hub, "-c", code.replace(HOME, str(drives)), folder=tmp_path)
+    video = "first/left_image_raw.mp4"
+    fetched = sum(count for name, count in hub.sent if name == video)
+    assert 0 < fetched < (drives / video).stat().st_size
+    assert "first/right_image_raw.mp4" not in [name for name, _ in hub.sent]
+
+
+def test_commands_take_it(hub: Hub, drives: Path, tmp_path: Path) -> None:
+    told = json.loads(run(hub, "-m", "mp4ds", "info", HOME, "--json", folder=tmp_path))
+    assert [Path(item["path"]).name for item in told] == ["first", "second"]
+    said = run(hub, "-m", "mp4ds", "validate", f"{HOME}@main/first", "--deep", folder=tmp_path)
+    assert "no problem" in said
+    words = ("unpack", f"{HOME}/first", "--to", "bag", "-o", "again.bag")
+    run(hub, "-m", "mp4ds", *words, folder=tmp_path)
+    local = mp4ds.unpack(drives / "first", "bag", tmp_path / "local.bag")
+    assert (tmp_path / "again.bag").read_bytes() == Path(local.output).read_bytes()
+
+
+def test_a_repository_that_is_not_there_is_a_sentence(hub: Hub, tmp_path: Path) -> None:
+    code = (
+        "import mp4ds\n"
+        "for name in ('someone/nothing/first', 'someone/drives/third'):\n"
+        "    try:\n"
+        "        mp4ds.open(f'hf://datasets/{name}')\n"
+        "    except mp4ds.SourceNotFoundError as error:\n"
+        "        print(error)\n"
+    )
+    lines = run(hub, "-c", code, folder=tmp_path).splitlines()
+    assert lines == [
+        "hf://datasets/someone/nothing/first: no such file or folder. Check the path.",
+        "hf://datasets/someone/drives/third: no such file or folder. Check the path.",
+    ]
+
+
+# ---------------------------------------------------------------- card
+
+ABOUT = {
+    "title": "A workshop | *two* arms",
+    "description": "Lamps off.\nDoors <open>.",
+    "authors": [{"name": "A lab", "affiliation": "A university"}, {"name": "B"}],
+    "license": "CC-BY-4.0",
+    "doi": "10.1234/abc",
+    "links": ["https://example.org/paper"],
+    "keywords": ["slam", "robotics"],
+}
+
+
+def packed(folder: Path, name: str, about: dict[str, object] | None) -> Path:
+    demo(folder / f"{name}.bag", seconds=0.2)
+    options = mp4ds.PackOptions()
+    if about is not None:
+        (folder / "about.yaml").write_text(yaml.safe_dump(about))
+        options = mp4ds.PackOptions(about=folder / "about.yaml")
+    mp4ds.pack(folder / f"{name}.bag", folder / name, options)
+    return folder / name
+
+
+def metadata_of(text: str) -> dict[str, object]:
+    found: dict[str, object] = yaml.safe_load(text.split("---\n")[1])
+    return found
+
+
+def test_a_card_has_what_was_told(tmp_path: Path) -> None:
+    path = packed(tmp_path, "drive 1", ABOUT)
+    text = card([path])
+    assert metadata_of(text) == {
+        "pretty_name": ABOUT["title"],
+        "license": "cc-by-4.0",
+        "tags": ["robotics", "video", "ros", "mp4ds", "slam"],
+        "task_categories": ["robotics"],
+        "size_categories": ["n<1K"],
+    }
+    assert "# A workshop \\| \\*two\\* arms" in text
+    assert "Lamps off. Doors \\<open\\>." in text
+    assert "**Authors**: A lab (A university); B" in text
+    assert "<https://doi.org/10.1234/abc> <https://example.org/paper>" in text
+    assert "mp4ds info 'hf://datasets/OWNER/NAME/drive 1'" in text
+    assert 'dataset["/left/image_raw"]' in text
+    row = next(line for line in text.splitlines() if line.startswith("| drive 1"))
+    assert "| 6 | 0.2 |" in row
+
+
+@each(
+    ("licenses", "expected"),
+    [
+        (["CC-BY-4.0", "CC-BY-4.0"], {"license": "cc-by-4.0"}),
+        (["House rules"], {"license": "other", "license_name": "House rules"}),
+        (["MIT", "CC0-1.0"], {"license": "other", "license_name": "MIT, CC0-1.0"}),
+        ([None], {}),
+    ],
+)
+def test_licenses(licenses: list[str | None], expected: dict[str, str], tmp_path: Path) -> None:
+    paths = [
+        packed(tmp_path, f"drive{number}", {"license": license_id} if license_id else None)
+        for number, license_id in enumerate(licenses)
+    ]
+    found = metadata_of(card(paths))
+    assert {key: found[key] for key in found if key.startswith("license")} == expected
+
+
+def test_the_hub_reads_the_metadata(tmp_path: Path) -> None:
+    hub = pytest.importorskip("huggingface_hub")
+    found = hub.DatasetCard(card([packed(tmp_path, "drive", ABOUT)]))
+    assert (found.data.license, found.data.pretty_name) == ("cc-by-4.0", ABOUT["title"])
+    assert found.data.tags == ["robotics", "video", "ros", "mp4ds", "slam"]
+
+
+def test_info_prints_it(drives: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mp4ds", "info", str(drives), "--card"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert done.stdout == card([drives / "first", drives / "second"])

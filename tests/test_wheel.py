@@ -1,0 +1,251 @@
+"""What is released: the sdist, the wheels made of it, and what else says what they are."""
+
+from __future__ import annotations
+
+import email
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from collections.abc import Iterator
+from email.message import Message
+from importlib.metadata import requires
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import mp4ds
+from each import each
+from waiting import WATCHDOG_S
+
+ROOT = Path(__file__).parents[1]
+for _module in ("hatchling", "hatch_fancy_pypi_readme"):
+    pytest.importorskip(_module)
+VERSION = mp4ds.__version__
+OWN_NAMES = {"isal": "python-isal", "xxhash": "python-xxhash"}
+"""Packages that conda-forge calls otherwise."""
+
+
+def built(kind: str, source: Path, target: Path, **environment: str) -> Path:
+    """What hatchling makes of a source tree, without a network: an ``sdist`` or a ``wheel``."""
+    code = f"import hatchling.build as b, sys; print(b.build_{kind}(sys.argv[1]))"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(target)],
+        cwd=source,
+        capture_output=True,
+        text=True,
+        timeout=WATCHDOG_S,
+        check=False,
+        env={**os.environ, **environment},
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return target / done.stdout.split()[-1]
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return built("sdist", ROOT, tmp_path_factory.mktemp("sdist"))
+
+
+@pytest.fixture(scope="module")
+def unpacked(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("unpacked")
+    with tarfile.open(sdist) as archive:
+        archive.extractall(folder, **({"filter": "data"} if sys.version_info >= (3, 12) else {}))
+    return folder / f"mp4ds-{VERSION}"
+
+
+@pytest.fixture(scope="module")
+def pure(unpacked: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[zipfile.ZipFile]:
+    target = tmp_path_factory.mktemp("pure")
+    with zipfile.ZipFile(built("wheel", unpacked, target, MP4DS_PURE="1")) as wheel:
+        yield wheel
+
+
+def metadata_of(wheel: zipfile.ZipFile, name: str = "METADATA") -> Message:
+    text = wheel.read(f"mp4ds-{VERSION}.dist-info/{name}").decode()
+    return email.message_from_string(text)
+
+
+# ---------------------------------------------------------------- contents
+
+
+def test_the_pure_wheel_has_what_the_package_needs_and_no_more(pure: zipfile.ZipFile) -> None:
+    names = set(pure.namelist())
+    source = ROOT / "src" / "mp4ds"
+    expected = {
+        f"mp4ds/{path.relative_to(source).as_posix()}"
+        for path in source.rglob("*")
+        if path.is_file() and path.suffix not in (".c", ".pyc", ".so")
+    }
+    expected |= {
+        f"mp4ds/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "schemas").rglob("*.json")
+    }
+    assert {name for name in names if name.startswith("mp4ds/")} == expected
+    assert {"mp4ds/py.typed", "mp4ds/plugins/reporting/page/report.js"} <= expected
+    assert "mp4ds/schemas/v1.0/stream.schema.json" in expected
+    others = {name.split("/", 1)[1] for name in names - expected}
+    assert others == {
+        *("METADATA", "RECORD", "WHEEL", "entry_points.txt", "licenses/LICENSE"),
+        *("data/share/bash-completion/completions/mp4ds", "data/share/zsh/site-functions/_mp4ds"),
+        "data/share/fish/vendor_completions.d/mp4ds.fish",
+    }
+    assert metadata_of(pure, "WHEEL")["Tag"] == "py3-none-any"
+
+
+@pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
+def test_a_compiled_wheel_is_for_its_platform(unpacked: Path, tmp_path: Path) -> None:
+    source = shutil.copytree(unpacked, tmp_path / "source")
+    path = built("wheel", source, tmp_path, MP4DS_PURE="0")
+    with zipfile.ZipFile(path) as wheel:
+        assert "mp4ds/video/_colour.so" in wheel.namelist()
+        assert "mp4ds/video/colour.c" not in wheel.namelist()
+        assert re.fullmatch(r"py3-none-(linux|macosx)_\w+", metadata_of(wheel, "WHEEL")["Tag"])
+        wheel.extractall(tmp_path / "installed")
+    code = "import mp4ds.video.colour as c; assert c._compiled() is not None; print(c.__file__)"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=WATCHDOG_S,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(tmp_path / "installed")},
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(str(tmp_path / "installed"))
+
+
+def test_the_sdist_has_its_tests_and_no_rubbish(unpacked: Path) -> None:
+    for name in ("tests/test_wheel.py", "tools/test.sh", "src/mp4ds/video/colour.c", "LICENSE"):
+        assert (unpacked / name).is_file(), name
+    names = [path.relative_to(unpacked).parts for path in unpacked.rglob("*")]
+    rubbish = {".venv", "build", "dist", "__pycache__", "quickstart"}
+    assert not [parts for parts in names if rubbish & {*parts} or parts[-1].endswith(".so")]
+
+
+def test_the_page_on_the_index_needs_no_file_of_the_repository(pure: zipfile.ZipFile) -> None:
+    metadata = metadata_of(pure)
+    text = str(metadata.get_payload())
+    targets = re.findall(r"\]\(([^)]+)\)", text)
+    assert len(targets) > 15
+    for target in targets:
+        found = re.fullmatch(
+            r"https://[\w.]+/mp4ds/mp4ds/(?:blob/)?v([\d.a-z]+)/([^#]+)(#.+)?", target
+        )
+        assert found, target
+        assert found[1] == VERSION
+        assert (ROOT / found[2]).exists(), target
+    assert metadata["Description-Content-Type"] == "text/markdown"
+    assert metadata["License-Expression"] == "Apache-2.0"
+    urls = dict(url.split(", ") for url in metadata.get_all("Project-URL", []))
+    assert {"Documentation", "Repository", "Changelog", "Issues"} == set(urls)
+
+
+def test_the_shell_completes_by_the_packaged_file(pure: zipfile.ZipFile, tmp_path: Path) -> None:
+    bash = shutil.which("bash")
+    if not bash:
+        pytest.skip("there is no bash")
+    name = f"mp4ds-{VERSION}.data/data/share/bash-completion/completions/mp4ds"
+    (tmp_path / "completion").write_bytes(pure.read(name))
+    code = """
+    . ./completion
+    COMP_WORDS=(mp4ds vali) COMP_CWORD=1
+    $(complete -p mp4ds | sed 's/.*-F \\([^ ]*\\).*/\\1/') mp4ds
+    echo "${COMPREPLY[@]}"
+    """
+    done = subprocess.run(
+        [bash, "-c", code],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=WATCHDOG_S,
+        check=False,
+        env={**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
+    )
+    assert done.stdout.split() == ["validate"], done.stderr
+
+
+# ---------------------------------------------------------------- what else says the same
+
+
+def texts() -> Iterator[tuple[Path, str]]:
+    """Files that name addresses of the project."""
+    patterns = ("*.md", "*.toml", "*.cff", "*.yml", "Dockerfile*", "conda/*", ".github/**/*.yml")
+    for pattern in (*patterns, "docs/**/*.md", "spec/*.md"):
+        for path in ROOT.glob(pattern):
+            yield path, path.read_text()
+
+
+def test_the_project_has_one_address() -> None:
+    pyproject = (ROOT / "pyproject.toml").read_text()
+    repository = re.findall(r'^Repository = "(.*)"$', pyproject, re.MULTILINE)[0]
+    site = re.findall(r'^Documentation = "(.*)"$', pyproject, re.MULTILINE)[0]
+    raw = repository.replace("https://github.com", "https://raw.githubusercontent.com")
+    count = 0
+    for path, text in texts():
+        for url in re.findall(r"https://[\w./-]*\bmp4ds\b[\w./-]*", text):
+            is_ours = url.startswith((repository, site, raw)) or "pypi.org" in url
+            assert is_ours, f"{path.relative_to(ROOT)}: {url}"
+            count += 1
+    assert count > 8
+
+
+def test_the_citation_is_of_this_version() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == VERSION
+    assert citation["license"] == "Apache-2.0"
+    (paper,) = citation["references"]
+    readme = (ROOT / "README.md").read_text()
+    assert paper["title"] in re.sub(r"[{}]", "", readme)
+    assert all(author["family-names"] in readme for author in paper["authors"][:2])
+
+
+def test_the_recipe_for_conda_needs_what_the_package_needs() -> None:
+    recipe = yaml.safe_load((ROOT / "conda" / "recipe.yaml").read_text())
+    assert recipe["context"]["version"] == VERSION
+    told = {
+        name: least
+        for name, _, least in (one.partition(" >=") for one in recipe["requirements"]["run"])
+    }
+    pyproject = (ROOT / "pyproject.toml").read_text()
+    listed = pyproject.partition("\ndependencies = [")[2].partition("\n]")[0]
+    needed: dict[str, Any] = {"python": "3.10"}
+    for name, least in re.findall(r'^  "([\w-]+)>=([\d.]+)', listed, re.MULTILINE):
+        needed[OWN_NAMES.get(name, name)] = least  # of several lines the last, for newer Pythons
+    assert told == needed
+    host = {one.split(" ")[0] for one in recipe["requirements"]["host"]}
+    assert {"hatchling", "hatch-fancy-pypi-readme"} <= host
+
+
+@each("name", ["Dockerfile", "Dockerfile.ros2"])
+def test_images_are_made_of_what_is_sent_to_be_built(name: str) -> None:
+    lines = (ROOT / ".dockerignore").read_text().splitlines()
+    sent = [line[1:] for line in lines if line.startswith("!")]
+    assert all((ROOT / path).exists() for path in sent)
+    pyproject = (ROOT / "pyproject.toml").read_text()
+    included = re.findall(r'^"([\w./-]+)" = ', pyproject, re.MULTILINE)
+    for path in ("src", "hatch_build.py", "LICENSE", "README.md", *included):
+        assert path.split("/")[0] in sent, path
+    extras = re.findall(r"\[([a-z,]+)\]", (ROOT / name).read_text())
+    known = {
+        re.split(r"\W", one.rpartition("extra == ")[2][1:])[0] for one in requires("mp4ds") or []
+    }
+    assert extras
+    assert {extra for found in extras for extra in found.split(",")} <= known
+
+
+@each("path", sorted((ROOT / ".github" / "workflows").glob("*.yml")), ids=lambda path: path.name)
+def test_workflows_run_what_is_there(path: Path) -> None:
+    workflow = yaml.safe_load(path.read_text())
+    for job in workflow["jobs"].values():
+        assert job["timeout-minutes"]
+        for step in job["steps"]:
+            command = step.get("run", "")
+            for file in re.findall(r"[\w./-]+\.(?:sh|py|cff|md)\b|\.ci/\w+", command):
+                assert (ROOT / file).exists() or f"> {file}" in command, f"{path.name}: {file}"
