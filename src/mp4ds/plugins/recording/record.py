@@ -17,7 +17,7 @@ from mp4ds.errors import Mp4dsError, OptionError, RecordError, TargetExistsError
 from mp4ds.files.outputs import check_target, move_into_place, sync, work_folder
 from mp4ds.format.manifest import About
 from mp4ds.format.sidecars import load_about
-from mp4ds.options import Options, exclude, force, option, parse_size
+from mp4ds.options import Options, argument, exclude, force, option, parse_size
 from mp4ds.packing.journal import JOURNAL_NAME, Journal, is_unfinished
 from mp4ds.packing.live import Intake, LivePacker, LiveRecording
 from mp4ds.packing.manifest import (
@@ -108,8 +108,7 @@ class RecordOptions(Options):
         "YAML with title, description, authors, license, doi, links or keywords.", metavar="FILE"
     )
     force: bool = force()
-    names: NodeNames = PLAIN
-    """What ROS calls the node and its topics; without a counterpart among the options."""
+    names: NodeNames = argument("What ROS calls the node and its topics.", PLAIN)
 
 
 @dataclass(frozen=True)
