@@ -196,8 +196,8 @@ def test_frames_that_are_shown_in_another_order(
 # an index with two tracks is refused, others are no mp4
 UNREADABLE = {
     "nasa_13013.mp4": "has 2 video tracks, not one",
-    "av1_video.mkv": "no index",
-    "vtest.avi": "no index",
+    "av1_video.mkv": "no readable index",
+    "vtest.avi": "no readable index",
 }
 FILES = sorted(path.name for path in (DATA / "video").glob("*.*"))
 

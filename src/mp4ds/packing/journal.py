@@ -23,6 +23,7 @@ import xxhash
 
 from mp4ds.errors import SourceError
 from mp4ds.files.outputs import lock
+from mp4ds.files.urls import remote
 from mp4ds.format.fields import FORMAT_VERSION, Model
 from mp4ds.format.models import ChannelModel, Header
 from mp4ds.packing.look import StreamKey
@@ -35,7 +36,7 @@ JOURNAL_NAME = "journal.jsonl"
 
 def is_unfinished(folder: Path) -> bool:
     """Whether a folder holds a recording that is being made, or was cut off."""
-    return (folder / JOURNAL_NAME).is_file()
+    return not remote(folder) and (folder / JOURNAL_NAME).is_file()
 
 
 FRAME_COLUMNS = (

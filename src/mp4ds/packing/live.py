@@ -270,7 +270,8 @@ class LivePacker(Packer):
                     self._take(message, workers)
                 if time.monotonic() >= next_checkpoint:
                     self._verbatim.flush()
-                    syncing.ask()
+                    if not self._intake.is_behind:
+                        syncing.ask()
                     next_checkpoint = time.monotonic() + _CHECKPOINT_S
             self._on_read()
             self._cameras.settle(workers)

@@ -34,6 +34,7 @@ from mp4ds.packing.planning import available_cores
 from mp4ds.packing.recovery import recover
 from mp4ds.packing.tracks import StreamSettings
 from mp4ds.plan import LOSSLESS, MAX_GOP, Selection, parse_quality
+from mp4ds.plugins.playing.timeline import quick_switches
 from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import sourced
 from mp4ds.plugins.recording.source import Source, SourceOptions, Wanted, open_source
@@ -365,6 +366,10 @@ class Recorder:
         Raises:
             Mp4dsError: As `record`.
         """
+        with quick_switches():
+            return self._run()
+
+    def _run(self) -> RecordSummary:
         summary = RecordSummary(recovered=self._recover())
         begun = time.monotonic()
         self._begin_split()
