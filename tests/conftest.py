@@ -19,6 +19,7 @@ NETWORKS = {
     "test_play_ros1": "ros1",
     "test_publish_ros1": "ros1",
     "test_record_ros1": "ros1",
+    "test_ros_packages": "ros1",
     "test_publish_dds": "dds",
     "test_publish_ros2": "dds",
     "test_record_ros2": "dds",

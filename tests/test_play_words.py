@@ -70,6 +70,9 @@ def test_words_of_other_players(typed: str, expected: str, tmp_path: Path) -> No
         ("--message-order sent", "as they were received"),
         ("--topics", "--topics requires an argument"),
         ("--ros-args --nonsense", "--nonsense is not known"),
+        ("--ros-args -p use_sim_time:=perhaps", "use_sim_time is true or false"),
+        ("--ros-args -p use_sim_time", "no parameter of ROS"),
+        ("--ros-args --params-file /none/at.yaml", "/none/at.yaml: cannot be read"),
         ("--ros-args -r nonsense", "no rule of ROS"),
         ("__ns:=/1", "no namespace"),
     ],
@@ -83,10 +86,10 @@ def test_what_has_no_counterpart_is_told(typed: str, says: str) -> None:
     ("typed", "names"),
     [
         ("", PLAIN),
-        ("--ros-args -r __node:=x -p use_sim_time:=true -p a:=b", NodeNames("x")),
+        ("--ros-args -r __node:=x -p use_sim_time:=true -p a:=b",
+         NodeNames("x", use_sim_time=True)),
         ("--ros-args --remap __ns:=/robot --log-level warn", NodeNames("", "/robot", (), "warn")),
-        ("--ros-args -r player:__node:=x -r /a:=/b --params-file f.yaml",
-         NodeNames("x", "", (("/a", "/b"),))),
+        ("--ros-args -r player:__node:=x -r /a:=/b", NodeNames("x", "", (("/a", "/b"),))),
         ("--ros-args --log-level rcl:=debug --disable-rosout-logs --", PLAIN),
         ("__name:=x __ns:=/y __log:=/tmp/x.log _rate:=3 /a:=/b",
          NodeNames("x", "/y", (("/a", "/b"),))),
@@ -95,6 +98,39 @@ def test_what_has_no_counterpart_is_told(typed: str, says: str) -> None:
 )  # fmt: skip
 def test_ros_tells_names(typed: str, names: NodeNames) -> None:
     assert node_arguments(["drive", *typed.split()]) == (["drive"], names)
+
+
+def test_ros1_tells_parameters_of_any_text() -> None:
+    words = ["drive", "__log:=/home/a b/x.log", "_frame:=", "_name:=two words", "__master:=x"]
+    assert node_arguments(words) == (["drive"], PLAIN)
+
+
+@each(
+    ("text", "node", "expected"),
+    [
+        ("/**:\n  ros__parameters:\n    use_sim_time: true\n", "", True),
+        ("/robot/x:\n  ros__parameters: {use_sim_time: true, a: [1, 2]}\n", "x", True),
+        ("robot:\n  x:\n    ros__parameters:\n      use_sim_time: true\n", "x", True),
+        ("/robot/y:\n  ros__parameters:\n    use_sim_time: true\n", "x", None),
+        ("/**: {ros__parameters: {use_sim_time: true}}\n"
+         "/robot/x: {ros__parameters: {use_sim_time: false}}\n", "x", False),
+        ("", "x", None),
+    ],
+    ids=["all", "name", "nested", "another", "both", "empty"],
+)  # fmt: skip
+def test_parameters_in_a_file(text: str, node: str, expected: bool | None, tmp_path: Path) -> None:
+    """As launch files of ROS 2 give them; the name may stand behind the file."""
+    (tmp_path / "f.yaml").write_text(text)
+    words = ["--ros-args", "--params-file", str(tmp_path / "f.yaml"), "-r", "__ns:=/robot"]
+    words += ["-r", f"__node:={node}"] if node else []
+    assert node_arguments(words)[1].use_sim_time is expected
+
+
+def test_ros1_tells_a_namespace_by_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_NAMESPACE", "/robot")
+    assert PLAIN.in_world("ros1").resolved("imu") == "/robot/imu"
+    assert PLAIN.in_world("ros2").resolved("imu") == "/imu"
+    assert NodeNames(namespace="/own").in_world("ros1").resolved("imu") == "/own/imu"
 
 
 def test_rules_go_by_full_names() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import signal
 import subprocess
@@ -23,12 +24,19 @@ from mp4ds.packing.journal import JOURNAL_NAME
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.packer import TOO_LATE
 from mp4ds.packing.recovery import CUT_OFF
-from mp4ds.plugins.recording.record import RecordOptions, RecordSummary, open_recorder
-from mp4ds.plugins.recording.source import Wanted
+from mp4ds.plugins.publishing.names import NodeNames
+from mp4ds.plugins.recording.record import (
+    Recorder,
+    RecordOptions,
+    RecordSummary,
+    open_recorder,
+)
+from mp4ds.plugins.recording.source import SourceOptions, Wanted
 from mp4ds.records import Message
 from record_scenes import PlayedSource
 from scenes import Scene, scene
 from sources import SOURCES
+from test_bad_input import call
 from waiting import until
 
 Compare = Callable[..., list[str]]
@@ -109,6 +117,76 @@ def test_topics_that_are_wanted() -> None:
     assert all(map(Wanted(), topics))
     with pytest.raises(OptionError, match="not a valid pattern"):
         Wanted(regex="(")
+
+
+def test_topics_that_ros_renames() -> None:
+    """As for `rosbag record`: subscribed to by the new name, recorded by the one that was typed."""
+    names = NodeNames("bag", "/robot", (("front", "/camera/image"), ("/tf", "tf"), ("imu", "/x")))
+    wanted = Wanted(("front", "/tf", "odom", "/gps/*"), exclude=("left",), names=names)
+    topics = ("/camera/image", "/robot/tf", "/robot/odom", "/gps/fix", "/tf", "/robot/front", "/x")
+    found = [topic for topic in topics if wanted(topic)]
+    assert found == [*topics[:4]]
+    assert [*map(wanted.recorded_as, found)] == ["/robot/front", "/tf", "/robot/odom", "/gps/fix"]
+    everything = Wanted(exclude=("left",), names=names)
+    assert everything("/camera/image")
+    assert not everything("/robot/left")
+    assert everything.recorded_as("/camera/image") == "/camera/image"
+    with pytest.raises(OptionError, match="/robot/front and /camera/image are one topic"):
+        Wanted(("front", "/camera/image"), names=names)
+
+
+class Opened:
+    """What the command opens instead of a source of ROS."""
+
+    def __init__(self, source: PlayedSource, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.kind, self.options = "", SourceOptions("")
+        self._source = source
+        monkeypatch.setattr("mp4ds.plugins.recording.record.open_source", self)
+        make = Recorder.__init__
+
+        def made(recorder: Recorder, *arguments: Any) -> None:
+            make(recorder, *arguments)
+            source.stop = recorder.stop
+
+        monkeypatch.setattr(Recorder, "__init__", made)
+
+    def __call__(self, kind: str, options: SourceOptions) -> PlayedSource:
+        self.kind, self.options = kind, options
+        return self._source
+
+
+def test_what_launch_files_append(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mp4ds.cli.output._quiet", False)
+    source = PlayedSource(write(tmp_path, of=scene("mono8", frames=2)))
+    opened = Opened(source, monkeypatch)
+    told = call(
+        *("record", "--ros2", "-o", tmp_path / "live", "camera", "--no-progress"),
+        *("--ros-args", "-r", "__node:=bag", "-r", "__ns:=/robot"),
+        *("-r", "camera:=/cam/image_raw", "-p", "use_sim_time:=true", "--log-level", "warn"),
+    )
+    assert (told.code, told.err) == (0, "")
+    names = opened.options.names
+    assert (opened.kind, names.node, names.namespace) == ("ros2", "bag", "/robot")
+    assert opened.options.use_sim_time
+    with mp4ds.open(tmp_path / "live") as dataset:
+        assert len(dataset["/cam/image_raw"]) == 2  # as the source calls it
+    assert call("record", "--ros-args", "--nonsense").code == 2
+
+
+def test_one_that_may_not_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second signal says where the rest is."""
+    opened = Opened(PlayedSource(write(tmp_path)), monkeypatch)
+
+    def drain(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Recorder, "_drain", drain)
+    monkeypatch.chdir(tmp_path)
+    told = call("record", "--ros1", "-o", "", "-a", "--no-progress")
+    assert opened.kind == "ros1"
+    assert told.code == 130
+    found = re.search(r"is in (\S+/mp4ds_[\d_-]+\.recording): make a dataset", told.err)
+    assert found, told.err
 
 
 @each(

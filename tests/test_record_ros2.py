@@ -7,13 +7,14 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mp4ds
 from mp4ds.bags.formats import open_reader
+from mp4ds.plugins.publishing.names import NodeNames
 from mp4ds.plugins.publishing.ros2_writers import Qos, recorded_qos
 from mp4ds.plugins.recording.record import RecordOptions, open_recorder
 from mp4ds.plugins.recording.ros2_channels import (
@@ -121,25 +122,54 @@ def test_a_recording_is_a_rosbag2(side: Side, tmp_path: Path) -> None:
     assert [*map(padded, found)] == [*map(padded, images)]
 
 
+class Controls:
+    """Of a recorder, that keeps what it is asked."""
+
+    def __init__(self) -> None:
+        self.is_paused = False
+        self.asked: list[str] = []
+
+    def pause(self) -> None:
+        self.is_paused = True
+
+    def resume(self) -> None:
+        self.is_paused = False
+
+    def split(self) -> None:
+        self.asked.append("split")
+
+    def stop(self) -> None:
+        self.asked.append("stop")
+
+
+def test_ros_renames_topics(side: Side) -> None:
+    """And /clock; the recording has the names that were asked for."""
+    names = NodeNames("bag", "/robot", (("name", "/front/name"), ("/clock", "/sim")))
+    found, clock = channel("/front/name", STRING), 1_700_000_000 * 10**9
+    heard = Heard()
+    options = SourceOptions("recorder", use_sim_time=True, names=names)
+    with side.open(names=names) as publisher:
+        publisher.advertise(found)
+        publisher.clock(clock)
+        source = open_source("ros2", options)
+        source.serve(Controls())
+        source.start(Wanted(("name",), names=names), heard.take)
+
+        def arrives() -> bool:
+            publisher.clock(clock)
+            publisher.publish(found, message(STRING, 1), 0)
+            return any(log == clock for _, log in heard.times)
+
+        assert until(arrives)
+        asked = side.peer.call("/robot/bag/is_paused", "IsPaused", {})
+        source.close()
+    assert asked == {"paused": False}
+    assert {*heard.payloads} == {*source.state.topics} == {"/robot/name"}
+    assert source.address.endswith(("rclpy as bag", "Cyclone DDS"))
+
+
 def test_services(side: Side) -> None:
     """Those of rosbag2's recorder."""
-
-    class Controls:
-        is_paused = False
-        asked: ClassVar[list[str]] = []
-
-        def pause(self) -> None:
-            self.is_paused = True
-
-        def resume(self) -> None:
-            self.is_paused = False
-
-        def split(self) -> None:
-            self.asked.append("split")
-
-        def stop(self) -> None:
-            self.asked.append("stop")
-
     controls = Controls()
     source = open_source("ros2", SourceOptions("rosbag2_recorder"))
     source.serve(controls)

@@ -12,5 +12,5 @@ unset PYTHONDONTWRITEBYTECODE # or each of some hundred processes compiles all m
 .venv/bin/pytest -n auto --dist worksteal -m "not network and not slow" "$@"
 # of no other file than those of NETWORKS in tests/conftest.py: to collect all takes 5 seconds
 [ $# -gt 0 ] || set -- tests/test_play_ros1.py tests/test_publish_{dds,ros1,ros2}.py \
-  tests/test_record_{ros1,ros2}.py
+  tests/test_record_{ros1,ros2}.py tests/test_ros_packages.py
 exec .venv/bin/pytest -n 2 --dist loadgroup -m "network and not slow" "$@"

@@ -54,6 +54,11 @@ def option(
     return field(default=default, metadata={"shown": shown})
 
 
+def argument(help: str, default: Any) -> Any:  # noqa: A002
+    """A field of `Options` that is no option of a command."""
+    return field(default=default, metadata={"help": help})
+
+
 class Options:
     """Base of dataclasses of options: documents their fields, and keeps values within bounds.
 
@@ -62,11 +67,12 @@ class Options:
     """
 
     def __init_subclass__(cls) -> None:
-        lines = [
-            f"    {name}: {value.metadata['shown'].help}"
+        told = {
+            name: value.metadata.get("help") or value.metadata["shown"].help
             for name, value in vars(cls).items()
-            if isinstance(value, Field) and "shown" in value.metadata
-        ]
+            if isinstance(value, Field)
+        }
+        lines = [f"    {name}: {text}" for name, text in told.items()]
         cls.__doc__ = "\n".join([f"{cls.__doc__}\n\nAttributes:", *lines])
 
     def __post_init__(self) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,17 +10,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mp4ds.cli.keyboard import Keyboard
-from mp4ds.cli.options import Command, JsonFlag, takes
+from mp4ds.cli.nodes import NodeCommand, names_in, say_as_much
+from mp4ds.cli.options import JsonFlag, takes
 from mp4ds.cli.output import be_quiet, complain, is_quiet, print_json, say, shown
 from mp4ds.cli.play_words import STORAGES, spelled
-from mp4ds.cli.process import DEBUG, caught_signals, told_errors
+from mp4ds.cli.process import caught_signals, told_errors
 from mp4ds.errors import OptionError
 from mp4ds.plugins.playing.play import PlayOptions, open_player
-from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import Controls
 
 if TYPE_CHECKING:
     from mp4ds.plugins.playing.player import PlayProgress, PlaySummary
+    from mp4ds.plugins.publishing.names import NodeNames
 
 _FASTER = 1.1
 
@@ -135,28 +134,22 @@ def print_play(summary: PlaySummary) -> None:
 
 # ---------------------------------------------------------------- play
 
-_NAMES = "mp4ds.names"  # what ROS told, in click's context
 
-
-class PlayCommand(Command):
+class PlayCommand(NodeCommand):
     """The command, which understands how the options of other players are typed."""
 
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse arguments, in the words of `rosbag play` and `ros2 bag play`."""
+    def spelled(self, ctx: Any, args: Sequence[str]) -> tuple[list[str], NodeNames]:
+        """Arguments in the words of `rosbag play` and `ros2 bag play`, as the command has them."""
         valued = {
             name
             for option in self.get_params(ctx)
             if option.param_type_name == "option" and not getattr(option, "is_flag", False)
             for name in option.opts
         }
-        with told_errors("--json" in args):
-            words, ctx.meta[_NAMES] = spelled(args, valued.__contains__)
-        parsed: list[str] = super().parse_args(ctx, words)
-        return parsed
+        return spelled(args, valued.__contains__)
 
 
 COMMAND = PlayCommand
-_QUIET = {"error", "fatal"}
 
 
 @takes(PlayOptions, without=("to", "clock"))
@@ -207,8 +200,10 @@ def play(
     with --ros1, -p is --prefix, as in `rosbag play`. Lists such as --topics /a /b are understood.
     """
     with told_errors(as_json), ExitStack() as stack:
-        names: NodeNames = context.meta.get(_NAMES, PLAIN)
-        _say_as_much(log_level or names.log_level, quiet)
+        names = names_in(context)
+        say_as_much(log_level or names.log_level)
+        if quiet:
+            be_quiet()
         if storage not in ("", *STORAGES):
             raise OptionError(
                 f"`storage` {storage!r} is none of {', '.join(STORAGES)}. With --ros2, -s is "
@@ -240,15 +235,3 @@ def play(
         print_play(summary)
     if caught:
         raise typer.Exit(128 + caught[0])
-
-
-def _say_as_much(level: str, quiet: bool) -> None:
-    """Tell as much as was asked for."""
-    if level not in ("", "debug", "info", "warn", *_QUIET):
-        raise OptionError(f"`log_level` {level!r} is not debug, info, warn, error or fatal.")
-    if level == "debug":
-        os.environ[DEBUG] = "1"
-    if quiet or level in ("warn", *_QUIET):
-        be_quiet()
-    if level in _QUIET:
-        warnings.simplefilter("ignore")

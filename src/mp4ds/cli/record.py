@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from mp4ds.cli.keyboard import Keyboard
+from mp4ds.cli.nodes import NodeCommand, names_in, say_as_much
 from mp4ds.cli.options import JsonFlag, takes
-from mp4ds.cli.output import complain, print_json, print_pack, say
+from mp4ds.cli.output import complain, is_quiet, print_json, print_pack, say
 from mp4ds.cli.process import caught_signals, told_errors
 from mp4ds.errors import OptionError
 from mp4ds.plugins.recording.record import RecordOptions, open_recorder
@@ -23,11 +24,13 @@ if TYPE_CHECKING:
 
 _LOG_S = 10.0
 _SHOWN = 20  # topics
+COMMAND = NodeCommand
 
 
 @takes(RecordOptions, without=("to",))
 def record(
     options: Callable[[], RecordOptions],
+    context: typer.Context,
     topics: Annotated[
         Optional[list[str]],  # noqa: UP045 - read at run time by typer
         typer.Argument(metavar="TOPIC...", help="Topic names or quoted globs; -a records all."),
@@ -48,6 +51,9 @@ def record(
     no_keyboard: Annotated[
         bool, typer.Option("--disable-keyboard-controls", help="Disable the keyboard controls.")
     ] = False,
+    progress: Annotated[
+        bool, typer.Option("--progress/--no-progress", help="Show what is being recorded.")
+    ] = True,
     as_json: JsonFlag = False,
 ) -> None:
     """Record topics of a live robot, ROS 1 or ROS 2, into a dataset.
@@ -59,15 +65,27 @@ def record(
         if ros1 and ros2:
             raise OptionError("--ros1 contradicts --ros2.")
         kind = "ros1" if ros1 else "ros2" if ros2 else None
-        report = stack.enter_context(record_progress(is_quiet=as_json))
-        recorder = stack.enter_context(
-            open_recorder(topics or (), output, replace(options(), to=kind), progress=report)
-        )
-        complain(f"recording from {recorder.address}")
+        names = names_in(context)
+        say_as_much(names.log_level)
+        is_silent = as_json or not progress or is_quiet()
+        report = stack.enter_context(record_progress(is_quiet=is_silent))
+        told = replace(options(), to=kind, names=names)
+        # a launch file cannot leave out an argument: an empty one is none
+        opened = open_recorder(topics or (), output or None, told, progress=report)
+        recorder = stack.enter_context(opened)
+        if not is_quiet():
+            complain(f"recording from {recorder.address}")
         stack.enter_context(caught_signals(recorder.stop))
         if not no_keyboard:
             stack.enter_context(Keyboard({" ": recorder.toggle_paused, "q": recorder.stop}))
-        summary = recorder.run()
+        try:
+            summary = recorder.run()
+        except KeyboardInterrupt:  # asked twice, as launch files do when their time is over
+            left = " and ".join(map(str, recorder.unfinished)) or "no folder"
+            raise KeyboardInterrupt(
+                f"interrupted while finishing; what is missing is in {left}: make a dataset of it "
+                "by mp4ds pack --salvage"
+            ) from None
     if as_json:
         print_json(summary)
     else:

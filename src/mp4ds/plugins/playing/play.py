@@ -11,7 +11,17 @@ from pathlib import Path
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import OptionError
-from mp4ds.options import Options, every, exclude, jpeg_quality, max_rate, option, resize, topics
+from mp4ds.options import (
+    Options,
+    argument,
+    every,
+    exclude,
+    jpeg_quality,
+    max_rate,
+    option,
+    resize,
+    topics,
+)
 from mp4ds.plugins.playing.player import Player, PlayerOptions, PlayProgress, PlaySummary
 from mp4ds.plugins.playing.timeline import Names, Timeline, Wanted
 from mp4ds.plugins.publishing.names import PLAIN, NodeNames
@@ -117,8 +127,7 @@ class PlayOptions(Options):
         "--allow-origin",
         metavar="URL",
     )
-    names: NodeNames = PLAIN
-    """What ROS calls the node and its topics; without a counterpart among the options."""
+    names: NodeNames = argument("What ROS calls the node and its topics.", PLAIN)
 
 
 def play(
@@ -168,6 +177,7 @@ def open_player(
     _check(chosen)
     kind = chosen.to or ("" if publisher else sourced())
     world = publisher.world if publisher else WORLDS.get(kind)
+    chosen = replace(chosen, names=chosen.names.in_world(world))
     places = datasets_in(datasets)
     with ExitStack() as stack:
         opened = [

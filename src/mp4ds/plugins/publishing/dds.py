@@ -353,7 +353,7 @@ class DdsPublisher:
         parting_s: float = PARTING_S,
     ) -> None:
         self._domain = domain_id(domain)
-        self._node = "/".join(filter(None, (names.namespace.strip("/"), names.node or node)))
+        self._node = names.of_node(node)
         self._clock_topic = names.renamed(CLOCK)
         self._parting_s = parting_s
         self._types: World = ros2_world(_DISTRIBUTION)

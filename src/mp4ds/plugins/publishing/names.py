@@ -2,29 +2,36 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 from mp4ds.errors import OptionError
 
 _NODE = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _NAMESPACE = re.compile(r"/?(?:[A-Za-z_]\w*/?)*", re.ASCII)
 _RULE = re.compile(r"(?:[A-Za-z_]\w*:(?!=))?([^:=\s]+):=(\S+)")
+_OTHER = re.compile(r"_(?!_(?:node|name|ns):=).*:=.*", re.DOTALL)
+"""Read by ROS itself, such as ``__log:=``, or a private parameter."""
+
 _BARE = re.compile(r"[~/A-Za-z_][\w/~]*:=.*", re.ASCII)
 _VALUED = {
     "-r": "remap",
     "--remap": "remap",
     "--log-level": "log_level",
-    "-p": "",
-    "--param": "",
-    "--params-file": "",
+    "-p": "parameter",
+    "--param": "parameter",
+    "--params-file": "file",
     "--log-config-file": "",
     "-e": "",
     "--enclave": "",
 }
 """Arguments of ROS 2 that take a value -> what it is for; empty for what has no meaning here."""
 
+_SIM_TIME = "use_sim_time"
 _FLAG = re.compile(r"--(?:enable|disable)-[\w-]+-logs")
 _LEVELS = ("debug", "info", "warn", "error", "fatal")
 
@@ -38,19 +45,31 @@ class NodeNames:
         namespace: Where it is, such as ``/robot``; empty for the root.
         rules: New names of topics, by the names that the node gives them.
         log_level: How much it is to say, as ROS 2 calls it; empty where that is not told.
+        use_sim_time: The parameter of this name; None where that is not told.
     """
 
     node: str = ""
     namespace: str = ""
     rules: tuple[tuple[str, str], ...] = ()
     log_level: str = ""
+    use_sim_time: bool | None = None
+
+    def in_world(self, world: str | None) -> NodeNames:
+        """The same in ROS 1, where the environment may tell the namespace, or in ROS 2."""
+        told = os.environ.get("ROS_NAMESPACE", "") if world == "ros1" else ""
+        return replace(self, namespace=told) if told and not self.namespace else self
+
+    def of_node(self, node: str) -> str:
+        """The node's name below the root, such as ``robot/player``, if it is `node` by itself."""
+        return "/".join(filter(None, (self.namespace.strip("/"), self.node or node)))
 
     def renamed(self, topic: str) -> str:
         """The name of a topic by the rules; itself where none is about it."""
-        found = {self._resolved(old): new for old, new in self.rules}.get(self._resolved(topic))
-        return topic if found is None else self._resolved(found)
+        found = {self.resolved(old): new for old, new in self.rules}.get(self.resolved(topic))
+        return topic if found is None else self.resolved(found)
 
-    def _resolved(self, name: str) -> str:
+    def resolved(self, name: str) -> str:
+        """A name from the root on, such as ``/robot/imu``."""
         root = "/" + self.namespace.strip("/")
         if name.startswith("/"):
             return name
@@ -69,8 +88,8 @@ def node_arguments(
     """Take the arguments of ROS out of a command line.
 
     Those of ROS 2 stand between ``--ros-args`` and ``--`` or the end; those of ROS 1 anywhere:
-    ``__name:=x``, ``__ns:=/y``, ``_parameter:=1``, ``/topic:=/other``. Parameters are left out,
-    for a command has none.
+    ``__name:=x``, ``__ns:=/y``, ``_parameter:=1``, ``/topic:=/other``. Parameters other than
+    ``use_sim_time`` are left out, for a command has none.
 
     Args:
         words: The command line.
@@ -84,22 +103,25 @@ def node_arguments(
     """
     rest: list[str] = []
     names = NodeNames()
+    parameters: list[tuple[str, str]] = []
     left = iter(words)
     is_own = False
     for word in left:
         if word == "--ros-args":
-            names = _ros2(left, names)
+            names = _ros2(left, names, parameters)
         elif word == "--":
-            return [*rest, word, *left], names
+            rest += [word, *left]
         elif _BARE.fullmatch(word) and not is_own:
             names = _told(names, word)
         else:
             is_own = word in rules_of or (is_own and ":=" in word)
             rest.append(word)
+    for kind, value in parameters:  # of files, those that are for this name
+        names = _with_file(names, Path(value)) if kind == "file" else _with(names, value)
     return rest, names
 
 
-def _ros2(words: Iterator[str], names: NodeNames) -> NodeNames:
+def _ros2(words: Iterator[str], names: NodeNames, parameters: list[tuple[str, str]]) -> NodeNames:
     for word in words:
         name, has_value, value = word.partition("=")
         if word == "--":
@@ -115,10 +137,50 @@ def _ros2(words: Iterator[str], names: NodeNames) -> NodeNames:
             names = _told(names, value)
         elif _VALUED[name] == "log_level":
             names = replace(names, log_level=value if value in _LEVELS else "")
+        elif _VALUED[name]:
+            parameters.append((_VALUED[name], value))
     return names
 
 
+def _with(names: NodeNames, parameter: str) -> NodeNames:
+    """With a parameter, as ``name:=value``."""
+    name, is_told, value = parameter.partition(":=")
+    if not is_told:
+        raise OptionError(f"{parameter!r} is no parameter of ROS: write it as name:=value.")
+    if name.rpartition(":")[2] != _SIM_TIME:
+        return names
+    return replace(names, use_sim_time=_truth(value, "--ros-args"))
+
+
+def _with_file(names: NodeNames, path: Path) -> NodeNames:
+    """With the parameters of a file that are for this node."""
+    from mp4ds.plugins.publishing.ros2_writers import load_map  # which imports this module
+
+    own = names.of_node("")
+    for node, parameters in _nodes(load_map(path, "nodes to parameters"), ""):
+        if node in ("**", own) and _SIM_TIME in parameters:
+            names = replace(names, use_sim_time=_truth(parameters[_SIM_TIME], str(path)))
+    return names
+
+
+def _nodes(found: Mapping[Any, Any], place: str) -> Iterator[tuple[str, Mapping[Any, Any]]]:
+    for key, value in found.items():
+        if isinstance(value, dict) and key == "ros__parameters":
+            yield place, value
+        elif isinstance(value, dict):
+            yield from _nodes(value, f"{place}/{key}".replace("//", "/").strip("/"))
+
+
+def _truth(value: Any, place: str) -> bool:
+    known = {"true": True, "false": False}
+    if str(value).lower() in known:
+        return known[str(value).lower()]
+    raise OptionError(f"{place}: {_SIM_TIME} is true or false, and not {value!r}.")
+
+
 def _told(names: NodeNames, rule: str) -> NodeNames:
+    if _OTHER.fullmatch(rule):
+        return names
     match = _RULE.fullmatch(rule)
     if not match:
         raise OptionError(f"{rule!r} is no rule of ROS: write it as /old/topic:=/new/topic.")
@@ -131,6 +193,4 @@ def _told(names: NodeNames, rule: str) -> NodeNames:
         if not _NAMESPACE.fullmatch(new):
             raise OptionError(f"{rule!r}: {new!r} is no namespace, such as /robot.")
         return replace(names, namespace=new)
-    if old.startswith("_"):  # __log, __master and the like are read by ROS itself; parameters
-        return names
     return replace(names, rules=(*names.rules, (old, new)))

@@ -276,12 +276,26 @@ def load_overrides(path: Path) -> dict[str, Qos]:
     Raises:
         OptionError: It cannot be read, or holds something else; names the key.
     """
+    document = load_map(path, "topics to QoS profiles")
+    return {_topic(path, topic): _override(path, topic, value) for topic, value in document.items()}
+
+
+def load_map(path: Path, of: str) -> dict[Any, Any]:
+    """Read a small YAML file of the user's.
+
+    Args:
+        path: The file; an empty one is an empty map.
+        of: What it maps to what.
+
+    Raises:
+        OptionError: It cannot be read, or is no map.
+    """
     try:
         data = path.read_bytes()
     except OSError as error:
         raise OptionError(f"{path}: cannot be read: {error.strerror}.") from None
     if len(data) > _MAX_BYTES:
-        raise OptionError(f"{path}: is larger than {_MAX_BYTES} bytes, too large for QoS profiles.")
+        raise OptionError(f"{path}: is larger than {_MAX_BYTES} bytes, too large for {of}.")
     try:
         document = yaml.load(data.decode(), Loader=_Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -290,8 +304,8 @@ def load_overrides(path: Path) -> dict[str, Qos]:
     if document is None:
         return {}
     if not isinstance(document, dict):
-        raise OptionError(f"{path}: is no map of topics to QoS profiles.")
-    return {_topic(path, topic): _override(path, topic, value) for topic, value in document.items()}
+        raise OptionError(f"{path}: is no map of {of}.")
+    return document
 
 
 def _topic(path: Path, topic: Any) -> str:

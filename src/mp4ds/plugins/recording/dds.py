@@ -50,6 +50,7 @@ _CLOCK = "/clock"
 class _Topic:
     """A topic that somebody publishes, and which is wanted."""
 
+    recorded: str  # its name in the recording
     since: float
     is_wanted: bool
     endpoints: dict[Any, Any] = field(default_factory=dict)
@@ -73,6 +74,7 @@ class DdsSource:
     def __init__(self, options: SourceOptions) -> None:
         self.state = SourceState()
         self._options = options
+        self._clock = options.names.renamed(_CLOCK)
         overrides = options.qos_overrides
         self._overrides = load_overrides(overrides) if overrides is not None else {}
         domain = domain_id(None)
@@ -101,7 +103,7 @@ class DdsSource:
         self._services = serve(
             self._participant,
             self._listener,
-            self._options.node,
+            self._options.names.of_node(self._options.node),
             RECORDER_SERVICES,
             controls,
             world,
@@ -120,7 +122,7 @@ class DdsSource:
             for name, topic in self._topics.items():
                 if topic.reader is None and time.monotonic() - topic.since > _SETTLE_S:
                     self._subscribe(name, topic, take)
-                self._count_lost(name, topic)
+                self._count_lost(topic)
             if poll_s is None and time.monotonic() > deadline:
                 return
 
@@ -131,8 +133,9 @@ class DdsSource:
         if is_bare or not ros_type(endpoint.type_name):
             return
         is_wanted = wanted(topic) and (self._options.hidden or not is_hidden(topic))
-        if is_wanted or (topic == _CLOCK and self._sim_time_ns is not None):
-            known = self._topics.setdefault(topic, _Topic(time.monotonic(), is_wanted))
+        if is_wanted or (topic == self._clock and self._sim_time_ns is not None):
+            met = _Topic(wanted.recorded_as(topic), time.monotonic(), is_wanted)
+            known = self._topics.setdefault(topic, met)
             known.endpoints[endpoint.key] = endpoint
 
     def _subscribe(self, name: str, topic: _Topic, take: Callable[[Message], None]) -> None:
@@ -149,7 +152,7 @@ class DdsSource:
         definition = definition or announced_definition(kind, type_hash)
         if not definition:
             self.state.warnings[f"{name}: the definition of {type_name} is not known here"] = None
-        channel = channel_of(self._count, name, type_name, definition, type_hash, offered)
+        channel = channel_of(self._count, topic.recorded, type_name, definition, type_hash, offered)
         self._count += 1
         qos = self._overrides.get(name, asked_qos(offered, _DEPTH))
         try:
@@ -161,10 +164,10 @@ class DdsSource:
             topic.reader = False
             self.state.warnings[f"{name}: cannot be received: {error.msg}"] = None
             return
-        if name == _CLOCK and self._sim_time_ns is not None:
+        if name == self._clock and self._sim_time_ns is not None:
             self._listener.hear(topic.reader, self._tick)
         if topic.is_wanted:
-            self.state.topics[name] = None
+            self.state.topics[topic.recorded] = None
             self._listener.hear(topic.reader, partial(self._received, channel, take))
 
     def _tick(self, sample: Any) -> None:
@@ -176,11 +179,11 @@ class DdsSource:
         now = time.time_ns() if self._sim_time_ns is None else self._sim_time_ns
         take(Message(channel, now, sent if sent > 0 else now, 0, data))
 
-    def _count_lost(self, name: str, topic: _Topic) -> None:
+    def _count_lost(self, topic: _Topic) -> None:
         if topic.reader:
             status = topic.reader.get_sample_lost_status()
             if status.total_count:
-                self.state.lost[name] = status.total_count
+                self.state.lost[topic.recorded] = status.total_count
 
     def close(self) -> None:
         """See `Source.close`."""

@@ -17,7 +17,7 @@ from mp4ds.errors import Mp4dsError, OptionError, RecordError, TargetExistsError
 from mp4ds.files.outputs import check_target, move_into_place, sync, work_folder
 from mp4ds.format.manifest import About
 from mp4ds.format.sidecars import load_about
-from mp4ds.options import Options, exclude, force, option, parse_size
+from mp4ds.options import Options, argument, exclude, force, option, parse_size
 from mp4ds.packing.journal import JOURNAL_NAME, Journal, is_unfinished
 from mp4ds.packing.live import Intake, LivePacker, LiveRecording
 from mp4ds.packing.manifest import (
@@ -35,6 +35,7 @@ from mp4ds.packing.recovery import recover
 from mp4ds.packing.tracks import StreamSettings
 from mp4ds.plan import LOSSLESS, MAX_GOP, Selection, parse_quality
 from mp4ds.plugins.playing.timeline import quick_switches
+from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import sourced
 from mp4ds.plugins.recording.source import Source, SourceOptions, Wanted, open_source
 from mp4ds.records import Message
@@ -108,6 +109,7 @@ class RecordOptions(Options):
         "YAML with title, description, authors, license, doi, links or keywords.", metavar="FILE"
     )
     force: bool = force()
+    names: NodeNames = argument("What ROS calls the node and its topics.", PLAIN)
 
 
 @dataclass(frozen=True)
@@ -225,24 +227,27 @@ def open_recorder(
     chosen = options or RecordOptions()
     if not (topics or chosen.all or chosen.regex):
         raise OptionError("Name topics, or give `all` or `regex`.")
+    kind = source.profile if source else chosen.to or sourced()
+    names = chosen.names.in_world(kind)
     wanted = Wanted(
         () if chosen.all else topics,
         regex="" if chosen.all else chosen.regex,
         exclude=chosen.exclude,
         exclude_regex=chosen.exclude_regex,
+        names=names,
     )
     settings = _settings(chosen)
     about = load_about(chosen.about) if chosen.about is not None else None
     if source is None:
-        kind = chosen.to or sourced()
         source = open_source(
             kind,
             SourceOptions(
                 chosen.node or _NODES[kind],
-                use_sim_time=chosen.use_sim_time,
+                use_sim_time=chosen.use_sim_time or bool(names.use_sim_time),
                 poll_s=chosen.polling_interval / 1000 if chosen.discover else None,
                 hidden=chosen.hidden,
                 qos_overrides=chosen.qos_overrides,
+                names=names,
             ),
         )
     with ExitStack() as stack:
@@ -318,6 +323,11 @@ class Recorder:
     def received(self) -> int:
         """Messages that came so far."""
         return sum(self._intake.received.values())
+
+    @property
+    def unfinished(self) -> list[Path]:
+        """Folders of which no dataset was made yet."""
+        return [split.folder for split in self._splits if split.folder.is_dir()]
 
     # ------------------------------------------------------------ controls
 

@@ -46,7 +46,7 @@ class RospySource:
     def __init__(self, options: SourceOptions) -> None:
         self.state = SourceState()
         self._options = options
-        self._rospy, self.address = start_node(options.node)
+        self._rospy, self.address = start_node(options.node, options.names)
         self._subscribers: dict[str, Any] = {}
         self._channels: dict[tuple[str, tuple[tuple[str, str], ...]], Channel] = {}
         self._lock = threading.Lock()
@@ -58,7 +58,7 @@ class RospySource:
         """See `Source.start`."""
         if self._options.use_sim_time or self._follows_clock():
             self._sim_time_ns = 0
-            self._subscribe(_CLOCK, self._tick)
+            self._subscribe(self._options.names.renamed(_CLOCK), self._tick)
         if not self._look(wanted, take):
             raise PublishError(self.address, "the ROS master does not answer any more")
         if self._options.poll_s is not None:
@@ -89,9 +89,9 @@ class RospySource:
         for topic, _ in found or ():
             if topic not in self._subscribers and wanted(topic):
                 self._subscribers[topic] = self._subscribe(
-                    topic, partial(self._received, topic, take)
+                    topic, partial(self._received, wanted.recorded_as(topic), take)
                 )
-                self.state.topics[topic] = None
+                self.state.topics[wanted.recorded_as(topic)] = None
         return found is not None
 
     def _subscribe(self, topic: str, receive: Callable[[Any], None]) -> Any:

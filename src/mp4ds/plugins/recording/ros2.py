@@ -62,7 +62,10 @@ class RclpySource:
         self._overrides = load_overrides(overrides) if overrides is not None else {}
         self._context = Context()
         rclpy.init(args=[], context=self._context)
-        self._node = rclpy.create_node(options.node, context=self._context)
+        names = options.names
+        self._node = rclpy.create_node(
+            names.node or options.node, context=self._context, namespace=names.namespace or None
+        )
         self.address = f"ROS 2, by rclpy as {self._node.get_name()}"
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
@@ -75,9 +78,9 @@ class RclpySource:
         """See `Source.start`."""
         if self._options.use_sim_time:
             self._sim_time_ns = 0
-            kind = message_class(CLOCK, CLOCK_TYPE)
+            clock, kind = self._options.names.renamed(CLOCK), message_class(CLOCK, CLOCK_TYPE)
             self._node.create_subscription(
-                kind, CLOCK, self._tick, qos_profile(CLOCK_QOS), raw=True
+                kind, clock, self._tick, qos_profile(CLOCK_QOS), raw=True
             )
         self._look(wanted, take)
         self._thread = threading.Thread(
@@ -117,10 +120,17 @@ class RclpySource:
                 self._subscriptions[topic] = None
                 self.state.warnings[f"{topic}: has several types, {', '.join(kinds)}"] = None
                 continue
-            self._subscriptions[topic] = self._subscribe(topic, kinds[0], publishers, take)
+            self._subscriptions[topic] = self._subscribe(
+                topic, wanted.recorded_as(topic), kinds[0], publishers, take
+            )
 
     def _subscribe(
-        self, topic: str, type_name: str, publishers: Sequence[Any], take: Callable[[Message], None]
+        self,
+        topic: str,
+        name: str,
+        type_name: str,
+        publishers: Sequence[Any],
+        take: Callable[[Message], None],
     ) -> Any:
         try:
             kind = message_class(topic, type_name)
@@ -135,10 +145,10 @@ class RclpySource:
         if not definition:
             self.state.warnings[f"{topic}: the definition of {type_name} is not known here"] = None
         channel = channel_of(
-            len(self._subscriptions), topic, type_name, definition, type_hash, offered
+            len(self._subscriptions), name, type_name, definition, type_hash, offered
         )
         qos = self._overrides.get(topic, asked_qos(offered, _DEPTH))
-        self.state.topics[topic] = None
+        self.state.topics[name] = None
         return self._node.create_subscription(
             kind, topic, partial(self._received, channel, take), qos_profile(qos), raw=True
         )

@@ -14,6 +14,7 @@ from typing import Protocol
 from mp4ds.bags.protocols import Format
 from mp4ds.errors import OptionError
 from mp4ds.plan import Selection
+from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.records import Message
 
 
@@ -26,9 +27,11 @@ class Wanted:
             tell are wanted.
         exclude: Names, or globs, that are not wanted in any case.
         exclude_regex: A pattern that no wanted topic's name has.
+        names: Namespace of the node, and rules for those of `topics`: as `rosbag record` does, the
+            recorder subscribes to a topic by its new name, and records it by the one given here.
 
     Raises:
-        OptionError: A pattern is not valid.
+        OptionError: A pattern is not valid, or the rules make one topic of two.
     """
 
     def __init__(
@@ -38,9 +41,19 @@ class Wanted:
         regex: str = "",
         exclude: Sequence[str] = (),
         exclude_regex: str = "",
+        names: NodeNames = PLAIN,
     ) -> None:
-        self._named = Selection([_rooted(topic) for topic in topics]) if topics else None
-        self._exclude = Selection([_rooted(topic) for topic in exclude]) if exclude else None
+        self._recorded: dict[str, str] = {}
+        for topic in topics:
+            asked = names.resolved(topic.strip())
+            first = self._recorded.setdefault(names.renamed(asked), asked)
+            if first != asked:
+                raise OptionError(
+                    f"{first} and {asked} are one topic by the rules of ROS: name one."
+                )
+        self._named = Selection([*self._recorded]) if topics else None
+        left_out = [names.resolved(topic.strip()) for topic in exclude]
+        self._exclude = Selection(left_out) if exclude else None
         self._regex = _compiled("regex", regex)
         self._exclude_regex = _compiled("exclude_regex", exclude_regex)
 
@@ -55,9 +68,9 @@ class Wanted:
         is_named = self._named is not None and self._named(topic)
         return is_named or bool(self._regex and self._regex.search(topic))
 
-
-def _rooted(topic: str) -> str:
-    return "/" + topic.strip().lstrip("/")
+    def recorded_as(self, topic: str) -> str:
+        """The name that a topic has in the recording."""
+        return self._recorded.get(topic, topic)
 
 
 def _compiled(option: str, pattern: str) -> re.Pattern[str] | None:
@@ -154,6 +167,7 @@ class SourceOptions:
         poll_s: Seconds between looks for new topics; None for one look only.
         hidden: Whether topics are taken of which a part begins with an underscore.
         qos_overrides: YAML of QoS by topic.
+        names: What ROS calls the node, where it is not `node`, and /clock.
     """
 
     node: str
@@ -161,6 +175,7 @@ class SourceOptions:
     poll_s: float | None = 0.1
     hidden: bool = False
     qos_overrides: Path | None = None
+    names: NodeNames = PLAIN
 
 
 _SOURCES: Mapping[str, str] = {

@@ -1,0 +1,17 @@
+"""Puts files where ROS 2 looks for them. The distribution has another name than mp4ds's own."""
+
+from xml.etree import ElementTree
+
+from setuptools import setup
+
+setup(
+    name="mp4ds-ros",
+    version=ElementTree.parse("package.xml").findtext("version"),
+    packages=[],
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/mp4ds"]),
+        ("share/mp4ds", ["package.xml"]),
+        ("share/mp4ds/launch", ["launch/play.launch.xml", "launch/record.launch.xml"]),
+        ("lib/mp4ds", ["scripts/play", "scripts/record"]),
+    ],
+)

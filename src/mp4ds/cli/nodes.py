@@ -1,0 +1,59 @@
+"""Commands that run as nodes of ROS, and take what launch files and users tell a node."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+from mp4ds.cli.options import Command
+from mp4ds.cli.output import be_quiet
+from mp4ds.cli.process import DEBUG, told_errors
+from mp4ds.errors import OptionError
+from mp4ds.plugins.publishing.names import PLAIN, NodeNames, node_arguments
+
+_NAMES = "mp4ds.names"  # what ROS told, in click's context
+_QUIET = {"error", "fatal"}
+
+
+class NodeCommand(Command):
+    """A command that is a node: ``__name:=x``, ``--ros-args`` and the like are not options."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse what is left of the arguments without those of ROS."""
+        with told_errors("--json" in args):
+            words, ctx.meta[_NAMES] = self.spelled(ctx, args)
+        parsed: list[str] = super().parse_args(ctx, words)
+        return parsed
+
+    def spelled(self, ctx: Any, args: Sequence[str]) -> tuple[list[str], NodeNames]:
+        """The arguments as the command has them, and what ROS tells the node.
+
+        Raises:
+            OptionError: An argument of ROS makes no sense.
+        """
+        del ctx
+        return node_arguments(args, rules_of=())
+
+
+def names_in(ctx: Any) -> NodeNames:
+    """What ROS told a command."""
+    names: NodeNames = ctx.meta.get(_NAMES, PLAIN)
+    return names
+
+
+def say_as_much(level: str) -> None:
+    """Tell as much as was asked for, in the words of ROS 2; empty for as much as ever.
+
+    Raises:
+        OptionError: There is no such level.
+    """
+    if level not in ("", "debug", "info", "warn", *_QUIET):
+        raise OptionError(f"`log_level` {level!r} is not debug, info, warn, error or fatal.")
+    if level == "debug":
+        os.environ[DEBUG] = "1"
+    if level in ("warn", *_QUIET):
+        be_quiet()
+    if level in _QUIET:
+        warnings.simplefilter("ignore")

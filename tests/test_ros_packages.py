@@ -1,0 +1,285 @@
+"""The packages of ros/: they are where ROS looks for them, and their launch files start nodes."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+import typer
+
+import mp4ds
+from each import each
+from mp4ds.cli import app_for
+from mp4ds.packing.journal import JOURNAL_NAME
+from mp4ds.plugins.recording.record import UNFINISHED
+from player_scenes import make_drive
+from roscore import RECORD, Core, python, wait_until
+from roscore import _core as _core
+from roscore import roscore as roscore
+from test_examples import ROOT
+from test_record_ros1 import contents
+from waiting import WATCHDOG_S
+
+ROS1, ROS2 = ROOT / "ros" / "ros1", ROOT / "ros" / "ros2"
+LAUNCHED = {
+    "ros1 play": ROS1 / "launch" / "play.launch",
+    "ros1 record": ROS1 / "launch" / "record.launch",
+    "ros2 play": ROS2 / "launch" / "play.launch.xml",
+    "ros2 record": ROS2 / "launch" / "record.launch.xml",
+}
+
+
+def done(command: Sequence[str], **options: Any) -> str:
+    result = subprocess.run(command, capture_output=True, text=True, check=False, **options)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
+# ---------------------------------------------------------------- what the files say
+
+
+@each("package", [ROS1, ROS2], ids=lambda path: path.name)
+def test_versions(package: Path) -> None:
+    found = ElementTree.parse(package / "package.xml")
+    assert found.findtext("version") == mp4ds.__version__
+    assert found.findtext("name") == "mp4ds"
+
+
+@each("kind", LAUNCHED)
+def test_the_page_has_every_argument(kind: str) -> None:
+    page = (ROOT / "docs" / "ros.md").read_text()
+    ros, command = kind.split()
+    table = page[page.index(f"`{command}.launch`\n") :].partition("\n##")[0]
+    rows = re.findall(r"^\| `(\w+)` \|([^|]*)\|([^|]*)\|", table, re.M)
+    told = {
+        name: default.strip().strip("`")
+        for name, default, text in rows
+        if ros == "ros2" or "(ROS 2" not in text
+    }
+    assert told == {
+        one.attrib["name"]: one.attrib.get("default", "required")
+        for one in ElementTree.parse(LAUNCHED[kind]).getroot().findall("arg")
+    }
+
+
+def substituted(text: str, values: dict[str, str]) -> str:
+    return re.sub(r"\$\(var (\w+)\)", lambda match: values[match[1]], text)
+
+
+@each("command", ["play", "record"])
+def test_launch_files_of_ros2(command: str, tmp_path: Path) -> None:
+    """With every condition met, their words are options of the command."""
+    root = ElementTree.parse(LAUNCHED[f"ros2 {command}"]).getroot()
+    values = {one.attrib["name"]: one.attrib.get("default", "drive") for one in root.iter("arg")}
+    values |= {"topics": "/camera/* /tf", "output": "live"}
+    values["options"] = "--force -x /a*" if command == "record" else ""
+    for let in root.iter("let"):
+        values[let.attrib["name"]] = substituted(let.attrib["value"], values)
+        assert {*let.attrib} <= {"name", "value", "if", "unless"}
+    (node,) = root.iter("node")
+    assert node.attrib["pkg"] == "mp4ds"
+    program = ROS2 / "scripts" / node.attrib["exec"]
+    assert os.access(program, os.X_OK)
+    words = substituted(node.attrib["args"], values).split()
+    environment = {
+        one.attrib["name"]: substituted(one.attrib["value"], values) for one in node.findall("env")
+    }
+    (tmp_path / "python3").write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
+    (tmp_path / "python3").chmod(0o755)
+    (tmp_path / "camera").mkdir()  # no file is taken for a topic
+    told = done(
+        [str(program), *words, "--ros-args", "-r", "__node:=x", "-p", "use_sim_time:=true"],
+        env={"PATH": f"{tmp_path}:/usr/bin:/bin", **environment},
+        cwd=tmp_path,
+    ).splitlines()
+    assert told[:4] == ["-m", "mp4ds", command, "--ros2"]
+    made: Any = typer.main.get_command(app_for(command))
+    context = made.commands[command].make_context(command, told[3:])
+    assert context.params["ros2"]
+    if command == "play":
+        assert context.params["datasets"] == ["drive"]
+        assert context.params["loop"]
+        assert context.params["clock"]
+        assert context.params["paused"]
+        assert context.params["topics"] == ["/camera/*", "/tf"]
+    else:
+        assert context.params["topics"] == ["/camera/*", "/tf"]
+        assert context.params["exclude"] == ["/a*"]
+        assert context.params["output"] == "live"
+
+
+def test_ros2_finds_it(tmp_path: Path) -> None:
+    """As colcon installs it: with setuptools, under a prefix."""
+    pytest.importorskip("setuptools")
+    shutil.copytree(ROS2, tmp_path / "source")
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps"]
+    command += ["--no-build-isolation", "--ignore-installed", "--prefix", str(tmp_path / "prefix")]
+    done([*command, str(tmp_path / "source")])
+    prefix = tmp_path / "prefix"
+    index = prefix / "share" / "ament_index" / "resource_index" / "packages" / "mp4ds"
+    assert index.exists()
+    share = prefix / "share" / "mp4ds"
+    assert (share / "package.xml").read_bytes() == (ROS2 / "package.xml").read_bytes()
+    for name in ("play", "record"):
+        assert (share / "launch" / f"{name}.launch.xml").exists()
+        assert os.access(prefix / "lib" / "mp4ds" / name, os.X_OK)
+    (metadata,) = prefix.rglob("METADATA")
+    text = metadata.read_text()
+    # mp4ds itself stays what Python finds by its name
+    assert f"Name: mp4ds-ros\nVersion: {mp4ds.__version__}\n" in text
+
+
+# ---------------------------------------------------------------- ROS 1
+
+
+class Workspace:
+    """A workspace of catkin in which the package is installed.
+
+    Args:
+        folder: Where to make it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        shutil.copytree(ROS1, folder / "src" / "mp4ds")
+        environment = {"PATH": "/usr/bin:/bin", "HOME": str(folder)}
+        done(["/usr/bin/catkin_make", "install"], cwd=folder, env=environment)
+        # the Python of the tests, with ROS's packages behind its own
+        interpreter, option, program = python()
+        (folder / "program.py").write_text(program)
+        (folder / "bin").mkdir()
+        shim = folder / "bin" / "python3"
+        shim.write_text(
+            f'#!/bin/sh\nshift\nexec {interpreter} {option} "$(cat {folder}/program.py)" "$@"\n'
+        )
+        shim.chmod(0o755)
+
+    def command(self, place: Path, *words: str) -> list[str]:
+        """A command as typed in a folder, with the workspace sourced."""
+        program = 'cd "$1" && . "$0/install/setup.sh" && shift && PATH="$0/bin:$PATH" exec "$@"'
+        return ["sh", "-c", program, str(self.folder), str(place), *words]
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    for program in ("roslaunch", "rosrun", "catkin_make", "make"):
+        if not Path("/usr/bin", program).exists():
+            pytest.skip(f"ROS 1 is not installed: no /usr/bin/{program}")
+    return Workspace(tmp_path_factory.mktemp("catkin"))
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    """Twenty images and other topics, packed; the bag lies beside it."""
+    mp4ds.pack(make_drive(tmp_path / "a drive.bag"), tmp_path / "a drive")
+    return tmp_path / "a drive"
+
+
+IMAGES = "/camera/image_raw"
+
+
+def payloads(recording: Path) -> dict[str, list[bytes]]:
+    return {topic: found for (topic, *_), found in contents(recording).items()}
+
+
+def noted(folder: Path) -> int:
+    """Images that a recorder has taken."""
+    journal = folder.with_name(folder.name + UNFINISHED) / JOURNAL_NAME
+    return len(re.findall(r'^\w+ \["(?:frame|verbatim)"', journal.read_text(), re.M))
+
+
+def test_roslaunch(roscore: Core, workspace: Workspace, drive: Path, tmp_path: Path) -> None:
+    """One launch file records what another one plays, until Ctrl-C; paths are of the shell."""
+    start = workspace.command(tmp_path, "roslaunch", "mp4ds", "record.launch")
+    recorder = roscore.start(*start, "output:=a live one", "topics:=/camera/* /tf", "name:=bag")
+    try:
+        wait_until(lambda: "/bag" in roscore.nodes())
+        start = workspace.command(tmp_path, "roslaunch", "mp4ds", "play.launch")
+        start += ["dataset:=a drive", "clock:=true", f"topics:={IMAGES} /tf", "rate:=2"]
+        code, output, errors = roscore.run(*start, "options:=--wait-for-subscribers")
+        assert code == 0, errors
+        assert "has died" not in output + errors
+        assert roscore.run("rosparam", "get", "/use_sim_time")[1].strip() == "true"
+        wait_until(lambda: noted(tmp_path / "a live one") == 20)
+    finally:
+        recorder.send_signal(signal.SIGINT)
+        code = recorder.wait(WATCHDOG_S)
+        roscore.run("rosparam", "delete", "/use_sim_time")
+    log = (roscore.folder / "sh.log").read_text()
+    assert code == 0, log
+    assert "has died" not in log
+    assert "escalating" not in log
+    assert not [*tmp_path.glob(f"*{UNFINISHED}")]
+    assert mp4ds.validate(tmp_path / "a live one", deep=True) == []
+    mp4ds.unpack(tmp_path / "a live one", None, tmp_path / "again.bag")
+    found, due = payloads(tmp_path / "again.bag"), payloads(tmp_path / "a drive.bag")
+    assert {*found} == {IMAGES, "/tf"}
+    assert found[IMAGES] == due[IMAGES]
+    assert found["/tf"] == due["/tf"][: len(found["/tf"])]
+
+
+NAMES = ("/renamed:=/camera/image_raw", "__ns:=/camera", "__log:=/tmp/a log")
+
+
+def test_rosrun_renames_topics(
+    roscore: Core, workspace: Workspace, drive: Path, tmp_path: Path
+) -> None:
+    """As `rosrun rosbag record` does; names from the root on, where that keeps relative ones."""
+    ours = workspace.command(tmp_path, "rosrun", "mp4ds", "record", "-o", "live")
+    words = ("/renamed", "/tf", "/tf:=/none", *NAMES)
+    theirs = [RECORD, "-O", str(tmp_path / "theirs.bag"), *words]
+    started = [roscore.start(*command) for command in ([*ours, *words, "__name:=ours"], theirs)]
+    play = workspace.command(tmp_path, "rosrun", "mp4ds", "play", "-q", "--pause", "--topics")
+    try:
+        started.append(roscore.start(*play, IMAGES, str(drive), "__name:=player"))
+        wait_until(
+            lambda: roscore.run("rosnode", "info", "/player")[1].count("* to: /camera/") == 2
+        )
+        pause = ("rosservice", "call", "/player/pause_playback")
+        assert roscore.run(*pause, "false")[0] == 0
+        started[-1].wait(WATCHDOG_S)
+        wait_until(lambda: noted(tmp_path / "live") == 20)
+    finally:
+        for process in started:
+            process.send_signal(signal.SIGINT)  # which nobody gets where it has ended
+        codes = [process.wait(WATCHDOG_S) for process in started]
+    assert codes == [0, 0, 0], (roscore.folder / "sh.log").read_text()
+    mp4ds.unpack(tmp_path / "live", None, tmp_path / "again.bag")
+    found, due = payloads(tmp_path / "again.bag"), payloads(tmp_path / "theirs.bag")
+    assert found == due
+    assert {*found} == {"/renamed"}
+
+
+def test_a_namespace_of_roslaunch(
+    roscore: Core, workspace: Workspace, drive: Path, tmp_path: Path
+) -> None:
+    """Which it tells by the environment."""
+    (tmp_path / "robot.launch").write_text(
+        '<launch><group ns="robot"><remap from="front" to="/camera/image_raw"/>'
+        '<include file="$(find mp4ds)/launch/record.launch">'
+        '<arg name="topics" value="front"/><arg name="output" value="live"/>'
+        "</include></group></launch>"
+    )
+    start = workspace.command(tmp_path, "roslaunch", str(tmp_path / "robot.launch"))
+    recorder = roscore.start(*start)
+    try:
+        wait_until(lambda: "/robot/recorder" in roscore.nodes())
+        play = workspace.command(tmp_path, "rosrun", "mp4ds", "play", str(drive))
+        options = ("--topics", IMAGES, "--wait-for-subscribers")
+        code, _, errors = roscore.run(*play, *options)
+        assert code == 0, errors
+        wait_until(lambda: noted(tmp_path / "live") == 20)
+    finally:
+        recorder.send_signal(signal.SIGINT)
+        assert recorder.wait(WATCHDOG_S) == 0
+    with mp4ds.open(tmp_path / "live") as dataset:
+        assert {channel.topic for channel in dataset.channels} == {"/robot/front"}
