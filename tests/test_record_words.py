@@ -55,7 +55,7 @@ def test_the_page_lists_the_options_of_both_recorders() -> None:
     """Those of rosbag record as it tells them, those of rosbag2 by name."""
     table = (ROOT / "docs/recording.md").read_text().partition("## Options")[2]
     listed = set(re.findall(r"(?<![\w-])--?[a-zA-Z][\w-]*", table))
-    assert known_words() - {"--ros-args", "--size"} <= listed | {"--compression-mode"}
+    assert known_words() - {"--ros-args", "-r", "--size"} <= listed | {"--compression-mode"}
     rosbag2 = {
         *("--all", "--topics", "--regex", "--exclude-regex", "--exclude-topics", "--output"),
         *("--storage", "--max-bag-size", "--max-bag-duration", "--max-cache-size"),

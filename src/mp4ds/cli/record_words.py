@@ -39,6 +39,7 @@ def known_words() -> Collection[str]:
         "--split",
         "--size",
         "--ros-args",
+        "-r",
     }
 
 
