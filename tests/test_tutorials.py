@@ -26,7 +26,7 @@ import pytest
 import typer
 
 from each import each
-from mp4ds.cli import app_for
+from mp4ds.cli import app_for, play_words, record_words
 from test_examples import ROOT
 from waiting import WATCHDOG_S
 
@@ -163,6 +163,9 @@ def test_there_are_tutorials_and_they_run_something() -> None:
 # ---------------------------------------------------------------- options that pages name
 
 
+WORDS = {"play": play_words.known_words, "record": record_words.known_words}
+
+
 @cache
 def options_of(command: str) -> set[str]:
     group = typer.main.get_command(app_for())
@@ -171,7 +174,8 @@ def options_of(command: str) -> set[str]:
     below = getattr(known, "commands", {}).values()
     params = [option for each in (known, *below) for option in each.params]
     names = {name for option in params for name in (*option.opts, *option.secondary_opts)}
-    return {name for name in names if name.startswith("-")} | {"--help", "-h"}
+    words = WORDS.get(command, lambda: ())()  # of nodes, as users of ROS type them
+    return {name for name in names if name.startswith("-")} | {"--help", "-h", *words}
 
 
 def invocations(text: str) -> Iterator[tuple[str, list[str]]]:

@@ -27,6 +27,15 @@ class NodeCommand(Command):
         parsed: list[str] = super().parse_args(ctx, words)
         return parsed
 
+    def valued(self, ctx: Any) -> set[str]:
+        """Options that have a word behind them."""
+        return {
+            name
+            for option in self.get_params(ctx)
+            if option.param_type_name == "option" and not getattr(option, "is_flag", False)
+            for name in option.opts
+        }
+
     def spelled(self, ctx: Any, args: Sequence[str]) -> tuple[list[str], NodeNames]:
         """The arguments as the command has them, and what ROS tells the node.
 

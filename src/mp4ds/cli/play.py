@@ -140,13 +140,7 @@ class PlayCommand(NodeCommand):
 
     def spelled(self, ctx: Any, args: Sequence[str]) -> tuple[list[str], NodeNames]:
         """Arguments in the words of `rosbag play` and `ros2 bag play`, as the command has them."""
-        valued = {
-            name
-            for option in self.get_params(ctx)
-            if option.param_type_name == "option" and not getattr(option, "is_flag", False)
-            for name in option.opts
-        }
-        return spelled(args, valued.__contains__)
+        return spelled(args, self.valued(ctx).__contains__)
 
 
 COMMAND = PlayCommand

@@ -46,7 +46,7 @@ _FOREIGN = ("--bags", "--input", "--message-order", "--progress-bar-update-rate"
 def known_words() -> Collection[str]:
     """Options that are understood besides those that ``--help`` shows."""
     letters = (name for found in _LETTERS.values() for name in found)
-    return {*_LISTS, *_IGNORED, *_REFUSED, *_FOREIGN, *letters, "--ros-args"}
+    return {*_LISTS, *_IGNORED, *_REFUSED, *_FOREIGN, *letters, "--ros-args", "-r"}
 
 
 def spelled(

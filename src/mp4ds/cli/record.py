@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
@@ -14,17 +14,29 @@ from mp4ds.cli.nodes import NodeCommand, names_in, say_as_much
 from mp4ds.cli.options import JsonFlag, takes
 from mp4ds.cli.output import complain, is_quiet, print_json, print_pack, say
 from mp4ds.cli.process import caught_signals, told_errors
+from mp4ds.cli.record_words import spelled
 from mp4ds.errors import OptionError
 from mp4ds.plugins.recording.record import RecordOptions, open_recorder
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from mp4ds.plugins.publishing.names import NodeNames
     from mp4ds.plugins.recording.record import RecordProgress, RecordSummary
 
 _LOG_S = 10.0
 _SHOWN = 20  # topics
-COMMAND = NodeCommand
+
+
+class RecordCommand(NodeCommand):
+    """The command, which understands how the options of other recorders are typed."""
+
+    def spelled(self, ctx: Any, args: Sequence[str]) -> tuple[list[str], NodeNames]:
+        """Arguments in the words of ROS's own recorders, as the command has them."""
+        return spelled(args, self.valued(ctx).__contains__)
+
+
+COMMAND = RecordCommand
 
 
 @takes(RecordOptions, without=("to",))

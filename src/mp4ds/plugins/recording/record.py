@@ -17,7 +17,7 @@ from mp4ds.errors import Mp4dsError, OptionError, RecordError, TargetExistsError
 from mp4ds.files.outputs import check_target, move_into_place, sync, work_folder
 from mp4ds.format.manifest import About
 from mp4ds.format.sidecars import load_about
-from mp4ds.options import Options, argument, exclude, force, option, parse_size
+from mp4ds.options import Options, argument, force, option, parse_size
 from mp4ds.packing.journal import JOURNAL_NAME, Journal, is_unfinished
 from mp4ds.packing.live import Intake, LivePacker, LiveRecording
 from mp4ds.packing.manifest import (
@@ -57,9 +57,11 @@ class RecordOptions(Options):
     to: str | None = option("ros1 or ros2; by default, the one that is sourced.")
     all: bool = option("Record all topics, including new ones.", False, "-a")
     regex: str = option("Also record topics that match a regular expression.", "", "-e")
-    exclude: Sequence[str] = exclude("--exclude", "--exclude-topics")
+    exclude: Sequence[str] = option(
+        "Leave out matching topics; repeatable.", (), "--exclude", metavar="GLOB"
+    )
     exclude_regex: str = option(
-        "Leave out topics that match a regular expression.", "", "--exclude-regex"
+        "Leave out topics that match a regular expression.", "", "--exclude-regex", "-x"
     )
     duration: float | None = option("Stop after N seconds.", None, "--duration")
     max_duration: float | None = option(
