@@ -186,8 +186,7 @@ def invocations(text: str) -> Iterator[tuple[str, list[str]]]:
         *re.findall(r"`(mp4ds [^`]*)`", re.sub(r"```.*?```", "", text, flags=re.S)),
     ]:
         for line in span.replace("\\\n", " ").splitlines():
-            own = re.split(" #| --ros-args ", line)[0]  # what is behind is ROS's
-            for found in re.finditer(r"\bmp4ds ([a-z][a-z-]*)\b([^|;&]*)", own):
+            for found in re.finditer(r"\bmp4ds ([a-z][a-z-]*)\b([^|;&]*)", line.split(" #")[0]):
                 yield found[1], re.findall(r"(?<![\w-])--?[a-z][a-z0-9-]*", found[2])
 
 
