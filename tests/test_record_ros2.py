@@ -188,6 +188,31 @@ def test_services(side: Side) -> None:
     assert (controls.is_paused, controls.asked) == (False, ["split", "stop"])
 
 
+def test_a_message_that_cannot_be_taken(side: Side) -> None:
+    """It is counted as lost, and told; the next ones are taken."""
+    recorded, taken = channel("/robot/name", STRING), []
+
+    def take(message: Message) -> None:
+        if not taken:
+            taken.append(None)
+            raise ValueError("no")
+        taken.append(message)
+
+    source = open_source("ros2", SourceOptions("recorder"))
+    with side.open() as publisher:
+        publisher.advertise(recorded)
+        source.start(Wanted(), take)
+        assert until(lambda: publisher.subscribers(recorded) == 1)
+        for number in range(3):
+            publisher.publish(recorded, message(STRING, number), 0)
+        assert until(lambda: len(taken) == 3)
+        source.close()
+    assert source.state.lost == {"/robot/name": 1}
+    assert [*source.state.warnings] == [
+        "/robot/name: a message could not be taken: ValueError('no')"
+    ]
+
+
 def test_hidden_topics_are_left_out(side: Side) -> None:
     hidden, plain = channel("/robot/_internal", STRING), channel("/robot/name", STRING)
     heard = Heard()

@@ -31,7 +31,13 @@ from mp4ds.plugins.recording.ros2_channels import (
     standard_definition,
     time_of,
 )
-from mp4ds.plugins.recording.source import RecorderControls, SourceOptions, SourceState, Wanted
+from mp4ds.plugins.recording.source import (
+    RecorderControls,
+    SourceOptions,
+    SourceState,
+    Wanted,
+    told,
+)
 from mp4ds.records import Channel, Message
 
 _DEPTH = 100
@@ -150,6 +156,8 @@ class DdsSource:
         type_name = ros_type(endpoints[0].type_name)
         definition = standard_definition(type_name, type_hash)
         definition = definition or announced_definition(kind, type_hash)
+        if len({endpoint.type_name for endpoint in endpoints}) > 1:
+            self.state.warnings[f"{name}: has several types; only {type_name} is recorded"] = None
         if not definition:
             self.state.warnings[f"{name}: the definition of {type_name} is not known here"] = None
         channel = channel_of(self._count, topic.recorded, type_name, definition, type_hash, offered)
@@ -168,7 +176,8 @@ class DdsSource:
             self._listener.hear(topic.reader, self._tick)
         if topic.is_wanted:
             self.state.topics[topic.recorded] = None
-            self._listener.hear(topic.reader, partial(self._received, channel, take))
+            receive = told(self.state, name, partial(self._received, channel, take))
+            self._listener.hear(topic.reader, receive)
 
     def _tick(self, sample: Any) -> None:
         self._sim_time_ns = time_of(sample.payload)

@@ -13,7 +13,13 @@ from mp4ds.bags.protocols import Format
 from mp4ds.bags.ros1_records import make_channel
 from mp4ds.errors import PublishError
 from mp4ds.plugins.publishing.ros1 import ANSWER_S, answer, start_node
-from mp4ds.plugins.recording.source import RecorderControls, SourceOptions, SourceState, Wanted
+from mp4ds.plugins.recording.source import (
+    RecorderControls,
+    SourceOptions,
+    SourceState,
+    Wanted,
+    told,
+)
 from mp4ds.records import Channel, Message
 
 _RECEIVED_BYTES = 2**18
@@ -22,6 +28,7 @@ _RECEIVED_BYTES = 2**18
 _LEAST_POLL_S = 0.5
 """Seconds between questions to the master: it is asked over the network."""
 
+_DEAF = "the ROS master does not answer: new topics are not seen"
 _DEAF = "the ROS master does not answer: new topics are not seen"
 _TIME = struct.Struct("<II")
 _CLOCK = "/clock"
@@ -76,9 +83,7 @@ class RospySource:
     def _keep_looking(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
         while not self._ended.wait(max(self._options.poll_s or 0.0, _LEAST_POLL_S)):
             if not self._look(wanted, take):
-                self.state.warnings["the ROS master does not answer: new topics are not seen"] = (
-                    None
-                )
+                self.state.warnings[_DEAF] = None
 
     def _look(self, wanted: Wanted, take: Callable[[Message], None]) -> bool:
         """Subscribe to what is published and wanted; returns whether the master answered."""
@@ -88,10 +93,10 @@ class RospySource:
             return False
         for topic, _ in found or ():
             if topic not in self._subscribers and wanted(topic):
-                self._subscribers[topic] = self._subscribe(
-                    topic, partial(self._received, wanted.recorded_as(topic), take)
-                )
-                self.state.topics[wanted.recorded_as(topic)] = None
+                name = wanted.recorded_as(topic)
+                receive = told(self.state, name, partial(self._received, name, take))
+                self._subscribers[topic] = self._subscribe(topic, receive)
+                self.state.topics[name] = None
         return found is not None
 
     def _subscribe(self, topic: str, receive: Callable[[Any], None]) -> Any:

@@ -23,7 +23,13 @@ from mp4ds.plugins.recording.ros2_channels import (
     standard_definition,
     time_of,
 )
-from mp4ds.plugins.recording.source import RecorderControls, SourceOptions, SourceState, Wanted
+from mp4ds.plugins.recording.source import (
+    RecorderControls,
+    SourceOptions,
+    SourceState,
+    Wanted,
+    told,
+)
 from mp4ds.records import Channel, Message
 
 _DEPTH = 100
@@ -149,14 +155,15 @@ class RclpySource:
         )
         qos = self._overrides.get(topic, asked_qos(offered, _DEPTH))
         self.state.topics[name] = None
+        receive = told(self.state, topic, partial(self._received, channel, take))
+        # rclpy tells of when a message was sent where a callback takes exactly two arguments
         return self._node.create_subscription(
-            kind, topic, partial(self._received, channel, take), qos_profile(qos), raw=True
+            kind, topic, lambda raw, info: receive(raw, info), qos_profile(qos), raw=True
         )
 
     def _received(
         self, channel: Channel, take: Callable[[Message], None], raw: bytes, info: Any
     ) -> None:
-        # rclpy tells of when a message was sent where a callback cannot do without
         now = time.time_ns() if self._sim_time_ns is None else self._sim_time_ns
         sent = info["source_timestamp"]
         take(Message(channel, now, sent if sent > 0 else now, 0, raw))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from mp4ds.bags.protocols import Format
 from mp4ds.errors import OptionError
@@ -93,6 +93,25 @@ class SourceState:
     lost: Counter[str] = field(default_factory=Counter)
     warnings: dict[str, None] = field(default_factory=dict)
     topics: dict[str, None] = field(default_factory=dict)
+
+
+def told(state: SourceState, topic: str, receive: Callable[..., None]) -> Callable[..., None]:
+    """What middlewares are to call: they keep to themselves, or die of, what a callback raises.
+
+    Args:
+        state: Told of each message that could not be taken.
+        topic: Of the messages.
+        receive: Takes a message.
+    """
+
+    def call(*message: Any) -> None:
+        try:
+            receive(*message)
+        except Exception as error:
+            state.lost[topic] += 1
+            state.warnings[f"{topic}: a message could not be taken: {error!r}"] = None
+
+    return call
 
 
 class RecorderControls(Protocol):
