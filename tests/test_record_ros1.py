@@ -83,13 +83,15 @@ def test_as_rosbag_record(roscore: Core, tmp_path: Path, name: str) -> None:
 
 def test_topics_that_are_named(roscore: Core, tmp_path: Path) -> None:
     bag = make_drive(tmp_path / "drive.bag")
-    command = ours(tmp_path / "live", "/camera/*", "-e", "^/tf$")
-    recorded(roscore, tmp_path, [command], [PLAY, "-q", "--delay", "4", str(bag)])
-    with mp4ds.open(tmp_path / "live") as dataset:
-        assert sorted({channel.topic for channel in dataset.channels}) == [
-            "/camera/image_raw",
-            "/tf",
-        ]
+    commands = {  # with -e all are regular expressions, as for rosbag record
+        "globs": ours(tmp_path / "globs", "/camera/*", "/tf"),
+        "patterns": ours(tmp_path / "patterns", "/camera/.*", "-e", "/tf"),
+    }
+    recorded(roscore, tmp_path, [*commands.values()], [PLAY, "-q", "--delay", "4", str(bag)])
+    for name in commands:
+        with mp4ds.open(tmp_path / name) as dataset:
+            found = {channel.topic for channel in dataset.channels}
+            assert found == {"/camera/image_raw", "/tf"}, name
 
 
 def test_a_recorder_that_is_killed(roscore: Core, tmp_path: Path) -> None:

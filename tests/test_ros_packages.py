@@ -81,7 +81,7 @@ def test_launch_files_of_ros2(command: str, tmp_path: Path) -> None:
     root = ElementTree.parse(LAUNCHED[f"ros2 {command}"]).getroot()
     values = {one.attrib["name"]: one.attrib.get("default", "drive") for one in root.iter("arg")}
     values |= {"topics": "/camera/* /tf", "output": "live"}
-    values["options"] = "--force -x /a*" if command == "record" else ""
+    values["options"] = "--force --exclude /a*" if command == "record" else ""
     for let in root.iter("let"):
         values[let.attrib["name"]] = substituted(let.attrib["value"], values)
         assert {*let.attrib} <= {"name", "value", "if", "unless"}
