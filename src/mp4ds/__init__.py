@@ -47,6 +47,7 @@ if TYPE_CHECKING:
         OutOfReachError,
         PartsFailedError,
         PublishError,
+        RecordError,
         RemoteError,
         SampleError,
         ScoringError,
