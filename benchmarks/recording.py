@@ -135,7 +135,7 @@ def end(process: subprocess.Popen[str]) -> int:
 
 def unpacked(dataset: Path, folder: Path) -> Path:
     """The bag of a dataset."""
-    bag = folder / f"{dataset.name}-again.bag"
+    bag = folder / "again.bag"
     bag.unlink(missing_ok=True)
     command = [sys.executable, "-m", "mp4ds", "-q", "unpack", str(dataset), "--to", "bag"]
     subprocess.run([*command, "-o", str(bag)], check=True)
@@ -218,9 +218,10 @@ def kills(core: Core, folder: Path, count: int) -> None:
     assert said(source) == "begun"
     made: list[tuple[Path, int]] = []
     for number in range(count):
-        dataset = folder / f"killed{number}"
-        for path in (dataset, dataset.with_name(f"{dataset.name}.recording")):
-            shutil.rmtree(path, ignore_errors=True)
+        # each in a folder of its own: the next one would recover it
+        shutil.rmtree(folder / f"kill{number}", ignore_errors=True)
+        dataset = folder / f"kill{number}" / "drive"
+        dataset.parent.mkdir()
         recorder = core.start(*ours(dataset))
         unfinished = dataset.with_name(f"{dataset.name}.recording")
         wait_until(lambda path=unfinished: any(path.glob("cam*.mp4")) if path.exists() else False)
