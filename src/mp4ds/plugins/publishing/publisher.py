@@ -158,8 +158,12 @@ WORLDS: Mapping[str, str | None] = {"ros1": "ros1", "ros2": "ros2", "foxglove": 
 _PATIENCE_S = 2.0
 
 
-def sourced() -> str:
+def sourced(command: str = "play", others: str = " or `foxglove`") -> str:
     """What is sourced here: ``ros1`` or ``ros2``.
+
+    Args:
+        command: What is to be done, for the error.
+        others: What else can be named, for the error.
 
     Raises:
         PublishError: Neither is.
@@ -171,9 +175,9 @@ def sourced() -> str:
         if find_spec(module) is not None:
             return kind
     raise PublishError(
-        "play",
-        "no ROS is sourced here: source its setup file, or name what to play into: `ros1`, "
-        "`ros2` (without ROS by pip install 'mp4ds[dds]') or `foxglove`",
+        command,
+        "no ROS is sourced here: source its setup file, or give `ros1`, `ros2` (without ROS by "
+        f"pip install 'mp4ds[dds]'){others}",
     )
 
 

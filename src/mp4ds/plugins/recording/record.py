@@ -229,7 +229,7 @@ def open_recorder(
     chosen = options or RecordOptions()
     if not (topics or chosen.all or chosen.regex):
         raise OptionError("Name topics, or give `all` or `regex`.")
-    kind = source.profile if source else chosen.to or sourced()
+    kind = source.profile if source else chosen.to or sourced("record", "")
     names = chosen.names.in_world(kind)
     wanted = Wanted(
         () if chosen.all else topics,
