@@ -185,7 +185,12 @@ def installed_definition(type_name: str, share: Sequence[Path]) -> str:
             return ""
         found[name] = text
         todo += _parts(text, package)
-    main, *parts = found.items()
+    return _with_parts(found)
+
+
+def _with_parts(texts: Mapping[str, str]) -> str:
+    """A definition with those of its parts behind it; the first text is the type's own."""
+    main, *parts = texts.items()
     rest = (f"\n{_SEPARATOR}\nMSG: {name.replace('/msg/', '/')}\n{text}" for name, text in parts)
     return "".join((main[1], *rest))
 
@@ -226,9 +231,8 @@ def announced_definition(kind: Any, type_hash: str) -> str:
         texts = dict(_structures(kind))
     except (Refused, AttributeError, TypeError, ValueError):
         return ""
-    main, *parts = texts.items()
-    rest = (f"\n{_SEPARATOR}\nMSG: {name.replace('/msg/', '/')}\n{text}" for name, text in parts)
-    return _proven(Schema(main[0], _ENCODING, "".join((main[1], *rest)).encode()), type_hash)
+    name = next(iter(texts))
+    return _proven(Schema(name, _ENCODING, _with_parts(texts).encode()), type_hash)
 
 
 def _structures(kind: Any) -> Iterator[tuple[str, str]]:
