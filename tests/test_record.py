@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,10 @@ import pytest
 import mp4ds
 from each import each
 from mp4ds.bags.formats import open_sources
+from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, RecordError, SourceError, TargetExistsError
+from mp4ds.files.sources import JOURNAL_NAME
 from mp4ds.packing import live
-from mp4ds.packing.journal import JOURNAL_NAME
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.packer import TOO_LATE
 from mp4ds.packing.recovery import CUT_OFF
@@ -375,6 +377,13 @@ def test_a_recorder_that_is_killed(cut_off: tuple[list[Path], Path], tmp_path: P
     paths, folder = cut_off
     with pytest.raises(OptionError, match="--salvage"):
         mp4ds.pack(folder, tmp_path / "salvaged", PackOptions(quality="visual"))
+    for wrong in (mp4ds.validate, mp4ds.open, partial(mp4ds.pack, dataset=tmp_path / "no")):
+        with pytest.raises(mp4ds.Mp4dsError):
+            wrong(folder)
+    with pytest.raises(SourceError, match="pack --salvage"):
+        open_sources([folder])
+    with pytest.raises(SourceError, match="pack --salvage"):
+        datasets_in(folder)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     summary = mp4ds.pack(folder, tmp_path / "salvaged", PackOptions(salvage=True))
     assert summary.losses[-1].problem == CUT_OFF

@@ -14,7 +14,7 @@ import pytest
 import mp4ds
 from conftest import real
 from mp4ds.bags.formats import open_reader
-from mp4ds.packing.journal import JOURNAL_NAME
+from mp4ds.files.sources import JOURNAL_NAME
 from mp4ds.packing.options import PackOptions
 from mp4ds.records import Message
 from player_scenes import make_drive

@@ -19,6 +19,7 @@ from mp4ds.files.outputs import begins_with
 from mp4ds.files.sources import (
     HOW_TO_OPEN,
     is_folder,
+    refuse_unfinished,
     source_digest,
     source_size,
     video_at,
@@ -340,6 +341,7 @@ def format_of(path: Path) -> str:
         if not path.exists():
             raise SourceNotFoundError(path)
         if path.is_dir():
+            refuse_unfinished(path)
             return "rosbag2"
         if not path.is_file():
             raise SourceError(path, "is neither a file nor a folder")

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from mp4ds.errors import Mp4dsError, SourceError, SourceNotFoundError
+from mp4ds.files.sources import refuse_unfinished
 from mp4ds.files.urls import RemotePath, location
 from mp4ds.format.sidecars import MANIFEST_NAME
 
@@ -67,6 +68,7 @@ def _below(path: Path) -> list[Path]:
         return [path.parent]
     if not path.is_dir() or (path / MANIFEST_NAME).is_file():
         return [path]
+    refuse_unfinished(path)
     found = sorted(manifest.parent for manifest in path.rglob(MANIFEST_NAME))
     # names that begin with a dot are being made
     found = [one for one in found if not _is_hidden(one, path)]

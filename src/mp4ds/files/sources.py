@@ -43,6 +43,29 @@ HOW_TO_OPEN = (
 """Advice for a video given instead of a recording or dataset."""
 
 
+JOURNAL_NAME = "journal.jsonl"
+"""File of a folder in which a recording is being made, or was when it was cut off."""
+
+
+def is_unfinished(folder: Path) -> bool:
+    """Whether a folder holds a recording that is being made, or was cut off."""
+    return not remote(folder) and (folder / JOURNAL_NAME).is_file()
+
+
+def refuse_unfinished(folder: Path) -> None:
+    """Refuse a recording that is not a dataset yet.
+
+    Raises:
+        SourceError: It is one.
+    """
+    if is_unfinished(folder):
+        raise SourceError(
+            folder,
+            "is being recorded, or was cut off",
+            f"Make a dataset of it first: mp4ds pack --salvage {folder} -o DATASET.",
+        )
+
+
 def video_at(path: Path) -> str:
     """What kind of video a file is, with its article; empty if it is none or cannot be read."""
     try:

@@ -23,21 +23,12 @@ import xxhash
 
 from mp4ds.errors import SourceError
 from mp4ds.files.outputs import lock
-from mp4ds.files.urls import remote
+from mp4ds.files.sources import JOURNAL_NAME
 from mp4ds.format.fields import FORMAT_VERSION, Model
 from mp4ds.format.models import ChannelModel, Header
 from mp4ds.packing.look import StreamKey
 from mp4ds.records import Channel, Message
 from mp4ds.video.packets import packet_digest
-
-JOURNAL_NAME = "journal.jsonl"
-"""File of a folder into which a recording is made."""
-
-
-def is_unfinished(folder: Path) -> bool:
-    """Whether a folder holds a recording that is being made, or was cut off."""
-    return not remote(folder) and (folder / JOURNAL_NAME).is_file()
-
 
 FRAME_COLUMNS = (
     *("log_time", "publish_time", "sequence", "stamp", "seq", "pts", "variant", "ordinal"),

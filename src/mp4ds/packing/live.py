@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.protocols import Format
+from mp4ds.files.sources import JOURNAL_NAME
 from mp4ds.packing.engine import Workers
-from mp4ds.packing.journal import JOURNAL_NAME, Journal
+from mp4ds.packing.journal import Journal
 from mp4ds.packing.manifest import PartRecord
 from mp4ds.packing.packer import TOO_LATE, Packer, PartSettings
 from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Record, Schema

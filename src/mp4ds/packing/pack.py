@@ -27,7 +27,7 @@ from mp4ds.errors import (
     WriteError,
 )
 from mp4ds.files.outputs import check_target, digest_file, staged
-from mp4ds.files.sources import source_digest, source_size, unchanged
+from mp4ds.files.sources import is_unfinished, source_digest, source_size, unchanged
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.sidecars import MANIFEST_NAME, load_about, load_manifest, load_stream
 from mp4ds.messages.serializations import is_camera
@@ -40,7 +40,6 @@ from mp4ds.packing.job import (
     outcome_options,
     span_of,
 )
-from mp4ds.packing.journal import is_unfinished
 from mp4ds.packing.manifest import (
     Origin,
     PartRecord,

@@ -19,6 +19,7 @@ from mp4ds.bags.salvage.losses import losses_of
 from mp4ds.bags.salvage.mcap import McapSalvage
 from mp4ds.dataset.rebuild import columns_model
 from mp4ds.files.outputs import begins_with, staged
+from mp4ds.files.sources import JOURNAL_NAME
 from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.format.manifest import About
 from mp4ds.format.models import CameraInfo
@@ -26,7 +27,7 @@ from mp4ds.format.sidecars import dump_document
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.messages.transforms import TransformCollector
 from mp4ds.packing.calibrations import Calibrations
-from mp4ds.packing.journal import FRAME_COLUMNS, JOURNAL_NAME, Notes, StreamNote
+from mp4ds.packing.journal import FRAME_COLUMNS, Notes, StreamNote
 from mp4ds.packing.manifest import (
     Origin,
     PartRecord,

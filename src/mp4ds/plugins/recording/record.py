@@ -15,10 +15,11 @@ from pathlib import Path
 from mp4ds.dataset.checks import validate
 from mp4ds.errors import Mp4dsError, OptionError, RecordError, TargetExistsError, WriteError
 from mp4ds.files.outputs import check_target, move_into_place, sync, work_folder
+from mp4ds.files.sources import JOURNAL_NAME, is_unfinished
 from mp4ds.format.manifest import About
 from mp4ds.format.sidecars import load_about
 from mp4ds.options import Options, argument, force, option, parse_size
-from mp4ds.packing.journal import JOURNAL_NAME, Journal, is_unfinished
+from mp4ds.packing.journal import Journal
 from mp4ds.packing.live import Intake, LivePacker, LiveRecording
 from mp4ds.packing.manifest import (
     Origin,
