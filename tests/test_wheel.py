@@ -41,7 +41,8 @@ def built(kind: str, source: Path, target: Path, **environment: str) -> Path:
         text=True,
         timeout=WATCHDOG_S,
         check=False,
-        env={**os.environ, **environment},
+        # the build imports hatch_build.py from the tree, and would leave it compiled there
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1", **environment},
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return target / done.stdout.split()[-1]
