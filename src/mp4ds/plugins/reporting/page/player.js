@@ -114,7 +114,9 @@ var mp4dsPlayer = (() => {
       const sought = this.sought;
       // no new picture is presented if the one sought is already on screen
       const settle = () => {
-        if (!this.busy && !this.isPresented && this.sought === sought && this.video.paused) this.show(sought);
+        if (this.busy || this.sought !== sought || !this.video.paused) return;
+        if (!this.isPresented) this.show(sought);
+        else if (this.shown !== sought) this.seek();  // only an earlier picture was reported, late
       };
       if (this.video.requestVideoFrameCallback) setTimeout(settle, this.presented === sought ? LATE : LOST); else settle();
     }
