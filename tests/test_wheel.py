@@ -191,7 +191,7 @@ def test_the_project_has_one_address() -> None:
     count = 0
     for path, text in texts():
         for url in re.findall(r"https://[\w./-]*\bmp4ds\b[\w./-]*", text):
-            is_ours = url.startswith((repository, site, raw)) or "pypi.org" in url
+            is_ours = url.startswith((repository, site, raw))
             assert is_ours, f"{path.relative_to(ROOT)}: {url}"
             count += 1
     assert count > 8

@@ -113,7 +113,7 @@ def _use(first: Brief, versions: str) -> list[str]:
     topic = next(iter(first.frames), "/camera/image_raw")
     url = f"hf://datasets/{_PLACE}/{' '.join(first.path.name.split())}"
     return [
-        f"These are datasets of [mp4ds](https://pypi.org/project/mp4ds/), format {versions}:",
+        f"These are datasets of [mp4ds](https://github.com/mp4ds/mp4ds), format {versions}:",
         "mp4 files that any player opens, with the exact stamps, headers and calibrations in YAML.",
         "",
         "```sh",
