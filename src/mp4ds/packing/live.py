@@ -1,7 +1,7 @@
 """A recording that is being made, packed while its messages come.
 
 Nothing waits: an image that its encoder has no time for is kept verbatim, what there is no memory
-for is dropped and counted. What came is on the disk within `DURABLE_S`, but for the frames that an
+for is dropped and counted. What came is on the disk within two seconds, but for the frames that an
 encoder holds (spec/index.md, "Unfinished recordings").
 """
 
@@ -30,9 +30,6 @@ from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, R
 
 LATE_S = 0.5
 """Seconds that an image may wait for its encoder."""
-
-DURABLE_S = 2.0
-"""Seconds within which what came is on the disk, but for the frames that an encoder holds."""
 
 _CHECKPOINT_S = 0.5
 _NICE = 10
