@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,8 @@ LOOPBACK = (
     "</Discovery></Domain></CycloneDDS>"
 )
 STORE = get_typestore(Stores.ROS2_JAZZY)
+# each once in a process: publishers of an earlier test live until the garbage collector finds them
+_DOMAINS = cycle(random.SystemRandom().sample(range(200), 200))
 KINDS = (
     "std_msgs/msg/Header",
     "std_msgs/msg/String",
@@ -152,7 +155,7 @@ def dds_side(monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
     pytest.importorskip("cyclonedds")
     from mp4ds.plugins.publishing.dds import DdsPublisher
 
-    domain = random.SystemRandom().randrange(200)
+    domain = next(_DOMAINS)
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
     for name in ("ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
         monkeypatch.delenv(name, raising=False)
