@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import mp4ds
+from each import LONGEST
 from mp4ds.packing.options import PackOptions
 from mp4ds.video.encoder import ordinary_scheduling
 from sources import SOURCES, load_tool, scene
@@ -40,6 +41,11 @@ def real(name: str) -> Path:
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Let one case of a test be chosen that goes through many."""
     parser.addoption("--case", default="", help="of tests over each row of a table: part of a name")
+
+
+def pytest_make_parametrize_id(val: object, argname: str) -> str | None:
+    """Name a case by its argument where the value is too long for a name."""
+    return argname if isinstance(val, (str, bytes)) and len(val) > LONGEST else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

