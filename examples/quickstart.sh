@@ -4,10 +4,9 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 work=${1:-quickstart}
-[ -x .venv/bin/python ] || "${PYTHON:-python3}" -m venv .venv
-.venv/bin/python -m pip install --quiet .
+bash tools/install.sh
 mkdir -p "$work"
-export PATH="$PWD/.venv/bin:$PATH"
+export PATH="$PWD/${VENV:-.venv}/bin:$PATH"
 mp4ds demo "$work/demo.bag" --force
 mp4ds pack "$work/demo.bag" -o "$work/demo" --force
 mp4ds validate "$work/demo" --deep

@@ -18,6 +18,8 @@ from typing import Any
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 import mp4ds
 from each import each
@@ -222,6 +224,44 @@ def test_the_recipe_for_conda_needs_what_the_package_needs() -> None:
     assert told == needed
     host = {one.split(" ")[0] for one in recipe["requirements"]["host"]}
     assert {"hatchling", "hatch-fancy-pypi-readme"} <= host
+
+
+def pinned() -> Iterator[Requirement]:
+    """What lock/ has, each with hashes of its files and no address."""
+    for name in ("run", "test"):
+        text = (ROOT / "lock" / f"{name}.txt").read_text()
+        head, text = ("", text) if name == "run" else text.split("\n", 1)
+        assert head == {"run": "", "test": "--requirement run.txt"}[name]
+        for one in re.split(r"\n(?=\w)", text.rstrip()):
+            requirement, *hashes = one.split(" \\\n")
+            assert all(re.fullmatch(r"    --hash=sha256:[0-9a-f]{64}", line) for line in hashes), (
+                one
+            )
+            assert hashes, one
+            yield Requirement(requirement)
+
+
+@each("python", ["3.10", "3.11", "3.12", "3.13", "3.14"])
+@each("system", ["linux x86_64", "linux aarch64", "darwin arm64"])
+def test_the_lock_has_what_is_asked_for(python: str, system: str) -> None:
+    platform, machine = system.split()
+    environment = {"python_version": python, "python_full_version": f"{python}.9", "extra": ""}
+    environment |= {"sys_platform": platform, "platform_machine": machine}
+    lock: dict[str, list[str]] = {}
+    for pin in pinned():
+        if not pin.marker or pin.marker.evaluate(environment):
+            (version,) = pin.specifier
+            lock.setdefault(canonicalize_name(pin.name), []).append(version.version)
+    pyproject = (ROOT / "pyproject.toml").read_text()
+    starts = r"^(?:requires|dependencies|test) = \[(.*?)\]$"
+    asked = re.findall(r'"([^"]+)"', "".join(re.findall(starts, pyproject, re.DOTALL | re.M)))
+    assert len(asked) > 40
+    for text in asked:
+        one = Requirement(text)
+        if not one.marker or one.marker.evaluate(environment):
+            versions = lock.get(canonicalize_name(one.name), [])
+            is_met = len(versions) == 1 and versions[0] in one.specifier
+            assert is_met, f"{text}: lock/ has {versions}; bash tools/lock.sh renews it"
 
 
 @each("name", ["Dockerfile", "Dockerfile.ros2"])

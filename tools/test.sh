@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Makes a virtual environment in .venv, installs the package with its test tools, and tests it.
+# Makes a virtual environment in .venv, installs the package with its test tools, as lock/ has them,
+# and tests it. Arguments are for pytest.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 unset PYTHONDONTWRITEBYTECODE # or each of some hundred processes compiles all modules anew
-[ -x .venv/bin/python ] || "${PYTHON:-python3}" -m venv .venv
-.venv/bin/python -m pip install --quiet --editable '.[test]'
+bash tools/install.sh test
 .venv/bin/ruff check .
 .venv/bin/ruff format --check .
 .venv/bin/mypy

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Takes the README's first command and the quick tests through every Python of this machine, each with
-# the newest and with the lowest dependencies, and prints a table. Each gets a clone and an environment
-# of its own in build/versions, and a log.
+# the newest and with the lowest dependencies (not those of lock/), and prints a table. Each gets a
+# clone and an environment of its own in build/versions, and a log.
 #
 #   bash tools/test_versions.sh [ARGUMENT OF PYTEST ...]
 #   PYTHONS="3.10 3.13" DEPENDENCIES=lowest bash tools/test_versions.sh tests/test_video_file.py
@@ -10,7 +10,6 @@ cd "$(dirname "$0")/.."
 unset PYTHONDONTWRITEBYTECODE # as in tools/test.sh
 work=$PWD/build/versions
 mkdir -p "$work"
-[ -x "$work/uv/bin/uv" ] || { python3 -m venv "$work/uv" && "$work/uv/bin/pip" install --quiet uv; }
 
 # the interpreter of a version: on the path, or of pyenv
 python_of() {
@@ -27,14 +26,9 @@ try() (
   rm -rf "$place" && mkdir "$place" && git clone --quiet . "$place/mp4ds"
   [ ! -d ../shared ] || ln -s "$(realpath ../shared)" "$place/shared"
   cd "$place/mp4ds"
-  if [ "$dependencies" = lowest ]; then
-    "$work/uv/bin/uv" venv --quiet --seed --python "$python" .venv
-    # wheels only: nobody means to build an old numpy for a new Python
-    "$work/uv/bin/uv" pip install --quiet --python .venv/bin/python --resolution lowest-direct \
-      --only-binary :all: --no-binary mp4ds '.[test]'
-  fi
-  PYTHON=$python bash examples/quickstart.sh
-  .venv/bin/python -m pip install --quiet --editable '.[test]'
+  export PYTHON=$python DEPENDENCIES=$dependencies
+  bash examples/quickstart.sh
+  bash tools/install.sh test
   .venv/bin/python -m pip list --format freeze
   .venv/bin/pytest -n auto --dist worksteal -q -m "not slow and not network" "$@"
 )
