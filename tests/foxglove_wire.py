@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
-from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import Message
-from google.protobuf.message_factory import GetMessageClass
+from google.protobuf.message_factory import GetMessages
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from scenes import Record, typestore
@@ -50,11 +49,8 @@ def renumbered_class(msgtype: str) -> tuple[type[Message], bytes]:
     for fields in (m.field for m in described.file[-1].message_type):
         for place, field in enumerate(fields):
             field.number = 30 - 3 * place
-    pool = DescriptorPool()
-    for file in described.file:
-        pool.AddSerializedFile(file.SerializeToString())
     name = message_class(msgtype).DESCRIPTOR.full_name
-    found: type[Message] = GetMessageClass(pool.FindMessageTypeByName(name))
+    found: type[Message] = GetMessages(described.file)[name]
     return found, described.SerializeToString()
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from rosbags.highlevel import AnyReader
 
 import mp4ds
@@ -243,6 +244,17 @@ def channel(encoding: str, name: str = "", schema: bytes = b"", kind: str = "") 
 def test_topics_that_cannot_be_decoded(odd: Channel, problem: str) -> None:
     with pytest.raises(mp4ds.OptionError, match=rf"/odd cannot be decoded: .*{problem}.*\.raw"):
         decoder_of(odd)
+
+
+def test_a_type_declared_inside_another_in_a_file_that_comes_before_its_imports() -> None:
+    files = FileDescriptorSet()
+    outer = files.file.add(name="a.proto", package="p", dependency=["b.proto"])
+    inner = outer.message_type.add(name="Outer").nested_type.add(name="Inner")
+    inner.field.add(name="part", number=7, label=1, type=11, type_name=".p.Part")
+    part = files.file.add(name="b.proto", package="p").message_type.add(name="Part")
+    part.field.add(name="text", number=1, label=1, type=9)
+    decode = decoder_of(channel("protobuf", "p.Outer.Inner", files.SerializeToString(), "protobuf"))
+    assert decode(memoryview(b"\x3a\x04\x0a\x02hi")).part.text == "hi"
 
 
 @each("encoding", ["ros1", "cdr", "json", "protobuf"])

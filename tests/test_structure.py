@@ -79,7 +79,7 @@ HOMES = {
     "av": ("video",),
     "PIL": ("video",),
     "fsspec": ("files",),
-    "google": ("messages", "bags"),
+    "google": ("messages",),
     "torch": ("torch",),
     "typer": ("cli",),
     "rich": ("cli",),

@@ -19,6 +19,7 @@ from mp4ds.bags.types import (
     types_of,
 )
 from mp4ds.errors import OptionError, Refused
+from mp4ds.messages.descriptors import decoder_of_schema
 from mp4ds.messages.wire import WireError
 from mp4ds.records import Channel
 
@@ -105,11 +106,9 @@ def _protobuf(channel: Channel) -> Decoder:
     if schema is None or schema.encoding != "protobuf":
         raise _undecodable(channel, "they are protobuf, and their definition is unknown")
     try:
-        decoder = protobuf_decoder(schema.name, schema.data)
+        return decoder_of_schema(schema.name, schema.data)
     except WireError as error:
         raise _undecodable(channel, str(error)) from None
-
-    return lambda payload: decoder(bytes(payload))
 
 
 _DECODERS: Mapping[str, Callable[[Channel], Decoder]] = {
@@ -118,51 +117,3 @@ _DECODERS: Mapping[str, Callable[[Channel], Decoder]] = {
     "json": _json,
     "protobuf": _protobuf,
 }
-
-
-def protobuf_decoder(type_name: str, schema: bytes) -> Callable[[bytes], Any]:
-    """A decoder of serialized messages; it raises WireError for invalid ones.
-
-    Args:
-        type_name: Full name of the message's type.
-        schema: A serialized FileDescriptorSet that declares it and everything it refers to.
-
-    Raises:
-        WireError: It does not.
-    """
-    # needed for recordings with protobuf only
-    from google.protobuf.message import DecodeError
-
-    try:
-        message_class = _message_class(type_name, schema)
-    except (DecodeError, LookupError, ValueError, TypeError, RecursionError):
-        raise WireError(f"its schema does not declare {type_name}") from None
-
-    def decode(data: bytes) -> Any:
-        try:
-            return message_class.FromString(data)
-        except (DecodeError, ValueError):  # the latter by protobuf's pure Python
-            raise WireError(f"it is not a {type_name}") from None
-
-    return decode
-
-
-def _message_class(type_name: str, schema: bytes) -> Any:
-    from google.protobuf.descriptor_pb2 import FileDescriptorSet
-    from google.protobuf.descriptor_pool import DescriptorPool
-    from google.protobuf.message_factory import GetMessageClass
-
-    waiting = {file.name: file for file in FileDescriptorSet.FromString(schema).file}
-    pool = DescriptorPool()
-
-    def add(name: str) -> None:
-        """Add a file, after those it imports."""
-        file = waiting.pop(name, None)
-        if file is not None:
-            for dependency in file.dependency:
-                add(dependency)
-            pool.Add(file)
-
-    while waiting:
-        add(next(iter(waiting)))
-    return GetMessageClass(pool.FindMessageTypeByName(type_name))

@@ -10,9 +10,9 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
+from mp4ds.messages.descriptors import decoder_of_schema
 from mp4ds.messages.serializations import wire_of
 from mp4ds.messages.wire import PrimitiveReader, WireError
 from mp4ds.records import Channel, Schema
@@ -23,7 +23,6 @@ MAX_TRANSFORMS = 1000
 _MAX_MESSAGE = 1 << 20
 _MAX_IN_MESSAGE = 10 * MAX_TRANSFORMS
 _MAX_SCHEMA = 1 << 20
-_MAX_SCHEMA_FILES = 100
 _TOLERANCE = 0.01  # of a rotation's squared norm, as in tf2
 _TOPIC = "tf_static"
 _ROS_TYPES = {
@@ -99,7 +98,9 @@ def _parser(channel: Channel) -> Parser:
         if encoding == "json":
             return lambda data: _read_nodes(_parse_json(data), many)
         if encoding == "protobuf":
-            decode = _protobuf_decoder(channel.schema)
+            if len(channel.schema.data) > _MAX_SCHEMA:
+                raise WireError(f"its schema has {len(channel.schema.data)} bytes")
+            decode = decoder_of_schema(channel.schema.name, channel.schema.data)
             return lambda data: _read_nodes(decode(data), many)
     raise WireError(f"type {channel.type_name!r} in {encoding!r} is no transform")
 
@@ -145,57 +146,6 @@ def _parse_json(data: memoryview) -> Any:
         return json.loads(bytes(data))
     except (ValueError, RecursionError) as error:
         raise WireError(f"it is no JSON: {error}") from None
-
-
-def _protobuf_decoder(schema: Schema) -> Callable[[memoryview], Any]:
-    """Decodes messages by a recorded descriptor, whatever its field numbers."""
-    if len(schema.data) > _MAX_SCHEMA:
-        raise WireError(f"its descriptor has {len(schema.data)} bytes")
-    try:
-        # a large import that most recordings do not need
-        descriptor_pb2 = import_module("google.protobuf.descriptor_pb2")
-        pools = import_module("google.protobuf.descriptor_pool")
-        factory = import_module("google.protobuf.message_factory")
-        decode_error = import_module("google.protobuf.message").DecodeError
-    except ImportError:
-        raise WireError("protobuf is not installed") from None
-    try:
-        files = descriptor_pb2.FileDescriptorSet.FromString(schema.data).file
-        pool = pools.DescriptorPool()
-        for file in _in_order({file.name: file for file in files}):
-            pool.Add(file)
-        message_class = factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
-    except (decode_error, TypeError, ValueError, KeyError, RecursionError) as error:
-        raise WireError(f"its descriptor does not parse: {error}") from None
-
-    def decode(data: memoryview) -> Any:
-        try:
-            return message_class.FromString(bytes(data))
-        except (decode_error, ValueError) as error:
-            raise WireError(f"it does not parse: {error}") from None
-
-    return decode
-
-
-def _in_order(files: dict[str, Any]) -> list[Any]:
-    """Descriptor files, each after those it imports.
-
-    Raises:
-        ValueError: One is missing, they import each other, or there are too many.
-    """
-    if len(files) > _MAX_SCHEMA_FILES:
-        raise ValueError(f"it has {len(files)} files")
-    ordered: dict[str, Any] = {}
-    while len(ordered) < len(files):
-        ready = [
-            name
-            for name, file in files.items()
-            if name not in ordered and all(other in ordered for other in file.dependency)
-        ]
-        if not ready:
-            raise ValueError("it imports what it does not hold")
-        ordered.update((name, files[name]) for name in ready)
-    return list(ordered.values())
 
 
 def _read_nodes(message: Any, many: bool) -> list[Transform]:
