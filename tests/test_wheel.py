@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[1]
 for _module in ("hatchling", "hatch_fancy_pypi_readme"):
     pytest.importorskip(_module)
 VERSION = mp4ds.__version__
-OWN_NAMES = {"isal": "python-isal", "xxhash": "python-xxhash"}
+OWN_NAMES = {"xxhash": "python-xxhash"}
 """Packages that conda-forge calls otherwise."""
 
 

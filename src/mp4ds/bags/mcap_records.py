@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -20,11 +21,6 @@ from mp4ds.bags.protocols import ZSTD_PIECE, most_unpacked
 from mp4ds.errors import SourceError, SourceNotFoundError
 from mp4ds.files.urls import expect
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
-
-try:
-    from isal.isal_zlib import crc32  # more than ten times as fast as zlib's
-except ImportError:  # no wheel for this machine
-    from zlib import crc32
 
 MAGIC = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES = 4 * 2**30
@@ -267,7 +263,7 @@ def parse_attachment(body: bytes | memoryview) -> mcap_records.Attachment:
     attachment: mcap_records.Attachment
     attachment, length = _parse(mcap_records.Attachment, body)
     (crc,) = struct.unpack_from("<I", body, length - 4)
-    if crc and crc != crc32(memoryview(body)[: length - 4]):
+    if crc and crc != zlib.crc32(memoryview(body)[: length - 4]):
         raise DamageError(f"the attachment {attachment.name!r} does not match its checksum")
     return attachment
 
@@ -303,7 +299,7 @@ def unpack_chunk(body: bytes | memoryview) -> bytes | memoryview:
     content = _decompress(compression, data, size)
     if len(content) != size:
         raise DamageError(f"a chunk holds {len(content)} bytes instead of {size}")
-    if crc and crc != crc32(content):
+    if crc and crc != zlib.crc32(content):
         raise DamageError("a chunk does not match its checksum")
     return content
 
