@@ -24,7 +24,7 @@ from mp4ds.bags.mcap import McapReader
 from mp4ds.bags.mcap_records import DamageError, unzstd
 from mp4ds.bags.mcap_write import McapWriter
 from mp4ds.bags.rosbag2_files import ZstdFile
-from mp4ds.errors import ConversionError, OptionError, SourceError, SourceNotFoundError
+from mp4ds.errors import ConversionError, Mp4dsError, OptionError, SourceError, SourceNotFoundError
 from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record, Schema
 
 REAL_FILES = (
@@ -571,6 +571,19 @@ def test_an_abandoned_file_is_not_finished(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="stop"):
         write_it()
     refuse(path, "mcap recover|is not an MCAP file|is empty")
+
+
+def test_a_release_of_mcap_without_what_is_set_in_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Later(Writer):
+        def __init__(self, *args: Any, **options: Any) -> None:
+            super().__init__(*args, **options)
+            del self._Writer__compression
+
+    monkeypatch.setattr("mp4ds.bags.mcap_write.Writer", Later)
+    with pytest.raises(Mp4dsError, match=r"a\.mcap: mcap \S+ is newer .* 'mcap<"):
+        McapWriter(tmp_path / "a.mcap", profile="")
 
 
 @pytest.mark.parametrize("count", [0, 200])

@@ -7,16 +7,18 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import mcap
 import zstandard
 from mcap.writer import CompressionType, Writer
 
 from mp4ds._version import __version__
 from mp4ds.bags.protocols import most_unpacked
-from mp4ds.errors import ConversionError, OptionError
+from mp4ds.errors import ConversionError, Mp4dsError, OptionError
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
 
 CHUNK_BYTES = 2**20
 MAX_CHANNELS = 2**16 - 1
+_COMPRESSION = "_Writer__compression"  # no public name lets one chunk be compressed otherwise
 
 _COMPRESSIONS = {
     "zstd": CompressionType.ZSTD,
@@ -52,6 +54,7 @@ class McapWriter:
 
     Raises:
         OptionError: The compression is unknown.
+        Mp4dsError: The installed mcap is too new.
         OSError: It cannot be written.
     """
 
@@ -78,6 +81,11 @@ class McapWriter:
             self._writer: Any = Writer(
                 self._file, chunk_size=chunk_size, compression=_COMPRESSIONS[compression]
             )
+            if not hasattr(self._writer, _COMPRESSION):  # else noticed at the first large message
+                raise Mp4dsError(
+                    f"{path}: mcap {mcap.__version__} is newer than this mp4ds supports. Install "
+                    f"an older one: pip install 'mcap<{mcap.__version__}'"
+                )
             self._writer.start(profile=profile, library=library or f"mp4ds {__version__}")
         except BaseException:
             self._abandon()
@@ -135,13 +143,12 @@ class McapWriter:
     @contextmanager
     def _uncompressed(self) -> Iterator[None]:
         """Turn compression off for the chunk that a message larger than a chunk completes."""
-        name = "_Writer__compression"
-        before = getattr(self._writer, name)
-        setattr(self._writer, name, CompressionType.NONE)
+        before = getattr(self._writer, _COMPRESSION)
+        setattr(self._writer, _COMPRESSION, CompressionType.NONE)
         try:
             yield
         finally:
-            setattr(self._writer, name, before)
+            setattr(self._writer, _COMPRESSION, before)
 
     def _add(self, message: Message) -> None:
         self._writer.add_message(
@@ -154,8 +161,7 @@ class McapWriter:
 
     def flush(self) -> None:
         """Give the system all that was written, so that a reader of damaged files has it."""
-        self._writer._Writer__finalize_chunk()
-        self._file.flush()
+        self._writer.flush()
 
     def add_attachment(self, attachment: Attachment) -> None:
         """Append an attachment."""
