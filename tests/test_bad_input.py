@@ -29,6 +29,7 @@ from coded_scenes import CODED
 from conftest import real
 from each import each, fresh
 from mp4ds.cli import app_for
+from mp4ds.plugins import demo as demo_of
 from scenes import ENCODINGS, IMAGE, START, Record, Scene, image_cdr, image_ros1, picture
 from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2
 from waiting import WATCHDOG_S, until
@@ -967,7 +968,6 @@ def test_a_preset_that_is_wrong(codec: str, small_bag: Path, tmp_path: Path) -> 
         ("unpack", "DATASET", "--to", "mcap", "--every", "0"),
         ("unpack", "DATASET", "--to", "mcap", "--every", "1.5"),
         ("demo", "OUT.bag", "--seconds", "0"),
-        ("demo", "OUT.bag", "--seconds", "nan"),
         ("sell", "BAG"),
     ],
     ids=" ".join,
@@ -982,6 +982,16 @@ def test_a_command_line_that_cannot_be_understood(
         assert result.code == 2
         assert "Traceback" not in result.err
         assert "Error" in result.err
+
+
+@each("seconds", ["0", "3601", "nan", "inf"])
+def test_a_demo_of_no_length(seconds: str, tmp_path: Path) -> None:
+    with unchanged(tmp_path):
+        result = call("demo", tmp_path / "out.bag", "--seconds", seconds)
+        assert result.code == 2
+        assert "seconds" in result.err
+    with unchanged(tmp_path), pytest.raises(mp4ds.OptionError, match="seconds, not"):
+        demo_of.demo(tmp_path / "out.bag", seconds=float(seconds))
 
 
 # ---------------------------------------------------------------- datasets that are none

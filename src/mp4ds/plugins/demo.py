@@ -51,15 +51,18 @@ def demo(output: Path | str = "demo.bag", *, seconds: float = 3.0, force: bool =
 
     Args:
         output: The .bag file to make.
-        seconds: Length of the recording.
+        seconds: Length of the recording, from 0.1 to 3600.
         force: Replace an existing file.
 
     Returns:
         Number of messages.
 
     Raises:
+        OptionError: The file is not a .bag, or the length is out of bounds.
         TargetError: The file cannot be written there.
     """
+    if not 0.1 <= seconds <= 3600:  # not a number, too: older typers let it pass
+        raise OptionError(f"A demo lasts from 0.1 to 3600 seconds, not {seconds:g}.")
     target = Path(os.path.abspath(output))  # noqa: PTH100 - keeps links, unlike resolve()
     if target.suffix != ".bag":
         raise OptionError(f"The demo is a ROS 1 bag, and {target.name!r} does not end in .bag.")
