@@ -277,8 +277,10 @@ def test_an_unsuitable_topic_of_poses_is_refused_first(
 
 def test_colmap_without_poses(dataset: Path, tmp_path: Path) -> None:
     summary = export(dataset, "colmap", tmp_path / "out", topics=["/front/*"])
-    assert not (tmp_path / "out/sparse/0/images.txt").exists()
-    assert any("images.txt is not written" in note for note in summary.notes)
+    assert any("images.txt is empty" in note for note in summary.notes)
+    for name in ("images.txt", "points3D.txt"):  # COLMAP refuses a model without them
+        lines = (tmp_path / "out/sparse/0" / name).read_text().splitlines()
+        assert all(line.startswith("#") for line in lines)
 
 
 def lens(model: str, d: list[float]) -> Calibration:
@@ -298,7 +300,11 @@ def lens(model: str, d: list[float]) -> Calibration:
     ("model", "d", "colmap", "euroc"),
     [
         ("plumb_bob", [0.0] * 5, ("PINHOLE", []), "radial-tangential"),
-        ("", [], ("PINHOLE", []), "none"),
+        ("", [], ("PINHOLE", []), "radial-tangential"),
+        ("Brown Conrady", D, ("OPENCV", D), "radial-tangential"),
+        ("Inverse Brown Conrady", [0.0] * 5, ("PINHOLE", []), "radial-tangential"),
+        ("Inverse Brown Conrady", D, None, "Inverse Brown Conrady"),
+        ("equidistant", [], ("OPENCV_FISHEYE", [0.0] * 4), "equidistant"),
         ("plumb_bob", [*D, 0.0], ("OPENCV", D), "radial-tangential"),
         ("plumb_bob", [*D, 0.5], ("FULL_OPENCV", [*D, 0.5, 0, 0, 0]), "plumb_bob"),
         (
@@ -322,6 +328,103 @@ def test_models_of_distortion(
     else:
         assert found == (colmap[0], [100.0, 90.0, 32.0, 24.0, *colmap[1]])
     assert distortion(calibration)[0] == euroc
+
+
+# ---------------------------------------------------------------- and imported again
+
+LENSES = {
+    "plumb_bob": ([*D, 0.5], "plumb_bob", [*D, 0.5]),
+    "Brown Conrady": ([*D, 0.0], "plumb_bob", [*D, 0.0]),
+    "rational_polynomial": ([*D, *range(1, 5)], "rational_polynomial", [*D, *range(1, 5)]),
+    "equidistant": (D, "equidistant", D),
+    "vendor": ([1.0], "vendor", [1.0]),
+    "": ([], "plumb_bob", [0.0] * 5),
+}
+"""As recorded -> coefficients, and model and coefficients as imported."""
+IMPORTED = {  # layout -> topics of the cameras, of the IMU, of the poses
+    "euroc": (("/cam0/image_raw", "/cam1/image_raw", "/cam2/image_raw"), "/imu0", "/pose0"),
+    "kitti": (("/image_00/image_raw", "/image_01/image_raw", "/image_02/image_raw"), "", ""),
+    "tum": (("/rgb/image_raw", "/depth/image_raw"), "/accelerometer", "/groundtruth"),
+}
+
+
+def with_lens(model: str, *, rectified: bool) -> Scene:
+    """The drive with another lens; an unrectified camera has zeros for R and P."""
+
+    def changed(message: Record) -> Record:
+        if not message.topic.endswith("camera_info"):
+            return message
+        lens = {"distortion_model": model, "d": [*LENSES[model][0]]}
+        bare = {} if rectified else {"r": [0.0] * 9, "p": [0.0] * 12}
+        return replace(message, values={**message.values, **lens, **bare})
+
+    return Scene([changed(message) for message in MADE.messages])
+
+
+@each("model", LENSES)
+@pytest.mark.parametrize("to", ["euroc", "kitti"])
+def test_calibrations_are_imported_again(to: str, model: str, tmp_path: Path) -> None:
+    made = with_lens(model, rectified=model != "Brown Conrady")
+    source = pack_drive(tmp_path, Scene([m for m in made.messages if m.topic.startswith("/front")]))
+    mp4ds.export(source, to, tmp_path / "out")
+    images = mp4ds.PackOptions(images=mp4ds.ImageFolder())
+    mp4ds.pack(tmp_path / "out", tmp_path / "again", images)
+    with mp4ds.open(tmp_path / "again") as dataset:
+        found = dataset[IMPORTED[to][0][0]].intrinsics_at(0)
+    if to == "kitti" and model in ("equidistant", "vendor"):  # which it cannot hold
+        assert found is None
+        return
+    _, name, d = LENSES[model]
+    assert (found.distortion_model, found.d) == (name, d)
+    assert found.k == pytest.approx([FX, 0, CX, 0, FX, CY, 0, 0, 1])
+    assert found.r == [1, 0, 0, 0, 1, 0, 0, 0, 1]
+    assert found.p == pytest.approx([FX, 0, CX, 0, 0, FX, CY, 0, 0, 0, 1, 0])
+
+
+@each("to", IMPORTED)
+def test_import_takes_what_export_wrote(to: str, dataset: Path, tmp_path: Path) -> None:
+    export(dataset, to, tmp_path / "out", **({} if to == "kitti" else {"poses": ODOMETRY}))
+    images = mp4ds.PackOptions(images=mp4ds.ImageFolder())
+    mp4ds.pack(tmp_path / "out", tmp_path / "again", images)
+    cameras, imu, poses = IMPORTED[to]
+    recorded = (COLOUR, DEPTH) if to == "tum" else (COLOUR, GREY, DEPTH)
+    with mp4ds.open(tmp_path / "again") as again:
+        for camera, topic in zip(cameras, recorded, strict=True):
+            frames = list(again[camera])
+            assert [frame.stamp_ns for frame in frames] == stamps_of(MADE, topic)
+            for number, frame in enumerate(frames):
+                assert (frame.data == pixels_of(topic, number)).all()
+        if imu:
+            found = [message.decoded for message in again.messages([imu])]
+            sent = [message.values for message in MADE.messages if message.topic == IMU]
+            assert sorted(one.linear_acceleration.z for one in found) == sorted(
+                one["linear_acceleration"]["z"] for one in sent
+            )
+        if poses:
+            found = [message.decoded for message in again.messages([poses])]
+            places = [
+                (one.header.stamp.sec * 10**9 + one.header.stamp.nanosec, one.pose.position.x)
+                for one in found
+            ]
+            assert places == [pose_at(number) for number in range(FRAMES + 1)]
+            assert {one.pose.orientation.w for one in found} == {1.0}
+
+
+def test_images_for_colmap_are_a_plain_folder(dataset: Path, tmp_path: Path) -> None:
+    export(dataset, "colmap", tmp_path / "out")
+    images = mp4ds.PackOptions(images=mp4ds.ImageFolder())
+    mp4ds.pack(tmp_path / "out/images/front_image_raw", tmp_path / "again", images)
+    with mp4ds.open(tmp_path / "again") as again:
+        (stream,) = again.streams
+        assert [frame.stamp_ns for frame in stream] == stamps_of(MADE, COLOUR)
+        assert (stream[3].data == pixels_of(COLOUR, 3)).all()
+
+
+@each("to", ["euroc", "kitti"])
+def test_cameras_without_a_common_frame(to: str, dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(mp4ds.OptionError, match="not every camera has a frame at this time"):
+        export(dataset, to, tmp_path / "out", topics=[COLOUR, GREY], tolerance_ns=0)
+    assert list(tmp_path.iterdir()) == []
 
 
 # ---------------------------------------------------------------- poses

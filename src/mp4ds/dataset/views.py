@@ -45,6 +45,36 @@ def effective(calibration: CalibrationFields) -> tuple[Matrix, Matrix]:
     return matrices[0], matrices[1]
 
 
+# names of lens models by ROS and other drivers, in lower case with underscores
+_POLYNOMIAL = {"plumb_bob", "rational_polynomial", "radtan", "brown_conrady", "brown"}
+_FISHEYE = {"equidistant", "fisheye", "kannala_brandt", "kannala_brandt4"}
+_WITHOUT = {"", "none", "inverse_brown_conrady", "modified_brown_conrady"} | _POLYNOMIAL
+
+
+def lens_of(calibration: Calibration) -> tuple[str, list[float]]:
+    """Distortion model and coefficients, in ROS's terms where it has them.
+
+    Returns:
+        ``none`` without coefficients, for a lens that does not distort; ``plumb_bob`` with 5,
+        ``rational_polynomial`` with 8, 12 or 14, ``equidistant`` with 4; else what was recorded.
+    """
+    name = calibration.distortion_model.strip().lower().replace(" ", "_")
+    d = list(calibration.d)
+    while d and not d[-1]:  # a longer model whose further coefficients are zero is the shorter one
+        d.pop()
+    if name in _WITHOUT and not d:
+        return "none", []
+    sizes: tuple[tuple[str, int], ...] = ()
+    if name in _POLYNOMIAL:
+        sizes = (("plumb_bob", 5), *(("rational_polynomial", size) for size in (8, 12, 14)))
+    elif name in _FISHEYE:
+        sizes = (("equidistant", 4),)
+    for model, size in sizes:
+        if len(d) <= size:
+            return model, d + [0.0] * (size - len(d))
+    return calibration.distortion_model, list(calibration.d)
+
+
 @dataclass(frozen=True, slots=True)
 class Placement:
     """The crop of an image, and its size after resizing.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.dataset.views import lens_of
 from mp4ds.errors import OptionError
 from mp4ds.format.models import Calibration
 from mp4ds.plan import FileNames
@@ -65,31 +66,23 @@ def write(job: ExportJob) -> None:
         values = " ".join(map(repr, found[1]))
         lines.append(f"{len(images)} {found[0]} {width} {height} {values}")
     (folder / "cameras.txt").write_text("\n".join([*lines, ""]), encoding="utf-8")
-    if poses is not None:
-        _write_images(job, images, poses)
-    else:
-        job.note(
-            "images.txt is not written: it needs the pose of each image (--poses TOPIC); "
-            "cameras.txt gives the cameras"
-        )
+    _write_images(job, images, poses)
 
 
 def model_of(calibration: Calibration) -> tuple[str, list[float]] | None:
-    """COLMAP's camera model and its parameters; None if it has none.
-
-    If all extra parameters are zero, the simpler equivalent model is used.
-    """
+    """COLMAP's camera model and its parameters, the simplest that is equal; None if it has none."""
     k = calibration.k
     values = [k[0], k[4], k[2] + _HALF_PIXEL, k[5] + _HALF_PIXEL]
-    name, d = calibration.distortion_model, list(calibration.d)
-    if name in ("equidistant", "fisheye"):
-        return ("OPENCV_FISHEYE", [*values, *d]) if len(d) == 4 else None
-    if name in ("", "none", "plumb_bob", "rational_polynomial") and not any(d):
+    model, d = lens_of(calibration)
+    if model == "none":
         return "PINHOLE", values
-    if name not in ("plumb_bob", "rational_polynomial") or any(d[8:]):
-        return None
-    d = (d + [0.0] * 8)[:8]
-    return ("FULL_OPENCV", [*values, *d]) if any(d[4:]) else ("OPENCV", [*values, *d[:4]])
+    if model == "equidistant":
+        return "OPENCV_FISHEYE", [*values, *d]
+    if model == "plumb_bob" and not d[4]:
+        return "OPENCV", [*values, *d[:4]]
+    if model in ("plumb_bob", "rational_polynomial") and len(d) <= 8:
+        return "FULL_OPENCV", [*values, *(d + [0.0] * 3)[:8]]
+    return None
 
 
 @dataclass(frozen=True)
@@ -162,13 +155,18 @@ def _poses(job: ExportJob) -> Poses | None:
 
 
 def _write_images(
-    job: ExportJob, images: Sequence[tuple[int, ExportedCamera, Sequence[str]]], poses: Poses
+    job: ExportJob, images: Sequence[tuple[int, ExportedCamera, Sequence[str]]], poses: Poses | None
 ) -> None:
-    tree = StaticTree(static_transforms(job.source.dataset))
-    track = PoseTrack.of(poses.rows())
-    number = 0
-    with (job.path / _MODEL / "images.txt").open("w", encoding="utf-8") as file:
+    folder = job.path / _MODEL
+    (folder / "points3D.txt").write_text("# no points\n", encoding="utf-8")
+    with (folder / "images.txt").open("w", encoding="utf-8") as file:
         file.write("# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# no points\n")
+        if poses is None:  # COLMAP refuses a model without the file
+            job.note("images.txt is empty: it needs the pose of each image (--poses TOPIC)")
+            return
+        tree = StaticTree(static_transforms(job.source.dataset))
+        track = PoseTrack.of(poses.rows())
+        number = 0
         for camera_id, camera, files in images:
             place = tree.pose(camera.frame_id, poses.body)
             if place is None:
@@ -193,7 +191,6 @@ def _write_images(
                     f"{camera.topic}: {missing} of {len(camera)} images are before the first or "
                     "after the last pose, so they are not in images.txt"
                 )
-    (job.path / _MODEL / "points3D.txt").write_text("# no points\n", encoding="utf-8")
     job.source.ledger.hold(poses.topic, len(track.times))
     job.places[f"{_MODEL}/images.txt"] = poses.topic
     job.note(f"{poses.topic}: poses of images are interpolated between the recorded ones")

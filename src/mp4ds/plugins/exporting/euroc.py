@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from mp4ds.dataset.views import lens_of
 from mp4ds.format.models import Calibration
 from mp4ds.plugins.exporting.job import (
     ExportedCamera,
@@ -88,7 +89,7 @@ def _write_camera(job: ExportJob, place: str, camera: ExportedCamera, pose: Pose
         job.note(f"{camera.topic}: not calibrated")
     else:
         model, coefficients = distortion(calibration)
-        if model not in _MODELS:
+        if model not in ("radial-tangential", "equidistant"):
             job.note(f"{camera.topic}: EuRoC has no distortion {model}; it is given by its name")
         k = calibration.k
         lines += [
@@ -100,22 +101,14 @@ def _write_camera(job: ExportJob, place: str, camera: ExportedCamera, pose: Pose
     _write_sensor(job.path / place, "camera", camera.topic, pose, lines)
 
 
-_MODELS = ("radial-tangential", "equidistant", "none")
-
-
 def distortion(calibration: Calibration) -> tuple[str, list[float]]:
-    """Name and coefficients of a distortion, in EuRoC's terms if it has them.
-
-    Trailing zero coefficients of a longer ROS model are left out: the model is the same.
-    """
-    name, values = calibration.distortion_model, list(calibration.d)
-    if not any(values) and name in ("", "none", "plumb_bob", "rational_polynomial"):
-        return ("none", []) if not values else ("radial-tangential", [0.0] * 4)
-    if name in ("plumb_bob", "rational_polynomial") and not any(values[4:]):
-        return "radial-tangential", (values + [0.0] * 4)[:4]
-    if name in ("equidistant", "fisheye"):
-        return "equidistant", values
-    return name, values
+    """Name and coefficients of a distortion, in EuRoC's terms if it has them."""
+    model, d = lens_of(calibration)
+    if model == "none":
+        return "radial-tangential", [0.0] * 4
+    if model == "plumb_bob" and not d[4]:
+        return "radial-tangential", d[:4]
+    return model, d
 
 
 def _write_rows(job: ExportJob, place: str, topic: str, head: str, rows: Iterator[Row]) -> None:

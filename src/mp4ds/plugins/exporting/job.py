@@ -318,9 +318,9 @@ def chosen_cameras(
         view = _view(stream, options, notes)
         cameras.append(ExportedCamera(stream, kept, times[kept], view))
     cameras.sort(key=lambda camera: (camera.calibration is None, camera.topic))
-    if options.tolerance_ns is None or len(cameras) < 2:
-        return cameras
-    return _matched(cameras, options.tolerance_ns, ledger)
+    if options.tolerance_ns is not None and len(cameras) > 1:
+        cameras = _matched(cameras, options.tolerance_ns, ledger)
+    return [camera for camera in cameras if len(camera)]
 
 
 def _view(stream: Stream, options: ExportOptions, notes: list[str]) -> View:

@@ -6,12 +6,13 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from mp4ds.dataset.views import lens_of
 from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob, hold_calibration, that_png_holds
 from mp4ds.plugins.exporting.motion import StaticTree, static_transforms
 from mp4ds.plugins.exporting.tum import seconds
 
 _MOST_CAMERAS = 100  # two digits
-_FULL_D = 5
+_IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 
 def write(job: ExportJob) -> None:
@@ -55,20 +56,30 @@ def _calibration_lines(
     job: ExportJob, tree: StaticTree, first: ExportedCamera, number: int, camera: ExportedCamera
 ) -> list[str]:
     """The lines of a camera, with the names and order of calib_cam_to_cam.txt."""
-    calibration = hold_calibration(camera, job.source.ledger)
+    calibration = camera.calibration
     if calibration is None:
         job.note(f"{camera.topic}: not calibrated")
         return []
-    if calibration.distortion_model not in ("", "plumb_bob") or len(calibration.d) > _FULL_D:
+    model, d = lens_of(calibration)
+    if model not in ("none", "plumb_bob", "rational_polynomial"):
         job.note(
-            f"{camera.topic}: KITTI has no distortion {calibration.distortion_model} with "
-            f"{len(calibration.d)} parameters; D holds them unchanged"
+            f"{camera.topic}: KITTI has no distortion {model!r}, so it is not in "
+            "calib_cam_to_cam.txt"
         )
+        return []
+    if model == "rational_polynomial":
+        job.note(f"{camera.topic}: KITTI's D has 5 parameters, here it has {len(d)}, as in OpenCV")
+    hold_calibration(camera, job.source.ledger)
+    rotation, projection = calibration.r, calibration.p
+    if not projection[0]:
+        job.note(f"{camera.topic}: recorded without rectification, so P_rect is K without any")
+        k = calibration.k
+        rotation, projection = _IDENTITY, [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
     key, (width, height) = f"{number:02d}", camera.size
     lines = [
         _line(f"S_{key}", (width, height)),
         _line(f"K_{key}", calibration.k),
-        _line(f"D_{key}", [*calibration.d, *[0.0] * (_FULL_D - len(calibration.d))]),
+        _line(f"D_{key}", d or [0.0] * 5),
     ]
     pose = tree.pose(first.frame_id, camera.frame_id)
     if pose is None:
@@ -79,8 +90,8 @@ def _calibration_lines(
     return [
         *lines,
         _line(f"S_rect_{key}", (width, height)),
-        _line(f"R_rect_{key}", calibration.r),
-        _line(f"P_rect_{key}", calibration.p),
+        _line(f"R_rect_{key}", rotation),
+        _line(f"P_rect_{key}", projection),
     ]
 
 

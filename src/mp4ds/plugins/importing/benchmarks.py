@@ -37,7 +37,7 @@ from mp4ds.video.images import image_size
 
 LIST = "data.csv"
 _BODY, _WORLD = "body", "world"
-_POSES = ("state_groundtruth_estimate", "mocap")
+_POSES = ("state_groundtruth_estimate", "mocap", "pose")
 
 
 def sensors(folder: Path) -> list[Path]:
@@ -150,15 +150,16 @@ class _Calibrations:
     def __contains__(self, key: str) -> bool:
         return key in self.values
 
-    def numbers(self, key: str, count: int) -> Matrix:
-        """A list of them.
+    def numbers(self, key: str, *counts: int) -> Matrix:
+        """A list of as many numbers as one of the counts.
 
         Raises:
             SourceError: It is missing, or has another length.
         """
         found = self.values.get(key)
-        if found is None or len(found) != count or not np.isfinite(found).all():
-            raise SourceError(self.path, f"has no list {key} of {count} numbers")
+        if found is None or len(found) not in counts or not np.isfinite(found).all():
+            listed = " or ".join(map(str, counts))
+            raise SourceError(self.path, f"has no list {key} of {listed} numbers")
         return found
 
     def size(self, key: str) -> tuple[int, int]:
@@ -237,20 +238,24 @@ def _raw_calibration(
         return None
     size = image_size(files[0])
     p = values.numbers(f"P_rect_{number}", 12)
-    if size == values.size(f"S_rect_{number}"):
+    is_recorded, is_rectified = (size == values.size(f"{key}_{number}") for key in ("S", "S_rect"))
+    # of equal sizes the images are as recorded, unless their folder's name tells otherwise
+    if is_rectified and (not is_recorded or scene.folder.resolve().name.endswith("_sync")):
         _place(scene, name, np.eye(3), _origin(p))
         return _rectified(size, p)
-    if size != values.size(f"S_{number}"):
+    if not is_recorded:
         scene.skipped[f"calibrations of {name}, made for a different image size"] = 1
         return None
-    rotation = values.numbers(f"R_{number}", 9).reshape(3, 3)
-    translation = values.numbers(f"T_{number}", 3)
-    _place(scene, name, rotation.T, -rotation.T @ translation)
+    if f"R_{number}" in values:
+        rotation = values.numbers(f"R_{number}", 9).reshape(3, 3)
+        translation = values.numbers(f"T_{number}", 3)
+        _place(scene, name, rotation.T, -rotation.T @ translation)
+    d = values.numbers(f"D_{number}", 5, 8, 12, 14)
     return CalibrationFields(
         width=size[0],
         height=size[1],
-        distortion_model="plumb_bob",
-        d=tuple(values.numbers(f"D_{number}", 5).tolist()),
+        distortion_model="plumb_bob" if len(d) == 5 else "rational_polynomial",
+        d=tuple(d.tolist()),
         k=tuple(values.numbers(f"K_{number}", 9).tolist()),
         r=tuple(values.numbers(f"R_rect_{number}", 9).tolist()),
         p=tuple(p.tolist()),

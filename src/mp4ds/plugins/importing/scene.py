@@ -184,6 +184,7 @@ _MODELS = {
     "rational_polynomial": ("rational_polynomial", (8, 12, 14)),
     "equidistant": ("equidistant", (4,)),
     "fisheye": ("equidistant", (4,)),
+    "none": ("plumb_bob", (0, 4, 5)),
 }
 
 _OPENCV_HEADER = re.compile(rb"(?:\xef\xbb\xbf)?%YAML:1\.\d[ \t]*\r?\n(?:---[ \t]*\r?\n)?")
@@ -261,14 +262,14 @@ def euroc_calibration(path: Path, values: dict[str, Any]) -> CalibrationFields:
         width, height = _numbers(_known(values, "resolution"), "resolution", 2)
         fx, fy, cx, cy = _numbers(_known(values, "intrinsics"), "intrinsics", 4)
         k = (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0)
-        coefficients = _known(values, "distortion_coefficients")
+        name = str(_known(values, "distortion_model"))
+        d = _known(values, "distortion_coefficients")
+        d = _numbers(d, "distortion_coefficients", None)
         return CalibrationFields(
             width=_whole(width, "resolution"),
             height=_whole(height, "resolution"),
-            **_distortion(
-                str(_known(values, "distortion_model")),
-                _numbers(coefficients, "distortion_coefficients", None),
-            ),
+            # a model that is not known here may be known to those who read the messages
+            **(_distortion(name, d) if name in _MODELS else {"distortion_model": name, "d": d}),
             k=k,
             r=IDENTITY,
             p=projection(k),
@@ -305,7 +306,7 @@ def _distortion(name: str, values: tuple[float, ...]) -> dict[str, Any]:
         listed = " or ".join(map(str, counts))
         raise ValueError(f"{name} has {listed} distortion_coefficients, not {len(values)}")
     if model == "plumb_bob":  # ROS's also has the third radial coefficient
-        values = (*values, 0.0)[:5]
+        values = (*values, *(0.0,) * 5)[:5]
     return {"distortion_model": model, "d": values}
 
 

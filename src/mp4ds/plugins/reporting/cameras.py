@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mp4ds.dataset.rebuild import fields_of
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.views import effective
+from mp4ds.dataset.views import effective, lens_of
 from mp4ds.errors import OptionError
 from mp4ds.format.models import Calibration
 from mp4ds.plugins.reporting.proxies import why_not_seen
@@ -291,8 +291,7 @@ _CELLS = 12  # over the width of the image
 _POINTS = 97  # of a line
 _MARGIN = 0.02  # of the image's sides, beyond which a line is cut
 _REACH, _FARTHEST = 2.5, 5  # times the image without distortion, from its principal point
-_POLYNOMIAL = {"plumb_bob", "rational_polynomial", "radtan", "brown_conrady", "brown"}
-_FISHEYE = {"equidistant", "fisheye", "kannala_brandt", "kannala_brandt4"}
+_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
 _MOST_D = 12  # beyond are the tilts of a sensor
 
 
@@ -324,13 +323,12 @@ def overlay_of(calibration: Calibration, image_size: tuple[int, int], topic: str
     k, p = (np.array(matrix) for matrix in effective(fields_of(calibration)))
     is_rectified = any(part.startswith("image_rect") for part in topic.split("/"))
     matrix = p[:, :3] if is_rectified else k
-    d = [] if is_rectified else list(calibration.d)
-    problem = _problem(calibration, matrix, d, image_size)
+    model, d = ("none", []) if is_rectified else lens_of(calibration)
+    problem = _problem(calibration, matrix, model, d, image_size)
     if problem:
         return Overlay([], [], [], problem)
     width, height = image_size
     (fx, _, cx), (_, fy, cy) = matrix[0], matrix[1]
-    model = _name(calibration.distortion_model)
     step = width / fx / _CELLS
     lines: list[list[float]] = []
     axes: list[int] = []
@@ -353,12 +351,12 @@ def overlay_of(calibration: Calibration, image_size: tuple[int, int], topic: str
     return Overlay(lines, axes, [round((cx + 0.5) / width, 5), round((cy + 0.5) / height, 5)])
 
 
-def _name(model: str) -> str:
-    return model.strip().lower().replace(" ", "_")
-
-
 def _problem(
-    calibration: Calibration, matrix: Floats, d: Sequence[float], image_size: tuple[int, int]
+    calibration: Calibration,
+    matrix: Floats,
+    model: str,
+    d: Sequence[float],
+    image_size: tuple[int, int],
 ) -> str:
     """Why no grid is possible."""
     size = calibration.width, calibration.height
@@ -371,9 +369,8 @@ def _problem(
         return f"it is for images of {seen[0]}x{seen[1]}, these are {image_size[0]}x{image_size[1]}"
     if not any(d):
         return ""
-    name = _name(calibration.distortion_model)
-    if name not in _POLYNOMIAL | _FISHEYE:
-        return f"the distortion model {calibration.distortion_model!r} is not supported here"
+    if model not in _MODELS:
+        return f"the distortion model {model!r} is not supported here"
     if not np.isfinite(d).all() or any(d[_MOST_D:]):
         return "its sensor is tilted, which is not supported"
     return ""
@@ -386,7 +383,7 @@ def _distort(
     if not any(d):
         return x, y, np.ones(len(x), np.bool_)
     with np.errstate(all="ignore"):  # far outside the view
-        if model in _FISHEYE:
+        if model == "equidistant":
             return _fisheye(x, y, d)
         return _polynomial(x, y, d)
 
