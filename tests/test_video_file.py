@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from fractions import Fraction
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from av.stream import Disposition
 from numpy.typing import NDArray
 
 import mp4ds
@@ -176,6 +178,84 @@ def test_only_frames_are_read_without_a_sidecar(tmp_path: Path) -> None:
         with pytest.raises(mp4ds.FormatError, match=r"clip\.yaml.* \[file-missing\]"):
             call(tmp_path / "clip.mp4")
     assert [item.code for item in mp4ds.validate(tmp_path / "clip.mp4")] == ["file-missing"]
+
+
+def write_tracks(path: Path, encoders: list[str], *, in_fragments: bool = False) -> None:
+    """Tracks of 12 and 24 frames, the first smaller than the second, as two cameras in one file."""
+    muxer = {"movflags": "frag_keyframe+empty_moov"} if in_fragments else {}
+    with av.open(str(path), "w", options=muxer) as container:
+        streams: list[Any] = [container.add_stream(name, rate=30) for name in encoders]
+        for number, stream in enumerate(streams):
+            stream.width, stream.height, stream.pix_fmt = 64 << number, 48 << number, "yuv420p"
+            stream.options = {"g": "6"}
+        for number, stream in enumerate(streams):
+            for index in range(12 << number):
+                stream_frame = frame_of(number, index)
+                container.mux(stream.encode(stream_frame))
+            container.mux(stream.encode(None))
+
+
+def frame_of(track: int, index: int) -> av.VideoFrame:
+    pixels = np.full((48 << track, 64 << track, 3), 10 * index + 5 * track, np.uint8)
+    return av.VideoFrame.from_ndarray(pixels, format="rgb24")
+
+
+def check_frame(data: NDArray[Any], track: int, index: int) -> None:
+    expected = frame_of(track, index).to_ndarray().astype(float)
+    assert np.abs(data - expected).mean() < 4  # of the next frame 10, of the other track 5
+
+
+@each("encoders", [["libx264", "libx264"], ["libx264", "mpeg4"]], ids="-".join)
+@pytest.mark.parametrize("in_fragments", [False, True])
+def test_one_of_several_tracks(encoders: list[str], in_fragments: bool, tmp_path: Path) -> None:
+    path = tmp_path / "clip.mp4"
+    write_tracks(path, encoders, in_fragments=in_fragments)
+    name = {"libx264": "h264"}.get(encoders[1], encoders[1])
+    listed = f"2 video tracks, not one (0: h264 64x48, 1: {name} 128x96); `mp4ds.open` takes"
+    with pytest.raises(mp4ds.VideoError, match=re.escape(listed)):
+        mp4ds.open(path)
+    for track in (0, 1):
+        with mp4ds.open(path, track=track) as dataset:
+            (video,) = dataset.videos
+            assert video.image_size == (64 << track, 48 << track)
+            assert len(video) == 12 << track
+            for index in (7, 2, len(video) - 1):
+                check_frame(video[index].data, track, index)
+            for index, frame in enumerate(video):
+                check_frame(frame.data, track, index)
+    for track in (-1, 2):
+        with pytest.raises(mp4ds.OptionError, match=f"no `track` {track}; there are 0: h264"):
+            mp4ds.open(path, track=track)
+
+
+def test_a_track_is_of_a_video_without_a_sidecar(tmp_path: Path) -> None:
+    mp4ds.pack(SOURCES["bag-none"](tmp_path, scene("rgb8", frames=2)), tmp_path / "ds")
+    with pytest.raises(mp4ds.OptionError, match="`track` is for videos without a sidecar"):
+        mp4ds.open(tmp_path / "ds", track=0)
+    with pytest.raises(mp4ds.SourceNotFoundError):
+        mp4ds.open(tmp_path / "none.mp4", track=0)
+
+
+def test_a_picture_of_the_cover_is_no_track(tmp_path: Path) -> None:
+    write_video(tmp_path / "clip.mp4", "h264")
+    with (
+        av.open(str(tmp_path / "clip.mp4")) as source,
+        av.open(str(tmp_path / "cover.mp4"), "w") as target,
+    ):
+        copied = target.add_stream_from_template(source.streams.video[0])
+        cover: Any = target.add_stream("mjpeg", rate=1)
+        cover.width, cover.height, cover.pix_fmt = 64, 48, "yuvj420p"
+        cover.disposition = Disposition.attached_pic
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = copied
+                target.mux(packet)
+        target.mux(cover.encode(frame_of(0, 0)))
+        target.mux(cover.encode(None))
+    with av.open(str(tmp_path / "cover.mp4")) as container:
+        assert len(container.streams.video) == 2
+    with mp4ds.open(tmp_path / "cover.mp4") as dataset:
+        assert len(dataset["cover"]) == FRAMES
 
 
 @pytest.mark.parametrize(

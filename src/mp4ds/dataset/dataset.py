@@ -392,11 +392,11 @@ def _time_of(record: Record) -> int:
 class _VideoDataset(Dataset):
     """A third-party video."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, track: int | None) -> None:
         self.path = path
         self.manifest = None
         self.streams = []
-        self.videos = [Video(path)]
+        self.videos = [Video(path, track)]
 
     @property
     def profile(self) -> str:
@@ -404,7 +404,7 @@ class _VideoDataset(Dataset):
         return ""
 
 
-def open_dataset(path: Path | str) -> Dataset:
+def open_dataset(path: Path | str, *, track: int | None = None) -> Dataset:
     """Open a dataset, or one video with its sidecar. See `Dataset`.
 
     A video without a sidecar or dataset can be opened, too: it is then in `Dataset.videos`, and its
@@ -412,10 +412,18 @@ def open_dataset(path: Path | str) -> Dataset:
 
     Args:
         path: See `Dataset`.
+        track: Which video track of a video without a sidecar, from 0, if it has several.
+
+    Raises:
+        OptionError: There is no such track, or it is not such a video. See `Dataset` for others.
     """
     place = location(path)
     if place.suffix.lower() in _VIDEOS and place.is_file():
         beside = (place.with_suffix(".yaml"), place.parent / MANIFEST_NAME)
         if not any(path.exists() for path in beside):
-            return _VideoDataset(place)
-    return Dataset(place)
+            return _VideoDataset(place, track)
+    dataset = Dataset(place)
+    if track is not None:
+        dataset.close()
+        raise OptionError(f"{place}: `track` is for videos without a sidecar.")
+    return dataset

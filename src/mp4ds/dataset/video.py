@@ -24,15 +24,18 @@ class Video(DecodedFrames):
 
     Args:
         path: The video.
+        track: Which of several video tracks, from 0.
 
     Raises:
-        VideoError: It cannot be read, or does not have exactly one video track.
+        VideoError: It cannot be read, or has several video tracks and none was chosen.
+        OptionError: It has no such track.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, track: int | None = None) -> None:
         super().__init__()
         self.path = path
-        with VideoFile(path) as file:
+        self._track = track
+        with VideoFile(path, track) as file:
             self._codec, self._size, self._times = file.codec, file.size, file.times
 
     @property
@@ -82,10 +85,11 @@ class Video(DecodedFrames):
             codec=self._codec,
             size=self._size,
             frames=len(self),
+            track=self._track,
         )
 
     def _pictures(self, scale: Scale | None) -> Iterator[Picture]:
-        with VideoFile(self.path) as file:
+        with VideoFile(self.path, self._track) as file:
             for number in range(len(self)):
                 yield file.picture(number, scale)
 

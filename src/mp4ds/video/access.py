@@ -308,6 +308,7 @@ class FrameAccess:
         maker: Makes pictures of its frames.
         threads: Of the decoder. One takes the least CPU time; with more, one frame comes sooner.
         references: What the sidecar says about them, which saves reading packets to find out.
+        track: See `read_sample_table`.
 
     Raises:
         UnknownStructure: Its frames cannot be decoded one by one.
@@ -324,8 +325,10 @@ class FrameAccess:
         maker: PictureMaker,
         threads: int = 1,
         references: RecordedReferences | None = None,
+        track: int | None = None,
     ) -> None:
         self._path = path
+        self._track = track
         self._codec = codec
         self._maker = maker
         self._threads = threads
@@ -345,7 +348,8 @@ class FrameAccess:
 
     def _read_table(self, frames: int | None) -> SampleTable:
         try:
-            table = read_sample_table(self._file, self._path.stat().st_size, str(self._path))
+            size = self._path.stat().st_size
+            table = read_sample_table(self._file, size, str(self._path), self._track)
         except Refused as error:
             raise UnknownStructure(f"its index cannot be used: {error}") from None
         known = CODECS.get(self._codec)

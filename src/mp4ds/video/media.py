@@ -10,8 +10,9 @@ from typing import Any, BinaryIO
 
 import av
 from av.error import FFmpegError
+from av.stream import Disposition
 
-from mp4ds.errors import RemoteError, VideoError
+from mp4ds.errors import Mp4dsError, OptionError, RemoteError, VideoError
 from mp4ds.files.urls import remote
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import CODECS
@@ -43,6 +44,13 @@ def raise_if_scarce(error: BaseException | None = None) -> None:
 
 # ---------------------------------------------------------------- media
 
+
+def _described(track: Any) -> str:
+    """Codec and size of a track."""
+    context = track.codec_context
+    return f"{context.name} {context.width}x{context.height}" if context else "an unknown codec"
+
+
 # names and comments need not be UTF-8; PyAV 19 takes them as they are
 _ANY_METADATA: dict[str, Any] = (
     {"metadata_errors": "ignore"} if int(av.__version__.split(".")[0]) < 19 else {}
@@ -54,6 +62,8 @@ class Media:
 
     Args:
         path: The video.
+        track: Which of its video tracks, from 0; None: it has only one.
+        advice: What to do where it has several, for errors.
 
     Attributes:
         container: PyAV's.
@@ -61,10 +71,11 @@ class Media:
 
     Raises:
         VideoError: ``file-missing`` or ``video-unreadable``.
+        OptionError: It has no such track.
         RemoteError: It is at a URL, and cannot be read there.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, track: int | None = None, advice: str = "") -> None:
         if not path.is_file():
             raise VideoError("file-missing", path, "does not exist")
         self._path = path
@@ -82,22 +93,31 @@ class Media:
             self._close_file()
             raise
         try:
-            self.track = self._only_track()
-        except VideoError:
+            self.track = self._chosen(track, advice)
+        except Mp4dsError:
             self.close()
             raise
 
-    def _only_track(self) -> Any:
-        tracks = self.container.streams.video
-        if len(tracks) != 1:
-            raise VideoError(
-                "video-unreadable", self._path, f"has {len(tracks)} video tracks, not one"
+    def _chosen(self, number: int | None, advice: str) -> Any:
+        # a picture of the cover comes as one more track
+        streams = self.container.streams.video
+        tracks = [one for one in streams if not one.disposition & Disposition.attached_pic]
+        listed = ", ".join(f"{place}: {_described(one)}" for place, one in enumerate(tracks))
+        if number is None and len(tracks) != 1:
+            problem = f"has {len(tracks)} video tracks, not one"
+            if tracks:
+                problem += f" ({listed}){advice}"
+            raise VideoError("video-unreadable", self._path, problem)
+        if number is not None and not 0 <= number < len(tracks):
+            raise OptionError(
+                f"{self._path}: there is no `track` {number}; there are {listed or 'none'}."
             )
-        if tracks[0].codec_context is None or tracks[0].codec_context.codec is None:
+        track = tracks[number or 0]
+        if track.codec_context is None or track.codec_context.codec is None:
             raise VideoError(
                 "video-unreadable", self._path, "has a video track with an unknown codec"
             )
-        return tracks[0]
+        return track
 
     @cached_property
     def hidden(self) -> int:

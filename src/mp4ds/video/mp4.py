@@ -394,8 +394,10 @@ class _Movie:
         return np.frombuffer(self._data, row, count, box.start + at)
 
 
-def read_sample_table(stream: BinaryIO, size: int, place: str) -> SampleTable:
-    """Read the index of an mp4 with one video track.
+def read_sample_table(
+    stream: BinaryIO, size: int, place: str, track: int | None = None
+) -> SampleTable:
+    """Read the index of a video track of an mp4.
 
     Only the headers of its outermost boxes and its movie box are read, the latter at once.
 
@@ -405,6 +407,7 @@ def read_sample_table(stream: BinaryIO, size: int, place: str) -> SampleTable:
             have one size.
         size: Its bytes.
         place: Its name, for errors.
+        track: Which video track, from 0; None: there is only one.
 
     Raises:
         VideoError: ``video-unreadable``: there is no index, it contradicts itself or the file's
@@ -416,9 +419,11 @@ def read_sample_table(stream: BinaryIO, size: int, place: str) -> SampleTable:
     try:
         movie = _read_movie(stream, size)
         tracks = movie.tracks()
-        if len(tracks) != 1:
+        if track is None and len(tracks) != 1:
             raise VideoError("video-unreadable", place, f"has {len(tracks)} video tracks, not one")
-        return _parse_track(movie, tracks[0], size)
+        if track is not None and track >= len(tracks):
+            raise Refused("ffmpeg finds more tracks")
+        return _parse_track(movie, tracks[track or 0], size)
     except DamagedBoxError as error:
         raise VideoError("video-unreadable", place, f"has no readable index: {error}") from None
 

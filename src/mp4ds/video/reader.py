@@ -161,10 +161,11 @@ _TRIES = 3
 
 
 class VideoFile:
-    """An mp4 with one video track, of any known codec. A context manager.
+    """A video track of an mp4, of any known codec. A context manager.
 
     Args:
         path: The video.
+        track: Which video track, from 0; None: there is only one.
 
     Attributes:
         codec: Name in the registry, or ffmpeg's.
@@ -172,14 +173,16 @@ class VideoFile:
         times: Presentation times, nanoseconds, rounded down, int64, shape (frames,), in order.
 
     Raises:
-        VideoError: It cannot be read, or is not such a video.
+        VideoError: It cannot be read, or has several video tracks; lists them.
+        OptionError: It has no such track.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, track: int | None = None) -> None:
         self._path = path
+        self._track = track
         self._frames: Iterator[av.VideoFrame] = iter(())
         self._last: int | None = None
-        self._media = Media(path)
+        self._media = Media(path, track, "; `mp4ds.open` takes the number of one as `track`")
         try:
             self._stream = self._media.track
             context: Any = self._stream.codec_context
@@ -203,7 +206,8 @@ class VideoFile:
         """Presentation ticks of the frames, and those of the key frames."""
         try:
             with self._path.open("rb") as file:
-                table = read_sample_table(file, self._path.stat().st_size, str(self._path))
+                size = self._path.stat().st_size
+                table = read_sample_table(file, size, str(self._path), self._track)
         except Refused:
             return self._read_packets()
         except OSError as error:
@@ -318,7 +322,9 @@ class VideoFile:
         self.close()
 
 
-def open_file_frames(path: Path, *, codec: str, size: tuple[int, int], frames: int) -> FrameReader:
+def open_file_frames(
+    path: Path, *, codec: str, size: tuple[int, int], frames: int, track: int | None
+) -> FrameReader:
     """The frames of a third-party video by number, as 8-bit RGB.
 
     Args:
@@ -326,13 +332,16 @@ def open_file_frames(path: Path, *, codec: str, size: tuple[int, int], frames: i
         codec: As in `VideoFile`.
         size: As in `VideoFile`.
         frames: How many there are.
+        track: As in `VideoFile`.
 
     Raises:
         VideoError: It cannot be read.
     """
     return FrameReader(
-        lambda: FrameAccess(path, codec=codec, frames=frames, maker=_maker_of(path, size)),
-        lambda: VideoFile(path),
+        lambda: FrameAccess(
+            path, codec=codec, frames=frames, maker=_maker_of(path, size), track=track
+        ),
+        lambda: VideoFile(path, track),
     )
 
 
