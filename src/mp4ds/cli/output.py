@@ -152,15 +152,21 @@ def print_pack(summary: PackSummary) -> None:
     if summary.is_copy:
         say(f"{summary.dataset}: {size_text(summary.dataset_bytes)}, copied")
         return
-    ratio = summary.source_bytes / summary.dataset_bytes
-    change = f"{ratio:.2f} times smaller" if ratio >= 1 else f"{1 / ratio:.2f} times as large"
     say(
         f"{summary.dataset}: {size_text(summary.source_bytes)} -> "
-        f"{size_text(summary.dataset_bytes)} "
-        f"({change}), of which messages.mcap {size_text(summary.messages_bytes)}"
+        f"{size_text(summary.dataset_bytes)}{_change(summary)}, of which messages.mcap "
+        f"{size_text(summary.messages_bytes)}"
     )
     if summary.larger:
         say(f"larger than its source: {summary.larger}")
+
+
+def _change(summary: PackSummary) -> str:
+    """How much smaller a dataset is than its source; empty if the source has no bytes."""
+    if not summary.source_bytes:
+        return ""
+    ratio = summary.source_bytes / summary.dataset_bytes
+    return f" ({ratio:.2f} times smaller)" if ratio >= 1 else f" ({1 / ratio:.2f} times as large)"
 
 
 def _loss_text(loss: Loss) -> str:
