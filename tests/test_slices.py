@@ -284,6 +284,7 @@ def test_one_slice_each(recording: Path, tmp_path: Path) -> None:
         (Slice(str(START + 7)), START + 7, None),
         (Slice("2023-11-14T22:13:21"), START + 10**9, None),
         (Slice("1", None, "9000000000"), START + 10**9, 2**63 - 1),
+        (Slice(1e-5, None, 1e-6), START + 10**4, START + 11_000),
     ],
 )
 def test_how_it_is_written(asked: Slice, start: int | None, end: int | None) -> None:
@@ -297,13 +298,15 @@ def test_how_it_is_written(asked: Slice, start: int | None, end: int | None) -> 
         (Slice("1", "2", "3"), "two of `start`, `end` and `duration`"),
         (Slice("soon"), "`start` 'soon' is not a valid time"),
         (Slice(duration="-1"), "`duration`"),
-        (Slice("2", "1"), "nothing was recorded from .*22:13:22Z until .*22:13:21Z"),
-        (Slice("3.1"), r"drive.bag: nothing was recorded from .* 3 seconds"),
-        (Slice(end="2023-11-14T22:13:20"), "nothing"),
+        (Slice(duration="+1e9"), r"`duration` '\+1e9' is not a number of seconds"),
+        (Slice("2", "1"), "slice is empty: `start` is .*22:13:22Z, `end` is .*22:13:21Z"),
+        (Slice("3.1"), r"drive.bag: nothing was recorded from \S*23.1Z on\. .* 3 seconds"),
+        (Slice(end="2023-11-14T22:13:20"), "nothing was recorded before \\S*22:13:20Z"),
+        (Slice("2020-01-01T00:00:00", duration=1), r"nothing was recorded from \S+ until \S+1Z\."),
         (Slice("9999999999999999999"), "is not a valid time"),
         (Slice("99999999999.5"), "is not a valid time"),
-        (Slice(duration="9999999999999999999"), "is not a valid time"),
-        (Slice(duration="0"), "nothing"),
+        (Slice(duration="9999999999999999999"), "is not a number of seconds"),
+        (Slice(duration="0"), "is not a number of seconds"),
     ],
 )
 def test_what_is_none(asked: Slice, message: str) -> None:

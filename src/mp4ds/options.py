@@ -218,24 +218,49 @@ class Slice:
         Raises:
             OptionError: A time is not valid, or the slice contains nothing.
         """
-        start = None if self.start is None else time_of(str(self.start), first, "start")
-        end = None if self.end is None else time_of(str(self.end), first, "end")
+        start = None if self.start is None else time_of(_written(self.start), first, "start")
+        end = None if self.end is None else time_of(_written(self.end), first, "end")
         if self.duration is not None:
-            length = time_of(f"+{self.duration}", 0, "duration")
+            length = _length(_written(self.duration))
             if start is not None and end is not None:
                 raise OptionError("Give at most two of `start`, `end` and `duration`.")
             if end is not None:
                 start = max(end - length, -_LATEST)
             else:
                 end = min((first if start is None else start) + length, _LATEST)
-        begin, stop = first if start is None else start, last + 1 if end is None else end
-        if begin >= stop or begin > last or stop <= first:
+        if start is not None and end is not None and start >= end:
             raise OptionError(
-                f"{place}: nothing was recorded from {iso_text(begin)} until {iso_text(stop)}. It "
-                f"has messages from {iso_text(first)} to {iso_text(last)}, "
-                f"{(last - first) / _NS:.9g} seconds."
+                f"The slice is empty: `start` is {iso_text(start)}, `end` is {iso_text(end)}."
+            )
+        if (start is not None and start > last) or (end is not None and end <= first):
+            raise OptionError(
+                f"{place}: nothing was recorded {_span_text(start, end)}. It has messages from "
+                f"{iso_text(first)} to {iso_text(last)}, {(last - first) / _NS:.9g} seconds."
             )
         return start, end
+
+
+def _written(value: str | float) -> str:
+    """A time or duration as users write it, without an exponent."""
+    text = str(value)
+    return f"{value:.9f}" if isinstance(value, float) and "e" in text else text
+
+
+def _length(text: str) -> int:
+    """Nanoseconds of a duration in seconds."""
+    match = _NUMBER.fullmatch(text.strip())
+    length = _nanoseconds(int(match[1]), match[2]) if match and text.isascii() else 0
+    if not 0 < length <= _LATEST:
+        raise OptionError(f"`duration` {text!r} is not a number of seconds, such as 2.5.")
+    return length
+
+
+def _span_text(start: int | None, end: int | None) -> str:
+    if start is None:
+        return f"before {iso_text(end or 0)}"
+    if end is None:
+        return f"from {iso_text(start)} on"
+    return f"from {iso_text(start)} until {iso_text(end)}"
 
 
 WHOLE = Slice()
