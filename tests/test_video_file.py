@@ -330,5 +330,5 @@ def test_nothing_but_an_mp4_is_read(kind: str, tmp_path: Path) -> None:
             frame.pts = 0
             output.mux(stream.encode(frame))
             output.mux(stream.encode(None))
-    with pytest.raises(mp4ds.VideoError, match="is not an mp4: Invalid data"):
+    with pytest.raises(mp4ds.VideoError, match="is not an mp4 "):
         mp4ds.open(path)

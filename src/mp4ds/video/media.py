@@ -16,6 +16,7 @@ from mp4ds.errors import Mp4dsError, OptionError, RemoteError, VideoError
 from mp4ds.files.urls import remote
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import CODECS
+from mp4ds.video.mp4 import why_unreadable
 
 _FILES = (errno.EMFILE, errno.ENFILE)
 _ENOUGH_BYTES = 32 * 2**20
@@ -87,8 +88,8 @@ class Media:
         except (FFmpegError, OSError) as error:
             self._close_file()
             raise_if_scarce(error)
-            reason = error.strerror or error
-            raise VideoError("video-unreadable", path, f"is not an mp4: {reason}") from None
+            problem = why_unreadable(path) or f"cannot be read: {error.strerror or error}"
+            raise VideoError("video-unreadable", path, problem) from None
         except BaseException:
             self._close_file()
             raise
@@ -107,6 +108,7 @@ class Media:
             problem = f"has {len(tracks)} video tracks, not one"
             if tracks:
                 problem += f" ({listed}){advice}"
+            problem = why_unreadable(self._path) or problem
             raise VideoError("video-unreadable", self._path, problem)
         if number is not None and not 0 <= number < len(tracks):
             raise OptionError(
@@ -114,9 +116,8 @@ class Media:
             )
         track = tracks[number or 0]
         if track.codec_context is None or track.codec_context.codec is None:
-            raise VideoError(
-                "video-unreadable", self._path, "has a video track with an unknown codec"
-            )
+            problem = why_unreadable(self._path) or "has a video track with an unknown codec"
+            raise VideoError("video-unreadable", self._path, problem)
         return track
 
     @cached_property

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from mp4ds.errors import Refused, VideoError
 
 _HEADER, _LONG_HEADER = 8, 16
+_OUTERMOST = (b"ftyp", b"styp", b"pnot", b"wide", b"free", b"skip", b"uuid", b"meta", b"sidx",
+              b"moov", b"moof", b"mdat", b"mfra")  # fmt: skip
 _MOST_BOXES = 1_000  # siblings; no video has a tenth of that
 
 
@@ -61,7 +63,7 @@ def boxes(file: BinaryIO, start: int, end: int, *, outermost: bool = False) -> I
         file.seek(start)
         header = file.read(min(_LONG_HEADER, end - start))
         if len(header) < _HEADER:
-            raise DamagedBoxError("the file ends before its last box")
+            raise DamagedBoxError("the file ends in the middle of a box")
         size, kind = struct.unpack_from(">I4s", header)
         head = _HEADER
         if size == 1 and len(header) == _LONG_HEADER:
@@ -69,6 +71,8 @@ def boxes(file: BinaryIO, start: int, end: int, *, outermost: bool = False) -> I
             head = _LONG_HEADER
         elif size == 0 and outermost:
             size = end - start
+        if outermost and kind in _OUTERMOST and size > end - start:
+            raise DamagedBoxError("the file ends in the middle of a box")
         if not head <= size <= end - start:
             raise DamagedBoxError("a box is damaged")
         yield Box(kind, start + head, start + size)
@@ -86,6 +90,23 @@ def find_box(file: BinaryIO, kind: bytes, start: int, end: int, *, outermost: bo
         if box.kind == kind:
             return box
     raise DamagedBoxError(f"box {kind.decode('latin-1')} is missing")
+
+
+def why_unreadable(path: Path) -> str:
+    """Why a file is no readable mp4, as a phrase; empty if its outermost boxes do not tell."""
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            if not size:
+                return "is empty"
+            if file.read(_HEADER)[4:] not in _OUTERMOST:
+                return "is not an mp4"
+            kinds = {box.kind for box in boxes(file, 0, size, outermost=True)}
+    except DamagedBoxError as error:
+        return f"was cut short or damaged: {error}"
+    except OSError:
+        return ""
+    return "" if b"moov" in kinds else "was cut short: it has no index (moov)"
 
 
 # ---------------------------------------------------------------- sample entry
