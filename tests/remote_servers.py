@@ -43,6 +43,7 @@ class Server:
         delay: Seconds that it waits before each answer.
         sent: Bytes of files that a plain one sent.
         endless: Whether a plain one goes on sending after a range, without telling a length.
+        breaks_off: Whether a plain one closes the connection in the middle of its answers.
     """
 
     url: str
@@ -51,6 +52,7 @@ class Server:
     delay: float = 0.0
     sent: int = 0
     endless: bool = False
+    breaks_off: bool = False
 
     def heard(self, method: str, path: str, header: str | None) -> int | None:
         """Note a request; the status to fail with, if it is to fail."""
@@ -83,6 +85,7 @@ class Server:
         self.fails = lambda _: None
         self.delay = 0.0
         self.sent = 0
+        self.breaks_off = False
 
 
 class _Quiet(WSGIRequestHandler):
@@ -173,6 +176,9 @@ def web_server(folder: Path, *, ranges: bool = True) -> Iterator[Server]:
                 self.send_header("Content-Length", str(end - start))
             self.send_header("ETag", f'"{size}-{file.stat().st_mtime_ns}"')
             self.end_headers()
+            if body and server.breaks_off:
+                end = start + (end - start) // 2
+                self.close_connection = True
             if body:
                 self._send(file, start, end)
             while body and server.endless and not self.close_connection and server.sent < 2**30:

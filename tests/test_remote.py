@@ -450,6 +450,15 @@ def test_what_is_refused(command: list[str], s3: Server, web: Server) -> None:
         assert "403" in said
 
 
+def test_a_connection_that_is_closed_early(web: Server, tmp_path: Path) -> None:
+    write_bag(tmp_path / "web" / "early.bag", scene("mono8"))
+    web.breaks_off = True
+    code, said = run("info", f"{web.url}/early.bag")
+    assert code == 1
+    assert "could not be read: the server closed the connection before it had sent all. " in said
+    assert "400" not in said
+
+
 def test_without_credentials(s3: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     import s3fs
 

@@ -23,6 +23,8 @@ _TAGS = ("ETag", "etag", "blob_id", "md5Hash", "Content-MD5")
 _TIMES = ("LastModified", "Last-Modified", "mtime")
 _REFUSED = (401, 403)
 _MISSING = (404, 410)
+_PARSER = "aiohttp.http_exceptions"
+_BROKEN_OFF = ("ContentLengthError", "TransferEncodingError", "IncompleteReadError")
 _NO_CREDENTIALS = "Credentials"  # in the names of errors of store libraries
 _NETWORK = "Check the network, and try again."
 _ACCESS = "Check the address and your credentials for it."
@@ -299,7 +301,9 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
 
 
 def _status(error: BaseException) -> int | None:
-    """The HTTP status of an error."""
+    """The HTTP status that a server answered with."""
+    if type(error).__module__ == _PARSER:  # which numbers its own errors as if they were answers
+        return None
     response = getattr(error, "response", None)
     if isinstance(response, Mapping):
         return _number(response.get("ResponseMetadata", {}).get("HTTPStatusCode"))
@@ -322,8 +326,11 @@ def _is_timeout(error: BaseException) -> bool:
 def _text(error: BaseException) -> str:
     if _is_timeout(error):
         return "it took too long to answer"
+    if type(error).__name__ in _BROKEN_OFF:
+        return "the server closed the connection before it had sent all"
     message = getattr(error, "message", None)
     if isinstance(message, str) and _status(error):
-        return f"{_status(error)} {message}"  # without the URL, which may hold a secret
-    text = " ".join(str(error).split()).rstrip(".")
+        return f"{_status(error)} {message.rstrip('.')}"  # the URL may hold a secret
+    told = message if type(error).__module__ == _PARSER else error
+    text = " ".join(str(told).split()).rstrip(".")
     return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]} ..."
