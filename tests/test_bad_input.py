@@ -836,7 +836,8 @@ def test_a_lost_terminal_leaves_nothing(
     with unchanged(tmp_path):
         arguments = ("pack", long_demo, "-o", tmp_path / "x", *SLOW)
         options = {"numbers": numbers, "preexec_fn": ignore if is_ignored else None}
-        refused(interrupted(tmp_path, *arguments, **options), code, "terminated")
+        result = interrupted(tmp_path, *arguments, **options)
+        refused(result, code, "terminated; no partial output was left behind")  # nor is any kept
 
 
 def test_interrupting_an_unpack(long_demo: Path, tmp_path: Path) -> None:

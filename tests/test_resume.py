@@ -236,17 +236,22 @@ def test_two_at_a_time_are_refused(
     assert refusals
 
 
+@pytest.mark.parametrize(
+    "interruption", [KeyboardInterrupt(), SystemExit(143)], ids=["ctrl-c", "sigterm"]
+)
 def test_an_interrupt_keeps_what_is_finished(
-    tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
+    interruption: BaseException, tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(name: str) -> bool:
         if name == PARTS[2]:
-            raise KeyboardInterrupt
+            raise interruption
         return False
 
     use(monkeypatch, InlineEngine(interrupt))
-    with pytest.raises(KeyboardInterrupt, match=r"run the same command again to resume"):
+    with pytest.raises(type(interruption)) as caught:
         mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
+    assert "run the same command again to resume" in caught.value.args[0]
+    assert getattr(caught.value, "code", 143) == 143
     engine = use(monkeypatch, InlineEngine())
     mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
     assert engine.ran == PARTS[2:]

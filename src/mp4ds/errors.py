@@ -68,6 +68,11 @@ def _as_path(path: Path | str) -> Path:
     return Path(path) if isinstance(path, str) else path
 
 
+def counted(count: int, noun: str) -> str:
+    """A number of things, such as ``1 message`` or ``2 messages``."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def reason_of(error: BaseException) -> str:
     """The system's description of an error, and what helps; without a full stop."""
     if getattr(error, "errno", None) in (errno.EMFILE, errno.ENFILE):
@@ -78,6 +83,14 @@ def reason_of(error: BaseException) -> str:
 def sentence_of(error: OSError) -> str:
     """A system error: where, and what; without a full stop."""
     return f"{error.filename or 'a file'}: {reason_of(error)}"
+
+
+def interrupted(error: KeyboardInterrupt | SystemExit, text: str) -> BaseException:
+    """An interruption, by Ctrl-C or a signal that ends the process, that says what is left."""
+    told = type(error)(f"interrupted; {text}")
+    if isinstance(told, SystemExit) and isinstance(error, SystemExit):
+        told.code = error.code
+    return told
 
 
 class SourceError(Mp4dsError, ValueError):
@@ -198,8 +211,7 @@ class WriteError(Mp4dsError, OSError):
     def __init__(self, path: Path | str, cause: BaseException) -> None:
         self.path = _as_path(path)
         super().__init__(
-            f"{path}: could not be written: {reason_of(cause)}. The source is untouched, and the "
-            "partial output was removed."
+            f"{path}: could not be written: {reason_of(cause)}. The partial output was removed."
         )
 
 

@@ -11,6 +11,7 @@ import typer
 from mp4ds.cli.options import JsonFlag, takes
 from mp4ds.cli.output import print_json, print_table, say, size_text
 from mp4ds.cli.process import told_errors
+from mp4ds.errors import interrupted
 from mp4ds.plugins.evaluating.evaluate import evaluate as run
 from mp4ds.plugins.evaluating.options import EvaluateOptions
 
@@ -182,8 +183,8 @@ def evaluate(
 def _interruptible() -> Iterator[None]:
     try:
         yield
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"interrupted; {_AGAIN}") from None
+    except (KeyboardInterrupt, SystemExit) as error:
+        raise interrupted(error, _AGAIN) from None
 
 
 @contextmanager

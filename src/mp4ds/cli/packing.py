@@ -49,8 +49,8 @@ def pack(
 ) -> None:
     """Pack a recording into a dataset of mp4 files, or repack a dataset.
 
-    Lossless by default: `mp4ds unpack` restores every message exactly. To resume an interrupted
-    pack, run the same command again. Repacking a dataset keeps exact what was exact.
+    Lossless by default: `mp4ds unpack` restores every message exactly. To resume a long pack that
+    was interrupted, run the same command again. Repacking a dataset keeps exact what was exact.
     """
     from mp4ds.packing.pack import pack as run
     from mp4ds.packing.pack import pack_each, pack_share
@@ -110,7 +110,7 @@ def images(
     """Make a dataset from a folder of timestamped images.
 
     EuRoC, KITTI and TUM RGB-D folders are imported with all their cameras. Lossless by default. To
-    resume an interrupted import, run the same command again.
+    resume a long import that was interrupted, run the same command again.
     """
     from mp4ds.packing.pack import pack as run
 

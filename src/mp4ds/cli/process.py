@@ -24,7 +24,7 @@ from mp4ds.cli.options import in_flags
 from mp4ds.cli.output import complain, print_json, printed
 from mp4ds.errors import Mp4dsError, sentence_of
 
-_AGAIN = "run the same command again to resume"
+_NOTHING_LEFT = "no partial output was left behind"
 _BAD_PATH = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EACCES, errno.EINVAL)
 DEBUG = "MP4DS_DEBUG"
 _NO_MEMORY = "out of memory; try fewer --jobs"
@@ -41,9 +41,10 @@ def told_errors(as_json: bool) -> Iterator[None]:
     except (typer.Exit, typer.Abort, typer.BadParameter):
         raise
     except KeyboardInterrupt as interrupt:
-        _fail(str(interrupt) or "interrupted; no partial output was left behind", 130, as_json)
-    except SystemExit as ended:  # by SIGTERM
-        _fail("terminated; finished parts of a pack are kept: " + _AGAIN, ended.code, as_json)
+        _fail(str(interrupt) or f"interrupted; {_NOTHING_LEFT}", 130, as_json)
+    except SystemExit as ended:  # by SIGTERM; without words of its own, its argument is its code
+        told = ended.args[0] if ended.args and isinstance(ended.args[0], str) else ""
+        _fail(told or f"terminated; {_NOTHING_LEFT}", ended.code, as_json)
     except Mp4dsError as error:
         _fail(in_flags(str(error)), error.exit_code, as_json)
     except OSError as error:

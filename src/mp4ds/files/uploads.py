@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
-from mp4ds.errors import Mp4dsError, RemoteError, TargetError, TargetExistsError
+from mp4ds.errors import Mp4dsError, RemoteError, TargetError, TargetExistsError, interrupted
 from mp4ds.files.outputs import Owned, lock, refuse_not_ours, refuse_strangers
 from mp4ds.files.urls import RemotePath
 
@@ -65,8 +65,8 @@ def uploaded(
             _send(local, target, old, last, report)
         except (TargetError, RemoteError) as error:
             raise type(error)(target, str(error).rstrip("."), kept) from None
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"interrupted while uploading. {kept}") from None
+        except (KeyboardInterrupt, SystemExit) as error:
+            raise interrupted(error, f"the upload is incomplete. {kept}") from None
         _remove(local)
     return made
 

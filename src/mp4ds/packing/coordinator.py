@@ -18,6 +18,7 @@ from mp4ds.errors import (
     SourceError,
     TargetError,
     WriteError,
+    interrupted,
 )
 from mp4ds.files.outputs import is_seen, move_into_place, sync
 from mp4ds.packing.engine import Engine, Outcome
@@ -131,7 +132,7 @@ class JobProgress:
 _LISTED = 10
 _JOINED_AT_ONCE = 4  # more would only wait for the disk
 _SHARED = "all machines must share the dataset's folder"
-_KEPT = "interrupted; finished parts are kept: run the same command again to resume"
+_KEPT = "finished parts are kept: run the same command again to resume"
 
 
 class Coordinator:
@@ -333,6 +334,6 @@ def claimed(runs: Sequence[PackRun], *, shared: bool) -> Iterator[None]:
                     kept = True
                 elif not shared:
                     run.place.remove()
-            if kept and isinstance(error, KeyboardInterrupt):
-                raise KeyboardInterrupt(_KEPT) from None
+            if kept and isinstance(error, (KeyboardInterrupt, SystemExit)):
+                raise interrupted(error, _KEPT) from None
             raise

@@ -20,7 +20,7 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import recorded_storage
 from mp4ds.dataset.slicing import sliced
 from mp4ds.dataset.stream import Stream
-from mp4ds.errors import ConversionError, FormatError, OptionError, WriteError
+from mp4ds.errors import ConversionError, FormatError, OptionError, WriteError, interrupted
 from mp4ds.files.outputs import Owned, staged
 from mp4ds.files.uploads import uploaded
 from mp4ds.files.urls import RemotePath, location, remote
@@ -290,11 +290,9 @@ def unpack_each(
             summaries.append(summary)
             if progress:
                 progress(UnpackProgress(len(summaries), len(outputs)))
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(
-            f"interrupted; {len(summaries)} of {len(outputs)} datasets were unpacked, and no "
-            "partial output was left behind"
-        ) from None
+    except (KeyboardInterrupt, SystemExit) as error:
+        done = f"{len(summaries)} of {len(outputs)} datasets were unpacked"
+        raise interrupted(error, f"{done}, and no partial output was left behind") from None
     return summaries
 
 
