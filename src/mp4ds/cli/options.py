@@ -97,11 +97,29 @@ _PANELS = {
 }
 _PANEL_OF = {name: panel for panel, names in _PANELS.items() for name in names}
 _TYPES = {"int": "N", "float": "N", "str": "TEXT", "path": "PATH"}
+_NOT_A_NUMBER = {  # by the type of pydantic's error: typer shows its sentences
+    "int_parsing": "{input!r} is not a whole number",
+    "float_parsing": "{input!r} is not a number",
+    "greater_than_equal": "{input} is below {ge:g}",
+    "less_than_equal": "{input} is above {le:g}",
+}
 _EXTRAS = re.compile(r"(?:^|  )\[([^\]]*)\]$")
 
 
 class Command(typer.core.TyperCommand):
-    """A command whose help groups its options by topic."""
+    """A command whose help groups its options by topic, and that says what a number may be."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments."""
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            cause: Any = error.__cause__
+            found: dict[str, Any] = cause.errors()[0] if hasattr(cause, "errors") else {}
+            if found.get("type") in _NOT_A_NUMBER:
+                text = _NOT_A_NUMBER[found["type"]]
+                error.message = text.format(input=found["input"], **found.get("ctx", {}))
+            raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """The usage line, with arguments named as in the help."""

@@ -465,7 +465,7 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
             "`transcode` needs a lossy `quality`, such as visual: a JPEG file is smaller than "
             "any lossless video of its pixels."
         )
-    check_codec(
+    codec = check_codec(
         options.codec,
         options.preset,
         lossless=quality.lossless,
@@ -473,13 +473,13 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
         varied=quality.target is not None,
     )
     if not (options.cluster or options.join):  # otherwise others encode, or have encoded
-        check_hardware(options.codec)
+        check_hardware(codec)
     if quality.target and quality.target.metric == "vmaf" and not options.join:
         from mp4ds.video.libvmaf import find_ffmpeg
 
         find_ffmpeg()  # fails before anything is read, saying how to get one
     transcode = options.transcode or (not quality.lossless and _has_transcoded(paths))
-    chosen = replace(options, quality=str(quality), transcode=transcode, images=images)
+    chosen = replace(options, quality=str(quality), codec=codec, transcode=transcode, images=images)
     chosen.group_frames  # noqa: B018 - refuses a purpose that is none
     return chosen
 

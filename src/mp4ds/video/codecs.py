@@ -371,6 +371,11 @@ def codecs_to_try(pixel_format: str) -> Sequence[str]:
     return tuple(name for name, coding in _LOSSLESS[pixel_format].items() if coding.tried)
 
 
+def codec_name(name: str) -> str:
+    """A codec as the registry names it: H.265 is also called HEVC."""
+    return f"h265{name[4:]}" if name.startswith("hevc") else name
+
+
 def check_codec(
     codec: str | None,
     preset: str | None,
@@ -378,7 +383,7 @@ def check_codec(
     lossless: bool,
     crf: int | None = None,
     varied: bool = False,
-) -> None:
+) -> str | None:
     """Refuse a codec that cannot encode any stream of a profile, or options it does not have.
 
     Args:
@@ -388,9 +393,13 @@ def check_codec(
         crf: Constant rate factor, where there is one.
         varied: Whether videos with several crf will be joined into one.
 
+    Returns:
+        The codec by its `codec_name`.
+
     Raises:
         OptionError: Names those that can.
     """
+    codec = codec and codec_name(codec)
     software = {name for codings in _LOSSLESS.values() for name in codings} if lossless else _LOSSY
     able = software if lossless else {*software, *HARDWARE}
     if varied and codec is not None and codec in HARDWARE:
@@ -401,10 +410,11 @@ def check_codec(
             "with `mp4ds evaluate`."
         )
     if codec is not None and codec not in able:
+        known = ", ".join(sorted(able))
+        if codec not in _PRESETS:
+            raise OptionError(f"`codec` {codec!r} is not one that mp4ds can encode. Use {known}.")
         kind = "lossless" if lossless else "lossy"
-        raise OptionError(
-            f"`codec` {codec!r} does not support {kind} packing. Use {', '.join(sorted(able))}."
-        )
+        raise OptionError(f"`codec` {codec!r} does not support {kind} packing. Use {known}.")
     name = codec or (lossless_codecs("gray")[0] if lossless else _DEFAULT_LOSSY)
     if preset is not None and preset not in _PRESETS[name]:
         known = ", ".join(_PRESETS[name])
@@ -414,6 +424,7 @@ def check_codec(
         )
     if crf is not None:
         _check_crf(name, preset, crf)
+    return codec
 
 
 def _check_crf(codec: str, preset: str | None, crf: int) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from mp4ds.errors import OptionError
 from mp4ds.options import Options, cluster, option, parse_words
 from mp4ds.plan import visual_setting
-from mp4ds.video.codecs import AV1, HARDWARE, LOSSY_GOP, MAX_CRF, check_codec
+from mp4ds.video.codecs import AV1, HARDWARE, LOSSY_GOP, MAX_CRF, check_codec, codec_name
 from mp4ds.video.scores import METRICS
 
 ENCODER_NAMES = {"svtav1": "av1", "x264": "h264", "x265": "h265"}
@@ -187,7 +187,7 @@ def grid_of(options: EvaluateOptions) -> Grid:
 
 
 def _codec(name: str) -> str:
-    codec = ENCODER_NAMES.get(name, name)
+    codec = codec_name(ENCODER_NAMES.get(name, name))
     if codec not in MAX_CRF:
         names = [f"{encoder} ({codec})" for encoder, codec in ENCODER_NAMES.items()]
         known = ", ".join([*names, AV1[1], *HARDWARE])

@@ -273,10 +273,11 @@ def _settings(options: RecordOptions) -> StreamSettings:
     for name, seconds in (("duration", options.duration), ("max_duration", options.max_duration)):
         if seconds is not None and not 0 <= seconds < 1e9:
             raise OptionError(f"`{name}` {seconds:g} is not a number of seconds from 0.")
-    check_codec(options.codec, options.preset, lossless=quality.lossless, crf=quality.crf)
     return StreamSettings(
         quality=quality,
-        codec=options.codec,
+        codec=check_codec(
+            options.codec, options.preset, lossless=quality.lossless, crf=quality.crf
+        ),
         preset=options.preset,
         gop=options.gop or (LOSSLESS_GOP if quality.lossless else LOSSY_GOP),
         threads=1 if quality.lossless else available_cores(),
