@@ -221,8 +221,14 @@ def test_plain_scalars(text: str, value: Any) -> None:
         ("# nothing\n", "no document"),
         ("a: 1e999\n", "finite"),
         ("a: " + "9" * 5000 + "\n", "integer"),
-        ("a: [1\n", "expected"),
-        ("a: 'b\n", "scan"),
+        (
+            "a: [1\n",
+            "is not valid YAML of the subset, perhaps cut short: line 2: did not find expected",
+        ),
+        (
+            "a: 'b\n",
+            "is not valid YAML of the subset, perhaps cut short: line 2: found unexpected end",
+        ),
         ("a: \x00\n", "not valid"),
         ("a:\n\t- b\n", "not valid"),
         ("[" * 100_000, "nest"),  # PyYAML may refuse it itself, before it gives us 32 levels

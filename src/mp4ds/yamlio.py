@@ -148,10 +148,10 @@ def _parse(data: bytes, place: str) -> dict[str, Any]:
     try:
         document = _build(yaml.parse(data.decode(), Loader=_Parser), _scalar, is_subset=True)
     except (yaml.YAMLError, ValueError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise FormatError(
-            "yaml-invalid", place, f"is not valid YAML of the subset: {reason}"
-        ) from None
+        mark = getattr(error, "problem_mark", None)
+        is_at_end = mark is not None and mark.index >= len(data.decode(errors="replace"))
+        problem = f"is not valid YAML of the subset{', perhaps cut short' if is_at_end else ''}"
+        raise FormatError("yaml-invalid", place, f"{problem}: {_reason(error)}") from None
     if not isinstance(document, dict):
         raise FormatError("yaml-invalid", place, "is not a mapping")
     return document
@@ -173,7 +173,15 @@ def build(text: str, scalar: Callable[[Any], Any]) -> Any:
     try:
         return _build(yaml.parse(text, Loader=_Parser), scalar, is_subset=False)
     except yaml.YAMLError as error:
-        raise ValueError(" ".join(str(error).split())) from None
+        raise ValueError(_reason(error)) from None
+
+
+def _reason(error: Exception) -> str:
+    """What a parser says, with the line, in one sentence."""
+    mark = getattr(error, "problem_mark", None)
+    if isinstance(error, yaml.MarkedYAMLError) and mark and error.problem:
+        return f"line {mark.line + 1}: {error.problem}"
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 class _Node:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from mp4ds.errors import Mp4dsError
+from mp4ds.errors import Mp4dsError, counted
 from mp4ds.options import iso_text
 
 if TYPE_CHECKING:
@@ -223,18 +223,19 @@ def print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> None
     for problem in chain.from_iterable(found.values()):
         say(problem)
     count = sum(map(len, found.values()))
-    problems = f"{count} problem{'s' * (count > 1)}" if count else "no problems"
-    depth = (
-        "every video was decoded, every message with a digest checked"
-        if deep
-        else "frames were not decoded (--deep does)"
-    )
+    problems = counted(count, "problem") if count else "no problems"
+    if not deep:
+        depth = "; frames were not decoded (--deep does)"
+    elif not count:
+        depth = "; every video was decoded, every message with a digest checked"
+    else:
+        depth = ""  # what is missing or broken was not
     if len(found) == 1:
-        say(f"{next(iter(found))}: {problems}; {depth}")
+        say(f"{next(iter(found))}: {problems}{depth}")
         return
     wrong = sum(map(bool, found.values()))
     where = f" in {wrong} of them" if wrong else ""
-    say(f"{len(found)} datasets: {problems}{where}; {depth}")
+    say(f"{len(found)} datasets: {problems}{where}{depth}")
 
 
 def print_overview(rows: Sequence[Brief]) -> None:

@@ -28,7 +28,14 @@ from mp4ds.files.urls import location
 from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.format.manifest import FileEntry, Manifest, StreamEntry
 from mp4ds.format.models import References, StreamSidecar, VideoModel
-from mp4ds.format.sidecars import MANIFEST_NAME, load_document, model_problems, schema_text
+from mp4ds.format.sidecars import (
+    MANIFEST_NAME,
+    THE_TOP,
+    cut_short,
+    load_document,
+    model_problems,
+    schema_text,
+)
 from mp4ds.records import Message, Record
 from mp4ds.video.access import digest_video, packets_in_groups
 from mp4ds.video.references import Structures
@@ -128,9 +135,12 @@ def _read(path: Path, kind: str, model: type[_Model]) -> tuple[_Model | None, li
         return None, [Problem(error.code, error.place, error.problem)]
     if document["kind"] != kind:
         return None, [Problem("kind-unknown", str(path), f"is not a {kind}")]
+    if problem := cut_short(document):
+        return None, [Problem("schema-invalid", str(path), problem)]
     problems = [
-        Problem("schema-invalid", f"{path} at {'.'.join(map(str, error.absolute_path))}", reason)
+        Problem("schema-invalid", f"{path} at {place}", reason)
         for error in _schema_validator(kind).iter_errors(document)
+        for place in [".".join(map(str, error.absolute_path)) or THE_TOP]
         for reason in [_shortened(error.message)]
     ]
     if problems:
@@ -161,6 +171,7 @@ def _validate_dataset(folder: Path, deep: bool, report: _Report) -> list[Problem
     if manifest is None:
         return problems
     problems = list(_check_files(folder, manifest, report))
+    told = {(problem.code, problem.place) for problem in problems}
     streams: list[Stream] = []
     for entry in manifest.streams:
         sidecar, found = _read(folder / entry.sidecar, "stream", StreamSidecar)
@@ -181,7 +192,11 @@ def _validate_dataset(folder: Path, deep: bool, report: _Report) -> list[Problem
             problems += _check_deep(stream, part)
         if dataset is not None and not problems:
             problems += _check_recorded(dataset, manifest, report)
-    return problems
+    return [
+        problem
+        for number, problem in enumerate(problems)
+        if number < len(told) or (problem.code, problem.place) not in told
+    ]
 
 
 def _check_files(folder: Path, manifest: Manifest, report: _Report) -> Iterator[Problem]:

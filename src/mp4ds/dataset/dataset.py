@@ -29,8 +29,8 @@ from mp4ds.dataset.rebuild import Choice, everything, last_of, within
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic_frames import TopicFrames
 from mp4ds.dataset.video import Video
-from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
-from mp4ds.files.sources import HOW_TO_OPEN, video_at
+from mp4ds.errors import OptionError, SourceError, SourceNotFoundError, counted
+from mp4ds.files.sources import HOW_TO_OPEN, is_folder, video_at
 from mp4ds.files.urls import location
 from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.format.manifest import Manifest
@@ -81,6 +81,9 @@ class Dataset:
             remedy = "Give a folder made by `mp4ds pack`, or a sidecar next to its video."
             if video := video_at(self.path):
                 problem, remedy = f"is {video}, not a dataset", HOW_TO_OPEN
+            elif is_folder(self.path) and (inside := sorted(self.path.glob(f"*/{MANIFEST_NAME}"))):
+                problem = f"is a folder of {counted(len(inside), 'dataset')}, not a dataset"
+                remedy = f"Open one of them, such as {inside[0].parent}."
             raise SourceError(self.path, problem, remedy)
         if self.path.is_dir():
             self.manifest = load_manifest(self.path / MANIFEST_NAME)

@@ -163,6 +163,8 @@ MIGRATIONS: dict[str, Callable[[Document, str], Document]] = {"0": _from_0, "1.0
 # ---------------------------------------------------------------- files
 
 MANIFEST_NAME = "dataset.yaml"
+THE_TOP = "the top"
+"""Where a problem of a whole document is."""
 
 _COMMENTS = {
     "stream": "One camera stream, packed by mp4ds: frame n of the video is entry n of each column.",
@@ -227,6 +229,20 @@ def load_document(path: Path) -> dict[str, Any]:
     return document if found == supported else _without_news(document, path)
 
 
+def cut_short(document: dict[str, Any]) -> str:
+    """What the end of a document lacks, which `load_document` returned; empty if nothing.
+
+    Keys are written in the order of the model, so the last one is missing from a file that ends
+    early.
+    """
+    fields = model_for(document).model_fields
+    required = [name for name, field in fields.items() if field.is_required()]
+    if required[-1] in document:
+        return ""
+    missing = ", ".join(name for name in required if name not in document)
+    return f"ends without {missing}: it was probably cut short"
+
+
 def _without_news(document: dict[str, Any], path: Path) -> dict[str, Any]:
     """A document of a newer minor version without the keys that this one does not know."""
     dropped: list[str] = []
@@ -283,6 +299,8 @@ def load_manifest(path: Path) -> Manifest:
 
 
 def _model(model: type[_ModelT], document: dict[str, Any], path: Path) -> _ModelT:
+    if problem := cut_short(document):
+        raise FormatError("model-invalid", path, problem)
     try:
         return model.model_validate(document)
     except ValidationError as error:
@@ -316,7 +334,7 @@ def model_problems(error: ValidationError) -> list[tuple[str, str]]:
     """Place and sentence of each problem that a model found."""
     return [
         (
-            ".".join(map(str, item["loc"])) or "the top",
+            ".".join(map(str, item["loc"])) or THE_TOP,
             item["msg"].removeprefix("Value error, "),
         )
         for item in error.errors(include_url=False, include_input=False)

@@ -88,6 +88,8 @@ def wire_of(message_encoding: str, data: memoryview) -> str:
                 "it is compressed by zstd, as rosbag2 does in its compression mode MESSAGE: pack "
                 "the folder with its metadata.yaml"
             )
+        if len(data) < 4:
+            raise WireError("it is too short for a CDR encapsulation")
         raise WireError(f"its CDR encapsulation is {bytes(data[:4]).hex()}, which is not plain CDR")
     raise WireError(f"serialization {message_encoding!r} is not modelled")
 

@@ -25,7 +25,7 @@ from mp4ds.errors import SourceError, VideoError
 from mp4ds.files.urls import location
 from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.format.manifest import Manifest
-from mp4ds.format.sidecars import MANIFEST_NAME
+from mp4ds.format.sidecars import MANIFEST_NAME, THE_TOP
 from mp4ds.records import Attachment, Message, MetadataRecord
 from mp4ds.video.packets import PacketReader
 from mp4ds.video.planes import raw_pictures
@@ -80,7 +80,7 @@ def conformance_dump(
 
 def _problem(problem: Problem) -> Values:
     """A problem; its place is a file name and a key in it, or just a topic."""
-    file, _, key = problem.place.removesuffix(" at the top").partition(" at ")
+    file, _, key = problem.place.removesuffix(f" at {THE_TOP}").partition(" at ")
     is_file = Path(file).suffix in (".yaml", ".yml", ".mp4", ".mcap")
     return {
         "file": Path(file).name if is_file else "",

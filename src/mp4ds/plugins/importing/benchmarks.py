@@ -325,7 +325,7 @@ def _place(scene: Scene, name: str, rotation: Matrix, translation: Matrix) -> No
         scene.transforms.append(transform(first, name, rotation, translation))
     except ValueError as error:
         raise SourceError(
-            scene.folder, f"{name} has a calibration without a pose: {error}"
+            scene.folder, f"its calibration gives no pose for {name}: {error}"
         ) from None
 
 

@@ -141,7 +141,7 @@ def quaternion(rotation: Matrix) -> tuple[float, float, float, float]:
     m = rotation
     is_near = np.abs(m @ m.T - np.eye(3)).max(initial=0) < _TOLERANCE
     if not np.isfinite(m).all() or not is_near or np.linalg.det(m) < 0:
-        raise ValueError("its rotation is not valid")
+        raise ValueError("the rotation is not valid")
     symmetric = np.empty((4, 4))
     symmetric[:3, :3] = m + m.T - np.trace(m) * np.eye(3)
     vector = [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]
@@ -165,7 +165,7 @@ def transform(parent: str, child: str, rotation: Matrix, translation: Matrix) ->
         ValueError: The rotation is not valid.
     """
     if not np.isfinite(translation).all():
-        raise ValueError("its translation is not finite")
+        raise ValueError("the translation is not finite")
     x, y, z = (translation + 0.0).tolist()  # without negative zeros
     return Transform(parent, child, (x, y, z), quaternion(rotation))
 
