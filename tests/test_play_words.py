@@ -67,14 +67,14 @@ def test_words_of_other_players(typed: str, expected: str, tmp_path: Path) -> No
     ("typed", "says"),
     [
         ("--publish-service-requests", "services are not called"),
-        ("--message-order sent", "as they were received"),
+        ("--message-order sent", "order in which they were received"),
         ("--topics", "--topics requires an argument"),
         ("--ros-args --nonsense", "--nonsense is not known"),
-        ("--ros-args -p use_sim_time:=perhaps", "use_sim_time is true or false"),
-        ("--ros-args -p use_sim_time", "no parameter of ROS"),
+        ("--ros-args -p use_sim_time:=perhaps", "use_sim_time must be true or false"),
+        ("--ros-args -p use_sim_time", "is not a ROS parameter"),
         ("--ros-args --params-file /none/at.yaml", "/none/at.yaml: cannot be read"),
-        ("--ros-args -r nonsense", "no rule of ROS"),
-        ("__ns:=/1", "no namespace"),
+        ("--ros-args -r nonsense", "is not a remapping"),
+        ("__ns:=/1", "is not a valid namespace"),
     ],
 )
 def test_what_has_no_counterpart_is_told(typed: str, says: str) -> None:
@@ -214,8 +214,8 @@ def test_the_table_has_every_option_of_ros1() -> None:
 def test_the_table_says_what_is_here() -> None:
     known = ours() | set(known_words())
     for key, (name, here) in rows().items():
-        if here.startswith("no:"):
-            with pytest.raises(OptionError, match="no counterpart"):
+        if here.startswith("not supported:"):
+            with pytest.raises(OptionError, match="is not supported"):
                 words(name)
         else:
             assert name in known, key

@@ -150,10 +150,10 @@ def test_topics(
     ("options", "words"),
     [
         ({"topics": ["/none"]}, "`topics` '/none' matches no topic"),
-        ({"regex": "tf"}, "`regex` 'tf' matches no topic as a whole"),
-        ({"exclude_regex": "tf"}, "`exclude_regex` 'tf' matches no topic as a whole"),
-        ({"regex": "("}, "no regular expression"),
-        ({"exclude_regex": "["}, "no regular expression"),
+        ({"regex": "tf"}, "`regex` 'tf' fully matches no topic"),
+        ({"exclude_regex": "tf"}, "`exclude_regex` 'tf' fully matches no topic"),
+        ({"regex": "("}, "not a valid regular expression"),
+        ({"exclude_regex": "["}, "not a valid regular expression"),
         ({"clock_topics": ["/none"]}, "`clock_topics` '/none'"),
         ({"pause_topics": ["/none"]}, "`pause_topics` '/none'"),
         ({"clock_topics": ["/tf"], "clock": 5.0}, "`clock_topics` contradicts `clock`"),
@@ -162,12 +162,12 @@ def test_topics(
         ({"skip_empty": -1.0}, "`skip_empty` -1"),
         ({"until_sec": float("nan")}, "`until_sec` nan"),
         ({"wait_for_all_acked": -1}, "`wait_for_all_acked` -1"),
-        ({"remap": ["/tf"]}, "is no rule"),
+        ({"remap": ["/tf"]}, "is not a remapping"),
         ({"remap": ["/none:=/other"]}, "there is no such topic"),
         ({"rate": 0.0}, "`rate` 0"),
         ({"rate": float("nan")}, "`rate` nan"),
         ({"start_offset": -1.0}, "`start_offset` -1"),
-        ({"start_offset": 100.0}, "after the end"),
+        ({"start_offset": 100.0}, "past the end"),
         ({"duration": float("inf")}, "`duration` inf"),
         ({"clock": 0.0}, "`clock` 0"),
         ({"publish_as": "jpg"}, "`publish_as` 'jpg'"),
@@ -262,11 +262,11 @@ def test_a_recorded_clock_is_not_published_beside_ours(tmp_path: Path) -> None:
 def test_what_is_missed_of_the_beginning_of_a_clock_that_is_followed() -> None:
     """A clock that is first heard 0.2 s after the start is at the start; later, in the middle."""
     start, allowed = 7 * 10**9, 200 * 10**6
-    assert not FollowedClock().hear(start + allowed, start)
-    assert FollowedClock().hear(start + allowed + 1, start)
+    assert not FollowedClock().update(start + allowed, start)
+    assert FollowedClock().update(start + allowed + 1, start)
     clock = FollowedClock()
-    assert not clock.hear(start - 10**9, start)
-    assert not clock.hear(start + allowed + 1, start), "it went on as it does"
+    assert not clock.update(start - 10**9, start)
+    assert not clock.update(start + allowed + 1, start), "it went on as it does"
 
 
 def test_follows_a_clock(drive: tuple[Path, list[Recorded]]) -> None:

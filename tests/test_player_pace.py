@@ -137,13 +137,13 @@ def test_lateness_is_told_apart() -> None:
     ):
         late = Lateness()
         for by, was_awaited, waits in steps:
-            assert late.met(by * MS, was_awaited=was_awaited) == waits * MS
+            assert late.record(by * MS, was_awaited=was_awaited) == waits * MS
     late = Lateness()
-    late.met(9 * NS, was_awaited=False)
+    late.record(9 * NS, was_awaited=False)
     assert not late.suspended()
-    late.met(11 * NS, was_awaited=False)
+    late.record(11 * NS, was_awaited=False)
     assert late.suspended() == 11 * NS  # Ctrl-Z
-    assert late.met(0, was_awaited=False) == 0
+    assert late.record(0, was_awaited=False) == 0
 
 
 class Machine:
@@ -306,7 +306,7 @@ def test_what_is_not_installed_is_left_out_and_counted(drive: Path) -> None:
     publisher = RecordingPublisher(
         world="ros2", not_installed=frozenset({"tf2_msgs/msg/TFMessage"})
     )
-    with pytest.warns(UserWarning, match=r"not installed there: /tf_static \(tf2_msgs") as told:
+    with pytest.warns(UserWarning, match=r"are not installed: /tf_static \(tf2_msgs") as told:
         _, summary = run(drive, publisher, immediate=True)
     assert len(told) == 1
     assert summary.not_installed == {"/tf_static": 4}

@@ -298,7 +298,7 @@ def test_a_quality_of_service_that_makes_no_sense_is_told(side: Side) -> None:
     nonsense = Qos(deadline_ns=-5)
     with (
         side.open(overrides={"/a": nonsense}) as publisher,
-        pytest.raises(ConversionError, match="quality of service"),
+        pytest.raises(ConversionError, match="or its QoS"),
     ):
         publisher.advertise(channel("/a", STRING))
 

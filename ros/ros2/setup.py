@@ -1,4 +1,4 @@
-"""Puts files where ROS 2 looks for them. The distribution has another name than mp4ds's own."""
+"""Installs files where ROS 2 looks for them. Named mp4ds-ros, as mp4ds is the Python package."""
 
 from xml.etree import ElementTree
 

@@ -293,7 +293,7 @@ def exclude(*flags: str) -> Any:
     return option("Leave out matching topics.", (), *flags, "-x", metavar="GLOB")
 
 
-def resize(help: str = "Scale images down, calibrations to match.") -> Any:  # noqa: A002
+def resize(help: str = "Scale images down, and the calibrations with them.") -> Any:  # noqa: A002
     """The option for resizing images: a factor, or width and height in pixels."""
     return option(help, None, metavar="0.5|WxH", parse=parse_resize)
 
@@ -310,7 +310,7 @@ def max_rate() -> Any:
 
 def jpeg_quality() -> Any:
     """The option for the quality of JPEG files."""
-    return option("Quality of the JPEG files that are made.", 95, least=1, most=100)
+    return option("Quality of JPEG images that are encoded.", 95, least=1, most=100)
 
 
 def start() -> Any:

@@ -33,7 +33,7 @@ COMMANDS = {
     ),
     "play": (
         "play",
-        "Publish datasets as if they were the recording: into ROS 1, ROS 2 or Foxglove.",
+        "Play back datasets, publishing to ROS 1, ROS 2 or Foxglove.",
     ),
     "record": (
         "record",

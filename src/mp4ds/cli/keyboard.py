@@ -1,4 +1,4 @@
-"""Keys of a terminal that a command takes while it runs, and how the terminal gets back."""
+"""Keyboard controls of a running command, which always restore the terminal."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from types import FrameType
 from typing import Any
 
 _POLL_S = 0.2
-"""How often it is looked whether the command is in the foreground again."""
+"""How often to check whether the command is in the foreground again."""
 
 _ENDING = ("SIGTERM", "SIGHUP", "SIGQUIT")
-"""Signals that end a program without a word, where nobody handles them."""
+"""Signals whose default action ends the program at once."""
 
 _ESCAPE = 0x1B
 _ARROWS = {ord("A"): "up", ord("B"): "down", ord("C"): "right", ord("D"): "left"}
@@ -23,16 +23,16 @@ _MAX_SEQUENCE = 32
 
 
 class Keyboard:
-    """Does what keys say, while it is entered; a context manager.
+    """A context manager that runs actions when keys are pressed.
 
-    Where standard input is no terminal it does nothing.
+    It does nothing if standard input is not a terminal.
 
-    The terminal is set to give keys at once and not to show them. It is as it was after the end,
-    whatever ends the body or, by a signal, the program; and while the program is stopped
+    The terminal is set to deliver each key at once, without echo. Its settings are restored at the
+    end, even if an exception or a signal ends the program, and while the program is stopped
     (Ctrl-Z) or in the background, where it reads nothing.
 
     Args:
-        actions: What is done for each key, by the names of `Keys`; others are ignored.
+        actions: The action of each key, named as by `Keys`; other keys are ignored.
         fd: File descriptor of the terminal; None for standard input.
     """
 
@@ -67,12 +67,12 @@ class Keyboard:
         self._leave()
 
     def _leave(self) -> None:
-        """Give the terminal back."""
+        """Restore the terminal, and end the thread."""
         if self._terminal is not None:
             self._terminal.leave()
         if self._wake is not None:
             os.close(self._wake[1])
-            # a key's action that does not end, with all of the program, is not waited for
+            # do not wait for long: the action of a key may be stuck
             if self._thread is not None and self._thread.ident is not None:
                 self._thread.join(_POLL_S * 5)
             if self._thread is None or not self._thread.is_alive():
@@ -107,7 +107,7 @@ class Keyboard:
     # ------------------------------------------------------------ signals
 
     def _handle_signals(self) -> None:
-        """Only the main thread can; elsewhere the terminal is given back at the end alone."""
+        """Only the main thread can; in others, the terminal is restored at the end only."""
         if threading.current_thread() is not threading.main_thread():
             return
         for name in _ENDING:
@@ -124,7 +124,7 @@ class Keyboard:
         signal.raise_signal(number)
 
     def _on_stop(self, number: int, frame: FrameType | None) -> None:
-        """Stop, as is usual; the thread takes the terminal again after it went on."""
+        """Stop as usual; after the program has continued, the thread sets the terminal again."""
         if self._terminal is None:
             return
         self._terminal.leave()
@@ -135,7 +135,7 @@ class Keyboard:
 
 
 class Keys:
-    """Takes keys out of what a terminal sends, wherever that is cut."""
+    """Decodes keys from what a terminal sends, in pieces of any size."""
 
     def __init__(self) -> None:
         self._sequence = b""
@@ -143,8 +143,7 @@ class Keys:
     def feed(self, data: bytes) -> Iterator[str]:
         """The keys that are complete: a character, ``up``, ``down``, ``left`` or ``right``.
 
-        Other sequences, such as those of function keys, are left out. An escape that no sequence
-        follows is left out, too.
+        Other sequences, such as those of function keys, and a lone escape are ignored.
         """
         for byte in data:
             if byte == _ESCAPE:
@@ -163,18 +162,18 @@ class Keys:
 
 
 class _Terminal:
-    """A terminal that gives keys at once while it is taken."""
+    """A terminal that can be switched to deliver keys at once, and back."""
 
     def __init__(self, fd: int, termios: Any) -> None:
         self.fd = fd
         self._termios = termios
         self._before: list[Any] | None = None
         self._is_left = False
-        # a signal may come while the main thread has it
+        # reentrant, as a signal may arrive while the main thread holds it
         self._lock = threading.RLock()
 
     def take(self) -> bool:
-        """Set it if it is the program's at present; returns whether it is."""
+        """Switch to single keys if the program is in the foreground; returns whether it is."""
         with self._lock:
             if self._is_left or not self._is_in_foreground():
                 return False
@@ -188,7 +187,7 @@ class _Terminal:
             return True
 
     def leave(self) -> None:
-        """Have it as it was, and not take it again."""
+        """Restore the settings, and leave them alone until `come_back`."""
         with self._lock:
             self._is_left = True
             before, self._before = self._before, None
@@ -200,7 +199,7 @@ class _Terminal:
                 return
 
     def come_back(self) -> None:
-        """Let it be taken again."""
+        """Allow `take` again."""
         with self._lock:
             self._is_left = False
 
@@ -212,20 +211,20 @@ class _Terminal:
         return attributes
 
     def _is_in_foreground(self) -> bool:
-        """Whether it may be read and set: a program in the background would be stopped."""
+        """Whether the terminal may be read and set: a background program would be stopped."""
         try:
             return os.tcgetpgrp(self.fd) == os.getpgrp()
-        except OSError:  # not the terminal that controls the program: nobody stops it
+        except OSError:  # not the controlling terminal: nothing would stop the program
             return True
 
 
 def _terminal(fd: int | None) -> _Terminal | None:
-    """The terminal, where there is one."""
+    """The terminal, if there is one."""
     try:
         import termios
 
         number = sys.stdin.fileno() if fd is None else fd
         return _Terminal(number, termios) if os.isatty(number) else None
     except (ImportError, AttributeError, OSError, ValueError):
-        # another system; standard input that is None, closed, or a file of Python's
+        # no termios on this system; standard input is None, closed, or not a real file
         return None

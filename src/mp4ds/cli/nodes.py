@@ -1,4 +1,4 @@
-"""Commands that run as nodes of ROS, and take what launch files and users tell a node."""
+"""Commands that run as ROS nodes, and accept ROS arguments from users and launch files."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from mp4ds.cli.process import DEBUG, told_errors
 from mp4ds.errors import OptionError
 from mp4ds.plugins.publishing.names import PLAIN, NodeNames, node_arguments
 
-_NAMES = "mp4ds.names"  # what ROS told, in click's context
+_NAMES = "mp4ds.names"  # key of the ROS arguments in click's context
 _QUIET = {"error", "fatal"}
 
 
 class NodeCommand(Command):
-    """A command that is a node: ``__name:=x``, ``--ros-args`` and the like are not options."""
+    """A command that is a node: takes ``__name:=x``, ``--ros-args`` and the like."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse what is left of the arguments without those of ROS."""
+        """Parse the arguments other than ROS arguments."""
         with told_errors("--json" in args):
             words, ctx.meta[_NAMES] = self.spelled(ctx, args)
         parsed: list[str] = super().parse_args(ctx, words)
         return parsed
 
     def valued(self, ctx: Any) -> set[str]:
-        """Options that have a word behind them."""
+        """Options that take a value."""
         return {
             name
             for option in self.get_params(ctx)
@@ -37,23 +37,23 @@ class NodeCommand(Command):
         }
 
     def spelled(self, ctx: Any, args: Sequence[str]) -> tuple[list[str], NodeNames]:
-        """The arguments as the command has them, and what ROS tells the node.
+        """The arguments of the command, and the ROS arguments.
 
         Raises:
-            OptionError: An argument of ROS makes no sense.
+            OptionError: A ROS argument is not valid.
         """
         del ctx
         return node_arguments(args, rules_of=())
 
 
 def names_in(ctx: Any) -> NodeNames:
-    """What ROS told a command."""
+    """The ROS arguments of a command."""
     names: NodeNames = ctx.meta.get(_NAMES, PLAIN)
     return names
 
 
 def say_as_much(level: str) -> None:
-    """Tell as much as was asked for, in the words of ROS 2; empty for as much as ever.
+    """Set how much is printed, by a log level of ROS 2; empty: leave it.
 
     Raises:
         OptionError: There is no such level.

@@ -1,4 +1,4 @@
-"""``mp4ds play``: the keyboard of a player, where it stands, and what it did."""
+"""``mp4ds play``: keyboard controls, progress and summary of the player."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _FASTER = 1.1
 
 
 def player_keys(controls: Controls) -> Mapping[str, Callable[[], object]]:
-    """What each key does to a player.
+    """The action of each key.
 
-    Space: pause or resume; right or ``s``: one message; left or ``b``: one back; up and down: 10 %
-    faster and slower; ``t``: pause for topics or not.
+    Space: pause or resume; right or ``s``: next message; left or ``b``: previous message; up and
+    down: 10 % faster and slower; ``t``: turn pausing for topics on or off.
     """
     return {
         " ": controls.toggle_paused,
@@ -45,36 +45,36 @@ def player_keys(controls: Controls) -> Mapping[str, Callable[[], object]]:
 
 
 def _rounded(rate: float) -> float:
-    """Without the last digits, so that faster and slower cancel."""
+    """Without the last digits, so that going faster and then slower gives the same rate again."""
     return float(f"{rate:.9g}")
 
 
-# ---------------------------------------------------------------- what is shown
+# ---------------------------------------------------------------- progress and summary
 
 _NS = 1_000_000_000
-_SLOW_S = 0.5  # that is told at once; less is no more than told at the end
+_SLOW_S = 0.5  # warned about at once; less is only mentioned in the summary
 
 
 @contextmanager
 def play_progress(*, is_quiet: bool) -> Iterator[Callable[[PlayProgress], None]]:
-    """On a terminal, a line that tells where it stands; anywhere, that it cannot keep up.
+    """Shows the position on a terminal, and warns anywhere if playback cannot keep up.
 
     Args:
-        is_quiet: No line.
+        is_quiet: Do not show the position.
     """
     from rich.console import Console
     from rich.text import Text
 
     console = Console(stderr=True)
-    told: set[str] = set()
+    warned: set[str] = set()
 
     def warn(state: PlayProgress) -> None:
-        if state.slowed_s >= _SLOW_S and "slow" not in told:
-            told.add("slow")
-            tell("messages are not ready in time: the clock waits (--drop leaves out frames)")
-        if state.dropped and "dropped" not in told:
-            told.add("dropped")
-            tell("frames are not made in time: late ones are left out")
+        if state.slowed_s >= _SLOW_S and "slow" not in warned:
+            warned.add("slow")
+            note("slowing down: messages are not ready in time (--drop drops late frames instead)")
+        if state.dropped and "dropped" not in warned:
+            warned.add("dropped")
+            note("dropping late frames: they are not decoded in time")
 
     if is_quiet or not console.is_terminal:
         yield warn
@@ -83,18 +83,18 @@ def play_progress(*, is_quiet: bool) -> Iterator[Callable[[PlayProgress], None]]
 
         def report(state: PlayProgress) -> None:
             warn(state)
-            status.update(Text(_standing(state)))
+            status.update(Text(_progress_line(state)))
 
         yield report
 
 
-def tell(text: str) -> None:
-    """Say something beside the result."""
+def note(text: str) -> None:
+    """Print a note to stderr, unless quiet."""
     if not is_quiet():
         complain(text)
 
 
-def _standing(state: PlayProgress) -> str:
+def _progress_line(state: PlayProgress) -> str:
     now, length = ((time - state.start_ns) / _NS for time in (state.time_ns, state.end_ns))
     parts = [
         f"{now:.1f} of {length:.1f} s",
@@ -104,19 +104,19 @@ def _standing(state: PlayProgress) -> str:
     if state.slowed_s >= _SLOW_S:
         parts.append(f"slowed by {state.slowed_s:.1f} s")
     if state.dropped:
-        parts.append(f"{state.dropped} late frames left out")
+        parts.append(f"{state.dropped} late frames dropped")
     return " · ".join(parts)
 
 
 def print_play(summary: PlaySummary) -> None:
-    """Tell what was played."""
+    """Print what was played."""
     for topic, count in summary.messages.items():
         say(f"{topic}: {count}")
     for topic, reasons in summary.as_recorded.items():
         for reason, count in reasons.items():
-            say(f"{topic}: {count} as recorded: {reason}")
+            say(f"{topic}: {count} published as recorded: {reason}")
     for topic, count in summary.not_installed.items():
-        say(f"{topic}: {count} left out, of a type that is not installed")
+        say(f"{topic}: {count} not played: the message type is not installed")
     for topic, count in summary.thinned.items():
         say(f"{topic}: {count} frames left out on request")
     total = sum(summary.messages.values())
@@ -127,19 +127,19 @@ def print_play(summary: PlaySummary) -> None:
         text += ", stopped before the end"
     say(text)
     if summary.slowed_s >= 0.1:
-        say(f"{summary.slowed_s:.1f} s longer than recorded: messages were not ready in time")
+        say(f"took {summary.slowed_s:.1f} s longer: messages were not ready in time")
     if summary.dropped:
-        say(f"{summary.dropped} frames left out, since they were late")
+        say(f"{summary.dropped} late frames dropped")
 
 
 # ---------------------------------------------------------------- play
 
 
 class PlayCommand(NodeCommand):
-    """The command, which understands how the options of other players are typed."""
+    """The command, which also takes the options of `rosbag play` and `ros2 bag play`."""
 
     def spelled(self, ctx: Any, args: Sequence[str]) -> tuple[list[str], NodeNames]:
-        """Arguments in the words of `rosbag play` and `ros2 bag play`, as the command has them."""
+        """Translate options of `rosbag play` and `ros2 bag play` to those of this command."""
         return spelled(args, self.valued(ctx).__contains__)
 
 
@@ -151,47 +151,56 @@ def play(
     options: Callable[[], PlayOptions],
     context: typer.Context,
     datasets: Annotated[
-        list[str], typer.Argument(metavar="DATASET...", help="Datasets; several are merged.")
+        list[str],
+        typer.Argument(metavar="DATASET...", help="Datasets; several are merged by time."),
     ],
-    ros1: Annotated[bool, typer.Option("--ros1", help="Into ROS 1.")] = False,
+    ros1: Annotated[bool, typer.Option("--ros1", help="Publish to ROS 1.")] = False,
     ros2: Annotated[
-        bool, typer.Option("--ros2", help="Into ROS 2, by rclpy or else by Cyclone DDS.")
+        bool, typer.Option("--ros2", help="Publish to ROS 2, with rclpy or else Cyclone DDS.")
     ] = False,
     foxglove: Annotated[
-        bool, typer.Option("--foxglove", help="To Foxglove, as a WebSocket server.")
+        bool, typer.Option("--foxglove", help="Serve to Foxglove, over a WebSocket.")
     ] = False,
     clock: Annotated[
         bool,
         typer.Option(
             "--clock",
-            help="Publish /clock, and lead those that follow it; a rate may stand behind it.",
+            help="Publish /clock, optionally at the given rate: --clock 50.",
         ),
     ] = False,
     clock_hz: Annotated[
-        float, typer.Option("--hz", help="The rate of --clock; 40 with --ros2.")
+        float,
+        typer.Option(
+            "--hz",
+            help="Rate of --clock; default: 100, or 40 with --ros2.",
+            show_default=False,
+        ),
     ] = 100.0,
     storage: Annotated[
-        str, typer.Option("--storage", help="sqlite3 or mcap: of no meaning for datasets.")
+        str,
+        typer.Option("--storage", help="Accepted for compatibility with `ros2 bag play`; ignored."),
     ] = "",
     log_level: Annotated[
         str,
-        typer.Option("--log-level", help="debug, info, warn, error or fatal: what is told."),
+        typer.Option("--log-level", help="Logging level: debug, info, warn, error or fatal."),
     ] = "",
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
     no_keyboard: Annotated[
-        bool, typer.Option("--disable-keyboard-controls", help="Leave the keyboard alone.")
+        bool, typer.Option("--disable-keyboard-controls", help="Disable the keyboard controls.")
     ] = False,
     progress: Annotated[
-        bool, typer.Option("--progress/--no-progress", help="A line that tells where it is.")
+        bool, typer.Option("--progress/--no-progress", help="Show the playback position.")
     ] = True,
     as_json: JsonFlag = False,
 ) -> None:
-    """Publish datasets as if they were the recording: into ROS 1, ROS 2 or Foxglove.
+    """Play back datasets, publishing to ROS 1, ROS 2 or Foxglove.
 
-    Keys: space pauses; right: one message; left: one back; up and down: faster and slower.
+    Keys: space: pause or resume; right and left: next and previous message; up and down: faster
+    and slower.
 
-    With --ros2, -x is --exclude-regex, -s is --storage and -i a dataset, as in `ros2 bag play`;
-    with --ros1, -p is --prefix, as in `rosbag play`. Lists such as --topics /a /b are understood.
+    Options can be written as for `rosbag play` or `ros2 bag play`, such as --topics /a /b. With
+    --ros2, -x means --exclude-regex, -s means --storage, and -i names a dataset; with --ros1, -p
+    means --prefix.
     """
     with told_errors(as_json), ExitStack() as stack:
         names = names_in(context)
@@ -200,14 +209,14 @@ def play(
             be_quiet()
         if storage not in ("", *STORAGES):
             raise OptionError(
-                f"`storage` {storage!r} is none of {', '.join(STORAGES)}. With --ros2, -s is "
-                "--storage; seconds to leave out are --start-offset."
+                f"`storage` {storage!r} is not {' or '.join(STORAGES)}. With --ros2, -s means "
+                "--storage; to start later, use --start-offset."
             )
         kinds = {"ros1": ros1, "ros2": ros2, "foxglove": foxglove}
         chosen = [name for name, on in kinds.items() if on]
         if len(chosen) > 1:
             raise OptionError(f"--{chosen[0]} contradicts --{chosen[1]}.")
-        told = replace(
+        chosen_options = replace(
             options(),
             to=chosen[0] if chosen else None,
             clock=clock_hz if clock else None,
@@ -215,10 +224,10 @@ def play(
         )
         is_silent = as_json or not progress or is_quiet()
         report = stack.enter_context(play_progress(is_quiet=is_silent))
-        player = stack.enter_context(open_player(datasets, told, progress=report))
-        tell(f"publishing to {player.address}")
+        player = stack.enter_context(open_player(datasets, chosen_options, progress=report))
+        note(f"publishing to {player.address}")
         if player.follows_clock:
-            tell("the /clock of another player leads (--clock: this one, --no-follow-clock: none)")
+            note("following another player's /clock (--no-follow-clock: play independently)")
         caught = stack.enter_context(caught_signals(player.stop))
         if not no_keyboard:
             stack.enter_context(Keyboard(player_keys(player)))

@@ -1,4 +1,4 @@
-"""The command line of ``mp4ds play`` as users of `rosbag play` and `ros2 bag play` type it."""
+"""Accept the options of `rosbag play` and `ros2 bag play` in ``mp4ds play``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _LETTERS = {
     "ros1": {"-p": "--prefix"},
     "ros2": {"-x": "--exclude-regex", "-s": "--storage", "-i": "--input"},
 }
-"""What letters mean to users of one player that mean something else to those of the other."""
+"""Short options that mean different things in the two players -> their long options here."""
 
 _LISTS = {
     **dict.fromkeys(("--topics", "--exclude-topics", "--clock-topics", "--pause-topics"), ""),
@@ -24,9 +24,9 @@ _LISTS = {
     "--services": "--topics",
     "--exclude-services": "--exclude-topics",
 }
-"""Options with several words behind them -> what they are called here, if otherwise."""
+"""Options that take several values -> their name here, if it differs."""
 
-_EVENTS = "/_service_event"  # a service's topic, where its calls are recorded
+_EVENTS = "/_service_event"  # appended to a service's name: the topic with its recorded calls
 _NUMBER = re.compile(r"[0-9]+(\.[0-9]+)?")
 _IGNORED = {
     "--disable-loan-message": 0,
@@ -34,17 +34,18 @@ _IGNORED = {
     "--storage-config-file": 1,
     "--progress-bar-separation-lines": 1,
 }
-"""Options that change nothing here -> how many words they take."""
+"""Options that have no effect here -> how many values they take."""
 
+_NO_CALLS = "services are not called; recorded service events are played as topics"
 _REFUSED = {
-    "--publish-service-requests": "services are not called; their events are played as topics",
-    "--service-requests-source": "services are not called; their events are played as topics",
+    "--publish-service-requests": _NO_CALLS,
+    "--service-requests-source": _NO_CALLS,
 }
 _FOREIGN = ("--bags", "--input", "--message-order", "--progress-bar-update-rate")
 
 
 def known_words() -> Collection[str]:
-    """Options that are understood besides those that ``--help`` shows."""
+    """Options that are accepted but not shown by ``--help``."""
     letters = (name for found in _LETTERS.values() for name in found)
     return {*_LISTS, *_IGNORED, *_REFUSED, *_FOREIGN, *letters, "--ros-args", "-r"}
 
@@ -52,14 +53,14 @@ def known_words() -> Collection[str]:
 def spelled(
     arguments: Sequence[str], takes_value: Callable[[str], bool]
 ) -> tuple[list[str], NodeNames]:
-    """Arguments as the command has them, and what ROS tells the node.
+    """Translate arguments of other players to those of this command; and the ROS arguments.
 
     Args:
-        arguments: As they were typed.
-        takes_value: Whether an option of the command has a word behind it.
+        arguments: As typed by the user.
+        takes_value: Whether an option of this command takes a value.
 
     Raises:
-        OptionError: An option of another player has no meaning here, or a value that is none.
+        OptionError: An option of another player is not supported, or its value is not valid.
     """
     words, names = node_arguments(arguments, rules_of=("--remap", "-m"))
     flavour = "ros1" if "--ros1" in words else "ros2" if "--ros2" in words else ""
@@ -72,7 +73,7 @@ def spelled(
 
 
 def _split(words: Sequence[str], letters: dict[str, str]) -> list[str]:
-    """Words with values of their own, and with letters as the long names that they stand for."""
+    """Arguments with values split off from their options, and short options as long ones."""
     made: list[str] = []
     for word in words:
         name, has_value, value = word.partition("=")
@@ -86,7 +87,7 @@ def _split(words: Sequence[str], letters: dict[str, str]) -> list[str]:
 
 
 class _Words:
-    """Goes through words, and gives those of the command."""
+    """Iterates over arguments, translated to those of this command."""
 
     def __init__(self, words: list[str], takes_value: Callable[[str], bool]) -> None:
         self._left = words[::-1]
@@ -103,7 +104,7 @@ class _Words:
             if word in _LISTS:
                 yield from self._list(word)
             elif word in _REFUSED:
-                raise OptionError(f"{word} has no counterpart: {_REFUSED[word]}.")
+                raise OptionError(f"{word} is not supported: {_REFUSED[word]}.")
             elif word in _IGNORED:
                 for _ in range(_IGNORED[word]):
                     self._value(word)
@@ -126,7 +127,7 @@ class _Words:
         return self._left.pop()
 
     def _list(self, option: str) -> Iterator[str]:
-        """Words up to the next option; or to a dataset, where none was told before."""
+        """Values up to the next option, or up to a dataset if none was given before."""
         name, is_first = _LISTS[option] or option, True
         ending = _EVENTS if "services" in option else ""
         while is_first or (self._left and self._is_in_list(name, self._left[-1])):
@@ -155,7 +156,8 @@ class _Words:
         elif option == "--message-order":
             if (order := self._value(option)) != "received":
                 raise OptionError(
-                    f"--message-order {order!r}: messages come as they were received."
+                    f"--message-order {order!r} is not supported: messages are played in the order "
+                    "in which they were received."
                 )
         elif not _NUMBER.fullmatch(rate := self._value(option)) or not float(rate):
             yield "--no-progress"

@@ -1,1 +1,1 @@
-"""Dataset -> ROS 1, ROS 2 or Foxglove, as if it were the recording."""
+"""Plays datasets back, to ROS 1, ROS 2 or Foxglove."""

@@ -1,4 +1,4 @@
-"""The clocks that a player goes by: its own, that of others, and what is late by them."""
+"""The clocks that set the pace of a player: its own, or another player's; and lateness."""
 
 from __future__ import annotations
 
@@ -10,37 +10,37 @@ from itertools import pairwise
 
 NS = 1_000_000_000
 
-_TOLD = 8  # times of a clock that its pace is taken from
+_RECENT = 8  # times of another clock from which its rate is estimated
 _JUMP_NS = 2 * NS
-"""A clock of others that goes on by more than this at once was moved."""
+"""Another player's clock that advances by more than this at once has jumped."""
 _MISSED_NS = NS // 5
-"""What may be missed of the beginning of a clock, as it takes a while to be connected with it."""
+"""How much of the beginning of a clock may be missed, since it takes a while to connect to it."""
 
 CATCH_UP_NS = 100_000_000
-"""How late a message may be for want of being ready."""
+"""How late a message may be because it was not ready."""
 
 _SUSPENDED_NS = 10 * NS
-"""A longer stall was meant: Ctrl-Z, or a machine that slept."""
+"""A longer stall is a suspension: Ctrl-Z, or a machine that was asleep."""
 
 
 class Pace:
-    """Maps this machine's steady clock to the time of the recording. All times are nanoseconds.
+    """Maps the machine's monotonic clock to recording time. All times are in nanoseconds.
 
     Args:
-        rate: Seconds of the recording in a second.
-        steady: The machine's clock, which never jumps.
+        rate: Seconds of the recording per second.
+        steady: The monotonic clock.
     """
 
     def __init__(self, rate: float = 1.0, *, steady: Callable[[], int] = time.monotonic_ns) -> None:
         self._steady = steady
         self._rate = rate
         self._is_running = False
-        self._at = 0  # time of the recording ...
-        self._since = steady()  # ... at this time of the machine
+        self._at = 0  # recording time ...
+        self._since = steady()  # ... at this time of the monotonic clock
 
     @property
     def rate(self) -> float:
-        """Seconds of the recording in a second."""
+        """Seconds of the recording per second."""
         return self._rate
 
     @rate.setter
@@ -50,46 +50,46 @@ class Pace:
 
     @property
     def is_running(self) -> bool:
-        """Whether it goes on."""
+        """Whether time passes."""
         return self._is_running
 
     def now(self) -> int:
-        """The time of the recording."""
+        """The recording time."""
         if not self._is_running:
             return self._at
         return self._at + int((self._steady() - self._since) * self._rate)
 
     def jump(self, time_ns: int) -> None:
-        """Go on from a time of the recording; or stand there, where it stands."""
+        """Continue from another recording time; stay paused if it is paused."""
         self._at, self._since = time_ns, self._steady()
 
-    def run(self) -> None:
-        """Go on."""
+    def resume(self) -> None:
+        """Let time pass."""
         self.jump(self.now())
         self._is_running = True
 
-    def stand(self) -> None:
-        """Stand still."""
+    def pause(self) -> None:
+        """Stop time."""
         self.jump(self.now())
         self._is_running = False
 
     def seconds_until(self, time_ns: int) -> float:
-        """Seconds of this machine until a time of the recording; negative where it is past.
+        """Real seconds until a recording time; negative if it is past.
 
-        Where it stands still, as if it went on now.
+        If it is paused, as if it were resumed now.
         """
         return (time_ns - self.now()) / self._rate / NS
 
     def wall_of(self, time_ns: int) -> int:
-        """When a time of the recording is or was, as nanoseconds since 1970."""
+        """The wall-clock time of a recording time, in nanoseconds since 1970."""
         return time.time_ns() + int((time_ns - self.now()) / self._rate)
 
 
 class Ticks:
-    """When /clock is due: so many times a second, as long as the machine can.
+    """When /clock is to be published: at a fixed rate, if the machine keeps up.
 
     Args:
-        hertz: How often; None for never.
+        hertz: The rate; None for never.
     """
 
     def __init__(self, hertz: float | None) -> None:
@@ -97,26 +97,26 @@ class Ticks:
         self._next = 0.0 if hertz else math.inf
 
     def is_due(self) -> bool:
-        """Whether it is due; counts as published then."""
+        """Whether it is time to publish; if so, the caller is expected to do it."""
         now = time.monotonic()
         if now < self._next:
             return False
         self._next += self._period
-        if self._next <= now:  # what was missed is not made up for
+        if self._next <= now:  # do not make up for missed ones
             self._next = now + self._period
         return True
 
     @property
     def seconds_left(self) -> float:
-        """Until it is due."""
+        """Seconds until the next one."""
         return max(0.0, self._next - time.monotonic())
 
 
 class Lateness:
-    """Why messages are late: they were not ready, or the player was not scheduled. Nanoseconds.
+    """Why messages are late: not ready in time, or the player was not scheduled. In nanoseconds.
 
-    What is late since the machine was busy elsewhere is made up for, as every player does. Where
-    messages are read or decoded more slowly than they are played, the clock has to wait.
+    After the machine was busy elsewhere, the player catches up, as every player does. If messages
+    are read or decoded more slowly than they are played, the clock has to wait for them.
     """
 
     def __init__(self) -> None:
@@ -124,15 +124,15 @@ class Lateness:
         self._stalled = 0
 
     def clear(self) -> None:
-        """Begin anew, as after a jump."""
+        """Start over, as after a seek."""
         self._unready = self._stalled = 0
 
-    def met(self, late: int, *, was_awaited: bool) -> int:
-        """Take a message that is due; returns by how much the clock has to wait for its like.
+    def record(self, late: int, *, was_awaited: bool) -> int:
+        """Note how late the next message is; returns by how much to hold back the clock.
 
         Args:
-            late: How late it is; negative where it is early.
-            was_awaited: Whether there was no message at all for a while.
+            late: How late it is; negative if it is early.
+            was_awaited: Whether the player had to wait until the message was ready.
         """
         more = late - self._unready - self._stalled
         if late <= 0:
@@ -148,59 +148,59 @@ class Lateness:
         return waiting
 
     def suspended(self) -> int:
-        """How long the player did not run at all, where nobody would want that made up for."""
+        """How long the player was suspended, for which it should not catch up."""
         gone = self._stalled if self._stalled > _SUSPENDED_NS else 0
         self._stalled -= gone
         return gone
 
 
 class FollowedClock:
-    """The clock of others, which tells its time now and then.
+    """Another player's clock, which publishes its time now and then.
 
-    Between two times it is taken to go on as it did, by no more than one of its steps: the last
-    messages of a player may come after the last time that it tells.
+    Between two published times it is assumed to run on at its recent rate, but no further than one
+    of its steps: the last messages of a player may come after the last time that it publishes.
 
     Args:
-        steady: This machine's clock, nanoseconds.
+        steady: The monotonic clock, nanoseconds.
     """
 
     def __init__(self, *, steady: Callable[[], int] = time.monotonic_ns) -> None:
         self._steady = steady
-        self._told: deque[tuple[int, int]] = deque(maxlen=_TOLD)  # its time, and this machine's
+        self._heard: deque[tuple[int, int]] = deque(maxlen=_RECENT)  # its time, and ours
 
     @property
     def time_ns(self) -> int | None:
-        """The last time that it told; None for nothing yet."""
-        return self._told[-1][0] if self._told else None
+        """The last time that was received; None for none yet."""
+        return self._heard[-1][0] if self._heard else None
 
-    def hear(self, time_ns: int, start: int) -> bool:
-        """Take a time; returns whether it was moved, or is first heard in the middle.
+    def update(self, time_ns: int, start: int) -> bool:
+        """Receive a time; returns whether the clock jumped, or was joined in the middle.
 
         Args:
-            time_ns: What it tells.
-            start: Where the recording starts, nanoseconds.
+            time_ns: The time received.
+            start: Start of the recording, nanoseconds.
         """
         before = self.time_ns
         is_moved = time_ns > start + _MISSED_NS
         if before is not None:
             is_moved = not before <= time_ns <= before + _JUMP_NS
-            if is_moved or time_ns == before:  # it stands, or is somewhere else
-                self._told.clear()
-        self._told.append((time_ns, self._steady()))
+            if is_moved or time_ns == before:  # it is paused, or has jumped
+                self._heard.clear()
+        self._heard.append((time_ns, self._steady()))
         return is_moved
 
     def seconds_until(self, time_ns: int) -> float:
-        """Seconds of this machine until it is a time; infinite where that cannot be told yet."""
-        if not self._told or time_ns <= self._told[-1][0]:
-            return 0.0 if self._told else math.inf
-        steps = [later - earlier for (earlier, _), (later, _) in pairwise(self._told)]
-        if not steps or time_ns > self._told[-1][0] + max(steps):
+        """Real seconds until it reaches a time; infinite if that is not known yet."""
+        if not self._heard or time_ns <= self._heard[-1][0]:
+            return 0.0 if self._heard else math.inf
+        steps = [later - earlier for (earlier, _), (later, _) in pairwise(self._heard)]
+        if not steps or time_ns > self._heard[-1][0] + max(steps):
             return math.inf
-        rate = sum(steps) / max(1, self._told[-1][1] - self._told[0][1])
-        waited = self._steady() - self._told[-1][1]
-        return max(0.0, (time_ns - self._told[-1][0]) / rate - waited) / NS
+        rate = sum(steps) / max(1, self._heard[-1][1] - self._heard[0][1])
+        waited = self._steady() - self._heard[-1][1]
+        return max(0.0, (time_ns - self._heard[-1][0]) / rate - waited) / NS
 
     @property
     def silent_s(self) -> float:
-        """Seconds since it told a time; 0 where it never did."""
-        return (self._steady() - self._told[-1][1]) / NS if self._told else 0.0
+        """Seconds since the last time was received; 0 if none ever was."""
+        return (self._steady() - self._heard[-1][1]) / NS if self._heard else 0.0

@@ -1,4 +1,4 @@
-"""Dataset -> ROS 1, ROS 2 or Foxglove, at the recorded times."""
+"""Play datasets back to ROS 1, ROS 2 or Foxglove, at the recorded times."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from mp4ds.plugins.publishing.publisher import WORLDS, Publisher, open_publisher
 from mp4ds.unpacking.pictures import Reduction
 
 KINDS = {"raw": "raw", "compressed": "jpeg", "ffmpeg": "ffmpeg"}
-"""What images can be published as, by the name of the transport: kinds of `mp4ds.unpacking`."""
+"""Transport that cameras are published as -> kind of image in `mp4ds.unpacking`."""
 
 _NS = 1_000_000_000
 _CLOCK = "/clock"
@@ -37,97 +37,107 @@ _CLOCK = "/clock"
 
 @dataclass(frozen=True)
 class PlayOptions(Options):
-    """How to play."""
+    """How to play datasets back."""
 
-    to: str | None = option("ros1, ros2 or foxglove; what is sourced by default.")
-    rate: float = option("Times the recorded speed.", 1.0, "-r")
+    to: str | None = option("ros1, ros2 or foxglove; default: the ROS that is sourced.")
+    rate: float = option("Playback rate; 2 is twice as fast.", 1.0, "-r")
     start_offset: float = option(
-        "Seconds to leave out at first.", 0.0, "--start-offset", "--start", "-s"
+        "Start this many seconds into the recording.", 0.0, "--start-offset", "--start", "-s"
     )
     duration: float | None = option(
-        "Seconds to play.", None, "--duration", "--playback-duration", "-u"
+        "Play only this many seconds.", None, "--duration", "--playback-duration", "-u"
     )
     until_sec: float | None = option(
-        "The last time to play, seconds since 1970; with `duration`, whichever is later.",
+        "Play until this time, in seconds since 1970, or for `duration`, whichever is later.",
         None,
         "--playback-until-sec",
     )
-    until_nsec: int | None = option("The same in nanoseconds.", None, "--playback-until-nsec")
-    loop: bool = option("Start over at the end.", False, "-l")
-    keep_alive: bool = option("Stay at the end, for those that come late.", False, "-k")
-    delay: float = option(
-        "Seconds to wait before the first message, in ROS 2 of each loop.", 0.0, "-d"
+    until_nsec: int | None = option(
+        "Play until this time, in nanoseconds since 1970.", None, "--playback-until-nsec"
     )
-    paused: bool = option("Stand still at first.", False, "--pause", "--start-paused", "-p")
+    loop: bool = option("Loop playback.", False, "-l")
+    keep_alive: bool = option("Keep running at the end, for late subscribers.", False, "-k")
+    delay: float = option("Seconds to wait before playing; in ROS 2, before each loop.", 0.0, "-d")
+    paused: bool = option("Start paused.", False, "--pause", "--start-paused", "-p")
     topics: Sequence[str] = topics()
     exclude: Sequence[str] = exclude("--exclude", "--exclude-topics")
-    regex: str = option("Topics that match as a whole.", "", "-e")
-    exclude_regex: str = option("Leave out topics that match as a whole.", "")
-    remap: Sequence[str] = option("Give a topic another name.", (), "-m", metavar="OLD:=NEW")
-    prefix: str = option("Put before the topics.", "")
-    clock: float | None = option("Hz at which /clock is published, to lead those that follow it.")
-    clock_topics: Sequence[str] = option(
-        "Publish /clock before each message of these topics.", (), metavar="TOPIC"
+    regex: str = option(
+        "Only topics that fully match a regular expression, and those of `topics`.", "", "-e"
     )
-    clock_topics_all: bool = option("Publish /clock before each message.", False)
+    exclude_regex: str = option("Leave out topics that fully match a regular expression.", "")
+    remap: Sequence[str] = option("Rename a topic; repeatable.", (), "-m", metavar="OLD:=NEW")
+    prefix: str = option("Prefix for all topics that are not remapped.", "")
+    clock: float | None = option("Publish /clock at this rate in Hz; default: do not publish it.")
+    clock_topics: Sequence[str] = option(
+        "Publish /clock just before each message on these topics.", (), metavar="TOPIC"
+    )
+    clock_topics_all: bool = option("Publish /clock just before each message.", False)
     follow_clock: bool | None = option(
-        "Play by the /clock of another player; by default where /use_sim_time is set (ROS 1) and "
-        "there is no `clock`.",
+        "Play in step with another player's /clock; default: if /use_sim_time is set (ROS 1) and "
+        "`clock` is not given.",
         None,
         "--follow-clock/--no-follow-clock",
     )
-    immediate: bool = option("As fast as can be.", False, "-i")
+    immediate: bool = option("Publish as fast as possible.", False, "-i")
     skip_empty: float | None = option(
-        "Skip times of more seconds without a message.", metavar="SECONDS"
+        "Skip gaps between messages that are longer than this.", metavar="SECONDS"
     )
     pause_topics: Sequence[str] = option(
-        "Pause before each message of these topics.", (), metavar="TOPIC"
+        "Pause before each message on these topics.", (), metavar="TOPIC"
     )
     rate_control_topic: str = option(
-        "Wait where the stamps of this topic fall behind; ROS 1.", "", metavar="TOPIC"
+        "Wait when playback gets too far ahead of the header stamps on this topic (ROS 1).",
+        "",
+        metavar="TOPIC",
     )
-    rate_control_max_delay: float = option("How far, seconds.", 1.0)
-    wait_for_subscribers: bool = option("Begin when all topics have one.", False)
+    rate_control_max_delay: float = option(
+        "Seconds that playback may be ahead of `rate_control_topic`.", 1.0
+    )
+    wait_for_subscribers: bool = option("Wait for a subscriber on each topic first.", False)
     wait_for_all_acked: int | None = option(
-        "Wait at the end until all is acknowledged, for so many ms at most, 0 for ever; ROS 2.",
+        "At the end, wait this many milliseconds at most for subscribers to acknowledge all "
+        "messages; 0: wait forever (ROS 2).",
         None,
         metavar="MS",
         least=0,
     )
     queue: int = option(
-        "Messages that may wait for a subscriber in ROS 1; 0 for any number.", 0, least=0
+        "Outgoing queue per subscriber, in messages; 0: no limit but 128 MiB (ROS 1).", 0, least=0
     )
     qos_overrides: Path | None = option(
-        "QoS by topic, for ROS 2.", None, "--qos-profile-overrides-path", metavar="YAML"
+        "QoS profiles by topic (ROS 2).", None, "--qos-profile-overrides-path", metavar="YAML"
     )
-    publish_as: str | None = option("Cameras as raw, compressed (JPEG) or ffmpeg (video packets).")
+    publish_as: str | None = option(
+        "Publish cameras as raw, compressed (JPEG) or ffmpeg (video packets); default: as recorded."
+    )
     jpeg_quality: int = jpeg_quality()
     resize: float | tuple[int, int] | None = resize()
     every: int = every()
     max_rate: float | None = max_rate()
     read_ahead: int = option(
-        "Frames of each camera that are made ahead.",
+        "Frames per camera to decode ahead.",
         8,
         "--read-ahead",
         "--read-ahead-queue-size",
         least=1,
         most=10_000,
     )
-    drop: bool = option("Leave out frames that come late, keep the speed.", False)
-    restamp: str | None = option("Give headers the time of publishing.", metavar="now")
+    drop: bool = option("Drop late frames instead of playing slower.", False)
+    restamp: str | None = option("Set header stamps to the time of publishing.", metavar="now")
     lock_step: str = option(
-        "The next frame goes when a message came on this topic.", "", metavar="TOPIC"
+        "Publish the next frame only after a message on this topic.", "", metavar="TOPIC"
     )
-    host: str = option("To listen on, for Foxglove.", "127.0.0.1")
-    port: int = option("To listen on, for Foxglove.", 8765, least=0, most=65535)
+    host: str = option("Address to listen on (Foxglove).", "127.0.0.1")
+    port: int = option(
+        "Port to listen on (Foxglove); 0 picks a free one.", 8765, least=0, most=65535
+    )
     origins: Sequence[str] = option(
-        "A web site that may connect, such as http://robot:8080, besides Foxglove's and those of "
-        "this machine.",
+        "Also let this web site connect, such as http://robot:8080 (Foxglove).",
         (),
         "--allow-origin",
         metavar="URL",
     )
-    names: NodeNames = argument("What ROS calls the node and its topics.", PLAIN)
+    names: NodeNames = argument("Name, namespace and remappings of the ROS node.", PLAIN)
 
 
 def play(
@@ -136,12 +146,12 @@ def play(
     *,
     progress: Callable[[PlayProgress], None] | None = None,
 ) -> PlaySummary:
-    """Publish datasets as if they were the recording.
+    """Play back datasets, publishing their messages at the recorded times.
 
     Args:
-        datasets: Datasets, or sidecars beside their videos; or URLs. Several are merged by log
-            time.
-        options: How.
+        datasets: Datasets, or sidecars next to their videos; paths or URLs. Several are merged by
+            log time.
+        options: How to play them.
         progress: Called a few times a second.
 
     Returns:
@@ -150,7 +160,7 @@ def play(
     Raises:
         OptionError: An option is wrong.
         ConversionError: A topic cannot be published there; names it.
-        PublishError: ROS is not there, or was lost.
+        PublishError: ROS is not available, or the connection was lost.
         FormatError: A dataset is damaged.
     """
     with open_player(datasets, options, progress=progress) as player:
@@ -165,13 +175,13 @@ def open_player(
     publisher: Publisher | None = None,
     progress: Callable[[PlayProgress], None] | None = None,
 ) -> Iterator[Player]:
-    """A player of datasets, which is not running yet. See `play`.
+    """A player of datasets that is not running yet.
 
     Args:
-        datasets: See `play`.
-        options: See `play`.
-        publisher: Where to publish, not closed here; None for what the options say.
-        progress: See `play`.
+        datasets: As for `play`.
+        options: As for `play`.
+        publisher: Where to publish, not closed here; None: as the options say.
+        progress: As for `play`.
     """
     chosen = options or PlayOptions()
     _check(chosen)
@@ -219,7 +229,7 @@ def _opened(kind: str, chosen: PlayOptions, timeline: Timeline) -> Publisher:
         ("rate_control_topic", "ros1", bool(chosen.rate_control_topic)),
     ):
         if is_given and kind != needed:
-            raise OptionError(f"`{name}` goes with `{needed}`.")
+            raise OptionError(f"`{name}` needs `{needed}`.")
     patience = chosen.wait_for_all_acked
     return open_publisher(
         kind,
@@ -240,7 +250,8 @@ def _player_options(chosen: PlayOptions, timeline: Timeline) -> PlayerOptions:
     if start > timeline.end_ns:
         length = (timeline.end_ns - timeline.start_ns) / _NS
         raise OptionError(
-            f"`start_offset` {chosen.start_offset:g} is after the end: there are {length:.3f} s"
+            f"`start_offset` {chosen.start_offset:g} is past the end: the recording has "
+            f"{length:.3f} s."
         )
     skip = chosen.skip_empty
     clock_with = timeline.named("clock_topics", chosen.clock_topics)
@@ -267,7 +278,7 @@ def _player_options(chosen: PlayOptions, timeline: Timeline) -> PlayerOptions:
 
 
 def _end(chosen: PlayOptions, start: int) -> int | None:
-    """The last time that is played; None for the end. Of several the later one, as in ROS 2."""
+    """The last time to play; None for the end. Of several, the latest, as in `ros2 bag play`."""
     ends = []
     if chosen.duration is not None:
         ends.append(start + round(chosen.duration * _NS))
@@ -279,13 +290,13 @@ def _end(chosen: PlayOptions, start: int) -> int | None:
 
 
 def _check(options: PlayOptions) -> None:
-    """Refuse what makes no sense, or contradicts itself.
+    """Refuse options that are invalid or contradict each other.
 
     Raises:
-        OptionError: Says what.
+        OptionError: Names the option.
     """
     if not (math.isfinite(options.rate) and options.rate > 0):
-        raise OptionError(f"`rate` {options.rate:g} is not above 0.")
+        raise OptionError(f"`rate` {options.rate:g} is not greater than 0.")
     for name, seconds in (
         ("start_offset", options.start_offset),
         ("duration", options.duration or 0.0),
@@ -294,11 +305,11 @@ def _check(options: PlayOptions) -> None:
         ("rate_control_max_delay", options.rate_control_max_delay),
     ):
         if not (math.isfinite(seconds) and seconds >= 0):
-            raise OptionError(f"`{name}` {seconds:g} is no number of seconds from 0.")
+            raise OptionError(f"`{name}` {seconds:g} is not a number of seconds, 0 or more.")
     if options.clock is not None and not 0 < options.clock <= 10_000:
-        raise OptionError(f"`clock` {options.clock:g} is not from 0 to 10000 Hz.")
+        raise OptionError(f"`clock` {options.clock:g} is not a rate from 0 to 10000 Hz.")
     if options.until_sec is not None and not math.isfinite(options.until_sec):
-        raise OptionError(f"`until_sec` {options.until_sec:g} is no number of seconds.")
+        raise OptionError(f"`until_sec` {options.until_sec:g} is not a number of seconds.")
     if options.clock_topics and options.clock_topics_all:
         raise OptionError("`clock_topics` contradicts `clock_topics_all`.")
     for name, given in (
@@ -306,7 +317,7 @@ def _check(options: PlayOptions) -> None:
         ("clock_topics_all", options.clock_topics_all),
     ):
         if given and options.clock is not None:
-            raise OptionError(f"`{name}` contradicts `clock`, which goes by a rate.")
+            raise OptionError(f"`{name}` contradicts `clock`, which publishes at a fixed rate.")
     if options.publish_as not in (None, *KINDS):
         raise OptionError(
             f"`publish_as` {options.publish_as!r} is not known. Use {', '.join(KINDS)}."
@@ -323,5 +334,5 @@ def _check(options: PlayOptions) -> None:
         ):
             if given:
                 raise OptionError(
-                    f"`{name}` contradicts `follow_clock`: the clock of others leads."
+                    f"`{name}` contradicts `follow_clock`: another player's clock sets the pace."
                 )

@@ -1,4 +1,4 @@
-"""Publishes a timeline at its own pace, or at that of a clock of others."""
+"""The player: publishes a timeline at its own pace, or in step with another player's clock."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from mp4ds.records import Channel
 
 @dataclass(frozen=True)
 class PlayerOptions:
-    """How a timeline is played. Times are nanoseconds of the recording, topics as published.
+    """How to play a timeline. Times are in nanoseconds of the recording, topics as published.
 
     Attributes:
-        rate: Seconds of the recording in a second.
-        start_ns: Where to begin; None for the first message.
-        end_ns: Nothing after this is played; None for all.
+        rate: Seconds of the recording per second.
+        start_ns: Where to start; None for the first message.
+        end_ns: The last time to play; None for the end.
         loop: Start over at the end.
-        keep_alive: Stay at the end, for those that come late.
-        delay_s: Seconds to wait before.
-        delays_loops: Whether to wait as long before each loop.
-        paused: Stand still at first.
-        immediate: Publish as fast as can be.
-        clock_hz: How often /clock is published; None for not at all.
-        clock_with: Topics before whose messages /clock is published; None for all.
-        follow: Play by the /clock of others.
-        wait_for_subscribers: Wait until every topic has one.
-        drop: Leave out frames that come too late, rather than play slower.
-        skip_empty_ns: Longer times without a message are skipped; None for none.
-        pause_topics: Topics before whose messages it stands still.
-        lock_step: Topic of whose messages each lets the next frame go; empty for none.
-        rate_control: Topic whose stamps this player keeps to; empty for none.
-        rate_control_ns: How far it may be ahead of them.
-        restamp: Give headers the time at which they are published.
+        keep_alive: Keep running at the end, for late subscribers.
+        delay_s: Seconds to wait before playing.
+        delays_loops: Whether to wait before each loop, too.
+        paused: Start paused.
+        immediate: Publish as fast as possible.
+        clock_hz: Rate at which /clock is published; None: it is not.
+        clock_with: Topics whose messages /clock is published before; None for all.
+        follow: Play in step with another player's /clock.
+        wait_for_subscribers: Wait until every topic has a subscriber.
+        drop: Drop late frames instead of playing slower.
+        skip_empty_ns: Skip gaps between messages that are longer than this; None: skip none.
+        pause_topics: Topics to pause before each message of.
+        lock_step: Topic on which a message is awaited before the next frame; empty for none.
+        rate_control: Topic whose header stamps limit the pace; empty for none.
+        rate_control_ns: How far playback may be ahead of these stamps.
+        restamp: Set header stamps to the time of publishing.
     """
 
     rate: float = 1.0
@@ -68,17 +68,17 @@ class PlayerOptions:
 
 @dataclass(frozen=True)
 class PlayProgress:
-    """Where a player stands. Times are nanoseconds of the recording.
+    """Progress of a player. Times are in nanoseconds of the recording.
 
     Attributes:
-        time_ns: The time now.
-        start_ns: Of what is played.
-        end_ns: Of what is played.
-        rate: Seconds of the recording in a second.
-        state: ``playing``, ``paused``, or what it waits for.
-        messages: How many were published.
-        slowed_s: Seconds that the clock stood since messages were not read or decoded in time.
-        dropped: Frames left out since they were late.
+        time_ns: The current time.
+        start_ns: Start of what is played.
+        end_ns: End of what is played.
+        rate: Seconds of the recording per second.
+        state: ``playing``, ``paused``, or what it is waiting for.
+        messages: Number of messages published.
+        slowed_s: Seconds that the clock waited for messages to be read or decoded.
+        dropped: Number of late frames dropped.
     """
 
     time_ns: int
@@ -96,16 +96,16 @@ class PlaySummary:
     """What was played.
 
     Attributes:
-        messages: Messages published, by topic.
-        not_installed: Messages left out since their type is not installed, by topic.
-        dropped: Frames left out since they were late.
-        slowed_s: Seconds that the clock stood since messages were not read or decoded in time.
-        seconds: How long it took.
+        messages: Number of messages published, by topic.
+        not_installed: Number of messages not played because their type is not installed, by topic.
+        dropped: Number of late frames dropped.
+        slowed_s: Seconds that the clock waited for messages to be read or decoded.
+        seconds: Duration of playback.
         loops: How often it started over.
-        stopped: Whether it was ended before its end.
-        as_recorded: Where images were to be given in another form, the camera topics of which
-            messages stayed as recorded: reason -> how many.
-        thinned: Frames left out on request, by topic.
+        stopped: Whether it was stopped before the end.
+        as_recorded: Images that could not be converted as requested and were published as
+            recorded: topic -> reason -> number.
+        thinned: Number of frames left out as requested, by topic.
     """
 
     messages: dict[str, int] = field(default_factory=dict)
@@ -123,27 +123,27 @@ class PlaySummary:
 
 _REPORT_S = 0.2
 _WAKE_S = 0.1
-_SETTLE_S = 0.2  # as rosbag play: what was advertised has to get about
+_SETTLE_S = 0.2  # as rosbag play: gives subscribers time to connect
 _FOLLOW_END_S = 5.0
 
 
 @dataclass(eq=False)
 class _Burst:
-    """Messages to publish while it stands still."""
+    """Messages to publish while paused."""
 
     left: float
     done: int = 0
 
 
 class Player:
-    """Plays a timeline once. `run` belongs to one thread, the controls to any other.
+    """Plays a timeline once. `run` is called by one thread, the controls by any.
 
     Args:
         timeline: What to play.
-        publisher: Where; not closed here.
-        options: How.
-        progress: Called a few times a second, by the thread that runs it.
-        steady: This machine's clock, nanoseconds.
+        publisher: Where to publish; not closed here.
+        options: How to play it.
+        progress: Called a few times a second, by the thread of `run`.
+        steady: The monotonic clock, nanoseconds.
     """
 
     def __init__(
@@ -165,24 +165,24 @@ class Player:
         self._end = timeline.end_ns if end is None else min(end, timeline.end_ns)
         self._changed = threading.Condition(threading.RLock())
         self._playback: Playback | None = None
-        self._read_ns: int | None = None  # where the playback begins, before it is used
+        self._read_ns: int | None = None  # where the playback starts, until it is used
         self._is_paused = self._options.paused
         self._is_stopped = False
         self._is_over = False
         self._is_resting = False  # at the end, kept alive
         self._burst: _Burst | None = None
-        self._target: int | None = self._start  # where to go on
+        self._target: int | None = self._start  # where to continue
         self._has_looped = False
         self._lateness = Lateness()
-        self._was_awaited = False  # whether the next message was not ready when it was asked for
+        self._was_awaited = False  # whether the next message was not ready in time
         self._followed = FollowedClock(steady=steady)
-        self._replies = 1  # of the consumer that is waited for
-        self._controlled: int = self._start  # the last stamp of the topic that controls the rate
+        self._replies = 1  # on the lock-step topic
+        self._controlled: int = self._start  # the last stamp on the rate-control topic
         self._pauses_for_topics = True
-        self._paused_at: Due | None = None  # the message that it was paused before
-        self._last_frame: int | None = None  # log time of the frame that was published last
+        self._paused_at: Due | None = None  # the message before which it paused
+        self._last_frame: int | None = None  # log time of the last frame published
         self._history: deque[int] = deque(maxlen=10_000)
-        self._reached = self._start  # log time of what was published last
+        self._reached = self._start  # log time of the last message published
         self._ticks = Ticks(self._options.clock_hz)
         self._next_report = 0.0
         self._missing: dict[int, Channel] = {}  # by id()
@@ -191,41 +191,41 @@ class Player:
 
     @property
     def address(self) -> str:
-        """Where it publishes, to be shown."""
+        """Where it publishes, for display."""
         return self._publisher.address
 
     @property
     def follows_clock(self) -> bool:
-        """Whether it plays by the /clock of others."""
+        """Whether it plays in step with another player's /clock."""
         return self._options.follow
 
     # ------------------------------------------------------------ controls
 
     @property
     def is_paused(self) -> bool:
-        """See `Controls`."""
+        """Whether playback is paused."""
         return self._is_paused
 
     @property
     def rate(self) -> float:
-        """See `Controls`."""
+        """Seconds of the recording per second."""
         return self._pace.rate
 
     @property
     def start_ns(self) -> int:
-        """See `Controls`."""
+        """Log time of the first message."""
         return self._timeline.start_ns
 
     def pause(self) -> None:
-        """See `Controls`."""
+        """Pause playback."""
         self._set_paused(True)
 
     def resume(self) -> None:
-        """See `Controls`."""
+        """Resume playback."""
         self._set_paused(False)
 
     def toggle_paused(self) -> None:
-        """See `Controls`."""
+        """Pause or resume playback."""
         with self._changed:
             self._set_paused(not self._is_paused)
 
@@ -236,15 +236,15 @@ class Player:
             self._lateness.clear()
             if is_paused:
                 self._pace.jump(self._time())
-                self._pace.stand()
+                self._pace.pause()
             self._changed.notify_all()
 
     def toggle_topic_pauses(self) -> None:
-        """See `Controls`."""
+        """Turn pausing before messages on chosen topics off, or on again."""
         self._pauses_for_topics = not self._pauses_for_topics
 
     def set_rate(self, rate: float) -> bool:
-        """See `Controls`."""
+        """Change the playback rate; returns False if it is not greater than 0."""
         if not (math.isfinite(rate) and rate > 0):
             return False
         with self._changed:
@@ -254,14 +254,14 @@ class Player:
         return True
 
     def play_next(self) -> bool:
-        """See `Controls`."""
+        """While paused, publish the next message."""
         return self.burst(1) == 1
 
     def burst(self, messages: int) -> int:
-        """See `Controls`."""
+        """While paused, publish messages as fast as possible; 0: all that are left."""
         mine = _Burst(messages or math.inf)
         with self._changed:
-            while self._burst is not None and self._can_step():  # one at a time
+            while self._burst is not None and self._can_step():  # one burst at a time
                 self._changed.wait(_WAKE_S)
             if messages < 0 or not self._can_step():
                 return 0
@@ -277,7 +277,7 @@ class Player:
         return self._is_paused and not (self._is_over or self._is_stopped)
 
     def step_back(self) -> bool:
-        """See `Controls`."""
+        """While paused, go back by one message."""
         with self._changed:
             if not self._is_paused or len(self._history) < 2:
                 return False
@@ -288,7 +288,7 @@ class Player:
             return self.play_next()
 
     def seek(self, time_ns: int) -> int:
-        """See `Controls`."""
+        """Continue at a recording time, or the nearest that is played; returns that time."""
         with self._changed:
             self._target = min(max(time_ns, self._start), self._end + 1)
             self._burst = None
@@ -297,7 +297,7 @@ class Player:
             return min(self._target, self._end)
 
     def play(self, start_ns: int, end_ns: int | None) -> bool:
-        """See `Controls`."""
+        """Play an interval, if the player is waiting at the end."""
         with self._changed:
             if not self._is_resting or start_ns > self._timeline.end_ns:
                 return False
@@ -309,18 +309,18 @@ class Player:
         return True
 
     def stop(self) -> None:
-        """See `Controls`."""
-        # no lock: a signal may interrupt the very thread that holds it
+        """Stop playback, and end `run`."""
+        # without the lock: a signal handler may interrupt the thread that holds it
         self._is_stopped = True
 
     # ------------------------------------------------------------ the loop
 
     def run(self) -> PlaySummary:
-        """Play until the end, or until it is stopped.
+        """Play until the end, or until stopped.
 
         Raises:
             ConversionError: A topic cannot be published there.
-            PublishError: The receiving side was lost, or has none of the types.
+            PublishError: The connection was lost, or none of the message types is installed.
             FormatError: A dataset is damaged; names the topic and the message.
         """
         began = time.monotonic()
@@ -353,7 +353,7 @@ class Player:
         self._pace.jump(self._start)
         if self._options.clock_with != frozenset():
             self._publisher.clock(self._start)  # advertised before the first message
-        self._read_from(self._start)  # frames are made while it waits
+        self._read_from(self._start)  # decode ahead while waiting
         self._wait(max(_SETTLE_S, self._options.delay_s), "waiting")
         channels = [one for one in self._timeline.channels if id(one) not in self._missing]
         while self._options.wait_for_subscribers and not self._is_stopped:
@@ -365,7 +365,7 @@ class Player:
         for channel in self._timeline.channels:
             try:
                 self._publisher.advertise(channel)
-            except Refused:  # a type that is not installed
+            except Refused:  # the message type is not installed
                 self._missing[id(channel)] = channel
                 self._done.not_installed.setdefault(channel.topic, 0)
             else:
@@ -374,11 +374,14 @@ class Player:
             return
         missing = self._missing.values()
         named = ", ".join(sorted({f"{one.topic} ({one.type_name})" for one in missing}))
-        problem = f"types of messages are not installed there: {named}"
         if len(self._missing) == len(self._timeline.channels):
+            problem = f"no message type of the recording is installed: {named}"
             raise PublishError(self._publisher.address, problem)
-        remedy = "install their packages, or leave the topics out with `exclude`"
-        warnings.warn(f"Not played, for their {problem}; {remedy}.", stacklevel=2)
+        warnings.warn(
+            f"These topics are not played, as their message types are not installed: {named}; "
+            "install their packages, or leave the topics out with `exclude`.",
+            stacklevel=2,
+        )
 
     def _wait(self, seconds: float, state: str) -> None:
         end = time.monotonic() + seconds
@@ -392,13 +395,13 @@ class Player:
             self._publisher.clock(self._time())
 
     def _advance(self) -> bool:
-        """Publish what is due, or wait a little; returns whether it is not over."""
+        """Publish the next message if it is due, else wait a little; returns False at the end."""
         with self._changed:
             target, self._target = self._target, None
         if target is not None:
             self._jump(target)
         self._tick()
-        with self._changed:  # held until it waits, so that no message becomes ready unheard
+        with self._changed:  # held until `wait`, so that no notification is missed
             try:
                 due = self._playback.head() if self._playback else None
             except StopIteration:
@@ -419,7 +422,7 @@ class Player:
         return True
 
     def _seconds_until(self, due: Due | None) -> tuple[float, str]:
-        """How long to wait, and what for; 0: the message is to be published now."""
+        """How long to wait, and the state meanwhile; 0: publish the message now."""
         if due is not None and id(due.channel) in self._missing:
             return 0.0, "playing"
         self._pause_before(due)
@@ -430,9 +433,9 @@ class Player:
             self._was_awaited = self._pace.is_running
             return math.inf, "reading ahead"
         if due.is_frame and self._replies < 1 and due.time_ns != self._last_frame:
-            return self._stand(due, self._options.lock_step)
+            return self._hold(due, self._options.lock_step)
         if self._is_ahead():
-            return self._stand(due, self._options.rate_control)
+            return self._hold(due, self._options.rate_control)
         if self._options.immediate:
             return 0.0, "playing"
         if self._options.follow:
@@ -441,17 +444,17 @@ class Player:
         return self._until_due(due), "playing"
 
     def _pause_before(self, due: Due | None) -> None:
-        is_one = due is not None and due.channel.topic in self._options.pause_topics
-        if is_one and self._pauses_for_topics and due is not self._paused_at:
+        pauses = due is not None and due.channel.topic in self._options.pause_topics
+        if pauses and self._pauses_for_topics and due is not self._paused_at:
             self._paused_at = due
             if not self._is_paused:
                 self._set_paused(True)
 
-    def _stand(self, due: Due, topic: str) -> tuple[float, str]:
-        """Let the time stand where it reached a message that has to wait for others."""
+    def _hold(self, due: Due, topic: str) -> tuple[float, str]:
+        """Stop the clock at a message that has to wait for a message on another topic."""
         if self._pace.now() >= due.time_ns or topic == self._options.rate_control:
             now = min(self._pace.now(), due.time_ns)
-            self._pace.stand()
+            self._pace.pause()
             self._pace.jump(now)
             self._lateness.clear()
         return math.inf, f"waiting for {topic}"
@@ -462,13 +465,13 @@ class Player:
 
     def _until_due(self, due: Due) -> float:
         if not self._pace.is_running:
-            self._pace.run()
+            self._pace.resume()
         skip = self._options.skip_empty_ns
         if skip is not None and due.time_ns - self._pace.now() > skip:
             self._pace.jump(due.time_ns)
         seconds = self._pace.seconds_until(due.time_ns)
         if not self._options.drop:
-            waited = self._lateness.met(-round(seconds * NS), was_awaited=self._was_awaited)
+            waited = self._lateness.record(-round(seconds * NS), was_awaited=self._was_awaited)
             self._done.slowed_s += waited / NS
             behind = (waited + self._lateness.suspended()) * self._pace.rate
             if behind:
@@ -477,7 +480,7 @@ class Player:
         return max(seconds, 0.0)
 
     def _time(self) -> int:
-        """The time of the recording, which is not after what is still to be published."""
+        """The recording time; never later than a message that is still to be published."""
         if self._options.follow:
             return max(self._reached, self._followed.time_ns or 0)
         if self._options.immediate:
@@ -487,14 +490,14 @@ class Player:
             return now
         try:
             head = self._playback.head() if self._playback else None
-        except Exception:  # the end, or an error that is told when it is due
+        except Exception:  # the end, or an error that is raised when the message is due
             return min(now, self._end)
         return min(now, head.time_ns if head is not None else self._reached)
 
-    # ------------------------------------------------------------ what it does
+    # ------------------------------------------------------------ publishing
 
     def _jump(self, time_ns: int) -> None:
-        """Go on at a time of the recording."""
+        """Continue at a recording time."""
         if self._read_ns != time_ns:
             self._read_from(time_ns)
         self._read_ns = None
@@ -502,7 +505,7 @@ class Player:
             self._replies, self._last_frame, self._reached = 1, None, time_ns
             self._controlled = time_ns
             self._is_resting = self._was_awaited = False
-            self._pace.stand()
+            self._pace.pause()
             self._pace.jump(time_ns)
             self._lateness.clear()
         if self._has_looped and self._options.delays_loops:
@@ -521,8 +524,8 @@ class Player:
         self._read_ns = time_ns
 
     def _at_end(self) -> bool:
-        """Start over, or wait for who does; returns whether it goes on. Holds the lock."""
-        self._burst = None  # there is nothing left
+        """Start over, or wait for a control that does; returns whether to continue. Locked."""
+        self._burst = None  # no messages left
         self._changed.notify_all()
         if self._options.loop and not self._options.follow and not self._is_paused:
             if self._target is None:
@@ -559,7 +562,7 @@ class Player:
         self._report("paused" if self._is_paused else "playing")
 
     def _has_clock(self, due: Due) -> bool:
-        """Whether /clock goes with a message: on request, or where no time passes between two."""
+        """Whether to publish /clock before a message: as requested, or when not paced by time."""
         chosen, hertz = self._options.clock_with, self._options.clock_hz
         is_chosen = chosen is None or due.channel.topic in chosen
         return is_chosen or (hertz is not None and self._options.immediate)
@@ -596,7 +599,7 @@ class Player:
             return
         self._next_report = time.monotonic() + _REPORT_S
         with self._changed:
-            standing = PlayProgress(
+            progress = PlayProgress(
                 time_ns=self._time(),
                 start_ns=self._start,
                 end_ns=self._end,
@@ -606,9 +609,9 @@ class Player:
                 slowed_s=self._done.slowed_s,
                 dropped=self._done.dropped,
             )
-        self._progress(standing)
+        self._progress(progress)
 
-    # ------------------------------------------------------------ what others tell, from any thread
+    # ------------------------------------------------------------ callbacks, from any thread
 
     def _on_ready(self) -> None:
         with self._changed:
@@ -626,16 +629,16 @@ class Player:
 
     def _on_clock(self, time_ns: int) -> None:
         with self._changed:
-            if self._followed.hear(time_ns, self._start):
+            if self._followed.update(time_ns, self._start):
                 self._target = max(time_ns, self._start)
             self._changed.notify_all()
 
     def _is_late(self, time_ns: int) -> bool:
-        """Whether it is too late for a frame; counts it then."""
+        """Whether a frame is too late to be published; if so, counts it."""
         if not self._options.drop or self._options.immediate:
             return False
         with self._changed:
-            is_going = self._pace.is_running and not self._is_paused
-            is_late = is_going and self._pace.seconds_until(time_ns) * NS <= -CATCH_UP_NS
+            is_playing = self._pace.is_running and not self._is_paused
+            is_late = is_playing and self._pace.seconds_until(time_ns) * NS <= -CATCH_UP_NS
             self._done.dropped += is_late
         return is_late

@@ -1,4 +1,4 @@
-"""The messages of several datasets as they are to be published, from any time on."""
+"""The messages of several datasets, merged, as they are published, from any time on."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from mp4ds.unpacking.republish import Republisher
 
 
 class Names:
-    """New names of topics.
+    """Renames topics.
 
     Args:
-        remap: ``old:=new``, each of one topic; a missing slash at the beginning does not count.
-        prefix: Put before all names that are not remapped.
-        node: Rules of ROS, which apply to what comes of these; they may be about other topics.
+        remap: ``old:=new`` rules for single topics; the leading slash is optional.
+        prefix: Prefix for all topics that are not remapped.
+        node: ROS remappings, applied after the others; they may name topics that are not played.
 
     Raises:
-        OptionError: A rule is none.
+        OptionError: A rule is not valid.
     """
 
     def __init__(
@@ -53,24 +53,24 @@ class Names:
             old, found, new = rule.partition(":=")
             if not (found and old.strip("/ ") and new.strip("/ ")):
                 raise OptionError(
-                    f"`remap` {rule!r} is no rule: write it as /old/topic:=/new/topic"
+                    f"`remap` {rule!r} is not a remapping; write it as /old/topic:=/new/topic."
                 )
             self._rules[_rooted(old)] = new
         self._prefix = prefix.rstrip("/")
 
     def check(self, topics: Iterable[str]) -> None:
-        """Refuse a rule for a topic that is not there.
+        """Refuse rules for topics that do not exist.
 
         Raises:
-            OptionError: Names it.
+            OptionError: Names the topic.
         """
         known = {_rooted(topic) for topic in topics}
         for old in self._rules:
             if old not in known:
-                raise OptionError(f"`remap` {old!r}: there is no such topic to be played")
+                raise OptionError(f"`remap` {old!r}: there is no such topic to play.")
 
     def __call__(self, topic: str) -> str:
-        """The name of a topic."""
+        """The name that a topic is published under."""
         new = self._rules.get(_rooted(topic))
         if new is None:
             new = f"{self._prefix}/{topic.lstrip('/')}" if self._prefix else topic
@@ -81,14 +81,14 @@ class Wanted:
     """Which topics are played.
 
     Args:
-        topics: Globs; with neither these nor `regex`, all are.
-        exclude: Globs of those that are not.
-        regex: Topics that match it as a whole are played, too, as with ``ros2 bag play``.
-        exclude_regex: Topics that match it as a whole are not.
-        without: Topics that are not, whatever the others say.
+        topics: Globs of topics to play; all topics if neither these nor `regex` are given.
+        exclude: Globs of topics not to play.
+        regex: Topics that fully match it are played, too, as with ``ros2 bag play``.
+        exclude_regex: Topics that fully match it are not played.
+        without: Topics that are never played.
 
     Raises:
-        OptionError: A regular expression is none.
+        OptionError: A regular expression is not valid.
     """
 
     def __init__(
@@ -119,18 +119,18 @@ class Wanted:
         return (self._has_globs and self._by_glob(topic)) or bool(self._regex.fullmatch(topic))
 
     def check(self, topics: Iterable[str]) -> None:
-        """Refuse what matches no topic.
+        """Refuse patterns that match no topic.
 
         Raises:
-            OptionError: Names the pattern, and the topics there are.
+            OptionError: Names the pattern and the topics of the recording.
         """
         known = list(topics)
         self._globs.check(known)
         for name, regex in (("regex", self._regex), ("exclude_regex", self._exclude_regex)):
             if regex is not None and not any(regex.fullmatch(topic) for topic in known):
                 raise OptionError(
-                    f"`{name}` {regex.pattern!r} matches no topic as a whole; .* stands for any "
-                    "letters, such as in '.*camera.*'."
+                    f"`{name}` {regex.pattern!r} fully matches no topic; use .* for any text, as "
+                    "in '.*camera.*'."
                 )
 
 
@@ -138,7 +138,9 @@ def _expression(option: str, text: str) -> re.Pattern[str] | None:
     try:
         return re.compile(text) if text else None
     except re.error as error:
-        raise OptionError(f"`{option}` {text!r} is no regular expression: {error}") from None
+        raise OptionError(
+            f"`{option}` {text!r} is not a valid regular expression: {error}."
+        ) from None
 
 
 def _rooted(topic: str) -> str:
@@ -149,7 +151,7 @@ def _rooted(topic: str) -> str:
 
 
 class Restamper:
-    """Moves the stamps of messages. What had the same stamp has the same one again."""
+    """Replaces the header stamps of messages. Equal stamps stay equal."""
 
     def __init__(self) -> None:
         self._stamps: dict[int, tuple[Channel, HeaderStamps]] = {}
@@ -157,16 +159,15 @@ class Restamper:
     def restamped(
         self, channel: Channel, payload: bytes | memoryview, wall_of: Callable[[int], int]
     ) -> bytes | memoryview:
-        """A message as if it was made now; itself where it has no stamp.
+        """A message with new stamps; unchanged if it has none.
 
         Args:
-            channel: Of the message.
+            channel: Channel of the message.
             payload: The serialized message.
-            wall_of: The time of this machine, nanoseconds, at which the recording's time is
-                what it is given.
+            wall_of: Maps recording time to wall-clock time, both in nanoseconds.
 
         Raises:
-            ConversionError: It is not of the channel's type.
+            ConversionError: The message is not of the channel's type.
         """
         if id(channel) not in self._stamps:
             self._stamps[id(channel)] = (channel, HeaderStamps(channel))
@@ -176,7 +177,7 @@ class Restamper:
         try:
             return memoryview(stamps.moved(payload, wall_of))
         except ValueError as error:
-            problem = f"the stamp of a message cannot be changed: {error}"
+            problem = f"cannot replace the stamp of a message: {error}"
             raise ConversionError(channel.topic, problem) from None
 
 
@@ -188,13 +189,13 @@ _SWITCH_S = 0.001
 
 
 class ReadAhead(Generic[T]):
-    """An iterator whose items are made by a thread of its own, a bounded amount ahead.
+    """An iterator whose items are produced by a thread of its own, a bounded amount ahead.
 
     Args:
-        items: What makes them; used by the thread alone.
-        room: For items that wait; one always may.
-        size_of: The room that an item takes.
-        on_ready: Called, by the thread, when an item can be had where there was none.
+        items: The source; used by the thread alone.
+        room: Total size of the items that may wait; at least one always may.
+        size_of: The size of an item.
+        on_ready: Called by the thread when an item becomes available after there was none.
     """
 
     def __init__(
@@ -218,7 +219,7 @@ class ReadAhead(Generic[T]):
         self._thread.start()
 
     def __len__(self) -> int:
-        """Items that wait."""
+        """Number of items waiting."""
         return len(self._waiting)
 
     def __iter__(self) -> Iterator[T]:
@@ -231,10 +232,10 @@ class ReadAhead(Generic[T]):
             return self._take()
 
     def head(self) -> T | None:
-        """The next item, which stays; None while it is not made yet.
+        """The next item, without taking it; None while it is not ready.
 
         Raises:
-            StopIteration: There are no more.
+            StopIteration: There are no more items.
             BaseException: What the source raised.
         """
         with self._changed:
@@ -263,12 +264,12 @@ class ReadAhead(Generic[T]):
             self._error = error
         finally:
             close = getattr(self._items, "close", None)
-            if close is not None:  # a generator has files open
+            if close is not None:  # a generator may have open files
                 close()
             with self._changed:
                 self._is_done = True
                 self._changed.notify_all()
-            self._tell()
+            self._notify()
 
     def _put(self, item: T) -> bool:
         with self._changed:
@@ -282,28 +283,28 @@ class ReadAhead(Generic[T]):
             self._waiting.append(item)
             self._changed.notify_all()
         if is_first:
-            self._tell()
+            self._notify()
         return True
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         if self._on_ready is not None:
             self._on_ready()
 
     def stop(self) -> None:
-        """Tell the thread to end after the item that it makes."""
+        """Tell the thread to end after the current item."""
         with self._changed:
             self._is_closed = True
             self._waiting.clear()
             self._changed.notify_all()
 
     def join(self) -> None:
-        """Wait until the thread ended and what it read from is closed."""
+        """Wait until the thread has ended and closed its source."""
         self._thread.join()
 
 
 @contextmanager
 def quick_switches() -> Iterator[None]:
-    """Lets a thread that waits for the interpreter have it sooner than Python does by default."""
+    """Lets waiting threads have the interpreter sooner than Python does by default."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
     try:
@@ -316,13 +317,13 @@ def quick_switches() -> Iterator[None]:
 
 
 IsLate = Callable[[int], bool]
-"""Asked with the log time of a frame before it is made; if it is late, it is left out."""
+"""Called with the log time of a frame before it is decoded; a late frame is dropped."""
 
 _MERGED_AHEAD = 64 << 20
-"""Bytes, all topics together, that wait to be published; more frames wait where they are made."""
+"""Bytes of all topics waiting to be published; decoded frames wait in queues of their own, too."""
 
 _LEAST_SIZE = 64 << 10
-"""What a message counts at least: a thousand small ones wait, as with `ros2 bag play`."""
+"""Minimum size counted for a message: a thousand small ones wait, as with `ros2 bag play`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,8 +331,8 @@ class Due:
     """A message to be published.
 
     Attributes:
-        time_ns: When, in the recording's time.
-        channel: The channel to publish it on; one of `Timeline.channels`.
+        time_ns: When, in recording time.
+        channel: The channel to publish it on, one of `Timeline.channels`.
         payload: The serialized message.
         is_frame: Whether it is an image.
     """
@@ -343,26 +344,26 @@ class Due:
 
 
 class Timeline:
-    """What is played, merged by log time.
+    """The messages to play, merged by log time.
 
     Args:
-        datasets: Opened; not closed here.
-        world: What the messages have to be in: ``ros1``, ``ros2``; None for as recorded.
-        wanted: Which topics.
-        names: What they are called.
-        kind: What images are given as: one of `republish.KINDS`; None for as recorded.
-        reduction: How much smaller or fewer images are given.
-        jpeg_quality: Of JPEG files that are made, 1 to 100.
-        read_ahead: Frames of each stream that are made ahead.
+        datasets: Open datasets; not closed here.
+        world: Convert messages to this: ``ros1`` or ``ros2``; None: as recorded.
+        wanted: The topics to play.
+        names: The names to publish them under.
+        kind: Convert images to this, one of `republish.KINDS`; None: as recorded.
+        reduction: Smaller or fewer images.
+        jpeg_quality: Quality of JPEG images that are encoded, 1 to 100.
+        read_ahead: Frames of each stream to decode ahead.
 
     Attributes:
-        channels: All that is published.
+        channels: All channels that are published.
         start_ns: Log time of the first message, nanoseconds.
         end_ns: Log time of the last message, nanoseconds.
 
     Raises:
-        OptionError: Nothing is to be played.
-        ConversionError: A topic cannot be published there; names it.
+        OptionError: There is nothing to play.
+        ConversionError: A topic cannot be published; names it.
     """
 
     def __init__(
@@ -389,13 +390,13 @@ class Timeline:
         self.channels = [channel for part in self._parts for channel in part.published]
         spans = [part.span for part in self._parts if part.span]
         if not spans:
-            raise OptionError("there is no message to be played.")
+            raise OptionError("There is no message to play.")
         self.start_ns = min(first for first, _ in spans)
         self.end_ns = max(last for _, last in spans)
 
     @property
     def as_recorded(self) -> dict[str, dict[str, int]]:
-        """Camera topics of which messages stay as recorded where another form was asked for."""
+        """Images that could not be converted as requested: topic -> reason -> number."""
         return {
             topic: dict(reasons)
             for part in self._parts
@@ -405,7 +406,7 @@ class Timeline:
 
     @property
     def thinned(self) -> dict[str, int]:
-        """Frames left out on request so far, by topic."""
+        """Number of frames left out as requested so far, by topic."""
         return {
             topic: count
             for part in self._parts
@@ -420,37 +421,37 @@ class Timeline:
         is_late: IsLate,
         on_ready: Callable[[], None],
     ) -> Playback:
-        """Begin to read, by threads, from a time on.
+        """Start reading from a time on, in threads.
 
         Args:
-            start_ns: Log time of the first message that may come.
-            is_late: Asked before a frame is made.
-            on_ready: Called, from another thread, when a message can be had.
+            start_ns: The earliest log time to read.
+            is_late: Called before a frame is decoded.
+            on_ready: Called, from another thread, when a message becomes available.
         """
         return Playback(self._parts, start_ns, self._read_ahead, is_late, on_ready)
 
     def named(self, option: str, topics: Sequence[str]) -> frozenset[str]:
-        """What topics are called where they are published.
+        """The names that topics are published under.
 
         Args:
-            option: That names them, for errors.
+            option: The option that names the topics, for errors.
             topics: Their recorded names.
 
         Raises:
-            OptionError: There is no such topic to be played.
+            OptionError: No such topic is played.
         """
         for topic in topics:
             if _rooted(topic) not in self._names:
-                raise OptionError(f"`{option}` {topic!r}: there is no such topic to be played.")
+                raise OptionError(f"`{option}` {topic!r}: there is no such topic to play.")
         return frozenset(self._names[_rooted(topic)] for topic in topics)
 
     def latched(self, time_ns: int) -> list[Due]:
-        """What late subscribers get, by a time, of the latched channels."""
+        """The latched messages that a late subscriber would have got by a time."""
         return [due for part in self._parts for due in part.latched(time_ns)]
 
 
 class Playback:
-    """Messages from a time on, read ahead by threads. See `Timeline.play`."""
+    """Messages from a time on, read ahead by threads."""
 
     def __init__(
         self,
@@ -477,16 +478,16 @@ class Playback:
         self._merged = ReadAhead(merged, _MERGED_AHEAD, size_of=_size_of, on_ready=on_ready)
 
     def head(self) -> Due | None:
-        """The next message, which stays; None while it is not made yet.
+        """The next message, without taking it; None while it is not ready.
 
         Raises:
-            StopIteration: There are no more.
+            StopIteration: There are no more messages.
             Mp4dsError: A dataset is damaged.
         """
         return self._merged.head()
 
     def take(self) -> None:
-        """Go on to the message after the `head`."""
+        """Take the next message."""
         next(self._merged)
 
     def close(self) -> None:
@@ -505,7 +506,7 @@ def _size_of(due: Due) -> int:
 
 
 class _Part:
-    """One dataset, and what its channels are where they are published."""
+    """A dataset, and its channels as they are published."""
 
     def __init__(
         self,
@@ -545,7 +546,7 @@ class _Part:
             self._add(channel, channel)
 
     def _span(self) -> tuple[int, int] | None:
-        """Log times of the first and the last message of the topics that are wanted."""
+        """Log times of the first and the last message of the topics played."""
         ids = {item.id for item in self._dataset.channels if item.topic in self._topics}
         times = [times for key, times in self._dataset.times().items() if key in ids and len(times)]
         if not times:
@@ -554,7 +555,7 @@ class _Part:
 
     @property
     def published(self) -> list[Channel]:
-        """All that is published."""
+        """The channels that are published."""
         return list(self._channels.values())
 
     def _add(self, source: Channel, channel: Channel) -> Channel:
@@ -562,7 +563,7 @@ class _Part:
         return self._channels[source.id]
 
     def messages(self, start_ns: int, is_late: IsLate, ahead: Ahead) -> Iterator[Due]:
-        """Messages from a time on; see `Timeline.play`."""
+        """Messages from a time on."""
         frames = [stream.columns for stream in self._dataset.streams]
 
         def in_time(columns: DecodedColumns) -> Iterator[int]:
@@ -596,7 +597,7 @@ class _Part:
         return Due(message.log_time, channel, payload, source.id in self._frames)
 
     def latched(self, time_ns: int) -> Iterator[Due]:
-        """What is kept, by a time, of each latched channel."""
+        """The latched messages of each channel at a time."""
         channels = [item for item in self._dataset.channels if item.topic in self._topics]
         kept = {item.id: Kept[Message](item) for item in filter(is_latched, channels)}
         topics = {item.topic for item in channels if item.id in kept}

@@ -1,1 +1,1 @@
-"""Where messages are published. The only package that imports ROS and Foxglove."""
+"""Publishers for ROS 1, ROS 2 and Foxglove. Only this package and `recording` import them."""

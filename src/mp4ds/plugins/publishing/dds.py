@@ -1,4 +1,4 @@
-"""Publishes in ROS 2 without an installed ROS: over DDS, with Eclipse Cyclone DDS."""
+"""The ROS 2 publisher that needs no ROS: over DDS, with Eclipse Cyclone DDS."""
 
 from __future__ import annotations
 
@@ -35,24 +35,24 @@ from mp4ds.plugins.publishing.ros2_writers import (
 from mp4ds.records import Channel, Schema
 
 _SECOND = 10**9
-_PATIENCE = 15.0  # seconds; a subscriber that is silent for 10 s is taken for gone
-_UNDER_WAY = 2**18  # bytes that may wait where all are kept; the library allows twice as many
+_PATIENCE = 15.0  # seconds; DDS considers a subscriber that is silent for 10 s gone
+_UNDER_WAY = 2**18  # unacknowledged bytes with keep_all; the library allows twice as many
 _HANDSHAKE = 0.2  # seconds
-_YEAR = 366 * 86400.0  # seconds, of which more cannot be told
+_YEAR = 366 * 86400.0  # seconds, the longest wait that the library accepts
 _FOREVER = 2**63 - 1
 
 
 class DdsWriter:
-    """A writer of ready messages.
+    """A writer of serialized messages.
 
     Args:
-        participant: Whose writer it is.
-        topic: The topic, as ROS spells it.
-        kind: The type of its messages.
-        qos: What it offers.
+        participant: The DDS participant.
+        topic: The ROS name of the topic.
+        kind: The message type.
+        qos: The QoS profile to offer.
 
     Raises:
-        ConversionError: DDS cannot have the topic.
+        ConversionError: DDS refuses the topic.
     """
 
     def __init__(self, participant: Any, topic: str, kind: DdsType, qos: Qos) -> None:
@@ -73,15 +73,14 @@ class DdsWriter:
                 participant, dds, qos=dds_qos(qos, user_data=_user_data(kind))
             )
         except DDSException as error:
-            problem = f"DDS refuses it or its quality of service: {error.msg}"
+            problem = f"DDS refuses it or its QoS: {error.msg}"
             raise ConversionError(topic, problem, "Leave it out, or override its QoS.") from None
 
     def write(self, payload: bytes | memoryview) -> None:
         """Write a message.
 
-        Where only the last few are kept, as players do, it waits for nobody. Where all are kept,
-        it waits until subscribers have most of them; the library would do that with Python's
-        lock held.
+        With keep_last, as players use it, it waits for nobody. With keep_all, it waits until
+        subscribers have most of the messages; the library would do that while holding the GIL.
         """
         from cyclonedds.core import DDSException
 
@@ -91,7 +90,9 @@ class DdsWriter:
             message += b"\0"
         is_much = self._keeps_all and self._under_way + len(message) > _UNDER_WAY
         if is_much and not self.wait(_PATIENCE):
-            problem = "a subscriber has taken nothing for 15 s: stop it, or play best effort"
+            problem = (
+                "a subscriber has received nothing for 15 s: stop it, or offer best_effort QoS"
+            )
             raise PublishError(self._name, problem)
         self._under_way += len(message)
         try:
@@ -99,13 +100,13 @@ class DdsWriter:
         except DDSException as error:
             if error.code == DDSException.DDS_RETCODE_BAD_PARAMETER:
                 raise ConversionError(self._name, "a message is not of its type") from None
-            raise PublishError(self._name, f"DDS does not take a message: {error.msg}") from None
+            raise PublishError(self._name, f"DDS refuses a message: {error.msg}") from None
 
     def _check(self, message: bytes) -> None:
         if len(message) < 4:
-            raise ConversionError(self._name, "a message lacks the header of CDR")
+            raise ConversionError(self._name, "a message has no CDR header")
         if not message[1] & 1 and not self._kind.is_real:
-            problem = "a message is big-endian, and its definition, by which to turn it, is missing"
+            problem = "a message is big-endian, and cannot be converted without its definition"
             raise ConversionError(self._name, problem)
 
     def wait(self, seconds: float) -> bool:
@@ -115,16 +116,15 @@ class DdsWriter:
         try:
             done = bool(self._writer.wait_for_acks(int(min(seconds, _YEAR) * _SECOND)))
         except AttributeError:
-            done = False  # how version 11 of the library tells that time is up
+            done = False  # how version 11 of the library reports a timeout
         if done:
             self._under_way = 0
         return done
 
     def subscribers(self) -> int:
-        """How many subscribers there are that will get the next message.
+        """How many subscribers will get the next message.
 
-        A new one counts when it has been seen for a moment: DDS shakes hands first, and what is
-        sent meanwhile it does not get.
+        A new one counts after a moment, as it does not get what is sent during the DDS handshake.
         """
         now = time.monotonic()
         connected = self._writer.get_matched_subscriptions()
@@ -133,12 +133,12 @@ class DdsWriter:
 
 
 def dds_qos(qos: Qos, *, user_data: str = "", ignore_own: bool = False) -> Any:
-    """A quality of service as Cyclone DDS has it, chosen as rmw_cyclonedds does.
+    """A QoS profile for Cyclone DDS, mapped as by rmw_cyclonedds.
 
     Args:
-        qos: That of ROS.
-        user_data: What to tell others, such as the type hash.
-        ignore_own: For a reader: whether to overlook what this participant writes.
+        qos: The ROS profile.
+        user_data: User data to announce, such as the type hash.
+        ignore_own: For a reader: whether to ignore what this participant writes.
     """
     from cyclonedds.core import Policy
     from cyclonedds.core import Qos as DdsQos
@@ -185,14 +185,14 @@ def _user_data(kind: DdsType) -> str:
 def _topic_name(topic: str, qos: Qos) -> str:
     name = dds_topic(topic, bare=qos.avoid_ros_namespace_conventions)
     if name is None:
-        remedy = "Play it under another name."
-        raise ConversionError(topic, "ROS 2 has no topics of such names", remedy)
+        remedy = "Rename it with `remap`."
+        raise ConversionError(topic, "its name is not valid in ROS 2", remedy)
     return name
 
 
 # ---------------------------------------------------------------- services
 
-_READER_PATIENCE = 0.1  # seconds until the reader of who asks has to be known, as in ROS
+_READER_PATIENCE = 0.1  # seconds to wait for the client's reader to connect, as in ROS
 _HEADER = "uint64 client_guid\nint64 sequence_number\n"
 _FILLER = "structure_needs_at_least_one_member"
 _CLIENT = re.compile(rb"(?:^|;)clientid=([^;]*);")
@@ -200,7 +200,7 @@ _CLIENT = re.compile(rb"(?:^|;)clientid=([^;]*);")
 
 def serve(
     participant: Any,
-    ears: DdsListener,
+    listener: DdsListener,
     node: str,
     services: Sequence[Service],
     controls: Any,
@@ -209,18 +209,18 @@ def serve(
     """Offer services.
 
     Args:
-        participant: Who offers them.
-        ears: Hears the requests; they are answered on its thread.
+        participant: The DDS participant.
+        listener: Receives the requests; they are answered on its thread.
         node: Name of the node that they belong to.
-        services: What they do.
-        controls: What they do it with.
+        services: The services.
+        controls: The player or recorder that they control.
         world: The types of ROS 2.
 
     Returns:
-        What has to be kept while they are offered.
+        Objects to keep while the services are offered.
     """
     return [
-        _Server(participant, ears, f"/{node}/{service.name}", service, controls, number, world)
+        _Server(participant, listener, f"/{node}/{service.name}", service, controls, number, world)
         for number, service in enumerate(services, 1)
     ]
 
@@ -229,7 +229,7 @@ class _Server:
     def __init__(
         self,
         participant: Any,
-        ears: DdsListener,
+        listener: DdsListener,
         name: str,
         service: Service,
         controls: Any,
@@ -244,7 +244,7 @@ class _Server:
         self._controls = controls
         request, request_hash = message_class(f"{service.kind}_Request", service.request, world)
         self._reply, reply_hash = message_class(f"{service.kind}_Response", service.response, world)
-        # tells clients which reader and which writer are one service
+        # lets clients match the reader and the writer of a service
         own = f"serviceid={_identity(participant, number)};"
         self._reader = DataReader(
             participant,
@@ -256,7 +256,7 @@ class _Server:
             Topic(participant, f"rr{name}Reply", self._reply),
             qos=dds_qos(Qos(), user_data=f"{own}typehash={reply_hash};"),
         )
-        ears.hear(self._reader, self._on_request)
+        listener.hear(self._reader, self._on_request)
 
     def _on_request(self, request: Any) -> None:
         fields = dict(self._service.answer(self._controls, request))
@@ -268,9 +268,9 @@ class _Server:
         self._wait_for_reader(request.sample_info.publication_handle)
         self._writer.write(reply)
 
-    def _wait_for_reader(self, asking: int) -> None:
-        """Wait until the reader of who asked is connected, so that it gets the reply."""
-        endpoint = self._reader.get_matched_publication_data(asking)
+    def _wait_for_reader(self, writer: int) -> None:
+        """Wait until the client's reader is connected, so that it gets the reply."""
+        endpoint = self._reader.get_matched_publication_data(writer)
         client = _client_of(endpoint)
         end = time.monotonic() + _READER_PATIENCE
         while client and client not in self._connected() and time.monotonic() < end:
@@ -283,11 +283,11 @@ class _Server:
 
 
 def message_class(kind: str, definition: str, world: World) -> tuple[Any, str]:
-    """The class of a request or response with what goes before it, and its type hash.
+    """The class of a request or response with the service header, and its type hash.
 
     Args:
         kind: Its type, such as ``Seek_Request``.
-        definition: Its fields, as of a message.
+        definition: Its fields, as in a message definition.
         world: The types of ROS 2.
     """
     short, name = f"rosbag2_interfaces/msg/{kind}", f"rosbag2_interfaces/srv/{kind}"
@@ -300,7 +300,7 @@ def message_class(kind: str, definition: str, world: World) -> tuple[Any, str]:
 
 
 def _identity(participant: Any, number: int) -> str:
-    """Tells services apart: the participant, and a number within it."""
+    """A unique id of a service: the participant, and a number within it."""
     return ".".join(f"{byte:x}" for byte in participant.guid.bytes[:12] + number.to_bytes(4, "big"))
 
 
@@ -315,26 +315,25 @@ def _client_of(endpoint: Any) -> bytes:
 
 # ---------------------------------------------------------------- publisher
 
-_DISTRIBUTION = "jazzy"  # its definitions stand in for those that a recording lacks
+_DISTRIBUTION = "jazzy"  # its definitions are used if a recording has none
 _TIME = struct.Struct("<iI")
 _CDR_HEADER = 4  # bytes
 
 
 class DdsPublisher:
-    """A publisher of ROS 2 topics (`Publisher`) that is a participant of DDS by itself.
+    """Publishes to ROS 2, as a DDS participant.
 
-    ROS 2 of any middleware can subscribe. Messages go out as they are, but that DDS fills up
-    their end to a multiple of 4 bytes, and that messages of the other byte order are turned
-    into this machine's.
+    ROS 2 nodes with any DDS middleware can subscribe. Messages are sent as recorded, except that
+    DDS pads them to a multiple of 4 bytes, and that the byte order becomes this machine's.
 
     Channels share writers (`Writers`).
 
     Args:
         domain: The DDS domain, 0 to 232; None for that of ROS_DOMAIN_ID, else 0.
-        overrides: Topic -> quality of service to offer instead of the recorded one.
-        node: Name of the node that the services belong to, where `names` has none.
-        names: What the node and /clock are called.
-        parting_s: How long subscribers have to acknowledge at the end; may be infinite.
+        overrides: Topic -> QoS profile to offer instead of the recorded one.
+        node: Name of the node that the services belong to, if `names` has none.
+        names: Name, namespace and remappings of the node.
+        parting_s: How long to wait at the end for acknowledgements; may be infinite.
 
     Raises:
         OptionError: There is no such domain.
@@ -358,7 +357,7 @@ class DdsPublisher:
         self._parting_s = parting_s
         self._types: World = ros2_world(_DISTRIBUTION)
         self._participant = open_participant(self._domain)
-        self._ears = DdsListener(self._participant)
+        self._listener = DdsListener(self._participant)
         self._writers: Writers[DdsWriter] = Writers(overrides)
         self._services: list[Any] = []
         self._clock: DdsWriter | None = None
@@ -366,11 +365,11 @@ class DdsPublisher:
 
     @property
     def address(self) -> str:
-        """Its domain, to be shown."""
-        return f"ROS 2, domain {self._domain}, by Cyclone DDS"
+        """Its domain, for display."""
+        return f"ROS 2, domain {self._domain} (Cyclone DDS)"
 
     def advertise(self, channel: Channel) -> None:
-        """Announce a channel before its first message; see `Publisher`."""
+        """Announce a channel before its first message."""
 
         def make(qos: Qos) -> DdsWriter:
             kind = message_type(channel, self._types)
@@ -379,16 +378,16 @@ class DdsPublisher:
         self._writers.add(channel, channel.schema, make)
 
     def publish(self, channel: Channel, payload: bytes | memoryview, time_ns: int) -> None:
-        """Publish one message of a channel that was advertised; see `Publisher`.
+        """Publish a message of an advertised channel.
 
         Raises:
             ConversionError: The message is not of its type.
-            PublishError: A subscriber takes nothing for 15 s, where all are kept.
+            PublishError: With keep_all, a subscriber has received nothing for 15 s.
         """
         self._writers[channel].write(payload)
 
     def clock(self, time_ns: int) -> None:
-        """Publish the time of the recording as /clock."""
+        """Publish a recording time as /clock."""
         if self._clock is None:
             kind = message_type(_clock_channel(), self._types)
             self._clock = DdsWriter(self._participant, self._clock_topic, kind, CLOCK_QOS)
@@ -399,7 +398,7 @@ class DdsPublisher:
         return self._writers[channel].subscribers()
 
     def follow_clock(self, on_time: Callable[[int], None]) -> None:
-        """Call with each time, nanoseconds, that others publish as /clock."""
+        """Call back with each time, in nanoseconds, that another node publishes as /clock."""
         from cyclonedds.sub import DataReader
         from cyclonedds.topic import Topic
 
@@ -407,29 +406,29 @@ class DdsPublisher:
         topic = Topic(self._participant, dds_topic(self._clock_topic), kind.writes)
         qos = dds_qos(CLOCK_QOS, user_data=_user_data(kind), ignore_own=True)
         reader = DataReader(self._participant, topic, qos=qos)
-        self._ears.hear(reader, lambda sample: on_time(_time_of(sample.payload)))
+        self._listener.hear(reader, lambda sample: on_time(_time_of(sample.payload)))
 
     def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
-        """Call for each message of others on a topic, from when somebody publishes it."""
+        """Call back for each message of others on a topic, as soon as it has a publisher."""
         name = dds_topic(topic)
         if name is None:
-            raise OptionError(f"{topic!r} is no topic name of ROS 2.")
-        self._ears.seek(name, lambda: on_message(None))
+            raise OptionError(f"{topic!r} is not a valid ROS 2 topic name.")
+        self._listener.seek(name, lambda: on_message(None))
 
     def serve(self, controls: Controls) -> None:
-        """Offer the services of `ros2 bag play`, for clients that use rmw_cyclonedds."""
+        """Offer the services of `ros2 bag play` to clients that use rmw_cyclonedds."""
         self._services += serve(
-            self._participant, self._ears, self._node, PLAYER_SERVICES, controls, self._types
+            self._participant, self._listener, self._node, PLAYER_SERVICES, controls, self._types
         )
 
     @property
     def wants_clock(self) -> bool:
-        """False: in ROS 2 each node is told by itself to use a simulated time."""
+        """False: in ROS 2, simulated time is configured for each node."""
         return False
 
     @property
     def is_alive(self) -> bool:
-        """Whether it was not closed: nobody else can."""
+        """Whether it is open: it cannot be shut down from outside."""
         return self._is_open
 
     def close(self) -> None:
@@ -440,7 +439,7 @@ class DdsPublisher:
         end = time.monotonic() + self._parting_s
         for writer in self._writers:
             writer.wait(max(0.0, end - time.monotonic()))
-        self._ears.close()
+        self._listener.close()
         self._services.clear()
         self._writers.clear()
         self._clock = None
@@ -458,6 +457,6 @@ def _clock_channel() -> Channel:
 
 
 def _time_of(payload: bytes) -> int:
-    """Nanoseconds of a Clock message, which the library has turned into this machine's order."""
+    """Nanoseconds of a Clock message, which the library has converted to our byte order."""
     sec, nanosec = _TIME.unpack_from(payload, _CDR_HEADER)
     return int(sec) * _SECOND + int(nanosec)

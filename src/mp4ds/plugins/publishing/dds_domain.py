@@ -1,4 +1,4 @@
-"""A DDS domain as ROS 2 uses it: its types, and what others publish there."""
+"""A DDS domain as ROS 2 uses it: types, and messages of other participants."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ _LOCAL = (
 
 
 def domain_id(asked: int | None) -> int:
-    """The domain that was asked for, else that of ROS_DOMAIN_ID, else 0.
+    """The requested domain, else that of ROS_DOMAIN_ID, else 0.
 
     Raises:
         OptionError: There is no such domain.
     """
-    told = os.environ.get("ROS_DOMAIN_ID", "").strip()
-    if asked is None and not told:
+    variable = os.environ.get("ROS_DOMAIN_ID", "").strip()
+    if asked is None and not variable:
         return 0
-    text = told if asked is None else str(asked)
+    text = variable if asked is None else str(asked)
     where = "ROS_DOMAIN_ID" if asked is None else "The domain"
     if not text.isascii() or not text.isdigit() or len(text) > 9 or int(text) > _LAST:
-        raise OptionError(f"{where} is {text!r}, and DDS has domains 0 to {_LAST}.")
+        raise OptionError(f"{where} is {text!r}; it has to be from 0 to {_LAST}.")
     return int(text)
 
 
 def open_participant(domain: int) -> Any:
     """A participant of a domain, configured by CYCLONEDDS_URI.
 
-    Discovery is kept to this machine where ROS_LOCALHOST_ONLY or ROS_AUTOMATIC_DISCOVERY_RANGE
-    say so, as ROS 2 does it.
+    Discovery is limited to this machine if ROS_LOCALHOST_ONLY or ROS_AUTOMATIC_DISCOVERY_RANGE say
+    so, as in ROS 2.
 
     Raises:
-        PublishError: Cyclone DDS is not installed, or refuses.
+        PublishError: Cyclone DDS is not installed, or cannot join the domain.
     """
     where = f"DDS domain {domain}"
     try:
@@ -62,7 +62,7 @@ def open_participant(domain: int) -> Any:
         from cyclonedds.domain import Domain, DomainParticipant
     except ImportError:
         problem = (
-            "Cyclone DDS is not installed, and no ROS 2 is sourced; source one, "
+            "Cyclone DDS is not installed, and no ROS 2 is sourced; source ROS 2, "
             "or run: pip install 'mp4ds[dds]'"
         )
         raise PublishError(where, problem) from None
@@ -75,13 +75,13 @@ def open_participant(domain: int) -> Any:
         participant.mp4ds_domain = opened  # lives as long
         return participant
     except DDSException as error:
-        problem = f"cannot be entered: {error.msg}; look at the network and at CYCLONEDDS_URI"
+        problem = f"cannot be joined: {error.msg}; check the network and CYCLONEDDS_URI"
         raise PublishError(where, problem) from None
 
 
 def _is_local() -> bool:
-    told = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").strip().upper()
-    return told == "LOCALHOST" or os.environ.get("ROS_LOCALHOST_ONLY", "").strip() == "1"
+    discovery = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").strip().upper()
+    return discovery == "LOCALHOST" or os.environ.get("ROS_LOCALHOST_ONLY", "").strip() == "1"
 
 
 # ---------------------------------------------------------------- types
@@ -95,7 +95,7 @@ _NAME = re.compile(r"[A-Za-z]\w*(?:/[A-Za-z]\w*)+", re.ASCII)
 _TOPIC = re.compile(r"/?[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*", re.ASCII)
 _HASH = re.compile(r"RIHS01_[0-9a-f]{64}")
 _MAX_NESTING = 50
-_MAX_SIZE = 2**28  # bytes of what has a fixed size: the library counts them in 32 bits
+_MAX_SIZE = 2**28  # bytes of fixed-size parts: the library counts them in 32 bits
 _BASES = {
     "bool": "bool",
     "octet": "byte",
@@ -109,9 +109,9 @@ _BASES = {
 
 
 def as_is(kind: Any) -> Any:
-    """Let messages of a class be made of, and become, ready CDR with its header of 4 bytes.
+    """Make the messages of a class hold serialized CDR, including the header of 4 bytes.
 
-    Set from outside: the library takes a base class for one of IDL.
+    The class is patched, since the library takes a base class for an IDL type.
     """
 
     def make(self: Any, payload: bytes) -> None:
@@ -130,7 +130,7 @@ def as_is(kind: Any) -> Any:
     kind.__init__ = make
     kind.serialize = serialize
     kind.deserialize = classmethod(deserialize)
-    kind.deserialize_key = classmethod(deserialize)  # of what tells that a writer has left
+    kind.deserialize_key = classmethod(deserialize)  # called when a writer has left
     return kind
 
 
@@ -139,10 +139,10 @@ class DdsType:
     """How messages of a channel are written.
 
     Attributes:
-        writes: The class of messages: made of bytes.
-        type_hash: ``RIHS01_...``; empty where the definition is not known.
+        writes: The class of the messages, which are created from bytes.
+        type_hash: ``RIHS01_...``; empty if the definition is unknown.
         is_real: Whether it announces the real type.
-        is_empty: Whether it has no field: messages have one byte, which some recordings lack.
+        is_empty: Whether it has no fields: messages have one byte, which some recordings lack.
     """
 
     writes: Any
@@ -152,10 +152,10 @@ class DdsType:
 
 
 def dds_topic(topic: str, *, bare: bool = False) -> str | None:
-    """The DDS name of a topic, such as ``rt/camera/image``; None where ROS 2 has no such topic.
+    """The DDS name of a topic, such as ``rt/camera/image``; None if it is not valid in ROS 2.
 
     Args:
-        topic: As ROS spells it.
+        topic: The ROS name.
         bare: Without the prefix of ROS.
     """
     if not _TOPIC.fullmatch(topic) or "__" in topic:
@@ -170,7 +170,7 @@ def dds_name(type_name: str) -> str:
 
 
 def opaque_type(name: str) -> Any:
-    """A class of messages of a type of which only the DDS name is known, with dots."""
+    """A class for messages of a type of which only the DDS name, with dots, is known."""
     from cyclonedds.idl import make_idl_struct
 
     short = name.rpartition(".")[2]
@@ -181,16 +181,16 @@ def message_type(channel: Channel, world: World) -> DdsType:
     """How messages of a channel are written.
 
     Raises:
-        ConversionError: The type has no name that ROS 2 could have.
+        ConversionError: The name of the type is not valid in ROS 2.
     """
     name = _full_name(channel.type_name)
     if not _NAME.fullmatch(name):
-        problem = f"{channel.type_name!r} is no message type of ROS 2"
+        problem = f"{channel.type_name!r} is not a ROS 2 message type"
         raise ConversionError(channel.topic, problem, "Leave the topic out.")
-    type_hash = _told_hash(channel)
+    type_hash = _metadata_hash(channel)
     try:
         types = _known_types(channel, world)
-        type_hash = type_hash or _made_hash(types, name, world)
+        type_hash = type_hash or _computed_hash(types, name, world)
         real = as_is(make_struct(types, name))
     except Refused:
         return DdsType(opaque_type(dds_name(name)), type_hash, False, False)
@@ -200,27 +200,27 @@ def message_type(channel: Channel, world: World) -> DdsType:
 
 def recorded_hash(channel: Channel) -> str:
     """The hash of a channel's type, RIHS01_...: as recorded, else of its definition; or empty."""
-    if told := _told_hash(channel):
-        return told
+    if recorded := _metadata_hash(channel):
+        return recorded
     try:
         world = ros2_world("jazzy")
-        return _made_hash(_known_types(channel, world), _full_name(channel.type_name), world)
+        return _computed_hash(_known_types(channel, world), _full_name(channel.type_name), world)
     except (Refused, KeyError):
         return ""
 
 
-def _told_hash(channel: Channel) -> str:
+def _metadata_hash(channel: Channel) -> str:
     recorded = channel.metadata.get(HASH_KEY, "")
     return recorded if _HASH.fullmatch(recorded) else ""
 
 
-def _made_hash(types: Types, name: str, world: World) -> str:
+def _computed_hash(types: Types, name: str, world: World) -> str:
     hashed = make_store(types, world).hash_rihs01
     return by_library(incomprehensible(name), hashed, name)
 
 
 def _full_name(name: str) -> str:
-    """A name as ROS 2 has it: ``std_msgs/String`` is short for ``std_msgs/msg/String``."""
+    """The full name: ``std_msgs/String`` is short for ``std_msgs/msg/String``."""
     rooms = name.split("/")
     return f"{rooms[0]}/msg/{rooms[1]}" if len(rooms) == 2 else name
 
@@ -239,15 +239,15 @@ def _filler(world: World) -> Any:
 
 
 def make_struct(types: Types, name: str, *, has_fields: bool = False) -> Any:
-    """The class of a type, made after those of its parts.
+    """Create the class of a type, after those of the types it refers to.
 
     Args:
-        types: The definitions, complete.
+        types: All definitions.
         name: Which one.
-        has_fields: Whether messages are made of and taken apart into fields.
+        has_fields: Whether messages have fields; otherwise, only their bytes.
 
     Raises:
-        Refused: There is no such type in DDS.
+        Refused: DDS cannot have this type.
     """
     return _StructMaker(types, has_fields).struct(name)[0]
 
@@ -260,7 +260,7 @@ class _StructMaker:
         self._open: list[str] = []
 
     def struct(self, name: str) -> tuple[Any, int]:
-        """The class of a type, and bytes of what has a fixed size."""
+        """The class of a type, and the size of its fixed-size parts in bytes."""
         from cyclonedds.idl import make_idl_struct
 
         if name in self._made:
@@ -313,20 +313,20 @@ def _base(name: str, bound: int) -> Any:
 
 # ---------------------------------------------------------------- listening
 
-_PATIENCE = 50_000_000  # ns that the thread sleeps at most: then it looks for new publishers
+_PATIENCE = 50_000_000  # ns between checks for new publishers
 _BATCH = 100
-_KEPT = 1000  # messages that may wait to be taken
-_TYPE_PATIENCE = 2_000_000_000  # ns to wait for another participant to tell of a type
+_KEPT = 1000  # history depth of readers
+_TYPE_PATIENCE = 2_000_000_000  # ns to wait for another participant to describe a type
 
 
 class DdsListener:
-    """Calls back for each message of others; a thread that runs until `close`.
+    """Calls back for each message of others, from a thread that runs until `close`.
 
-    Only this thread calls back. Listeners of the library are not used: they would wait for
-    Python's lock while it is held by a write that waits for the very thread they run on.
+    The library's own listeners are not used: they would wait for the GIL while it is held by a
+    write that waits for the very thread they run on.
 
     Args:
-        participant: The participant of which the readers are.
+        participant: The participant that the readers belong to.
     """
 
     def __init__(self, participant: Any) -> None:
@@ -338,13 +338,13 @@ class DdsListener:
         self._thread: threading.Thread | None = None
 
     def hear(self, reader: Any, on_sample: Callable[[Any], None]) -> None:
-        """Call with each valid sample that a reader gets."""
+        """Call back with each valid sample that a reader receives."""
         with self._lock:
             self._readers.append((reader, on_sample))
         self._start()
 
     def seek(self, topic: str, on_message: Callable[[], None]) -> None:
-        """Call for each message of a topic, whatever its type, from when it has a publisher.
+        """Call back for each message of any type on a topic, as soon as it has a publisher.
 
         Args:
             topic: Its DDS name.
@@ -355,7 +355,7 @@ class DdsListener:
         self._start()
 
     def close(self) -> None:
-        """End the thread, and let go of the readers and of the participant."""
+        """End the thread, and release the readers and the participant."""
         self._ended.set()
         if self._thread and self._thread is not threading.current_thread():
             self._thread.join()
@@ -401,7 +401,7 @@ def _has_data(reader: Any) -> Any:
 
 
 class _Sought:
-    """A topic whose type will be known when somebody publishes it."""
+    """A topic whose type is unknown until it has a publisher."""
 
     def __init__(self, participant: Any, topic: str, on_message: Callable[[], None]) -> None:
         from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
@@ -413,11 +413,11 @@ class _Sought:
         self._publications = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
 
     def on_sample(self, _: Any) -> None:
-        """A message came."""
+        """A message was received."""
         self._on_message()
 
     def found(self) -> list[Any]:
-        """Readers of the types of publishers that have appeared since the last call."""
+        """Readers for the publishers discovered since the last call, one per type."""
         readers = []
         own = self._participant.guid
         for endpoint in self._publications.take(_BATCH):
@@ -438,7 +438,7 @@ class _Sought:
             Policy.Reliability.BestEffort if best_effort else Policy.Reliability.Reliable(0),
             Policy.History.KeepLast(_KEPT),
             Policy.IgnoreLocal.Participant,
-            # nodes look for it, and complain where there is none
+            # nodes look for the hash, and warn if it is missing
             *([Policy.Userdata(hashed[0])] if hashed else []),
         )
         try:
@@ -447,15 +447,15 @@ class _Sought:
             )
             return [DataReader(self._participant, topic, qos=qos)]
         except DDSException:
-            return []  # a second type of the topic: a participant knows one
+            return []  # another type of this topic: a participant can have only one
 
 
 def publisher_type(participant: Any, endpoint: Any) -> Any:
-    """The class of a publisher's messages: where it tells its own type, readers have to have it.
+    """The class of a publisher's messages. If it announces its type, readers need the same.
 
     Args:
-        participant: Who asks.
-        endpoint: The publisher, as discovery tells of it.
+        participant: Our participant.
+        endpoint: The publisher, as discovered.
     """
     from cyclonedds.core import DDSException
     from cyclonedds.dynamic import get_types_for_typeid
@@ -464,7 +464,7 @@ def publisher_type(participant: Any, endpoint: Any) -> Any:
         try:
             return as_is(get_types_for_typeid(participant, endpoint.type_id, _TYPE_PATIENCE)[0])
         except DDSException:
-            pass  # ROS goes by the name alone
+            pass  # the name is all that ROS compares
     return opaque_type(endpoint.type_name.replace("::", "."))
 
 
@@ -472,7 +472,7 @@ _TYPE_HASH = re.compile(rb"typehash=RIHS\d\d_[0-9a-f]+;")
 
 
 def _user_data(qos: Any) -> bytes:
-    """What a participant tells of a reader or writer."""
+    """The user data of a reader or writer."""
     from cyclonedds.core import Policy
 
     return bytes(qos[Policy.Userdata].data) if Policy.Userdata in qos else b""

@@ -1,7 +1,7 @@
-"""Messages to Foxglove and its kin, as they are recorded, over a WebSocket server.
+"""The publisher for Foxglove and compatible clients, which is a WebSocket server.
 
-Clients are shown the very messages of the recording, with their log times; whatever the
-serialization. Where they can control a player, they play, pause, seek and set the rate.
+Clients get the recorded messages unchanged, in any serialization, with their log times. They can
+play, pause, seek and set the rate of a player that allows it.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def is_welcome(origin: str | None, allowed: Sequence[str]) -> bool:
     """Whether a client may connect.
 
     Args:
-        origin: The header ``Origin`` of its request: browsers always send it.
-        allowed: Origins of web sites that may, besides those of this machine.
+        origin: The ``Origin`` header of its request, which browsers always send.
+        allowed: Origins of web sites that may, besides local ones.
     """
     if origin is None or origin in allowed:
         return True
@@ -54,23 +54,23 @@ def is_welcome(origin: str | None, allowed: Sequence[str]) -> bool:
         return False
     if parts.scheme in ("http", "https"):
         return host in _LOOPBACK_NAMES
-    return bool(parts.scheme)  # of a program, such as file: ; that of a framed page is "null"
+    return bool(parts.scheme)  # a program's, such as file: ; that of a framed page is "null"
 
 
 class Gate:
-    """Passes on what welcome clients and the SDK's server say to each other.
+    """A proxy in front of the SDK's server, which only allowed clients get through.
 
-    What waits for a slow client is bounded: the server is not read while a client takes nothing.
+    Memory for a slow client is bounded: nothing is read from the server until the client receives.
 
     Args:
         host: Address of this machine to listen on.
         port: Port to listen on; 0 picks a free one.
-        origins: Origins of web sites that may connect, besides those of this machine.
+        origins: Origins of web sites that may connect, besides local ones.
 
     Attributes:
-        port: That it listens on.
-        certificate: For the server, PEM.
-        key: For the server, PEM.
+        port: The port that it listens on.
+        certificate: Certificate for the server, PEM.
+        key: Key for the server, PEM.
 
     Raises:
         OSError: It cannot listen there.
@@ -90,17 +90,17 @@ class Gate:
         self._thread: threading.Thread | None = None
 
     def open(self, server_port: int) -> None:
-        """Let clients in.
+        """Start accepting clients.
 
         Args:
-            server_port: Of the SDK's server, on the loopback.
+            server_port: Port of the SDK's server on the loopback interface.
         """
         self._server_port = server_port
         self._thread = threading.Thread(target=self._run, name="foxglove gate", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """End all connections; what a client has not taken 0.5 s later is dropped."""
+        """Close all connections, after 0.5 s at most for clients to receive the rest."""
         if self._thread is None:
             self._listener.close()
             self._loop.close()
@@ -136,11 +136,11 @@ class Gate:
             if not self._is_welcome(head):
                 writer.write(_REFUSED)
             else:
-                await self._pass_on(head, reader, writer)
+                await self._relay(head, reader, writer)
             writer.close()
             await writer.wait_closed()
         except (OSError, EOFError, asyncio.LimitOverrunError, asyncio.TimeoutError):
-            pass  # it went away, or is no client
+            pass  # it disconnected, or is not a client
         finally:
             writer.transport.abort()
 
@@ -151,7 +151,7 @@ class Gate:
             return False
         return all(is_welcome(origin, self._origins) for origin in origins)
 
-    async def _pass_on(
+    async def _relay(
         self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> None:
         from_server, to_server = await asyncio.open_connection(
@@ -187,14 +187,14 @@ def _listener(host: str, port: int) -> socket.socket:
 
 
 def _certificate() -> tuple[bytes, bytes]:
-    """A certificate that nobody trusts, and its key: both PEM."""
+    """A self-signed certificate, and its key, both PEM."""
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
 
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, _NAME)])
-    # for ever: it lives as long as this process, and clocks may be wrong
+    # valid forever: it is used by this process only, and clocks may be wrong
     begin, end = (datetime.datetime(year, 1, 1) for year in (2000, 2200))
     certificate = (
         x509.CertificateBuilder()
@@ -215,21 +215,21 @@ def _certificate() -> tuple[bytes, bytes]:
 # ---------------------------------------------------------------- time and state
 
 _TIME_S = 0.05
-"""Time is told no more often: clients that do not take it are disconnected by the SDK."""
+"""Minimum interval between times sent: the SDK disconnects clients that do not keep up."""
 
 _STATE_S = 1.0
-"""The player's state is told at least as often, for clients that came since."""
+"""Maximum interval between states sent, for clients that have connected since."""
 
 MAX_TIME = 2**64 - 1
-"""The last time, nanoseconds, that the protocol can hold."""
+"""The latest time of the protocol, nanoseconds."""
 
 
 class PlaybackReporter:
-    """Tells the time of the messages, or of a clock, and the state of a player.
+    """Sends clients the time, of the messages or of a clock, and the state of a player.
 
     Args:
         websocket: The SDK's module of this name.
-        can_control: Whether clients were told that they control a player.
+        can_control: Whether clients may control a player.
     """
 
     def __init__(self, websocket: Any, *, can_control: bool) -> None:
@@ -240,56 +240,56 @@ class PlaybackReporter:
         self._time: int | None = None
         self._published: int | None = None
         self._has_clock = False
-        self._told: int | None = None
-        self._told_at = 0.0
-        # what is told is the latest: an older time would be a jump to clients
-        self._telling = threading.Lock()
+        self._sent: int | None = None
+        self._sent_at = 0.0
+        # keeps times in order: an older one would be a jump to clients
+        self._sending = threading.Lock()
         self._is_closing = threading.Event()
-        self._thread = threading.Thread(target=self._keep_telling, name="foxglove", daemon=True)
+        self._thread = threading.Thread(target=self._keep_sending, name="foxglove", daemon=True)
 
     def start(self, server: Any) -> None:
-        """Begin to tell a server's clients."""
+        """Start sending to a server's clients."""
         self._server = server
         self._thread.start()
 
     def serve(self, controls: Controls) -> None:
-        """Tell of this player, and do with it what clients want."""
+        """Report the state of this player, and let clients control it."""
         self._controls = controls
 
     def close(self) -> None:
-        """Tell nothing any more."""
+        """Stop sending."""
         self._is_closing.set()
         self._thread.join()
 
     def reach(self, time_ns: int) -> None:
-        """Be at the time of a message that is about to be published, nanoseconds."""
+        """Advance to the time of a message that is about to be published, nanoseconds."""
         has_jumped = self._published is not None and time_ns < self._published
         self._published = self._time = time_ns
         if has_jumped:
-            self._tell_state(did_seek=True)
-        if not self._has_clock and time.monotonic() - self._told_at >= _TIME_S:
-            self._tell_time()
+            self._send_state(did_seek=True)
+        if not self._has_clock and time.monotonic() - self._sent_at >= _TIME_S:
+            self._send_time()
 
     def clock(self, time_ns: int) -> None:
-        """Tell a time; from the first call on, those of messages are not told."""
+        """Send a clock's time; from the first call on, times of messages are not sent."""
         self._has_clock = True
         self._time = min(max(0, time_ns), MAX_TIME)
-        self._tell_time()
+        self._send_time()
 
     def on_request(self, request: Any) -> Any:
-        """What a client wants of the player is done; returns the player's state.
+        """Carry out a client's request; returns the player's state, or None without a player.
 
-        From any thread. Where there is no player the answer is None.
+        Called from any thread.
         """
         controls = self._controls
         if controls is None:
             return None
         did_seek = request.seek_time is not None
         if did_seek:
-            # the answer tells of this jump
+            # the response reports this jump
             self._time, self._published = controls.seek(request.seek_time), None
         if request.playback_speed != _as_float32(controls.rate):
-            # it comes as a float32: 1.1 is not to become 1.10000002384
+            # it arrives as a float32: 1.1 must not become 1.10000002384
             controls.set_rate(round(request.playback_speed, 6))
         if request.playback_command == self._sdk.PlaybackCommand.Play:
             controls.resume()
@@ -307,33 +307,33 @@ class PlaybackReporter:
             request_id=None,
         )
 
-    def _tell_state(self, *, did_seek: bool = False) -> None:
+    def _send_state(self, *, did_seek: bool = False) -> None:
         if self._controls is None or not self._can_control or self._time is None:
             return
-        # asked for outside of the lock: the player may have one of its own
+        # read outside of the lock: the player has a lock of its own
         is_paused, rate = self._controls.is_paused, self._controls.rate
-        with self._telling:
+        with self._sending:
             self._server.broadcast_playback_state(self._state(is_paused, rate, did_seek))
 
-    def _tell_time(self) -> None:
-        with self._telling:
+    def _send_time(self) -> None:
+        with self._sending:
             if self._time is not None:
-                self._told, self._told_at = self._time, time.monotonic()
+                self._sent, self._sent_at = self._time, time.monotonic()
                 self._server.broadcast_time(self._time)
 
-    def _keep_telling(self) -> None:
-        """What else would not be told: changes by other controls, the time of the last message."""
-        told: tuple[bool, float] | None = None
-        told_at = 0.0
+    def _keep_sending(self) -> None:
+        """Send changes made by other controls, and the time of the last message."""
+        sent: tuple[bool, float] | None = None
+        sent_at = 0.0
         while not self._is_closing.wait(_TIME_S):
-            if not self._has_clock and self._time != self._told:
-                self._tell_time()
+            if not self._has_clock and self._time != self._sent:
+                self._send_time()
             if self._controls is None or self._time is None:
                 continue
             state = self._controls.is_paused, self._controls.rate
-            if state != told or time.monotonic() - told_at >= _STATE_S:
-                told, told_at = state, time.monotonic()
-                self._tell_state()
+            if state != sent or time.monotonic() - sent_at >= _STATE_S:
+                sent, sent_at = state, time.monotonic()
+                self._send_state()
 
 
 def _as_float32(value: float) -> float:
@@ -346,17 +346,17 @@ def _as_float32(value: float) -> float:
 # ---------------------------------------------------------------- publisher
 
 _BACKLOG = 128
-"""Messages that wait for a slow client."""
+"""Messages that may wait for a slow client."""
 
 _BATCH = 32
 _BATCH_S = 0.01
-"""Pause after so many announcements: the SDK drops clients that do not take them."""
+"""Pause after each batch of announcements: the SDK drops clients that do not keep up."""
 
 _LINGER_S = 0.5
-"""How long what was published last may take to be sent before the server closes."""
+"""Time for sending the last messages before the server closes."""
 
 _STOP_S = 2.0
-"""How long the server waits for clients that take nothing, to say goodbye."""
+"""How long the server may take to close connections with clients that receive nothing."""
 
 _BINARY_SCHEMAS = ("protobuf", "flatbuffer")
 
@@ -364,37 +364,35 @@ _BINARY_SCHEMAS = ("protobuf", "flatbuffer")
 class FoxglovePublisher:
     """Serves messages to Foxglove clients over a WebSocket.
 
-    A client that takes messages more slowly than they come neither stops the others nor the
-    publisher: `backlog` messages wait for it, then the oldest is dropped for each new one, for
-    this client alone. The SDK counts no drops, so neither does this. A client that does not
-    even take the time, for `backlog` / 20 s, is disconnected with a status message and may
-    connect again. Memory is bounded by `backlog` times the size of the messages, for each slow
-    client.
+    A slow client delays neither the others nor the publisher: `backlog` messages wait for it, then
+    the oldest is dropped for each new one, for this client alone. The SDK does not count drops, so
+    neither does this class. A client that does not even receive the time, for `backlog` / 20 s, is
+    disconnected with a status message and may connect again. Memory is bounded by `backlog` times
+    the size of the messages, for each slow client.
 
-    What the publishers of a latched channel kept (ROS 1 latching, ROS 2 transient_local) is sent
-    again when a client subscribes to it; other subscribers get it a second time, with the same
-    log times.
+    Messages of a latched channel (ROS 1 latching, ROS 2 transient_local) are sent again when a
+    client subscribes to it; other subscribers get them a second time, with the same log times.
 
-    Channels without a schema are announced with an empty one. Bytes of a definition that are no
-    UTF-8 (in comments of old ROS 1 definitions) are announced as U+FFFD, since the protocol is
+    Channels without a schema are announced with an empty one. Bytes of a definition that are not
+    UTF-8 (in comments of old ROS 1 definitions) are announced as U+FFFD, since the protocol has
     text there.
 
     Args:
         host: Address of this machine to listen on.
         port: Port to listen on; 0 picks a free one.
-        name: What clients show as the server's name.
-        span: First and last log time of the recording, nanoseconds: the time line that clients
-            show to control the player. Without it they can only watch.
-        backlog: Messages that wait for each slow client; also control messages.
-        origins: Web sites that may connect, such as ``https://app.foxglove.dev``, besides those
-            of this machine; programs that are no browser always may.
+        name: The server's name, as shown by clients.
+        span: First and last log time of the recording, nanoseconds: the time line with which
+            clients control the player. Without it, they can only watch.
+        backlog: Messages that may wait for each slow client; also control messages.
+        origins: Web sites that may connect, such as ``https://app.foxglove.dev``, besides local
+            ones; programs other than browsers always may.
 
     Attributes:
-        world: None: messages go as they are recorded.
+        world: None: messages are sent as recorded.
 
     Raises:
-        PublishError: The port is taken, or the package is missing.
-        OptionError: An option cannot be.
+        PublishError: The port is in use, or the package is missing.
+        OptionError: An option is not valid.
     """
 
     world: str | None = None
@@ -417,7 +415,7 @@ class FoxglovePublisher:
         self._outlets: dict[int, _Outlet] = {}
         self._by_sdk_id: dict[int, list[_Outlet]] = {}
         self._subscribed: dict[int, set[int]] = {}
-        # one message at a time: a latched one must not overtake its successor
+        # keeps messages in order: a latched one must not overtake its successor
         self._sending = threading.Lock()
         self._sent_at = 0.0
         self._is_closed = False
@@ -440,8 +438,8 @@ class FoxglovePublisher:
         except OSError as error:
             raise PublishError(
                 self.address,
-                f"Foxglove cannot be served there: {error.strerror or error}; choose another port "
-                "with `port`, or `port` 0 for any that is free",
+                f"cannot listen there: {error.strerror or error}; choose another port with `port`, "
+                "or any free one with `port` 0",
             ) from None
 
     def _start(self, name: str, span: tuple[int, int] | None, backlog: int) -> Any:
@@ -468,7 +466,7 @@ class FoxglovePublisher:
     # ------------------------------------------------------------ messages
 
     def advertise(self, channel: Channel) -> None:
-        """See `Publisher`."""
+        """Announce a channel before its first message."""
         if id(channel) in self._outlets:
             return
         announced = self._sdk.Channel(
@@ -478,7 +476,7 @@ class FoxglovePublisher:
             metadata={_text(key): _text(value) for key, value in channel.metadata.items()},
             context=self._context,
         )
-        # channels that cannot be told apart are one to the SDK
+        # to the SDK, channels with the same properties are one channel
         outlet = _Outlet(channel, announced)
         with self._sending:
             self._outlets[id(channel)] = outlet
@@ -497,18 +495,18 @@ class FoxglovePublisher:
         return self._sdk.Schema(name=_text(schema.name), encoding=_text(schema.encoding), data=data)
 
     def publish(self, channel: Channel, payload: bytes | memoryview, time_ns: int) -> None:
-        """See `Publisher`."""
+        """Publish a message of an advertised channel."""
         outlet = self._outlets[id(channel)]
         if not 0 <= time_ns <= MAX_TIME:
             raise ConversionError(
                 channel.topic,
-                f"has a message of the time {time_ns} ns, and Foxglove's begin at 0",
-                "Leave the topic out.",
+                f"has a message at {time_ns} ns, and Foxglove has times from 0 to {MAX_TIME} ns",
+                "Leave the topic out with `exclude`.",
             )
         if self._is_closed:
             raise PublishError(self.address, "the server was closed")
         if outlet.kept is None:
-            # a latched message of the past does not bring the past back
+            # a latched message from the past must not set back the time
             self._teller.reach(time_ns)
         if outlet.kept is None and not outlet.announced.has_sinks():
             return
@@ -520,13 +518,13 @@ class FoxglovePublisher:
         self._sent_at = time.monotonic()
 
     def subscribers(self, channel: Channel) -> int:
-        """See `Publisher`; those of this very channel, not of all with its topic."""
+        """How many subscribers the channel has now, not counting others with its topic."""
         outlet = self._outlets[id(channel)]
         with self._sending:
             return len(self._subscribed.get(outlet.announced.id(), ()))
 
     def on_subscribe(self, client: int, channel: int) -> None:
-        """A client subscribed: what is latched is sent again. From any thread."""
+        """Send latched messages again, as a client has subscribed. Called from any thread."""
         with self._sending:
             self._subscribed.setdefault(channel, set()).add(client)
             for outlet in self._by_sdk_id.get(channel, ()):
@@ -535,69 +533,67 @@ class FoxglovePublisher:
                     self._sent_at = time.monotonic()
 
     def on_unsubscribe(self, client: int, channel: int) -> None:
-        """A client unsubscribed or left. From any thread."""
+        """Forget a client that has unsubscribed or disconnected. Called from any thread."""
         with self._sending:
             self._subscribed.get(channel, set()).discard(client)
 
     # ------------------------------------------------------------ time and controls
 
     def clock(self, time_ns: int) -> None:
-        """See `Publisher`; from the first call on, no other time is told.
+        """Send a recording time; from the first call on, times of messages are not sent.
 
-        Times that Foxglove cannot hold are told as the nearest that it can.
+        Times that Foxglove does not have are sent as the nearest that it has.
         """
         if not self._is_closed:
             self._teller.clock(time_ns)
 
     def serve(self, controls: Controls) -> None:
-        """See `Publisher`; clients control the player if the recording's span was given."""
+        """Let clients control the player, if the recording's span was given."""
         self._teller.serve(controls)
 
-    # ------------------------------------------------------------ what it has not, and the end
+    # ------------------------------------------------------------ unsupported, and the end
 
     def follow_clock(self, on_time: Callable[[int], None]) -> None:
-        """See `Publisher`.
+        """Not supported.
 
         Raises:
             OptionError: Always: Foxglove clients publish no clock.
         """
-        raise OptionError(
-            "another clock cannot be followed with `foxglove`: its clients have none."
-        )
+        raise OptionError("`foxglove` has no other players whose clock could be followed.")
 
     def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
-        """See `Publisher`.
+        """Not supported.
 
         Raises:
-            OptionError: Always: there are no topics of others.
+            OptionError: Always: Foxglove clients publish no messages.
         """
         raise OptionError(
-            f"{topic} cannot be listened to with `foxglove`: its clients publish nothing."
+            f"`foxglove` cannot subscribe to {topic}: Foxglove clients publish no messages."
         )
 
     @property
     def wants_clock(self) -> bool:
-        """False: clients are told the time anyway."""
+        """False: clients are sent the time anyway."""
         return False
 
     @property
     def is_alive(self) -> bool:
-        """Whether it was not closed: nobody shuts it down from outside."""
+        """Whether it is open: it cannot be shut down from outside."""
         return not self._is_closed
 
     def close(self) -> None:
-        """See `Publisher`; what a client has not taken 0.5 s after the last message is dropped."""
+        """Close the server, after 0.5 s at most for clients to receive the last messages."""
         if self._is_closed:
             return
         self._is_closed = True
         try:
             with self._sending:
-                is_anybody_there = any(self._subscribed.values())
-            if is_anybody_there:
+                has_subscribers = any(self._subscribed.values())
+            if has_subscribers:
                 time.sleep(max(0.0, self._sent_at + _LINGER_S - time.monotonic()))
         finally:
             self._teller.close()
-            # in a thread: the SDK waits for ever for a client that takes nothing
+            # in a thread: the SDK waits forever for a client that receives nothing
             stopper = threading.Thread(target=self._server.stop, name="foxglove stop", daemon=True)
             stopper.start()
             stopper.join(_STOP_S)
@@ -611,16 +607,16 @@ class FoxglovePublisher:
 
 
 class _Outlet:
-    """A channel as it is announced, and what is kept of it where it is latched."""
+    """An announced channel, and its latched messages."""
 
     def __init__(self, channel: Channel, announced: Any) -> None:
-        self.channel = channel  # held, so that its id() stays its own
+        self.channel = channel  # a reference, so that its id() stays unique
         self.announced = announced
         self.kept = Kept[tuple[bytes, int]](channel) if is_latched(channel) else None
 
 
 class _Listener:
-    """What the SDK calls, from threads of its own."""
+    """The SDK's callbacks, called from threads of its own."""
 
     def __init__(self, publisher: FoxglovePublisher, teller: PlaybackReporter) -> None:
         self._publisher = publisher
@@ -638,15 +634,15 @@ class _Listener:
 
 def _check(port: int, span: tuple[int, int] | None, backlog: int) -> None:
     if not 0 <= port <= 65535:
-        raise OptionError(f"`port` {port} is no port: they go from 0 to 65535.")
+        raise OptionError(f"`port` {port} is not a port from 0 to 65535.")
     if span is not None and not 0 <= span[0] <= span[1] <= MAX_TIME:
-        raise OptionError(f"{span[0]} to {span[1]} ns is no span of time that Foxglove can show.")
+        raise OptionError(f"{span[0]} to {span[1]} ns: Foxglove cannot show this interval.")
     if backlog < 1:
-        raise OptionError(f"{backlog} messages cannot wait for a client: at least 1.")
+        raise OptionError(f"`backlog` {backlog} is below 1.")
 
 
 def _sdk(address: str) -> Any:
-    """The SDK, which logs only where the program set up logging for it."""
+    """The SDK, which logs only if the program has set up logging for it."""
     try:
         import foxglove
         import foxglove.websocket
@@ -659,10 +655,10 @@ def _sdk(address: str) -> Any:
 
 
 def _missing(address: str, package: str) -> PublishError:
-    said = f"needs the Python package {package}: pip install 'mp4ds[foxglove]'"
-    return PublishError(address, said)
+    problem = f"needs the Python package {package}: pip install 'mp4ds[foxglove]'"
+    return PublishError(address, problem)
 
 
 def _text(text: str) -> str:
-    """Text that UTF-8 can hold: a recording's may have bytes that it could not."""
+    """Text that can be encoded as UTF-8, which a recording's may not."""
     return text.encode("utf-8", "replace").decode()

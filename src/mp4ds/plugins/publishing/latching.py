@@ -1,4 +1,4 @@
-"""What late subscribers get of a latched channel: what its publishers kept."""
+"""The messages of a latched channel that late subscribers get."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from mp4ds.messages.wire import WireError
 from mp4ds.records import QOS_KEY, Channel
 
 PLAYER_DEPTH = 10
-"""What rosbag2 keeps of a topic: recordings seldom know the depth of their publishers."""
+"""rosbag2's history depth: recordings seldom know the depth of their publishers."""
 
 TF_STATIC_DEPTH = 100
-"""What tf2's listeners take of /tf_static."""
+"""History depth of tf2's listeners for /tf_static."""
 
 MOST = 1000
 _TF_STATIC = "tf_static"
@@ -26,16 +26,16 @@ _Item = TypeVar("_Item")
 def kept_depth(channel: Channel) -> int:
     """How many messages of a latched channel late subscribers get.
 
-    A channel of ROS 1 has one publisher, which keeps one. rosbag2 merges all publishers of a topic
-    into one channel, of which each kept as many as its own profile says; publishers that came after
-    the recorder have none in it.
+    A ROS 1 channel has one publisher, which latches one message. rosbag2 merges all publishers of a
+    topic into one channel; each of them kept as many messages as its own profile says. Publishers
+    that started after the recorder have no profile in it.
     """
     if is_ros1(channel):
         return 1
     if _parser(channel):
         return TF_STATIC_DEPTH
     qos = channel.metadata.get(QOS_KEY, "")
-    if qos == LATCHED_QOS:  # by mp4ds, of a publisher of ROS 1
+    if qos == LATCHED_QOS:  # written by mp4ds for a latching ROS 1 publisher
         return 1
     total = sum(_depth(profile) for profile in native_qos(qos))
     return min(max(total, PLAYER_DEPTH), MOST)
@@ -49,18 +49,18 @@ def _depth(profile: Mapping[str, Any]) -> int:
 
 
 def is_ros1(channel: Channel) -> bool:
-    """Whether it is latched as ROS 1 does it."""
+    """Whether it is latched in the sense of ROS 1."""
     return channel.metadata.get("latching", "").lower() in ("1", "true")
 
 
 class Kept(Generic[_Item]):
-    """What is kept of a latched channel for those that come late, the oldest first.
+    """The messages of a latched channel that are kept for late subscribers, oldest first.
 
-    Of /tf_static it is the newest transform of each child frame, for its publishers may each have
-    sent one of many. What is sent again, since the player goes back, is kept once.
+    For /tf_static, these are the newest transforms of each child frame, as each of many publishers
+    may have sent a few. A message that is sent again, after going back, is kept once.
 
     Args:
-        channel: The channel, as it was recorded.
+        channel: The channel, as recorded.
     """
 
     def __init__(self, channel: Channel) -> None:
@@ -76,7 +76,7 @@ class Kept(Generic[_Item]):
 
         Args:
             payload: The serialized message.
-            item: What stands for it.
+            item: What to return for it when iterating.
         """
         kept = [one for one in self._kept if one[0] != payload]
         kept.append((payload, self._children(payload) if self._children else None, item))
@@ -89,7 +89,7 @@ _Row = tuple["bytes | memoryview", "frozenset[str] | None", _Item]
 
 
 def _uncovered(rows: list[_Row[_Item]]) -> list[_Row[_Item]]:
-    """The messages that have a child frame that no later one has."""
+    """The messages with a child frame that is in no later message."""
     later: set[str] = set()
     found = []
     for row in reversed(rows):
@@ -101,7 +101,7 @@ def _uncovered(rows: list[_Row[_Item]]) -> list[_Row[_Item]]:
 
 
 def _parser(channel: Channel) -> Callable[[bytes | memoryview], frozenset[str] | None] | None:
-    """What gives the child frames of a message of /tf_static; None for other channels."""
+    """A function that returns the child frames of a /tf_static message; None for other channels."""
     if channel.topic.rpartition("/")[2] != _TF_STATIC:
         return None
     try:
@@ -113,6 +113,6 @@ def _parser(channel: Channel) -> Callable[[bytes | memoryview], frozenset[str] |
         try:
             return frozenset(one.child for one in parse(memoryview(payload)))
         except WireError:
-            return None  # kept as it is
+            return None  # kept in any case
 
     return children

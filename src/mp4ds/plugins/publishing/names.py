@@ -1,4 +1,4 @@
-"""What ROS tells each of its nodes on the command line: names, and rules for those of topics."""
+"""ROS arguments of a node on the command line: names and remappings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NODE = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _NAMESPACE = re.compile(r"/?(?:[A-Za-z_]\w*/?)*", re.ASCII)
 _RULE = re.compile(r"(?:[A-Za-z_]\w*:(?!=))?([^:=\s]+):=(\S+)")
 _OTHER = re.compile(r"_(?!_(?:node|name|ns):=).*:=.*", re.DOTALL)
-"""Read by ROS itself, such as ``__log:=``, or a private parameter."""
+"""Handled by ROS itself, such as ``__log:=``, or a private parameter."""
 
 _BARE = re.compile(r"[~/A-Za-z_][\w/~]*:=.*", re.ASCII)
 _VALUED = {
@@ -29,7 +29,7 @@ _VALUED = {
     "-e": "",
     "--enclave": "",
 }
-"""Arguments of ROS 2 that take a value -> what it is for; empty for what has no meaning here."""
+"""ROS 2 arguments that take a value -> what it is; empty for those that are ignored."""
 
 _SIM_TIME = "use_sim_time"
 _FLAG = re.compile(r"--(?:enable|disable)-[\w-]+-logs")
@@ -38,14 +38,14 @@ _LEVELS = ("debug", "info", "warn", "error", "fatal")
 
 @dataclass(frozen=True)
 class NodeNames:
-    """What a node is told on the command line.
+    """The ROS arguments of a node.
 
     Attributes:
-        node: Its name; empty for its own.
-        namespace: Where it is, such as ``/robot``; empty for the root.
-        rules: New names of topics, by the names that the node gives them.
-        log_level: How much it is to say, as ROS 2 calls it; empty where that is not told.
-        use_sim_time: The parameter of this name; None where that is not told.
+        node: Its name; empty for the default.
+        namespace: Its namespace, such as ``/robot``; empty for the root.
+        rules: Remappings of topics: old name, new name.
+        log_level: The log level, as in ROS 2; empty if not given.
+        use_sim_time: The parameter of this name; None if not given.
     """
 
     node: str = ""
@@ -55,21 +55,21 @@ class NodeNames:
     use_sim_time: bool | None = None
 
     def in_world(self, world: str | None) -> NodeNames:
-        """The same in ROS 1, where the environment may tell the namespace, or in ROS 2."""
-        told = os.environ.get("ROS_NAMESPACE", "") if world == "ros1" else ""
-        return replace(self, namespace=told) if told and not self.namespace else self
+        """The same for a ROS version: in ROS 1 the environment may set the namespace."""
+        namespace = os.environ.get("ROS_NAMESPACE", "") if world == "ros1" else ""
+        return replace(self, namespace=namespace) if namespace and not self.namespace else self
 
     def of_node(self, node: str) -> str:
-        """The node's name below the root, such as ``robot/player``, if it is `node` by itself."""
+        """The node's name with its namespace, such as ``robot/player``; `node` is the default."""
         return "/".join(filter(None, (self.namespace.strip("/"), self.node or node)))
 
     def renamed(self, topic: str) -> str:
-        """The name of a topic by the rules; itself where none is about it."""
+        """The name of a topic after remapping; unchanged if no rule applies."""
         found = {self.resolved(old): new for old, new in self.rules}.get(self.resolved(topic))
         return topic if found is None else self.resolved(found)
 
     def resolved(self, name: str) -> str:
-        """A name from the root on, such as ``/robot/imu``."""
+        """The absolute name, such as ``/robot/imu``."""
         root = "/" + self.namespace.strip("/")
         if name.startswith("/"):
             return name
@@ -79,27 +79,27 @@ class NodeNames:
 
 
 PLAIN = NodeNames()
-"""Nothing was told."""
+"""No ROS arguments."""
 
 
 def node_arguments(
     words: Sequence[str], *, rules_of: Sequence[str] = ("--remap", "-m")
 ) -> tuple[list[str], NodeNames]:
-    """Take the arguments of ROS out of a command line.
+    """Separate the ROS arguments from the others of a command line.
 
-    Those of ROS 2 stand between ``--ros-args`` and ``--`` or the end; those of ROS 1 anywhere:
+    ROS 2 arguments are between ``--ros-args`` and ``--`` or the end, ROS 1 arguments anywhere:
     ``__name:=x``, ``__ns:=/y``, ``_parameter:=1``, ``/topic:=/other``. Parameters other than
-    ``use_sim_time`` are left out, for a command has none.
+    ``use_sim_time`` are ignored.
 
     Args:
         words: The command line.
-        rules_of: Options of the command that have rules for topics of their own behind them.
+        rules_of: Options of the command itself that take remappings.
 
     Returns:
-        The words that are left, and what ROS told.
+        The other arguments, and the ROS arguments.
 
     Raises:
-        OptionError: An argument of ROS makes no sense.
+        OptionError: A ROS argument is not valid.
     """
     rest: list[str] = []
     names = NodeNames()
@@ -112,11 +112,11 @@ def node_arguments(
         elif word == "--":
             rest += [word, *left]
         elif _BARE.fullmatch(word) and not is_own:
-            names = _told(names, word)
+            names = _with_rule(names, word)
         else:
             is_own = word in rules_of or (is_own and ":=" in word)
             rest.append(word)
-    for kind, value in parameters:  # of files, those that are for this name
+    for kind, value in parameters:  # last, as files have sections for node names
         names = _with_file(names, Path(value)) if kind == "file" else _with(names, value)
     return rest, names
 
@@ -130,11 +130,11 @@ def _ros2(words: Iterator[str], names: NodeNames, parameters: list[tuple[str, st
             continue
         if name not in _VALUED:
             known = ", ".join(_VALUED)
-            raise OptionError(f"--ros-args {word} is not known. Use {known}; -- ends them.")
+            raise OptionError(f"--ros-args {word} is not known. Use {known}; end them with --.")
         if not (has_value and name.startswith("--")):
             value = next(words, "")
         if _VALUED[name] == "remap":
-            names = _told(names, value)
+            names = _with_rule(names, value)
         elif _VALUED[name] == "log_level":
             names = replace(names, log_level=value if value in _LEVELS else "")
         elif _VALUED[name]:
@@ -143,17 +143,17 @@ def _ros2(words: Iterator[str], names: NodeNames, parameters: list[tuple[str, st
 
 
 def _with(names: NodeNames, parameter: str) -> NodeNames:
-    """With a parameter, as ``name:=value``."""
-    name, is_told, value = parameter.partition(":=")
-    if not is_told:
-        raise OptionError(f"{parameter!r} is no parameter of ROS: write it as name:=value.")
+    """Add a parameter given as ``name:=value``."""
+    name, is_given, value = parameter.partition(":=")
+    if not is_given:
+        raise OptionError(f"{parameter!r} is not a ROS parameter; write it as name:=value.")
     if name.rpartition(":")[2] != _SIM_TIME:
         return names
     return replace(names, use_sim_time=_truth(value, "--ros-args"))
 
 
 def _with_file(names: NodeNames, path: Path) -> NodeNames:
-    """With the parameters of a file that are for this node."""
+    """Add the parameters that a file has for this node."""
     from mp4ds.plugins.publishing.ros2_writers import load_map  # which imports this module
 
     own = names.of_node("")
@@ -175,22 +175,22 @@ def _truth(value: Any, place: str) -> bool:
     known = {"true": True, "false": False}
     if str(value).lower() in known:
         return known[str(value).lower()]
-    raise OptionError(f"{place}: {_SIM_TIME} is true or false, and not {value!r}.")
+    raise OptionError(f"{place}: {_SIM_TIME} must be true or false, not {value!r}.")
 
 
-def _told(names: NodeNames, rule: str) -> NodeNames:
+def _with_rule(names: NodeNames, rule: str) -> NodeNames:
     if _OTHER.fullmatch(rule):
         return names
     match = _RULE.fullmatch(rule)
     if not match:
-        raise OptionError(f"{rule!r} is no rule of ROS: write it as /old/topic:=/new/topic.")
+        raise OptionError(f"{rule!r} is not a remapping; write it as /old/topic:=/new/topic.")
     old, new = match.groups()
     if old in ("__node", "__name"):
         if not _NODE.fullmatch(new):
-            raise OptionError(f"{rule!r}: a node cannot be called {new!r}.")
+            raise OptionError(f"{rule!r}: {new!r} is not a valid node name.")
         return replace(names, node=new)
     if old == "__ns":
         if not _NAMESPACE.fullmatch(new):
-            raise OptionError(f"{rule!r}: {new!r} is no namespace, such as /robot.")
+            raise OptionError(f"{rule!r}: {new!r} is not a valid namespace, such as /robot.")
         return replace(names, namespace=new)
     return replace(names, rules=(*names.rules, (old, new)))

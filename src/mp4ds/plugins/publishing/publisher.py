@@ -1,4 +1,4 @@
-"""Where messages are published: ROS 1, ROS 2, Foxglove."""
+"""What ROS 1, ROS 2 and Foxglove publishers have in common, and how to open one."""
 
 from __future__ import annotations
 
@@ -14,74 +14,74 @@ from mp4ds.records import Channel
 
 
 class Controls(Protocol):
-    """What remote controls (services, a web page, keys) may do to a player; from any thread."""
+    """Remote controls of a player, for services, a web page or keys; called from any thread."""
 
     @property
     def is_paused(self) -> bool:
-        """Whether it stands still."""
+        """Whether playback is paused."""
 
     @property
     def rate(self) -> float:
-        """Seconds of the recording in a second."""
+        """Seconds of the recording per second."""
 
     def pause(self) -> None:
-        """Stand still."""
+        """Pause playback."""
 
     def resume(self) -> None:
-        """Go on."""
+        """Resume playback."""
 
     def toggle_paused(self) -> None:
-        """Stand still or go on."""
+        """Pause or resume playback."""
 
     def set_rate(self, rate: float) -> bool:
-        """Play at another rate; returns whether there is such a rate: above 0."""
+        """Change the playback rate; returns False if it is not greater than 0."""
 
     def play_next(self) -> bool:
-        """While it stands still, publish one message; returns, when it is out, whether it did."""
+        """While paused, publish the next message; returns, afterwards, whether there was one."""
 
     def burst(self, messages: int) -> int:
-        """While it stands still, publish messages as fast as can be; 0: all that are left.
+        """While paused, publish this many messages as fast as possible; 0: all that are left.
 
-        Returns, when they are out, how many there were.
+        Returns, afterwards, how many there were.
         """
 
     def step_back(self) -> bool:
-        """While it stands still, go back by one message; returns whether that is out."""
+        """While paused, go back by one message; returns whether it was published."""
 
     def seek(self, time_ns: int) -> int:
-        """Go on at a time of the recording, or at the nearest that is played; returns which."""
+        """Continue at a recording time, or the nearest that is played; returns that time."""
 
     def play(self, start_ns: int, end_ns: int | None) -> bool:
-        """Play again from a time to another; returns whether it does, being at its end.
+        """Play an interval, if the player is waiting at the end; returns whether it does.
 
         Args:
-            start_ns: The first time, of the recording.
-            end_ns: The last time; None for the end.
+            start_ns: First recording time.
+            end_ns: Last recording time; None for the end.
         """
 
     def toggle_topic_pauses(self) -> None:
-        """Pause before the messages of some topics or not, as was asked for at first."""
+        """Turn pausing before messages on chosen topics off, or on again."""
 
     @property
     def start_ns(self) -> int:
         """Log time of the first message of the recording."""
 
     def stop(self) -> None:
-        """End."""
+        """Stop playback, and end."""
 
 
 class Publisher(Protocol):
-    """Where messages are published. A context manager; used by one thread.
+    """Publishes messages. A context manager; used by one thread.
 
     Attributes:
-        world: What messages have to be in: ``ros1``, ``ros2``; None for as they are recorded.
+        world: What messages are to be converted to: ``ros1``, ``ros2``; None: as recorded.
     """
 
     world: str | None
 
     @property
     def address(self) -> str:
-        """Where it publishes, to be shown: a URL, or whose ROS it is."""
+        """Where it publishes, for display: a URL, or which ROS."""
 
     def advertise(self, channel: Channel) -> None:
         """Announce a channel before its first message. Several channels may have one topic.
@@ -89,61 +89,61 @@ class Publisher(Protocol):
         Latching (ROS 1) and QoS (ROS 2) are those of its metadata.
 
         Raises:
-            Refused: Its type is not installed there.
-            ConversionError: It cannot be published there; names the topic.
-            PublishError: The other side refuses.
+            Refused: Its message type is not installed.
+            ConversionError: It cannot be published; names the topic.
+            PublishError: The connection is lost.
         """
 
     def publish(self, channel: Channel, payload: bytes | memoryview, time_ns: int) -> None:
-        """Publish one message of a channel that was advertised.
+        """Publish a message of an advertised channel.
 
         Args:
-            channel: The very object that was advertised.
+            channel: The same object that was advertised.
             payload: The serialized message; not kept after the call.
-            time_ns: The recording's time, nanoseconds.
+            time_ns: Recording time, nanoseconds.
 
         Raises:
             PublishError: The connection is lost.
         """
 
     def clock(self, time_ns: int) -> None:
-        """Publish the time of the recording as /clock; advertised by the first call."""
+        """Publish a recording time as /clock, which the first call advertises."""
 
     def subscribers(self, channel: Channel) -> int:
         """How many subscribers a channel's topic has now."""
 
     def follow_clock(self, on_time: Callable[[int], None]) -> None:
-        """Call with each time, nanoseconds, that others publish as /clock, from any thread.
+        """Call back, from any thread, with each time that another node publishes as /clock.
 
         Raises:
-            OptionError: There is no such clock here.
+            OptionError: There is no /clock here.
         """
 
     def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
-        """Call for each message on a topic of others, whatever its type, from any thread.
+        """Call back, from any thread, for each message of any type on another node's topic.
 
         Args:
             topic: The topic.
-            on_message: Called with the stamp, nanoseconds, of a message that begins with a header;
-                with None for others, and where it cannot be told.
+            on_message: Called with the header stamp of the message, in nanoseconds; with None if
+                it has no header, or that is not known.
 
         Raises:
-            OptionError: That cannot be done here.
+            OptionError: There are no other nodes here.
         """
 
     def serve(self, controls: Controls) -> None:
-        """Offer a player's remote controls as this side's players do; nothing where it has none."""
+        """Offer remote control of a player as is usual here, if at all."""
 
     @property
     def wants_clock(self) -> bool:
-        """Whether everybody here is told to use a simulated time (ROS 1: /use_sim_time)."""
+        """Whether all nodes are configured to use simulated time (ROS 1: /use_sim_time)."""
 
     @property
     def is_alive(self) -> bool:
-        """Whether it still publishes; False once it was shut down from outside."""
+        """Whether it can still publish; False once it was shut down from outside."""
 
     def close(self) -> None:
-        """Send what is waiting to be sent, as far as that ends soon, and leave."""
+        """Send what is still waiting, for a limited time, and disconnect."""
 
     def __enter__(self) -> Publisher: ...
 
@@ -153,17 +153,17 @@ class Publisher(Protocol):
 # ---------------------------------------------------------------- opening
 
 WORLDS: Mapping[str, str | None] = {"ros1": "ros1", "ros2": "ros2", "foxglove": None}
-"""What can be published to, and what messages have to be in there; None: as recorded."""
+"""Kinds of publishers -> what messages are converted to; None: as recorded."""
 
 _PATIENCE_S = 2.0
 
 
 def sourced(command: str = "play", others: str = " or `foxglove`") -> str:
-    """What is sourced here: ``ros1`` or ``ros2``.
+    """Which ROS is sourced: ``ros1`` or ``ros2``.
 
     Args:
-        command: What is to be done, for the error.
-        others: What else can be named, for the error.
+        command: The command, for the error.
+        others: Other choices than ROS, for the error.
 
     Raises:
         PublishError: Neither is.
@@ -176,8 +176,8 @@ def sourced(command: str = "play", others: str = " or `foxglove`") -> str:
             return kind
     raise PublishError(
         command,
-        "no ROS is sourced here: source its setup file, or give `ros1`, `ros2` (without ROS by "
-        f"pip install 'mp4ds[dds]'){others}",
+        "no ROS is sourced: source its setup file, or choose `ros1`, `ros2` (works without ROS "
+        f"after pip install 'mp4ds[dds]'){others}",
     )
 
 
@@ -194,34 +194,34 @@ def open_publisher(
     span: tuple[int, int] | None = None,
     is_paced: bool = True,
 ) -> Publisher:
-    """Join what is to be published to.
+    """Open a publisher.
 
     Args:
         kind: One of `WORLDS`.
-        names: What the node and its topics are called, in ROS.
-        qos_overrides: A YAML file of QoS profiles by topic, for ROS 2.
-        parting_s: How long subscribers have to acknowledge at the end, in ROS 2; None for 3 s.
-        queue_size: Messages that may wait for each subscriber of a topic, in ROS 1; 0 for any
-            number, as far as `MAX_BYTES` allows.
-        host: Address to listen on, for Foxglove.
-        port: Port to listen on, for Foxglove.
-        origins: Web sites that may connect, for Foxglove.
+        names: Name, namespace and remappings of the ROS node.
+        qos_overrides: A YAML file of QoS profiles by topic (ROS 2).
+        parting_s: How long to wait at the end for acknowledgements (ROS 2); None for 3 s.
+        queue_size: Messages that may wait for each subscriber of a topic (ROS 1); 0 for any
+            number, up to `MAX_BYTES`.
+        host: Address to listen on (Foxglove).
+        port: Port to listen on (Foxglove).
+        origins: Web sites that may connect (Foxglove).
         span: Log times of the first and the last message, nanoseconds.
-        is_paced: Whether messages come at their times; else slow subscribers are waited for where
-            that is possible, which is in ROS 1.
+        is_paced: Whether messages are published at their times; if not, the ROS 1 publisher waits
+            for slow subscribers.
 
     Raises:
-        OptionError: There is no such kind, or the file of QoS profiles makes no sense.
-        PublishError: It is not there: a library, a master, a free port.
+        OptionError: There is no such kind, or the file of QoS profiles is not valid.
+        PublishError: Something is missing: a library, a master, a free port.
     """
     if kind not in WORLDS:
-        raise OptionError(f"cannot play into {kind!r}. Use {', '.join(WORLDS)}.")
+        raise OptionError(f"cannot publish to {kind!r}. Use {', '.join(WORLDS)}.")
     if qos_overrides is not None and kind != "ros2":
-        raise OptionError("`qos_overrides` goes with `ros2`.")
+        raise OptionError("`qos_overrides` needs `ros2`.")
     if kind == "ros1":
         from mp4ds.plugins.publishing.ros1 import RospyPublisher
 
-        # what waits is bounded by its bytes: a hundred small messages are a moment
+        # limited by bytes, as a hundred small messages last for a moment only
         wait_s = 0.0 if is_paced else _PATIENCE_S
         return RospyPublisher(names=names, queue_size=queue_size, wait_s=wait_s)
     if kind == "foxglove":

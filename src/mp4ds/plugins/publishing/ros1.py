@@ -1,4 +1,4 @@
-"""Publishes messages in ROS 1, through rospy."""
+"""The ROS 1 publisher, which uses rospy."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from mp4ds.plugins.publishing.publisher import Controls
 from mp4ds.records import Channel
 
 MAX_BYTES = 128 << 20
-"""What waits for one subscriber of a topic: nearly a second of a 5 MB camera at 30 Hz."""
+"""Queue limit per subscriber and topic: nearly a second of a 5 MB camera at 30 Hz."""
 
 _LENGTH = struct.Struct("<I")
 
 
 @dataclass(frozen=True, slots=True)
 class RosType:
-    """What ROS 1 calls a type.
+    """A message type as ROS 1 describes it.
 
     Attributes:
-        name: Such as ``sensor_msgs/Image``.
-        md5sum: By which publishers and subscribers know that they mean the same.
-        definition: The text, with those of the types it refers to; may be empty.
+        name: Name, such as ``sensor_msgs/Image``.
+        md5sum: Checksum by which publishers and subscribers make sure that their types match.
+        definition: The definition, followed by those of the types it refers to; may be empty.
     """
 
     name: str
@@ -49,12 +49,12 @@ class RosType:
 
 
 class Sender:
-    """Sends to one subscriber, on a thread of its own, so that nobody waits for a slow one.
+    """Sends to one subscriber, in a thread of its own, so that a slow one delays no others.
 
     Args:
         transport: rospy's connection to it.
-        messages: How many may wait, 0 for as many as `MAX_BYTES` allows; beyond, the oldest is
-            dropped.
+        messages: Queue size, 0 for as many as `MAX_BYTES` allows; when the queue is full, the
+            oldest message is dropped.
     """
 
     def __init__(self, transport: Any, messages: int) -> None:
@@ -65,12 +65,12 @@ class Sender:
         self._bytes = 0
         self._taken = 0
         self._is_sending = False
-        self._is_behind = False  # was waited for in vain
+        self._is_behind = False  # a wait for it has timed out
         self._is_over = False
         self._changed = threading.Condition()
         connection = transport.socket
         if connection is not None:
-            # A small message would wait for the receipt of the one before: 40 ms on Linux.
+            # Nagle's algorithm would delay small messages: 40 ms on Linux.
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         threading.Thread(target=self._run, name="ros1-sender", daemon=True).start()
 
@@ -78,8 +78,8 @@ class Sender:
         """Queue a message.
 
         Args:
-            data: As it is sent.
-            wait_s: How long to wait for a subscriber that takes nothing, if its queue is full.
+            data: The bytes to send.
+            wait_s: How long to wait for a subscriber that receives nothing, if its queue is full.
         """
         with self._changed:
             if wait_s and not self._is_behind:
@@ -92,7 +92,7 @@ class Sender:
             self._changed.notify_all()
 
     def flush(self, deadline: float) -> None:
-        """Wait until all is sent, but not beyond a time of ``time.monotonic()``."""
+        """Wait until everything is sent, or until a ``time.monotonic()`` deadline."""
         with self._changed:
             self._changed.wait_for(
                 lambda: self._is_over or not (self._queue or self._is_sending),
@@ -100,7 +100,7 @@ class Sender:
             )
 
     def end(self) -> None:
-        """Send nothing more."""
+        """Discard the queue, and send nothing more."""
         with self._changed:
             self._is_over = True
             self._queue.clear()
@@ -123,7 +123,7 @@ class Sender:
         while (data := self._next()) is not None:
             try:
                 self._transport.write_data(data)
-            except Exception:  # the socket's errors, rospy's, and those of a race between both
+            except Exception:  # errors of the socket, of rospy, and of a race between both
                 break
         self.end()
         self._transport.close()
@@ -146,14 +146,14 @@ class Sender:
 
 
 class AdvertisedTopic:
-    """A topic that is advertised.
+    """An advertised topic.
 
     Args:
-        name: As it is advertised.
-        kind: The type of its messages.
-        make_publisher: Makes a publisher of rospy without a queue; called with a name, a type and
-            who is told of subscribers.
-        messages: How many may wait for each subscriber.
+        name: The name.
+        kind: The message type.
+        make_publisher: Creates a rospy publisher without a queue; called with the name, the type
+            and a listener for subscribers.
+        messages: Queue size per subscriber.
     """
 
     def __init__(
@@ -170,23 +170,23 @@ class AdvertisedTopic:
         self._senders: dict[Any, Sender] = {}
         self._latched: dict[str, bytes] = {}  # by who published it
         self._dropped = 0
-        with self._lock:  # the first may come before rospy returns
+        with self._lock:  # a subscriber may connect before rospy returns
             self._publisher = make_publisher(name, kind, self)
             self._greet()
 
     @property
     def subscribers(self) -> int:
-        """How many there are now."""
+        """Number of current subscribers."""
         return int(self._publisher.get_num_connections())
 
     @property
     def dropped(self) -> int:
-        """Messages that were dropped since a subscriber was too slow."""
+        """Messages dropped because a subscriber was too slow."""
         with self._lock:
             return self._dropped + sum(sender.dropped for sender in self._senders.values())
 
     def mark_latched(self) -> None:
-        """Tell subscribers to come that it is latched."""
+        """Announce to later subscribers that the topic is latched."""
         self._publisher.impl.add_headers({"latching": "1"})
 
     def publish(
@@ -196,8 +196,8 @@ class AdvertisedTopic:
 
         Args:
             payload: The message; not kept unless it is latched.
-            caller: Who published it, if the last one of each is to be latched.
-            wait_s: How long to wait for a subscriber that takes nothing and has a full queue.
+            caller: The node that published it, if the last message of each node is latched.
+            wait_s: How long to wait for a subscriber that receives nothing and has a full queue.
         """
         with self._lock:
             self._greet()
@@ -211,28 +211,28 @@ class AdvertisedTopic:
                 self._latched[caller] = data
 
     def flush(self, deadline: float) -> None:
-        """Wait until all is sent, but not beyond a time of ``time.monotonic()``."""
+        """Wait until everything is sent, or until a ``time.monotonic()`` deadline."""
         with self._lock:
             senders = list(self._senders.values())
         for sender in senders:
             sender.flush(deadline)
 
     def end(self) -> None:
-        """Send nothing more."""
+        """Discard the queue, and send nothing more."""
         with self._lock:
             for sender in self._senders.values():
                 sender.end()
 
     def peer_subscribe(self, *_: object) -> None:
-        """Called by rospy when it has made a connection."""
+        """Called by rospy when a subscriber has connected."""
         with self._lock:
             self._greet()
 
     def peer_unsubscribe(self, *_: object) -> None:
-        """Called by rospy when it has lost one: its sender ends by itself."""
+        """Called by rospy when a subscriber has disconnected: its sender ends by itself."""
 
     def _greet(self) -> None:
-        """Give those that have come what is latched, before anything else; forget the others."""
+        """Send new subscribers the latched messages first; forget those that are gone."""
         connections = self._publisher.impl.connections
         if len(connections) == len(self._senders) and all(c in self._senders for c in connections):
             return
@@ -252,7 +252,7 @@ class AdvertisedTopic:
 _T = TypeVar("_T")
 
 ANSWER_S = 4.0
-"""For the master to answer, seconds."""
+"""Seconds to wait for an answer of the master."""
 
 _BACKLOG = 1024
 _LOGGING = "version: 1\nincremental: true\n"
@@ -262,51 +262,53 @@ def start_node(
     node: str,
     names: NodeNames = PLAIN,
 ) -> tuple[Any, str]:
-    """Make this process a node; returns rospy, and where its master is.
+    """Make this process a node; returns rospy, and the address of the master.
 
     Args:
-        node: Its name, to which a number is added; where `names` has one, that is the whole name.
-        names: What it is called, and where it is.
+        node: Its name, to which a number is appended, unless `names` has a name.
+        names: Name, namespace and remappings of the node.
 
     Raises:
-        OptionError: The address of the master is none.
-        PublishError: There is no rospy, or no master answers.
+        OptionError: The address of the master is not valid.
+        PublishError: rospy is missing, or no master answers.
     """
     rosgraph, rospy = _imported()
     try:
         master = str(rosgraph.get_master_uri())
-        # init_node() would ask for ever
+        # init_node() would wait for it forever
         has_master = answer(rosgraph.is_master_online, ANSWER_S)
     except ValueError as error:
-        raise OptionError(f"The address of the ROS master is wrong: {error}.") from None
+        raise OptionError(f"The address of the ROS master is not valid: {error}.") from None
     if not has_master:
-        problem = "no ROS master answers there; start roscore, or set ROS_MASTER_URI"
+        problem = "no ROS master answers; start roscore, or set ROS_MASTER_URI"
         raise PublishError(master, problem)
     if rospy.core.is_initialized() or rospy.is_shutdown():
-        raise PublishError(master, "this process was a ROS node already; start another one")
+        raise PublishError(
+            master, "a process can be a ROS node only once, and this one was; start a new process"
+        )
     try:
         with _own_logging():
             rospy.init_node(
                 node,
-                argv=[f"__{key}:={value}" for key, value in _told(names)],
+                argv=[f"__{key}:={value}" for key, value in _node_arguments(names)],
                 anonymous=True,
                 disable_signals=True,
-                disable_rostime=True,  # this process tells the time, and waits for nobody's
+                disable_rostime=True,  # this process publishes the time, and must not wait for it
                 disable_rosout=True,  # /rosout may be a topic of the recording
             )
             _receive_many()
     except (rospy.ROSException, ValueError, OSError) as error:
-        raise PublishError(master, f"no node can be started ({error})") from None
+        raise PublishError(master, f"cannot start a node ({error})") from None
     return rospy, master
 
 
-def _told(names: NodeNames) -> list[tuple[str, str]]:
-    told = (("name", names.node), ("ns", names.namespace))
-    return [(key, value) for key, value in told if value]
+def _node_arguments(names: NodeNames) -> list[tuple[str, str]]:
+    arguments = (("name", names.node), ("ns", names.namespace))
+    return [(key, value) for key, value in arguments if value]
 
 
 def _receive_many() -> None:
-    """Let many subscribers come at once: beyond rospy's 5, they try again after seconds."""
+    """Let many subscribers connect at once: beyond rospy's 5, they retry only after seconds."""
     from rospy.impl.tcpros_base import init_tcpros_server
 
     server = init_tcpros_server().tcp_ros_server
@@ -321,8 +323,8 @@ def _imported() -> tuple[Any, Any]:
         import rospy
     except ImportError as error:
         problem = (
-            f"ROS 1 cannot be used here ({error}); source its setup.bash, or install python3-rospy "
-            "and use an environment made by python3 -m venv --system-site-packages"
+            f"ROS 1 is not available ({error}); source its setup.bash, or install python3-rospy "
+            "and use a virtual environment made with python3 -m venv --system-site-packages"
         )
         raise PublishError("rospy", problem) from None
     finally:
@@ -332,7 +334,7 @@ def _imported() -> tuple[Any, Any]:
 
 @contextmanager
 def _own_logging() -> Iterator[None]:
-    """Keep rospy from configuring the logging of the whole process, unless the user asks for it."""
+    """Keep rospy from configuring the logging of the process, unless the user configured it."""
     with tempfile.TemporaryDirectory() as folder:
         config = Path(folder, "logging.yaml")
         config.write_text(_LOGGING)
@@ -347,7 +349,7 @@ def _own_logging() -> Iterator[None]:
 
 
 def answer(call: Callable[[], _T], seconds: float) -> _T | None:
-    """What a call returns, None if that takes too long: rospy's calls have no time-out."""
+    """The result of a call, or None after a timeout, as rospy's calls have none."""
     future: Future[_T] = Future()
 
     def ask() -> None:
@@ -364,14 +366,14 @@ def answer(call: Callable[[], _T], seconds: float) -> _T | None:
 
 
 def is_name(name: str) -> bool:
-    """Whether a topic may be called so."""
+    """Whether a topic name is valid."""
     import rosgraph.names
 
     return bool(name.strip("/")) and bool(rosgraph.names.is_legal_name(name))
 
 
 def raw_class(kind: RosType) -> Any:
-    """A message class whose one field is the serialized message."""
+    """A message class whose only field is the serialized message."""
     import genpy
 
     def serialize(self: Any, buff: Any) -> None:
@@ -395,7 +397,7 @@ def raw_class(kind: RosType) -> Any:
 
 
 def set_bool_class() -> Any:
-    """The class of std_srvs/SetBool, which need not be installed."""
+    """A class for std_srvs/SetBool, which may not be installed."""
     request = "8b94c1b53db61fb6aed406028ad6332a", b"bool data\n"
     response = "937c9679a518e3a18d831e57125ea522", b"bool success\nstring message\n"
     members = {
@@ -409,35 +411,35 @@ def set_bool_class() -> Any:
 
 # ---------------------------------------------------------------- the publisher
 
-_FLUSH_S = 3.0  # for what waits to be sent
-_FAREWELL_S = 0.5  # for subscribers to read it: those of rospy forget it when the publisher goes
+_FLUSH_S = 3.0  # to send what is queued
+_FAREWELL_S = 0.5  # for subscribers to read it: rospy's drop unread data at a disconnect
 _TIME = struct.Struct("<II")
 _NS = 1_000_000_000
 _CLOCK = RosType("rosgraph_msgs/Clock", "a9c97c1d230cfc112e270351a944ee47", b"time clock\n")
-_CLOCK_QUEUE = 10  # an old time is of no use, but the first of some may be that of a message
+_CLOCK_QUEUE = 10  # old times are of no use, but one of the last few may belong to a message
 _RENAME = "Leave the topic out with `exclude`, or rename it with `remap`."
 _REMEDY = "Leave the topic out with `exclude`."
 
 
 class RospyPublisher:
-    """Publishes in ROS 1 as a node of its own. There can be one in a process, and only once.
+    """Publishes to ROS 1, as a node of its own. A process can have one only once.
 
-    rospy is that of the ROS 1 that is sourced, or any other that Python finds. A subscriber that is
-    too slow loses the oldest messages, as with every publisher of ROS 1, and holds up nobody.
+    It uses the rospy of the ROS 1 that is sourced, or any other that Python finds. A subscriber
+    that is too slow loses the oldest messages, as with every ROS 1 publisher, and delays no others.
 
     Args:
-        node: Name of the node, where `names` has none; a number is added to it.
-        names: What the node and /clock are called.
+        node: Name of the node if `names` has none; a number is appended.
+        names: Name, namespace and remappings of the node.
         queue_size: Messages that may wait for each subscriber of a topic, as with
-            ``rosbag play --queue``; 0 for any number. More than 128 MiB never wait.
-        wait_s: How long a message waits for a subscriber that takes nothing and has a full queue,
-            before its oldest message is dropped; seconds. Above 0 a player that does not keep to a
-            time is as fast as its subscribers, and they lose nothing. One that was waited for in
-            vain is not waited for again before it has caught up.
+            ``rosbag play --queue``; 0 for any number. The limit of 128 MiB applies in any case.
+        wait_s: How many seconds to wait for a subscriber that receives nothing and has a full
+            queue, before its oldest message is dropped. Above 0, publishing without pacing is as
+            fast as the subscribers, which lose nothing. After a timeout, a subscriber is not waited
+            for again until it has caught up.
 
     Raises:
-        OptionError: An option makes no sense.
-        PublishError: There is no rospy, or no master answers.
+        OptionError: An option is not valid.
+        PublishError: rospy is missing, or no master answers.
     """
 
     world: str | None = "ros1"
@@ -451,7 +453,7 @@ class RospyPublisher:
         wait_s: float = 0.0,
     ) -> None:
         if queue_size < 0 or wait_s < 0:
-            raise OptionError("A queue of ROS 1 cannot be shorter than 0. Use 100, or 0 for any.")
+            raise OptionError("A ROS 1 queue cannot be shorter than 0. Use 100, or 0 for no limit.")
         self._rospy, self._master = start_node(node, names)
         self._clock_topic = names.renamed("/clock")
         self._queue_size, self._wait_s = queue_size, wait_s
@@ -462,11 +464,11 @@ class RospyPublisher:
 
     @property
     def address(self) -> str:
-        """Its master, to be shown."""
+        """Its master, for display."""
         return f"ROS 1, {self._master}"
 
     def advertise(self, channel: Channel) -> None:
-        """See `Publisher`."""
+        """Announce a channel before its first message."""
         self._check_alive()
         topic = self._topic(channel.topic, self._kind(channel), self._queue_size)
         caller = None
@@ -476,31 +478,31 @@ class RospyPublisher:
         self._channels[id(channel)] = channel, topic, caller
 
     def publish(self, channel: Channel, payload: bytes | memoryview, time_ns: int) -> None:
-        """See `Publisher`."""
+        """Publish a message of an advertised channel."""
         _, topic, caller = self._channels[id(channel)]
         self._check_alive()
         topic.publish(payload, caller=caller, wait_s=self._wait_s)
 
     def clock(self, time_ns: int) -> None:
-        """See `Publisher`."""
+        """Publish a recording time as /clock."""
         if not 0 <= time_ns < _NS << 32:
-            problem = f"ROS 1 cannot tell the time {time_ns} ns, only those of 1970 to 2106"
-            raise ConversionError("/clock", problem, "Play without a clock.")
+            problem = f"ROS 1 has times from 1970 to 2106 only, not {time_ns} ns"
+            raise ConversionError("/clock", problem, "Play without /clock.")
         self._check_alive()
         topic = self._topic(self._clock_topic, _CLOCK, _CLOCK_QUEUE)
         topic.publish(_TIME.pack(*divmod(time_ns, _NS)))
 
     def subscribers(self, channel: Channel) -> int:
-        """See `Publisher`."""
+        """How many subscribers the channel's topic has now."""
         return self._channels[id(channel)][1].subscribers
 
     @property
     def dropped(self) -> int:
-        """Messages that subscribers did not get because they were too slow, so far."""
+        """Messages dropped so far because subscribers were too slow."""
         return sum(topic.dropped for topic in self._topics.values())
 
     def follow_clock(self, on_time: Callable[[int], None]) -> None:
-        """See `Publisher`."""
+        """Call back with each time, in nanoseconds, that another node publishes as /clock."""
 
         def on_message(message: Any) -> None:
             if len(message._buff) == _TIME.size:
@@ -510,7 +512,7 @@ class RospyPublisher:
         self._subscribe(self._clock_topic, on_message)
 
     def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
-        """See `Publisher`."""
+        """Call back for each message on another node's topic, with its header stamp."""
         self._subscribe(topic, lambda message: on_message(_stamp_of(message)))
 
     def serve(self, controls: Controls) -> None:
@@ -521,10 +523,10 @@ class RospyPublisher:
             is_change = is_wanted != controls.is_paused
             if is_change:
                 (controls.pause if is_wanted else controls.resume)()
-                told = f"Playback is now {'paused' if is_wanted else 'resumed'}"
+                answer_text = f"Playback is now {'paused' if is_wanted else 'resumed'}"
             else:
-                told = f"Bag is already {'paused.' if is_wanted else 'running.'}"
-            text = told.encode()
+                answer_text = f"Bag is already {'paused.' if is_wanted else 'running.'}"
+            text = answer_text.encode()
             return service._response_class(struct.pack("<BI", is_change, len(text)) + text)
 
         service = set_bool_class()
@@ -532,20 +534,20 @@ class RospyPublisher:
 
     @property
     def wants_clock(self) -> bool:
-        """See `Publisher`."""
+        """Whether /use_sim_time is set."""
         try:
             found = answer(lambda: self._rospy.get_param("/use_sim_time", False), ANSWER_S)
         except (OSError, self._rospy.ROSException) as error:
-            raise PublishError(self._master, f"the ROS master was lost ({error})") from None
+            raise PublishError(self._master, f"lost the ROS master ({error})") from None
         return bool(found)
 
     @property
     def is_alive(self) -> bool:
-        """See `Publisher`."""
+        """Whether the node has not been shut down."""
         return not self._rospy.is_shutdown()
 
     def close(self) -> None:
-        """See `Publisher`."""
+        """Send what is still waiting, for a limited time, and shut down the node."""
         if self._is_closed:
             return
         self._is_closed = True
@@ -554,7 +556,7 @@ class RospyPublisher:
             topic.flush(deadline)
         if self.is_alive and any(topic.subscribers for topic in self._topics.values()):
             time.sleep(_FAREWELL_S)
-        # A master that is gone is not waited for.
+        # The master may be gone.
         answer(lambda: self._rospy.signal_shutdown("the player has ended"), ANSWER_S)
         for topic in self._topics.values():
             topic.end()
@@ -567,26 +569,27 @@ class RospyPublisher:
 
     def _check_alive(self) -> None:
         if not self.is_alive:
-            raise PublishError(self._master, "the node was shut down by somebody else; play again")
+            raise PublishError(self._master, "the node was shut down from outside; play again")
 
     def _kind(self, channel: Channel) -> RosType:
         if channel.message_encoding != "ros1":
-            problem = f"its messages are {channel.message_encoding or 'of no known encoding'}"
-            raise ConversionError(channel.topic, f"{problem}, not of ROS 1", _REMEDY)
+            encoding = channel.message_encoding or "unknown"
+            problem = f"its message encoding is {encoding}, not ros1"
+            raise ConversionError(channel.topic, problem, _REMEDY)
         if not channel.metadata.get("md5sum"):
-            told = {key: value for key, value in channel.metadata.items() if key != "md5sum"}
+            metadata = {key: value for key, value in channel.metadata.items() if key != "md5sum"}
             self._converter = self._converter or Converter("ros1")
-            channel = self._converter.channel(replace(channel, metadata=told))
+            channel = self._converter.channel(replace(channel, metadata=metadata))
         schema, md5sum = channel.schema, channel.metadata.get("md5sum")
         if schema is None or not schema.name or not md5sum:
-            problem = f"the definition of its type {channel.type_name!r} is not known"
+            problem = f"the definition of its type {channel.type_name!r} is unknown"
             raise ConversionError(channel.topic, problem, _REMEDY)
         return RosType(schema.name.replace("/msg/", "/"), md5sum, schema.data)
 
     def _topic(self, name: str, kind: RosType, queue_size: int) -> AdvertisedTopic:
         """The topic of that name, advertised; channels of one topic share it."""
         if not is_name(name):
-            raise ConversionError(name, "ROS 1 cannot have a topic of that name", _RENAME)
+            raise ConversionError(name, "its name is not valid in ROS 1", _RENAME)
         resolved = self._rospy.resolve_name(name)
         topic = self._topics.get(resolved)
         if topic is None:
@@ -594,20 +597,20 @@ class RospyPublisher:
             topic = self._topics[resolved] = AdvertisedTopic(name, kind, make, messages=queue_size)
         if topic.kind.md5sum != kind.md5sum:
             problem = (
-                f"it has messages of types that differ, {topic.kind.name} ({topic.kind.md5sum}) "
-                f"and {kind.name} ({kind.md5sum}), and a topic of ROS 1 has one type"
+                f"it has messages of different types, {topic.kind.name} ({topic.kind.md5sum}) "
+                f"and {kind.name} ({kind.md5sum}), and a ROS 1 topic has one type"
             )
-            raise ConversionError(name, problem, "Leave it out, or play the recordings apart.")
+            raise ConversionError(name, problem, "Leave it out, or play the recordings separately.")
         return topic
 
     def _make_publisher(self, name: str, kind: RosType, listener: Any) -> Any:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # rospy's advice on queues, of which it is to have none
+            warnings.simplefilter("ignore")  # rospy's advice to use its queues
             return self._rospy.Publisher(name, raw_class(kind), subscriber_listener=listener)
 
     def _subscribe(self, topic: str, on_message: Callable[[Any], None]) -> None:
         if not is_name(topic):
-            raise OptionError(f"ROS 1 has no topic named {topic!r}. Give one such as /reply.")
+            raise OptionError(f"{topic!r} is not a valid ROS 1 topic name, such as /reply.")
         self._rospy.Subscriber(topic, self._rospy.AnyMsg, on_message, tcp_nodelay=True)
 
 

@@ -1,4 +1,4 @@
-"""Publishes in ROS 2 by the ROS that is installed: rclpy, with any of its middlewares."""
+"""The ROS 2 publisher that uses rclpy, with any of its middlewares."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ from mp4ds.plugins.publishing.ros2_writers import (
 from mp4ds.records import Channel
 
 _SECOND = 10**9
-_LOOK = 0.1  # seconds between two looks for who publishes a topic
+_LOOK = 0.1  # seconds between two checks for publishers of a topic
 _NO_SUPPORT = ("UnsupportedTypeSupport", "NoTypeSupportImportedException")
-"""Errors of a type without its compiled half, by name: each distribution has them elsewhere."""
+"""Errors of a type without compiled type support, by name: their module differs by distro."""
 
 
 class RclpyPublisher:
-    """A publisher of ROS 2 topics (`Publisher`) that is a node of the ROS that is sourced.
+    """Publishes to ROS 2, as a node of the ROS that is sourced.
 
-    The packages with the types of the messages have to be installed there.
+    The packages with the message types have to be installed.
 
     Args:
-        overrides: Topic -> quality of service to offer instead of the recorded one.
-        node: Name of the node, where `names` has none.
-        names: What the node and /clock are called.
-        parting_s: How long subscribers have to acknowledge at the end; may be infinite.
+        overrides: Topic -> QoS profile to offer instead of the recorded one.
+        node: Name of the node, if `names` has none.
+        names: Name, namespace and remappings of the node.
+        parting_s: How long to wait at the end for acknowledgements; may be infinite.
 
     Raises:
         PublishError: No ROS 2 is sourced.
@@ -66,7 +66,7 @@ class RclpyPublisher:
             from rclpy.context import Context
             from rclpy.executors import SingleThreadedExecutor
         except ImportError as error:
-            problem = f"rclpy is missing ({error}); source a ROS 2 first"
+            problem = f"rclpy is missing ({error}); source ROS 2 first"
             raise PublishError("ROS 2", problem) from None
         self._context = Context()
         rclpy.init(args=[], context=self._context)
@@ -86,11 +86,11 @@ class RclpyPublisher:
 
     @property
     def address(self) -> str:
-        """Whose ROS it is, to be shown."""
-        return f"ROS 2, by rclpy as {self._node.get_name()}"
+        """Its node, for display."""
+        return f"ROS 2, as node {self._node.get_name()} (rclpy)"
 
     def advertise(self, channel: Channel) -> None:
-        """Announce a channel before its first message; see `Publisher`."""
+        """Announce a channel before its first message."""
         kind = channel.type_name
         self._writers.add(channel, kind, partial(self._create, channel.topic, kind))
         if kind not in self._compared:
@@ -102,7 +102,7 @@ class RclpyPublisher:
 
         Raises:
             Refused: The type is not installed.
-            ConversionError: The topic has no valid name, or the type none.
+            ConversionError: The name of the topic or the type is not valid.
         """
         from rclpy.exceptions import InvalidTopicNameException
 
@@ -110,25 +110,25 @@ class RclpyPublisher:
         try:
             return self._node.create_publisher(kind, topic, qos_profile(qos))
         except InvalidTopicNameException:
-            remedy = "Play it under another name."
-            raise ConversionError(topic, "ROS 2 has no topics of such names", remedy) from None
+            remedy = "Rename it with `remap`."
+            raise ConversionError(topic, "its name is not valid in ROS 2", remedy) from None
         except Exception as error:  # rclpy's errors have no common base
             if type(error).__name__ not in _NO_SUPPORT:
-                raise ConversionError(topic, f"ROS 2 does not take it: {error}") from None
-            raise Refused(f"the type {type_name!r} is not installed whole: {error}") from None
+                raise ConversionError(topic, f"ROS 2 refuses it: {error}") from None
+            raise Refused(f"the type {type_name!r} has an incomplete package: {error}") from None
 
     def publish(self, channel: Channel, payload: bytes | memoryview, time_ns: int) -> None:
-        """Publish one message of a channel that was advertised; see `Publisher`."""
+        """Publish a message of an advertised channel."""
         self._send(self._writers[channel], channel.topic, bytes(payload))
 
     def _send(self, publisher: Any, topic: str, payload: bytes) -> None:
         try:
             publisher.publish(payload)
         except Exception as error:  # rclpy's errors have no common base
-            raise PublishError(topic, f"ROS 2 does not take a message: {error}") from None
+            raise PublishError(topic, f"ROS 2 refuses a message: {error}") from None
 
     def clock(self, time_ns: int) -> None:
-        """Publish the time of the recording as /clock."""
+        """Publish a recording time as /clock."""
         if self._clock is None:
             self._clock = self._create(self._clock_topic, CLOCK_TYPE, CLOCK_QOS)
         self._send(self._clock, self._clock_topic, clock_message(time_ns))
@@ -138,14 +138,14 @@ class RclpyPublisher:
         return int(self._writers[channel].get_subscription_count())
 
     def follow_clock(self, on_time: Callable[[int], None]) -> None:
-        """Call with each time, nanoseconds, that others publish as /clock."""
+        """Call back with each time, in nanoseconds, that another node publishes as /clock."""
         topic = self._clock_topic
         self._subscribe(topic, CLOCK_TYPE, CLOCK_QOS, lambda raw: on_time(_time_of(raw)))
 
     def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
-        """Call for each message on a topic, from when somebody publishes it."""
+        """Call back for each message on a topic, as soon as it has a publisher."""
         if dds_topic(topic) is None:
-            raise OptionError(f"{topic!r} is no topic name of ROS 2.")
+            raise OptionError(f"{topic!r} is not a valid ROS 2 topic name.")
         thread = threading.Thread(target=self._seek, args=(topic, on_message), daemon=True)
         self._threads.append(thread)
         thread.start()
@@ -171,7 +171,7 @@ class RclpyPublisher:
         self._node.create_subscription(kind, topic, on_raw, qos_profile(qos), raw=True)
 
     def serve(self, controls: Controls) -> None:
-        """Offer the services of `ros2 bag play`, where rosbag2_interfaces is installed."""
+        """Offer the services of `ros2 bag play`, if rosbag2_interfaces is installed."""
         serve(self._node, PLAYER_SERVICES, controls)
 
     def _spin(self) -> None:
@@ -185,7 +185,7 @@ class RclpyPublisher:
 
     @property
     def wants_clock(self) -> bool:
-        """False: in ROS 2 each node is told by itself to use a simulated time."""
+        """False: in ROS 2, simulated time is configured for each node."""
         return False
 
     @property
@@ -221,10 +221,10 @@ class RclpyPublisher:
 
 
 def message_class(topic: str, type_name: str) -> Any:
-    """The class of a topic's messages.
+    """The message class of a topic.
 
     Raises:
-        ConversionError: The type is not installed, or ROS 2 has no types of such names.
+        ConversionError: The type is not installed, or its name is not valid.
     """
     try:
         return _installed_class(topic, type_name)
@@ -241,27 +241,27 @@ def _installed_class(topic: str, type_name: str) -> Any:
         raise Refused(f"the type {type_name!r} is not installed in this ROS 2") from None
     except ValueError:
         remedy = "Leave the topic out."
-        problem = f"{type_name!r} is no message type of ROS 2"
+        problem = f"{type_name!r} is not a ROS 2 message type"
         raise ConversionError(topic, problem, remedy) from None
-    except Exception as error:  # of the package itself, which cannot be imported
-        raise Refused(f"the type {type_name!r} is not installed whole: {error}") from None
+    except Exception as error:  # the package cannot be imported
+        raise Refused(f"the type {type_name!r} has an incomplete package: {error}") from None
 
 
 def _compare(channel: Channel) -> None:
-    """Warn where the installed type is not the recorded one: its name alone is no proof."""
+    """Warn if the installed type differs from the recorded one of the same name."""
     installed = _installed_hash(channel.type_name)
     recorded = recorded_hash(channel) if installed else ""
     if recorded and recorded != installed:
         warnings.warn(
             f"{channel.topic}: the installed type {channel.type_name} differs from the recorded "
-            "one, so that subscribers may read nonsense; install the version of its package that "
-            "was recorded with.",
+            "one, so subscribers may read garbage; install the version of its package that was "
+            "used for the recording.",
             stacklevel=2,
         )
 
 
 def _installed_hash(type_name: str) -> str:
-    """The hash of an installed type, RIHS01_...; empty where ROS 2 has none, as before Iron."""
+    """The hash of an installed type, RIHS01_...; empty if there is none, as before Iron."""
     try:
         from ament_index_python.packages import get_package_share_directory
 
@@ -275,7 +275,7 @@ def _installed_hash(type_name: str) -> str:
 
 
 def qos_profile(qos: Qos) -> Any:
-    """A quality of service as rclpy has it."""
+    """A QoS profile for rclpy."""
     from rclpy.duration import Duration
     from rclpy.qos import (
         DurabilityPolicy,
@@ -286,9 +286,9 @@ def qos_profile(qos: Qos) -> Any:
     )
 
     def duration(nanoseconds: int | None) -> Any:
-        return Duration(nanoseconds=nanoseconds or 0)  # 0 stands for no limit
+        return Duration(nanoseconds=nanoseconds or 0)  # 0 means no limit
 
-    # manual_by_node is no more: it asserted the same for all publishers of a node
+    # manual_by_node was removed from ROS 2
     liveliness = "AUTOMATIC" if qos.liveliness != "manual_by_topic" else "MANUAL_BY_TOPIC"
     return QoSProfile(
         history=HistoryPolicy[qos.history.upper()],
@@ -304,19 +304,19 @@ def qos_profile(qos: Qos) -> Any:
 
 
 def serve(node: Any, services: Sequence[Service], controls: Any) -> None:
-    """Offer services of a node, where rosbag2_interfaces is installed.
+    """Offer services of a node, if rosbag2_interfaces is installed.
 
     Args:
-        node: The node of rclpy.
-        services: What they do.
-        controls: What they do it with.
+        node: The rclpy node.
+        services: The services.
+        controls: The player or recorder that they control.
     """
     try:
         import rosbag2_interfaces.srv as kinds
     except ImportError:
         return
     for service in services:
-        if kind := getattr(kinds, service.kind, None):  # older ones have fewer
+        if kind := getattr(kinds, service.kind, None):  # older versions have fewer
             answer = partial(_answer, service, controls)
             node.create_service(kind, f"~/{service.name}", answer)
 

@@ -1,4 +1,4 @@
-"""What both ways into ROS 2 share: writers of channels, QoS profiles, the services of a player."""
+"""What both ROS 2 publishers share: writers of channels, QoS profiles, the player's services."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Service:
         kind: Its type in ``rosbag2_interfaces/srv``.
         request: Definition of a request.
         response: Definition of a response.
-        answer: Called with the controls and a request: does what that asks, and returns the fields
-            of the response.
+        answer: Called with the controls and a request; carries it out, and returns the fields of
+            the response.
     """
 
     name: str
@@ -46,11 +46,11 @@ class Service:
 
 
 class Pausable(Protocol):
-    """What can be paused, a player or a recorder."""
+    """A player or recorder, which can be paused."""
 
     @property
     def is_paused(self) -> bool:
-        """Whether it is."""
+        """Whether it is paused."""
         ...
 
     def pause(self) -> object:
@@ -58,18 +58,18 @@ class Pausable(Protocol):
         ...
 
     def resume(self) -> object:
-        """Let it continue."""
+        """Resume it."""
         ...
 
 
 def pause(controls: Pausable, _: Any) -> Mapping[str, Any]:
-    """Answer a request to pause."""
+    """Pause as requested."""
     controls.pause()
     return {}
 
 
 def resume(controls: Pausable, _: Any) -> Mapping[str, Any]:
-    """Answer a request to resume."""
+    """Resume as requested."""
     controls.resume()
     return {}
 
@@ -80,7 +80,7 @@ def _toggle_paused(controls: Controls, _: Any) -> Mapping[str, Any]:
 
 
 def is_paused(controls: Pausable, _: Any) -> Mapping[str, Any]:
-    """Answer whether it is paused."""
+    """Report whether it is paused."""
     return {"paused": controls.is_paused}
 
 
@@ -103,8 +103,10 @@ def _burst(controls: Controls, request: Any) -> Mapping[str, Any]:
 def _play(controls: Controls, request: Any) -> Mapping[str, Any]:
     start = controls.start_ns + _nanoseconds(request.start_offset)
     length, until = map(_nanoseconds, (request.playback_duration, request.playback_until_timestamp))
-    # 0, which nobody plays, is what clients send who leave it out
-    ends = [time for time, is_told in ((start + length, length > 0), (until, until > 0)) if is_told]
+    # clients that leave out an end send 0
+    ends = [
+        time for time, is_given in ((start + length, length > 0), (until, until > 0)) if is_given
+    ]
     return {"success": controls.play(start, max(ends, default=None))}
 
 
@@ -135,14 +137,14 @@ PLAYER_SERVICES = (
     Service("seek", "Seek", "builtin_interfaces/Time time", _SUCCESS, _seek),
     Service("stop", "Stop", NOTHING, NOTHING, _stop),
 )
-"""Those of `ros2 bag play`, which are answered when what they ask for is done."""
+"""The services of `ros2 bag play`. They respond when the request has been carried out."""
 
 
 # ---------------------------------------------------------------- QoS
 
 _MAX_BYTES = 2**20
 _MAX_DEPTH = 2**31 - 1
-_INFINITE_SECONDS = 2**31 - 1  # the least of the three infinities that middlewares recorded
+_INFINITE_SECONDS = 2**31 - 1  # the smallest of the values that middlewares use for infinity
 _NAMES = {
     "history": ("keep_last", "keep_all"),
     "reliability": ("reliable", "best_effort"),
@@ -160,18 +162,18 @@ _Loader: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 @dataclass(frozen=True, slots=True)
 class Qos:
-    """What a publisher offers; the default is that of `ros2 bag play`.
+    """The QoS profile that a publisher offers; the defaults are those of `ros2 bag play`.
 
     Attributes:
         history: ``keep_last`` or ``keep_all``.
         depth: How many messages ``keep_last`` keeps, at least 1.
         reliability: ``reliable`` or ``best_effort``.
         durability: ``volatile`` or ``transient_local``.
-        deadline_ns: Nanoseconds between two messages at most; None for no limit.
-        lifespan_ns: Nanoseconds that a message is of use; None for ever.
+        deadline_ns: Maximum nanoseconds between two messages; None for no limit.
+        lifespan_ns: Nanoseconds after which a message expires; None for never.
         liveliness: ``automatic``, ``manual_by_node`` or ``manual_by_topic``.
-        lease_ns: Nanoseconds after which a silent publisher counts as dead; None for never.
-        avoid_ros_namespace_conventions: Whether the topic has its bare name in DDS.
+        lease_ns: Nanoseconds after which a silent publisher is considered dead; None for never.
+        avoid_ros_namespace_conventions: Whether the topic's DDS name has no ``rt/`` prefix.
     """
 
     history: str = "keep_last"
@@ -186,7 +188,7 @@ class Qos:
 
     @property
     def is_reliable(self) -> bool:
-        """Whether lost messages are sent again."""
+        """Whether lost messages are resent."""
         return self.reliability == "reliable"
 
     @property
@@ -196,13 +198,13 @@ class Qos:
 
 
 CLOCK_QOS = Qos(depth=1, reliability="best_effort")
-"""That of /clock, as rclcpp's ClockQoS."""
+"""The profile of /clock, rclcpp's ClockQoS."""
 
 
 def recorded_qos(text: str) -> tuple[Qos, ...]:
     """The profiles that the publishers of a topic offered when it was recorded.
 
-    Policies that are unknown or left to the system become the default ones; a text that is no
+    Policies that are unknown or system defaults become the defaults of `Qos`; a text that is not a
     list of profiles has none.
 
     Args:
@@ -233,20 +235,20 @@ def _recorded_duration(value: Any) -> int | None:
 
 
 def _duration(sec: int, nsec: int) -> int | None:
-    """Nanoseconds; None for what is infinite or, as 0 is in ROS, not specified."""
+    """Nanoseconds; None if it is infinite or, as 0 is in ROS, unspecified."""
     return None if sec >= _INFINITE_SECONDS else (sec * _SECOND + nsec or None)
 
 
 def offered_qos(channel: Channel, overrides: Mapping[str, Qos]) -> Qos:
-    """What a player offers for a channel, chosen as `ros2 bag play` does.
+    """The profile that a player offers for a channel, chosen as by `ros2 bag play`.
 
-    That of the overrides; else the recorded one where all recorded publishers agree on what
-    subscribers can tell; else the default. Of latched topics the depth is the sum of what all
-    publishers kept, since it is what late subscribers get.
+    It is that of the overrides; else the recorded one, if those of all recorded publishers are the
+    same to subscribers; else the default. For a latched topic, the depth is the number of messages
+    that all publishers kept together, since that is what late subscribers get.
 
     Args:
         channel: The channel, with the recorded profiles in its metadata.
-        overrides: Topic -> what to offer instead.
+        overrides: Topic -> profile to offer instead.
     """
     if channel.topic in overrides:
         return overrides[channel.topic]
@@ -268,13 +270,13 @@ def _as_subscribers_see(qos: Qos) -> Qos:
 
 
 def load_overrides(path: Path) -> dict[str, Qos]:
-    """Read a file of `--qos-profile-overrides-path`, in the form of `ros2 bag play`.
+    """Read a file for `--qos-profile-overrides-path`, in the format of `ros2 bag play`.
 
     Returns:
-        Topic -> its quality of service; what is not told is the default.
+        Topic -> its profile; policies that the file leaves out have the default.
 
     Raises:
-        OptionError: It cannot be read, or holds something else; names the key.
+        OptionError: It cannot be read or is not valid; names the key.
     """
     document = load_map(path, "topics to QoS profiles")
     return {_topic(path, topic): _override(path, topic, value) for topic, value in document.items()}
@@ -285,17 +287,17 @@ def load_map(path: Path, of: str) -> dict[Any, Any]:
 
     Args:
         path: The file; an empty one is an empty map.
-        of: What it maps to what.
+        of: What it maps, for errors.
 
     Raises:
-        OptionError: It cannot be read, or is no map.
+        OptionError: It cannot be read, or is not a map.
     """
     try:
         data = path.read_bytes()
     except OSError as error:
         raise OptionError(f"{path}: cannot be read: {error.strerror}.") from None
     if len(data) > _MAX_BYTES:
-        raise OptionError(f"{path}: is larger than {_MAX_BYTES} bytes, too large for {of}.")
+        raise OptionError(f"{path}: is larger than {_MAX_BYTES} bytes, too large to map {of}.")
     try:
         document = yaml.load(data.decode(), Loader=_Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -304,19 +306,19 @@ def load_map(path: Path, of: str) -> dict[Any, Any]:
     if document is None:
         return {}
     if not isinstance(document, dict):
-        raise OptionError(f"{path}: is no map of {of}.")
+        raise OptionError(f"{path}: does not map {of}.")
     return document
 
 
 def _topic(path: Path, topic: Any) -> str:
     if not isinstance(topic, str):
-        raise OptionError(f"{path}: {topic!r} is no topic name; put it in quotes.")
+        raise OptionError(f"{path}: {topic!r} is not a topic name; put it in quotes.")
     return topic
 
 
 def _override(path: Path, topic: Any, profile: Any) -> Qos:
     if not isinstance(profile, dict):
-        raise OptionError(f"{path}: {topic}: is no QoS profile; list policies such as depth: 1.")
+        raise OptionError(f"{path}: {topic}: is not a QoS profile; list policies such as depth: 1.")
     found: dict[str, Any] = {}
     for key, value in profile.items():
         place = f"{path}: {topic}: {key}"
@@ -330,7 +332,7 @@ def _override(path: Path, topic: Any, profile: Any) -> Qos:
             found[key] = _flag(place, value)
         else:
             known = ", ".join((*_NAMES, "depth", *_DURATIONS, _BARE))
-            raise OptionError(f"{place}: is no QoS policy. Use {known}.")
+            raise OptionError(f"{place}: is not a QoS policy. Use {known}.")
     return Qos(**found)
 
 
@@ -345,7 +347,7 @@ def _name(place: str, value: Any, names: tuple[str, ...]) -> str:
 
 def _whole(place: str, value: Any) -> int:
     if type(value) is not int or not 0 <= value <= _MAX_DEPTH:
-        raise OptionError(f"{place}: {value!r} is no whole number from 0 to {_MAX_DEPTH}.")
+        raise OptionError(f"{place}: {value!r} is not an integer from 0 to {_MAX_DEPTH}.")
     return value
 
 
@@ -359,10 +361,10 @@ def _override_duration(place: str, value: Any) -> int | None:
     if value is None or value == {}:
         return None
     if not isinstance(value, dict) or set(value) != {"sec", "nsec"}:
-        raise OptionError(f"{place}: is no duration; give sec and nsec.")
+        raise OptionError(f"{place}: is not a duration; give sec and nsec.")
     sec, nsec = value["sec"], value["nsec"]
     if type(sec) is not int or type(nsec) is not int or sec < 0 or nsec < 0:
-        raise OptionError(f"{place}: sec and nsec have to be whole numbers from 0 on.")
+        raise OptionError(f"{place}: sec and nsec have to be integers, 0 or more.")
     return _duration(sec, nsec)
 
 
@@ -371,7 +373,7 @@ def _override_duration(place: str, value: Any) -> int | None:
 CLOCK = "/clock"
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 PARTING_S = 3.0
-"""Seconds that subscribers have at the end."""
+"""Seconds to wait at the end for acknowledgements."""
 
 _LITTLE = b"\0\1\0\0"
 _TIME = struct.Struct("<iI")
@@ -384,13 +386,13 @@ def clock_message(time_ns: int) -> bytes:
 
 
 class Writers(Generic[_Writer]):
-    """The writers of the channels that were advertised.
+    """The writers of advertised channels.
 
-    Channels of one topic, type and quality of service have one writer; latched ones have one
-    each, so that late subscribers get the last message of each, as from the recorded publishers.
+    Channels with the same topic, type and QoS share a writer; latched ones have one each, so that
+    late subscribers get the last message of each, as from the recorded publishers.
 
     Args:
-        overrides: Topic -> quality of service to offer instead of the recorded one.
+        overrides: Topic -> QoS profile to offer instead of the recorded one.
     """
 
     def __init__(self, overrides: Mapping[str, Qos]) -> None:
@@ -399,21 +401,21 @@ class Writers(Generic[_Writer]):
         self._shared: dict[tuple[str, Hashable, Qos], _Writer] = {}
 
     def add(self, channel: Channel, kind: Hashable, make: Callable[[Qos], _Writer]) -> None:
-        """See that a channel has a writer.
+        """Add a channel, with a writer of its own or a shared one.
 
         Args:
             channel: The channel.
-            kind: What stands for its type.
-            make: Makes a writer of it.
+            kind: Identifies its type.
+            make: Creates a writer for it.
 
         Raises:
-            ConversionError: Its messages are not those of ROS 2.
+            ConversionError: Its messages are not in CDR.
         """
         if id(channel) in self._channels:
             return
         if channel.message_encoding != "cdr":
-            encoding = channel.message_encoding or "of no known encoding"
-            raise ConversionError(channel.topic, f"its messages are {encoding}, not those of ROS 2")
+            encoding = channel.message_encoding or "unknown"
+            raise ConversionError(channel.topic, f"its message encoding is {encoding}, not cdr")
         qos = offered_qos(channel, self._overrides)
         key = (channel.topic, kind, qos)
         writer = None if qos.is_latched else self._shared.get(key)
@@ -428,6 +430,6 @@ class Writers(Generic[_Writer]):
         return (writer for _, writer in self._channels.values())
 
     def clear(self) -> None:
-        """Let go of them."""
+        """Release all writers."""
         self._channels.clear()
         self._shared.clear()
