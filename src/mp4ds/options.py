@@ -329,7 +329,7 @@ def end() -> Any:
 
 def duration() -> Any:
     """The option for the length of a slice."""
-    return option("Seconds from `start` on, or up to `end`.", metavar="SECONDS")
+    return option("Length of the slice: seconds from `start`, or before `end`.", metavar="SECONDS")
 
 
 def cluster() -> Any:

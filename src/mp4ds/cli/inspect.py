@@ -91,12 +91,19 @@ def info(
     ] = False,
     start: Annotated[
         Optional[str],  # noqa: UP045 - read at run time by typer
-        typer.Option("--start", metavar="TIME", help="Show a slice only; times as for `pack`."),
+        typer.Option("--start", metavar="TIME", help="Begin at this time, written as for `pack`."),
     ] = None,
-    end: Annotated[Optional[str], typer.Option("--end", metavar="TIME")] = None,  # noqa: UP045
+    end: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--end", metavar="TIME", help="Stop before this time."),
+    ] = None,
     duration: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option("--duration", metavar="SECONDS"),
+        typer.Option(
+            "--duration",
+            metavar="SECONDS",
+            help="Length of the slice: seconds from --start, or before --end.",
+        ),
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:

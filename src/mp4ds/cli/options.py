@@ -52,9 +52,11 @@ _PANELS = {
         *("start_offset", "until_sec", "until_nsec", "skip_empty", "topic", "at"),
         *("sheet", "every", "max_rate", "sync", "tolerance_ns", "camera_info", "salvage", "poses"),
         *("all", "exclude_regex", "hidden", "max_duration", "max_size", "start_paused"),
-        *("state", "action", "task", "cameras", "frames", "clips"),
+        *("state", "action", "task", "cameras", "frames", "clips", "streams", "hours"),
     ),
     "How": (
+        *("layout", "stamps", "unit", "calibration", "frame_id", "encoding"),
+        *("codecs", "presets", "target", "rates"),
         *("quality", "codec", "preset", "transcode", "purpose", "gop", "images", "image_format"),
         *("jpeg_quality", "resize", "pixels", "fps", "crf", "proxies", "proxy_width", "scores"),
         *("publish_as", "storage", "exact", "about", "skip_unconvertible", "rate", "loop"),
@@ -89,10 +91,10 @@ _PANELS = {
             "origins",
             "serve",
         ),
-        *("layout", "stamps", "unit", "calibration", "frame_id", "encoding"),
     ),
     "Long jobs": (
         *("jobs", "memory", "window", "cluster", "shard", "join", "keep_going", "restart"),
+        "threads",
     ),
 }
 _PANEL_OF = {name: panel for panel, names in _PANELS.items() for name in names}

@@ -37,13 +37,12 @@ def pack(
             "--output",
             "-o",
             metavar="DATASET",
-            help="Folder to create; if it ends in a slash, one dataset per SOURCE is made inside "
-            "it.",
+            help="Folder to create; if it ends in a slash, one dataset per SOURCE is made in it.",
         ),
     ],
     shard: Annotated[
         Optional[str],  # noqa: UP045 - read at run time by typer
-        typer.Option("--shard", metavar="I/N", help="Pack only the Ith of N shares of the parts."),
+        typer.Option("--shard", metavar="I/N", help="Pack only share I of N shares of the parts."),
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:

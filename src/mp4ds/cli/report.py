@@ -34,7 +34,7 @@ def report(
     options: Callable[[], ReportOptions],
     datasets: DatasetsArgument,
     serve: Annotated[
-        bool, typer.Option("--serve", help="Then serve it to browsers on this machine.")
+        bool, typer.Option("--serve", help="Serve the report to browsers on this machine.")
     ] = False,
     port: Annotated[
         int, typer.Option("--port", min=0, max=65535, help="Port for --serve; 0 picks a free one.")

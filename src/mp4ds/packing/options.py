@@ -87,7 +87,7 @@ class PackOptions(SliceOptions):
     preset: str | None = option("Encoder preset, such as 6, veryfast or p4.")
     transcode: bool = option("Re-encode JPEG images at `quality` instead of copying them.", False)
     camera_info: Sequence[str] = option(
-        "Pair topics whose names and stamps do not match them up.",
+        "Pair a camera topic with its camera_info, if neither names nor stamps do.",
         (),
         metavar="IMAGE=INFO",
     )
@@ -118,7 +118,7 @@ class PackOptions(SliceOptions):
         parse=parse_size,
     )
     cluster: str | None = cluster()
-    join: bool = option("Join what the shards packed into the dataset.", False)
+    join: bool = option("Join the parts packed with --shard into the dataset.", False)
     keep_going: bool = option("If a part fails, continue with the others.", False)
     salvage: bool = option("Pack what is still readable of a damaged recording.", False)
     restart: bool = option("Discard an unfinished run and start over.", False)

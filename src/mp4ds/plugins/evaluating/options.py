@@ -103,10 +103,10 @@ class EvaluateOptions(Options):
     topics: Sequence[str] = option("Only matching cameras.", (), "-t", metavar="GLOB")
     exclude: Sequence[str] = option("Leave out matching cameras.", (), "-x", metavar="GLOB")
     start: float | None = option(
-        "Where the clips begin; default: clips from the middle.", metavar="SECONDS"
+        "Where the clips start; default: in the middle.", metavar="SECONDS"
     )
     duration: float | None = option("Length of the clips, instead of `frames`.", metavar="SECONDS")
-    frames: int = option("Of a clip.", 150, least=1)
+    frames: int = option("Frames per clip.", 150, least=1)
     fps: float = option("Frame rate of a folder of images.", 30.0)
     target: str = option("Score to reach, such as vmaf=99.5, psnr_y=42 or ssim=0.98.", "vmaf=99.5")
     rates: Sequence[float] = option(
@@ -115,8 +115,8 @@ class EvaluateOptions(Options):
         metavar="HZ",
         parse=_rates,
     )
-    streams: int | None = option("Number of cameras to estimate a dataset's size for.", least=1)
-    hours: float | None = option("Hours of recording to estimate it for.")
+    streams: int | None = option("Number of cameras, to estimate the size of a dataset.", least=1)
+    hours: float | None = option("Hours of recording, to estimate the size of a dataset.")
     gop: int = option("Maximum key frame interval in frames.", LOSSY_GOP, least=1, most=100_000)
     threads: int | None = option(
         "Threads per encoder; default: all cores, or one on a cluster.", least=1, most=1024

@@ -71,9 +71,9 @@ class StillOptions(SliceOptions):
     end: str | float | None = end()
     duration: str | float | None = duration()
     resize: float | tuple[int, int] | None = resize(
-        "Size of the image, or of each frame on a sheet (default there: 320 columns)."
+        "Size of the image, or of each frame on a sheet (default: 320 pixels wide)."
     )
-    exact: bool = option("Keep the samples as recorded, as unpack --to images does.", False)
+    exact: bool = option("Keep the pixel values as recorded, as unpack --to images does.", False)
     force: bool = force()
 
     def __post_init__(self) -> None:
