@@ -195,8 +195,8 @@ def play(
 ) -> None:
     """Play back datasets, publishing to ROS 1, ROS 2 or Foxglove.
 
-    Keys: space: pause or resume; right and left: next and previous message; up and down: faster
-    and slower.
+    Keys: space pauses or resumes, right and left publish the next or previous message, up and down
+    play faster or slower.
 
     Options can be written as for `rosbag play` or `ros2 bag play`, such as --topics /a /b. With
     --ros2, -x means --exclude-regex, -s means --storage, and -i names a dataset; with --ros1, -p

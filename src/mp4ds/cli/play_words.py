@@ -41,13 +41,13 @@ _REFUSED = {
     "--publish-service-requests": _NO_CALLS,
     "--service-requests-source": _NO_CALLS,
 }
-_FOREIGN = ("--bags", "--input", "--message-order", "--progress-bar-update-rate")
+_TRANSLATED = ("--bags", "--input", "--message-order", "--progress-bar-update-rate")
 
 
 def known_words() -> Collection[str]:
     """Options that are accepted but not shown by ``--help``."""
     letters = (name for found in _LETTERS.values() for name in found)
-    return {*_LISTS, *_IGNORED, *_REFUSED, *_FOREIGN, *letters, "--ros-args", "-r"}
+    return {*_LISTS, *_IGNORED, *_REFUSED, *_TRANSLATED, *letters, "--ros-args", "-r"}
 
 
 def spelled(
@@ -64,7 +64,7 @@ def spelled(
     """
     words, names = node_arguments(arguments, rules_of=("--remap", "-m"))
     flavour = "ros1" if "--ros1" in words else "ros2" if "--ros2" in words else ""
-    made = _Words(_split(words, _LETTERS.get(flavour, {})), takes_value)
+    made = _Translator(_split(words, _LETTERS.get(flavour, {})), takes_value)
     made.has_datasets = "--bags" in words
     result = [*made]
     if flavour == "ros2" and "--clock" in result and "--hz" not in result:
@@ -77,7 +77,7 @@ def _split(words: Sequence[str], letters: dict[str, str]) -> list[str]:
     made: list[str] = []
     for word in words:
         name, has_value, value = word.partition("=")
-        if name in (*_LISTS, *_IGNORED, *_FOREIGN, "--clock") and has_value:
+        if name in (*_LISTS, *_IGNORED, *_TRANSLATED, "--clock") and has_value:
             made += [name, value]
         elif word[:2] in letters and not word.startswith("--"):
             made += [letters[word[:2]], *filter(None, [word[2:]])]
@@ -86,20 +86,20 @@ def _split(words: Sequence[str], letters: dict[str, str]) -> list[str]:
     return made
 
 
-class _Words:
+class _Translator:
     """Iterates over arguments, translated to those of this command."""
 
     def __init__(self, words: list[str], takes_value: Callable[[str], bool]) -> None:
-        self._left = words[::-1]
+        self._rest = words[::-1]
         self._takes_value = takes_value
         self.has_datasets = False
 
     def __iter__(self) -> Iterator[str]:
-        while self._left:
-            word = self._left.pop()
+        while self._rest:
+            word = self._rest.pop()
             if word == "--":
                 yield word
-                yield from self._left[::-1]
+                yield from self._rest[::-1]
                 return
             if word in _LISTS:
                 yield from self._list(word)
@@ -108,29 +108,29 @@ class _Words:
             elif word in _IGNORED:
                 for _ in range(_IGNORED[word]):
                     self._value(word)
-            elif word in _FOREIGN:
+            elif word in _TRANSLATED:
                 yield from self._foreign(word)
             elif word == "--clock":
                 yield word
-                if self._left and _NUMBER.fullmatch(self._left[-1]):
-                    yield from ("--hz", self._left.pop())
+                if self._rest and _NUMBER.fullmatch(self._rest[-1]):
+                    yield from ("--hz", self._rest.pop())
             else:
                 yield word
                 if word.startswith("-") and len(word) > 1:
-                    yield from [self._left.pop()] if self._left and self._takes_value(word) else []
+                    yield from [self._rest.pop()] if self._rest and self._takes_value(word) else []
                 else:
                     self.has_datasets = True
 
     def _value(self, option: str) -> str:
-        if not self._left:
+        if not self._rest:
             raise OptionError(f"{option} requires an argument.")
-        return self._left.pop()
+        return self._rest.pop()
 
     def _list(self, option: str) -> Iterator[str]:
         """Values up to the next option, or up to a dataset if none was given before."""
         name, is_first = _LISTS[option] or option, True
         ending = _EVENTS if "services" in option else ""
-        while is_first or (self._left and self._is_in_list(name, self._left[-1])):
+        while is_first or (self._rest and self._is_in_list(name, self._rest[-1])):
             value = self._value(option)
             if value.startswith("-"):
                 raise OptionError(f"{option} requires an argument.")
@@ -146,13 +146,13 @@ class _Words:
 
     def _foreign(self, option: str) -> Iterator[str]:
         if option == "--bags":
-            while self._left and not self._left[-1].startswith("-"):
-                yield self._left.pop()
+            while self._rest and not self._rest[-1].startswith("-"):
+                yield self._rest.pop()
         elif option == "--input":
             self.has_datasets = True
             yield self._value(option)
-            if self._left and self._left[-1] in STORAGES:
-                self._left.pop()
+            if self._rest and self._rest[-1] in STORAGES:
+                self._rest.pop()
         elif option == "--message-order":
             if (order := self._value(option)) != "received":
                 raise OptionError(

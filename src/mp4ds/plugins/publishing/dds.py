@@ -79,7 +79,7 @@ class DdsWriter:
     def write(self, payload: bytes | memoryview) -> None:
         """Write a message.
 
-        With keep_last, as players use it, it waits for nobody. With keep_all, it waits until
+        With keep_last, which players use, it does not wait. With keep_all, it waits until
         subscribers have most of the messages; the library would do that while holding the GIL.
         """
         from cyclonedds.core import DDSException
@@ -409,7 +409,7 @@ class DdsPublisher:
         self._listener.hear(reader, lambda sample: on_time(_time_of(sample.payload)))
 
     def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
-        """Call back for each message of others on a topic, as soon as it has a publisher."""
+        """Call back for each message of other nodes on a topic, as soon as it has a publisher."""
         name = dds_topic(topic)
         if name is None:
             raise OptionError(f"{topic!r} is not a valid ROS 2 topic name.")

@@ -320,7 +320,7 @@ _TYPE_PATIENCE = 2_000_000_000  # ns to wait for another participant to describe
 
 
 class DdsListener:
-    """Calls back for each message of others, from a thread that runs until `close`.
+    """Calls back for each message of other nodes, from a thread that runs until `close`.
 
     The library's own listeners are not used: they would wait for the GIL while it is held by a
     write that waits for the very thread they run on.

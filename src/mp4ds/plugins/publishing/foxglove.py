@@ -419,7 +419,7 @@ class FoxglovePublisher:
         self._sending = threading.Lock()
         self._sent_at = 0.0
         self._is_closed = False
-        self._teller = PlaybackReporter(self._sdk.websocket, can_control=span is not None)
+        self._reporter = PlaybackReporter(self._sdk.websocket, can_control=span is not None)
         self._gate = self._opened((FOXGLOVE_ORIGIN, *origins))
         self._port = self._gate.port
         try:
@@ -428,7 +428,7 @@ class FoxglovePublisher:
             self._gate.close()
             raise
         self._gate.open(self._server.port)
-        self._teller.start(self._server)
+        self._reporter.start(self._server)
 
     def _opened(self, origins: Sequence[str]) -> Gate:
         try:
@@ -452,7 +452,7 @@ class FoxglovePublisher:
             tls_key=self._gate.key,
             context=self._context,
             capabilities=[capability.Time],
-            server_listener=_Listener(self, self._teller),
+            server_listener=_Listener(self, self._reporter),
             playback_time_range=span,
             message_backlog_size=backlog,
         )
@@ -507,7 +507,7 @@ class FoxglovePublisher:
             raise PublishError(self.address, "the server was closed")
         if outlet.kept is None:
             # a latched message from the past must not set back the time
-            self._teller.reach(time_ns)
+            self._reporter.reach(time_ns)
         if outlet.kept is None and not outlet.announced.has_sinks():
             return
         data = payload if isinstance(payload, bytes) else bytes(payload)
@@ -545,11 +545,11 @@ class FoxglovePublisher:
         Times that Foxglove does not have are sent as the nearest that it has.
         """
         if not self._is_closed:
-            self._teller.clock(time_ns)
+            self._reporter.clock(time_ns)
 
     def serve(self, controls: Controls) -> None:
         """Let clients control the player, if the recording's span was given."""
-        self._teller.serve(controls)
+        self._reporter.serve(controls)
 
     # ------------------------------------------------------------ unsupported, and the end
 
@@ -592,7 +592,7 @@ class FoxglovePublisher:
             if has_subscribers:
                 time.sleep(max(0.0, self._sent_at + _LINGER_S - time.monotonic()))
         finally:
-            self._teller.close()
+            self._reporter.close()
             # in a thread: the SDK waits forever for a client that receives nothing
             stopper = threading.Thread(target=self._server.stop, name="foxglove stop", daemon=True)
             stopper.start()
@@ -618,9 +618,9 @@ class _Outlet:
 class _Listener:
     """The SDK's callbacks, called from threads of its own."""
 
-    def __init__(self, publisher: FoxglovePublisher, teller: PlaybackReporter) -> None:
+    def __init__(self, publisher: FoxglovePublisher, reporter: PlaybackReporter) -> None:
         self._publisher = publisher
-        self._teller = teller
+        self._reporter = reporter
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
         self._publisher.on_subscribe(client.id, channel.id)
@@ -629,7 +629,7 @@ class _Listener:
         self._publisher.on_unsubscribe(client.id, channel.id)
 
     def on_playback_control_request(self, playback_control_request: Any) -> Any:
-        return self._teller.on_request(playback_control_request)
+        return self._reporter.on_request(playback_control_request)
 
 
 def _check(port: int, span: tuple[int, int] | None, backlog: int) -> None:

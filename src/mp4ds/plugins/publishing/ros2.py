@@ -202,7 +202,7 @@ class RclpyPublisher:
         end = time.monotonic() + self._parting_s
         if self._context.ok():
             for publisher in self._writers:
-                left = end - time.monotonic()  # infinite is told by a negative one
+                left = end - time.monotonic()  # rclpy takes a negative one for infinite
                 left = -1.0 if math.isinf(left) else max(0.0, left)
                 publisher.wait_for_all_acked(Duration(seconds=left))
         self._ended.set()
