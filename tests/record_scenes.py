@@ -13,10 +13,11 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.protocols import Format
-from mp4ds.plugins.recording.record import RecordOptions, open_recorder
+from mp4ds.plugins.recording.record import RecordOptions, RecordSummary, open_recorder
 from mp4ds.plugins.recording.source import RecorderControls, SourceState, Wanted
 from mp4ds.records import Message
 
@@ -71,6 +72,14 @@ class PlayedSource:
 
     def close(self) -> None:
         pass
+
+
+def recorded(source: PlayedSource, target: Path, **options: Any) -> RecordSummary:
+    with open_recorder(
+        (), target, RecordOptions(**{"all": True, **options}), source=source
+    ) as recorder:
+        source.stop = recorder.stop
+        return recorder.run()
 
 
 def _main(recording: str, dataset: str, rate: str) -> None:

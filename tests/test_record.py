@@ -30,12 +30,11 @@ from mp4ds.plugins.publishing.names import NodeNames
 from mp4ds.plugins.recording.record import (
     Recorder,
     RecordOptions,
-    RecordSummary,
     open_recorder,
 )
 from mp4ds.plugins.recording.source import SourceOptions, Wanted
 from mp4ds.records import Message
-from record_scenes import PlayedSource
+from record_scenes import PlayedSource, recorded
 from scenes import Scene, scene
 from sources import SOURCES
 from test_bad_input import call
@@ -49,14 +48,6 @@ def write(folder: Path, source: str = "bag-none", of: Scene | None = None) -> li
     (folder / "source").mkdir()
     made = of or scene("bayer_rggb8", frames=40)
     return SOURCES[source](folder / "source", replace(made, silent={}))  # nobody hears of those
-
-
-def recorded(source: PlayedSource, target: Path, **options: Any) -> RecordSummary:
-    with open_recorder(
-        (), target, RecordOptions(**{"all": True, **options}), source=source
-    ) as recorder:
-        source.stop = recorder.stop
-        return recorder.run()
 
 
 def again(dataset: Path, folder: Path, to: str | None = None) -> Path:
@@ -187,7 +178,7 @@ def test_one_that_may_not_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     told = call("record", "--ros1", "-o", "", "-a", "--no-progress")
     assert opened.kind == "ros1"
     assert told.code == 130
-    found = re.search(r"is in (\S+/mp4ds_[\d_-]+\.recording): make a dataset", told.err)
+    found = re.search(r"pack --salvage \S+/mp4ds_[\d_-]+\.recording -o ", told.err)
     assert found, told.err
 
 
@@ -408,17 +399,6 @@ def test_files_that_are_torn(cut_off: tuple[list[Path], Path], tmp_path: Path) -
             mp4ds.pack(torn, made, PackOptions(salvage=True))
             found = assert_prefix(paths, made, tmp_path)
             assert set(found) <= {message.channel.topic for message in messages(paths)}
-
-
-def test_the_next_recording_recovers_the_last(
-    cut_off: tuple[list[Path], Path], tmp_path: Path
-) -> None:
-    paths, folder = cut_off
-    summary = recorded(PlayedSource(paths), tmp_path / "next")
-    assert summary.recovered == [tmp_path / "live"]
-    assert not folder.exists()
-    assert_prefix(paths, tmp_path / "live", tmp_path)
-    assert mp4ds.validate(tmp_path / "next", deep=True) == []
 
 
 def test_a_recording_that_is_being_made_is_left_alone(tmp_path: Path) -> None:

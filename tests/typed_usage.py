@@ -97,7 +97,7 @@ def recorded(dataset: Path) -> list[Path]:
     options = mp4ds.RecordOptions(to="ros2", exclude=["/rosout"], max_duration=600.0)
     summary: mp4ds.RecordSummary = mp4ds.record(["/cam*/*"], dataset, options, progress=use)
     counts: dict[str, int] = summary.dropped
-    use(counts, summary.lost, summary.recovered)
+    use(counts, summary.lost, summary.warnings)
     return [made.dataset for made in summary.datasets]
 
 

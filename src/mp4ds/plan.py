@@ -22,6 +22,7 @@ MAX_GOP = 100_000
 """Maximum key frame interval that may be asked for, frames."""
 
 _MAX_NAME = 100
+_STEM = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,119}")
 _RESERVED = {"dataset", "messages", "con", "prn", "aux", "nul"} | {
     f"{port}{number}" for port in ("com", "lpt") for number in range(10)
 }
@@ -228,3 +229,15 @@ class FileNames:
             name = f"{stem}-{number}"
         self._taken.add(name.casefold())
         return name, name != stem
+
+    def claim(self, stem: str) -> None:
+        """Take a stem that a file says another run gave a stream.
+
+        Raises:
+            ValueError: No run gives such a stem, or it is taken.
+        """
+        key = stem.casefold()
+        is_plain = _STEM.fullmatch(stem) and key.split(".")[0] not in _RESERVED
+        if not is_plain or key in self._taken:
+            raise ValueError(f"{stem[:_MAX_NAME]!r} is not the name of a stream's files")
+        self._taken.add(key)

@@ -16,6 +16,7 @@ from mp4ds.cli.output import complain, is_quiet, print_json, print_pack, say
 from mp4ds.cli.process import caught_signals, told_errors
 from mp4ds.cli.record_words import spelled
 from mp4ds.errors import OptionError
+from mp4ds.files.sources import salvage_command
 from mp4ds.plugins.recording.record import RecordOptions, open_recorder
 
 if TYPE_CHECKING:
@@ -93,10 +94,11 @@ def record(
         try:
             summary = recorder.run()
         except KeyboardInterrupt:  # asked twice, as launch files do when their time is over
-            left = " and ".join(map(str, recorder.unfinished)) or "no folder"
+            commands = "; ".join(map(salvage_command, recorder.unfinished))
             raise KeyboardInterrupt(
-                f"interrupted while finishing; what is missing is in {left}: make a dataset of it "
-                "by mp4ds pack --salvage"
+                f"interrupted before the recording was finished; recover it: {commands}"
+                if commands
+                else "interrupted; everything recorded is in datasets"
             ) from None
     if as_json:
         print_json(summary)
@@ -197,8 +199,6 @@ def _table(state: RecordProgress) -> Table:
 
 def print_record(summary: RecordSummary) -> None:
     """Tell what was recorded."""
-    for path in summary.recovered:
-        say(f"{path}: recovered from an interrupted recording")
     for made in summary.datasets:
         print_pack(made)
     for topic, count in summary.dropped.items():

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -47,9 +48,19 @@ JOURNAL_NAME = "journal.jsonl"
 """File of a folder in which a recording is being made, or was when it was cut off."""
 
 
+UNFINISHED = ".recording"
+"""What the name of such a folder ends with."""
+
+
 def is_unfinished(folder: Path) -> bool:
     """Whether a folder holds a recording that is being made, or was cut off."""
     return not remote(folder) and (folder / JOURNAL_NAME).is_file()
+
+
+def salvage_command(folder: Path) -> str:
+    """The command that makes a dataset of an unfinished recording."""
+    target = folder.with_suffix("") if folder.suffix == UNFINISHED else "DATASET"
+    return f"mp4ds pack --salvage {shlex.quote(str(folder))} -o {shlex.quote(str(target))}"
 
 
 def refuse_unfinished(folder: Path) -> None:
@@ -62,7 +73,7 @@ def refuse_unfinished(folder: Path) -> None:
         raise SourceError(
             folder,
             "is being recorded, or was cut off",
-            f"Make a dataset of it first: mp4ds pack --salvage {folder} -o DATASET.",
+            f"Make a dataset of it first: {salvage_command(folder)}",
         )
 
 

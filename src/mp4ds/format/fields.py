@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
@@ -101,6 +101,11 @@ def of_types(kind: type[T], values: Mapping[str, Any]) -> T:
     """
     adapter: TypeAdapter[T] = TypeAdapter(kind)
     return adapter.validate_python(values)
+
+
+def json_parser(shape: Any) -> Callable[[bytes], Any]:
+    """Reads JSON of one shape, such as ``tuple[str, Size]``; raises ValueError for any other."""
+    return TypeAdapter(shape, config=ConfigDict(strict=True)).validate_json
 
 
 # ---------------------------------------------------------------- columns

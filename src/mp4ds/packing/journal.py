@@ -11,23 +11,38 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 import threading
 from array import array
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import xxhash
 
+from mp4ds.bags.protocols import Format
 from mp4ds.errors import SourceError
 from mp4ds.files.outputs import lock
 from mp4ds.files.sources import JOURNAL_NAME
-from mp4ds.format.fields import FORMAT_VERSION, Model
+from mp4ds.format.fields import (
+    FORMAT_VERSION,
+    Base64,
+    Int64,
+    Model,
+    Profile,
+    Size,
+    Uint32,
+    Uint64,
+    decode_base64,
+    json_parser,
+)
 from mp4ds.format.models import ChannelModel, Header
 from mp4ds.packing.look import StreamKey
+from mp4ds.plan import FileNames
 from mp4ds.records import Channel, Message
+from mp4ds.video.codecs import CODECS
 from mp4ds.video.packets import packet_digest
 
 FRAME_COLUMNS = (
@@ -39,6 +54,7 @@ FRAME_COLUMNS = (
 ``seq`` and ``pts`` are 0 where its messages have none, the digest is 0 where the stream is lossy.
 """
 
+_ORDINAL = FRAME_COLUMNS.index("ordinal")
 _HASH_DIGITS = 8
 
 
@@ -141,14 +157,44 @@ def _dumped(model: Model) -> Any:
 
 # ---------------------------------------------------------------- reading
 
+_Moment = Size
+_SHAPES: Mapping[str, Any] = {
+    "begin": tuple[str, str, dict[str, str]],
+    "channel": tuple[str, int, ChannelModel],
+    "stream": tuple[str, str, int, StreamKey, Profile, bool, bool, bool, dict[str, Any]],
+    "header": tuple[str, str, Header],
+    "frame": tuple[
+        str, str, _Moment, _Moment, Uint32, Int64, Uint32, Int64, Size, Size, Int64, Size, Uint64
+    ],
+    "packet": tuple[str, str, Uint64],
+    "calibration": tuple[str, int, _Moment, _Moment, Uint32, Base64],
+    "pairs": tuple[str, list[tuple[int, int]]],
+    "verbatim": tuple[str, int, Size, str],
+}
+_PARSERS = {kind: json_parser(shape) for kind, shape in _SHAPES.items()}
+"""What the lines of a journal hold: whoever wrote it may have given them a checksum."""
+
+_KIND = re.compile(rb'\["([a-z]+)"')
+_MAX_LINE = 2**26
+
+
+class _Facts(Model):
+    """What the first line says of the recording."""
+
+    format: Format
+    profile: Literal["ros1", "ros2"]
+    quality: Profile
+
 
 @dataclass
 class Notes:
-    """What a journal says.
+    """What a journal says, as far as it can be read.
 
     Attributes:
         path: The journal.
         facts: See `Journal`.
+        end: Where reading stopped, bytes.
+        is_damaged: Whether there are more lines after that: then it was not just cut off.
         channels: By id.
         streams: In the order in which they began.
         headers: Of each stream, by its stem.
@@ -159,37 +205,47 @@ class Notes:
     """
 
     path: Path
-    facts: dict[str, str]
+    facts: _Facts
+    end: int = 0
+    is_damaged: bool = False
     channels: dict[int, Channel] = field(default_factory=dict)
     streams: list[StreamNote] = field(default_factory=list)
-    headers: dict[str, list[Header]] = field(default_factory=lambda: defaultdict(list))
+    headers: dict[str, list[Header]] = field(default_factory=dict)
     frames: dict[str, list[array[int]]] = field(default_factory=dict)
     packets: dict[str, array[int]] = field(default_factory=dict)
     pairs: dict[int, int] = field(default_factory=dict)
     verbatim: dict[int, list[tuple[int, str]]] = field(default_factory=lambda: defaultdict(list))
+    _names: FileNames = field(default_factory=FileNames)
 
     @classmethod
     def read(cls, path: Path) -> Notes:
-        """Read a journal up to its end, or to the line that was being written.
+        """Read a journal up to its end, or to the first line that is damaged or incomplete.
 
         Raises:
-            SourceError: It is being written, is none, or another version's.
+            SourceError: It is being written, is not a journal, or of another version, or a line
+                makes no sense.
         """
         try:
             lines = _lines(path)
-            first = next(lines, None)
+            _, first = next(lines, (0, None))
             if not first or first[0] != "begin" or first[1] != FORMAT_VERSION:
                 raise SourceError(
                     path,
                     "is damaged at its beginning, or of another version of mp4ds",
                     "Use the version that made the recording.",
                 )
-            notes = cls(path, first[2])
-            for values in lines:
+            notes = cls(path, _Facts.model_validate(first[2]))
+            for end, values in lines:
+                if values is None:
+                    break
                 notes._take(*values)
+                notes.end = end
+            notes.is_damaged = any(values is not None for _, values in lines)
             return notes
         except BlockingIOError:
-            raise SourceError(path.parent, "is being recorded", "Wait, or stop that.") from None
+            raise SourceError(
+                path.parent, "is being recorded", "Wait, or stop the recorder."
+            ) from None
         except SourceError:
             raise
         except (ValueError, TypeError, LookupError):
@@ -197,47 +253,70 @@ class Notes:
 
     def calibrations(self) -> Iterator[Message]:
         """The calibrations, in the order in which they came."""
-        for kind, *values in _lines(self.path):
-            if kind == "calibration":
-                number, log_time, publish_time, sequence, data = values
-                payload = base64.b64decode(data)
-                yield Message(self.channels[number], log_time, publish_time, sequence, payload)
+        for _, values in _lines(self.path):
+            if values is None:
+                return
+            if values[0] == "calibration":
+                yield self._calibration(*values[1:])
+
+    def _calibration(
+        self, channel: int, log_time: int, publish_time: int, sequence: int, data: str
+    ) -> Message:
+        payload = decode_base64(data)
+        return Message(self.channels[channel], log_time, publish_time, sequence, payload)
 
     def _take(self, kind: str, *values: Any) -> None:
         if kind == "frame":
-            for column, value in zip(self.frames[values[0]], values[1:], strict=True):
+            stem, *columns = values
+            *_, variant, ordinal, _, _, _ = columns
+            earlier = self.frames[stem][_ORDINAL]
+            if variant >= len(self.headers[stem]) or (earlier and ordinal <= earlier[-1]):
+                raise ValueError(kind)
+            for column, value in zip(self.frames[stem], columns, strict=True):
                 column.append(value)
         elif kind == "packet":
             self.packets[values[0]].append(values[1])
         elif kind == "header":
-            self.headers[values[0]].append(Header.model_validate(values[1]))
+            self.headers[values[0]].append(values[1])
         elif kind == "verbatim":
             channel, ordinal, reason = values
-            self.verbatim[channel].append((ordinal, reason))
+            self.verbatim[self.channels[channel].id].append((ordinal, reason))
         elif kind == "channel":
-            self.channels[values[0]] = ChannelModel.model_validate(values[1]).to_record(values[0])
+            self.channels[values[0]] = values[1].to_record(values[0])
         elif kind == "stream":
-            stem, channel, key, *rest = values
-            self.streams.append(StreamNote(stem, channel, StreamKey(**key), *rest))
-            self.frames[stem] = [array("Q" if n == "digest" else "q") for n in FRAME_COLUMNS]
-            self.packets[stem] = array("Q")
+            note = StreamNote(*values)
+            self._names.claim(note.stem)
+            if note.channel not in self.channels or note.video["codec"] not in CODECS:
+                raise ValueError(kind)
+            self.streams.append(note)
+            self.headers[note.stem] = []
+            self.frames[note.stem] = [array("Q" if n == "digest" else "q") for n in FRAME_COLUMNS]
+            self.packets[note.stem] = array("Q")
         elif kind == "pairs":
             self.pairs.update(values[0])
-        elif kind != "calibration":
+        elif kind == "calibration":
+            self._calibration(*values)  # it is read again when it is needed: there may be many
+        else:
             raise ValueError(kind)
 
 
-def _lines(path: Path) -> Iterator[list[Any]]:
-    """What the lines of a journal say, up to the first that is not whole.
+def _lines(path: Path) -> Iterator[tuple[int, tuple[Any, ...] | None]]:
+    """Where each line of a journal ends, and what it says; None for one that is not whole.
 
     Raises:
         BlockingIOError: It is being written.
+        ValueError: A line is whole, and makes no sense.
     """
+    end = 0
     with path.open("r+b") as file:
         lock(file)
-        for line in file:
+        while line := file.readline(_MAX_LINE):
+            end += len(line)
             text = line[_HASH_DIGITS + 1 :].rstrip(b"\n")
             digest = xxhash.xxh32_hexdigest(text).encode()
             if not line.endswith(b"\n") or line[:_HASH_DIGITS] != digest:
-                return
-            yield json.loads(text)
+                yield end, None
+            elif match := _KIND.match(text):
+                yield end, _PARSERS[match[1].decode()](text)
+            else:
+                raise ValueError(text[:20])

@@ -27,7 +27,13 @@ from mp4ds.errors import (
     WriteError,
 )
 from mp4ds.files.outputs import check_target, digest_file, staged
-from mp4ds.files.sources import is_unfinished, source_digest, source_size, unchanged
+from mp4ds.files.sources import (
+    is_unfinished,
+    salvage_command,
+    source_digest,
+    source_size,
+    unchanged,
+)
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.sidecars import MANIFEST_NAME, load_about, load_manifest, load_stream
 from mp4ds.messages.serializations import is_camera
@@ -269,14 +275,15 @@ def _recovered(paths: Sequence[Path], target: Path, options: PackOptions) -> Pac
     """The dataset of a recording that was cut off while `mp4ds record` made it."""
     from mp4ds.packing.recovery import recover
 
+    folder = next(filter(is_unfinished, paths))
     usual = replace(_USUAL, salvage=True, force=options.force, about=options.about)
     if len(paths) > 1 or replace(options, quality=None) != usual:
         raise OptionError(
-            f"{paths[0]} was being recorded when it was cut off. Make a dataset of it first: mp4ds "
-            f"pack --salvage {paths[0]} -o DATASET, and pack that."
+            f"{folder} was being recorded when it was cut off. Make a dataset of it first, and "
+            f"pack that: {salvage_command(folder)}"
         )
     about = load_about(options.about) if options.about is not None else None
-    return recover(paths[0], target, force=options.force, about=about)
+    return recover(folder, target, force=options.force, about=about)
 
 
 def _copied(

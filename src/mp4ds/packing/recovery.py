@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import stat
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,8 +19,10 @@ from mp4ds.bags.mcap_write import McapWriter
 from mp4ds.bags.protocols import Format, write_record
 from mp4ds.bags.salvage.losses import losses_of
 from mp4ds.bags.salvage.mcap import McapSalvage
+from mp4ds.dataset.checks import validate
 from mp4ds.dataset.rebuild import columns_model
-from mp4ds.files.outputs import begins_with, staged
+from mp4ds.errors import Mp4dsError, SourceError
+from mp4ds.files.outputs import begins_with, is_mine, staged
 from mp4ds.files.sources import JOURNAL_NAME
 from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.format.manifest import About
@@ -42,6 +46,7 @@ from mp4ds.records import Channel, Loss, Message
 from mp4ds.video.packets import copy_fragments
 
 CUT_OFF = "the recording was cut off; what came in its last two seconds may be missing"
+DAMAGED = "damaged here; frames recorded after this cannot be recovered"
 CUT_OFF_AS_IT_WAS = "stored as it was when the recording was cut off"
 
 
@@ -50,26 +55,73 @@ def recover(
 ) -> PackSummary:
     """Make the dataset of a recording that was cut off; nothing is encoded anew.
 
+    The folder may come from anybody: what its journal says is checked, and what belongs to another
+    user is not read.
+
     Args:
         folder: Where the recording was made; it stays as it is.
         target: The dataset.
         force: Replace an existing one.
-        about: What is told of the recording.
+        about: Description of the recording.
 
     Raises:
-        SourceError: It is being recorded, or its journal is damaged.
+        SourceError: It is being recorded, its journal is damaged, or it belongs to another user.
         TargetError: The dataset may not be written there.
         WriteError: The disk refused.
     """
-    notes = Notes.read(folder / JOURNAL_NAME)
+    if not is_mine(folder.stat(), folder.absolute().parent):
+        raise _foreign(folder)
+    files = _Files(folder)
+    notes = Notes.read(files.at(JOURNAL_NAME))
     with staged(target, force=force, owned=dataset_files, sources=[folder]) as made:
         made.mkdir()
-        part = _Recovery(folder, made, notes).run()
-        recorded = _Recorded(notes.facts["format"], notes.facts["profile"])  # type: ignore[arg-type]
-        origin = Origin(about=about)
-        write_manifest(part, recorded, origin, notes.facts["quality"])
-        source_bytes = sum(path.stat().st_size for path in folder.iterdir())
-        return summarize(part, target, source_bytes, origin)
+        origin, facts = Origin(about=about), notes.facts
+        try:
+            part = _Recovery(files, made, notes).run()
+            recorded = _Recorded(facts.format, facts.profile)
+            write_manifest(part, recorded, origin, facts.quality)
+            problems = validate(made)
+        except Mp4dsError:
+            raise
+        except ValueError:  # a model refused what the journal says
+            raise SourceError(notes.path, "is damaged") from None
+        if problems:
+            raise SourceError(notes.path, f"is damaged: {problems[0].message}")
+        return summarize(part, target, files.bytes, origin)
+
+
+class _Files:
+    """The files of the folder that are read.
+
+    Args:
+        folder: Their folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.bytes = 0
+        self._folder = folder
+
+    def at(self, name: str) -> Path:
+        """The path of a file, which need not exist.
+
+        Raises:
+            SourceError: It is not an ordinary file of this user.
+        """
+        path = self._folder / name
+        if os.path.lexists(path):
+            found = path.lstat()
+            if not stat.S_ISREG(found.st_mode):
+                problem = "is a symbolic link" if path.is_symlink() else "is not a regular file"
+                raise SourceError(path, problem, "Put the recorder's own file in its place.")
+            if not is_mine(found, self._folder):
+                raise _foreign(path)
+            self.bytes += found.st_size
+        return path
+
+
+def _foreign(path: Path) -> SourceError:
+    remedy = "If you trust it, salvage a copy of the folder that you own."
+    return SourceError(path, "belongs to another user", remedy)
 
 
 @dataclass(frozen=True)
@@ -94,8 +146,8 @@ class _Stream:
 class _Recovery:
     """See `recover`."""
 
-    def __init__(self, folder: Path, made: Path, notes: Notes) -> None:
-        self._folder = folder
+    def __init__(self, files: _Files, made: Path, notes: Notes) -> None:
+        self._files = files
         self._notes = notes
         self._part = PartRecord(made)
         self._by_identity = {channel.identity: channel for channel in notes.channels.values()}
@@ -107,7 +159,7 @@ class _Recovery:
         for channel in self._by_identity.values():
             part.topic(channel)
         streams = [stream for note in self._notes.streams if (stream := self._stream(note))]
-        with McapWriter(part.messages_path, profile=self._notes.facts["profile"]) as writer:
+        with McapWriter(part.messages_path, profile=self._notes.facts.profile) as writer:
             self._copy(writer)
             self._calibrate(streams, writer)
             in_videos = {stream.channel.id for stream in streams}
@@ -118,6 +170,9 @@ class _Recovery:
             self._number([item for item in streams if item.channel.id == channel.id], channel)
         part.streams = [self._finished(stream) for stream in streams]
         end = part.span[1] if part.span else None
+        if self._notes.is_damaged:
+            size = self._notes.path.stat().st_size - self._notes.end
+            part.losses.append(Loss(JOURNAL_NAME, self._notes.end, size, DAMAGED, start=end))
         part.losses.append(Loss(JOURNAL_NAME, None, None, CUT_OFF, start=end))
         return part
 
@@ -126,7 +181,7 @@ class _Recovery:
         noted = self._notes.frames[note.stem]
         values = {name: np.array(column) for name, column in zip(FRAME_COLUMNS, noted, strict=True)}
         name = f"{note.stem}.mp4"
-        source, target = self._folder / name, self._part.folder / name
+        source, target = self._files.at(name), self._part.folder / name
         packets, ticks = self._notes.packets[note.stem], values["tick"].tolist()
         frames = copy_fragments(source, note.video["codec"], ticks, packets, target)
         if not frames:
@@ -142,7 +197,7 @@ class _Recovery:
 
     def _copy(self, writer: McapWriter) -> None:
         """The messages that were kept as they came; calibrations are taken from the journal."""
-        path, part = self._folder / MESSAGES_NAME, self._part
+        path, part = self._files.at(MESSAGES_NAME), self._part
         if not (path.is_file() and path.stat().st_size and begins_with(path, MAGIC)):
             return  # nothing of it reached the disk
         transforms = TransformCollector()
@@ -193,6 +248,8 @@ class _Recovery:
         unnoted = range(end, end + max(0, count - len(noted)))
         kept = np.array([*(ordinal for ordinal, _ in noted[:count]), *unnoted], np.int64)
         there = np.sort(np.concatenate([kept, *(one.columns["ordinal"] for one in streams)]))
+        if not np.all(there[1:] > there[:-1]):
+            raise SourceError(self._notes.path, f"is damaged: {channel.topic} has a message twice")
         for stream in streams:
             stream.columns["ordinal"] = np.searchsorted(there, stream.columns["ordinal"])
         topic, places = self._part.topic(channel), np.searchsorted(there, kept).tolist()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import threading
 import time
 from collections import Counter
@@ -12,10 +11,9 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 
-from mp4ds.dataset.checks import validate
-from mp4ds.errors import Mp4dsError, OptionError, RecordError, TargetExistsError, WriteError
+from mp4ds.errors import Mp4dsError, OptionError, RecordError, TargetError, WriteError
 from mp4ds.files.outputs import check_target, move_into_place, sync, work_folder
-from mp4ds.files.sources import JOURNAL_NAME, is_unfinished
+from mp4ds.files.sources import JOURNAL_NAME, UNFINISHED, is_unfinished, salvage_command
 from mp4ds.format.manifest import About
 from mp4ds.format.sidecars import load_about
 from mp4ds.options import Options, argument, force, option, parse_size
@@ -32,7 +30,6 @@ from mp4ds.packing.manifest import (
 from mp4ds.packing.options import PackSummary
 from mp4ds.packing.packer import PartSettings
 from mp4ds.packing.planning import available_cores
-from mp4ds.packing.recovery import recover
 from mp4ds.packing.tracks import StreamSettings
 from mp4ds.plan import LOSSLESS, MAX_GOP, Selection, parse_quality
 from mp4ds.plugins.playing.timeline import quick_switches
@@ -41,9 +38,6 @@ from mp4ds.plugins.publishing.publisher import sourced
 from mp4ds.plugins.recording.source import Source, SourceOptions, Wanted, open_source
 from mp4ds.records import Message
 from mp4ds.video.codecs import LOSSLESS_GOP, LOSSY_GOP, check_codec
-
-UNFINISHED = ".recording"
-"""What the name of a folder ends with in which a recording is made."""
 
 _NS = 1_000_000_000
 _REPORT_S = 0.2
@@ -168,7 +162,6 @@ class RecordSummary:
         seconds: How long it took.
         dropped: Messages for which there was no memory, by topic.
         lost: Messages that the middleware says it lost, by topic.
-        recovered: Datasets made of recordings that were cut off earlier.
         warnings: Sentences.
     """
 
@@ -176,7 +169,6 @@ class RecordSummary:
     seconds: float = 0.0
     dropped: dict[str, int] = field(default_factory=dict)
     lost: dict[str, int] = field(default_factory=dict)
-    recovered: list[Path] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
 
@@ -374,7 +366,8 @@ class Recorder:
             return self._run()
 
     def _run(self) -> RecordSummary:
-        summary = RecordSummary(recovered=self._recover())
+        summary = RecordSummary()
+        self._warn_of_unfinished()
         begun = time.monotonic()
         self._begin_split()
         try:
@@ -476,21 +469,14 @@ class Recorder:
             lost=self._source.state.lost[topic],
         )
 
-    def _recover(self) -> list[Path]:
-        """Make datasets of the recordings beside this one that were cut off."""
-        made = []
+    def _warn_of_unfinished(self) -> None:
+        """Name recordings beside this one that were interrupted, or are being made."""
         for folder in sorted(self._target.parent.glob(f"*{UNFINISHED}")):
-            target = folder.with_name(folder.name.removesuffix(UNFINISHED))
-            if not is_unfinished(folder) or target.exists():
-                continue
-            with suppress(
-                Mp4dsError, OSError
-            ):  # another recorder is at work, or `pack` tells why not
-                recover(folder, target)
-                if not validate(target):
-                    shutil.rmtree(folder)
-                made.append(target)
-        return made
+            if is_unfinished(folder):
+                self._source.state.warnings[
+                    f"{folder}: is an unfinished recording. Unless it is still being recorded, "
+                    f"recover it: {salvage_command(folder)}"
+                ] = None
 
 
 class _Split:
@@ -517,7 +503,11 @@ class _Split:
         try:
             self.folder.mkdir()
         except FileExistsError:
-            raise TargetExistsError(self.folder) from None
+            raise TargetError(
+                self.folder,
+                "already exists, since a recording of this name is unfinished",
+                f"Choose another name, or recover that first: {salvage_command(self.folder)}",
+            ) from None
         except OSError as error:
             raise WriteError(target, error) from None
         facts = {"format": source.format, "profile": source.profile}
@@ -567,7 +557,10 @@ class _Split:
         try:
             part = self._packer.run()
             if self._is_spare and not part.counts:
-                shutil.rmtree(self.folder)
+                for path in (part.messages_path, self._journal.path):
+                    path.unlink()
+                with suppress(OSError):  # it holds what others put there
+                    self.folder.rmdir()
                 return
             origin = Origin(about=self._about)
             write_manifest(part, self._recording, origin, self._profile)
