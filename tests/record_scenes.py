@@ -10,7 +10,8 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ class PlayedSource:
         paths: The recording.
         rate: Times the recorded speed; None for as fast as they are read.
         before: Called before each message, by its number.
+        altered: What messages of a topic become, by their number in the topic.
     """
 
     address = "a recording"
@@ -39,12 +41,14 @@ class PlayedSource:
         *,
         rate: float | None = None,
         before: Callable[[int], object] = lambda number: None,
+        altered: Mapping[str, Callable[[Message, int], Message]] = {},
     ) -> None:
         self.state = SourceState()
         self.stop: Callable[[], None] = lambda: None
         self._paths = list(paths)
         self._rate = rate
         self._before = before
+        self._altered = altered
         with open_sources(self._paths) as reader:
             self.format: Format = reader.format
             self.profile = reader.profile
@@ -54,6 +58,7 @@ class PlayedSource:
 
     def _play(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
         begun, first = time.monotonic(), None
+        counts: Counter[str] = Counter()
         with open_sources(self._paths) as reader:
             for number, record in enumerate(reader.records()):
                 if not isinstance(record, Message) or not wanted(record.channel.topic):
@@ -63,8 +68,11 @@ class PlayedSource:
                 if self._rate:
                     due = begun + (record.log_time - first) / 1e9 / self._rate
                     time.sleep(max(0.0, due - time.monotonic()))
-                self.state.topics[record.channel.topic] = None
-                take(replace(record, data=bytes(record.data)))
+                topic = record.channel.topic
+                self.state.topics[topic] = None
+                alter = self._altered.get(topic, lambda message, number: message)
+                take(alter(replace(record, data=bytes(record.data)), counts[topic]))
+                counts[topic] += 1
         self.stop()
 
     def serve(self, controls: RecorderControls) -> None:

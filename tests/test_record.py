@@ -308,6 +308,39 @@ def test_a_buffer_that_is_full(tmp_path: Path) -> None:
     assert intake.received == {message.channel.topic: 5}
 
 
+@each("field", ["log_time", "publish_time"])
+def test_times_that_no_recording_can_hold(
+    field: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such messages are left out and counted; the others are recorded."""
+    paths = write(tmp_path, of=scene("mono8", frames=20))
+    times = {
+        3: -1,
+        5: 2**63,
+        7: 2**64,
+        9: -(2**70),
+        11: 0,
+        13: 2**32 * 10**9,
+        15: 2**32 * 10**9 - 1,
+    }
+
+    def altered(message: Message, number: int) -> Message:
+        return replace(message, **{field: times[number]}) if number in times else message
+
+    monkeypatch.setattr("mp4ds.cli.output._quiet", False)
+    source = PlayedSource(paths, altered={"/cam/image_raw": altered, "/imu": altered})
+    Opened(source, monkeypatch)
+    told = call("record", "--ros1", "-a", "-o", tmp_path / "live", "--no-progress")
+    assert told.code == 1
+    why = "their log time is negative or too large"
+    for topic in ("/cam/image_raw", "/imu"):
+        assert f"{topic}: 5 messages left out: {why}" in told.out
+    assert mp4ds.validate(tmp_path / "live", deep=True) == []
+    with mp4ds.open(tmp_path / "live") as dataset:
+        assert len(dataset["/cam/image_raw"]) == 15
+    shutil.rmtree(tmp_path / "live")
+
+
 def messages(paths: list[Path]) -> Iterator[Message]:
     with open_sources(paths) as reader:
         for record in reader.records():

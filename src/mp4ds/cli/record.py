@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 _LOG_S = 10.0
 _SHOWN = 20  # topics
+_UNTIMED = "their log time is negative or too large"
 
 
 class RecordCommand(NodeCommand):
@@ -104,7 +105,7 @@ def record(
         print_json(summary)
     else:
         print_record(summary)
-    if summary.dropped or summary.lost:
+    if summary.dropped or summary.lost or summary.untimed:
         raise typer.Exit(1)
 
 
@@ -135,6 +136,7 @@ def record_progress(*, is_quiet: bool) -> Iterator[Callable[[RecordProgress], No
                     "images arrive faster than they can be encoded: storing them as received",
                 ),
                 (item.lost, "the middleware is losing messages"),
+                (item.untimed, f"leaving out messages: {_UNTIMED}"),
             ):
                 if count and (line := f"{topic}: {what}") not in told:
                     told.add(line)
@@ -182,7 +184,7 @@ def _table(state: RecordProgress) -> Table:
         table.add_column(name, justify="left" if name == "topic" else "right")
     busiest = sorted(state.topics.items(), key=lambda item: -item[1].bytes_per_s)
     for topic, item in busiest[:_SHOWN]:
-        gone = item.dropped + item.lost
+        gone = item.dropped + item.lost + item.untimed
         share = f"{100 * item.verbatim / item.messages:.0f} %" if item.verbatim else ""
         table.add_row(
             Text(topic),
@@ -205,3 +207,5 @@ def print_record(summary: RecordSummary) -> None:
         say(f"{topic}: {count} messages dropped, since the buffer was full")
     for topic, count in summary.lost.items():
         say(f"{topic}: {count} messages lost by the middleware")
+    for topic, count in summary.untimed.items():
+        say(f"{topic}: {count} messages left out: {_UNTIMED}")

@@ -27,6 +27,7 @@ from mp4ds.packing.journal import Journal
 from mp4ds.packing.manifest import PartRecord
 from mp4ds.packing.packer import TOO_LATE, Packer, PartSettings
 from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Record, Schema
+from mp4ds.times import INT64_MAX
 
 LATE_S = 0.5
 """Seconds that an image may wait for its encoder."""
@@ -42,13 +43,16 @@ class Intake:
 
     Args:
         most_bytes: Payloads that wait at most; beyond, the oldest messages are dropped and counted.
+        last_ns: The latest log or publish time that the recording can hold; the first one is 0.
     """
 
-    def __init__(self, most_bytes: int) -> None:
+    def __init__(self, most_bytes: int, last_ns: int = INT64_MAX) -> None:
         self.dropped: Counter[str] = Counter()
+        self.untimed: Counter[str] = Counter()  # with a time that no recording can hold
         self.received: Counter[str] = Counter()
         self.received_bytes: Counter[str] = Counter()
         self._most = most_bytes
+        self._last_ns = last_ns
         self._bytes = 0
         self._waiting: deque[Message] = deque()
         self._changed = threading.Condition()
@@ -72,6 +76,10 @@ class Intake:
                 return
             self.received[topic] += 1
             self.received_bytes[topic] += len(message.data)
+            times = message.log_time, message.publish_time
+            if min(times) < 0 or max(times) > self._last_ns:
+                self.untimed[topic] += 1
+                return
             while self._waiting and self._bytes + len(message.data) > self._most:
                 gone = self._waiting.popleft()
                 self._bytes -= len(gone.data)

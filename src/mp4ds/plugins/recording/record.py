@@ -37,10 +37,14 @@ from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import sourced
 from mp4ds.plugins.recording.source import Source, SourceOptions, Wanted, open_source
 from mp4ds.records import Message
+from mp4ds.times import INT64_MAX
 from mp4ds.video.codecs import LOSSLESS_GOP, LOSSY_GOP, check_codec
 
 _NS = 1_000_000_000
 _REPORT_S = 0.2
+_LAST_NS = {"ros1": 2**32 * _NS - 1, "ros2": INT64_MAX}
+"""The latest time that a bag, or a rosbag2, can hold."""
+
 _NODES = {"ros1": "record", "ros2": "rosbag2_recorder"}
 """Names of the nodes of ROS's own recorders."""
 
@@ -120,6 +124,7 @@ class TopicProgress:
         verbatim: Camera messages stored as received, not encoded.
         dropped: Messages dropped because the buffer was full.
         lost: Messages lost according to the middleware.
+        untimed: Messages left out because of their log time.
     """
 
     messages: int
@@ -128,6 +133,7 @@ class TopicProgress:
     verbatim: int
     dropped: int
     lost: int
+    untimed: int
 
 
 @dataclass(frozen=True)
@@ -162,6 +168,7 @@ class RecordSummary:
         seconds: How long it took.
         dropped: Messages for which there was no memory, by topic.
         lost: Messages that the middleware says it lost, by topic.
+        untimed: Messages left out because their log time is negative or too large, by topic.
         warnings: Sentences.
     """
 
@@ -169,6 +176,7 @@ class RecordSummary:
     seconds: float = 0.0
     dropped: dict[str, int] = field(default_factory=dict)
     lost: dict[str, int] = field(default_factory=dict)
+    untimed: dict[str, int] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
 
@@ -307,7 +315,7 @@ class Recorder:
         self._source = source
         self._about = about
         self._progress = progress
-        self._intake = Intake(options.buffer * 10**6)
+        self._intake = Intake(options.buffer * 10**6, _LAST_NS[source.profile])
         self._changed = threading.Event()
         self._is_stopped = False
         self._is_paused = options.start_paused
@@ -387,6 +395,7 @@ class Recorder:
         summary.seconds = time.monotonic() - begun
         summary.dropped = dict(self._intake.dropped)
         summary.lost = dict(self._source.state.lost)
+        summary.untimed = dict(self._intake.untimed)
         summary.warnings = list(self._source.state.warnings)
         return summary
 
@@ -467,6 +476,7 @@ class Recorder:
             verbatim=verbatim,
             dropped=self._intake.dropped[topic],
             lost=self._source.state.lost[topic],
+            untimed=self._intake.untimed[topic],
         )
 
     def _warn_of_unfinished(self) -> None:
