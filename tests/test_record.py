@@ -182,6 +182,17 @@ def test_one_that_may_not_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert found, told.err
 
 
+def test_nothing_to_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As ROS's own recorders do: a recording without messages, and that is no failure."""
+    monkeypatch.setattr("mp4ds.cli.output._quiet", False)
+    Opened(PlayedSource(write(tmp_path, of=scene("mono8", frames=2))), monkeypatch)
+    told = call("record", "--ros1", "-o", tmp_path / "live", "/nothing", "--no-progress")
+    assert told.code == 0, told
+    assert told.out == f"{tmp_path / 'live'}: empty: no matching topic was published\n"
+    assert mp4ds.validate(tmp_path / "live", deep=True) == []
+    assert again(tmp_path / "live", tmp_path).stat().st_size > 0
+
+
 @each(
     "options, said",
     [

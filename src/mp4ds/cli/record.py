@@ -202,7 +202,12 @@ def _table(state: RecordProgress) -> Table:
 def print_record(summary: RecordSummary) -> None:
     """Tell what was recorded."""
     for made in summary.datasets:
-        print_pack(made)
+        if any(topic.messages for topic in made.topics):
+            print_pack(made)
+            continue
+        topics = ", ".join(topic.topic for topic in made.topics)
+        why = f"no message came on {topics}" if topics else "no matching topic was published"
+        say(f"{made.dataset}: empty: {why}")
     for topic, count in summary.dropped.items():
         say(f"{topic}: {count} messages dropped, since the buffer was full")
     for topic, count in summary.lost.items():
