@@ -118,6 +118,25 @@ def test_a_recorder_that_is_killed(roscore: Core, tmp_path: Path) -> None:
             assert found == due[topic][: len(found)]
 
 
+def test_a_clock_that_starts_late(roscore: Core, tmp_path: Path) -> None:
+    """Nothing is recorded before its first time: no message has the time 0."""
+    bag = make_drive(tmp_path / "drive.bag")
+    roscore.run("rosparam", "set", "/use_sim_time", "true")
+    try:
+        recorder = ours(tmp_path / "live", "-a", "--exclude", "/rosout*")
+        recorded(roscore, tmp_path, [recorder], [PLAY, "-q", "--clock", "--delay", "4", str(bag)])
+    finally:
+        roscore.run("rosparam", "delete", "/use_sim_time")
+    assert "waiting for /clock" in (roscore.folder / "python.log").read_text()
+    with open_reader(bag) as reader:
+        due = [one.log_time for one in reader.records() if isinstance(one, Message)]
+    with mp4ds.open(tmp_path / "live") as dataset:
+        times = [one.log_time_ns for one in dataset.messages()]
+    assert times
+    assert min(due) <= min(times)
+    assert max(times) <= max(due) + 10**9
+
+
 def test_without_a_master(tmp_path: Path) -> None:
     if why := missing():
         pytest.skip(why)

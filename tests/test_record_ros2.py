@@ -168,6 +168,51 @@ def test_ros_renames_topics(side: Side) -> None:
     assert source.address.endswith(("rclpy as bag", "Cyclone DDS"))
 
 
+def test_nothing_is_recorded_before_the_clock(side: Side) -> None:
+    """As by `ros2 bag record`; what is latched still comes, with the clock's time."""
+    plain, latched = channel("/robot/name", STRING), channel("/robot/map", STRING, qos=LATCHED)
+    heard, clock = Heard(), 1_700_000_000 * 10**9
+    with side.open() as publisher:
+        for one in (plain, latched):
+            publisher.advertise(one)
+        publisher.publish(latched, message(STRING, 77), 0)
+        source = open_source("ros2", SourceOptions("recorder", use_sim_time=True, poll_s=0.01))
+        source.start(Wanted(("/robot/*",)), heard.take)
+        assert source.state.waiting_for == "/clock"
+        publisher.publish(plain, message(STRING, 1), 0)
+        publisher.clock(0)  # as simulators do at first: no time yet
+        publisher.publish(plain, message(STRING, 2), 0)
+        assert publisher.subscribers(plain) == 0
+
+        def arrives() -> bool:
+            publisher.clock(clock)
+            return bool(heard.payloads["/robot/map"]) and publisher.subscribers(plain) == 1
+
+        assert until(arrives)
+        assert source.state.waiting_for == ""
+        publisher.publish(plain, message(STRING, 3), 0)
+        assert until(lambda: heard.payloads["/robot/name"])
+        source.close()
+    assert [*map(padded, heard.payloads["/robot/map"])] == [padded(message(STRING, 77))]
+    assert [*map(padded, heard.payloads["/robot/name"])] == [padded(message(STRING, 3))]
+    assert {log for _, log in heard.times} == {clock}
+
+
+def test_the_clock_is_recorded_by_itself(side: Side) -> None:
+    heard, clock = Heard(), 1_700_000_000 * 10**9
+    with side.open() as publisher:
+        source = open_source("ros2", SourceOptions("recorder", use_sim_time=True, poll_s=0.01))
+        source.start(Wanted(), heard.take)
+
+        def arrives() -> bool:
+            publisher.clock(clock + len(heard.times))
+            return len(heard.payloads["/clock"]) > 3
+
+        assert until(arrives)
+        source.close()
+    assert {log for _, log in heard.times} <= {*range(clock, clock + 5)}
+
+
 def test_services(side: Side) -> None:
     """Those of rosbag2's recorder."""
     controls = Controls()

@@ -128,6 +128,9 @@ def record_progress(*, is_quiet: bool) -> Iterator[Callable[[RecordProgress], No
             if warning not in told:
                 told.add(warning)
                 complain(warning)
+        if state.state.startswith("waiting") and state.state not in told:
+            told.add(state.state)
+            complain(f"{state.state}: nothing is recorded before the first time (--use-sim-time)")
         for topic, item in state.topics.items():
             for count, what in (
                 (item.dropped, "dropping messages: the buffer is full (--buffsize)"),

@@ -97,7 +97,7 @@ class DdsSource:
     def start(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
         """See `Source.start`."""
         if self._options.use_sim_time:
-            self._sim_time_ns = 0
+            self.state.waiting_for = self._clock
         self._thread = threading.Thread(
             target=self._look, args=(wanted, take), name="topics", daemon=True
         )
@@ -125,10 +125,14 @@ class DdsSource:
             for endpoint in found.take(_BATCH):
                 if endpoint.sample_info.valid_data:
                     self._meet(endpoint, wanted)
+            is_waiting = bool(self.state.waiting_for)
             for name, topic in self._topics.items():
-                if topic.reader is None and time.monotonic() - topic.since > _SETTLE_S:
+                is_due = name == self._clock or not is_waiting
+                if is_due and topic.reader is None and time.monotonic() - topic.since > _SETTLE_S:
                     self._subscribe(name, topic, take)
                 self._count_lost(topic)
+            if is_waiting:
+                deadline = time.monotonic() + 2 * _SETTLE_S
             if poll_s is None and time.monotonic() > deadline:
                 return
 
@@ -139,7 +143,7 @@ class DdsSource:
         if is_bare or not ros_type(endpoint.type_name):
             return
         is_wanted = wanted(topic) and (self._options.hidden or not is_hidden(topic))
-        if is_wanted or (topic == self._clock and self._sim_time_ns is not None):
+        if is_wanted or (topic == self._clock and self._options.use_sim_time):
             met = _Topic(wanted.recorded_as(topic), time.monotonic(), is_wanted)
             known = self._topics.setdefault(topic, met)
             known.endpoints[endpoint.key] = endpoint
@@ -172,15 +176,18 @@ class DdsSource:
             topic.reader = False
             self.state.warnings[f"{name}: cannot be received: {error.msg}"] = None
             return
-        if name == self._clock and self._sim_time_ns is not None:
-            self._listener.hear(topic.reader, self._tick)
+        receive = told(self.state, name, partial(self._received, channel, take))
+        if name == self._clock and self._options.use_sim_time:
+            receive = partial(self._tick, receive if topic.is_wanted else None)
         if topic.is_wanted:
             self.state.topics[topic.recorded] = None
-            receive = told(self.state, name, partial(self._received, channel, take))
-            self._listener.hear(topic.reader, receive)
+        self._listener.hear(topic.reader, receive)
 
-    def _tick(self, sample: Any) -> None:
-        self._sim_time_ns = time_of(sample.payload)
+    def _tick(self, receive: Callable[[Any], None] | None, sample: Any) -> None:
+        if now := time_of(sample.payload):  # 0 is no time yet, for ROS
+            self._sim_time_ns, self.state.waiting_for = now, ""
+            if receive is not None:
+                receive(sample)
 
     def _received(self, channel: Channel, take: Callable[[Message], None], sample: Any) -> None:
         data = sample.payload

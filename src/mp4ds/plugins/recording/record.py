@@ -143,7 +143,7 @@ class RecordProgress:
     Attributes:
         dataset: That is being made.
         seconds: Since it began.
-        state: ``recording``, ``paused`` or ``finishing``.
+        state: ``recording``, ``paused``, ``finishing``, or the topic of the clock it waits for.
         topics: By name.
         waiting_bytes: Payloads that wait.
         bytes_written: Of this dataset.
@@ -384,6 +384,8 @@ class Recorder:
             while not self._is_stopped:
                 self._changed.wait(_REPORT_S)
                 self._changed.clear()
+                if self._source.state.waiting_for:
+                    begun = time.monotonic()
                 self._go_on(begun)
         finally:
             self._source.close()
@@ -411,7 +413,9 @@ class Recorder:
             self._begin_split()
         if self._options.duration and time.monotonic() - begun >= self._options.duration:
             self._is_stopped = True
-        self._report(begun, "paused" if self._is_paused else "recording")
+        clock = self._source.state.waiting_for
+        state = f"waiting for {clock}" if clock else "recording"
+        self._report(begun, "paused" if self._is_paused else state)
 
     def _begin_split(self) -> None:
         number = len(self._splits)

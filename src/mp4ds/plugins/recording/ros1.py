@@ -28,7 +28,7 @@ _RECEIVED_BYTES = 2**18
 _LEAST_POLL_S = 0.5
 """Seconds between questions to the master: it is asked over the network."""
 
-_DEAF = "the ROS master does not answer: new topics are not seen"
+_CLOCK_POLL_S = 0.01
 _DEAF = "the ROS master does not answer: new topics are not seen"
 _TIME = struct.Struct("<II")
 _CLOCK = "/clock"
@@ -63,12 +63,13 @@ class RospySource:
 
     def start(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
         """See `Source.start`."""
-        if self._options.use_sim_time or self._follows_clock():
-            self._sim_time_ns = 0
-            self._subscribe(self._options.names.renamed(_CLOCK), self._tick)
-        if not self._look(wanted, take):
+        is_simulated = self._options.use_sim_time or self._follows_clock()
+        if is_simulated:
+            self.state.waiting_for = self._options.names.renamed(_CLOCK)
+            self._subscribe(self.state.waiting_for, self._tick)
+        elif not self._look(wanted, take):
             raise PublishError(self.address, "the ROS master does not answer any more")
-        if self._options.poll_s is not None:
+        if self._options.poll_s is not None or is_simulated:
             self._thread = threading.Thread(
                 target=self._keep_looking, args=(wanted, take), name="topics", daemon=True
             )
@@ -81,9 +82,20 @@ class RospySource:
         return bool(self._rospy.get_param("/use_sim_time", False))
 
     def _keep_looking(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
-        while not self._ended.wait(max(self._options.poll_s or 0.0, _LEAST_POLL_S)):
+        while self.state.waiting_for:
+            if self._ended.wait(_CLOCK_POLL_S):
+                return
+        wait_s = 0.0 if self._sim_time_ns is not None else self._poll_s
+        while not self._ended.wait(wait_s):
             if not self._look(wanted, take):
                 self.state.warnings[_DEAF] = None
+            elif self._options.poll_s is None:
+                return
+            wait_s = self._poll_s
+
+    @property
+    def _poll_s(self) -> float:
+        return max(self._options.poll_s or 0.0, _LEAST_POLL_S)
 
     def _look(self, wanted: Wanted, take: Callable[[Message], None]) -> bool:
         """Subscribe to what is published and wanted; returns whether the master answered."""
@@ -111,7 +123,8 @@ class RospySource:
 
     def _tick(self, message: Any) -> None:
         sec, nsec = _TIME.unpack_from(message._buff)
-        self._sim_time_ns = sec * 10**9 + nsec
+        if now := sec * 10**9 + nsec:  # 0 is no time yet, for ROS
+            self._sim_time_ns, self.state.waiting_for = now, ""
 
     def _channel(self, topic: str, header: Mapping[str, str]) -> Channel:
         key = topic, tuple(sorted(header.items()))

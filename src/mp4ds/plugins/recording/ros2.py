@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import time
@@ -83,12 +84,13 @@ class RclpySource:
     def start(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
         """See `Source.start`."""
         if self._options.use_sim_time:
-            self._sim_time_ns = 0
-            clock, kind = self._options.names.renamed(CLOCK), message_class(CLOCK, CLOCK_TYPE)
+            self.state.waiting_for = self._options.names.renamed(CLOCK)
+            kind = message_class(CLOCK, CLOCK_TYPE)
             self._node.create_subscription(
-                kind, clock, self._tick, qos_profile(CLOCK_QOS), raw=True
+                kind, self.state.waiting_for, self._tick, qos_profile(CLOCK_QOS), raw=True
             )
-        self._look(wanted, take)
+        else:
+            self._look(wanted, take)
         self._thread = threading.Thread(
             target=self._spin, args=(wanted, take), name="mp4ds-rclpy", daemon=True
         )
@@ -101,14 +103,14 @@ class RclpySource:
     def _spin(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
         from rclpy.executors import ExternalShutdownException
 
-        poll_s = self._options.poll_s
-        next_look = time.monotonic() + (poll_s or 0.0)
+        every_s = math.inf if self._options.poll_s is None else self._options.poll_s
+        next_look = 0.0 if self.state.waiting_for else time.monotonic() + every_s
         try:
             while not self._ended.is_set() and self._context.ok():
                 self._executor.spin_once(timeout_sec=_SPIN_S)
-                if poll_s is not None and time.monotonic() >= next_look:
+                if not self.state.waiting_for and time.monotonic() >= next_look:
                     self._look(wanted, take)
-                    next_look = time.monotonic() + poll_s
+                    next_look = time.monotonic() + every_s
         except ExternalShutdownException:
             pass
 
@@ -169,7 +171,8 @@ class RclpySource:
         take(Message(channel, now, sent if sent > 0 else now, 0, raw))
 
     def _tick(self, raw: bytes) -> None:
-        self._sim_time_ns = time_of(raw)
+        if now := time_of(raw):  # 0 is no time yet, for ROS
+            self._sim_time_ns, self.state.waiting_for = now, ""
 
     def close(self) -> None:
         """See `Source.close`."""

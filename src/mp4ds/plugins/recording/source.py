@@ -88,11 +88,13 @@ class SourceState:
         lost: Messages that the middleware says it lost, by topic.
         warnings: Sentences to be shown once each.
         topics: Those that are subscribed to.
+        waiting_for: The clock without which nothing is recorded yet; empty once it runs.
     """
 
     lost: Counter[str] = field(default_factory=Counter)
     warnings: dict[str, None] = field(default_factory=dict)
     topics: dict[str, None] = field(default_factory=dict)
+    waiting_for: str = ""
 
 
 def told(state: SourceState, topic: str, receive: Callable[..., None]) -> Callable[..., None]:
@@ -156,6 +158,9 @@ class Source(Protocol):
 
     def start(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
         """Begin to receive, on threads of its own.
+
+        With a simulated time, as `ros2 bag record` does, it subscribes to nothing else until
+        /clock tells one: what came before would have no time, and what is latched still comes.
 
         Args:
             wanted: Which topics.
