@@ -35,7 +35,7 @@ from mp4ds.bags.rosbag2_metadata import parse_qos
 from mp4ds.errors import RemoteError
 from mp4ds.records import Channel, Message, Schema
 from remote_servers import web_server
-from test_bags_mcap import chunk, file_of
+from test_bags_mcap import channel_record, chunk, file_of, record
 
 MAX_SECONDS = 4.0
 MAX_MEMORY = 1000 * 2**20
@@ -72,9 +72,9 @@ def bounded(outcome: Outcome) -> Outcome:
 # ---------------------------------------------------------------- sqlite3
 
 
-def database(path: Path, *statements: str) -> Path:
+def database(path: Path, *statements: str, page_size: int = PAGE) -> Path:
     with closing(sqlite3.connect(path)) as connection, connection:
-        connection.execute(f"PRAGMA page_size = {PAGE}")
+        connection.execute(f"PRAGMA page_size = {page_size}")
         for statement in statements:
             connection.execute(statement)
     return path
@@ -446,8 +446,8 @@ def test_chunks_that_unpack_to_much(name: str, tmp_path: Path, jail: Jail) -> No
     assert bounded(jail.records(path, salvage=True)).problems
 
 
-def test_a_bag_that_unpacks_to_much(tmp_path: Path, jail: Jail) -> None:
-    path = tmp_path / "a.bag"
+def bag_of(path: Path, packed: bytes, size: int) -> None:
+    """A bag of one chunk of bz2 data."""
     channel = Channel(0, "/a", "ros1", Schema("a/A", "ros1msg", b"uint8[] x"), {"md5sum": "0" * 32})
     with Ros1Writer(path, compression="bz2") as writer:
         writer.add_channel(channel)
@@ -455,43 +455,142 @@ def test_a_bag_that_unpacks_to_much(tmp_path: Path, jail: Jail) -> None:
     data = path.read_bytes()
     at = data.index(b"size=")
     start = data.index(b"BZh") - 4
-    packed = bz2.compress(bytes(150 * 2**20))
     end = start + 4 + int.from_bytes(data[start : start + 4], "little")
-    size = struct.pack("<I", 150 * 2**20)
-    made = data[: at + 5] + size + data[at + 9 : start] + struct.pack("<I", len(packed)) + packed
+    said = struct.pack("<I", size)
+    made = data[: at + 5] + said + data[at + 9 : start] + struct.pack("<I", len(packed)) + packed
     made += data[end:]
     place = made.index(b"index_pos=") + 10
     index = int.from_bytes(made[place : place + 8], "little") + len(made) - len(data)
     path.write_bytes(made[:place] + struct.pack("<Q", index) + made[place + 8 :])
+
+
+def test_a_bag_that_unpacks_to_much(tmp_path: Path, jail: Jail) -> None:
+    path = tmp_path / "a.bag"
+    bag_of(path, bz2.compress(bytes(150 * 2**20)), 150 * 2**20)
     assert "declares 157286400 bytes but has" in bounded(jail.records(path)).text
     problems = bounded(jail.records(path, salvage=True)).problems
     assert any("unpacks to more than 134217728 bytes" in problem for problem in problems)
 
 
-@pytest.mark.parametrize("name", ["a.db3.zstd", "a.mcap.zstd"])
-def test_a_file_that_unpacks_to_much(name: str, tmp_path: Path, jail: Jail) -> None:
+def write_bag_info(folder: Path, name: str, mode: str) -> None:
+    storage = "sqlite3" if "db3" in name else "mcap"
+    (folder / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  version: 5\n"
+        f"  storage_identifier: {storage}\n  relative_file_paths: [{name}]\n"
+        f"  compression_format: zstd\n  compression_mode: {mode}\n"
+    )
+
+
+FILES = {
+    "a.db3.zstd": "it unpacks to more than 134217728 bytes, too many for its size",
+    "a.mcap.zstd": f"it declares {LARGE} bytes, over the limit of {512 * 2**20}",
+}
+
+
+@pytest.mark.parametrize(("name", "problem"), FILES.items())
+def test_a_file_that_unpacks_to_much(name: str, problem: str, tmp_path: Path, jail: Jail) -> None:
     suffix = name.partition(".")[2].removesuffix(".zstd")
     start = b"SQLite format 3\0"
     if suffix == "mcap":
         start = file_of()[:-50] + struct.pack("<BQ", 5, LARGE)
     packed = zstandard.compress(start) + zstd_bomb(LARGE, told=False)
     (tmp_path / name).write_bytes(packed)
-    storage = {"db3": "sqlite3"}.get(suffix, suffix)
-    (tmp_path / "metadata.yaml").write_text(
-        "rosbag2_bagfile_information:\n  version: 5\n"
-        f"  storage_identifier: {storage}\n  relative_file_paths: [{name}]\n"
-        "  compression_format: zstd\n  compression_mode: FILE\n"
-    )
+    write_bag_info(tmp_path, name, "FILE")
     outcome = bounded(jail.records(tmp_path))
-    assert "it unpacks to more than 134217728 bytes, too many for its size" in outcome.text
+    assert problem in outcome.text
     bounded(jail.records(tmp_path, salvage=True))
 
 
 def test_a_message_that_unpacks_to_much() -> None:
     for told in (True, False):
-        with pytest.raises(DamageError, match=r"declares|unpacks to more"):
+        with pytest.raises(DamageError, match=r"declares|unpacks to \d+, over the limit"):
             unzstd(zstd_bomb(2**30, told=told))
     assert unzstd(zstd_bomb(2**20, told=False)) == bytes(2**20)
+
+
+GIB = 2**30
+MESSAGE = channel_record(1, "/a") + struct.pack("<BQHIQQ", 5, 22 + GIB, 1, 0, 1, 1)
+
+
+def lz4_message() -> bytes:
+    machine = lz4.frame.LZ4FrameCompressor(block_size=lz4.frame.BLOCKSIZE_MAX4MB)
+    zeros = (machine.compress(bytes(2**22)) for _ in range(GIB // 2**22))
+    return b"".join([machine.begin(), machine.compress(MESSAGE), *zeros, machine.flush()])
+
+
+def zstd_message(start: bytes = MESSAGE) -> bytes:
+    """With blocks of 512 zeros, four bytes each."""
+    count = GIB // 512
+    head = b"\x28\xb5\x2f\xfd\0\x38" + struct.pack("<I", len(start) << 3)[:3] + start
+    zeros = struct.pack("<I", 512 << 3 | 2)
+    return head + zeros * (count - 1) + struct.pack("<I", 512 << 3 | 3)
+
+
+@pytest.mark.parametrize("compression", ["lz4", "zstd", "bz2"])
+def test_a_chunk_is_bounded_whatever_its_ratio(
+    compression: str, tmp_path: Path, jail: Jail
+) -> None:
+    """A GiB from less than 256 times as many bytes."""
+    if compression == "bz2":
+        path, size = tmp_path / "a.bag", GIB
+        bag_of(path, bz2.compress(bytes(GIB // 2 + 2**20)) + bytes(GIB // 250), GIB)
+    else:
+        path, size = tmp_path / "a.mcap", len(MESSAGE) + GIB
+        content = lz4_message() if compression == "lz4" else zstd_message()
+        path.write_bytes(file_of(chunk(content, compression, crc=0, size=size)))
+    refused = bounded(jail.records(path)).text
+    assert re.search(rf"declares {size} bytes but has \d+, over the limit of {GIB // 2}\.", refused)
+    assert "set the environment variable MP4DS_MAX_DECOMPRESSED to a larger size" in refused
+    problems = bounded(jail.records(path, salvage=True)).problems
+    assert any("the limit (MP4DS_MAX_DECOMPRESSED sets another)" in told for told in problems)
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "a.mcap.zstd", "a.db3.zstd"])
+def test_a_message_is_bounded_whatever_its_ratio(name: str, tmp_path: Path, jail: Jail) -> None:
+    path = tmp_path / name
+    if name == "a.mcap":
+        sent = struct.pack("<HIQQ", 1, 0, 1, 1) + zstd_message(b"")
+        path.write_bytes(file_of(channel_record(1, "/a"), record(5, sent)))
+    elif name == "a.mcap.zstd":
+        start = zstandard.compress(file_of()[:-50])
+        path.write_bytes(start + zstd_message() + zstandard.compress(file_of()[-50:]))
+    else:
+        whole = database(
+            tmp_path / "a",
+            TOPICS,
+            MESSAGES,
+            TOPIC,
+            f"INSERT INTO messages VALUES(1, 1, 1, zeroblob({6 * 10**8}))",
+            page_size=2**16,
+        )
+        packed = zstandard.compress(whole.read_bytes())
+        path.write_bytes(packed + struct.pack("<II", 0x184D2A50, 2**20) + bytes(2**20))
+        whole.unlink()
+    mode = "MESSAGE" if name == "a.mcap" else "FILE"
+    write_bag_info(tmp_path, name, mode)
+    assert "over the limit of 536870912" in bounded(jail.records(tmp_path)).text
+    assert bounded(jail.records(tmp_path, salvage=True)).problems
+
+
+def test_the_limit_is_yours_to_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    content = channel_record(1, "/a") + record(5, struct.pack("<HIQQ", 1, 0, 1, 1) + bytes(2**28))
+    path = tmp_path / "a.mcap"
+    path.write_bytes(file_of(chunk(zstandard.compress(content), "zstd", crc=0, size=len(content))))
+
+    def read() -> list[int]:
+        with McapReader(path) as reader:
+            return [len(item.data) for item in reader.records() if isinstance(item, Message)]
+
+    with pytest.raises(mp4ds.SourceError, match="MP4DS_MAX_DECOMPRESSED"):
+        read()  # as of a recording that claims more than it holds
+    monkeypatch.setenv("MP4DS_MAX_DECOMPRESSED", "300M")
+    assert read() == [2**28]
+    monkeypatch.setenv("MP4DS_MAX_DECOMPRESSED", "200M")
+    with pytest.raises(mp4ds.SourceError, match=f"over the limit of {200 * 2**20}"):
+        read()
+    monkeypatch.setenv("MP4DS_MAX_DECOMPRESSED", "much")
+    with pytest.raises(mp4ds.OptionError, match="MP4DS_MAX_DECOMPRESSED: 'much' is not a size"):
+        read()
 
 
 def test_what_is_written_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

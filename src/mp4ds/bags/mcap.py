@@ -38,6 +38,7 @@ from mp4ds.bags.mcap_records import (
     parse,
     parse_message,
     unpack_chunk,
+    unreadable,
 )
 from mp4ds.bags.protocols import (
     Format,
@@ -83,7 +84,7 @@ def _other_at(stream: RecordStream, place: int, declared: Declared) -> Attachmen
     except DamageError as error:
         raise stream.damaged(error) from None
     if record is None:
-        raise stream.damaged("it differs from the one read before")
+        raise stream.damaged(DamageError("it differs from the one read before"))
     return record
 
 
@@ -402,8 +403,8 @@ class McapReader:
         try:
             data = self._decompress(memoryview(message.data))
         except DamageError as error:
-            place = f"message of log time {message.log_time}, topic {message.channel.topic}"
-            raise SourceError(self.path, f"is damaged: {place}: {error}", SALVAGE_REMEDY) from None
+            place = f": message of log time {message.log_time}, topic {message.channel.topic}"
+            raise unreadable(self.path, place, error, SALVAGE_REMEDY) from None
         return Message(
             message.channel, message.log_time, message.publish_time, message.sequence, data
         )

@@ -17,7 +17,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
-from mp4ds.bags.protocols import ZSTD_PIECE, most_unpacked
+from mp4ds.bags.protocols import DECOMPRESSED, ZSTD_PIECE, most_held
 from mp4ds.errors import SourceError, SourceNotFoundError
 from mp4ds.files.urls import expect
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
@@ -43,6 +43,7 @@ CUT_SHORT_REMEDY = f"The recording was cut short: use `mcap recover`, or {SALVAG
 
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 _PIECE_BYTES = 16 * 2**20
+_PACKED_PIECE = 2**16
 _FRAME = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
@@ -52,6 +53,36 @@ _RecordT = TypeVar("_RecordT", covariant=True)
 
 class DamageError(ValueError):
     """Damage inside a record; the reader adds where it is."""
+
+
+class OversizeError(DamageError):
+    """A chunk or message that would take too much memory, or says so because it is damaged.
+
+    Args:
+        what: What it is, a phrase.
+        most: Bytes that it may have.
+    """
+
+    def __init__(self, what: str, most: int) -> None:
+        super().__init__(f"{what}, over the limit of {most}")
+
+
+def unreadable(path: Path, place: str, error: Exception, remedy: str) -> SourceError:
+    """The error for a recording with damage, or with something too large.
+
+    Args:
+        path: The recording.
+        place: Where in it; comes after "is damaged".
+        error: What is wrong there.
+        remedy: What to do about damage.
+    """
+    if isinstance(error, OversizeError):
+        remedy = (
+            f"If it is sound, and fits in memory, set the environment variable {DECOMPRESSED} to a "
+            f"larger size, such as 4G, or {SALVAGE}"
+        )
+        return SourceError(path, f"cannot be read{place}: {error}", remedy)
+    return SourceError(path, f"is damaged{place}: {error}", remedy)
 
 
 class MessageHead(NamedTuple):
@@ -192,13 +223,13 @@ class RecordStream:
 
     def _read_in_pieces(self, length: int) -> bytes:
         # A stream of unknown size may state any length: allocate only what is there.
-        pieces = bytearray()
-        while len(pieces) < length:
-            piece = self._stream.read(min(_PIECE_BYTES, length - len(pieces)))
+        pieces = io.BytesIO()
+        while (left := length - pieces.tell()) > 0:
+            piece = self._stream.read(min(_PIECE_BYTES, left))
             if not piece:
                 break
-            pieces += piece
-        return bytes(pieces)
+            pieces.write(piece)
+        return pieces.getvalue()
 
     def next(self) -> tuple[int, bytes]:
         """Read one record.
@@ -214,17 +245,18 @@ class RecordStream:
                 f"holds a record of {length} bytes at byte {self.start}: it is damaged",
                 SALVAGE_REMEDY,
             )
+        if self.size is None and length > (most := most_held()):
+            raise self.damaged(OversizeError(f"it declares {length} bytes", most))
         return opcode, self.read(length)
 
     def cut_short(self) -> SourceError:
         """The error for a file that ends before it should."""
         return SourceError(self.path, "ends before its footer", CUT_SHORT_REMEDY)
 
-    def damaged(self, problem: object) -> SourceError:
+    def damaged(self, problem: DamageError) -> SourceError:
         """The error for a damaged record: the one that was read last."""
-        return SourceError(
-            self.path, f"is damaged in its record at byte {self.start}: {problem}", SALVAGE_REMEDY
-        )
+        place = f" in its record at byte {self.start}"
+        return unreadable(self.path, place, problem, SALVAGE_REMEDY)
 
 
 class _ExactStream(ReadDataStream):
@@ -307,14 +339,14 @@ def unpack_chunk(body: bytes | memoryview) -> bytes | memoryview:
 def _decompress(compression: str, data: memoryview, size: int) -> bytes | memoryview:
     if compression == "":
         return data
-    if size > most_unpacked(len(data)):
-        raise DamageError(f"a chunk declares {size} bytes but has {len(data)}")
+    if size > (most := most_held(len(data))):
+        raise OversizeError(f"a chunk declares {size} bytes but has {len(data)}", most)
     if compression == "zstd":
         return unzstd(data, size)
     if compression == "lz4":
         machine = lz4.frame.LZ4FrameDecompressor()
         try:
-            content: bytes = machine.decompress(data, max_length=size + 1)
+            content = expand(machine, data, size)
         except RuntimeError as error:
             raise DamageError(f"the lz4 data of a chunk is damaged: {error}") from None
         if not machine.eof:
@@ -323,6 +355,47 @@ def _decompress(compression: str, data: memoryview, size: int) -> bytes | memory
     raise DamageError(
         f"a chunk is compressed with {compression!r}; only zstd and lz4 are supported"
     )
+
+
+class Decompressor(Protocol):
+    """What bz2 and lz4 have in common."""
+
+    @property
+    def eof(self) -> bool:
+        """Whether the data are complete."""
+        ...
+
+    @property
+    def needs_input(self) -> bool:
+        """Whether all data was used."""
+        ...
+
+    @property
+    def unused_data(self) -> bytes | None:
+        """What followed the data."""
+        ...
+
+    def decompress(self, data: bytes | memoryview, /, max_length: int) -> bytes:
+        """Decompress data, and what was left over before."""
+        ...
+
+
+def expand(machine: Decompressor, data: bytes | memoryview, size: int) -> bytes:
+    """Decompress data to a size, or to a byte more if there is more.
+
+    A large result is made in pieces: both libraries need twice its memory to make it at once.
+    """
+    if size <= _PIECE_BYTES:
+        return machine.decompress(data, max_length=size + 1)
+    content = io.BytesIO()
+    for at in range(0, len(data), _PACKED_PIECE):
+        piece = data[at : at + _PACKED_PIECE]
+        while not machine.eof and (left := size + 1 - content.tell()) > 0:
+            content.write(machine.decompress(piece, max_length=min(left, _PIECE_BYTES)))
+            piece = b""
+            if machine.needs_input:
+                break
+    return content.getvalue()
 
 
 def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
@@ -341,8 +414,8 @@ def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
             return _unzstd_unsized(data)
         if size is not None and stated not in (-1, size):
             raise DamageError(f"zstd data holds {stated} bytes instead of {size}")
-        if stated > most_unpacked(len(data)):
-            raise DamageError(f"zstd data declares {stated} bytes but has {len(data)}")
+        if stated > (most := most_held(len(data))):
+            raise OversizeError(f"zstd data declares {stated} bytes but has {len(data)}", most)
         return zstandard.ZstdDecompressor().decompress(
             data, max_output_size=size or 0, allow_extra_data=False
         )
@@ -352,17 +425,17 @@ def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
 
 def _unzstd_unsized(data: bytes | memoryview) -> bytes:
     decompressor = zstandard.ZstdDecompressor().decompressobj()
-    content = bytearray()
-    most = most_unpacked(len(data))
+    content = io.BytesIO()
+    most = most_held(len(data))
     used = 0
     while used < len(data) and not decompressor.eof:
-        content += decompressor.decompress(data[used : used + ZSTD_PIECE])
+        content.write(decompressor.decompress(data[used : used + ZSTD_PIECE]))
         used += ZSTD_PIECE
-        if len(content) > most:
-            raise DamageError(f"zstd data of {len(data)} bytes unpacks to more than {most}")
+        if content.tell() > most:
+            raise OversizeError(f"zstd data of {len(data)} bytes unpacks to {content.tell()}", most)
     if not decompressor.eof or decompressor.unused_data or used < len(data):
         raise DamageError("zstd data is cut short, or holds more than one frame")
-    return bytes(content)
+    return content.getvalue()
 
 
 def chunk_records(content: bytes | memoryview) -> Iterator[tuple[int, int, memoryview]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,8 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.errors import OptionError
+from mp4ds.options import parse_size
 from mp4ds.records import (
     EVERYTHING,
     Attachment,
@@ -265,24 +268,47 @@ def merged(parts: Sequence[SourcePart]) -> Iterator[Record]:
 
 # ---------------------------------------------------------------- bounds
 
-CHUNK_RATIO = 256  # of lz4 it is 255
-"""Maximum compression ratio of a large chunk or message."""
-
-FILE_RATIO = 1024
-"""The same for a whole file, which is not held in memory."""
+DECOMPRESSED = "MP4DS_MAX_DECOMPRESSED"
+"""Environment variable with the bytes that one chunk or message may decompress to."""
 
 ZSTD_PIECE = 2**11
 """Bytes of zstd decompressed at a time, which give 64 MiB at most."""
 
 _ALWAYS = 128 * 2**20
+_CHUNK_RATIO = 256  # of lz4 it is 255
+_FILE_RATIO = 1024
+_MOST = 512 * 2**20  # recorders make chunks of 1 to 4 MiB unless told otherwise
 
 
-def most_unpacked(packed: int, ratio: int = CHUNK_RATIO) -> int:
-    """Maximum decompressed size of so many bytes.
+def most_unpacked(packed: int) -> int:
+    """Maximum decompressed size of a chunk or message of so many bytes, unless told otherwise.
 
-    Small ones are not limited: they may hold a black picture.
+    Small ones are not limited by their ratio: they may hold a black picture.
     """
-    return max(_ALWAYS, ratio * packed)
+    return min(max(_ALWAYS, _CHUNK_RATIO * packed), _MOST)
+
+
+def most_in_file(packed: int) -> int:
+    """Maximum decompressed size of a file of so many bytes, which is not held in memory."""
+    return max(_ALWAYS, _FILE_RATIO * packed)
+
+
+def most_held(packed: int | None = None) -> int:
+    """Maximum decompressed size of a chunk or message, as `DECOMPRESSED` says if it is set.
+
+    Args:
+        packed: Its compressed size; None where that of the whole file is known only.
+
+    Raises:
+        OptionError: The variable does not hold a size.
+    """
+    told = os.environ.get(DECOMPRESSED)
+    if not told:
+        return _MOST if packed is None else most_unpacked(packed)
+    try:
+        return parse_size(told)
+    except OptionError as error:
+        raise OptionError(f"{DECOMPRESSED}: {error}") from None
 
 
 # ---------------------------------------------------------------- without an index

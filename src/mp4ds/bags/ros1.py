@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from mp4ds.bags.mcap_records import DamageError
 from mp4ds.bags.protocols import Format
 from mp4ds.bags.ros1_records import (
-    COPY_AGAIN,
     DAMAGE,
     MAGIC,
     MAX_TIME,
@@ -31,13 +30,12 @@ from mp4ds.bags.ros1_records import (
     check_bag,
     check_between,
     count_messages,
+    damaged,
     make_channel,
     payload,
-    reason,
     split_header,
     unpack_chunk,
 )
-from mp4ds.errors import SourceError
 from mp4ds.files.urls import expect
 from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Record, Schema
 
@@ -95,7 +93,7 @@ class Ros1Reader:
         try:
             self._bag = _Bag(path)
         except DAMAGE as error:
-            raise SourceError(path, f"is damaged: {reason(error)}", COPY_AGAIN) from None
+            raise damaged(path, error) from None
         try:
             self._index = self._bag.take_index()
             for number, chunk in enumerate(self._bag.chunks):
@@ -103,7 +101,7 @@ class Ros1Reader:
                     self._chunk(number)  # otherwise nothing would check whether it holds messages
         except DAMAGE as error:
             self._close()
-            raise SourceError(path, f"is damaged: {reason(error)}", COPY_AGAIN) from None
+            raise damaged(path, error) from None
 
     @property
     def channels(self) -> Sequence[Channel]:
@@ -156,10 +154,8 @@ class Ros1Reader:
         try:
             data = payload(self._chunk(chunk), offset, channel.id, time)
         except DAMAGE as error:
-            place = f"topic {channel.topic}, chunk at byte {self._bag.chunks[chunk].start}"
-            raise SourceError(
-                self.path, f"is damaged: {place}: {reason(error)}", COPY_AGAIN
-            ) from None
+            place = f": topic {channel.topic}, chunk at byte {self._bag.chunks[chunk].start}"
+            raise damaged(self.path, error, place) from None
         return Message(channel, time, time, 0, data)
 
     def _chunk(self, number: int) -> memoryview:
@@ -167,11 +163,10 @@ class Ros1Reader:
         if number in self._chunks:
             self._chunks.move_to_end(number)
             return self._chunks[number]
-        unpacked = self._bag.content(number)
-        size = len(unpacked) + sum(map(len, self._chunks.values()))
+        size = self._bag.chunks[number].size + sum(map(len, self._chunks.values()))
         while len(self._chunks) > 1 and (len(self._chunks) >= CACHED_CHUNKS or size > CACHED_BYTES):
             size -= len(self._chunks.popitem(last=False)[1])
-        self._chunks[number] = unpacked
+        unpacked = self._chunks[number] = self._bag.content(number)
         return unpacked
 
     def stats(self) -> Mapping[int, ChannelStats]:

@@ -15,8 +15,16 @@ from typing import BinaryIO
 
 import lz4.frame
 
-from mp4ds.bags.mcap_records import SALVAGE, DamageError, open_source, other_begin
-from mp4ds.bags.protocols import most_unpacked
+from mp4ds.bags.mcap_records import (
+    SALVAGE,
+    DamageError,
+    OversizeError,
+    expand,
+    open_source,
+    other_begin,
+    unreadable,
+)
+from mp4ds.bags.protocols import most_held
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, Schema
 
@@ -151,7 +159,7 @@ def check_bag(path: Path) -> int:
             header = file.header(Op.BAG)
             index, encryptor = header.number(b"index_pos", 8), header.get(b"encryptor", b"")
         except DAMAGE as error:
-            raise SourceError(path, f"is damaged: {reason(error)}", COPY_AGAIN) from None
+            raise damaged(path, error) from None
     if encryptor:
         raise SourceError(path, "is encrypted", "Decrypt it with `rosbag decrypt` first.")
     if index == 0:
@@ -183,11 +191,17 @@ def other_format(path: Path, start: bytes) -> SourceError:
     return other_begin(path, "a ROS 1 bag", MAGIC, start)
 
 
-def reason(error: DamageError | OSError) -> str:
-    """An error of `DAMAGE` in words, as the end of a sentence."""
+def damaged(path: Path, error: DamageError | OSError, place: str = "") -> SourceError:
+    """What to raise for an error of `DAMAGE`.
+
+    Args:
+        path: The bag.
+        error: What was raised.
+        place: Where in it; comes after "is damaged".
+    """
     if isinstance(error, OSError) and error.strerror:
-        return f"it cannot be read: {error.strerror}"
-    return str(error)
+        error = DamageError(f"it cannot be read: {error.strerror}")
+    return unreadable(path, place, error, COPY_AGAIN)
 
 
 def split_header(raw: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -287,11 +301,11 @@ def unpack_chunk(compression: str, size: int, data: bytes) -> bytes:
     if compression == "none":
         unpacked = data
     elif compression in ("bz2", "lz4"):
-        if size > most_unpacked(len(data)):
-            raise DamageError(f"it declares {size} bytes but has {len(data)}")
+        if size > (most := most_held(len(data))):
+            raise OversizeError(f"it declares {size} bytes but has {len(data)}", most)
         machine = BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
         try:
-            unpacked = machine.decompress(data, max_length=size + 1)
+            unpacked = expand(machine, data, size)
         except (OSError, RuntimeError):
             raise DamageError(f"its {compression} data is damaged") from None
         if not machine.eof:

@@ -15,7 +15,7 @@ from typing import Protocol
 import zstandard
 
 from mp4ds.bags.mcap_records import SALVAGE, open_source
-from mp4ds.bags.protocols import FILE_RATIO, ZSTD_PIECE, HoldBack, most_unpacked
+from mp4ds.bags.protocols import ZSTD_PIECE, HoldBack, most_in_file
 from mp4ds.bags.rosbag2_metadata import BagInfo
 from mp4ds.errors import SourceError
 from mp4ds.records import QOS_KEY, Channel, Message, Record, Schema
@@ -51,7 +51,7 @@ class ZstdStream:
     def __init__(self, path: Path) -> None:
         self._file = open_source(path)
         self._frame = zstandard.ZstdDecompressor().decompressobj()
-        self._most = most_unpacked(path.stat().st_size, FILE_RATIO)
+        self._most = most_in_file(path.stat().st_size)
         self._given = 0
         self._is_within = False
         self._left = bytearray()

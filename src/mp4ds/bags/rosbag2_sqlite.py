@@ -15,7 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.mcap_records import SALVAGE, SALVAGE_REMEDY, DamageError, open_source
+from mp4ds.bags.mcap_records import (
+    SALVAGE,
+    SALVAGE_REMEDY,
+    DamageError,
+    OversizeError,
+    open_source,
+    unreadable,
+)
+from mp4ds.bags.protocols import most_held
 from mp4ds.errors import SourceError
 from mp4ds.records import EVERYTHING, HASH_KEY, Channel, ChannelStats, Excerpt, Message, Schema
 
@@ -362,6 +370,8 @@ class SqliteReader:
         )
 
     def _message(self, tables: Tables, row_id: int, place: str) -> Message:
+        if self.path != self._shown:
+            self._check_size(tables, row_id, place)
         query = "SELECT topic_id, timestamp, data, typeof(data) FROM messages WHERE id = ?"
         row = next(tables.rows(query, (row_id,)), None)
         if row is None:
@@ -385,8 +395,18 @@ class SqliteReader:
             try:
                 data = self._decompress(data)
             except DamageError as error:
-                raise SourceError(self._shown, f"{place}: {error}", SALVAGE_REMEDY) from None
+                raise unreadable(self._shown, f": {place}", error, SALVAGE_REMEDY) from None
         return Message(channel, timestamp, timestamp, 0, data)
+
+    def _check_size(self, tables: Tables, row_id: int, place: str) -> None:
+        """Refuse a message that a decompressed copy holds though its file is small."""
+        found = tables.select(
+            "SELECT length(data) FROM messages WHERE id = ?", (row_id,)
+        ).fetchone()
+        size, most = found[0] if found else None, most_held()
+        if isinstance(size, int) and size > most:
+            error = OversizeError(f"it has {size} bytes", most)
+            raise unreadable(self._shown, f": {place}", error, SALVAGE_REMEDY)
 
     def stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans by channel id."""

@@ -31,7 +31,7 @@ from mp4ds.bags.protocols import HOLD_BYTES, BagReader, Format, HoldBack
 from mp4ds.bags.rosbag2_files import ZstdStream
 from mp4ds.bags.salvage.losses import Draft, FileSalvage, LossLog, Tally
 from mp4ds.bags.salvage.mcap_summary import McapFraming, SalvagedSummary, read_summary
-from mp4ds.bags.salvage.scan import MAX_UNPROVEN, RecordFrame, Scan, Window, unpack
+from mp4ds.bags.salvage.scan import MAX_UNPROVEN, RecordFrame, Scan, Window, lost_by, unpack
 from mp4ds.errors import SourceError
 from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record, Schema
 
@@ -217,8 +217,8 @@ class McapPass:
         if self._decompress:
             try:
                 data = self._decompress(head.data)
-            except DamageError:
-                problem = f"messages of {channel.topic} whose compressed data is damaged"
+            except DamageError as error:
+                problem = f"messages of {channel.topic} {lost_by(error)}"
                 loss = self._lose_message(head.channel_id, head.log_time, offset, problem)
                 loss.topics[channel.topic] = None
                 return None

@@ -6,14 +6,15 @@ import io
 from bz2 import BZ2Decompressor
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import lz4.frame
 import zstandard
 
-from mp4ds.bags.mcap_records import open_source
-from mp4ds.bags.protocols import ZSTD_PIECE, most_unpacked
+from mp4ds.bags.mcap_records import DamageError, Decompressor, OversizeError, open_source
+from mp4ds.bags.protocols import DECOMPRESSED, ZSTD_PIECE, most_held
 from mp4ds.errors import SourceError
 
 BLOCK = 2**20
@@ -357,6 +358,13 @@ class Unpacked(NamedTuple):
     is_sound: bool = True
 
 
+def lost_by(error: DamageError) -> str:
+    """What is wrong with messages whose payload cannot be decompressed, a phrase."""
+    if isinstance(error, OversizeError):
+        return f"that decompress to too much ({DECOMPRESSED} is the limit)"
+    return "whose compressed data is damaged"
+
+
 def unpack(compression: str, data: memoryview, size: int) -> Unpacked:
     """Decompress as much as possible.
 
@@ -370,34 +378,38 @@ def unpack(compression: str, data: memoryview, size: int) -> Unpacked:
         content = bytes(data[:size])
         problem = "" if len(content) == size else "a chunk is cut short"
         return Unpacked(content, len(content), problem)
-    size = min(size, most_unpacked(len(data)))
+    most = most_held(len(data))
+    limit = f", the limit ({DECOMPRESSED} sets another)" if size > most else ""
+    size = min(size, most)
     start = bytes(data[:4])
     found = next((name for magic, name in _MAGIC.items() if start.startswith(magic)), compression)
     if found not in _MACHINES:
         return Unpacked(
             b"", 0, f"a chunk is compressed with {compression!r}, which is not supported"
         )
-    pieces: list[bytes] = []
+    gathered = io.BytesIO()  # pieces in a list would need the memory twice
     left = size + 1
     machine = _MACHINES[found]()
     step = len(data) if size <= _MAX_AT_ONCE else _UNPACKED_PIECE
     at = 0
     try:
         while at < len(data) and left > 0 and not machine.eof:
-            pieces.append(machine.decompress(data[at : at + step], left))
-            left -= len(pieces[-1])
+            for piece in machine.pieces(data[at : at + step], left):
+                left -= gathered.write(piece)
             at += step
     except _DAMAGE:
         if step > _UNPACKED_PIECE:
-            pieces, left = _by_pieces(found, data, size)
+            gathered, left = _by_pieces(found, data, size)
         problem = f"the {found} data of a chunk is damaged"
-        return Unpacked(b"".join(pieces)[:size], 0, problem, found == "bz2")
-    content = b"".join(pieces)
+        gathered.truncate(size)
+        return Unpacked(gathered.getvalue(), 0, problem, found == "bz2")
+    if not machine.eof and left <= 0:
+        problem = f"the {found} data of a chunk unpacks to more than {size} bytes{limit}"
+        # bz2 verifies a block at its end, which was not reached here
+        gathered.truncate(0 if found == "bz2" else size)
+        return Unpacked(gathered.getvalue(), 0, problem, False)
+    content = gathered.getvalue()
     if not machine.eof:
-        if left <= 0:
-            problem = f"the {found} data of a chunk unpacks to more than {size} bytes"
-            # bz2 verifies a block at its end, which was not reached here
-            return Unpacked(b"" if found == "bz2" else content[:size], 0, problem, False)
         return Unpacked(content, 0, f"the {found} data of a chunk is cut short")
     used = min(at, len(data)) - machine.unused
     if len(content) != size:
@@ -406,23 +418,23 @@ def unpack(compression: str, data: memoryview, size: int) -> Unpacked:
     return Unpacked(content, used, "")
 
 
-def _by_pieces(compression: str, data: memoryview, size: int) -> tuple[list[bytes], int]:
+def _by_pieces(compression: str, data: memoryview, size: int) -> tuple[io.BytesIO, int]:
     """What can be decompressed before the damage."""
     machine = _MACHINES[compression]()
-    pieces: list[bytes] = []
+    gathered = io.BytesIO()
     left = size
     try:
         for start, end in _small_pieces(len(data)):
-            piece = machine.decompress(data[start:end], left)
+            piece = b"".join(machine.pieces(data[start:end], left))
             left -= len(piece)
             if compression == "bz2" and left <= 0 and not machine.eof:
                 break  # its last block was not verified
-            pieces.append(piece)
+            gathered.write(piece)
             if left <= 0 or machine.eof:
                 break
     except _DAMAGE:
         pass
-    return pieces, left
+    return gathered, left
 
 
 def _small_pieces(length: int) -> Iterator[tuple[int, int]]:
@@ -436,9 +448,11 @@ def _small_pieces(length: int) -> Iterator[tuple[int, int]]:
 _DAMAGE = (OSError, RuntimeError, EOFError, ValueError, zstandard.ZstdError)
 
 
-class _Bz2:
-    def __init__(self) -> None:
-        self._machine = BZ2Decompressor()
+class _BlockMachine:
+    """A decompressor of bz2 or lz4, which have the same methods."""
+
+    def __init__(self, make: Callable[[], Decompressor]) -> None:
+        self._machine = make()
 
     @property
     def eof(self) -> bool:
@@ -446,33 +460,19 @@ class _Bz2:
 
     @property
     def unused(self) -> int:
-        return len(self._machine.unused_data)
-
-    def decompress(self, data: memoryview, size: int) -> bytes:
-        return self._machine.decompress(data, max_length=size)
-
-
-class _Lz4:
-    def __init__(self) -> None:
-        self._machine = lz4.frame.LZ4FrameDecompressor()
-
-    @property
-    def eof(self) -> bool:
-        return bool(self._machine.eof)
-
-    @property
-    def unused(self) -> int:
         return len(self._machine.unused_data or b"")
 
-    def decompress(self, data: memoryview, size: int) -> bytes:
-        # It allocates the given maximum: the data cannot yield more than this at once.
-        room = min(size, _LZ4_RATIO * len(data) + _LZ4_BLOCK)
-        pieces: list[bytes] = [self._machine.decompress(data, max_length=room)]
-        size -= len(pieces[-1])
-        while size > 0 and pieces[-1] and not self._machine.eof and not self._machine.needs_input:
-            pieces.append(self._machine.decompress(b"", max_length=min(size, _LZ4_BLOCK)))
-            size -= len(pieces[-1])
-        return b"".join(pieces)
+    def pieces(self, data: memoryview, size: int) -> Iterator[bytes]:
+        # lz4 allocates the given maximum: the data cannot yield more than this at once.
+        room = min(_LZ4_RATIO * len(data) + _LZ4_BLOCK, _PIECE)
+        left: bytes | memoryview = data
+        while size > 0:
+            piece = self._machine.decompress(left, max_length=min(size, room))
+            yield piece
+            size -= len(piece)
+            if not piece or self._machine.eof or self._machine.needs_input:
+                break
+            left, room = b"", _LZ4_BLOCK
 
 
 class _Zstd:
@@ -488,17 +488,20 @@ class _Zstd:
     def unused(self) -> int:
         return len(self._machine.unused_data) + self._not_fed
 
-    def decompress(self, data: memoryview, size: int) -> bytes:
+    def pieces(self, data: memoryview, size: int) -> Iterator[bytes]:
         # It has no limit: small pieces bound the output of each.
-        pieces: list[bytes] = []
         for at in range(0, len(data), ZSTD_PIECE):
             if size < 0 or self._machine.eof:
                 self._not_fed = len(data) - at
                 break
-            pieces.append(self._machine.decompress(data[at : at + ZSTD_PIECE]))
-            size -= len(pieces[-1])
-        return b"".join(pieces)
+            piece = self._machine.decompress(data[at : at + ZSTD_PIECE])
+            yield piece
+            size -= len(piece)
 
 
-_Machine = _Bz2 | _Lz4 | _Zstd
-_MACHINES: dict[str, Callable[[], _Machine]] = {"bz2": _Bz2, "lz4": _Lz4, "zstd": _Zstd}
+_Machine = _BlockMachine | _Zstd
+_MACHINES: dict[str, Callable[[], _Machine]] = {
+    "bz2": partial(_BlockMachine, BZ2Decompressor),
+    "lz4": partial(_BlockMachine, lz4.frame.LZ4FrameDecompressor),
+    "zstd": _Zstd,
+}

@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.mcap_records import DamageError
-from mp4ds.bags.protocols import Format
+from mp4ds.bags.mcap_records import DamageError, OversizeError
+from mp4ds.bags.protocols import Format, most_held
 from mp4ds.bags.rosbag2_sqlite import SqliteReader
 from mp4ds.bags.salvage.losses import FileSalvage, LossLog
+from mp4ds.bags.salvage.scan import lost_by
 from mp4ds.bags.salvage.sqlite_pages import (
     HEADER_BYTES,
     INTERIOR,
@@ -564,6 +565,8 @@ class SqliteSalvage(FileSalvage):
         """
         if found.time < 0:
             raise Refused(f"messages of {topic} with a time before 1970")
+        if self.path != self._shown and row.size > (most := most_held()):
+            raise Refused(f"messages of {topic} {lost_by(OversizeError('', most))}")
         payload = database.payload(page, row) if row.size <= self._left else None
         if payload is None:
             raise Refused(f"messages of {topic} with damaged or missing pages")
@@ -571,6 +574,5 @@ class SqliteSalvage(FileSalvage):
         data = payload[found.blob :]
         try:
             return self._decompress(data) if self._decompress else data
-        except DamageError:
-            problem = f"messages of {topic} whose compressed data is damaged"
-            raise Refused(problem) from None
+        except DamageError as error:
+            raise Refused(f"messages of {topic} {lost_by(error)}") from None
