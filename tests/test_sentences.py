@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import re
 import shutil
 from collections.abc import Callable
@@ -11,9 +13,11 @@ import pytest
 
 import mp4ds
 from each import each, fresh
+from mp4ds.cli.output import Column, print_table
 from scenes import START, Record, Scene
-from sources import scene, write_bag
+from sources import scene, write_bag, write_mcap
 from test_bad_input import call
+from test_terminal import Screen
 
 VIDEO, SIDECAR = "cam_image_raw.mp4", "cam_image_raw.yaml"
 
@@ -51,6 +55,89 @@ def test_what_was_checked_of_a_dataset(dataset: Path) -> None:
         f"{dataset / VIDEO}: is listed in the manifest but missing [file-missing]",
         f"{dataset}: 1 problem",
     ]
+
+
+def test_only_what_was_packed_is_compared(tmp_path: Path) -> None:
+    """Without its camera, a dataset is not a thousand times smaller."""
+    write_bag(tmp_path / "drive.bag", scene("rgb8", width=640, height=480))
+    summary = mp4ds.pack(
+        tmp_path / "drive.bag", tmp_path / "drive", mp4ds.PackOptions(exclude=["/cam/image_raw"])
+    )
+    assert summary.source_bytes == sum(topic.raw_bytes for topic in summary.topics)
+    assert summary.source_bytes < 100_000
+
+
+def test_one_of_a_kind_is_singular(tmp_path: Path) -> None:
+    one = Record("/chatter", "std_msgs/msg/String", START, {"data": "x"})
+    write_mcap(tmp_path / "drive.mcap", Scene([one]), "ros2", metadata=False)
+    assert "s, 1 message\n" in call("info", tmp_path / "drive.mcap").out
+    call("pack", tmp_path / "drive.mcap", "-o", tmp_path / "drive")
+    done = call("unpack", tmp_path / "drive", "--to", "bag", "-o", tmp_path / "drive.bag")
+    assert "drive.bag: 1 message of 1 topic\n" in done.out
+    assert "not supported by this format: attachments (2)\n" in done.out
+
+
+# ---------------------------------------------------------------- tables
+
+TABLE = [
+    Column("topic", "topic"),
+    Column("type", "type", spare=1),
+    Column("messages"),
+    Column("gaps", spare=3),
+    Column("jitter", spare=2),
+    Column("content", "text"),
+]
+NAMES = [f"/vehicle/sensor_{n:02}/camera/image_rect_color/compressed" for n in range(70)]
+ROWS = [[name, "sensor_msgs/Image", "123", "", "0.5", "rgb8 " * 9] for name in NAMES]
+
+
+def printed(monkeypatch: pytest.MonkeyPatch, columns: int | None, first: int) -> list[str]:
+    """The lines of a table, on a terminal that is so wide, or in a pipe."""
+    screen = Screen() if columns else io.StringIO()
+    monkeypatch.setenv("COLUMNS", str(columns or 80))
+    with contextlib.redirect_stdout(screen):
+        is_cut = print_table(TABLE, ROWS, first=first)
+    assert is_cut == bool(columns)
+    return re.sub(r"\x1b\[[0-9;]*m", "", screen.getvalue()).splitlines()
+
+
+def test_a_pipe_gets_all_of_a_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One line for each row, nothing wrapped or shortened; no column without values."""
+    heading, *lines = printed(monkeypatch, None, 4)
+    assert heading.split() == ["topic", "type", "messages", "jitter", "content"]
+    assert [line.split()[:3] for line in lines] == [row[:3] for row in ROWS]
+    assert all(line.endswith("rgb8") for line in lines)
+
+
+@each("columns", [40, 80, 120, 300])
+def test_a_table_fits_a_terminal(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    heading, *lines = printed(monkeypatch, columns, 4)
+    assert max(map(len, (heading, *lines))) <= max(columns, 56)  # what is never left out
+    assert "gaps" not in heading
+    assert ("jitter" in heading) == (columns >= 80)
+    assert ("sensor_msgs/Image" in lines[0]) == (columns == 300)
+    assert ("  Image  " in lines[0]) == (80 <= columns < 300)
+    assert all(line.startswith("/vehi") for line in lines[:4])
+    assert lines[0].split()[0].endswith("compressed")
+    assert lines[4] == "66 other topics:"
+    assert len(lines) == 8
+    assert lines[-1].endswith(" ...")
+
+
+def test_a_table_of_few_rows_is_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), "ROWS", ROWS[:20])
+    assert len(printed(monkeypatch, 80, 4)) == 21
+
+
+def test_wide_letters_stay_in_their_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [["/\u8eca" * 30, "a/B", "1", "", "", "x"], ["/b", "a/B", "2", "", "", "x"]]
+    monkeypatch.setitem(globals(), "ROWS", rows)
+    for columns in (80, 40):
+        _, wide, plain = printed(monkeypatch, columns, 0)
+        start = plain.index("2")
+        assert len(wide[: wide.index("1")].encode("utf-16-le")) // 2 < start
+        taken = sum(2 if letter == "\u8eca" else 1 for letter in wide[: wide.index("1")])
+        assert taken == start
 
 
 # ---------------------------------------------------------------- what is wrong

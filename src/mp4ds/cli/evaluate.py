@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from mp4ds.cli.options import JsonFlag, takes
-from mp4ds.cli.output import print_json, print_table, say, size_text
+from mp4ds.cli.output import Column, print_json, print_table, say, size_text
 from mp4ds.cli.process import told_errors
-from mp4ds.errors import interrupted
+from mp4ds.errors import counted, interrupted
 from mp4ds.plugins.evaluating.evaluate import evaluate as run
 from mp4ds.plugins.evaluating.options import EvaluateOptions
 
@@ -24,21 +24,23 @@ if TYPE_CHECKING:
     )
 
 _CELLS = [
-    (name, "right")
-    for name in (
-        *("codec", "preset", "crf", "kbit/s", "B/frame", "fps", "CPU s", "decoded/CPU s"),
-        *("VMAF", "harmonic", "5 %", "least", "PSNR Y", "SSIM", "whole", "time"),
-    )
+    *(Column(name) for name in ("codec", "preset", "crf", "kbit/s")),
+    *(Column("B/frame", spare=9), Column("fps", spare=1), Column("CPU s", spare=6)),
+    *(Column("decoded/CPU s", spare=7), Column("VMAF"), Column("harmonic", spare=8)),
+    *(Column("5 %", spare=4), Column("least", spare=3), Column("PSNR Y"), Column("SSIM", spare=5)),
+    *(Column("whole"), Column("time", spare=2)),
 ]
 _RATES = [
-    (name, "right")
+    Column(name)
     for name in (
         *("Hz", "frames", "codec", "preset", "crf", "score", "ceiling"),
         *("B/frame", "ms/frame", "kbit/s"),
     )
 ]
-_STORAGE = [("stored as", "fold"), ("B/frame", "right"), ("size", "right"), ("days", "right"),
-            ("CPU days", "right")]  # fmt: skip
+_STORAGE = [
+    Column("stored as", "text"),
+    *(Column(name) for name in ("B/frame", "size", "days", "CPU days")),
+]
 
 
 def print_evaluation(result: Evaluation) -> None:
@@ -53,7 +55,7 @@ def print_evaluation(result: Evaluation) -> None:
         if not result.recommended:
             say("no setting reaches every camera's target")
     known = f", {result.known} reused from an earlier run" if result.known else ""
-    say(f"{result.output}/index.html: {result.tried} settings tried{known}")
+    say(f"{result.output}/index.html: {counted(result.tried, 'setting')} tried{known}")
 
 
 def _print_camera(camera: CameraEvaluation) -> None:

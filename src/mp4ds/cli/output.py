@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
 import sys
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from datetime import datetime, timezone
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from unicodedata import east_asian_width
 
 import typer
 
@@ -104,47 +108,136 @@ def size_text(count: float) -> str:
     return f"{count:.2f} TB"
 
 
-def print_table(columns: list[tuple[str, str]], rows: list[list[str]]) -> None:
-    """Print a table; a column is right-aligned, or folds if the screen is too narrow."""
-    if _quiet:
-        return
-    from rich.console import Console
-    from rich.table import Table
+@dataclass(frozen=True)
+class Column:
+    """A column of a table.
 
-    console = Console(markup=False, highlight=False)
-    if not console.is_terminal:
-        console = Console(markup=False, highlight=False, width=_PIPE_WIDTH)
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name, kind in columns:
-        if kind == "right":
-            table.add_column(name, justify="right", no_wrap=True)
-        else:
-            table.add_column(name, overflow="fold")
-    for row in rows:
-        table.add_row(*map(shown, row))
+    Attributes:
+        name: Its heading.
+        kind: ``number``, right-aligned; ``topic``, ``type`` or ``text``, which a terminal that is
+            too narrow shortens.
+        spare: A terminal that is too narrow leaves out the column with the largest number first;
+            0: none does.
+    """
+
+    name: str
+    kind: str = "number"
+    spare: int = 0
+
+
+def print_table(
+    columns: Sequence[Column], rows: Sequence[Sequence[str]], *, first: int | None = None
+) -> bool:
+    """Print a table with a line for each row, without the columns that are empty.
+
+    A terminal shows what fits: few rows, short type names, fewer columns. Other programs get all.
+
+    Args:
+        columns: Its columns.
+        rows: A text for each of them.
+        first: How many rows a terminal shows if there are too many for it, the others by name.
+
+    Returns:
+        Whether anything was shortened or left out.
+    """
+    if _quiet:
+        return False
+    cells = [[shown(cell) for cell in row] for row in rows]
+    width: int | None = None
+    folded: list[list[str]] = []
+    if sys.stdout.isatty():
+        width = shutil.get_terminal_size().columns
+        if len(rows) > _MOST_ROWS:
+            cells, folded = cells[: first or _MOST_ROWS], cells[first or _MOST_ROWS :]
+    kept = [n for n in range(len(columns)) if any(row[n] for row in cells)]
+    table = [[column.name for column in columns], *cells]
+    widths = _widths(kept, table)
+    is_cut = width is not None and sum(widths.values()) + 2 * len(kept) - 2 > width
+    if is_cut and width is not None:
+        widths = _fitted(columns, kept, table, width)
     with printed():
-        console.print(table)
+        for number, row in enumerate(table):
+            line = "  ".join(_cell(row[n], size, columns[n].kind) for n, size in widths.items())
+            is_heading = width is not None and not number
+            print(typer.style(line.rstrip(), bold=True) if is_heading else line.rstrip())
+    if folded and width is not None:
+        say(f"{counted(len(folded), f'other {columns[0].name}')}:")
+        names = ", ".join(row[0] for row in folded)
+        for line in textwrap.wrap(names, width - 2, max_lines=_MOST_LINES, placeholder=" ..."):
+            say(f"  {line}")
+    return is_cut or bool(folded)
+
+
+def _widths(kept: Sequence[int], table: Sequence[Sequence[str]]) -> dict[int, int]:
+    return {n: max(_width(row[n]) for row in table) for n in kept}
+
+
+def _fitted(
+    columns: Sequence[Column], kept: Sequence[int], table: list[list[str]], width: int
+) -> dict[int, int]:
+    """The columns that a terminal shows, and how wide; type names in the table are shortened."""
+    for row in table:
+        for n in kept:
+            if columns[n].kind == "type":
+                row[n] = re.sub(r"[\w.]+/(?:msg/)?", "", row[n])
+    widths = _widths(kept, table)
+
+    def excess(*, at_least: bool) -> int:
+        sizes = (
+            min(size, _SHORTEST.get(columns[n].kind, size)) if at_least else size
+            for n, size in widths.items()
+        )
+        return sum(sizes) + 2 * len(widths) - 2 - width
+
+    while excess(at_least=True) > 0 and any(columns[n].spare for n in widths):
+        del widths[max(widths, key=lambda n: columns[n].spare)]
+    while excess(at_least=False) > max(0, excess(at_least=True)):
+        longer = [n for n in widths if widths[n] > _SHORTEST.get(columns[n].kind, widths[n])]
+        widths[max(longer, key=lambda n: (columns[n].kind == "text", widths[n]))] -= 1
+    return widths
+
+
+def _width(text: str) -> int:
+    """Columns of a terminal that a text takes."""
+    return len(text) + sum(east_asian_width(letter) in "WF" for letter in text)
+
+
+def _cell(text: str, width: int, kind: str) -> str:
+    """A text of a table in a given width; if too long, without its end, or a topic's middle."""
+    if _width(text) > width:
+        begin = text[: (width - 3) // 3 if kind == "topic" else width - 3]
+        end = text[len(text) - (width - 3 - len(begin)) :]
+        while _width(begin) + _width(end) > width - 3:  # of wide letters
+            begin, end = begin[:-1], end if begin else end[1:]
+        text = f"{begin}...{end}"
+    space = " " * (width - _width(text))
+    return space + text if kind == "number" else text + space
 
 
 def print_pack(summary: PackSummary) -> None:
     """Print what became of each topic."""
-    print_table(_PACK_COLUMNS, [_pack_row(topic) for topic in summary.topics])
+    cameras = [topic for topic in summary.topics if topic.frames]
+    others = [topic for topic in summary.topics if not topic.frames]
+    rows = [_pack_row(topic) for topic in (*cameras, *others)]
+    print_table(_PACK_COLUMNS, rows, first=len(cameras))
     for topic in summary.topics:
         for reason, (count, first) in topic.verbatim.items():
+            share = f"{count} of {counted(topic.messages, 'message')}"
             say(
-                f"{topic.topic}: {count} of {topic.messages} messages stored verbatim in "
-                f"messages.mcap: {reason} (first: message {first})"
+                f"{topic.topic}: {share} stored verbatim in messages.mcap: {reason} (first: "
+                f"message {first})"
             )
         for note in topic.notes:
             say(f"{topic.topic}: {note}")
     for what, count in summary.skipped.items():
-        say(f"not packed exactly: {count} {what}")
+        say(f"not packed exactly: {what} ({count})")
     if summary.left_out:
         say(f"left out: {', '.join(summary.left_out)}")
     for loss in summary.losses[:_LOSSES_SHOWN]:
         say(f"lost: {_loss_text(loss)}")
     if len(summary.losses) > _LOSSES_SHOWN:
-        say(f"lost: {len(summary.losses) - _LOSSES_SHOWN} more places, listed in dataset.yaml")
+        more = counted(len(summary.losses) - _LOSSES_SHOWN, "more place")
+        say(f"lost: {more}, listed in dataset.yaml")
     if not any(topic.files for topic in summary.topics):
         say("no topic became a video: all messages are stored unchanged in messages.mcap")
     if summary.not_copied:
@@ -172,7 +265,7 @@ def _change(summary: PackSummary) -> str:
 def _loss_text(loss: Loss) -> str:
     place = f" at byte {loss.offset}" if loss.offset is not None else ""
     size = f", {size_text(loss.size)}" if loss.size is not None else ""
-    messages = f"; {loss.messages} messages" if loss.messages is not None else ""
+    messages = f"; {counted(loss.messages, 'message')}" if loss.messages is not None else ""
     topics = f" of {', '.join(loss.topics)}" if loss.topics else ""
     return f"{loss.file}{place}{size}: {loss.problem}{messages}{topics}"
 
@@ -196,24 +289,25 @@ def _pack_row(topic: TopicSummary) -> list[str]:
 
 
 def print_unpack(summary: UnpackSummary, noun: str) -> None:
-    """Print what was written, and what the target could not hold."""
+    """Print what was written, of things of that name, and what the target could not hold."""
     total = sum(summary.messages.values())
-    say(f"{summary.output}: {total} {noun} of {len(summary.messages)} topics")
+    topics = counted(len(summary.messages), "topic")
+    say(f"{summary.output}: {counted(total, noun)} of {topics}")
     for topic, now in summary.republished.items():
         taken = f" (the name {now.instead_of} is taken)" if now.instead_of else ""
         say(f"{topic}: written as {now.topic}, {now.type_name}{taken}")
     for topic, reasons in summary.as_recorded.items():
         for reason, count in reasons.items():
-            say(f"{topic}: {count} messages as recorded: {reason}")
+            say(f"{topic}: {counted(count, 'message')} as recorded: {reason}")
     for topic, reasons in summary.unconvertible.items():
         for reason, count in reasons.items():
-            say(f"{topic}: {count} messages left out: {reason}")
+            say(f"{topic}: {counted(count, 'message')} left out: {reason}")
     for topic, count in summary.thinned.items():
-        say(f"{topic}: {count} messages left out")
+        say(f"{topic}: {counted(count, 'message')} left out")
     if summary.converted:
         say(f"converted between ROS 1 and ROS 2: {', '.join(summary.converted)}")
     for what, count in summary.omitted.items():
-        say(f"not supported by this format: {count} {what}")
+        say(f"not supported by this format: {what} ({count})")
     if summary.left_out:
         say(f"left out: {', '.join(summary.left_out)}")
 
@@ -281,9 +375,13 @@ def print_info(result: Info) -> None:
         start = datetime.fromtimestamp(result.start / 1e9, timezone.utc)
         say(
             f"{start:%Y-%m-%d %H:%M:%S} UTC, {(result.end - result.start) / 1e9:.2f} s, "
-            f"{sum(topic.messages for topic in result.topics)} messages"
+            f"{counted(sum(topic.messages for topic in result.topics), 'message')}"
         )
-    print_table(_INFO_COLUMNS, [_info_row(topic) for topic in result.topics])
+    cameras = [topic for topic in result.topics if topic.content or topic.stored]
+    others = [topic for topic in result.topics if not topic.content and not topic.stored]
+    rows = [_info_row(topic) for topic in (*cameras, *others)]
+    if print_table(_INFO_COLUMNS, rows, first=len(cameras)):
+        say("shortened to fit; in full: --json, or `| less -S`")
     for note in result.notes:
         say(note)
 
@@ -322,42 +420,44 @@ def _number(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
-_PIPE_WIDTH = 160
+_MOST_ROWS = 20  # of a table on a terminal
+_MOST_LINES = 3  # of the names of other rows
+_SHORTEST = {"topic": 24, "type": 12, "text": 20}
 _SPEED_COLUMNS = [
-    ("topic", "fold"),
-    ("per frame", "right"),
-    ("ms, random access", "right"),
-    ("ms, in order", "right"),
+    Column("topic", "topic"),
+    Column("per frame"),
+    Column("ms, random access"),
+    Column("ms, in order"),
 ]
 _PACK_COLUMNS = [
-    ("topic", "fold"),
-    ("type", "fold"),
-    ("messages", "right"),
-    ("frames", "right"),
-    ("raw", "right"),
-    ("packed", "right"),
-    ("ratio", "right"),
-    ("stored in", "fold"),
+    Column("topic", "topic"),
+    Column("type", "type", spare=3),
+    Column("messages"),
+    Column("frames", spare=2),
+    Column("raw", spare=1),
+    Column("packed"),
+    Column("ratio"),
+    Column("stored in", "text"),
 ]
 _OVERVIEW_COLUMNS = [
-    ("dataset", "fold"),
-    ("begins", "left"),
-    ("seconds", "right"),
-    ("messages", "right"),
-    ("cameras", "right"),
-    ("frames", "right"),
-    ("size", "right"),
-    ("profile", "left"),
+    Column("dataset", "topic"),
+    Column("begins", "text", spare=1),
+    Column("seconds"),
+    Column("messages", spare=3),
+    Column("cameras", spare=2),
+    Column("frames"),
+    Column("size"),
+    Column("profile", "text", spare=4),
 ]
 _INFO_COLUMNS = [
-    ("topic", "fold"),
-    ("type", "fold"),
-    ("messages", "right"),
-    ("Hz", "right"),
-    ("jitter ms", "right"),
-    ("gaps", "right"),
-    ("longest s", "right"),
-    ("size", "right"),
-    ("content", "fold"),
-    ("stored", "fold"),
+    Column("topic", "topic"),
+    Column("type", "type", spare=1),
+    Column("messages"),
+    Column("Hz"),
+    Column("jitter ms", spare=6),
+    Column("gaps", spare=4),
+    Column("longest s", spare=5),
+    Column("size", spare=2),
+    Column("content", "text"),
+    Column("stored", "text", spare=3),
 ]

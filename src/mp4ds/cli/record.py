@@ -15,7 +15,7 @@ from mp4ds.cli.options import JsonFlag, takes
 from mp4ds.cli.output import complain, is_quiet, print_json, print_pack, say
 from mp4ds.cli.process import caught_signals, told_errors
 from mp4ds.cli.record_words import spelled
-from mp4ds.errors import OptionError
+from mp4ds.errors import OptionError, counted
 from mp4ds.files.sources import salvage_command
 from mp4ds.plugins.recording.record import RecordOptions, open_recorder
 
@@ -169,7 +169,7 @@ def _line(state: RecordProgress) -> str:
     rate = sum(item.bytes_per_s for item in state.topics.values())
     parts = [
         f"{state.state} {state.seconds:.0f} s",
-        f"{count} messages",
+        counted(count, "message"),
         f"{rate / 1e6:.1f} MB/s received",
         f"{state.bytes_written / 1e6:.1f} MB written",
     ]
@@ -184,7 +184,9 @@ def _table(state: RecordProgress) -> Table:
 
     table = Table(title=_line(state), title_justify="left", box=None, pad_edge=False)
     for name in ("topic", "messages", "Hz", "MB/s", "verbatim", "lost"):
-        table.add_column(name, justify="left" if name == "topic" else "right")
+        table.add_column(
+            name, justify="left" if name == "topic" else "right", no_wrap=True, overflow="ellipsis"
+        )
     busiest = sorted(state.topics.items(), key=lambda item: -item[1].bytes_per_s)
     for topic, item in busiest[:_SHOWN]:
         gone = item.dropped + item.lost + item.untimed
@@ -212,8 +214,8 @@ def print_record(summary: RecordSummary) -> None:
         why = f"no message came on {topics}" if topics else "no matching topic was published"
         say(f"{made.dataset}: empty: {why}")
     for topic, count in summary.dropped.items():
-        say(f"{topic}: {count} messages dropped, since the buffer was full")
+        say(f"{topic}: {counted(count, 'message')} dropped, since the buffer was full")
     for topic, count in summary.lost.items():
-        say(f"{topic}: {count} messages lost by the middleware")
+        say(f"{topic}: {counted(count, 'message')} lost by the middleware")
     for topic, count in summary.untimed.items():
-        say(f"{topic}: {count} messages left out: {_UNTIMED}")
+        say(f"{topic}: {counted(count, 'message')} left out: {_UNTIMED}")

@@ -13,6 +13,7 @@ from mp4ds.cli.output import print_json, print_unpack, say
 from mp4ds.cli.process import told_errors
 from mp4ds.cli.progress import progress_of
 from mp4ds.dataset.collections import datasets_in
+from mp4ds.errors import counted
 from mp4ds.plugins.exporting.export import export as run_export
 from mp4ds.plugins.exporting.job import ExportOptions, ExportSummary
 from mp4ds.unpacking.unpack import UnpackOptions, UnpackProgress, unpack_each
@@ -44,15 +45,15 @@ def unpack(
     Messages are converted between ROS 1 and ROS 2 if the output format requires it.
     """
     with told_errors(as_json), progress_of("unpacking", as_json) as tell:
-        noun = "images" if to == "images" else "messages"
+        noun = "image" if to == "images" else "message"
         found, chosen = datasets_in(datasets), options()
 
         def progress(state: UnpackProgress) -> None:
             total = state.messages_total
             if tell:
-                unit = noun if len(found) == 1 else "datasets"
-                told = f"{state.messages} of {total or '?'} {unit}"
-                tell(told, state.messages / total if total else None)
+                unit = noun if len(found) == 1 else "dataset"
+                done = f"{state.messages} of {total}" if total else f"{state.messages}"
+                tell(f"{done} {unit}s", state.messages / total if total else None)
 
         if len(found) == 1:
             summaries = [run(found[0], to, output, chosen, progress=progress)]
@@ -101,11 +102,12 @@ def export(
 def _print_export(summary: ExportSummary) -> None:
     """Print what was written, and every message that was not."""
     total = sum(summary.messages.values())
-    say(f"{summary.output}: {total} messages of {len(summary.messages)} topics")
+    topics = counted(len(summary.messages), "topic")
+    say(f"{summary.output}: {counted(total, 'message')} of {topics}")
     for place, topic in summary.places.items():
         say(f"{place}: {topic}")
     for note in summary.notes:
         say(f"note: {note}")
     for topic, reasons in summary.left_out.items():
         for reason, count in reasons.items():
-            say(f"left out: {count} messages of {topic}: {reason}")
+            say(f"left out: {counted(count, 'message')} of {topic}: {reason}")

@@ -463,11 +463,11 @@ def summarize(
     Args:
         part: All that was packed.
         target: The dataset's final name.
-        source_bytes: Bytes of the source files; None if a slice was taken, for the bytes of
-            its messages.
+        source_bytes: Bytes of the source files; None if only a slice was packed. Then, and if
+            topics were left out, the bytes of the packed messages are taken.
         origin: What it was read from.
     """
-    if source_bytes is None:
+    if source_bytes is None or part.left_out:
         source_bytes = sum(topic.raw_bytes for topic in part.topics.values())
     for stream in part.streams:
         video = stream.sidecar.video

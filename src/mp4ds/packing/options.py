@@ -256,7 +256,7 @@ class PackSummary:
     Attributes:
         dataset: The folder made.
         topics: One entry per topic, in the recording's order.
-        source_bytes: Bytes of the source files.
+        source_bytes: Bytes of the source files, or of the packed messages where not all were.
         dataset_bytes: Bytes of the dataset.
         messages_bytes: Bytes of messages.mcap.
         left_out: Topics left out on request.

@@ -114,7 +114,8 @@ def _use(first: Brief, versions: str) -> list[str]:
     url = f"hf://datasets/{_PLACE}/{' '.join(first.path.name.split())}"
     return [
         f"These are datasets of [mp4ds](https://github.com/mp4ds/mp4ds), format {versions}:",
-        "mp4 files that any player opens, with the exact stamps, headers and calibrations in YAML.",
+        "mp4 files that VLC, mpv and ffmpeg play, with exact stamps, headers and calibrations in",
+        "YAML.",
         "",
         "```sh",
         "pip install 'mp4ds[remote]' huggingface_hub",
