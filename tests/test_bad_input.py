@@ -858,7 +858,7 @@ BAD_OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     },
     "codec": (("pack", "BAG", "-o", "OUT", "--codec", "theora"), "h264"),
     "codec-lossless": (("pack", "BAG", "-o", "OUT", "--codec", "av1"), "av1"),
-    "codec-lossy": (("pack", "BAG", "-o", "OUT", "-q", "crf=20", "--codec", "ffv1"), "ffv1"),
+    "codec-lossy": (("pack", "BAG", "-o", "OUT", "--quality", "crf=20", "--codec", "ffv1"), "ffv1"),
     "topics": (("pack", "BAG", "-o", "OUT", "--topics", "/none/*"), "/cam/image_raw"),
     "second-topics": (("pack", "BAG", "-o", "OUT", "-t", "/imu", "-t", "/none"), "'/none'"),
     "exclude": (("pack", "BAG", "-o", "OUT", "--exclude", "/none/*"), "/cam/image_raw"),

@@ -47,10 +47,12 @@ def test_sentences_are_whole(tmp_path: Path) -> None:
 
 
 def test_nothing_is_printed_but_errors(packed_bag: Path, tmp_path: Path) -> None:
-    for words in (("info",), ("validate",), ("unpack", "-o", "again.bag")):
-        done = run("-q", words[0], str(packed_bag), *words[1:], folder=tmp_path)
-        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-    assert (tmp_path / "again.bag").exists()
+    for place in (0, 1):  # before the command or after it
+        for words in (["info"], ["validate"], ["unpack", "-o", f"again{place}.bag"]):
+            arguments = [*words, str(packed_bag)]
+            done = run(*arguments[:place], "-q", *arguments[place:], folder=tmp_path)
+            assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+        assert (tmp_path / f"again{place}.bag").exists()
     done = run("-q", "info", "nothing", folder=tmp_path)
     assert done.returncode == 2
     assert "no such file" in done.stderr

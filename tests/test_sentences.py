@@ -77,6 +77,24 @@ def test_one_of_a_kind_is_singular(tmp_path: Path) -> None:
     assert "not supported by this format: attachments (2)\n" in done.out
 
 
+def test_paths_are_as_users_write_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Relative to the current folder where they are inside of it, in results and errors alike."""
+    monkeypatch.chdir(tmp_path)
+    assert call("demo", "drive.bag", "--seconds", "0.2").out.startswith("drive.bag: ")
+    for words in (("pack", "drive.bag", "-o", tmp_path / "drive"), ("info", tmp_path / "drive")):
+        done = call(*words)
+        assert str(tmp_path) not in done.out
+        assert re.search("^drive: ", done.out, re.MULTILINE)
+    assert call("pack", "drive.bag", "-o", "drive").err.startswith("mp4ds: drive: already exists")
+    (tmp_path / "drive" / "left_image_raw.mp4").unlink()
+    for said in (call("validate", "drive"), call("validate", tmp_path / "drive")):
+        assert said.out.startswith("drive/left_image_raw.mp4: is listed in the manifest")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    for typed in (str(tmp_path / "drive"), "../drive"):
+        assert call("validate", typed).out.startswith(f"{typed}/left_image_raw.mp4: is listed")
+
+
 # ---------------------------------------------------------------- tables
 
 TABLE = [

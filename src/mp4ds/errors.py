@@ -33,6 +33,7 @@ The exit code is that of the command line. `Refused` is not one of them: users n
 from __future__ import annotations
 
 import errno
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -68,6 +69,18 @@ def _as_path(path: Path | str) -> Path:
     return Path(path) if isinstance(path, str) else path
 
 
+def path_text(path: object) -> str:
+    """A path as users write it: relative to the current folder, if it is inside."""
+    text = str(path)
+    try:
+        here = os.getcwd()  # noqa: PTH109 - starting up without pathlib's classes
+    except OSError:  # it was removed
+        return text
+    if text == here:
+        return "."
+    return text.removeprefix(here + os.sep) if here != os.sep else text
+
+
 def counted(count: int, noun: str) -> str:
     """A number of things, such as ``1 message`` or ``2 messages``."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
@@ -82,7 +95,7 @@ def reason_of(error: BaseException) -> str:
 
 def sentence_of(error: OSError) -> str:
     """A system error: where, and what; without a full stop."""
-    return f"{error.filename or 'a file'}: {reason_of(error)}"
+    return f"{path_text(error.filename or 'a file')}: {reason_of(error)}"
 
 
 def interrupted(error: KeyboardInterrupt | SystemExit, text: str) -> BaseException:
@@ -107,7 +120,7 @@ class SourceError(Mp4dsError, ValueError):
     def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
         self.path = _as_path(path)
         self.problem = problem
-        super().__init__(f"{path}: {problem}." + (f" {remedy}" if remedy else ""))
+        super().__init__(f"{path_text(path)}: {problem}." + (f" {remedy}" if remedy else ""))
 
 
 class SourceNotFoundError(SourceError, FileNotFoundError):
@@ -124,7 +137,7 @@ class TargetError(Mp4dsError, OSError):
 
     def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
         self.path = _as_path(path)
-        super().__init__(f"{path}: {problem}." + (f" {remedy}" if remedy else ""))
+        super().__init__(f"{path_text(path)}: {problem}." + (f" {remedy}" if remedy else ""))
 
 
 class TargetExistsError(TargetError, FileExistsError):
@@ -177,7 +190,7 @@ class FormatError(Mp4dsError, ValueError):
         self.code = code
         self.place = str(place)
         self.problem = problem
-        super().__init__(f"{place}: {problem} [{code}].")
+        super().__init__(f"{path_text(place)}: {problem} [{code}].")
 
 
 class VersionError(FormatError):
@@ -211,7 +224,8 @@ class WriteError(Mp4dsError, OSError):
     def __init__(self, path: Path | str, cause: BaseException) -> None:
         self.path = _as_path(path)
         super().__init__(
-            f"{path}: could not be written: {reason_of(cause)}. The partial output was removed."
+            f"{path_text(path)}: could not be written: {reason_of(cause)}. The partial output was "
+            "removed."
         )
 
 
@@ -220,8 +234,9 @@ class RecordError(Mp4dsError, OSError):
 
     def __init__(self, folder: Path, target: Path, cause: BaseException) -> None:
         super().__init__(
-            f"{folder}: could not be written: {reason_of(cause)}. What was recorded before is in "
-            f"it: make room, then run mp4ds pack --salvage {folder} -o {target}"
+            f"{path_text(folder)}: could not be written: {reason_of(cause)}. What was recorded "
+            "before is in it: make room, then run mp4ds pack --salvage "
+            f"{path_text(folder)} -o {path_text(target)}"
         )
 
 
@@ -246,8 +261,8 @@ class PartsFailedError(Mp4dsError):
         )
         more = f" And {len(failures) - 5} more." if len(failures) > 5 else ""
         super().__init__(
-            f"{dataset}: {len(failures)} of {total} parts could not be packed. {listed}{more} "
-            "Finished parts are kept: run the same command again to resume."
+            f"{path_text(dataset)}: {len(failures)} of {total} parts could not be packed. "
+            f"{listed}{more} Finished parts are kept: run the same command again to resume."
         )
 
 
@@ -279,7 +294,7 @@ class RemoteError(Mp4dsError):
 
     def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
         self.path = _as_path(path)
-        super().__init__(f"{path}: {problem}." + (f" {remedy}" if remedy else ""))
+        super().__init__(f"{path_text(path)}: {problem}." + (f" {remedy}" if remedy else ""))
 
 
 class PublishError(Mp4dsError, OSError):
@@ -335,8 +350,8 @@ class SegmentsDifferError(Mp4dsError):
     def __init__(self, first: Path, other: Path, differences: str) -> None:
         self.first, self.other = first, other
         super().__init__(
-            f"{other}: cannot be joined to {first}: they differ in {differences}. Encode both "
-            "with the same options, or keep them as two streams."
+            f"{path_text(other)}: cannot be joined to {path_text(first)}: they differ in "
+            f"{differences}. Encode both with the same options, or keep them as two streams."
         )
 
 

@@ -13,7 +13,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from mp4ds._version import __version__
-from mp4ds.cli.options import Command
+from mp4ds.cli.options import Command, QuietFlag, quietable
 from mp4ds.cli.output import be_quiet, say
 from mp4ds.cli.process import DEBUG, exit_code_of, prepare_process
 
@@ -96,15 +96,13 @@ def app_for(*names: str, is_completing: bool = False) -> typer.Typer:
         else:
             made = getattr(module, name.replace("-", "_"))
             kind = getattr(module, "COMMAND", Command)
-            app.command(name, short_help=does, cls=kind)(made)
+            app.command(name, short_help=does, cls=kind)(quietable(made))
     return app
 
 
 def _top(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
-    quiet: Annotated[
-        bool, typer.Option("--quiet", "-q", help="Print nothing but errors and --json output.")
-    ] = False,
+    quiet: QuietFlag = False,
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Show tracebacks of errors.")
     ] = False,

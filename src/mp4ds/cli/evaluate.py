@@ -11,7 +11,7 @@ import typer
 from mp4ds.cli.options import JsonFlag, takes
 from mp4ds.cli.output import Column, print_json, print_table, say, size_text
 from mp4ds.cli.process import told_errors
-from mp4ds.errors import counted, interrupted
+from mp4ds.errors import counted, interrupted, path_text
 from mp4ds.plugins.evaluating.evaluate import evaluate as run
 from mp4ds.plugins.evaluating.options import EvaluateOptions
 
@@ -55,7 +55,7 @@ def print_evaluation(result: Evaluation) -> None:
         if not result.recommended:
             say("no setting reaches every camera's target")
     known = f", {result.known} reused from an earlier run" if result.known else ""
-    say(f"{result.output}/index.html: {counted(result.tried, 'setting')} tried{known}")
+    say(f"{path_text(result.output)}/index.html: {counted(result.tried, 'setting')} tried{known}")
 
 
 def _print_camera(camera: CameraEvaluation) -> None:

@@ -21,7 +21,7 @@ from mp4ds.cli.output import (
 )
 from mp4ds.cli.process import told_errors
 from mp4ds.cli.progress import progress_of
-from mp4ds.errors import OptionError, counted
+from mp4ds.errors import OptionError, counted, path_text
 from mp4ds.options import Slice
 
 if TYPE_CHECKING:
@@ -233,7 +233,7 @@ def demo(
     if as_json:
         print_json({"output": output, "messages": messages})
     else:
-        say(f"{output}: {counted(messages, 'message')}")
+        say(f"{path_text(output)}: {counted(messages, 'message')}")
 
 
 def conformance_dump(
@@ -264,7 +264,7 @@ _MODELS = {
 
 def print_intrinsics(result: Intrinsics) -> None:
     """Print the calibrations of all cameras, one after another, and the static transforms."""
-    say(f"# {result.path}: {result.kind}, {counted(len(result.cameras), 'camera')}")
+    say(f"# {path_text(result.path)}: {result.kind}, {counted(len(result.cameras), 'camera')}")
     say("import numpy as np")
     for camera in result.cameras:
         _print_camera(camera)

@@ -12,6 +12,7 @@ import typer
 import typer.core
 from typer.models import OptionInfo
 
+from mp4ds.cli.output import be_quiet
 from mp4ds.errors import OptionError
 from mp4ds.options import Options, Shown, shown_of
 
@@ -35,6 +36,10 @@ JobsOption = Annotated[
 ]
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 ForceFlag = Annotated[bool, typer.Option("--force", "-f", help="Replace an existing output.")]
+
+QuietFlag = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Print nothing but errors and --json output.")
+]
 
 _FLAGS: dict[str, str] = {}  # flags of the options of all commands built so far
 
@@ -217,16 +222,46 @@ def takes(
                 **given,
             )
 
-        update_wrapper(call, command)
-        del call.__dict__["__wrapped__"]  # typer would follow it
         call.__dict__["kinds"] = kinds  # for the documentation
-        call.__dict__["__signature__"] = inspect.Signature(
-            [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in parameters]
-        )
-        call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-        return call
+        return _signed(call, command, parameters)
 
     return decorate
+
+
+def quietable(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the option ``--quiet``, which may also stand before the command."""
+    hints = get_type_hints(command, include_extras=True)
+    own = [
+        parameter.replace(annotation=_annotated(hints[name]), kind=inspect.Parameter.KEYWORD_ONLY)
+        for name, parameter in inspect.signature(command).parameters.items()
+    ]
+    if "quiet" in hints:
+        return command
+
+    def call(quiet: bool, **given: Any) -> None:
+        if quiet:
+            be_quiet()
+        command(**given)
+
+    quiet = inspect.Parameter(
+        "quiet", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=QuietFlag
+    )
+    return _signed(call, command, [*own, quiet])
+
+
+def _signed(
+    call: Callable[..., None],
+    command: Callable[..., None],
+    parameters: Sequence[inspect.Parameter],
+) -> Callable[..., None]:
+    """A function that calls a command, with the parameters that typer is to see."""
+    update_wrapper(call, command)
+    del call.__dict__["__wrapped__"]  # typer would follow it
+    call.__dict__["__signature__"] = inspect.Signature(
+        [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in parameters]
+    )
+    call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return call
 
 
 def _annotated(hint: Any) -> Any:

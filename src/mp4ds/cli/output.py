@@ -19,7 +19,7 @@ from unicodedata import east_asian_width
 
 import typer
 
-from mp4ds.errors import Mp4dsError, counted
+from mp4ds.errors import Mp4dsError, counted, path_text
 from mp4ds.options import iso_text
 
 if TYPE_CHECKING:
@@ -243,10 +243,10 @@ def print_pack(summary: PackSummary) -> None:
     if summary.not_copied:
         say(f"re-encoded, because it cannot be copied: {summary.not_copied}")
     if summary.is_copy:
-        say(f"{summary.dataset}: {size_text(summary.dataset_bytes)}, copied")
+        say(f"{path_text(summary.dataset)}: {size_text(summary.dataset_bytes)}, copied")
         return
     say(
-        f"{summary.dataset}: {size_text(summary.source_bytes)} -> "
+        f"{path_text(summary.dataset)}: {size_text(summary.source_bytes)} -> "
         f"{size_text(summary.dataset_bytes)}{_change(summary)}, of which messages.mcap "
         f"{size_text(summary.messages_bytes)}"
     )
@@ -292,7 +292,7 @@ def print_unpack(summary: UnpackSummary, noun: str) -> None:
     """Print what was written, of things of that name, and what the target could not hold."""
     total = sum(summary.messages.values())
     topics = counted(len(summary.messages), "topic")
-    say(f"{summary.output}: {counted(total, noun)} of {topics}")
+    say(f"{path_text(summary.output)}: {counted(total, noun)} of {topics}")
     for topic, now in summary.republished.items():
         taken = f" (the name {now.instead_of} is taken)" if now.instead_of else ""
         say(f"{topic}: written as {now.topic}, {now.type_name}{taken}")
@@ -315,7 +315,7 @@ def print_unpack(summary: UnpackSummary, noun: str) -> None:
 def print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> None:
     """Print all problems of datasets, and how thorough the check was."""
     for problem in chain.from_iterable(found.values()):
-        say(problem)
+        say(path_text(problem))
     count = sum(map(len, found.values()))
     problems = counted(count, "problem") if count else "no problems"
     if not deep:
@@ -325,7 +325,7 @@ def print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> None
     else:
         depth = ""  # what is missing or broken was not
     if len(found) == 1:
-        say(f"{next(iter(found))}: {problems}{depth}")
+        say(f"{path_text(next(iter(found)))}: {problems}{depth}")
         return
     wrong = sum(map(bool, found.values()))
     where = f" in {wrong} of them" if wrong else ""
@@ -370,7 +370,8 @@ def _moment(time_ns: int | None) -> str:
 
 def print_info(result: Info) -> None:
     """Print what is in a recording or dataset."""
-    say(f"{result.path}: {result.kind}, profile {result.profile or '-'}, {size_text(result.bytes)}")
+    kind = f"{result.kind}, profile {result.profile or '-'}"
+    say(f"{path_text(result.path)}: {kind}, {size_text(result.bytes)}")
     if result.start is not None and result.end is not None:
         start = datetime.fromtimestamp(result.start / 1e9, timezone.utc)
         say(

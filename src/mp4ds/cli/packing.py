@@ -8,7 +8,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from mp4ds.cli.options import Command, ForceFlag, JsonFlag, parse_share, takes
+from mp4ds.cli.options import Command, ForceFlag, JsonFlag, parse_share, quietable, takes
 from mp4ds.cli.output import print_json, print_pack, print_speeds, say
 from mp4ds.cli.process import told_errors
 from mp4ds.cli.progress import pack_progress
@@ -96,6 +96,7 @@ _Output = Annotated[
 
 
 @imports.command(cls=Command)
+@quietable
 @takes(ImageFolder, PackOptions, without=("images", *_ONLY_OF_RECORDINGS))
 def images(
     images_as: Callable[[], ImageFolder],
@@ -123,6 +124,7 @@ def images(
 
 
 @imports.command("ros-mp4", cls=Command)
+@quietable
 def ros_mp4(
     video: Annotated[str, typer.Argument(metavar="VIDEO", help="The mp4 file.")],
     sidecar: Annotated[

@@ -15,7 +15,7 @@ from mp4ds.cli.options import JsonFlag, takes
 from mp4ds.cli.output import complain, is_quiet, print_json, print_pack, say
 from mp4ds.cli.process import caught_signals, told_errors
 from mp4ds.cli.record_words import spelled
-from mp4ds.errors import OptionError, counted
+from mp4ds.errors import OptionError, counted, path_text
 from mp4ds.files.sources import salvage_command
 from mp4ds.plugins.recording.record import RecordOptions, open_recorder
 
@@ -212,7 +212,7 @@ def print_record(summary: RecordSummary) -> None:
             continue
         topics = ", ".join(topic.topic for topic in made.topics)
         why = f"no message came on {topics}" if topics else "no matching topic was published"
-        say(f"{made.dataset}: empty: {why}")
+        say(f"{path_text(made.dataset)}: empty: {why}")
     for topic, count in summary.dropped.items():
         say(f"{topic}: {counted(count, 'message')} dropped, since the buffer was full")
     for topic, count in summary.lost.items():

@@ -19,7 +19,7 @@ _ROS2_LETTERS = {"-b": "--max-size", "-s": "--storage"}
 _IGNORED = {
     **dict.fromkeys(("--storage", "--compression-mode", "--compression-format"), 1),
     **dict.fromkeys(("--compression-queue-size", "--compression-threads", "--chunksize"), 1),
-    **dict.fromkeys(("-j", "--bz2", "--lz4", "--quiet", "--tcpnodelay"), 0),
+    **dict.fromkeys(("-j", "--bz2", "--lz4", "--tcpnodelay"), 0),
 }
 """Options about what a dataset does not have -> how many words they take."""
 

@@ -22,7 +22,7 @@ from mp4ds.cli.output import print_json, printed, say, size_text
 from mp4ds.cli.process import told_errors
 from mp4ds.cli.progress import progress_of
 from mp4ds.dataset.collections import datasets_in
-from mp4ds.errors import OptionError
+from mp4ds.errors import OptionError, counted, path_text
 from mp4ds.plugins.reporting.report import ReportOptions, ReportSummary
 from mp4ds.plugins.reporting.report import report as run_report
 from mp4ds.plugins.reporting.stills import StillOptions
@@ -95,7 +95,7 @@ def _reports(
     else:
         for problem in summary.problems:
             say(f"not shown: {problem}")
-        say(f"{summary.index}: {summary.datasets} datasets")
+        say(f"{path_text(summary.index)}: {counted(summary.datasets, 'dataset')}")
     if summary.problems:
         raise typer.Exit(1)
 
@@ -106,7 +106,7 @@ def _print_report(summary: ReportSummary) -> None:
         say(f"{camera.topic}: plays {_PLAYS[camera.plays]}{note}")
     for problem in summary.problems:
         say(f"not shown: {problem}")
-    say(f"{summary.index}: {size_text(summary.bytes)}")
+    say(f"{path_text(summary.index)}: {size_text(summary.bytes)}")
 
 
 _PLAYS = {"video": "its own video", "proxy": "a proxy", "nothing": "nothing"}
@@ -139,9 +139,10 @@ def frames(
         return
     first, last = summary.frames[0], summary.frames[-1]
     if first is last:
-        say(f"{summary.output}: frame {first.index} of {summary.topic}, stamp {first.stamp_ns} ns")
+        place = f"{path_text(summary.output)}: frame {first.index} of {summary.topic}"
+        say(f"{place}, stamp {first.stamp_ns} ns")
     else:
         say(
-            f"{summary.output}: {len(summary.frames)} frames of {summary.topic}, from frame "
-            f"{first.index} to {last.index}"
+            f"{path_text(summary.output)}: {len(summary.frames)} frames of {summary.topic}, from "
+            f"frame {first.index} to {last.index}"
         )

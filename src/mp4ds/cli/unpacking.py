@@ -13,7 +13,7 @@ from mp4ds.cli.output import print_json, print_unpack, say
 from mp4ds.cli.process import told_errors
 from mp4ds.cli.progress import progress_of
 from mp4ds.dataset.collections import datasets_in
-from mp4ds.errors import counted
+from mp4ds.errors import counted, path_text
 from mp4ds.plugins.exporting.export import export as run_export
 from mp4ds.plugins.exporting.job import ExportOptions, ExportSummary
 from mp4ds.unpacking.unpack import UnpackOptions, UnpackProgress, unpack_each
@@ -103,7 +103,7 @@ def _print_export(summary: ExportSummary) -> None:
     """Print what was written, and every message that was not."""
     total = sum(summary.messages.values())
     topics = counted(len(summary.messages), "topic")
-    say(f"{summary.output}: {counted(total, 'message')} of {topics}")
+    say(f"{path_text(summary.output)}: {counted(total, 'message')} of {topics}")
     for place, topic in summary.places.items():
         say(f"{place}: {topic}")
     for note in summary.notes:

@@ -19,6 +19,7 @@ from mp4ds.errors import (
     TargetError,
     WriteError,
     interrupted,
+    path_text,
 )
 from mp4ds.files.outputs import is_seen, move_into_place, sync
 from mp4ds.packing.engine import Engine, Outcome
@@ -173,9 +174,10 @@ class Coordinator:
             names = [task.name for task in run.missing]
             if names:
                 listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
+                count = f"{len(names)} of {len(run.job.tasks)} parts"
                 raise OptionError(
-                    f"{run.target}: {len(names)} of {len(run.job.tasks)} parts are missing: "
-                    f"{listed}. Run their shards, or pack without `join` to pack them here."
+                    f"{path_text(run.target)}: {count} are missing: {listed}. Run their "
+                    "shards, or pack without `join` to pack them here."
                 )
 
     def run(self) -> Iterator[PackRun]:

@@ -76,9 +76,7 @@ class PackOptions(SliceOptions):
     duration: str | float | None = duration()
     quality: str | None = option(
         "lossless, visual, crf=N, or a score to reach: vmaf=99.5, psnr=42, ssim=0.98; default: "
-        "lossless, or the quality of a repacked dataset.",
-        None,
-        "-q",
+        "lossless, or the quality of a repacked dataset."
     )
     codec: str | None = option(
         "h264, h265, ffv1 (lossless), av1, av1-10bit (lossy); on a GPU av1-nvenc, h264-nvenc, "

@@ -85,7 +85,7 @@ class RecordOptions(Options):
         least=1,
         most=1_000_000,
     )
-    quality: str = option("lossless, visual or crf=N.", LOSSLESS, "-q")
+    quality: str = option("lossless, visual or crf=N.", LOSSLESS)
     codec: str | None = option("As in pack; by default the fastest to encode.")
     preset: str | None = option("The encoder's preset; by default the fastest.")
     gop: int | None = option(
