@@ -15,8 +15,8 @@ import mp4ds
 from each import each, fresh
 from mp4ds.cli.output import Column, print_table
 from scenes import START, Record, Scene
-from sources import scene, write_bag, write_mcap
-from test_bad_input import call
+from sources import scene, write_bag, write_mcap, write_rosbag2
+from test_bad_input import call, refused, unchanged
 from test_terminal import Screen
 
 VIDEO, SIDECAR = "cam_image_raw.mp4", "cam_image_raw.yaml"
@@ -93,6 +93,35 @@ def test_paths_are_as_users_write_them(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.chdir(tmp_path / "elsewhere")
     for typed in (str(tmp_path / "drive"), "../drive"):
         assert call("validate", typed).out.startswith(f"{typed}/left_image_raw.mp4: is listed")
+
+
+def test_a_dataset_is_named_after_its_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    source = tmp_path / "disk" / "drive.v2.bag"
+    write_bag(source, scene("mono8", frames=2))
+    assert call("pack", source).code == 0
+    assert mp4ds.validate("drive.v2", deep=True) == []
+    assert call("pack", source).err.startswith("mp4ds: drive.v2: already exists. ")
+    assert call("pack", source, "--force").code == 0
+    assert mp4ds.pack(write_named(tmp_path / "disk")).dataset == tmp_path / "here" / "folder"
+    monkeypatch.chdir(tmp_path / "disk")
+    for words, said in (
+        (["folder"], "Give --output, the dataset to make: folder is the recording itself."),
+        (["../here/drive.v2"], "only that of one recording is named by itself"),
+        (["drive.v2.bag", "folder"], "only that of one recording is named by itself"),
+    ):
+        with unchanged(tmp_path):
+            refused(call("pack", *words), 2, said)
+
+
+def write_named(folder: Path) -> Path:
+    """A rosbag2 folder."""
+    write_rosbag2(folder / "folder", scene("mono8", frames=2))
+    return folder / "folder"
 
 
 # ---------------------------------------------------------------- tables

@@ -32,14 +32,15 @@ def pack(
         ),
     ],
     output: Annotated[
-        str,
+        Optional[str],  # noqa: UP045 - read at run time by typer
         typer.Option(
             "--output",
             "-o",
             metavar="DATASET",
-            help="Folder to create; if it ends in a slash, one dataset per SOURCE is made in it.",
+            help="Folder to create; if it ends in a slash, one dataset per SOURCE is made in it. "
+            "Default: named after SOURCE, in the current folder.",
         ),
-    ],
+    ] = None,
     shard: Annotated[
         Optional[str],  # noqa: UP045 - read at run time by typer
         typer.Option("--shard", metavar="I/N", help="Pack only share I of N shares of the parts."),
@@ -57,16 +58,17 @@ def pack(
     summaries: list[PackSummary] = []
     with told_errors(as_json), pack_progress(as_json, whole=not shard) as progress:
         chosen = options()
-        if shard and (chosen.join or output.endswith("/")):
+        into = output if output and output.endswith("/") else None
+        if shard and (chosen.join or into):
             raise OptionError("`shard` cannot be combined with `join` or with several datasets.")
         if shard:
             pack_share(sources, output, parse_share(shard), chosen, progress=progress)
-        elif output.endswith("/"):
-            summaries = pack_each(sources, output, chosen, progress=progress)
+        elif into:
+            summaries = pack_each(sources, into, chosen, progress=progress)
         else:
             summaries = [run(sources, output, chosen, progress=progress)]
     if as_json:
-        print_json(summaries if output.endswith("/") or shard else summaries[0])
+        print_json(summaries if into or shard else summaries[0])
         return
     for summary in summaries:
         print_pack(summary)

@@ -25,6 +25,7 @@ from mp4ds.errors import (
     SourceError,
     TargetExistsError,
     WriteError,
+    path_text,
 )
 from mp4ds.files.outputs import check_target, digest_file, staged
 from mp4ds.files.sources import (
@@ -224,7 +225,7 @@ _USUAL = PackOptions()
 
 def pack(
     sources: Sequence[Path | str] | Path | str,
-    dataset: Path | str,
+    dataset: Path | str | None = None,
     options: PackOptions | None = None,
     *,
     progress: Report | None = None,
@@ -234,7 +235,8 @@ def pack(
     Args:
         sources: A bag, rosbag2 folder, MCAP file or dataset, or several that belong together; or
             URLs. A folder of images if the options have `images`.
-        dataset: The folder to make, or its URL.
+        dataset: The folder to make, or its URL; None for a folder in the current one with the name
+            of the recording.
         options: How to pack; lossless by default.
         progress: Called several times a second.
 
@@ -251,8 +253,8 @@ def pack(
             dataset, and calling it again resumes. Otherwise nothing is left behind.
     """
     paths = _paths(sources)
-    chosen = _checked(options or PackOptions(), paths)
-    return _pack(paths, _absolute(dataset), chosen, progress)
+    target = _target(dataset, paths)
+    return _pack(paths, target, _checked(options or PackOptions(), paths), progress)
 
 
 def _pack(
@@ -326,7 +328,7 @@ def _pack_to_store(
 
 def pack_share(
     sources: Sequence[Path | str] | Path | str,
-    dataset: Path | str,
+    dataset: Path | str | None,
     share: tuple[int, int],
     options: PackOptions | None = None,
     *,
@@ -336,7 +338,7 @@ def pack_share(
 
     Args:
         sources: As for `pack`, under the same path on all machines.
-        dataset: The folder to make in the end; parts are made next to it.
+        dataset: The folder to make in the end, as for `pack`; parts are made next to it.
         share: Number of this share, from 1, and the number of shares.
         options: How to pack; the same for all shares.
         progress: Called several times a second.
@@ -346,7 +348,7 @@ def pack_share(
     """
     paths = _paths(sources)
     chosen = _checked(options or PackOptions(), paths, may_copy=False)
-    target = _absolute(dataset)
+    target = _target(dataset, paths)
     store = remote(target)
     if store:
         from mp4ds.files.uploads import local_path
@@ -385,7 +387,7 @@ def pack_each(
     parent = _absolute(folder)
     targets: dict[Path, Path] = {}
     for source in paths:
-        target = parent / (source.name if source.is_dir() else source.stem)
+        target = parent / _name_of(source)
         if target in targets:
             raise OptionError(
                 f"{targets[target]} and {source} would both become {target}. Pack one of them "
@@ -611,6 +613,32 @@ def _task_bytes(runs: Sequence[PackRun]) -> int:
 def _paths(sources: Sequence[Path | str] | Path | str) -> list[Path]:
     several = [sources] if isinstance(sources, (str, Path, RemotePath)) else sources
     return [location(path) for path in several]
+
+
+def _target(dataset: Path | str | None, paths: Sequence[Path]) -> Path:
+    """The dataset to make: as named, or named after the recording, in the current folder.
+
+    Raises:
+        OptionError: It is not named, and has to be.
+    """
+    if dataset is not None:
+        return _absolute(dataset)
+    if len(paths) != 1 or dataset_at(paths[0]):
+        raise OptionError(
+            "Give `output`, the dataset to make: only that of one recording is named by itself."
+        )
+    source = _absolute(paths[0])
+    target = Path(os.path.abspath(_name_of(source)))  # noqa: PTH100 - keeps links
+    if target == source:
+        raise OptionError(
+            f"Give `output`, the dataset to make: {path_text(target)} is the recording itself."
+        )
+    return target
+
+
+def _name_of(source: Path) -> str:
+    """The name of a dataset after that of its recording."""
+    return source.name if source.is_dir() else source.stem
 
 
 def _absolute(path: Path | str) -> Path:
