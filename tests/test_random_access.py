@@ -438,6 +438,65 @@ def test_no_such_size_or_part(options: Any, colour: mp4ds.Stream) -> None:
             ask([0], **options)
 
 
+# ---------------------------------------------------------------- words
+
+MISTAKES: dict[str, tuple[type[Exception], str]] = {
+    "stream[[1, 2]]": (TypeError, r"not [1, 2]: read([0, 5]) and get([0, 5]) take several"),
+    "stream[np.arange(9)]": (TypeError, r"read([0, 5]) and get([0, 5]) take several"),
+    "stream[1.0]": (TypeError, "at(stamp_ns) a time"),
+    "stream.read(5)": (TypeError, "use [5]"),
+    "stream.read([0], resize=224)": (mp4ds.OptionError, "is a factor; for pixels, use (224, 224)"),
+    "stream.at(0.5)": (TypeError, "integers, in nanoseconds, not 0.5"),
+    "stream.between(0, 1.5)": (TypeError, "integers, in nanoseconds, not 1.5"),
+    "stream.at(0, tolerance_ns=0.1)": (TypeError, "integers, in nanoseconds, not 0.1"),
+    "stream.get_frames_at([1])": (AttributeError, "here it is dataset[topic].get([0, 5])"),
+    "stream.get_batch([1])": (AttributeError, "here it is dataset[topic].read([0, 5])"),
+    "dataset.get_frame_at(1)": (AttributeError, "here it is dataset[topic][7]"),
+    "stream.frames": (AttributeError, "'Stream' object has no attribute 'frames'"),
+    "dataset.frames": (AttributeError, "'Dataset' object has no attribute 'frames'"),
+}
+
+
+@each("code", MISTAKES)
+def test_what_to_write_instead(code: str, colour: mp4ds.Stream) -> None:
+    kind, words = MISTAKES[code]
+    with mp4ds.open(colour.path) as dataset, pytest.raises(kind, match=re.escape(words)):
+        eval(code, {"stream": colour, "dataset": dataset, "np": np})
+
+
+def test_an_error_in_a_property_is_its_own(colour: mp4ds.Stream) -> None:
+    class Other(mp4ds.Stream):
+        @property
+        def shape(self) -> tuple[int, ...]:
+            return self.encoding.shape  # type: ignore[attr-defined,no-any-return]
+
+    with pytest.raises(AttributeError, match="'str' object has no attribute 'shape'"):
+        _ = Other(colour.path).shape
+
+
+def test_what_it_is_in_a_line(tmp_path: Path) -> None:
+    dataset = packed(tmp_path, scene("rgb8", frames=FRAMES))
+    with mp4ds.open(dataset) as found:
+        assert re.fullmatch(
+            rf"<Dataset '{dataset}': {TOPIC}; 9 frames; \d+ messages; 0\.\d s; \d\.\d MB>",
+            repr(found),
+        )
+        assert repr(found[TOPIC]) == f"<Stream '{TOPIC}': 9 frames, 64x48 rgb8, 0.3 s>"
+        pair = mp4ds.open(found[TOPIC].path)
+        assert repr(pair) == f"<Dataset '{found[TOPIC].path}': {TOPIC}; 9 frames>"
+        video = shutil.copy(found[TOPIC].video_path, tmp_path / "clip.mp4")
+    with mp4ds.open(video) as found:
+        assert repr(found) == f"<Dataset '{video}': clip; 9 frames>"
+        assert repr(found["clip"]) == "<Video 'clip': 9 frames, 64x48 rgb8, 0.3 s>"
+    with mp4ds.open(packed(tmp_path / "odd", odd_scene("size-change"))) as found:
+        assert re.fullmatch(
+            r"<TopicFrames '/odd/image': 8 frames, \d\.\d s>", repr(found["/odd/image"])
+        )
+        first = found.streams[0]
+        first.video_path.unlink()
+    assert repr(mp4ds.Stream(first.path)) == "<Stream '/odd/image': 4 frames, 32x24 mono8>"
+
+
 # ---------------------------------------------------------------- intrinsics
 
 

@@ -371,7 +371,8 @@ def test_nothing_matches(tmp_path: Path) -> None:
         ({"topics": LEFT}, "topics is a list"),
         ({"topics": [LEFT, LEFT]}, "/left/image_raw is given twice"),
         ({"offsets": ()}, "offsets is empty"),
-        ({"offsets": (0.5,)}, "in frames must be integers"),
+        ({"offsets": [-0.1, 0]}, 'in frames must be integers; for seconds, give offsets_in="seco'),
+        ({"resize": 224}, "is a factor; for pixels, use (224, 224)"),
         ({"offsets_in": "minutes"}, "offsets_in is 'minutes'"),
         ({"offsets": (float("nan"),), "offsets_in": "seconds"}, "at most 1e9"),
         ({"tolerance_ns": 5}, 'belongs to offsets_in="seconds"'),
@@ -390,6 +391,24 @@ def test_wrong_options(drives: list[Path], options: dict[str, Any], sentence: st
     with pytest.raises(mp4ds.OptionError) as caught:
         FrameDataset(drives[0], **options)
     assert sentence in str(caught.value)
+
+
+def test_names_of_other_libraries(drives: list[Path]) -> None:
+    with pytest.raises(TypeError, match=r"here it is offsets=.* offsets_in="):
+        FrameDataset(drives[0], delta_timestamps={LEFT: [-0.1, 0]})  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="FrameDataset has no 'batch_size'"):
+        FrameDataset(drives[0], batch_size=4)  # type: ignore[arg-type]
+    dataset = FrameDataset(drives[0], topics=[LEFT])
+    for index in ([0, 1], slice(0, 2), 0.5):
+        with pytest.raises(TypeError, match=r"Subset\(dataset, \[0, 5\]\)"):
+            _ = dataset[index]  # type: ignore[index]
+
+
+def test_samples_in_a_line(drives: list[Path]) -> None:
+    dataset = FrameDataset(drives[:2], topics=[LEFT, RIGHT])
+    assert repr(dataset) == f"<FrameDataset: {len(dataset)} samples of 2 datasets, {LEFT}, {RIGHT}>"
+    stream = FrameStream(drives[0], topics=[LEFT])
+    assert repr(stream) == f"<FrameStream: {stream.samples} samples of 1 dataset, {LEFT}>"
 
 
 def test_wrong_options_of_streams(drives: list[Path]) -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ from mp4ds.dataset.channels import (
     log_times,
     when_asked,
 )
-from mp4ds.dataset.frames import Frames
+from mp4ds.dataset.frames import Frames, missing, seconds_of
 from mp4ds.dataset.messages import MessagesFile, RecordedMessage, as_recorded
 from mp4ds.dataset.rebuild import Choice, everything, last_of, within
 from mp4ds.dataset.stream import Stream
@@ -40,6 +41,7 @@ from mp4ds.times import Sync, synchronize
 
 _VIDEOS = (".mp4", ".m4v", ".mov")
 _JPEG_QUALITY = 95
+_MOST_TOPICS = 4  # named in a repr
 
 
 class Dataset:
@@ -102,6 +104,23 @@ class Dataset:
         dataset.path, dataset.manifest, dataset.jpeg_quality = folder, manifest, _JPEG_QUALITY
         dataset.streams, dataset.videos = list(streams), []
         return dataset
+
+    if not TYPE_CHECKING:  # else every name would pass for known
+
+        def __getattr__(self, name: str) -> Any:
+            return missing(self, name)
+
+    def __repr__(self) -> str:
+        topics = ", ".join(self.topics[:_MOST_TOPICS]) or "no camera"
+        if len(self.topics) > _MOST_TOPICS:
+            topics += f" and {len(self.topics) - _MOST_TOPICS} more"
+        parts = [topics, f"{sum(map(len, self._all))} frames"]
+        if manifest := self.manifest:
+            parts.append(f"{manifest.messages} messages")
+            if span := manifest.time_range:
+                parts.append(seconds_of(span.start, span.end))
+            parts.append(f"{sum(file.size for file in manifest.files) / 1e6:.1f} MB")
+        return f"<Dataset {str(self.path)!r}: {'; '.join(parts)}>"
 
     @property
     def _all(self) -> list[Stream | Video]:

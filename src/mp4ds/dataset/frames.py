@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import index as as_integer
-from typing import overload
+from reprlib import repr as shortened
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.dataset.views import Crop, Resize, View, check_outputs, output, view_of
-from mp4ds.errors import FrameNotFoundError, OptionError
+from mp4ds.errors import FrameNotFoundError, Mp4dsError, OptionError
 from mp4ds.format.models import Calibration
 from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.depth import metres_of
@@ -58,8 +60,8 @@ class StampIndex:
         """
         if mode not in _WANTED:
             raise OptionError(f"mode {mode!r} is not known: use {', '.join(_WANTED)}")
-        stamp = as_integer(stamp_ns)
-        tolerance = None if tolerance_ns is None else as_integer(tolerance_ns)
+        stamp = self._nanoseconds(stamp_ns)
+        tolerance = None if tolerance_ns is None else self._nanoseconds(tolerance_ns)
         if tolerance is not None and tolerance < 0:
             raise OptionError(f"tolerance is {tolerance} ns: use 0 or more")
         earlier, later = self._around(stamp)
@@ -77,8 +79,17 @@ class StampIndex:
 
     def between(self, start_ns: int, end_ns: int) -> NDArray[np.int64]:
         """Numbers of the frames with start_ns <= stamp < end_ns, by stamp."""
-        first, last = (self._place(as_integer(time)) for time in (start_ns, end_ns))
+        first, last = (self._place(self._nanoseconds(time)) for time in (start_ns, end_ns))
         return self._order[first : max(first, last)]
+
+    def _nanoseconds(self, time: int) -> int:
+        try:
+            return as_integer(time)
+        except TypeError:
+            raise TypeError(
+                f"times of {self._topic} are integers, in nanoseconds, not {time!r}: half a second "
+                "after its first frame is at stamps[0] + 500_000_000"
+            ) from None
 
     def _place(self, stamp: int) -> int:
         """How many stamps are smaller."""
@@ -100,6 +111,11 @@ class StampIndex:
         return int(self._sorted[place])
 
 
+def seconds_of(first_ns: int, last_ns: int) -> str:
+    """The time from one moment to another, for people."""
+    return f"{(last_ns - first_ns) / 1e9:.1f} s"
+
+
 def numbers_of(topic: str, count: int, indices: Sequence[int] | NDArray[np.int64]) -> list[int]:
     """Frame numbers; negative ones count from the end.
 
@@ -113,10 +129,18 @@ def numbers_of(topic: str, count: int, indices: Sequence[int] | NDArray[np.int64
         TypeError: One is not an integer.
     """
     numbers = []
+    if not isinstance(indices, Iterable):
+        raise TypeError(f"frames of {topic} are read by a list of numbers: use [{indices!r}]")
     for index in indices.tolist() if isinstance(indices, np.ndarray) else indices:
         if isinstance(index, bool):
             raise TypeError("frames are selected by number: for a mask, give np.flatnonzero(mask)")
-        asked = as_integer(index)
+        try:
+            asked = as_integer(index)
+        except TypeError:
+            raise TypeError(
+                f"frames of {topic} are selected by integers, not {shortened(index)}: "
+                "read([0, 5]) and get([0, 5]) take several, at(stamp_ns) a time"
+            ) from None
         number = asked + count if asked < 0 else asked
         if not 0 <= number < count:
             raise IndexError(
@@ -155,6 +179,32 @@ class Frame:
 
 Indices = Sequence[int] | NDArray[np.int64]
 
+_ELSEWHERE = {
+    "get_frame_at": "dataset[topic][7]",
+    "get_frames_at": "dataset[topic].get([0, 5]), or read([0, 5]) for one array",
+    "get_frames_in_range": "dataset[topic][2:12:3]",
+    "get_frame_played_at": "dataset[topic].at(stamp_ns)",
+    "get_frames_played_in_range": "dataset[topic].between(start_ns, end_ns)",
+    "get_batch": "dataset[topic].read([0, 5])",
+    "delta_timestamps": 'offsets=(-0.1, 0), offsets_in="seconds"',
+    "tolerance_s": "tolerance_ns",
+    "image_transforms": "transform",
+}
+"""Names of torchcodec, decord and LeRobot -> what does it here."""
+
+
+def absent(owner: object, name: str) -> str:
+    """What is wrong with a name that an object or a function does not have."""
+    hint = f"; here it is {_ELSEWHERE[name]}" if name in _ELSEWHERE else ""
+    return f"{type(owner).__name__} has no {name!r}{hint}"
+
+
+def missing(owner: object, name: str) -> Any:
+    """For ``__getattr__``: raises AttributeError."""
+    if name in _ELSEWHERE:
+        raise AttributeError(absent(owner, name))
+    return object.__getattribute__(owner, name)  # again, for the error of a property
+
 
 class Frames(ABC):
     """A sequence of frames, decoded on demand.
@@ -173,6 +223,19 @@ class Frames(ABC):
       bicubic interpolation; depths and other measurements use the nearest pixel. The frame's
       `intrinsics` are adjusted to match.
     """
+
+    if not TYPE_CHECKING:  # else every name would pass for known
+
+        def __getattr__(self, name: str) -> Any:
+            return missing(self, name)
+
+    def __repr__(self) -> str:
+        parts = [f"{len(self)} frame{'s' * (len(self) != 1)}"]
+        with suppress(Mp4dsError):  # of frames that differ
+            parts.append("{}x{} {}".format(*self.image_size, self.encoding))
+        with suppress(Mp4dsError):  # of a damaged sidecar, which is reported when it is used
+            parts.append(seconds_of(int(self.log_times.min()), int(self.log_times.max())))
+        return f"<{type(self).__name__} {self.topic!r}: {', '.join(parts)}>"
 
     # ------------------------------------------------------------ what they are
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import index as as_integer
@@ -132,6 +131,8 @@ Resize = float | tuple[int, int] | None
 
 Crop = tuple[int, int, int, int] | None
 """x, y, width and height in pixels of the image, applied first."""
+
+_MOST_TIMES = 16  # a larger factor was meant as pixels
 
 FORMATS = ("native", "rgb", "bgr", "gray", "depth_m")
 """As recorded; (H, W, 3); (H, W, 3); (H, W); (H, W) of float32, metres."""
@@ -279,8 +280,10 @@ def size_after(topic: str, cut: _Size, resize: float | Sequence[int]) -> _Size:
             width, height = (as_integer(side) for side in resize)
         else:
             factor = float(resize)
-            if not (math.isfinite(factor) and 0 < factor <= MAX_SIDE):
-                raise OptionError(f"{problem}: {advice}")
+            if _MOST_TIMES < factor <= MAX_SIDE:
+                advice = f"one number is a factor; for pixels, use ({factor:.0f}, {factor:.0f})"
+            if not 0 < factor <= _MOST_TIMES:
+                raise ValueError
             width, height = (max(1, round(side * factor)) for side in cut)
     except (TypeError, ValueError):
         raise OptionError(f"{problem}: {advice}") from None

@@ -20,7 +20,7 @@ from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import open_dataset
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.video import Video
-from mp4ds.dataset.views import FORMATS
+from mp4ds.dataset.views import FORMATS, size_after
 from mp4ds.errors import FormatError, Mp4dsError, OptionError, Refused, SampleError, VideoError
 from mp4ds.files.urls import location, spelled
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
@@ -148,6 +148,9 @@ def pictures_from(
     crops = _each("crop", crop, topics, None)
     for name in formats:
         _one_of("format", name, FORMATS)
+    for topic, size in zip(topics, sizes, strict=True):
+        if size is not None:  # now, rather than in a worker
+            size_after(topic, (1, 1), size)
     views = tuple(map(TensorView, formats, sizes, crops))
     if backend == "mp4ds" and device != "cpu":
         raise OptionError(f"device={device!r} needs backend='torchcodec'.")

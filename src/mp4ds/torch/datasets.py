@@ -7,13 +7,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from math import prod
 from operator import index as as_integer
-from typing import Any, Literal, Protocol, SupportsIndex
+from reprlib import repr as shortened
+from typing import Any, Literal, NoReturn, Protocol, SupportsIndex
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
+from mp4ds.dataset.frames import absent
 from mp4ds.errors import Mp4dsError, OptionError, SampleError
 from mp4ds.torch.cameras import (
     Backend,
@@ -104,7 +106,10 @@ def offsets_from(values: Sequence[float], unit: Unit, tolerance_ns: int | None) 
         raise OptionError("offsets is empty; use (0,) for the sample's own frame alone.")
     if unit == "frames":
         if any(isinstance(value, bool) or value != int(value) for value in given):
-            raise OptionError(f"offsets are {given}, but offsets in frames must be integers.")
+            raise OptionError(
+                f"offsets are {given}, but offsets in frames must be integers; "
+                'for seconds, give offsets_in="seconds".'
+            )
         if tolerance_ns is not None:
             raise OptionError('tolerance_ns belongs to offsets_in="seconds".')
         return Offsets(tuple(int(value) for value in given))
@@ -298,6 +303,16 @@ def _named(path: str, topic: str) -> Iterator[None]:
 
 # ---------------------------------------------------------------- dataset
 
+
+def described(samples: object, collection: Collection) -> str:
+    """The samples of a collection, in a line."""
+    count, several = len(collection.recordings), len(collection.recordings) != 1
+    return (
+        f"<{type(samples).__name__}: {int(collection.starts[-1])} samples of {count} "
+        f"dataset{'s' * several}, {', '.join(collection.topics)}>"
+    )
+
+
 SYNC_TOLERANCE_NS = 20_000_000
 
 
@@ -367,7 +382,10 @@ class FrameDataset(Dataset):
         cache_files: int = 16,
         backend: Backend = "mp4ds",
         device: str = "cpu",
+        **others: NoReturn,
     ) -> None:
+        for name in others:  # of other libraries, too
+            raise TypeError(absent(self, name))
         chosen = offsets_from(offsets, offsets_in, tolerance_ns)
         self._collection = Collection(paths, topics=topics, sync_tolerance_ns=sync_tolerance_ns)
         pictures = pictures_from(
@@ -402,6 +420,9 @@ class FrameDataset(Dataset):
     def unmatched(self) -> list[dict[str, NDArray[np.int64]]]:
         """For each dataset, the numbers of the frames that are not in any sample, by topic."""
         return [recording.unmatched for recording in self._collection.recordings]
+
+    def __repr__(self) -> str:
+        return described(self, self._collection)
 
     def __len__(self) -> int:
         return int(self._collection.starts[-1])
@@ -447,7 +468,13 @@ class FrameDataset(Dataset):
         return {key: _whole([sample[key] for sample in samples]) for key in samples[0]}
 
     def _number(self, index: SupportsIndex) -> int:
-        number = as_integer(index)
+        try:
+            number = as_integer(index)
+        except TypeError:
+            raise TypeError(
+                f"samples are selected by integers, not {shortened(index)}: for several, use "
+                "torch.utils.data.Subset(dataset, [0, 5])"
+            ) from None
         if not -len(self) <= number < len(self):
             raise IndexError(f"there are {len(self)} samples, and none with number {number}")
         return number % len(self)

@@ -21,7 +21,13 @@ from mp4ds.torch.cameras import (
     Resize,
     pictures_from,
 )
-from mp4ds.torch.datasets import SYNC_TOLERANCE_NS, Offsets, SampleReader, Transform
+from mp4ds.torch.datasets import (
+    SYNC_TOLERANCE_NS,
+    Offsets,
+    SampleReader,
+    Transform,
+    described,
+)
 
 _T = TypeVar("_T")
 _UNREAD = object()
@@ -194,6 +200,9 @@ class FrameStream(IterableDataset):
     def samples(self) -> int:
         """Number of samples per epoch, over all processes."""
         return int(self._collection.starts[-1])
+
+    def __repr__(self) -> str:
+        return described(self, self._collection)
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the order of the next epoch; the same number gives the same order.
