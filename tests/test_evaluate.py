@@ -46,6 +46,7 @@ from mp4ds.plugins.evaluating.options import (
     parse_crfs,
     parse_target,
 )
+from mp4ds.plugins.evaluating.page import table
 from mp4ds.plugins.evaluating.results import (
     Cell,
     EvaluateProgress,
@@ -546,6 +547,15 @@ def test_rates_are_searched(whole: Evaluation) -> None:
     assert 95 <= row.score < 99.8
     assert row.setting.crf > 8
     assert any("100 images per second" in note for note in camera.notes)
+
+
+def test_names_in_the_table_are_no_formulas(whole: Evaluation) -> None:
+    (camera,) = whole.cameras
+    cell = camera.cells[0]
+    setting = replace(cell.setting, preset="@SUM(A1)")
+    odd = replace(camera, topic='=HYPERLINK("x")', cells=[replace(cell, setting=setting)])
+    (line,) = csv.DictReader(table(replace(whole, cameras=[odd])).splitlines())
+    assert (line["topic"], line["preset"]) == ('\'=HYPERLINK("x")', "'@SUM(A1)")
 
 
 def test_files(whole: Evaluation) -> None:

@@ -310,6 +310,16 @@ def test_pycolmap_distorts_as_opencv(model: str, tmp_path: Path) -> None:
         assert camera.img_from_cam(point) == pytest.approx(expected, abs=1e-3)
 
 
+def test_a_topic_of_two_lines(tmp_path: Path) -> None:
+    made = scene("rgb8", frames=2, with_info=False)
+    topic = "/cam\n1.5 rgb/other.png"
+    images = [message for message in made.messages if message.topic == "/cam/image_raw"]
+    odd = Scene([replace(message, topic=topic) for message in images])
+    mp4ds.export(pack_drive(tmp_path, odd), "tum", tmp_path / "out")
+    lines = (tmp_path / "out/rgb.txt").read_text().splitlines()
+    assert len([line for line in lines if not line.startswith("#")]) == 2
+
+
 @pytest.mark.parametrize("to", ["colmap", "euroc", "tum"])
 def test_an_unsuitable_topic_of_poses_is_refused_first(
     to: str, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -421,6 +421,13 @@ projection_matrix:
 """
 
 
+def test_names_of_files_are_no_formulas(tmp_path: Path) -> None:
+    plain(tmp_path / "in", ["=1.png", "2.png"])
+    mp4ds.pack(tmp_path / "in", tmp_path / "ds", folder(rate="2", topic="@cam"))
+    lines = attachments(tmp_path / "ds" / "messages.mcap")["images.csv"].decode().splitlines()
+    assert lines[1:] == ["'@cam,0,2.png", "'@cam,500000000,./=1.png"]
+
+
 def test_jpeg_files_are_kept_beside_others(tmp_path: Path) -> None:
     for number in range(3):
         save(tmp_path / "in" / f"{number}.jpg", image(number, 3))

@@ -18,6 +18,7 @@ from mp4ds.files.outputs import (
     PAGE_SIGN,
     as_write_error,
     check_target,
+    csv_cell,
     digest_file,
     staged,
     write_listing,
@@ -52,6 +53,16 @@ def target(tmp_path: Path) -> Path:
 
 def only(folder: Path, *names: str) -> bool:
     return sorted(path.name for path in folder.iterdir()) == sorted(names)
+
+
+@each("text", ["=1+1", "+1+1", "-A1", "@SUM(A1)", "\t=1", "\r=1", "\uff1d1", "=", "-1-1"])
+def test_a_formula_in_a_csv_file_is_text(text: str) -> None:
+    assert csv_cell(text) == f"'{text}"
+
+
+@each("text", ["", "/cam=1", "cam", "-1", "+2.5", "'=1"])
+def test_other_text_in_a_csv_file_is_kept(text: str) -> None:
+    assert csv_cell(text) == text
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])

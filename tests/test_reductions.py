@@ -34,6 +34,7 @@ from mp4ds.unpacking.unpack import UnpackOptions
 from pictures import picture, pixels
 from republished import CAMERAS, Read, file_picture, psnr, read
 from scenes import Record, Scene, odd_scene, scene
+from sources import SOURCES
 from test_republish import Packed, on, still
 
 TOPIC = "/cam/image_raw"
@@ -425,6 +426,15 @@ def messages_of(
 
 
 # ---------------------------------------------------------------- image files
+
+
+def test_frames_named_like_formulas(tmp_path: Path) -> None:
+    (source,) = SOURCES["mcap-ros2-none"](tmp_path, scene("mono8", frames=1, frame_id="=1+\u00fc"))
+    mp4ds.pack(source, tmp_path / "ds")
+    mp4ds.unpack(tmp_path / "ds", "images", tmp_path / "out")
+    (stamps,) = (tmp_path / "out").glob("*/stamps.csv")
+    (row,) = csv.DictReader(stamps.read_text(encoding="utf-8").splitlines())
+    assert row["frame_id"] == "'=1+\u00fc"
 
 
 @each("image_format", ["png", "jpeg"])

@@ -567,6 +567,16 @@ def _replace(path: Path, target: Path, old: Path) -> None:
         raise
 
 
+_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")
+_NUMBER = re.compile(r"[+-]?[0-9]+(\.[0-9]+)?")
+
+
+def csv_cell(text: str) -> str:
+    """Text of a recording for a CSV file: what a spreadsheet takes for a formula follows a '."""
+    is_formula = text.startswith(_FORMULA) and not _NUMBER.fullmatch(text)
+    return f"'{text}" if is_formula else text
+
+
 def digest_file(path: Path) -> tuple[int, str]:
     """Size in bytes and SHA-256 of a file."""
     digest = hashlib.sha256()

@@ -21,7 +21,7 @@ from mp4ds.dataset.messages import recorded_storage
 from mp4ds.dataset.slicing import sliced
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import ConversionError, FormatError, OptionError, WriteError, interrupted
-from mp4ds.files.outputs import Owned, staged
+from mp4ds.files.outputs import Owned, csv_cell, staged
 from mp4ds.files.uploads import uploaded
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.options import (
@@ -152,14 +152,14 @@ def write_images(
         image_format = "jpeg" if keeps else "png"
     suffix = "jpg" if image_format == "jpeg" else "png"
     digits = len(str(len(stream) - 1))
-    with (folder / _STAMPS_NAME).open("w", newline="") as file:
+    with (folder / _STAMPS_NAME).open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(_HEAD)
         files = image_files(stream, image_format, reduction, jpeg_quality=jpeg_quality)
         for index, data in files:
             name = f"{index:0{digits}d}.{suffix}"
             (folder / name).write_bytes(data)
-            frame_id = headers[int(columns.variant[index])].frame_id
+            frame_id = csv_cell(headers[int(columns.variant[index])].frame_id)
             rows.writerow([name, int(columns.stamp[index]), int(columns.log_time[index]), frame_id])
             yield
 

@@ -13,7 +13,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from mp4ds.files.outputs import write_synced
+from mp4ds.files.outputs import csv_cell, write_synced
 from mp4ds.plugins.evaluating.options import EvaluateOptions
 from mp4ds.plugins.evaluating.results import CameraEvaluation, Cell, Evaluation, pareto, score_of
 from mp4ds.video.drawing import Dot, Line, Shape, Text, png_of, svg_of
@@ -411,7 +411,10 @@ def _columns() -> Iterator[str]:
 
 
 def _row(camera: CameraEvaluation, cell: Cell) -> dict[str, Any]:
-    setting = asdict(cell.setting)
+    setting = {
+        name: csv_cell(value) if isinstance(value, str) else value
+        for name, value in asdict(cell.setting).items()
+    }
     scores = {
         f"{metric}_{statistic}": f"{getattr(summary, statistic):.6f}"
         for metric, summary in cell.scores.items()
@@ -420,12 +423,12 @@ def _row(camera: CameraEvaluation, cell: Cell) -> dict[str, Any]:
     why = [item.why for item in camera.recommended if item.setting == cell.setting]
     figures = {name: getattr(cell, name) for name in _FIGURES}
     return {
-        "topic": camera.topic,
+        "topic": csv_cell(camera.topic),
         **setting,
         "frames": camera.frames,
         **{name: round(value, 6) for name, value in figures.items()},
         **scores,
-        "machine": cell.machine,
+        "machine": csv_cell(cell.machine),
         "recommended": " ".join(why),
     }
 

@@ -85,5 +85,6 @@ def _write_rows(job: ExportJob, name: str, topic: str, head: str, rows: Iterable
 
 def _write_list(path: Path, heads: Iterable[str], lines: Iterable[str]) -> None:
     with path.open("w", encoding="utf-8") as file:
-        file.writelines(f"# {head}\n" for head in heads)
+        # a topic may be of several lines
+        file.writelines(f"# {' '.join(head.splitlines())}\n" for head in heads)
         file.writelines(f"{line}\n" for line in lines)

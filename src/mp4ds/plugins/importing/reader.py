@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mp4ds.bags.convert import latched, ros2_channel
 from mp4ds.bags.protocols import Format
 from mp4ds.errors import OptionError, SourceError
+from mp4ds.files.outputs import csv_cell
 from mp4ds.files.sources import source_name, source_size
 from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
 from mp4ds.messages.serializations import plain_message
@@ -273,7 +274,9 @@ class ImagesReader:
         writer.writerow(("topic", "stamp_ns", "file"))
         for track in self._tracks:
             for stamp, path in zip(track.stamps.tolist(), track.files, strict=False):
-                writer.writerow((track.channel.topic, stamp, path.relative_to(self.path)))
+                name = str(path.relative_to(self.path))
+                name = name if csv_cell(name) == name else f"./{name}"
+                writer.writerow((csv_cell(track.channel.topic), stamp, name))
         return text.getvalue().encode(errors="backslashreplace")
 
     def stats(self) -> Mapping[int, ChannelStats]:
