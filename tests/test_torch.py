@@ -367,7 +367,8 @@ def test_nothing_matches(tmp_path: Path) -> None:
     ("options", "sentence"),
     [
         ({"topics": ["/up"]}, "has no stream '/up'; there are: /"),
-        ({"topics": []}, "no topics were selected"),
+        ({"topics": []}, "topics is empty"),
+        ({"offsets": 2}, "offsets is 2, but a list such as (-1, 0)"),
         ({"topics": LEFT}, "topics is a list"),
         ({"topics": [LEFT, LEFT]}, "/left/image_raw is given twice"),
         ({"offsets": ()}, "offsets is empty"),
@@ -402,6 +403,16 @@ def test_names_of_other_libraries(drives: list[Path]) -> None:
     for index in ([0, 1], slice(0, 2), 0.5):
         with pytest.raises(TypeError, match=r"Subset\(dataset, \[0, 5\]\)"):
             _ = dataset[index]  # type: ignore[index]
+
+
+def test_what_is_no_path(drives: list[Path]) -> None:
+    with mp4ds.open(drives[0]) as dataset:
+        for wrong in (None, 7, [drives[0]]):
+            with pytest.raises(TypeError, match="is no path: give a str"):
+                mp4ds.open(wrong)  # type: ignore[arg-type]
+        for several in (dataset, [dataset]):
+            with pytest.raises(TypeError, match=r"is no path: give a str"):
+                FrameDataset(several)  # type: ignore[arg-type]
 
 
 def test_samples_in_a_line(drives: list[Path]) -> None:

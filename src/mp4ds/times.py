@@ -293,6 +293,18 @@ class Sync:
         return len(self.indices)
 
 
+def nanoseconds(value: int, what: str, example: str = "half a second is 500_000_000") -> int:
+    """A time as users give it.
+
+    Raises:
+        TypeError: It is not an integer: seconds, in most cases.
+    """
+    try:
+        return as_integer(value)
+    except TypeError:
+        raise TypeError(f"{what} is an integer, in nanoseconds, not {value!r}: {example}") from None
+
+
 def synchronize(
     stamps: Mapping[str, Integers], *, tolerance_ns: int, reference: str | None = None
 ) -> Sync:
@@ -306,7 +318,7 @@ def synchronize(
     Raises:
         OptionError: There is no topic, no such reference, or the tolerance is negative.
     """
-    tolerance = as_integer(tolerance_ns)
+    tolerance = nanoseconds(tolerance_ns, "tolerance_ns")
     if tolerance < 0:
         raise OptionError(f"tolerance is {tolerance} ns: use 0 or more")
     if not stamps:

@@ -20,6 +20,7 @@ from mp4ds.format.models import Calibration
 from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.depth import metres_of
 from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
+from mp4ds.times import nanoseconds
 from mp4ds.video.pixels import Scale
 from mp4ds.video.reader import FrameReader
 
@@ -60,8 +61,8 @@ class StampIndex:
         """
         if mode not in _WANTED:
             raise OptionError(f"mode {mode!r} is not known: use {', '.join(_WANTED)}")
-        stamp = self._nanoseconds(stamp_ns)
-        tolerance = None if tolerance_ns is None else self._nanoseconds(tolerance_ns)
+        stamp = self._time(stamp_ns)
+        tolerance = None if tolerance_ns is None else nanoseconds(tolerance_ns, "tolerance_ns")
         if tolerance is not None and tolerance < 0:
             raise OptionError(f"tolerance is {tolerance} ns: use 0 or more")
         earlier, later = self._around(stamp)
@@ -79,17 +80,12 @@ class StampIndex:
 
     def between(self, start_ns: int, end_ns: int) -> NDArray[np.int64]:
         """Numbers of the frames with start_ns <= stamp < end_ns, by stamp."""
-        first, last = (self._place(self._nanoseconds(time)) for time in (start_ns, end_ns))
+        first, last = (self._place(self._time(time)) for time in (start_ns, end_ns))
         return self._order[first : max(first, last)]
 
-    def _nanoseconds(self, time: int) -> int:
-        try:
-            return as_integer(time)
-        except TypeError:
-            raise TypeError(
-                f"times of {self._topic} are integers, in nanoseconds, not {time!r}: half a second "
-                "after its first frame is at stamps[0] + 500_000_000"
-            ) from None
+    def _time(self, time: int) -> int:
+        example = "half a second after the first frame is stamps[0] + 500_000_000"
+        return nanoseconds(time, f"a time of {self._topic}", example)
 
     def _place(self, stamp: int) -> int:
         """How many stamps are smaller."""

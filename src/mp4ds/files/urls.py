@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path, PurePosixPath
+from reprlib import repr as shortened
 from threading import Lock
 from typing import Any, BinaryIO, NamedTuple, cast
 from urllib.parse import quote, unquote, urlsplit
@@ -575,8 +576,11 @@ def location(path: Path | str) -> Path:
 
     Raises:
         OptionError: The scheme is not known, or what it needs is not installed.
+        TypeError: It is neither a path nor a text, such as a list or an open dataset.
     """
     if not isinstance(path, str):
+        if not isinstance(path, (Path, RemotePath)):
+            raise TypeError(f"{shortened(path)} is no path: give a str, a pathlib.Path, or a URL")
         return path
     match = _URL.match(path)
     if match is None:

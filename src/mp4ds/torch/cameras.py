@@ -262,6 +262,8 @@ class Collection:
             raise OptionError(
                 f"sync_tolerance_ns is {sync_tolerance_ns}, but must not be negative."
             )
+        if topics is not None and not topics:
+            raise OptionError("topics is empty; use None for all cameras of the first dataset.")
         given = datasets_in(paths)
         known = _sources(given[0])
         self.topics = tuple(topics) if topics is not None else tuple(s.topic for s in known)
@@ -273,7 +275,8 @@ class Collection:
         if not self.starts[-1]:
             raise OptionError(
                 f"{given[0]}: no frames of {', '.join(self.topics)} have header stamps within "
-                f"{sync_tolerance_ns} ns of each other. Use a larger sync_tolerance_ns."
+                f"{sync_tolerance_ns} ns of each other. Use a larger sync_tolerance_ns, or one "
+                f"camera: topics=[{self.topics[0]!r}]."
             )
 
     @cached_property
@@ -334,7 +337,7 @@ def _sources(path: Path | str) -> list[CameraSource]:
 
 def _check_topics(topics: Sequence[str], path: Path | str) -> None:
     if not topics:
-        raise OptionError(f"{path}: has no camera, or no topics were selected.")
+        raise OptionError(f"{path}: has no camera; without topics, the first dataset needs one.")
     twice = [topic for topic in topics if topics.count(topic) > 1]
     if twice:
         raise OptionError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import prod
@@ -101,6 +101,8 @@ def offsets_from(values: Sequence[float], unit: Unit, tolerance_ns: int | None) 
     Raises:
         OptionError: There are none, or they are not valid in that unit.
     """
+    if not isinstance(values, Iterable):
+        raise OptionError(f"offsets is {values!r}, but a list such as (-1, 0).")
     given = tuple(values)
     if not given:
         raise OptionError("offsets is empty; use (0,) for the sample's own frame alone.")
