@@ -35,6 +35,8 @@ INSTALLED = (
     "tf2_msgs/msg/TFMessage",
 )
 
+EVENT = "std_srvs/srv/Trigger_Event"
+
 
 class HistoryPolicy(enum.IntEnum):
     SYSTEM_DEFAULT = 0
@@ -217,6 +219,9 @@ class Node:
             found.setdefault(one.topic, {})[one.kind.type_name] = None
         return [(topic, [*kinds]) for topic, kinds in found.items()]
 
+    def count_subscribers(self, topic_name: str) -> int:
+        return sum(one.topic == topic_name for one in self.bus.subscriptions)
+
     def destroy_node(self) -> None:
         bus = self.bus
         bus.publishers = [one for one in bus.publishers if one.node is not self]
@@ -261,13 +266,23 @@ class SingleThreadedExecutor:
 def _get_message(kinds: dict[str, Any]) -> Callable[[str], Any]:
     def get_message(identifier: str) -> Any:
         parts = identifier.split("/")
-        if len(parts) != 3:
+        if len(parts) != 3 or "srv" in parts:
             raise ValueError(f"Expected the full name of a message, got {identifier}")
         if identifier not in kinds:
             raise ModuleNotFoundError(f"No module named {parts[0]!r}")
         return kinds[identifier]
 
     return get_message
+
+
+def _get_service(kinds: dict[str, Any]) -> Callable[[str], Any]:
+    def get_service(identifier: str) -> Any:
+        event = f"{identifier}_Event"
+        if event not in kinds:
+            raise ModuleNotFoundError(f"No module named {identifier.split('/')[0]!r}")
+        return SimpleNamespace(Event=kinds[event])
+
+    return get_service
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> Bus:
@@ -283,6 +298,8 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Bus:
     bus.kinds = {
         name: SimpleNamespace(type_name=name, type_hash=_type_hash(name)) for name in INSTALLED
     }
+    # of services only the events, which are messages
+    bus.kinds[EVENT] = SimpleNamespace(type_name=EVENT)
     services = ("Pause", "Resume", "TogglePaused", "IsPaused", "GetRate", "SetRate")
     services += ("Play", "PlayNext", "Burst", "Seek", "Stop", "SplitBagfile")
     modules: dict[str, dict[str, Any]] = {
@@ -302,7 +319,10 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Bus:
             "LivelinessPolicy": LivelinessPolicy,
         },
         "rosidl_runtime_py": {},
-        "rosidl_runtime_py.utilities": {"get_message": _get_message(bus.kinds)},
+        "rosidl_runtime_py.utilities": {
+            "get_message": _get_message(bus.kinds),
+            "get_service": _get_service(bus.kinds),
+        },
         "ament_index_python": {},
         "ament_index_python.packages": {"get_package_share_directory": bus.share_of},
         "rosbag2_interfaces": {},

@@ -14,6 +14,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mp4ds
 from mp4ds.bags.formats import open_reader
+from mp4ds.bags.rosbag2_metadata import read_bag_info
+from mp4ds.errors import OptionError
 from mp4ds.plugins.publishing.names import NodeNames
 from mp4ds.plugins.publishing.ros2_writers import Qos, recorded_qos
 from mp4ds.plugins.recording.record import RecordOptions, open_recorder
@@ -120,6 +122,43 @@ def test_a_recording_is_a_rosbag2(side: Side, tmp_path: Path) -> None:
         assert reader.format == "rosbag2"
         found = [bytes(one.data) for one in reader.records() if isinstance(one, Message)]
     assert [*map(padded, found)] == [*map(padded, images)]
+
+
+def test_what_metadata_yaml_says(
+    side: Side, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Distribution, custom data and topics without messages are as `ros2 bag record` has them."""
+    monkeypatch.setenv("ROS_DISTRO", "jazzy")
+    silent, heard = channel("/robot/silent", IMAGE, qos=BEST_EFFORT), channel("/robot/name", STRING)
+    options = RecordOptions(to="ros2", all=True, custom_data=["operator=kim", "note=a=b"])
+    with side.open() as publisher:
+        for one in (silent, heard):
+            publisher.advertise(one)
+        with open_recorder((), tmp_path / "live", options) as recorder:
+
+            def publish() -> None:
+                assert until(lambda: publisher.subscribers(silent) == 1)
+                assert until(lambda: publisher.subscribers(heard) == 1)
+                publisher.publish(heard, message(STRING, 1), 0)
+                until(lambda: recorder.received == 1)
+                recorder.stop()
+
+            threading.Thread(target=publish).start()
+            (made,) = recorder.run().datasets
+    assert {item.topic: item.messages for item in made.topics} == {
+        "/robot/silent": 0,
+        "/robot/name": 1,
+    }
+    assert mp4ds.validate(tmp_path / "live", deep=True) == []
+    mp4ds.unpack(tmp_path / "live", None, tmp_path / "again")
+    info = read_bag_info(tmp_path / "again" / "metadata.yaml")
+    assert (info.ros_distro, info.custom_data) == ("jazzy", {"operator": "kim", "note": "a=b"})
+    assert {one.name: (one.type_name, one.count) for one in info.topics} == {
+        "/robot/silent": (IMAGE, 0),
+        "/robot/name": (STRING, 1),
+    }
+    hashes = {one.name: one.type_hash for one in info.topics}
+    assert hashes["/robot/silent"] == STORE.hash_rihs01(IMAGE)
 
 
 class Controls:
@@ -269,6 +308,55 @@ def test_hidden_topics_are_left_out(side: Side) -> None:
         assert until(lambda: publisher.subscribers(plain) == 1)
         source.close()
     assert [*source.state.topics] == ["/robot/name"]
+
+
+EVENT = "std_srvs/srv/Trigger_Event"
+
+
+def test_events_of_services(side: Side) -> None:
+    """Recorded with -a though their topics are hidden."""
+    events = Channel(1, "/arm/_service_event", "cdr", Schema(EVENT, "", b""), {})
+    heard = Heard()
+    with side.open() as publisher:
+        publisher.advertise(events)
+        source = open_source("ros2", SourceOptions("recorder"))
+        source.start(Wanted(all_topics=True, all_services=True), heard.take)
+        assert until(lambda: publisher.subscribers(events) == 1)
+        publisher.publish(events, bytes([0, 1, 0, 0, *range(32)]), 0)
+        assert until(lambda: heard.payloads["/arm/_service_event"])
+        source.close()
+    assert heard.channels["/arm/_service_event"].type_name == EVENT
+
+
+def test_topics_that_nobody_listens_to(side: Side) -> None:
+    heard_by, leaf = channel("/robot/name", STRING), channel("/robot/leaf", STRING)
+    side.peer.subscribe("/robot/name", STRING)
+    options = SourceOptions("recorder", ignore_leaf=True)
+    with side.open() as publisher:
+        for one in (heard_by, leaf):
+            publisher.advertise(one)
+        source = open_source("ros2", options)
+        source.start(Wanted(("/robot/*",)), Heard().take)
+        assert until(lambda: publisher.subscribers(heard_by) == 2)
+        source.close()
+    assert [*source.state.topics] == ["/robot/name"]
+
+
+def test_topics_that_nobody_publishes_yet(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain, heard = channel("/robot/name", STRING), Heard()
+    with SIDES["rclpy"](monkeypatch) as side:
+        side.peer.subscribe("/robot/name", STRING)
+        source = open_source("ros2", SourceOptions("recorder", unpublished=True, poll_s=None))
+        source.start(Wanted(), heard.take)
+        with side.open() as publisher:
+            publisher.advertise(plain)
+            assert publisher.subscribers(plain) == 2
+            publisher.publish(plain, message(STRING, 1), 0)
+            assert until(lambda: heard.payloads["/robot/name"])
+        source.close()
+    assert [*map(padded, heard.payloads["/robot/name"])] == [padded(message(STRING, 1))]
+    with pytest.raises(OptionError, match="needs a ROS 2 that is sourced"):
+        open_source("dds", SourceOptions("recorder", unpublished=True))
 
 
 def test_a_type_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -56,7 +56,8 @@ _PANELS = {
         *("topics", "exclude", "regex", "exclude_regex", "start", "end", "duration"),
         *("start_offset", "until_sec", "until_nsec", "skip_empty", "topic", "at"),
         *("sheet", "every", "max_rate", "sync", "tolerance_ns", "camera_info", "salvage", "poses"),
-        *("all", "exclude_regex", "hidden", "max_duration", "max_size", "start_paused"),
+        *("all", "all_topics", "all_services", "topic_types", "exclude_topic_types"),
+        *("hidden", "unpublished", "ignore_leaf", "max_duration", "max_size", "start_paused"),
         *("state", "action", "task", "cameras", "frames", "clips", "streams", "hours"),
     ),
     "How": (
@@ -79,6 +80,7 @@ _PANELS = {
             "use_sim_time",
             "discover",
             "polling_interval",
+            "custom_data",
         ),
     ),
     "Where": (

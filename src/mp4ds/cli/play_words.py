@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 
 from mp4ds.errors import OptionError
-from mp4ds.plugins.publishing.names import NodeNames, node_arguments
+from mp4ds.plugins.publishing.names import SERVICE_EVENTS, NodeNames, node_arguments
 
 STORAGES = ("sqlite3", "mcap")
 
@@ -26,7 +26,6 @@ _LISTS = {
 }
 """Options that take several values -> their name here, if it differs."""
 
-_EVENTS = "/_service_event"  # appended to a service's name: the topic with its recorded calls
 _NUMBER = re.compile(r"[0-9]+(\.[0-9]+)?")
 _IGNORED = {
     "--disable-loan-message": 0,
@@ -129,7 +128,7 @@ class _Translator:
     def _list(self, option: str) -> Iterator[str]:
         """Values up to the next option, or up to a dataset if none was given before."""
         name, is_first = _LISTS[option] or option, True
-        ending = _EVENTS if "services" in option else ""
+        ending = SERVICE_EVENTS if "services" in option else ""
         while is_first or (self._rest and self._is_in_list(name, self._rest[-1])):
             value = self._value(option)
             if value.startswith("-"):

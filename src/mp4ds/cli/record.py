@@ -62,6 +62,10 @@ def record(
     ros2: Annotated[
         bool, typer.Option("--ros2", help="Record from ROS 2, with rclpy or else Cyclone DDS.")
     ] = False,
+    log_level: Annotated[
+        str,
+        typer.Option("--log-level", help="Log verbosity: debug, info, warn, error or fatal."),
+    ] = "",
     no_keyboard: Annotated[
         bool, typer.Option("--disable-keyboard-controls", help="Disable the keyboard controls.")
     ] = False,
@@ -80,7 +84,7 @@ def record(
             raise OptionError("--ros1 contradicts --ros2.")
         kind = "ros1" if ros1 else "ros2" if ros2 else None
         names = names_in(context)
-        say_as_much(names.log_level)
+        say_as_much(log_level or names.log_level)
         is_silent = as_json or not progress or is_quiet()
         report = stack.enter_context(record_progress(is_quiet=is_silent))
         told = replace(options(), to=kind, names=names)

@@ -5,26 +5,36 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 
 from mp4ds.errors import OptionError
-from mp4ds.plugins.publishing.names import NodeNames, node_arguments
+from mp4ds.plugins.publishing.names import SERVICE_EVENTS, NodeNames, node_arguments
 
 _SAME = {
     **dict.fromkeys(("-O", "--output-name"), "--output"),
     "--max-bag-size": "--max-size",
-    "--exclude-topics": "--exclude",
     "--topic": "--topics",
 }
 """Options of other recorders -> what they are called here."""
 
 _ROS2_LETTERS = {"-b": "--max-size", "-s": "--storage"}
 _IGNORED = {
-    **dict.fromkeys(("--storage", "--compression-mode", "--compression-format"), 1),
-    **dict.fromkeys(("--compression-queue-size", "--compression-threads", "--chunksize"), 1),
+    **dict.fromkeys(("--storage", "--storage-preset-profile", "--storage-config-file"), 1),
+    **dict.fromkeys(("--compression-mode", "--compression-format", "--chunksize"), 1),
+    **dict.fromkeys(("--compression-queue-size", "--compression-threads"), 1),
+    **dict.fromkeys(("--compression-threads-priority", "--serialization-format"), 1),
     **dict.fromkeys(("-j", "--bz2", "--lz4", "--tcpnodelay"), 0),
 }
 """Options about what a dataset does not have -> how many words they take."""
 
 _BYTES = "--max-cache-size"
-_LISTS = ("--topics", "--exclude")
+_LISTS = {
+    "--topics": ("", ""),
+    "--services": ("", SERVICE_EVENTS),
+    "--exclude": ("--exclude", ""),
+    "--exclude-topics": ("--exclude", ""),
+    "--exclude-services": ("--exclude", SERVICE_EVENTS),
+    **{name: (name, "") for name in ("--topic-types", "--exclude-topic-types", "--custom-data")},
+}
+"""Options that take several words -> the option for each, empty for a topic; what is appended."""
+
 _MB = 10**6
 
 
@@ -34,8 +44,8 @@ def known_words() -> Collection[str]:
         *_SAME,
         *_ROS2_LETTERS,
         *_IGNORED,
+        *_LISTS,
         _BYTES,
-        "--topics",
         "--split",
         "--size",
         "--ros-args",
@@ -72,10 +82,13 @@ def spelled(
         word = left.pop()
         name = _SAME.get(word, word)
         if name in _LISTS:
+            option, ending = _LISTS[name]
             while left and not left[-1].startswith("-"):
-                found = left.pop()
-                topics += [found] if name == "--topics" else []
-                made += [] if name == "--topics" else [name, found]
+                found = left.pop().removesuffix(ending) + ending
+                if option:
+                    made += [option, found]
+                else:
+                    topics.append(found)
         elif name in _IGNORED:
             for _ in range(_IGNORED[name]):
                 value(name)

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
@@ -184,6 +184,7 @@ class LiveRecording:
         path: Where it is made.
         format: What it would have been recorded as: ``bag`` or ``rosbag2``.
         profile: ``ros1`` or ``ros2``.
+        others: What it holds besides messages.
     """
 
     library = ""
@@ -193,16 +194,23 @@ class LiveRecording:
     position = 0
     is_indexed = False
 
-    def __init__(self, path: Path, format: Format, profile: str) -> None:  # noqa: A002
+    def __init__(
+        self,
+        path: Path,
+        format: Format,  # noqa: A002
+        profile: str,
+        others: Sequence[Record] = (),
+    ) -> None:
         self.path = path
         self.format: Format = format
         self.profile = profile
         self.channels: list[Channel] = []
+        self._others = others
 
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
-        """Nothing: messages come to `LivePacker`."""
+        """What it holds besides messages, which come to `LivePacker`."""
         del excerpt
-        return iter(())
+        return iter(self._others)
 
     def stats(self) -> Mapping[int, ChannelStats]:
         """Nothing is known of what will come."""
@@ -233,6 +241,7 @@ class LivePacker(Packer):
         settings: How; of live streams.
         journal: Where to note what is done.
         intake: Where messages come from.
+        announced: The channels known so far, some of which may have no messages.
         is_over: Asked between messages whether no more belong to this recording.
         on_read: Called when the last message was taken, before videos are finished.
     """
@@ -245,6 +254,7 @@ class LivePacker(Packer):
         journal: Journal,
         *,
         intake: Intake,
+        announced: Callable[[], Iterable[Channel]],
         is_over: Callable[[PartRecord], bool],
         on_read: Callable[[], None],
     ) -> None:
@@ -252,6 +262,7 @@ class LivePacker(Packer):
         self._recording = recording
         self._folder = folder
         self._intake = intake
+        self._announced = announced
         self._is_over = is_over
         self._on_read = on_read
 
@@ -261,24 +272,26 @@ class LivePacker(Packer):
         return self._part
 
     def _read(self) -> None:
-        known: set[int] = set()
+        channels: dict[int, Channel] = {}
         next_checkpoint = time.monotonic() + _CHECKPOINT_S
         with _Syncing(self._folder) as syncing, PromptWorkers(self._is_behind) as workers:
+            for record in self._recording.records():
+                self._take(record, workers)
             while not self._is_over(self._part):
                 try:
                     message = self._intake.take(max(0.0, next_checkpoint - time.monotonic()))
                 except EOFError:
                     break
                 if message is not None:
-                    if message.channel.id not in known:
-                        known.add(message.channel.id)
-                        self._recording.channels.append(message.channel)
+                    channels[message.channel.id] = message.channel
                     self._take(message, workers)
                 if time.monotonic() >= next_checkpoint:
                     self._verbatim.flush()
                     if not self._intake.is_behind:
                         syncing.ask()
                     next_checkpoint = time.monotonic() + _CHECKPOINT_S
+            channels |= {channel.id: channel for channel in self._announced()}
+            self._recording.channels = list(channels.values())
             self._on_read()
             self._cameras.settle(workers)
         self._calibrations.finish()

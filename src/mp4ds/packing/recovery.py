@@ -42,7 +42,7 @@ from mp4ds.packing.manifest import (
 )
 from mp4ds.packing.options import PackSummary
 from mp4ds.packing.writer import stream_sidecar
-from mp4ds.records import Channel, Loss, Message
+from mp4ds.records import Channel, Loss, Message, MetadataRecord
 from mp4ds.video.packets import copy_fragments
 
 CUT_OFF = "the recording was cut off; what came in its last two seconds may be missing"
@@ -204,6 +204,8 @@ class _Recovery:
         with McapSalvage(path) as reader:
             reader.is_alone = False
             for record in reader.records():
+                if isinstance(record, MetadataRecord):
+                    writer.add_metadata(record)
                 if not isinstance(record, Message) or is_calibration(record.channel):
                     continue
                 channel = self._known(record.channel)

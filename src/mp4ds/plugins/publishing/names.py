@@ -11,6 +11,9 @@ from typing import Any
 
 from mp4ds.errors import OptionError
 
+SERVICE_EVENTS = "/_service_event"
+"""What follows the name of a service in that of the topic of its events, in ROS 2."""
+
 _NODE = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _NAMESPACE = re.compile(r"/?(?:[A-Za-z_]\w*/?)*", re.ASCII)
 _RULE = re.compile(r"(?:[A-Za-z_]\w*:(?!=))?([^:=\s]+):=(\S+)")

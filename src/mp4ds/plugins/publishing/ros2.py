@@ -31,6 +31,7 @@ from mp4ds.plugins.publishing.ros2_writers import (
 from mp4ds.records import Channel
 
 _SECOND = 10**9
+_EVENT = "_Event"
 _LOOK = 0.1  # seconds between two checks for publishers of a topic
 _NO_SUPPORT = ("UnsupportedTypeSupport", "NoTypeSupportImportedException")
 """Errors of a type without compiled type support, by name: their module differs by distro."""
@@ -233,9 +234,11 @@ def message_class(topic: str, type_name: str) -> Any:
 
 
 def _installed_class(topic: str, type_name: str) -> Any:
-    from rosidl_runtime_py.utilities import get_message
+    from rosidl_runtime_py.utilities import get_message, get_service
 
     try:
+        if "/srv/" in type_name and type_name.endswith(_EVENT):  # a part of the service's type
+            return get_service(type_name.removesuffix(_EVENT)).Event
         return get_message(type_name)
     except (AttributeError, ModuleNotFoundError):
         raise Refused(f"the type {type_name!r} is not installed in this ROS 2") from None

@@ -12,6 +12,7 @@ from typing import Any
 
 from mp4ds.bags.protocols import Format
 from mp4ds.bags.types import ros2_world
+from mp4ds.errors import OptionError
 from mp4ds.plugins.publishing.dds import dds_qos, serve
 from mp4ds.plugins.publishing.dds_domain import (
     DdsListener,
@@ -49,6 +50,7 @@ _SETTLE_S = 0.3
 _PREFIX = "rt/"
 _HASH = re.compile(rb"(?:^|;)typehash=(RIHS01_[0-9a-f]{64});")
 _BATCH = 100
+_MOST_ENDPOINTS = 10_000
 _CLOCK = "/clock"
 
 
@@ -78,6 +80,8 @@ class DdsSource:
     profile = "ros2"
 
     def __init__(self, options: SourceOptions) -> None:
+        if options.unpublished:
+            raise OptionError("`unpublished` needs a ROS 2 that is sourced.")
         self.state = SourceState()
         self._options = options
         self._clock = options.names.renamed(_CLOCK)
@@ -116,9 +120,14 @@ class DdsSource:
         )
 
     def _look(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
-        from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+        from cyclonedds.builtin import (
+            BuiltinDataReader,
+            BuiltinTopicDcpsPublication,
+            BuiltinTopicDcpsSubscription,
+        )
 
         found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        others = BuiltinDataReader(self._participant, BuiltinTopicDcpsSubscription)
         poll_s = self._options.poll_s
         deadline = time.monotonic() + 2 * _SETTLE_S
         while not self._ended.wait(poll_s or _SETTLE_S):
@@ -126,8 +135,9 @@ class DdsSource:
                 if endpoint.sample_info.valid_data:
                     self._meet(endpoint, wanted)
             is_waiting = bool(self.state.waiting_for)
+            heard = self._subscribed(others) if self._options.ignore_leaf else self._topics
             for name, topic in self._topics.items():
-                is_due = name == self._clock or not is_waiting
+                is_due = name == self._clock or (name in heard and not is_waiting)
                 if is_due and topic.reader is None and time.monotonic() - topic.since > _SETTLE_S:
                     self._subscribe(name, topic, take)
                 self._count_lost(topic)
@@ -136,13 +146,26 @@ class DdsSource:
             if poll_s is None and time.monotonic() > deadline:
                 return
 
+    def _subscribed(self, others: Any) -> set[str]:
+        """Topics that somebody else subscribes to."""
+        from cyclonedds.core import InstanceState
+
+        own = self._participant.guid
+        return {
+            f"/{endpoint.topic_name.removeprefix(_PREFIX)}"
+            for endpoint in others.read(_MOST_ENDPOINTS)
+            if endpoint.sample_info.valid_data
+            and endpoint.sample_info.instance_state == InstanceState.Alive
+            and endpoint.participant_key != own
+        }
+
     def _meet(self, endpoint: Any, wanted: Wanted) -> None:
         name = endpoint.topic_name
         topic = f"/{name.removeprefix(_PREFIX)}"
-        is_bare = not name.startswith(_PREFIX)
-        if is_bare or not ros_type(endpoint.type_name):
+        is_bare, type_name = not name.startswith(_PREFIX), ros_type(endpoint.type_name)
+        if is_bare or not type_name:
             return
-        is_wanted = wanted(topic) and (self._options.hidden or not is_hidden(topic))
+        is_wanted = wanted(topic, type_name) and (self._options.hidden or not is_hidden(topic))
         if is_wanted or (topic == self._clock and self._options.use_sim_time):
             met = _Topic(wanted.recorded_as(topic), time.monotonic(), is_wanted)
             known = self._topics.setdefault(topic, met)
@@ -180,7 +203,7 @@ class DdsSource:
         if name == self._clock and self._options.use_sim_time:
             receive = partial(self._tick, receive if topic.is_wanted else None)
         if topic.is_wanted:
-            self.state.topics[topic.recorded] = None
+            self.state.topics[topic.recorded] = channel
         self._listener.hear(topic.reader, receive)
 
     def _tick(self, receive: Callable[[Any], None] | None, sample: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections import Counter
@@ -11,6 +12,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 
+from mp4ds.bags.rosbag2_metadata import METADATA_FILE, NEWEST_VERSION, RECORD, dump_bag_info
 from mp4ds.errors import Mp4dsError, OptionError, RecordError, TargetError, WriteError
 from mp4ds.files.outputs import check_target, move_into_place, sync, work_folder
 from mp4ds.files.sources import JOURNAL_NAME, UNFINISHED, is_unfinished, salvage_command
@@ -36,7 +38,7 @@ from mp4ds.plugins.playing.timeline import quick_switches
 from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import sourced
 from mp4ds.plugins.recording.source import Source, SourceOptions, Wanted, open_source
-from mp4ds.records import Message
+from mp4ds.records import Message, MetadataRecord
 from mp4ds.times import INT64_MAX
 from mp4ds.video.codecs import LOSSLESS_GOP, LOSSY_GOP, check_codec
 
@@ -54,10 +56,20 @@ class RecordOptions(Options):
     """How to record."""
 
     to: str | None = option("ros1 or ros2; by default, the one that is sourced.")
-    all: bool = option("Record all topics, including new ones.", False, "-a")
-    regex: str = option("Also record topics that match a regular expression.", "", "-e")
+    all: bool = option(
+        "Record all topics, including new ones, and service events (ROS 2).", False, "-a"
+    )
+    all_topics: bool = option("Record all topics, without service events.", False)
+    all_services: bool = option("Record all service events (ROS 2).", False)
+    topic_types: Sequence[str] = option(
+        "Record topics of this type; repeatable.", (), metavar="TYPE"
+    )
+    regex: str = option("Record topics that match a regular expression.", "", "-e")
     exclude: Sequence[str] = option(
         "Leave out matching topics; repeatable.", (), "--exclude", metavar="GLOB"
+    )
+    exclude_topic_types: Sequence[str] = option(
+        "Leave out topics of this type; repeatable.", (), metavar="TYPE"
     )
     exclude_regex: str = option(
         "Leave out topics that match a regular expression.", "", "--exclude-regex", "-x"
@@ -103,8 +115,19 @@ class RecordOptions(Options):
         "Milliseconds between checks for new topics.", 100.0, "--polling-interval", "-p"
     )
     hidden: bool = option("Include hidden topics (ROS 2).", False, "--include-hidden-topics")
+    unpublished: bool = option(
+        "Include topics without a publisher (ROS 2, with rclpy).",
+        False,
+        "--include-unpublished-topics",
+    )
+    ignore_leaf: bool = option(
+        "Leave out topics without a subscriber (ROS 2).", False, "--ignore-leaf-topics"
+    )
     qos_overrides: Path | None = option(
         "QoS profiles by topic (ROS 2).", None, "--qos-profile-overrides-path", metavar="YAML"
+    )
+    custom_data: Sequence[str] = option(
+        "Entries for rosbag2's custom_data (ROS 2); repeatable.", (), metavar="KEY=VALUE"
     )
     about: str | None = option(
         "YAML with title, description, authors, license, doi, links or keywords.", metavar="FILE"
@@ -228,19 +251,25 @@ def open_recorder(
         progress: See `record`.
     """
     chosen = options or RecordOptions()
-    if not (topics or chosen.all or chosen.regex):
-        raise OptionError("Name topics, or give `all` or `regex`.")
+    is_all = chosen.all or chosen.all_topics or chosen.all_services
+    if not (topics or is_all or chosen.regex or chosen.topic_types):
+        raise OptionError("Name topics, or give `all`, `regex` or `topic_types`.")
     kind = source.profile if source else chosen.to or sourced("record", "")
     names = chosen.names.in_world(kind)
     wanted = Wanted(
-        () if chosen.all else topics,
-        regex="" if chosen.all else chosen.regex,
+        topics,
+        types=chosen.topic_types,
+        regex=chosen.regex,
+        all_topics=chosen.all or chosen.all_topics,
+        all_services=chosen.all or chosen.all_services,
         exclude=chosen.exclude,
+        exclude_types=chosen.exclude_topic_types,
         exclude_regex=chosen.exclude_regex,
         names=names,
     )
     settings = _settings(chosen)
     about = load_about(chosen.about) if chosen.about is not None else None
+    others = _bag_info(chosen.custom_data) if kind == "ros2" else []
     if source is None:
         source = open_source(
             kind,
@@ -249,6 +278,8 @@ def open_recorder(
                 use_sim_time=chosen.use_sim_time or bool(names.use_sim_time),
                 poll_s=chosen.polling_interval / 1000 if chosen.discover else None,
                 hidden=chosen.hidden,
+                unpublished=chosen.unpublished,
+                ignore_leaf=chosen.ignore_leaf,
                 qos_overrides=chosen.qos_overrides,
                 names=names,
             ),
@@ -260,7 +291,8 @@ def open_recorder(
             if dataset is not None
             else Path(f"{datetime.now():mp4ds_%Y_%m_%d-%H_%M_%S}")
         )
-        yield Recorder(target.absolute(), chosen, settings, wanted, source, about, progress)
+        made = target.absolute()
+        yield Recorder(made, chosen, settings, wanted, source, about, others, progress)
 
 
 def _settings(options: RecordOptions) -> StreamSettings:
@@ -285,6 +317,25 @@ def _settings(options: RecordOptions) -> StreamSettings:
     )
 
 
+def _bag_info(custom_data: Sequence[str]) -> list[MetadataRecord]:
+    """What metadata.yaml of a rosbag2 tells of the whole recording.
+
+    Raises:
+        OptionError: An entry is not of the form KEY=VALUE.
+    """
+    entries = [item.partition("=") for item in custom_data]
+    for key, is_told, value in entries:
+        if not (key and is_told):
+            raise OptionError(f"`custom_data` {key + value!r} is not of the form KEY=VALUE.")
+    custom = {key: value for key, _, value in entries}
+    distro = os.environ.get("ROS_DISTRO", "")  # where ros2 bag record takes it from
+    if not (custom or distro):
+        return []
+    info = {"version": NEWEST_VERSION, "custom_data": custom or None, "ros_distro": distro}
+    content = {"storage": "", "files": "", METADATA_FILE: dump_bag_info(info)}
+    return [MetadataRecord(RECORD, content)]
+
+
 class Recorder:
     """Records until it is stopped. See `open_recorder`.
 
@@ -294,7 +345,8 @@ class Recorder:
         settings: Of its streams.
         wanted: Which topics.
         source: Where messages come from.
-        about: What is told of the recording.
+        about: Description of the recording.
+        others: What it holds besides messages.
         progress: Called a few times a second.
     """
 
@@ -306,6 +358,7 @@ class Recorder:
         wanted: Wanted,
         source: Source,
         about: About | None,
+        others: Sequence[MetadataRecord],
         progress: Callable[[RecordProgress], None] | None,
     ) -> None:
         self._target = target
@@ -314,6 +367,7 @@ class Recorder:
         self._wanted = wanted
         self._source = source
         self._about = about
+        self._others = others
         self._progress = progress
         self._intake = Intake(options.buffer * 10**6, _LAST_NS[source.profile])
         self._changed = threading.Event()
@@ -527,13 +581,14 @@ class _Split:
         facts = {"format": source.format, "profile": source.profile}
         self._profile = str(recorder._settings.quality)
         self._journal = Journal(self.folder, {**facts, "quality": self._profile})
-        self._recording = LiveRecording(target, source.format, source.profile)
+        self._recording = LiveRecording(target, source.format, source.profile, recorder._others)
         self._packer = LivePacker(
             self._recording,
             self.folder,
             PartSettings(recorder._settings, selected=Selection()),
             self._journal,
             intake=recorder._intake,
+            announced=lambda: [*filter(None, list(source.state.topics.values()))],
             is_over=self._is_over,
             on_read=self._on_read,
         )

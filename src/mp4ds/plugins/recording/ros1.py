@@ -103,8 +103,8 @@ class RospySource:
             found = answer(self._rospy.get_published_topics, ANSWER_S)
         except (OSError, self._rospy.ROSException):
             return False
-        for topic, _ in found or ():
-            if topic not in self._subscribers and wanted(topic):
+        for topic, type_name in found or ():
+            if topic not in self._subscribers and wanted(topic, type_name):
                 name = wanted.recorded_as(topic)
                 receive = told(self.state, name, partial(self._received, name, take))
                 self._subscribers[topic] = self._subscribe(topic, receive)

@@ -117,12 +117,14 @@ class RclpySource:
     def _look(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
         """Subscribe to what is published and wanted."""
         for topic, kinds in self._node.get_topic_names_and_types():
-            if topic in self._subscriptions or not wanted(topic):
+            if topic in self._subscriptions or not any(wanted(topic, kind) for kind in kinds):
                 continue
             if is_hidden(topic) and not self._options.hidden:
                 continue
+            if self._options.ignore_leaf and not self._node.count_subscribers(topic):
+                continue
             publishers = self._node.get_publishers_info_by_topic(topic)
-            if not publishers:
+            if not (publishers or self._options.unpublished):
                 continue
             if len(kinds) > 1:
                 self._subscriptions[topic] = None
@@ -146,7 +148,8 @@ class RclpySource:
             self.state.warnings[str(error)] = None
             return None
         offered = [offered_by(item.qos_profile) for item in publishers]
-        type_hash = _hash_text(getattr(publishers[0], "topic_type_hash", None))
+        hashes = [_hash_text(getattr(item, "topic_type_hash", None)) for item in publishers]
+        type_hash = hashes[0] if hashes else ""
         share = [Path(p, "share") for p in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if p]
         definition = installed_definition(type_name, share)
         definition = definition or standard_definition(type_name, type_hash)
@@ -155,8 +158,9 @@ class RclpySource:
         channel = channel_of(
             len(self._subscriptions), name, type_name, definition, type_hash, offered
         )
-        qos = self._overrides.get(topic, asked_qos(offered, _DEPTH))
-        self.state.topics[name] = None
+        usual = asked_qos(offered, _DEPTH) if offered else Qos(depth=_DEPTH)
+        qos = self._overrides.get(topic, usual)
+        self.state.topics[name] = channel
         receive = told(self.state, topic, partial(self._received, channel, take))
         # rclpy tells of when a message was sent where a callback takes exactly two arguments
         return self._node.create_subscription(

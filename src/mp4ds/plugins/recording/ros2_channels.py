@@ -12,6 +12,7 @@ from typing import Any, get_args
 from mp4ds.bags.rosbag2_metadata import dump_yaml
 from mp4ds.bags.types import World, by_library, make_store, ros2_world, types_of
 from mp4ds.errors import Refused
+from mp4ds.plugins.publishing.names import SERVICE_EVENTS
 from mp4ds.plugins.publishing.ros2_writers import (
     NOTHING,
     Qos,
@@ -79,8 +80,13 @@ def asked_qos(profiles: Sequence[Qos], depth: int) -> Qos:
 
 
 def is_hidden(topic: str) -> bool:
-    """Whether ROS 2 hides a topic: a part of its name begins with an underscore."""
-    return any(part.startswith("_") for part in topic.split("/"))
+    """Whether ROS 2 hides a topic: a part of its name begins with an underscore.
+
+    Events of services are not hidden from recorders.
+    """
+    return not topic.endswith(SERVICE_EVENTS) and any(
+        part.startswith("_") for part in topic.split("/")
+    )
 
 
 def channel_of(

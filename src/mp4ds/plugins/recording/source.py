@@ -14,21 +14,28 @@ from typing import Any, Protocol
 from mp4ds.bags.protocols import Format
 from mp4ds.errors import OptionError
 from mp4ds.plan import Selection
-from mp4ds.plugins.publishing.names import PLAIN, NodeNames
-from mp4ds.records import Message
+from mp4ds.plugins.publishing.names import PLAIN, SERVICE_EVENTS, NodeNames
+from mp4ds.records import Channel, Message
 
 
 class Wanted:
     """Which topics are recorded.
 
+    Those that one of `topics`, `types`, `regex`, `all_topics` and `all_services` includes, or all
+    if none of these is given, except for those that are excluded.
+
     Args:
-        topics: Names, or globs; empty for all.
-        regex: A pattern that is found in a topic's name; empty for none. Topics that it or `topics`
-            tell are wanted.
-        exclude: Names, or globs, that are not wanted in any case.
-        exclude_regex: A pattern that no wanted topic's name has.
-        names: Namespace of the node, and rules for those of `topics`: as `rosbag record` does, the
-            recorder subscribes to a topic by its new name, and records it by the one given here.
+        topics: Names or globs.
+        types: Names of message types.
+        regex: A pattern, searched for in the topic's name; empty for none.
+        all_topics: Include all topics but those of service events.
+        all_services: Include those of service events (ROS 2).
+        exclude: Names or globs.
+        exclude_types: Names of message types.
+        exclude_regex: A pattern, searched for in the topic's name; empty for none.
+        names: Namespace of the node, and rules for the names of `topics`: as `rosbag record` does,
+            the recorder subscribes to a topic by its new name, and records it by the one given
+            here.
 
     Raises:
         OptionError: A pattern is not valid, or the rules make one topic of two.
@@ -38,8 +45,12 @@ class Wanted:
         self,
         topics: Sequence[str] = (),
         *,
+        types: Sequence[str] = (),
         regex: str = "",
+        all_topics: bool = False,
+        all_services: bool = False,
         exclude: Sequence[str] = (),
+        exclude_types: Sequence[str] = (),
         exclude_regex: str = "",
         names: NodeNames = PLAIN,
     ) -> None:
@@ -52,21 +63,28 @@ class Wanted:
                     f"{first} and {asked} are one topic by the rules of ROS: name one."
                 )
         self._named = Selection([*self._recorded]) if topics else None
+        self._types = {*types}
+        self._regex = _compiled("regex", regex)
+        is_all = not (topics or types or regex or all_topics or all_services)
+        self._all_topics, self._all_services = all_topics or is_all, all_services or is_all
         left_out = [names.resolved(topic.strip()) for topic in exclude]
         self._exclude = Selection(left_out) if exclude else None
-        self._regex = _compiled("regex", regex)
+        self._exclude_types = {*exclude_types}
         self._exclude_regex = _compiled("exclude_regex", exclude_regex)
 
-    def __call__(self, topic: str) -> bool:
+    def __call__(self, topic: str, type_name: str = "") -> bool:
         """Whether a topic is recorded."""
         if self._exclude and self._exclude(topic):
             return False
         if self._exclude_regex and self._exclude_regex.search(topic):
             return False
-        if self._named is None and self._regex is None:
+        if type_name in self._exclude_types:
+            return False
+        if self._all_services if topic.endswith(SERVICE_EVENTS) else self._all_topics:
             return True
         is_named = self._named is not None and self._named(topic)
-        return is_named or bool(self._regex and self._regex.search(topic))
+        is_found = self._regex is not None and self._regex.search(topic) is not None
+        return is_named or is_found or type_name in self._types
 
     def recorded_as(self, topic: str) -> str:
         """The name that a topic has in the recording."""
@@ -87,13 +105,14 @@ class SourceState:
     Attributes:
         lost: Messages that the middleware says it lost, by topic.
         warnings: Sentences to be shown once each.
-        topics: Those that are subscribed to.
+        topics: Those that are subscribed to; with the channel, where that is known before messages
+            come.
         waiting_for: The clock without which nothing is recorded yet; empty once it runs.
     """
 
     lost: Counter[str] = field(default_factory=Counter)
     warnings: dict[str, None] = field(default_factory=dict)
-    topics: dict[str, None] = field(default_factory=dict)
+    topics: dict[str, Channel | None] = field(default_factory=dict)
     waiting_for: str = ""
 
 
@@ -190,6 +209,8 @@ class SourceOptions:
         use_sim_time: Whether log times are those of /clock.
         poll_s: Seconds between looks for new topics; None for one look only.
         hidden: Whether topics are taken of which a part begins with an underscore.
+        unpublished: Whether topics are taken that nobody publishes yet, by rclpy.
+        ignore_leaf: Whether topics without a subscriber are left out, in ROS 2.
         qos_overrides: YAML of QoS by topic.
         names: What ROS calls the node, where it is not `node`, and /clock.
     """
@@ -198,6 +219,8 @@ class SourceOptions:
     use_sim_time: bool = False
     poll_s: float | None = 0.1
     hidden: bool = False
+    unpublished: bool = False
+    ignore_leaf: bool = False
     qos_overrides: Path | None = None
     names: NodeNames = PLAIN
 
