@@ -7,6 +7,7 @@ on stdin, and each is answered by a line on stdout.
 import base64
 import json
 import sys
+import threading
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +20,17 @@ from cyclonedds.builtin import (
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, float64, int32, int64, sequence, uint8, uint32, uint64
+from cyclonedds.idl.types import (
+    array,
+    bounded_str,
+    float64,
+    int32,
+    int64,
+    sequence,
+    uint8,
+    uint32,
+    uint64,
+)
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
@@ -131,6 +142,72 @@ class TFMessage(IdlStruct, typename="tf2_msgs.msg.dds_.TFMessage_"):
     transforms: sequence[TransformStamped]
 
 
+@dataclass
+class FieldType(IdlStruct, typename="type_description_interfaces.msg.dds_.FieldType_"):
+    type_id: uint8
+    capacity: uint64
+    string_capacity: uint64
+    nested_type_name: bounded_str[255]
+
+
+@dataclass
+class Field(IdlStruct, typename="type_description_interfaces.msg.dds_.Field_"):
+    name: str
+    type: FieldType
+    default_value: str
+
+
+@dataclass
+class Individual(
+    IdlStruct, typename="type_description_interfaces.msg.dds_.IndividualTypeDescription_"
+):
+    type_name: bounded_str[255]
+    fields: sequence[Field]
+
+
+@dataclass
+class TypeDescription(IdlStruct, typename="type_description_interfaces.msg.dds_.TypeDescription_"):
+    type_description: Individual
+    referenced_type_descriptions: sequence[Individual]
+
+
+@dataclass
+class TypeSource(IdlStruct, typename="type_description_interfaces.msg.dds_.TypeSource_"):
+    type_name: str
+    encoding: str
+    raw_file_contents: str
+
+
+@dataclass
+class KeyValue(IdlStruct, typename="type_description_interfaces.msg.dds_.KeyValue_"):
+    key: str
+    value: str
+
+
+@dataclass
+class DescriptionRequest(
+    IdlStruct, typename="type_description_interfaces.srv.dds_.GetTypeDescription_Request_"
+):
+    client_guid: uint64
+    sequence_number: int64
+    type_name: str
+    type_hash: str
+    include_type_sources: bool
+
+
+@dataclass
+class DescriptionResponse(
+    IdlStruct, typename="type_description_interfaces.srv.dds_.GetTypeDescription_Response_"
+):
+    client_guid: uint64
+    sequence_number: int64
+    successful: bool
+    failure_reason: str
+    type_description: TypeDescription
+    type_sources: sequence[TypeSource]
+    extra_information: sequence[KeyValue]
+
+
 TYPES: dict[str, Any] = {
     "std_msgs/msg/Header": raw(Header),
     "std_msgs/msg/String": raw(String),
@@ -168,6 +245,7 @@ class Peer:
         self._participant = DomainParticipant(domain)
         self._readers: dict[str, Any] = {}
         self._writers: dict[str, Any] = {}
+        self._kinds: dict[str, Any] = {}
         self._seen: dict[str, list[Any]] = {}
         self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._subscriptions = BuiltinDataReader(self._participant, BuiltinTopicDcpsSubscription)
@@ -246,6 +324,31 @@ class Peer:
         writer.write(TYPES[kind].deserialize(base64.b64decode(message)))
         return True
 
+    def publish_opaque(self, topic: str, typename: str, type_hash: str, message: str) -> bool:
+        """Publish a message of a type of which only the name and hash are announced."""
+        from cyclonedds.idl import make_idl_struct
+
+        data = base64.b64decode(message)
+        if topic not in self._writers:
+            kind = make_idl_struct(typename.rpartition(".")[2], typename, {}, dataclassify=False)
+            kind.serialize = lambda *_, **__: data
+            qos = Qos(Policy.Userdata(f"typehash={type_hash};".encode()), base=_qos())
+            dds = Topic(self._participant, topic, kind)
+            self._kinds[topic] = kind
+            self._writers[topic] = DataWriter(self._participant, dds, qos=qos)
+        self._writers[topic].write(self._kinds[topic]())
+        return True
+
+    def describe(self, node: str, sources: dict[str, str]) -> bool:
+        """Answer for the types that a node knows, as `rclcpp` and `rclpy` do."""
+        name = f"{node}/get_type_description"
+        asked = Topic(self._participant, f"rq/{name}Request", DescriptionRequest)
+        replies = Topic(self._participant, f"rr/{name}Reply", DescriptionResponse)
+        reader = DataReader(self._participant, asked, qos=_qos())
+        writer = DataWriter(self._participant, replies, qos=_qos())
+        threading.Thread(target=_describe, args=(reader, writer, sources), daemon=True).start()
+        return True
+
     def call(self, name: str, kind: str, request: list[Any]) -> Any:
         """Call a service as rmw_cyclonedds does; returns the fields of the reply."""
         asked, replied = SERVICES[kind]
@@ -282,6 +385,20 @@ class Peer:
         header = {"client_guid": uint64, "sequence_number": int64}
         typename = f"rosbag2_interfaces.srv.dds_.{name}"
         return make_idl_struct(name, typename, {**header, **fields})
+
+
+def _describe(reader: Any, writer: Any, sources: dict[str, str]) -> None:
+    while True:
+        for request in reader.take(10):
+            if request.sample_info.valid_data:
+                is_known = request.type_name in sources
+                found = [TypeSource(name, "msg", text) for name, text in sources.items()]
+                header = request.client_guid, request.sequence_number
+                told = TypeDescription(Individual(request.type_name, []), [])
+                sent = found if is_known and request.include_type_sources else []
+                reason = "" if is_known else "Type not registered"
+                writer.write(DescriptionResponse(*header, is_known, reason, told, sent, []))
+        time.sleep(0.005)
 
 
 def _qos(*, reliable: bool = True, latched: bool = False, depth: int = 1000) -> Qos:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import threading
 import time
 from collections import defaultdict
@@ -10,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rosbags.convert.converter import default_message
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mp4ds
+from each import each
 from mp4ds.bags.formats import open_reader
 from mp4ds.bags.rosbag2_metadata import read_bag_info
 from mp4ds.errors import OptionError
@@ -402,9 +405,60 @@ def test_a_definition_that_is_announced(monkeypatch: pytest.MonkeyPatch) -> None
     assert again.hash_rihs01("my_msgs/msg/Whole") == store.hash_rihs01("my_msgs/msg/Whole")
 
 
-def whole(store: Any) -> Any:
-    from rosbags.convert.converter import default_message
+CUSTOM = "my_msgs/msg/Part"
 
+
+@each("described", ["proven", "wrong", "unknown", "nobody"])
+def test_a_definition_that_a_node_describes(
+    described: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over DDS, the node that publishes is asked; its answer is proven by the type's hash."""
+    texts = {
+        CUSTOM: "# of a robot\nstd_msgs/Header header\nint16 number\n",
+        "std_msgs/msg/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+        "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec\n",
+    }
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(texts[CUSTOM], CUSTOM))
+    type_hash = store.hash_rihs01(CUSTOM)
+    payload = bytes(store.serialize_cdr(default_message(store, CUSTOM), CUSTOM))
+    typename, heard = "my_msgs.msg.dds_.Part_", Heard()
+    with SIDES["dds"](monkeypatch) as side:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(side.options["domain"]))
+        if described == "wrong":
+            texts[CUSTOM] = texts[CUSTOM].replace("int16", "int32")
+        if described != "nobody":
+            side.peer.ask("describe", "robot/other", {})
+            side.peer.ask("describe", "robot/part", {} if described == "unknown" else texts)
+        source = open_source("dds", SourceOptions("recorder"))
+        source.start(Wanted(("/robot/part",)), heard.take)
+
+        def arrives() -> bool:
+            message = base64.b64encode(payload).decode()
+            side.peer.ask("publish_opaque", "rt/robot/part", typename, type_hash, message)
+            return bool(heard.payloads["/robot/part"])
+
+        assert until(arrives)
+        source.close()
+    assert padded(heard.payloads["/robot/part"][0]) == padded(payload)
+    found = heard.channels["/robot/part"]
+    assert found.metadata[HASH_KEY] == type_hash
+    assert found.schema
+    if described != "proven":
+        assert (found.schema.encoding, found.schema.data) == ("", b"")
+        assert [*source.state.warnings] == [
+            f"/robot/part: the definition of {CUSTOM} is not known here"
+        ]
+        return
+    main, *parts = found.schema.data.decode().split("=" * 80)
+    assert main.startswith("# of a robot\n")
+    assert len(parts) == 2
+    again = get_typestore(Stores.ROS2_JAZZY)
+    again.register(get_types_from_msg(found.schema.data.decode(), CUSTOM))
+    assert again.hash_rihs01(CUSTOM) == type_hash
+
+
+def whole(store: Any) -> Any:
     return default_message(store, "my_msgs/msg/Whole")
 
 

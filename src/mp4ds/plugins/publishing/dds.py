@@ -13,6 +13,7 @@ from mp4ds.errors import ConversionError, OptionError, PublishError
 from mp4ds.plugins.publishing.dds_domain import (
     DdsListener,
     DdsType,
+    Types,
     dds_topic,
     domain_id,
     make_struct,
@@ -290,13 +291,26 @@ def message_class(kind: str, definition: str, world: World) -> tuple[Any, str]:
         definition: Its fields, as in a message definition.
         world: The types of ROS 2.
     """
-    short, name = f"rosbag2_interfaces/msg/{kind}", f"rosbag2_interfaces/srv/{kind}"
+    name = f"rosbag2_interfaces/srv/{kind}"
+    types, type_hash = service_types(name, definition, world)
+    return make_struct(types, name, has_fields=True), type_hash
+
+
+def service_types(name: str, definition: str, world: World) -> tuple[Types, str]:
+    """The types of a request or response with what goes before it, and its type hash.
+
+    Args:
+        name: Its type, such as ``rosbag2_interfaces/srv/Seek_Request``.
+        definition: Its fields, as of a message.
+        world: The types of ROS 2.
+    """
+    short = name.replace("/srv/", "/msg/")  # as definitions of messages are parsed
     types = types_of(Schema(short, "ros2msg", definition.encode()), world)
     types[name] = types.pop(short)
     type_hash = make_store(types, world).hash_rihs01(name)
     whole = types_of(Schema(short, "ros2msg", (_HEADER + definition).encode()), world)
     whole[name] = whole.pop(short)
-    return make_struct(whole, name, has_fields=True), type_hash
+    return whole, type_hash
 
 
 def _identity(participant: Any, number: int) -> str:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import re
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 from mp4ds.bags.protocols import Format
 from mp4ds.bags.types import ros2_world
-from mp4ds.errors import OptionError
+from mp4ds.errors import OptionError, Refused
 from mp4ds.plugins.publishing.dds import dds_qos, serve
 from mp4ds.plugins.publishing.dds_domain import (
     DdsListener,
@@ -39,6 +41,7 @@ from mp4ds.plugins.recording.source import (
     Wanted,
     told,
 )
+from mp4ds.plugins.recording.type_descriptions import REPLIES, ask_for_definition
 from mp4ds.records import Channel, Message
 
 _DEPTH = 100
@@ -63,6 +66,9 @@ class _Topic:
     is_wanted: bool
     endpoints: dict[Any, Any] = field(default_factory=dict)
     reader: Any = None
+    kind: Any = None  # class of its messages
+    definition: str = ""
+    asking: threading.Thread | None = None
 
 
 class DdsSource:
@@ -92,6 +98,7 @@ class DdsSource:
         self.address = f"DDS domain {domain}, by Cyclone DDS"
         self._listener = DdsListener(self._participant)
         self._topics: dict[str, _Topic] = {}
+        self._nodes: dict[Any, list[str]] = defaultdict(list)  # that describe types, by participant
         self._count = 0
         self._services: list[Any] = []
         self._ended = threading.Event()
@@ -138,7 +145,8 @@ class DdsSource:
             heard = self._subscribed(others) if self._options.ignore_leaf else self._topics
             for name, topic in self._topics.items():
                 is_due = name == self._clock or (name in heard and not is_waiting)
-                if is_due and topic.reader is None and time.monotonic() - topic.since > _SETTLE_S:
+                is_due = is_due and time.monotonic() - topic.since > _SETTLE_S
+                if is_due and topic.reader is None and self._is_defined(topic):
                     self._subscribe(name, topic, take)
                 self._count_lost(topic)
             if is_waiting:
@@ -161,6 +169,10 @@ class DdsSource:
 
     def _meet(self, endpoint: Any, wanted: Wanted) -> None:
         name = endpoint.topic_name
+        before, behind = REPLIES
+        if name.startswith(before) and name.endswith(behind):
+            node = name.removeprefix(before).removesuffix(behind)
+            self._nodes[endpoint.participant_key].append(node)
         topic = f"/{name.removeprefix(_PREFIX)}"
         is_bare, type_name = not name.startswith(_PREFIX), ros_type(endpoint.type_name)
         if is_bare or not type_name:
@@ -171,6 +183,35 @@ class DdsSource:
             known = self._topics.setdefault(topic, met)
             known.endpoints[endpoint.key] = endpoint
 
+    def _is_defined(self, topic: _Topic) -> bool:
+        """Whether the search for the definition of a topic's type is over; begins it."""
+        if topic.asking is not None:
+            return not topic.asking.is_alive()
+        endpoint = next(iter(topic.endpoints.values()))
+        type_hash, type_name = _hash_of(endpoint.qos), ros_type(endpoint.type_name)
+        topic.kind = publisher_type(self._participant, endpoint)
+        topic.definition = standard_definition(type_name, type_hash)
+        topic.definition = topic.definition or announced_definition(topic.kind, type_hash)
+        if topic.definition or not type_hash:
+            return True
+        topic.asking = threading.Thread(
+            target=self._ask, args=(topic, endpoint, type_name, type_hash), daemon=True
+        )
+        topic.asking.start()
+        return False
+
+    def _ask(self, topic: _Topic, endpoint: Any, type_name: str, type_hash: str) -> None:
+        """Ask the nodes of a publisher's process for the definition of its type."""
+        from cyclonedds.core import DDSException
+
+        world = ros2_world(DISTRIBUTION)
+        for node in self._nodes[endpoint.participant_key]:
+            if not topic.definition and not self._ended.is_set():
+                with suppress(DDSException, Refused):  # as good as no answer
+                    topic.definition = ask_for_definition(
+                        self._participant, node, type_name, type_hash, world
+                    )
+
     def _subscribe(self, name: str, topic: _Topic, take: Callable[[Message], None]) -> None:
         from cyclonedds.core import DDSException
         from cyclonedds.sub import DataReader
@@ -179,10 +220,8 @@ class DdsSource:
         endpoints = list(topic.endpoints.values())
         offered = [offered_by(endpoint.qos) for endpoint in endpoints]
         type_hash = _hash_of(endpoints[0].qos)
-        kind = publisher_type(self._participant, endpoints[0])
         type_name = ros_type(endpoints[0].type_name)
-        definition = standard_definition(type_name, type_hash)
-        definition = definition or announced_definition(kind, type_hash)
+        definition = topic.definition
         if len({endpoint.type_name for endpoint in endpoints}) > 1:
             self.state.warnings[f"{name}: has several types; only {type_name} is recorded"] = None
         if not definition:
@@ -191,7 +230,7 @@ class DdsSource:
         self._count += 1
         qos = self._overrides.get(name, asked_qos(offered, _DEPTH))
         try:
-            made = Topic(self._participant, _PREFIX + name.lstrip("/"), kind)
+            made = Topic(self._participant, _PREFIX + name.lstrip("/"), topic.kind)
             topic.reader = DataReader(
                 self._participant, made, qos=dds_qos(qos, user_data=_user_data(type_hash))
             )
@@ -231,6 +270,9 @@ class DdsSource:
         self._ended.set()
         if self._thread is not None:
             self._thread.join()
+        for topic in self._topics.values():
+            if topic.asking is not None:
+                topic.asking.join()
         self._listener.close()
         self._services.clear()
         self._topics.clear()

@@ -27,6 +27,7 @@ from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 DISTRIBUTION = "jazzy"
 _ENCODING = "ros2msg"
 _SEPARATOR = "=" * 80
+_MAX_TEXT = 2**22
 _NS = 10**9
 _INFINITE = {"sec": 2**63 // _NS, "nsec": 2**63 % _NS - 1}
 _FIELD = re.compile(r"^\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+\w+")
@@ -208,6 +209,23 @@ def _parts(text: str, package: str) -> Iterator[str]:
         if match and not _PRIMITIVE.fullmatch(match[1]):
             rooms = match[1].split("/")
             yield f"{rooms[0] if len(rooms) > 1 else package}/msg/{rooms[-1]}"
+
+
+def described_definition(texts: Mapping[str, str], type_name: str, type_hash: str) -> str:
+    """The definition of a type as a node describes it.
+
+    Args:
+        texts: Definitions by type, also of the type's parts.
+        type_name: The type.
+        type_hash: As it was announced, by which the definition is proven.
+
+    Returns:
+        The text with the definitions of its parts; empty where it cannot be proven.
+    """
+    if not type_hash or type_name not in texts or sum(map(len, texts.values())) > _MAX_TEXT:
+        return ""
+    text = _with_parts({type_name: texts[type_name], **texts})
+    return text if _proven(Schema(type_name, _ENCODING, text.encode()), type_hash) else ""
 
 
 # ---------------------------------------------------------------- DDS

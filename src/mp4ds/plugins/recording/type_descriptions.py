@@ -1,0 +1,84 @@
+"""Definitions of types as the nodes that publish them describe them, asked for over DDS."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from typing import Any
+
+from mp4ds.bags.types import World, by_library, make_store
+from mp4ds.plugins.publishing.dds import dds_qos, service_types
+from mp4ds.plugins.publishing.dds_domain import as_is, make_struct
+from mp4ds.plugins.publishing.ros2_writers import Qos
+from mp4ds.plugins.recording.ros2_channels import described_definition
+
+REPLIES = ("rr/", "/get_type_descriptionReply")
+"""What is before and behind the name of a node in that of the DDS topic of its answers."""
+
+_PACKAGE = "type_description_interfaces"
+_SERVICE = f"{_PACKAGE}/srv/GetTypeDescription"
+_REQUEST = "string type_name\nstring type_hash\nbool include_type_sources"
+_RESPONSE = f"""bool successful
+string failure_reason
+{_PACKAGE}/TypeDescription type_description
+{_PACKAGE}/TypeSource[] type_sources
+{_PACKAGE}/KeyValue[] extra_information"""
+_PATIENCE_S = 2.0  # for nodes whose middleware answers in another way, or that are gone
+_WAIT_S = 0.01
+
+
+def ask_for_definition(
+    participant: Any, node: str, type_name: str, type_hash: str, world: World
+) -> str:
+    """The definition of a type by the `get_type_description` service of a node.
+
+    Args:
+        participant: Who asks.
+        node: Name of the node below the root, such as ``robot/camera``.
+        type_name: Such as ``sensor_msgs/msg/Image``.
+        type_hash: As it was announced, by which the definition is proven.
+        world: The types of ROS 2.
+
+    Returns:
+        The text with the definitions of its parts; empty if there is no answer in time, or none
+        that can be proven.
+    """
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic
+
+    guid = secrets.randbits(63)
+    types, _ = service_types(f"{_SERVICE}_Request", _REQUEST, world)
+    replies, _ = service_types(f"{_SERVICE}_Response", _RESPONSE, world)
+    kind = as_is(make_struct(types, f"{_SERVICE}_Request"))
+    reply_kind = as_is(make_struct(replies, f"{_SERVICE}_Response"))
+    name = f"{node}/get_type_description"
+    # a service answers when it knows the reader of the same client
+    qos = dds_qos(Qos(), user_data=f"clientid={guid:x};")
+    writer = DataWriter(participant, Topic(participant, f"rq/{name}Request", kind), qos=qos)
+    reader = DataReader(participant, Topic(participant, f"rr/{name}Reply", reply_kind), qos=qos)
+    end = time.monotonic() + _PATIENCE_S
+    while not (writer.get_matched_subscriptions() and reader.get_matched_publications()):
+        if time.monotonic() > end:
+            return ""
+        time.sleep(_WAIT_S)
+    store: Any = make_store(types, world)
+    request = store.types[f"{_SERVICE}_Request"](
+        client_guid=guid,
+        sequence_number=1,
+        type_name=type_name,
+        type_hash=type_hash,
+        include_type_sources=True,
+    )
+    writer.write(kind(bytes(store.serialize_cdr(request, f"{_SERVICE}_Request"))))
+    parse: Any = make_store(replies, world).deserialize_cdr
+    while time.monotonic() < end:
+        for sample in reader.take(1):
+            if sample.sample_info.valid_data:
+                reply = by_library("", parse, sample.payload, f"{_SERVICE}_Response")
+                if reply.client_guid == guid:
+                    sources = reply.type_sources if reply.successful else ()
+                    texts = {one.type_name: one.raw_file_contents for one in sources}
+                    return described_definition(texts, type_name, type_hash)
+        time.sleep(_WAIT_S)
+    return ""
