@@ -13,7 +13,8 @@ import queue
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.machinery import ModuleSpec
 from pathlib import Path
@@ -99,6 +100,7 @@ class Bus:
         self.subscriptions: list[Subscription] = []
         self.services: dict[str, tuple[Any, Callable[[Any, Any], Any], Node]] = {}
         self.errors: list[str] = []
+        self.stopped: set[str] = set()  # topics of which nobody acknowledges a message
         self.kinds: dict[str, Any] = {}
         self.halves: set[str] = set()  # types of which only the Python half is installed
         self.share: Path | None = None  # where the definitions of types are installed
@@ -129,7 +131,7 @@ class Publisher:
         return sum(one.matches(self) for one in self.node.bus.subscriptions)
 
     def wait_for_all_acked(self, timeout: Duration = Duration(seconds=-1)) -> bool:  # noqa: B008
-        return True
+        return self.topic not in self.node.bus.stopped
 
 
 class Subscription:
@@ -377,6 +379,11 @@ class FakePeer:
 
     def forget(self, topic: str) -> None:
         self._seen[topic].clear()
+
+    @contextmanager
+    def stopped(self, topic: str) -> Iterator[None]:
+        self._bus.stopped.add(topic)
+        yield
 
     def connected(self, topic: str, count: int) -> int:
         subscriptions = [one for one in self._bus.subscriptions if one.topic == topic]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import random
+import signal
 import subprocess
 import sys
 import time
@@ -122,6 +123,14 @@ class DdsPeer:
     def forget(self, topic: str) -> None:
         self.ask("forget", f"rt{topic}")
 
+    @contextmanager
+    def stopped(self, topic: str) -> Iterator[None]:
+        self._process.send_signal(signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            self._process.send_signal(signal.SIGCONT)
+
     def connected(self, topic: str, count: int) -> int:
         return int(self.ask("connected", f"rt{topic}", count))
 
@@ -147,6 +156,13 @@ class Side:
 
     def open(self, **options: Any) -> Any:
         return self._kind(**self.options, **options)
+
+    @contextmanager
+    def stopped(self, publisher: Any, recorded: Channel) -> Iterator[None]:
+        """A subscriber of a channel that no longer acknowledges anything."""
+        connect(self, publisher, recorded)
+        with self.peer.stopped(recorded.topic):
+            yield
 
 
 @contextmanager

@@ -229,13 +229,25 @@ def test_ros_names_the_node_and_its_clock(side: Side) -> None:
         assert side.peer.connected("/sim", 1) == 1
 
 
-@pytest.mark.parametrize("seconds", [0.5, float("inf")])
+@pytest.mark.parametrize("seconds", [WATCHDOG_S, float("inf")])
 def test_subscribers_have_as_long_as_they_are_given(side: Side, seconds: float) -> None:
     recorded = channel("/robot/topic", STRING)
     with side.open(parting_s=seconds) as publisher:
         connect(side, publisher, recorded)
         publisher.publish(recorded, message(STRING, 1), 0)
     assert len(side.peer.received("/robot/topic", 1)) == 1
+
+
+def test_subscribers_that_do_not_acknowledge(side: Side) -> None:
+    """The topics are named, others are not."""
+    heard, plain = channel("/robot/topic", STRING), channel("/robot/other", STRING)
+    publisher = side.open(parting_s=0.5)
+    with side.stopped(publisher, heard):
+        publisher.advertise(plain)
+        publisher.publish(heard, message(STRING, 1), 0)
+        publisher.publish(plain, message(STRING, 1), 0)
+        with pytest.warns(UserWarning, match=r"^/robot/topic: subscribers have not acknowledged"):
+            publisher.close()
 
 
 def test_who_is_closed_is_gone(side: Side) -> None:

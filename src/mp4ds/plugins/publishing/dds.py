@@ -347,7 +347,8 @@ class DdsPublisher:
         overrides: Topic -> QoS profile to offer instead of the recorded one.
         node: Name of the node that the services belong to, if `names` has none.
         names: Name, namespace and remappings of the node.
-        parting_s: How long to wait at the end for acknowledgements; may be infinite.
+        parting_s: How long to wait at the end for acknowledgements, may be infinite; topics that
+            are not acknowledged by then are named in a warning. None: 3 s, without a warning.
 
     Raises:
         OptionError: There is no such domain.
@@ -363,7 +364,7 @@ class DdsPublisher:
         overrides: Mapping[str, Qos] = {},
         node: str = "rosbag2_player",
         names: NodeNames = PLAIN,
-        parting_s: float = PARTING_S,
+        parting_s: float | None = None,
     ) -> None:
         self._domain = domain_id(domain)
         self._node = names.of_node(node)
@@ -450,9 +451,11 @@ class DdsPublisher:
         if not self._is_open:
             return
         self._is_open = False
-        end = time.monotonic() + self._parting_s
-        for writer in self._writers:
-            writer.wait(max(0.0, end - time.monotonic()))
+        is_asked = self._parting_s is not None
+        end = time.monotonic() + (PARTING_S if self._parting_s is None else self._parting_s)
+        self._writers.wait(
+            lambda writer: writer.wait(max(0.0, end - time.monotonic())), warns=is_asked
+        )
         self._listener.close()
         self._services.clear()
         self._writers.clear()

@@ -228,10 +228,9 @@ def open_publisher(
         from mp4ds.plugins.publishing.foxglove import FoxglovePublisher
 
         return FoxglovePublisher(host=host, port=port, origins=origins, span=span)
-    from mp4ds.plugins.publishing.ros2_writers import PARTING_S, load_overrides
+    from mp4ds.plugins.publishing.ros2_writers import load_overrides
 
     overrides = load_overrides(qos_overrides) if qos_overrides is not None else {}
-    parting_s = PARTING_S if parting_s is None else parting_s
     if find_spec("rclpy") is not None:
         from mp4ds.plugins.publishing.ros2 import RclpyPublisher
 

@@ -46,7 +46,8 @@ class RclpyPublisher:
         overrides: Topic -> QoS profile to offer instead of the recorded one.
         node: Name of the node, if `names` has none.
         names: Name, namespace and remappings of the node.
-        parting_s: How long to wait at the end for acknowledgements; may be infinite.
+        parting_s: How long to wait at the end for acknowledgements, may be infinite; topics that
+            are not acknowledged by then are named in a warning. None: 3 s, without a warning.
 
     Raises:
         PublishError: No ROS 2 is sourced.
@@ -60,7 +61,7 @@ class RclpyPublisher:
         overrides: Mapping[str, Qos] = {},
         node: str = "rosbag2_player",
         names: NodeNames = PLAIN,
-        parting_s: float = PARTING_S,
+        parting_s: float | None = None,
     ) -> None:
         try:
             import rclpy
@@ -200,12 +201,16 @@ class RclpyPublisher:
 
         if self._ended.is_set():
             return
-        end = time.monotonic() + self._parting_s
+        is_asked = self._parting_s is not None
+        end = time.monotonic() + (PARTING_S if self._parting_s is None else self._parting_s)
+
+        def is_acknowledged(publisher: Any) -> bool:
+            left = end - time.monotonic()  # rclpy takes a negative one for infinite
+            left = -1.0 if math.isinf(left) else max(0.0, left)
+            return bool(publisher.wait_for_all_acked(Duration(seconds=left)))
+
         if self._context.ok():
-            for publisher in self._writers:
-                left = end - time.monotonic()  # rclpy takes a negative one for infinite
-                left = -1.0 if math.isinf(left) else max(0.0, left)
-                publisher.wait_for_all_acked(Duration(seconds=left))
+            self._writers.wait(is_acknowledged, warns=is_asked)
         self._ended.set()
         for thread in self._threads:
             if thread is not threading.current_thread():

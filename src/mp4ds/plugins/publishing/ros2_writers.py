@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Hashable, Iterator, Mapping
+import warnings
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
@@ -426,8 +427,20 @@ class Writers(Generic[_Writer]):
     def __getitem__(self, channel: Channel) -> _Writer:
         return self._channels[id(channel)][1]
 
-    def __iter__(self) -> Iterator[_Writer]:
-        return (writer for _, writer in self._channels.values())
+    def wait(self, is_acknowledged: Callable[[_Writer], bool], *, warns: bool) -> None:
+        """Wait for subscribers to acknowledge what was sent.
+
+        Args:
+            is_acknowledged: Waits for those of a writer; returns whether they did so in time.
+            warns: Whether to name the topics of which they did not.
+        """
+        found = {id(writer): (channel.topic, writer) for channel, writer in self._channels.values()}
+        late = sorted({topic for topic, writer in found.values() if not is_acknowledged(writer)})
+        if late and warns:
+            warnings.warn(
+                f"{', '.join(late)}: subscribers have not acknowledged every message in time",
+                stacklevel=2,
+            )
 
     def clear(self) -> None:
         """Release all writers."""
