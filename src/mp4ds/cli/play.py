@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -236,5 +237,5 @@ def play(
         print_json(summary)
     else:
         print_play(summary)
-    if caught:
+    if caught and caught[0] != signal.SIGINT:  # Ctrl-C is how players are ended, and no failure
         raise typer.Exit(128 + caught[0])
