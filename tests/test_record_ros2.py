@@ -296,7 +296,7 @@ def test_a_message_that_cannot_be_taken(side: Side) -> None:
         source.close()
     assert source.state.lost == {"/robot/name": 1}
     assert [*source.state.warnings] == [
-        "/robot/name: a message could not be taken: ValueError('no')"
+        "/robot/name: a message could not be recorded: ValueError('no')"
     ]
 
 
@@ -358,7 +358,7 @@ def test_topics_that_nobody_publishes_yet(monkeypatch: pytest.MonkeyPatch) -> No
             assert until(lambda: heard.payloads["/robot/name"])
         source.close()
     assert [*map(padded, heard.payloads["/robot/name"])] == [padded(message(STRING, 1))]
-    with pytest.raises(OptionError, match="needs a ROS 2 that is sourced"):
+    with pytest.raises(OptionError, match="source a ROS 2"):
         open_source("dds", SourceOptions("recorder", unpublished=True))
 
 
@@ -447,7 +447,7 @@ def test_a_definition_that_a_node_describes(
     if described != "proven":
         assert (found.schema.encoding, found.schema.data) == ("", b"")
         assert [*source.state.warnings] == [
-            f"/robot/part: the definition of {CUSTOM} is not known here"
+            f"/robot/part: recorded without the definition of {CUSTOM}, which was not found"
         ]
         return
     main, *parts = found.schema.data.decode().split("=" * 80)

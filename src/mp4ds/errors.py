@@ -34,6 +34,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -230,13 +231,13 @@ class WriteError(Mp4dsError, OSError):
 
 
 class RecordError(Mp4dsError, OSError):
-    """The disk refused while a recording was made; what came before is kept."""
+    """The disk is full, or failed, during a recording; what was recorded before is kept."""
 
     def __init__(self, folder: Path, target: Path, cause: BaseException) -> None:
         super().__init__(
-            f"{path_text(folder)}: could not be written: {reason_of(cause)}. What was recorded "
-            "before is in it: make room, then run mp4ds pack --salvage "
-            f"{path_text(folder)} -o {path_text(target)}"
+            f"{path_text(folder)}: could not be written: {reason_of(cause)}. It holds what was "
+            "recorded before. Make room, then run: mp4ds pack --salvage "
+            f"{shlex.quote(path_text(folder))} -o {shlex.quote(path_text(target))}"
         )
 
 

@@ -1,4 +1,4 @@
-"""``mp4ds record``: the keyboard of a recorder, what it shows, and what it did."""
+"""``mp4ds record``: keyboard controls, progress and results of a recorder."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ _UNTIMED = "their log time is negative or too large"
 
 
 class RecordCommand(NodeCommand):
-    """The command, which understands how the options of other recorders are typed."""
+    """The command; it also takes the options of ROS's own recorders."""
 
     def spelled(self, ctx: Any, args: Sequence[str]) -> tuple[list[str], NodeNames]:
-        """Arguments in the words of ROS's own recorders, as the command has them."""
+        """Translate arguments in the style of ROS's own recorders."""
         return spelled(args, self.valued(ctx).__contains__)
 
 
@@ -47,7 +47,7 @@ def record(
     context: typer.Context,
     topics: Annotated[
         Optional[list[str]],  # noqa: UP045 - read at run time by typer
-        typer.Argument(metavar="TOPIC...", help="Topic names or quoted globs; -a records all."),
+        typer.Argument(metavar="TOPIC...", help="Topic names, or globs in quotes; -a records all."),
     ] = None,
     output: Annotated[
         Optional[str],  # noqa: UP045 - read at run time by typer
@@ -55,12 +55,12 @@ def record(
             "--output",
             "-o",
             metavar="DATASET",
-            help="Folder to create; by default named after the time.",
+            help="Folder to create; default: named after the time.",
         ),
     ] = None,
     ros1: Annotated[bool, typer.Option("--ros1", help="Record from ROS 1.")] = False,
     ros2: Annotated[
-        bool, typer.Option("--ros2", help="Record from ROS 2, with rclpy or else Cyclone DDS.")
+        bool, typer.Option("--ros2", help="Record from ROS 2, with rclpy, or else Cyclone DDS.")
     ] = False,
     log_level: Annotated[
         str,
@@ -70,14 +70,15 @@ def record(
         bool, typer.Option("--disable-keyboard-controls", help="Disable the keyboard controls.")
     ] = False,
     progress: Annotated[
-        bool, typer.Option("--progress/--no-progress", help="Show what is being recorded.")
+        bool,
+        typer.Option("--progress/--no-progress", help="Show topics while recording."),
     ] = True,
     as_json: JsonFlag = False,
 ) -> None:
     """Record topics of a live robot, ROS 1 or ROS 2, into a dataset.
 
-    Ends at Ctrl-C. Lossless by default, with the fastest encoder settings. Images that cannot be
-    encoded in time are stored as received. Keys: space pauses, q stops.
+    Ctrl-C ends the recording. It is lossless by default, with the fastest encoder settings. Images
+    that cannot be encoded in time are stored as received. Keys: space pauses and resumes, q ends.
     """
     with told_errors(as_json), ExitStack() as stack:
         if ros1 and ros2:
@@ -115,10 +116,10 @@ def record(
 
 @contextmanager
 def record_progress(*, is_quiet: bool) -> Iterator[Callable[[RecordProgress], None]]:
-    """On a terminal, a table of the topics; in a log, a line every 10 s; warnings anywhere.
+    """On a terminal, a table of the topics; in a log, a line every 10 s; warnings in both.
 
     Args:
-        is_quiet: Warnings only.
+        is_quiet: Print warnings only.
     """
     from rich.console import Console
     from rich.live import Live
@@ -134,10 +135,10 @@ def record_progress(*, is_quiet: bool) -> Iterator[Callable[[RecordProgress], No
                 complain(warning)
         if state.state.startswith("waiting") and state.state not in told:
             told.add(state.state)
-            complain(f"{state.state}: nothing is recorded before the first time (--use-sim-time)")
+            complain(f"{state.state}: recording starts when it publishes a time")
         for topic, item in state.topics.items():
             for count, what in (
-                (item.dropped, "dropping messages: the buffer is full (--buffsize)"),
+                (item.dropped, "dropping messages: the buffer is full (--buffsize enlarges it)"),
                 (
                     item.verbatim,
                     "images arrive faster than they can be encoded: storing them as received",
@@ -178,7 +179,7 @@ def _line(state: RecordProgress) -> str:
         f"{state.bytes_written / 1e6:.1f} MB written",
     ]
     if state.waiting_bytes >= 1e6:
-        parts.append(f"{state.waiting_bytes / 1e6:.0f} MB waiting")
+        parts.append(f"{state.waiting_bytes / 1e6:.0f} MB buffered")
     return " · ".join(parts)
 
 
@@ -209,16 +210,16 @@ def _table(state: RecordProgress) -> Table:
 
 
 def print_record(summary: RecordSummary) -> None:
-    """Tell what was recorded."""
+    """Print what was recorded."""
     for made in summary.datasets:
         if any(topic.messages for topic in made.topics):
             print_pack(made)
             continue
         topics = ", ".join(topic.topic for topic in made.topics)
-        why = f"no message came on {topics}" if topics else "no matching topic was published"
+        why = f"no message arrived on {topics}" if topics else "no matching topic was published"
         say(f"{path_text(made.dataset)}: empty: {why}")
     for topic, count in summary.dropped.items():
-        say(f"{topic}: {counted(count, 'message')} dropped, since the buffer was full")
+        say(f"{topic}: {counted(count, 'message')} dropped: the buffer was full")
     for topic, count in summary.lost.items():
         say(f"{topic}: {counted(count, 'message')} lost by the middleware")
     for topic, count in summary.untimed.items():

@@ -1,4 +1,4 @@
-"""The command line of ``mp4ds record`` as users of ROS's own recorders type it."""
+"""Command lines of `rosbag record` and `ros2 bag record`, translated for ``mp4ds record``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _SAME = {
     "--max-bag-size": "--max-size",
     "--topic": "--topics",
 }
-"""Options of other recorders -> what they are called here."""
+"""Options of ROS's own recorders -> their name here."""
 
 _ROS2_LETTERS = {"-b": "--max-size", "-s": "--storage"}
 _IGNORED = {
@@ -22,7 +22,7 @@ _IGNORED = {
     **dict.fromkeys(("--compression-threads-priority", "--serialization-format"), 1),
     **dict.fromkeys(("-j", "--bz2", "--lz4", "--tcpnodelay"), 0),
 }
-"""Options about what a dataset does not have -> how many words they take."""
+"""Options without meaning for a dataset -> the number of values they take."""
 
 _BYTES = "--max-cache-size"
 _LISTS = {
@@ -33,13 +33,13 @@ _LISTS = {
     "--exclude-services": ("--exclude", SERVICE_EVENTS),
     **{name: (name, "") for name in ("--topic-types", "--exclude-topic-types", "--custom-data")},
 }
-"""Options that take several words -> the option for each, empty for a topic; what is appended."""
+"""Options that take several values -> the option for each (empty: a topic), and its suffix."""
 
 _MB = 10**6
 
 
 def known_words() -> Collection[str]:
-    """Options that are understood besides those that ``--help`` shows."""
+    """Options that are accepted besides those in ``--help``."""
     return {
         *_SAME,
         *_ROS2_LETTERS,
@@ -56,11 +56,14 @@ def known_words() -> Collection[str]:
 def spelled(
     arguments: Sequence[str], takes_value: Callable[[str], bool]
 ) -> tuple[list[str], NodeNames]:
-    """Arguments as the command has them, and what ROS tells the node.
+    """Translate a command line.
 
     Args:
-        arguments: As they were typed.
-        takes_value: Whether an option of the command has a word behind it.
+        arguments: As typed by the user.
+        takes_value: Whether an option of the command takes a value.
+
+    Returns:
+        Arguments of the command; name, namespace and remappings of the node.
 
     Raises:
         OptionError: An option lacks its value.
@@ -70,7 +73,7 @@ def spelled(
     is_split, is_ros1 = "--split" in words, "--ros1" in words
     made: list[str] = []
     topics: list[str] = []
-    patterns = False  # of rosbag record: its topics are regular expressions
+    patterns = False  # with -e, topics are regular expressions for rosbag record
     left = [part for word in words for part in _parted(letters.get(word, word))][::-1]
 
     def value(option: str) -> str:
@@ -121,7 +124,7 @@ def _parted(word: str) -> list[str]:
 
 
 def _seconds(duration: str) -> str:
-    """Seconds of ``90``, ``5m`` or ``2h``; what is none of these as it is."""
+    """``90``, ``5m`` or ``2h`` in seconds; anything else unchanged."""
     factor = {"m": 60, "h": 3600}.get(duration[-1:], 0)
     return str(int(duration[:-1]) * factor) if factor and duration[:-1].isdigit() else duration
 

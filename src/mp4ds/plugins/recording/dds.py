@@ -1,4 +1,4 @@
-"""Receives messages of ROS 2 without an installed ROS: over DDS, with Eclipse Cyclone DDS."""
+"""Receives messages from ROS 2 without an installed ROS: over DDS, with Eclipse Cyclone DDS."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ from mp4ds.plugins.recording.type_descriptions import REPLIES, ask_for_definitio
 from mp4ds.records import Channel, Message
 
 _DEPTH = 100
-"""Messages of a topic that may wait in DDS: they are taken out at once."""
+"""Depth of readers: messages are taken out at once."""
 
 _SETTLE_S = 0.3
-"""Seconds between a topic's first publisher and its subscription: what all offer decides."""
+"""Seconds from a topic's first publisher to its subscription: the QoS depends on all of them."""
 
 _PREFIX = "rt/"
 _HASH = re.compile(rb"(?:^|;)typehash=(RIHS01_[0-9a-f]{64});")
@@ -59,9 +59,9 @@ _CLOCK = "/clock"
 
 @dataclass
 class _Topic:
-    """A topic that somebody publishes, and which is wanted."""
+    """A published topic."""
 
-    recorded: str  # its name in the recording
+    recorded: str  # the name under which it is recorded
     since: float
     is_wanted: bool
     endpoints: dict[Any, Any] = field(default_factory=dict)
@@ -72,14 +72,14 @@ class _Topic:
 
 
 class DdsSource:
-    """Receives as a participant of DDS by itself. See `Source`.
+    """Receives as a DDS participant. See `Source`.
 
     Args:
-        options: How; the node has no name in DDS.
+        options: How to receive; the node's name is used for its services only.
 
     Raises:
-        PublishError: Cyclone DDS is not there.
-        OptionError: There is no such domain.
+        PublishError: Cyclone DDS is not installed, or finds no network.
+        OptionError: There is no such domain, or an option needs rclpy.
     """
 
     format: Format = "rosbag2"
@@ -87,7 +87,7 @@ class DdsSource:
 
     def __init__(self, options: SourceOptions) -> None:
         if options.unpublished:
-            raise OptionError("`unpublished` needs a ROS 2 that is sourced.")
+            raise OptionError("`unpublished` works with rclpy only: source a ROS 2.")
         self.state = SourceState()
         self._options = options
         self._clock = options.names.renamed(_CLOCK)
@@ -98,7 +98,9 @@ class DdsSource:
         self.address = f"DDS domain {domain}, by Cyclone DDS"
         self._listener = DdsListener(self._participant)
         self._topics: dict[str, _Topic] = {}
-        self._nodes: dict[Any, list[str]] = defaultdict(list)  # that describe types, by participant
+        self._nodes: dict[Any, list[str]] = defaultdict(
+            list
+        )  # whose types can be asked for, by participant
         self._count = 0
         self._services: list[Any] = []
         self._ended = threading.Event()
@@ -155,7 +157,7 @@ class DdsSource:
                 return
 
     def _subscribed(self, others: Any) -> set[str]:
-        """Topics that somebody else subscribes to."""
+        """Topics with subscribers in other processes."""
         from cyclonedds.core import InstanceState
 
         own = self._participant.guid
@@ -184,7 +186,7 @@ class DdsSource:
             known.endpoints[endpoint.key] = endpoint
 
     def _is_defined(self, topic: _Topic) -> bool:
-        """Whether the search for the definition of a topic's type is over; begins it."""
+        """Whether the definition of a topic's type has been looked for; starts to."""
         if topic.asking is not None:
             return not topic.asking.is_alive()
         endpoint = next(iter(topic.endpoints.values()))
@@ -201,13 +203,13 @@ class DdsSource:
         return False
 
     def _ask(self, topic: _Topic, endpoint: Any, type_name: str, type_hash: str) -> None:
-        """Ask the nodes of a publisher's process for the definition of its type."""
+        """Ask the nodes in a publisher's process for the definition of its type."""
         from cyclonedds.core import DDSException
 
         world = ros2_world(DISTRIBUTION)
         for node in self._nodes[endpoint.participant_key]:
             if not topic.definition and not self._ended.is_set():
-                with suppress(DDSException, Refused):  # as good as no answer
+                with suppress(DDSException, Refused):  # the same as no answer
                     topic.definition = ask_for_definition(
                         self._participant, node, type_name, type_hash, world
                     )
@@ -223,9 +225,11 @@ class DdsSource:
         type_name = ros_type(endpoints[0].type_name)
         definition = topic.definition
         if len({endpoint.type_name for endpoint in endpoints}) > 1:
-            self.state.warnings[f"{name}: has several types; only {type_name} is recorded"] = None
+            self.state.warn(f"{name}: has several types: only {type_name} is recorded")
         if not definition:
-            self.state.warnings[f"{name}: the definition of {type_name} is not known here"] = None
+            self.state.warn(
+                f"{name}: recorded without the definition of {type_name}, which was not found"
+            )
         channel = channel_of(self._count, topic.recorded, type_name, definition, type_hash, offered)
         self._count += 1
         qos = self._overrides.get(name, asked_qos(offered, _DEPTH))
@@ -236,7 +240,7 @@ class DdsSource:
             )
         except DDSException as error:
             topic.reader = False
-            self.state.warnings[f"{name}: cannot be received: {error.msg}"] = None
+            self.state.warn(f"{name}: not recorded: DDS refuses the subscription: {error.msg}")
             return
         receive = told(self.state, name, partial(self._received, channel, take))
         if name == self._clock and self._options.use_sim_time:
@@ -246,7 +250,7 @@ class DdsSource:
         self._listener.hear(topic.reader, receive)
 
     def _tick(self, receive: Callable[[Any], None] | None, sample: Any) -> None:
-        if now := time_of(sample.payload):  # 0 is no time yet, for ROS
+        if now := time_of(sample.payload):  # 0 means that the clock has not started
             self._sim_time_ns, self.state.waiting_for = now, ""
             if receive is not None:
                 receive(sample)
@@ -291,10 +295,10 @@ def _user_data(type_hash: str) -> str:
 
 
 def offered_by(qos: Any) -> Qos:
-    """What a publisher offers, of what discovery tells: not how many messages it keeps.
+    """The QoS of a publisher, as far as discovery shares it: the history depth is unknown.
 
     Args:
-        qos: As Cyclone DDS has it.
+        qos: The QoS in Cyclone DDS.
     """
     from cyclonedds.core import Policy
 

@@ -1,4 +1,4 @@
-"""A live robot -> datasets: what comes is encoded and put onto the disk as it comes."""
+"""A live robot -> datasets: messages are encoded and written to disk as they arrive."""
 
 from __future__ import annotations
 
@@ -45,38 +45,38 @@ from mp4ds.video.codecs import LOSSLESS_GOP, LOSSY_GOP, check_codec
 _NS = 1_000_000_000
 _REPORT_S = 0.2
 _LAST_NS = {"ros1": 2**32 * _NS - 1, "ros2": INT64_MAX}
-"""The latest time that a bag, or a rosbag2, can hold."""
+"""The latest time that a bag or rosbag2 can hold."""
 
 _NODES = {"ros1": "record", "ros2": "rosbag2_recorder"}
-"""Names of the nodes of ROS's own recorders."""
+"""Node names of ROS's own recorders."""
 
 
 @dataclass(frozen=True)
 class RecordOptions(Options):
     """How to record."""
 
-    to: str | None = option("ros1 or ros2; by default, the one that is sourced.")
+    to: str | None = option("ros1 or ros2; default: the one that is sourced.")
     all: bool = option(
-        "Record all topics, including new ones, and service events (ROS 2).", False, "-a"
+        "Record all topics, including new ones, and all service events (ROS 2).", False, "-a"
     )
-    all_topics: bool = option("Record all topics, without service events.", False)
+    all_topics: bool = option("Record all topics, but no service events.", False)
     all_services: bool = option("Record all service events (ROS 2).", False)
     topic_types: Sequence[str] = option(
         "Record topics of this type; repeatable.", (), metavar="TYPE"
     )
-    regex: str = option("Record topics that match a regular expression.", "", "-e")
+    regex: str = option("Record topics whose name matches a regular expression.", "", "-e")
     exclude: Sequence[str] = option(
-        "Leave out matching topics; repeatable.", (), "--exclude", metavar="GLOB"
+        "Leave out topics that match; repeatable.", (), "--exclude", metavar="GLOB"
     )
     exclude_topic_types: Sequence[str] = option(
         "Leave out topics of this type; repeatable.", (), metavar="TYPE"
     )
     exclude_regex: str = option(
-        "Leave out topics that match a regular expression.", "", "--exclude-regex", "-x"
+        "Leave out topics whose name matches a regular expression.", "", "--exclude-regex", "-x"
     )
     duration: float | None = option("Stop after N seconds.", None, "--duration")
     max_duration: float | None = option(
-        "Start a new dataset after this time; 0: never.",
+        "Start a new dataset after this many seconds; 0: never.",
         None,
         "--max-bag-duration",
         "-d",
@@ -90,7 +90,7 @@ class RecordOptions(Options):
         parse=parse_size,
     )
     buffer: int = option(
-        "Buffer in MB; when it is full, the oldest messages are dropped and counted.",
+        "Buffer size in MB; when the buffer is full, the oldest messages are dropped and counted.",
         256,
         "--buffsize",
         "-b",
@@ -98,21 +98,21 @@ class RecordOptions(Options):
         most=1_000_000,
     )
     quality: str = option("lossless, visual or crf=N.", LOSSLESS)
-    codec: str | None = option("As in pack; by default the fastest to encode.")
-    preset: str | None = option("The encoder's preset; by default the fastest.")
+    codec: str | None = option("As in pack; default: the fastest to encode.")
+    preset: str | None = option("Encoder preset; default: the fastest.")
     gop: int | None = option(
-        "Maximum distance of key frames, in frames; 10 by default, 30 if lossy.",
+        "Maximum key frame interval in frames; default: 10, or 30 if lossy.",
         least=1,
         most=MAX_GOP,
     )
     start_paused: bool = option("Start paused.", False, "--start-paused", "--pause")
-    use_sim_time: bool = option("Take log times from /clock.", False)
+    use_sim_time: bool = option("Take log times from /clock, and wait for it.", False)
     node: str | None = option(
-        "Name of the node; that of ROS's own recorder by default.", None, "--node-name"
+        "Node name; default: that of ROS's own recorder.", None, "--node-name"
     )
-    discover: bool = option("Look for new topics.", True, "--discovery/--no-discovery")
+    discover: bool = option("Keep looking for new topics.", True, "--discovery/--no-discovery")
     polling_interval: float = option(
-        "Milliseconds between checks for new topics.", 100.0, "--polling-interval", "-p"
+        "Milliseconds between two checks for new topics.", 100.0, "--polling-interval", "-p"
     )
     hidden: bool = option("Include hidden topics (ROS 2).", False, "--include-hidden-topics")
     unpublished: bool = option(
@@ -124,16 +124,22 @@ class RecordOptions(Options):
         "Leave out topics without a subscriber (ROS 2).", False, "--ignore-leaf-topics"
     )
     qos_overrides: Path | None = option(
-        "QoS profiles by topic (ROS 2).", None, "--qos-profile-overrides-path", metavar="YAML"
+        "QoS profiles to subscribe with, by topic (ROS 2).",
+        None,
+        "--qos-profile-overrides-path",
+        metavar="YAML",
     )
     custom_data: Sequence[str] = option(
-        "Entries for rosbag2's custom_data (ROS 2); repeatable.", (), metavar="KEY=VALUE"
+        "Entry for custom_data of the rosbag2 metadata (ROS 2); repeatable.",
+        (),
+        metavar="KEY=VALUE",
     )
     about: str | None = option(
-        "YAML with title, description, authors, license, doi, links or keywords.", metavar="FILE"
+        "YAML file with title, description, authors, license, doi, links or keywords.",
+        metavar="FILE",
     )
     force: bool = force()
-    names: NodeNames = argument("What ROS calls the node and its topics.", PLAIN)
+    names: NodeNames = argument("Name, namespace and remappings of the node.", PLAIN)
 
 
 @dataclass(frozen=True)
@@ -141,13 +147,13 @@ class TopicProgress:
     """State of a topic.
 
     Attributes:
-        messages: Received.
-        hz: Recent messages per second.
-        bytes_per_s: Recently received per second.
+        messages: Messages received.
+        hz: Messages per second, recently.
+        bytes_per_s: Bytes per second, recently.
         verbatim: Camera messages stored as received, not encoded.
         dropped: Messages dropped because the buffer was full.
-        lost: Messages lost according to the middleware.
-        untimed: Messages left out because of their log time.
+        lost: Messages lost, as reported by the middleware.
+        untimed: Messages left out because their log time is negative or too large.
     """
 
     messages: int
@@ -161,16 +167,16 @@ class TopicProgress:
 
 @dataclass(frozen=True)
 class RecordProgress:
-    """How a recording stands.
+    """Progress of a recording.
 
     Attributes:
-        dataset: That is being made.
-        seconds: Since it began.
-        state: ``recording``, ``paused``, ``finishing``, or the topic of the clock it waits for.
-        topics: By name.
-        waiting_bytes: Payloads that wait.
-        bytes_written: Of this dataset.
-        warnings: Sentences, each once.
+        dataset: The dataset being made.
+        seconds: Time since the recording began.
+        state: ``recording``, ``paused``, ``finishing`` or ``waiting for /clock``.
+        topics: State of each topic, by name.
+        waiting_bytes: Bytes of buffered messages.
+        bytes_written: Bytes of this dataset so far.
+        warnings: Warnings so far, each a sentence.
     """
 
     dataset: Path
@@ -184,15 +190,15 @@ class RecordProgress:
 
 @dataclass
 class RecordSummary:
-    """What was recorded.
+    """The result of a recording.
 
     Attributes:
-        datasets: What was made.
-        seconds: How long it took.
-        dropped: Messages for which there was no memory, by topic.
-        lost: Messages that the middleware says it lost, by topic.
+        datasets: One entry per dataset made.
+        seconds: Duration of the recording.
+        dropped: Messages dropped because the buffer was full, by topic.
+        lost: Messages lost, as reported by the middleware, by topic.
         untimed: Messages left out because their log time is negative or too large, by topic.
-        warnings: Sentences.
+        warnings: Warnings, each a sentence.
     """
 
     datasets: list[PackSummary] = field(default_factory=list)
@@ -213,20 +219,20 @@ def record(
     """Record topics until interrupted.
 
     Args:
-        topics: Names or globs; none with `all` or `regex`.
-        dataset: The folder to make; named by the time where None.
-        options: How.
+        topics: Names or globs; may be empty if the options select topics.
+        dataset: The folder to make; if None, it is named after the time.
+        options: How to record.
         progress: Called a few times a second.
 
     Returns:
-        What was recorded.
+        The result.
 
     Raises:
         OptionError: An option is wrong.
-        PublishError: ROS is not there.
-        TargetError: The dataset may not be written there.
-        RecordError: The disk refused; what came before stays in the folder ``NAME.recording``, of
-            which `mp4ds.pack` makes a dataset with `salvage`.
+        PublishError: There is no ROS, or it cannot be reached.
+        TargetError: The dataset cannot be written there.
+        RecordError: The disk is full, or failed. What was recorded before is in the folder
+            ``NAME.recording``; `mp4ds.pack` with `salvage` makes a dataset of it.
     """
     with open_recorder(topics, dataset, options, progress=progress) as recorder:
         return recorder.run()
@@ -241,14 +247,14 @@ def open_recorder(
     source: Source | None = None,
     progress: Callable[[RecordProgress], None] | None = None,
 ) -> Iterator[Recorder]:
-    """A recorder, which is not running yet. See `record`.
+    """A recorder that has not started yet; arguments as for `record`.
 
     Args:
-        topics: See `record`.
-        dataset: See `record`.
-        options: See `record`.
-        source: Where messages come from, closed here; None for what the options say.
-        progress: See `record`.
+        topics: Names or globs.
+        dataset: The folder to make.
+        options: How to record.
+        source: Where messages come from, closed at the end; None to open one by the options.
+        progress: Called a few times a second.
     """
     chosen = options or RecordOptions()
     is_all = chosen.all or chosen.all_topics or chosen.all_services
@@ -299,12 +305,12 @@ def _settings(options: RecordOptions) -> StreamSettings:
     quality = parse_quality(options.quality)
     if quality.target is not None:
         raise OptionError(
-            f"`quality` {options.quality} needs several tries. Record without loss, or visual, and "
-            "pack the dataset with that quality."
+            f"`quality` {options.quality} takes several tries per video. Record lossless or "
+            "visual, then pack the dataset with this quality."
         )
     for name, seconds in (("duration", options.duration), ("max_duration", options.max_duration)):
         if seconds is not None and not 0 <= seconds < 1e9:
-            raise OptionError(f"`{name}` {seconds:g} is not a number of seconds from 0.")
+            raise OptionError(f"`{name}` {seconds:g} is not a number of seconds, 0 or more.")
     return StreamSettings(
         quality=quality,
         codec=check_codec(
@@ -318,7 +324,7 @@ def _settings(options: RecordOptions) -> StreamSettings:
 
 
 def _bag_info(custom_data: Sequence[str]) -> list[MetadataRecord]:
-    """What metadata.yaml of a rosbag2 tells of the whole recording.
+    """What a rosbag2's metadata.yaml says of the recording as a whole.
 
     Raises:
         OptionError: An entry is not of the form KEY=VALUE.
@@ -337,13 +343,13 @@ def _bag_info(custom_data: Sequence[str]) -> list[MetadataRecord]:
 
 
 class Recorder:
-    """Records until it is stopped. See `open_recorder`.
+    """Records until it is stopped; see `open_recorder`.
 
     Args:
-        target: The dataset, absolute.
-        options: How.
-        settings: Of its streams.
-        wanted: Which topics.
+        target: The dataset, an absolute path.
+        options: How to record.
+        settings: How to encode.
+        wanted: Which topics to record.
         source: Where messages come from.
         about: Description of the recording.
         others: What it holds besides messages.
@@ -379,50 +385,50 @@ class Recorder:
 
     @property
     def received(self) -> int:
-        """Messages that came so far."""
+        """Number of messages received so far."""
         return sum(self._intake.received.values())
 
     @property
     def unfinished(self) -> list[Path]:
-        """Folders of which no dataset was made yet."""
+        """Folders of recordings that are not datasets yet."""
         return [split.folder for split in self._splits if split.folder.is_dir()]
 
     # ------------------------------------------------------------ controls
 
     @property
     def is_paused(self) -> bool:
-        """Whether messages are left out."""
+        """Whether the recording is paused."""
         return self._is_paused
 
     def pause(self) -> None:
-        """Leave out what comes from now on."""
+        """Pause: ignore messages from now on."""
         self._is_paused = True
 
     def resume(self) -> None:
-        """Record again."""
+        """Resume after a pause."""
         self._is_paused = False
 
     def toggle_paused(self) -> None:
-        """Pause, or resume."""
+        """Pause or resume."""
         self._is_paused = not self._is_paused
 
     def split(self) -> None:
-        """Begin another dataset."""
+        """Start a new dataset."""
         if self._splits:
             self._splits[-1].is_asked = True
 
     def stop(self) -> None:
-        """Stop; `run` then finishes what was recorded."""
+        """Stop; `run` then completes the dataset and returns."""
         self._is_stopped = True
         self._changed.set()
 
     # ------------------------------------------------------------ running
 
     def run(self) -> RecordSummary:
-        """Record until it is stopped.
+        """Record until stopped.
 
         Raises:
-            Mp4dsError: As `record`.
+            Mp4dsError: As for `record`.
         """
         with quick_switches():
             return self._run()
@@ -480,7 +486,7 @@ class Recorder:
         self._splits.append(_Split(self, target, is_spare=number > 0, tell=self._changed.set))
 
     def _drain(self, begun: float) -> None:
-        """Take what waits, into further datasets where it does not belong to this one."""
+        """Write what is still buffered, into further datasets where the current one is complete."""
         while True:
             split = self._splits[-1]
             while not split.is_read and not split.join(_REPORT_S):
@@ -490,7 +496,7 @@ class Recorder:
             self._begin_split()
 
     def _finish(self, split: _Split, begun: float) -> None:
-        """Wait for a dataset.
+        """Wait until a dataset is complete.
 
         Raises:
             Mp4dsError: It could not be made.
@@ -538,17 +544,17 @@ class Recorder:
         )
 
     def _warn_of_unfinished(self) -> None:
-        """Name recordings beside this one that were interrupted, or are being made."""
+        """Warn of unfinished recordings next to this one."""
         for folder in sorted(self._target.parent.glob(f"*{UNFINISHED}")):
             if is_unfinished(folder):
-                self._source.state.warnings[
-                    f"{folder}: is an unfinished recording. Unless it is still being recorded, "
+                self._source.state.warn(
+                    f"{folder}: unfinished recording; if no recorder is writing it any more, "
                     f"recover it: {salvage_command(folder)}"
-                ] = None
+                )
 
 
 class _Split:
-    """One dataset of a recording, made on a thread of its own."""
+    """One dataset of a recording, made in its own thread."""
 
     def __init__(
         self, recorder: Recorder, target: Path, *, is_spare: bool, tell: Callable[[], None]
@@ -559,7 +565,7 @@ class _Split:
         self.error: BaseException | None = None
         self.is_read = False
         self.is_asked = False
-        self._is_spare = is_spare  # not made where nothing came any more
+        self._is_spare = is_spare  # not made if no message is left for it
         self._tell = tell
         self._force = options.force
         self._about = recorder._about
@@ -573,8 +579,8 @@ class _Split:
         except FileExistsError:
             raise TargetError(
                 self.folder,
-                "already exists, since a recording of this name is unfinished",
-                f"Choose another name, or recover that first: {salvage_command(self.folder)}",
+                "already exists: a recording of this name was not finished",
+                f"Choose another name, or recover that one first: {salvage_command(self.folder)}",
             ) from None
         except OSError as error:
             raise WriteError(target, error) from None
@@ -597,14 +603,14 @@ class _Split:
 
     @property
     def size(self) -> int:
-        """Bytes of its files."""
+        """Bytes of its files so far."""
         with suppress(OSError):
             return folder_size(self.folder)
         return 0
 
     @property
     def verbatim(self) -> Counter[str]:
-        """Camera messages that are kept as they came, by topic."""
+        """Camera messages stored as received, by topic."""
         topics = list(self._packer.part.topics.values())
         return Counter({t.topic: sum(count for count, _ in t.verbatim.values()) for t in topics})
 
@@ -628,7 +634,7 @@ class _Split:
             if self._is_spare and not part.counts:
                 for path in (part.messages_path, self._journal.path):
                     path.unlink()
-                with suppress(OSError):  # it holds what others put there
+                with suppress(OSError):  # somebody else put a file there
                     self.folder.rmdir()
                 return
             origin = Origin(about=self._about)
@@ -652,15 +658,15 @@ class _Split:
             self._tell()
 
     def join(self, seconds: float) -> bool:
-        """Wait until it is made; returns whether it is."""
+        """Wait until it is complete; returns whether it is."""
         self._thread.join(seconds)
         return not self._thread.is_alive()
 
     def raise_error(self) -> None:
-        """Raise what it failed with.
+        """Raise the error it failed with, if any.
 
         Raises:
-            RecordError: The disk refused.
+            RecordError: The disk is full, or failed.
         """
         if self.error is None:
             return

@@ -1,4 +1,4 @@
-"""Receives messages of ROS 1, through rospy."""
+"""Receives messages from ROS 1, with rospy."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ from mp4ds.plugins.recording.source import (
 from mp4ds.records import Channel, Message
 
 _RECEIVED_BYTES = 2**18
-"""That are taken from a socket at a time; rospy's 64 KB cost it a third more."""
+"""Bytes read from a socket at a time; rospy's 64 KB take a third more CPU time."""
 
 _LEAST_POLL_S = 0.5
-"""Seconds between questions to the master: it is asked over the network."""
+"""Seconds between two queries of the master, at least: they go over the network."""
 
 _CLOCK_POLL_S = 0.01
-_DEAF = "the ROS master does not answer: new topics are not seen"
+_DEAF = "the ROS master does not respond: new topics are not noticed"
 _TIME = struct.Struct("<II")
 _CLOCK = "/clock"
 
 
 class RospySource:
-    """Receives in ROS 1 as a node of its own. See `Source`.
+    """Receives as a node of ROS 1. See `Source`.
 
-    Each publisher of a topic has a channel of its own, whose metadata is the header of its
-    connection, as `rosbag record` keeps it.
+    Each publisher of a topic has its own channel, whose metadata is the connection header, as
+    `rosbag record` keeps it.
 
     Args:
-        options: How.
+        options: How to receive.
 
     Raises:
-        PublishError: There is no rospy, or no master answers.
+        PublishError: rospy is missing, or no master responds.
     """
 
     format: Format = "bag"
@@ -68,7 +68,7 @@ class RospySource:
             self.state.waiting_for = self._options.names.renamed(_CLOCK)
             self._subscribe(self.state.waiting_for, self._tick)
         elif not self._look(wanted, take):
-            raise PublishError(self.address, "the ROS master does not answer any more")
+            raise PublishError(self.address, "the ROS master no longer responds")
         if self._options.poll_s is not None or is_simulated:
             self._thread = threading.Thread(
                 target=self._keep_looking, args=(wanted, take), name="topics", daemon=True
@@ -76,7 +76,7 @@ class RospySource:
             self._thread.start()
 
     def serve(self, controls: RecorderControls) -> None:
-        """Nothing: `rosbag record` has no services."""
+        """Offer nothing: `rosbag record` has no services."""
 
     def _follows_clock(self) -> bool:
         return bool(self._rospy.get_param("/use_sim_time", False))
@@ -88,7 +88,7 @@ class RospySource:
         wait_s = 0.0 if self._sim_time_ns is not None else self._poll_s
         while not self._ended.wait(wait_s):
             if not self._look(wanted, take):
-                self.state.warnings[_DEAF] = None
+                self.state.warn(_DEAF)
             elif self._options.poll_s is None:
                 return
             wait_s = self._poll_s
@@ -98,7 +98,7 @@ class RospySource:
         return max(self._options.poll_s or 0.0, _LEAST_POLL_S)
 
     def _look(self, wanted: Wanted, take: Callable[[Message], None]) -> bool:
-        """Subscribe to what is published and wanted; returns whether the master answered."""
+        """Subscribe to new topics; returns whether the master responded."""
         try:
             found = answer(self._rospy.get_published_topics, ANSWER_S)
         except (OSError, self._rospy.ROSException):
@@ -123,7 +123,7 @@ class RospySource:
 
     def _tick(self, message: Any) -> None:
         sec, nsec = _TIME.unpack_from(message._buff)
-        if now := sec * 10**9 + nsec:  # 0 is no time yet, for ROS
+        if now := sec * 10**9 + nsec:  # 0 means that the clock has not started
             self._sim_time_ns, self.state.waiting_for = now, ""
 
     def _channel(self, topic: str, header: Mapping[str, str]) -> Channel:

@@ -1,4 +1,4 @@
-"""Receives messages of ROS 2 by the ROS that is installed: rclpy, with any of its middlewares."""
+"""Receives messages from ROS 2 with rclpy, whatever its middleware."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from mp4ds.plugins.recording.source import (
 from mp4ds.records import Channel, Message
 
 _DEPTH = 100
-"""Messages of a topic that may wait in the middleware: they are taken out at once."""
+"""Depth of subscriptions: messages are taken out at once."""
 
 _SPIN_S = 0.1
 _INFINITE_NS = 2**63 - 1
@@ -43,10 +43,10 @@ _INFINITE_NS = 2**63 - 1
 class RclpySource:
     """Receives as a node of the ROS that is sourced. See `Source`.
 
-    The packages with the types of the messages have to be installed there.
+    The packages with the message types have to be installed.
 
     Args:
-        options: How.
+        options: How to receive.
 
     Raises:
         PublishError: No ROS 2 is sourced.
@@ -115,7 +115,7 @@ class RclpySource:
             pass
 
     def _look(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
-        """Subscribe to what is published and wanted."""
+        """Subscribe to new topics."""
         for topic, kinds in self._node.get_topic_names_and_types():
             if topic in self._subscriptions or not any(wanted(topic, kind) for kind in kinds):
                 continue
@@ -128,7 +128,7 @@ class RclpySource:
                 continue
             if len(kinds) > 1:
                 self._subscriptions[topic] = None
-                self.state.warnings[f"{topic}: has several types, {', '.join(kinds)}"] = None
+                self.state.warn(f"{topic}: not recorded: it has several types, {', '.join(kinds)}")
                 continue
             self._subscriptions[topic] = self._subscribe(
                 topic, wanted.recorded_as(topic), kinds[0], publishers, take
@@ -145,7 +145,7 @@ class RclpySource:
         try:
             kind = message_class(topic, type_name)
         except ConversionError as error:
-            self.state.warnings[str(error)] = None
+            self.state.warn(f"{topic}: not recorded: {error.problem}")
             return None
         offered = [offered_by(item.qos_profile) for item in publishers]
         hashes = [_hash_text(getattr(item, "topic_type_hash", None)) for item in publishers]
@@ -154,7 +154,9 @@ class RclpySource:
         definition = installed_definition(type_name, share)
         definition = definition or standard_definition(type_name, type_hash)
         if not definition:
-            self.state.warnings[f"{topic}: the definition of {type_name} is not known here"] = None
+            self.state.warn(
+                f"{topic}: recorded without the definition of {type_name}, which was not found"
+            )
         channel = channel_of(
             len(self._subscriptions), name, type_name, definition, type_hash, offered
         )
@@ -162,7 +164,7 @@ class RclpySource:
         qos = self._overrides.get(topic, usual)
         self.state.topics[name] = channel
         receive = told(self.state, topic, partial(self._received, channel, take))
-        # rclpy tells of when a message was sent where a callback takes exactly two arguments
+        # rclpy passes the source timestamp only to callbacks of exactly two arguments
         return self._node.create_subscription(
             kind, topic, lambda raw, info: receive(raw, info), qos_profile(qos), raw=True
         )
@@ -175,7 +177,7 @@ class RclpySource:
         take(Message(channel, now, sent if sent > 0 else now, 0, raw))
 
     def _tick(self, raw: bytes) -> None:
-        if now := time_of(raw):  # 0 is no time yet, for ROS
+        if now := time_of(raw):  # 0 means that the clock has not started
             self._sim_time_ns, self.state.waiting_for = now, ""
 
     def close(self) -> None:
@@ -191,7 +193,7 @@ class RclpySource:
 
 
 def offered_by(profile: Any) -> Qos:
-    """A QoS profile of rclpy as mp4ds has it."""
+    """The QoS of an rclpy profile."""
     history = profile.history.name.lower()
     liveliness = profile.liveliness.name.lower()
     return Qos(
@@ -212,6 +214,6 @@ def _finite(duration: Any) -> int | None:
 
 
 def _hash_text(type_hash: Any) -> str:
-    """``RIHS01_...`` of what rclpy has from Jazzy on; empty where it has none."""
+    """A type hash of rclpy (Jazzy and later) as ``RIHS01_...``; empty if there is none."""
     value = bytes(getattr(type_hash, "value", None) or b"")
     return f"RIHS{type_hash.version:02}_{value.hex()}" if any(value) else ""

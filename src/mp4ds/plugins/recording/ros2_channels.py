@@ -62,11 +62,11 @@ def _duration(nanoseconds: int | None) -> dict[str, int]:
 
 
 def asked_qos(profiles: Sequence[Qos], depth: int) -> Qos:
-    """What to ask of publishers so that each of them is heard, chosen as rosbag2 does.
+    """The QoS that matches all publishers, chosen as rosbag2 does.
 
     Args:
-        profiles: What they offer.
-        depth: Messages that may wait.
+        profiles: What the publishers offer.
+        depth: Depth of the subscription.
     """
     is_reliable = bool(profiles) and all(profile.is_reliable for profile in profiles)
     is_latched = bool(profiles) and all(profile.is_latched for profile in profiles)
@@ -83,7 +83,7 @@ def asked_qos(profiles: Sequence[Qos], depth: int) -> Qos:
 def is_hidden(topic: str) -> bool:
     """Whether ROS 2 hides a topic: a part of its name begins with an underscore.
 
-    Events of services are not hidden from recorders.
+    For recorders, service events are not hidden.
     """
     return not topic.endswith(SERVICE_EVENTS) and any(
         part.startswith("_") for part in topic.split("/")
@@ -99,8 +99,8 @@ def channel_of(
         number: Its id.
         topic: Its topic.
         type_name: Such as ``sensor_msgs/msg/Image``.
-        definition: With those of its parts; empty where it is not known.
-        type_hash: ``RIHS01_...``; empty where it is not known.
+        definition: Its definition, with those of its parts; empty if unknown.
+        type_hash: ``RIHS01_...``; empty if unknown.
         qos: What its publishers offer.
     """
     schema = Schema(type_name, _ENCODING if definition else "", definition.encode())
@@ -109,7 +109,7 @@ def channel_of(
 
 
 def time_of(clock: bytes | memoryview) -> int:
-    """Nanoseconds that a message of /clock tells, in CDR."""
+    """The time in a message of /clock (CDR), nanoseconds."""
     sec, nanosec = struct.unpack_from("<iI" if clock[1] & 1 else ">iI", clock, 4)
     return int(sec) * _NS + int(nanosec)
 
@@ -134,7 +134,7 @@ RECORDER_SERVICES = (
     Service("split_bagfile", "SplitBagfile", NOTHING, NOTHING, _split),
     Service("stop", "Stop", NOTHING, NOTHING, _stop),
 )
-"""Those of `ros2 bag record`, but for snapshots."""
+"""Those of `ros2 bag record`, except for snapshots."""
 
 
 # ---------------------------------------------------------------- definitions
@@ -146,11 +146,11 @@ def _world() -> World:
 
 
 def standard_definition(type_name: str, type_hash: str) -> str:
-    """The definition of a type that ROS 2 ships; empty where it has none, or another hash.
+    """The definition of a standard type; empty if it is not one, or its hash differs.
 
     Args:
         type_name: Such as ``sensor_msgs/msg/Image``.
-        type_hash: As it was announced; empty where it was not.
+        type_hash: As announced by the publisher; empty if it announced none.
     """
     if type_name not in _world().standard:
         return ""
@@ -158,7 +158,7 @@ def standard_definition(type_name: str, type_hash: str) -> str:
 
 
 def _proven(schema: Schema, type_hash: str) -> str:
-    """A definition with those of its parts, if it has the hash that was announced."""
+    """A definition with those of its parts; empty if its hash is not the one announced."""
     try:
         store: Any = make_store(types_of(schema, _world()), _world())
         if type_hash and by_library("", store.hash_rihs01, schema.name) != type_hash:
@@ -170,14 +170,14 @@ def _proven(schema: Schema, type_hash: str) -> str:
 
 
 def installed_definition(type_name: str, share: Sequence[Path]) -> str:
-    """The definition of a type as it is installed, with those of its parts, as rosbag2 keeps it.
+    """The installed definition of a type, with those of its parts, as rosbag2 stores it.
 
     Args:
         type_name: Such as ``sensor_msgs/msg/Image``.
-        share: Folders in which packages are.
+        share: The ``share`` folders of all workspaces.
 
     Returns:
-        The text; empty where a part is not installed as a ``.msg`` file.
+        The text; empty if a part is not installed as a ``.msg`` file.
     """
     found: dict[str, str] = {}
     todo = [type_name]
@@ -196,14 +196,14 @@ def installed_definition(type_name: str, share: Sequence[Path]) -> str:
 
 
 def _with_parts(texts: Mapping[str, str]) -> str:
-    """A definition with those of its parts behind it; the first text is the type's own."""
+    """A definition followed by those of its parts; the first text is the type's own."""
     main, *parts = texts.items()
     rest = (f"\n{_SEPARATOR}\nMSG: {name.replace('/msg/', '/')}\n{text}" for name, text in parts)
     return "".join((main[1], *rest))
 
 
 def _parts(text: str, package: str) -> Iterator[str]:
-    """Names of the types of a definition's fields, but for those that are built in."""
+    """Types of a definition's fields, except for built-in ones."""
     for line in text.splitlines():
         match = _FIELD.match(line.partition("#")[0])
         if match and not _PRIMITIVE.fullmatch(match[1]):
@@ -212,15 +212,15 @@ def _parts(text: str, package: str) -> Iterator[str]:
 
 
 def described_definition(texts: Mapping[str, str], type_name: str, type_hash: str) -> str:
-    """The definition of a type as a node describes it.
+    """The definition of a type as described by a node.
 
     Args:
-        texts: Definitions by type, also of the type's parts.
+        texts: Definitions of the type and its parts, by type.
         type_name: The type.
-        type_hash: As it was announced, by which the definition is proven.
+        type_hash: As announced by the publisher, which the definition must have.
 
     Returns:
-        The text with the definitions of its parts; empty where it cannot be proven.
+        The text, with the definitions of its parts; empty if it is not proven by the hash.
     """
     if not type_hash or type_name not in texts or sum(map(len, texts.values())) > _MAX_TEXT:
         return ""
@@ -232,7 +232,7 @@ def described_definition(texts: Mapping[str, str], type_name: str, type_hash: st
 
 
 def ros_type(dds_name: str) -> str:
-    """The type of ROS that DDS calls ``std_msgs::msg::dds_::String_``; empty for others."""
+    """The ROS name of a DDS type such as ``std_msgs::msg::dds_::String_``; empty for others."""
     if not _DDS_NAME.fullmatch(dds_name):
         return ""
     *rooms, _, name = dds_name.replace("::", ".").split(".")
@@ -240,14 +240,14 @@ def ros_type(dds_name: str) -> str:
 
 
 def announced_definition(kind: Any, type_hash: str) -> str:
-    """The definition of a type that a publisher announces over DDS.
+    """The definition of a type as announced by a publisher over DDS.
 
     Args:
-        kind: Its class, a structure of IDL.
-        type_hash: As it was announced, by which the definition is proven.
+        kind: Its class, an IDL structure.
+        type_hash: As announced by the publisher, which the definition must have.
 
     Returns:
-        The text with the definitions of its parts; empty where it cannot be proven.
+        The text, with the definitions of its parts; empty if it is not proven by the hash.
     """
     if not type_hash:
         return ""
@@ -260,7 +260,7 @@ def announced_definition(kind: Any, type_hash: str) -> str:
 
 
 def _structures(kind: Any) -> Iterator[tuple[str, str]]:
-    """Name and fields of a structure, then of its parts."""
+    """Name and fields of a structure, then those of its parts."""
     parts: list[Any] = []
     lines = [f"{_spelled(hint, parts)} {name}" for name, hint in kind.__annotations__.items()]
     yield ros_type(kind.__idl_typename__), "\n".join(lines) + "\n"
@@ -269,7 +269,7 @@ def _structures(kind: Any) -> Iterator[tuple[str, str]]:
 
 
 def _spelled(hint: Any, parts: list[Any]) -> str:
-    """A field's type as a ``.msg`` file has it."""
+    """A field's type as written in a ``.msg`` file."""
     from cyclonedds.idl import types
 
     inner, *notes = get_args(hint) or (hint,)

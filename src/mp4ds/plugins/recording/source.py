@@ -1,4 +1,4 @@
-"""What a recorder gets its messages from, and which topics it wants."""
+"""Where a recorder gets its messages from, and which topics it records."""
 
 from __future__ import annotations
 
@@ -33,12 +33,11 @@ class Wanted:
         exclude: Names or globs.
         exclude_types: Names of message types.
         exclude_regex: A pattern, searched for in the topic's name; empty for none.
-        names: Namespace of the node, and rules for the names of `topics`: as `rosbag record` does,
-            the recorder subscribes to a topic by its new name, and records it by the one given
-            here.
+        names: Namespace and remappings of the node. As in `rosbag record`, a topic is subscribed
+            to under its new name and recorded under the name given here.
 
     Raises:
-        OptionError: A pattern is not valid, or the rules make one topic of two.
+        OptionError: A pattern is not valid, or two topics are remapped to the same one.
     """
 
     def __init__(
@@ -60,7 +59,7 @@ class Wanted:
             first = self._recorded.setdefault(names.renamed(asked), asked)
             if first != asked:
                 raise OptionError(
-                    f"{first} and {asked} are one topic by the rules of ROS: name one."
+                    f"{first} and {asked} are the same topic after remapping: name one of them."
                 )
         self._named = Selection([*self._recorded]) if topics else None
         self._types = {*types}
@@ -87,7 +86,7 @@ class Wanted:
         return is_named or is_found or type_name in self._types
 
     def recorded_as(self, topic: str) -> str:
-        """The name that a topic has in the recording."""
+        """The name under which a topic is recorded."""
         return self._recorded.get(topic, topic)
 
 
@@ -95,19 +94,20 @@ def _compiled(option: str, pattern: str) -> re.Pattern[str] | None:
     try:
         return re.compile(pattern) if pattern else None
     except re.error as error:
-        raise OptionError(f"`{option}` {pattern!r} is not a valid pattern: {error}.") from None
+        raise OptionError(
+            f"`{option}` {pattern!r} is not a valid regular expression: {error}."
+        ) from None
 
 
 @dataclass
 class SourceState:
-    """What a source tells besides its messages; written by its own threads.
+    """State of a source, updated by its own threads.
 
     Attributes:
-        lost: Messages that the middleware says it lost, by topic.
-        warnings: Sentences to be shown once each.
-        topics: Those that are subscribed to; with the channel, where that is known before messages
-            come.
-        waiting_for: The clock without which nothing is recorded yet; empty once it runs.
+        lost: Messages lost, as reported by the middleware, by topic.
+        warnings: Sentences, each to be shown once.
+        topics: Topics subscribed to, with their channel if it is known before the first message.
+        waiting_for: The clock topic that the recording waits for; empty once the clock runs.
     """
 
     lost: Counter[str] = field(default_factory=Counter)
@@ -115,14 +115,18 @@ class SourceState:
     topics: dict[str, Channel | None] = field(default_factory=dict)
     waiting_for: str = ""
 
+    def warn(self, sentence: str) -> None:
+        """Add a warning."""
+        self.warnings[sentence] = None
+
 
 def told(state: SourceState, topic: str, receive: Callable[..., None]) -> Callable[..., None]:
-    """What middlewares are to call: they keep to themselves, or die of, what a callback raises.
+    """A callback for middlewares, which swallow, or crash on, what a callback raises.
 
     Args:
-        state: Told of each message that could not be taken.
-        topic: Of the messages.
-        receive: Takes a message.
+        state: Where to count each message that could not be recorded.
+        topic: The topic of the messages.
+        receive: Records a message.
     """
 
     def call(*message: Any) -> None:
@@ -130,44 +134,44 @@ def told(state: SourceState, topic: str, receive: Callable[..., None]) -> Callab
             receive(*message)
         except Exception as error:
             state.lost[topic] += 1
-            state.warnings[f"{topic}: a message could not be taken: {error!r}"] = None
+            state.warn(f"{topic}: a message could not be recorded: {error!r}")
 
     return call
 
 
 class RecorderControls(Protocol):
-    """What others may ask of a recorder."""
+    """What remote controls (services, keys) may do to a recorder."""
 
     @property
     def is_paused(self) -> bool:
-        """Whether messages are left out."""
+        """Whether it is paused."""
         ...
 
     def pause(self) -> None:
-        """Leave out what comes from now on."""
+        """Pause: ignore messages from now on."""
         ...
 
     def resume(self) -> None:
-        """Record again."""
+        """Resume after a pause."""
         ...
 
     def split(self) -> None:
-        """Begin another dataset."""
+        """Start a new dataset."""
         ...
 
     def stop(self) -> None:
-        """Stop, and finish what was recorded."""
+        """Stop, and complete the dataset."""
         ...
 
 
 class Source(Protocol):
-    """Receives messages of the topics that are wanted, those that appear later too.
+    """Receives the messages of wanted topics, including topics that appear later.
 
     Attributes:
-        format: What its messages would have been recorded as by ROS's own recorder.
+        format: The format of ROS's own recorder: ``bag`` or ``rosbag2``.
         profile: ``ros1`` or ``ros2``.
-        address: Where it listens, for users.
-        state: What it tells.
+        address: What it is connected to, to be displayed.
+        state: Its state.
     """
 
     format: Format
@@ -176,15 +180,15 @@ class Source(Protocol):
     state: SourceState
 
     def start(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
-        """Begin to receive, on threads of its own.
+        """Start receiving, in threads of its own.
 
-        With a simulated time, as `ros2 bag record` does, it subscribes to nothing else until
-        /clock tells one: what came before would have no time, and what is latched still comes.
+        With a simulated time, it subscribes to topics only once /clock has published a time, as
+        `ros2 bag record` does: earlier messages would have none, and latched ones still arrive.
 
         Args:
-            wanted: Which topics.
-            take: Called with each message, from any thread; it never waits. A channel has one id,
-                and another id than all others.
+            wanted: Which topics to receive.
+            take: Called with each message, from any thread; it does not block. Each channel has an
+                id of its own.
 
         Raises:
             PublishError: The middleware refuses.
@@ -192,11 +196,11 @@ class Source(Protocol):
         ...
 
     def serve(self, controls: RecorderControls) -> None:
-        """Offer the services of `ros2 bag record`, in ROS 2."""
+        """Offer the services of `ros2 bag record` (ROS 2)."""
         ...
 
     def close(self) -> None:
-        """Receive nothing more."""
+        """Stop receiving."""
         ...
 
 
@@ -205,14 +209,14 @@ class SourceOptions:
     """How a source receives.
 
     Attributes:
-        node: Name of the node.
+        node: Name of the node, if `names` has none.
         use_sim_time: Whether log times are those of /clock.
-        poll_s: Seconds between looks for new topics; None for one look only.
-        hidden: Whether topics are taken of which a part begins with an underscore.
-        unpublished: Whether topics are taken that nobody publishes yet, by rclpy.
-        ignore_leaf: Whether topics without a subscriber are left out, in ROS 2.
-        qos_overrides: YAML of QoS by topic.
-        names: What ROS calls the node, where it is not `node`, and /clock.
+        poll_s: Seconds between two checks for new topics; None to check only once.
+        hidden: Whether to include hidden topics (ROS 2).
+        unpublished: Whether to include topics without a publisher (rclpy).
+        ignore_leaf: Whether to leave out topics without a subscriber (ROS 2).
+        qos_overrides: YAML file of QoS profiles by topic.
+        names: Name, namespace and remappings of the node.
     """
 
     node: str
@@ -233,14 +237,14 @@ _SOURCES: Mapping[str, str] = {
 
 
 def open_source(kind: str, options: SourceOptions) -> Source:
-    """A source.
+    """Open a source.
 
     Args:
-        kind: ``ros1`` or ``ros2``; for ROS 2 that is Cyclone DDS where no ROS 2 is sourced.
-        options: How it receives.
+        kind: ``ros1`` or ``ros2``; ROS 2 is rclpy if a ROS 2 is sourced, else Cyclone DDS.
+        options: How to receive.
 
     Raises:
-        PublishError: The middleware is not there.
+        PublishError: The middleware is not installed, or cannot be reached.
     """
     if kind == "ros2" and find_spec("rclpy") is None:
         kind = "dds"

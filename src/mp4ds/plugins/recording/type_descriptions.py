@@ -1,4 +1,4 @@
-"""Definitions of types as the nodes that publish them describe them, asked for over DDS."""
+"""Asks the nodes that publish a type for its definition, over DDS."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mp4ds.plugins.publishing.ros2_writers import Qos
 from mp4ds.plugins.recording.ros2_channels import described_definition
 
 REPLIES = ("rr/", "/get_type_descriptionReply")
-"""What is before and behind the name of a node in that of the DDS topic of its answers."""
+"""DDS topic of a node's replies: what precedes and follows the node's name."""
 
 _PACKAGE = "type_description_interfaces"
 _SERVICE = f"{_PACKAGE}/srv/GetTypeDescription"
@@ -23,25 +23,25 @@ string failure_reason
 {_PACKAGE}/TypeDescription type_description
 {_PACKAGE}/TypeSource[] type_sources
 {_PACKAGE}/KeyValue[] extra_information"""
-_PATIENCE_S = 2.0  # for nodes whose middleware answers in another way, or that are gone
+_PATIENCE_S = 2.0  # some middlewares reply in another way, and nodes may be gone
 _WAIT_S = 0.01
 
 
 def ask_for_definition(
     participant: Any, node: str, type_name: str, type_hash: str, world: World
 ) -> str:
-    """The definition of a type by the `get_type_description` service of a node.
+    """The definition of a type, from the `get_type_description` service of a node.
 
     Args:
-        participant: Who asks.
-        node: Name of the node below the root, such as ``robot/camera``.
+        participant: The DDS participant.
+        node: Full name of the node without the leading slash, such as ``robot/camera``.
         type_name: Such as ``sensor_msgs/msg/Image``.
-        type_hash: As it was announced, by which the definition is proven.
+        type_hash: As announced by the publisher, which the definition must have.
         world: The types of ROS 2.
 
     Returns:
-        The text with the definitions of its parts; empty if there is no answer in time, or none
-        that can be proven.
+        The text, with the definitions of its parts; empty if no reply comes in time, or the one
+        that comes is not proven by the hash.
     """
     from cyclonedds.pub import DataWriter
     from cyclonedds.sub import DataReader
@@ -53,7 +53,7 @@ def ask_for_definition(
     kind = as_is(make_struct(types, f"{_SERVICE}_Request"))
     reply_kind = as_is(make_struct(replies, f"{_SERVICE}_Response"))
     name = f"{node}/get_type_description"
-    # a service answers when it knows the reader of the same client
+    # a server replies once it has discovered the reader with the same client id
     qos = dds_qos(Qos(), user_data=f"clientid={guid:x};")
     writer = DataWriter(participant, Topic(participant, f"rq/{name}Request", kind), qos=qos)
     reader = DataReader(participant, Topic(participant, f"rr/{name}Reply", reply_kind), qos=qos)
