@@ -351,7 +351,7 @@ def test_the_registry_lists_exactly_the_hardware() -> None:
 
 REFUSALS = {"Refused", "NoPicture", "WireError", "EncoderRefusedError", "count_verbatim"}
 ROOMS = ("messages", "dataset", "video", "packing")
-NO_CAMERA_MESSAGES = ("transforms.py", "mp4.py", "slicing.py")
+NO_CAMERA_MESSAGES = ("descriptors.py", "transforms.py", "mp4.py", "slicing.py")
 OF_READING = {
     *("* is no framing of NAL units", "* is no framing of AV1", "* is no framing of *"),
     "it has * NAL units where its framing has *",

@@ -15,7 +15,7 @@ import mp4ds
 from each import each, fresh
 from mp4ds.cli.output import Column, print_table
 from scenes import START, Record, Scene
-from sources import scene, write_bag, write_mcap, write_rosbag2
+from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2
 from test_bad_input import call, refused, unchanged
 from test_terminal import Screen
 
@@ -256,6 +256,18 @@ def test_a_folder_of_datasets_is_not_one(dataset: Path) -> None:
         f"{dataset.parent}: is a folder of 1 dataset, not a dataset. Open one of them, such as "
         f"{dataset}."
     )
+
+
+def test_a_recording_is_not_a_dataset(tmp_path: Path) -> None:
+    for kind in ("bag-none", "mcap-ros2-none", "rosbag2-sqlite3-v9"):
+        (tmp_path / kind).mkdir()
+        (source,) = SOURCES[kind](tmp_path / kind, scene("mono8", frames=2))
+        with pytest.raises(mp4ds.SourceError) as caught:
+            mp4ds.open(source)
+        assert str(caught.value) == (
+            f"{source}: is a recording, not a dataset. Make a dataset of it first: "
+            f"mp4ds pack {source}"
+        )
 
 
 @each(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import shlex
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -40,6 +41,7 @@ from mp4ds.records import Channel, Excerpt, Message, Record, Schema
 from mp4ds.times import Sync, synchronize
 
 _VIDEOS = (".mp4", ".m4v", ".mov")
+_RECORDINGS = (".bag", ".mcap", ".db3")
 _JPEG_QUALITY = 95
 _MOST_TOPICS = 4  # named in a repr
 
@@ -83,6 +85,9 @@ class Dataset:
             remedy = "Give a folder made by `mp4ds pack`, or a sidecar next to its video."
             if video := video_at(self.path):
                 problem, remedy = f"is {video}, not a dataset", HOW_TO_OPEN
+            elif self.path.suffix in _RECORDINGS or (self.path / "metadata.yaml").exists():
+                problem = "is a recording, not a dataset"
+                remedy = f"Make a dataset of it first: mp4ds pack {shlex.quote(str(self.path))}"
             elif is_folder(self.path) and (inside := sorted(self.path.glob(f"*/{MANIFEST_NAME}"))):
                 problem = f"is a folder of {counted(len(inside), 'dataset')}, not a dataset"
                 remedy = f"Open one of them, such as {inside[0].parent}."
