@@ -251,7 +251,7 @@ def test_any_name_that_the_disk_takes(name: str, tmp_path: Path) -> None:
 @each("code", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.EROFS])
 def test_a_disk_that_refuses(code: int, target: Path) -> None:
     with (  # noqa: PT012 - the body is what is tested
-        pytest.raises(WriteError, match="the partial output was removed") as caught,
+        pytest.raises(WriteError, match="The partial output was removed") as caught,
         staged(target, force=False, owned=nothing) as path,
     ):
         make(path, "folder")
