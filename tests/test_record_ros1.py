@@ -99,7 +99,8 @@ def test_a_recorder_that_is_killed(roscore: Core, tmp_path: Path) -> None:
     recorder = roscore.start(*ours(tmp_path / "live", "-a"))
     folder = tmp_path / "live.recording"
     video = folder / "camera_image_raw.mp4"
-    player = roscore.start(PLAY, "-q", "--delay", "2", str(bag))
+    wait_until(lambda: any("record" in node for node in roscore.nodes()))
+    player = roscore.start(PLAY, "-q", "--delay", "4", str(bag))
     try:
         wait_until(lambda: video.exists() and video.stat().st_size > 30_000)
         recorder.kill()
@@ -122,12 +123,21 @@ def test_a_clock_that_starts_late(roscore: Core, tmp_path: Path) -> None:
     """Nothing is recorded before its first time: no message has the time 0."""
     bag = make_drive(tmp_path / "drive.bag")
     roscore.run("rosparam", "set", "/use_sim_time", "true")
+    recorder = roscore.start(*ours(tmp_path / "live", "-a", "--exclude", "/rosout*"))
+    player = None
     try:
-        recorder = ours(tmp_path / "live", "-a", "--exclude", "/rosout*")
-        recorded(roscore, tmp_path, [recorder], [PLAY, "-q", "--clock", "--delay", "4", str(bag)])
+        log = roscore.folder / "python.log"
+        wait_until(lambda: log.exists() and "waiting for /clock" in log.read_text())
+        player = roscore.start(PLAY, "-q", "--clock", "--loop", str(bag))
+        video = tmp_path / "live.recording" / "camera_image_raw.mp4"
+        wait_until(lambda: video.exists() and video.stat().st_size > 10_000)
+        recorder.send_signal(signal.SIGINT)
+        assert recorder.wait(WATCHDOG_S) == 0
     finally:
+        for process in filter(None, (player, recorder)):
+            process.kill()
+            process.wait(WATCHDOG_S)
         roscore.run("rosparam", "delete", "/use_sim_time")
-    assert "waiting for /clock" in (roscore.folder / "python.log").read_text()
     with open_reader(bag) as reader:
         due = [one.log_time for one in reader.records() if isinstance(one, Message)]
     with mp4ds.open(tmp_path / "live") as dataset:
