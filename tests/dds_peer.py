@@ -319,7 +319,6 @@ class Peer:
             end = time.monotonic() + WATCHDOG_S
             while not self._writers[topic].matched_sub and time.monotonic() < end:
                 time.sleep(0.005)
-            time.sleep(0.3)  # the other side has to find this one, too
         writer = self._writers[topic]
         writer.write(TYPES[kind].deserialize(base64.b64decode(message)))
         return True

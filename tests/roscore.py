@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import queue
+import re
 import shutil
 import signal
 import socket
@@ -16,7 +17,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -214,6 +216,39 @@ class Core:
     def nodes(self) -> list[str]:
         """The names of all nodes."""
         return self.run("rosnode", "list")[1].split()
+
+    def connections(self, node: str) -> Counter[str]:
+        """How many connections a node has, by topic."""
+        return Counter(re.findall(r"\* topic: (\S+)", self.run("rosnode", "info", node)[1]))
+
+    def play(self, command: list[str], topics: Iterable[str], subscribers: int) -> tuple[str, str]:
+        """Run a player to its end, once each topic has its subscribers.
+
+        Returns its output and errors, when they have taken all that was sent.
+        """
+        before, wanted = {*self.nodes()}, dict.fromkeys(topics, subscribers)
+        player = subprocess.Popen(
+            [*self._prefix, *command, "--pause"],
+            env=self.environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            wait_until(lambda: any("play" in node for node in {*self.nodes()} - before))
+            (node,) = (node for node in {*self.nodes()} - before if "play" in node)
+            wait_until(lambda: self.connections(node) >= Counter(wanted))
+            wait_until(lambda: sum(map(self.connections, before), Counter()) >= Counter(wanted))
+            service = f"{node}/pause_playback"
+            wait_until(lambda: self.run("rosservice", "call", service, "false")[0] == 0)
+            output, errors = player.communicate(timeout=SECONDS)
+        finally:
+            player.kill()
+            player.wait()
+        assert player.returncode == 0, errors
+        wait_until(lambda: not any(map(self.connections, before)))
+        return output, errors
 
     def end_processes(self) -> None:
         """End what scripts are still running."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ from each import each
 from mp4ds.bags.formats import open_writer
 from mp4ds.errors import PublishError
 from mp4ds.plugins.playing import pace, timeline
-from mp4ds.plugins.playing.pace import Lateness, Ticks
+from mp4ds.plugins.playing.pace import Lateness, Pace, Ticks
 from mp4ds.plugins.playing.play import PlayOptions, open_player
 from mp4ds.plugins.playing.player import Player, PlaySummary
 from mp4ds.records import Message
@@ -56,6 +57,9 @@ class Hand:
     def monotonic(self) -> float:
         return self.now
 
+    def time_ns(self) -> int:
+        return round((1_900_000_000 + self.now) * NS)
+
 
 @each("hertz", [1.0, 40.0, 333.0])
 def test_ticks_are_as_many_as_asked_for(hertz: float, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -69,6 +73,16 @@ def test_ticks_are_as_many_as_asked_for(hertz: float, monkeypatch: pytest.Monkey
     hand.now += 5  # a stall is not made up for
     assert [ticks.is_due() for _ in range(3)] == [True, False, False]
     assert not Ticks(None).is_due()
+
+
+def test_the_time_of_day_of_a_recorded_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    hand = Hand(monkeypatch)
+    clock = Pace(10.0, steady=lambda: round(hand.now * NS))
+    clock.jump(START)
+    clock.run()
+    hand.now += 2
+    for seconds, told in ((20, 0), (0, -2), (35, 1.5)):
+        assert clock.wall_of(START + seconds * NS) == hand.time_ns() + told * NS
 
 
 def test_the_clock_has_its_rate_whatever_is_played(drive: Path) -> None:
@@ -86,7 +100,7 @@ def test_no_clock_is_ahead_of_a_message_that_is_still_to_come(drive: Path) -> No
     told: list[int] = []
     publisher.on_sent = lambda sent: told.append(sent.time_ns - publisher.clocks[-1].time_ns)
     run(drive, publisher, clock=200.0, rate=0.5)
-    assert len(publisher.clocks) > 26
+    assert len(publisher.clocks) > 5
     assert all(ahead >= 0 for ahead in told)
 
 
@@ -95,7 +109,7 @@ def test_the_clock_ticks_before_the_first_message(drive: Path) -> None:
     before: list[int] = []
     publisher.on_sent = lambda _: before.append(len(publisher.clocks))
     run(drive, publisher, clock=100.0, delay=0.5, rate=10.0)
-    assert before[0] > 10
+    assert before[0] > 2
     assert len({one.time_ns for one in publisher.clocks[: before[0]]}) == 1
 
 
@@ -147,13 +161,24 @@ def test_lateness_is_told_apart() -> None:
 
 
 class Machine:
-    """A steady clock that jumps when the process is not scheduled for a while."""
+    """A steady clock that goes on only while a player waits for a message to be due."""
 
     def __init__(self) -> None:
-        self.gone = 0
+        self.now = 100 * NS
 
     def __call__(self) -> int:
-        return time.monotonic_ns() + self.gone
+        return self.now
+
+    def drive(self, player: Player) -> None:
+        wait = player._changed.wait
+
+        def pass_time(seconds: float) -> None:
+            if seconds < pace.CATCH_UP_NS / NS:
+                self.now += math.ceil(seconds * NS)
+            else:  # nothing is read yet
+                wait(0.001)
+
+        player._changed.wait = pass_time
 
 
 def stalled(drive: Path, seconds: float) -> tuple[list[int], PlaySummary]:
@@ -164,26 +189,27 @@ def stalled(drive: Path, seconds: float) -> tuple[list[int], PlaySummary]:
     def on_sent(sent: Any) -> None:
         if sent.topic == CHATTER:
             late.append(machine() - sent.time_ns)
-            machine.gone += round(seconds * NS) if len(late) == 5 else 0
+            machine.now += round(seconds * NS) if len(late) == 5 else 0
 
     publisher.on_sent = on_sent
     with open_player(drive, PlayOptions(), publisher=publisher) as made:
         player = Player(made._timeline, publisher, steady=machine)
+        machine.drive(player)
         summary = player.run()
-    return [one - min(late) for one in late], summary
+    return [one - late[0] for one in late], summary
 
 
 def test_a_stall_is_made_up_for(drive: Path) -> None:
     late, summary = stalled(drive, 0.6)
     # each is due 50 ms after the one before: they come at once until it has caught up
-    for number, by in enumerate(late[5:15], 1):
-        assert by >= 600 * MS - number * STEP - MS
+    for number, by in enumerate(late[5:], 1):
+        assert abs(by - max(0, 600 * MS - number * STEP)) < MS
     assert summary.slowed_s == 0
 
 
 def test_a_suspended_player_goes_on_where_it_was(drive: Path) -> None:
     late, summary = stalled(drive, 30.0)
-    assert late[5] >= 30 * NS - STEP - MS
+    assert abs(late[5] - 30 * NS + STEP) < MS
     assert all(by >= 29 * NS for by in late[5:]), "the rest is as much later"
     assert summary.slowed_s == 0
 

@@ -68,10 +68,14 @@ def test_no_more_than_so_many_run_at_a_time(tmp_path: Path) -> None:
     code = (
         "import os, sys, time, json, pathlib\n"
         "here = pathlib.Path(sys.argv[1]); mine = here / str(os.getpid()); mine.touch()\n"
-        "time.sleep(0.1); seen = len(list(here.iterdir())); mine.unlink()\n"
+        "there = lambda: len(list(here.iterdir()))\n"
+        "met = here.with_name('met')\n"
+        "while not met.exists() and there() < 2: time.sleep(0.01)\n"
+        "met.touch(); time.sleep(0.1); seen = there(); mine.unlink()\n"
         "print(json.dumps({'done': True, 'seen': seen}))"
     )
-    engine = ProcessEngine(lambda _: [sys.executable, "-c", code, str(tmp_path)], 2)
+    (here := tmp_path / "here").mkdir()
+    engine = ProcessEngine(lambda _: [sys.executable, "-c", code, str(here)], 2)
     facts = [outcome.facts["seen"] for outcome in engine.run([(str(n),) for n in range(8)], ignore)]
     assert len(facts) == 8
     assert max(facts) == 2

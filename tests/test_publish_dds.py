@@ -7,7 +7,6 @@ import struct
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -148,9 +147,7 @@ def test_close_waits_until_messages_have_arrived(side: Side) -> None:
     connect(side, publisher, recorded)
     for number in range(500):
         publisher.publish(recorded, message(STRING, number), 0)
-    start = time.monotonic()
     publisher.close()
-    assert time.monotonic() - start < 10
     assert len(side.peer.received("/a", 500)) == 500
 
 

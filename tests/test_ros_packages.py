@@ -248,6 +248,7 @@ def test_rosrun_renames_topics(
         assert roscore.run(*pause, "false")[0] == 0
         started[-1].wait(WATCHDOG_S)
         wait_until(lambda: noted(tmp_path / "live") == 20)
+        wait_until(lambda: not any(map(roscore.connections, roscore.nodes())))
     finally:
         for process in started:
             process.send_signal(signal.SIGINT)  # which nobody gets where it has ended

@@ -6,7 +6,6 @@ import io
 import os
 import random
 import struct
-import time
 import tracemalloc
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
@@ -28,6 +27,7 @@ from mp4ds.video.mp4 import SampleTable, read_sample_table
 from mp4ds.video.packets import join_segments
 from test_packets import write as write_packets
 from test_video import LOSSLESS, LOSSY, encode, noise
+from waiting import lines_run
 
 Change = Callable[[bytes], bytes]
 STEP = 33_333
@@ -439,16 +439,14 @@ def long_video(frames: int, *, step: int = 33_333, frame_bytes: int = 100) -> by
     return mdat + bytes(int(sizes.sum())) + box(b"moov", moov)
 
 
-def test_hours_of_frames_take_milliseconds() -> None:
+def test_hours_of_frames_are_left_to_numpy() -> None:
     data = long_video(432_000)
-    begin = time.perf_counter()
     table = read_bytes(data)
-    seconds = time.perf_counter() - begin
     assert len(table.order) == 432_000
     assert table.sync.sum() == 432_000 // 30
     assert (table.places[0], table.places[-1] + table.sizes[-1]) == (16, data.rindex(b"moov") - 4)
     assert np.array_equal(table.places[1:], table.places[:-1] + table.sizes[:-1])
-    assert seconds < 1  # a machine that is busy; it takes some 20 ms
+    assert lines_run(lambda: read_bytes(data)) < 5_000  # some 20 ms
 
 
 # ---------------------------------------------------------------- what is refused
@@ -674,7 +672,6 @@ def test_damage_anywhere_in_the_index(seed: int, b_frames: bytes) -> None:
     rng = random.Random(seed)
     start = b_frames.index(b"moov") - 4
     outcomes = {"read": 0, "damaged": 0, "unindexed": 0}
-    begin = time.perf_counter()
     largest = 0
     for number in range(1_500):
         data = mutated(b_frames, start, rng)
@@ -689,4 +686,3 @@ def test_damage_anywhere_in_the_index(seed: int, b_frames: bytes) -> None:
             outcomes["unindexed"] += 1
     assert all(outcomes.values()), outcomes
     assert largest < 1 << 20
-    assert time.perf_counter() - begin < 60

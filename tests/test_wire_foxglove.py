@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import struct
-import time
 import tracemalloc
 from functools import cache
 from pathlib import Path
@@ -37,6 +36,7 @@ from mp4ds.messages.wire import (
 )
 from round_trips import Compare
 from scenes import Record
+from waiting import lines_run
 
 steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
@@ -593,12 +593,11 @@ MANY = {  # what is first, and repeated
 
 @each("kind", ["RawImage", "CameraCalibration"])
 @each("case", MANY)
-def test_large_hostile_messages_take_little_time(case: str, kind: str) -> None:
+def test_large_hostile_messages_take_little_work(case: str, kind: str) -> None:
     first, repeated = MANY[case]
     message = first + repeated * (LARGE // len(repeated))
-    of, start = form("protobuf", kind), time.process_time()
-    assert refused(of, message)
-    assert time.process_time() - start < 2
+    of = form("protobuf", kind)
+    assert lines_run(lambda: refused(of, message)) < 5_000_000  # some 0.1 s
 
 
 def test_a_large_message_takes_no_copy() -> None:

@@ -1,10 +1,12 @@
-"""Tests wait for events: nothing is said of how long they take on a busy machine."""
+"""Tests wait for events and count work: how long anything takes is a matter of the machine."""
 
 from __future__ import annotations
 
 import subprocess
+import sys
 import time
 from collections.abc import Callable
+from types import FrameType
 from typing import Any
 
 WATCHDOG_S = 300.0
@@ -31,3 +33,21 @@ def until(is_so: Callable[[], object], process: subprocess.Popen[Any] | None = N
                 said = process.communicate()
             raise AssertionError(f"it {'hangs' if is_late else 'ended before'}: {said}")
         time.sleep(0.005)
+
+
+def lines_run(call: Callable[[], object]) -> int:
+    """How many lines of Python something runs: few where all is left to numpy or a library."""
+    count = 0
+
+    def trace(_: FrameType, event: str, __: object) -> Any:
+        nonlocal count
+        count += event == "line"
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        call()
+    finally:
+        sys.settrace(before)
+    return count
