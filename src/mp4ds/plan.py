@@ -13,7 +13,7 @@ from fnmatch import fnmatchcase
 
 import xxhash
 
-from mp4ds.errors import OptionError
+from mp4ds.errors import OptionError, Refused
 
 LOSSLESS = "lossless"
 """The quality at which nothing is lost."""
@@ -234,10 +234,10 @@ class FileNames:
         """Take a stem that a file says another run gave a stream.
 
         Raises:
-            ValueError: No run gives such a stem, or it is taken.
+            Refused: No run gives such a stem, or it is taken.
         """
         key = stem.casefold()
         is_plain = _STEM.fullmatch(stem) and key.split(".")[0] not in _RESERVED
         if not is_plain or key in self._taken:
-            raise ValueError(f"{stem[:_MAX_NAME]!r} is not the name of a stream's files")
+            raise Refused(f"{stem[:_MAX_NAME]!r} is not a name for the files of a stream")
         self._taken.add(key)

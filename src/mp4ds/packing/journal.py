@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple
 import xxhash
 
 from mp4ds.bags.protocols import Format
-from mp4ds.errors import SourceError
+from mp4ds.errors import Refused, SourceError
 from mp4ds.files.outputs import lock
 from mp4ds.files.sources import JOURNAL_NAME
 from mp4ds.format.fields import (
@@ -248,6 +248,8 @@ class Notes:
             ) from None
         except SourceError:
             raise
+        except Refused as reason:
+            raise SourceError(path, f"is damaged: {reason}") from None
         except (ValueError, TypeError, LookupError):
             raise SourceError(path, "is damaged") from None
 
