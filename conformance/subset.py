@@ -43,7 +43,7 @@ class Loader(yaml.SafeLoader):
         """A map with keys that are strings, each once."""
         keys = [key.value for key, _ in node.value]
         if len(set(keys)) < len(keys) or any(not key.tag.endswith(":str") for key, _ in node.value):
-            raise yaml.YAMLError("a key stands twice or is no string")
+            raise yaml.YAMLError("a key stands twice or is not a string")
         return {key.value: self.construct_object(value, deep=True) for key, value in node.value}
 
 

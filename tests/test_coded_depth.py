@@ -66,9 +66,9 @@ def test_a_png_without_the_header() -> None:
 @each(
     ("data", "reason"),
     [
-        (b"", "no RVL"),
-        (bytes(11), "no RVL"),
-        (bytes(12) + b"\x89PNG\r\n\x1a\n", "no PNG"),
+        (b"", "not RVL"),
+        (bytes(11), "not RVL"),
+        (bytes(12) + b"\x89PNG\r\n\x1a\n", "not a PNG"),
         (bytes(12) + cv2.imencode(".png", room().astype(np.uint8))[1].tobytes(), "16 bits"),
         (
             bytes(12) + cv2.imencode(".png", np.dstack([room()] * 3))[1].tobytes(),

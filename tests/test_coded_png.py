@@ -331,9 +331,9 @@ def test_the_base_is_taken() -> None:
 @each(
     ("data", "reason"),
     [
-        (b"", "no PNG"),
-        (b"\xff\xd8" + BASE, "no PNG"),
-        (BASE[:20], "no PNG"),
+        (b"", "not a PNG"),
+        (b"\xff\xd8" + BASE, "not a PNG"),
+        (BASE[:20], "not a PNG"),
         (BASE[:25] + b"\1" + BASE[26:], "wrong checksum"),
         (made(GOOD, width=0), "0x3"),
         (made(GOOD, width=99999), "99999x3"),

@@ -718,6 +718,10 @@ def test_kitti_odometry(tmp_path: Path) -> None:
     assert (item.header.frame_id, item.child_frame_id) == ("image_0", "image_1")
     assert item.transform.translation.x == pytest.approx(0.5)  # to the right of the first
     assert item.transform.rotation.w == 1
+    calibrations = (root / "calib.txt").read_text().replace("P1: 7e+02", "P1: 0")
+    (root / "calib.txt").write_text(calibrations)
+    done = run("import", "images", root, "-o", tmp_path / "other")
+    refused(done, ": its calibration gives no pose for image_1: the translation is not finite.")
 
 
 @pytest.mark.parametrize("rectified", [True, False])

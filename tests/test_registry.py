@@ -356,9 +356,9 @@ OF_READING = {
     *("* is no framing of NAL units", "* is no framing of AV1", "* is no framing of *"),
     "it has * NAL units where its framing has *",
     *("a NAL unit's length in the video is wrong", "no PNG holds such pixels"),
-    "its NAL units do not stand behind lengths of four bytes",
+    "its NAL units do not have lengths of four bytes",
     *("the parameters of the track are cut short", "its PNG recipe holds unknown values"),
-    *("a message of this type needs a template", "says something else than the fields beside it"),
+    *("a message of this type needs a template", "contradicts the fields beside it"),
     *("a blank message has data", "a blank message has a timestamp or data"),
     *("it has no pixels", "* has no plain form"),
 }

@@ -94,7 +94,7 @@ def test_padding_beyond_a_bound_is_verbatim(
     summary = mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=window))
     (topic,) = (topic for topic in summary.topics if topic.topic == TOPIC)
     if window is None:
-        assert "too much padding between rows, another for each image" in topic.verbatim
+        assert "too much padding between rows, different in each image" in topic.verbatim
     assert 0 < topic.frames <= 8
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
     assert compare(paths, unpacked(tmp_path, "mcap")) == []

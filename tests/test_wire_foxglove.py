@@ -201,7 +201,7 @@ def test_a_blank_is_not_large() -> None:
     of = form("protobuf", "RawImage")
     blank = of.split(memoryview(payload("protobuf", "RawImage", 1, b"abcd"))).blank
     assert of.template(blank)
-    with pytest.raises(WireError, match="stand around its data"):
+    with pytest.raises(WireError, match="besides its data"):
         of.template(blank + b"\xba\x3e\xff\xff\x03" + bytes(MAX_BLANK - 1))
 
 
@@ -382,13 +382,13 @@ def test_protobuf_that_is_odd_elsewhere_is_proven(more: bytes, frame_id: str) ->
         (STAMP + b"\x10\x01", "its field data is not of the declared type"),
         (STAMP + DATA + b"\x20\x01", "its field frame_id is not of the declared type"),
         (STAMP + DATA + b"\x22\x01\xff", "not UTF-8"),
-        (STAMP + DATA + b"\x00\x00", "a tag in it"),
-        (STAMP + DATA + varint(2**32) + b"\x00", "a tag in it"),
-        (STAMP + DATA + b"\xff" * 9 + b"\x02", "a number in it does not end"),
+        (STAMP + DATA + b"\x00\x00", "it has an invalid tag"),
+        (STAMP + DATA + varint(2**32) + b"\x00", "it has an invalid tag"),
+        (STAMP + DATA + b"\xff" * 9 + b"\x02", "a number in it is cut short"),
         (STAMP + DATA + tag(9, 3) + tag(9, 4), "wire type 3"),
         (STAMP + DATA + tag(9, 7), "wire type 7"),
-        (STAMP + b"\x12" + varint(2**63) + b"x", "where a field needs"),
-        (STAMP + DATA + block(9, bytes(MAX_BLANK)), "bytes stand around its data"),
+        (STAMP + b"\x12" + varint(2**63) + b"x", "but a field extends to byte"),
+        (STAMP + DATA + block(9, bytes(MAX_BLANK)), "bytes besides its data"),
     ],
 )
 def test_protobuf_refusals_say_why(message: bytes, reason: str) -> None:
@@ -408,7 +408,7 @@ def test_protobuf_lists_packed_or_not() -> None:
             == FIELDS["CameraCalibration"]
         )
         assert proven(of, message.replace(packed, other))
-    assert "inside of one" in refused(of, message + block(5, bytes(7)))
+    assert "a list of numbers in it is cut short" in refused(of, message + block(5, bytes(7)))
 
 
 def image_schema() -> tuple[FileDescriptorSet, dict[str, FieldDescriptorProto]]:

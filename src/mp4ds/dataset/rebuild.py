@@ -249,7 +249,7 @@ class CameraInfoWriter:
             raise Refused(f"more than {MAX_CAMERA_INFOS} messages")
         fields = parts.fields
         if not isinstance(fields, CalibrationFields):
-            raise Refused("it is no calibration")
+            raise Refused("it is not a calibration")
         heads = self._heads or HeaderTable[Calibration](form)
         if heads.form.wire != form.wire:
             raise Refused("its byte order differs from the first one's")
@@ -433,7 +433,7 @@ def template_of(
         if isinstance(found, CodedFields):
             found = CodedFields(found.format)
         if (parts.frame_id, found) != (frame_id, fields):
-            raise WireError("says something else than the fields beside it")
+            raise WireError("contradicts the fields beside it")
         return form.template(blank)
     except ValueError as error:
         raise FormatError("header-mismatch", place, str(error)) from None

@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
-from mp4ds.errors import TargetError, TargetExistsError, WriteError
+from mp4ds.errors import TargetError, TargetExistsError, WriteError, counted
 
 try:
     import fcntl
@@ -178,10 +178,10 @@ def refuse_strangers(target: Path, others: Collection[str]) -> None:
     if not others:
         return
     listed = ", ".join(sorted(others)[:_NAMED]) + (", ..." if len(others) > _NAMED else "")
-    what = "1 item" if len(others) == 1 else f"{len(others)} items"
     raise TargetError(
         target,
-        f"holds {what} that mp4ds did not write ({listed}), so `force` does not replace it",
+        f"holds {counted(len(others), 'item')} that mp4ds did not write ({listed}), so `force` "
+        "does not replace it",
         "Move them elsewhere, or choose another name.",
     )
 

@@ -34,7 +34,7 @@ def decode_rvl(data: bytes | memoryview) -> Depth:
         Refused: It is not RVL, is cut short, or declares more pixels than it codes.
     """
     if len(data) < _HEADER.size or len(data) % _WORD_BYTES:
-        raise Refused("it is no RVL: it has no whole number of words")
+        raise Refused("it is not RVL: it has no whole number of words")
     columns, rows = _HEADER.unpack_from(data)
     check_size(columns, rows)
     if 2 * columns * rows > MAX_IMAGE_BYTES:

@@ -91,8 +91,8 @@ def parse(data: bytes | memoryview) -> JpegInfo:
     if bytes(data[:2]) != b"\xff\xd8":
         name = next((name for start, name in _OTHER_IMAGES if start.match(data)), "")
         if name:
-            raise Refused(f"it is {name}, and no JPEG")
-        raise Refused("it is no JPEG: it has no start-of-image marker")
+            raise Refused(f"it is {name}, not a JPEG")
+        raise Refused("it is not a JPEG: it has no start-of-image marker")
     info: JpegInfo | None = None
     scans = 0
     offset = 2

@@ -386,7 +386,7 @@ def parse(data: bytes | memoryview) -> PngInfo:
     """
     head = bytes(data[:33])
     if head[:8] != SIGNATURE or head[8:16] != b"\0\0\0\rIHDR" or len(head) < 33:
-        raise Refused("it is no PNG: it does not begin with a header")
+        raise Refused("it is not a PNG: it does not begin with a header")
     if zlib.crc32(head[12:29]) != int.from_bytes(head[29:33], "big"):
         raise Refused("its PNG's header has a wrong checksum")
     width, height = (int.from_bytes(head[at : at + 4], "big") for at in (16, 20))

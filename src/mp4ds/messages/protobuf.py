@@ -156,7 +156,7 @@ def check_around(size: int) -> None:
         WireError: They are more than a blank may have.
     """
     if size > MAX_BLANK:
-        raise WireError(f"{size} bytes stand around its data")
+        raise WireError(f"it has {size} bytes besides its data")
 
 
 # ---------------------------------------------------------------- protobuf
@@ -321,9 +321,9 @@ def _declared(type_name: str, schema: bytes, kinds: Mapping[str, Kind]) -> Mappi
             raise WireError(f"its schema has no field {name!r}")
         is_repeated = field.label == _REPEATED
         if field.type not in _TYPES[kind] or is_repeated != (kind == "doubles"):
-            raise WireError(f"field {name!r} of its schema is of another type than Foxglove's")
+            raise WireError(f"field {name!r} of its schema is not of Foxglove's type")
         if kind == "time" and field.type_name not in _TIMESTAMPS:
-            raise WireError(f"field {name!r} of its schema is no google.protobuf.Timestamp")
+            raise WireError(f"field {name!r} of its schema is not a google.protobuf.Timestamp")
         by_number[field.number] = _Declared(name, kind, _TYPES[kind][field.type])
     return by_number
 
@@ -337,7 +337,7 @@ def _declaration(type_name: str, schema: bytes) -> Any:
     try:
         files = FileDescriptorSet.FromString(schema).file
     except (DecodeError, ValueError):  # the latter by protobuf's pure Python
-        raise WireError("its schema is no FileDescriptorSet") from None
+        raise WireError("its schema is not a FileDescriptorSet") from None
     name = tuple(type_name.rsplit(".", 1))
     # compared one by one: names that are not UTF-8 come as bytes
     found = [
@@ -358,7 +358,7 @@ def _fields(data: memoryview) -> Iterator[_Field]:
         tag, at = _varint(data, at)
         number, wire_type = tag >> 3, tag & 7
         if number == 0 or tag >> 32:
-            raise WireError("a tag in it is not one")
+            raise WireError("it has an invalid tag")
         start = at
         if wire_type == _VARINT:
             end = _varint(data, at)[1]
@@ -370,7 +370,7 @@ def _fields(data: memoryview) -> Iterator[_Field]:
         else:
             raise WireError(f"it has a field of wire type {wire_type}")
         if end > len(data):
-            raise WireError(f"it ends at byte {len(data)} where a field needs {end}")
+            raise WireError(f"it ends at byte {len(data)}, but a field extends to byte {end}")
         yield _Field(number, wire_type, at, start, end)
         at = end
 
@@ -384,7 +384,7 @@ def _varint(data: memoryview, at: int) -> tuple[int, int]:
             if value > _UINT64:
                 break
             return value, at + index + 1
-    raise WireError("a number in it does not end")
+    raise WireError("a number in it is cut short")
 
 
 def _varint_bytes(value: int) -> bytes:
@@ -410,7 +410,7 @@ def _take(values: dict[str, Any], declared: _Declared, field: _Field, data: memo
         values[declared.name] = struct.unpack("<I", raw)[0]
     elif declared.kind == "doubles":
         if len(raw) % 8:
-            raise WireError("a list of numbers ends inside of one")
+            raise WireError("a list of numbers in it is cut short")
         values[declared.name] += struct.unpack(f"<{len(raw) // 8}d", raw)
 
 

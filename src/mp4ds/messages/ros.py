@@ -148,7 +148,7 @@ class RosForm:
         end = start + body_size
         around = start + len(data) - end
         if around > MAX_BLANK:
-            raise WireError(f"{around} bytes stand around its data")
+            raise WireError(f"it has {around} bytes besides its data")
         # the alignment of what follows depends on the body's length, so the blank keeps it modulo 4
         kept = body_size % _ALIGNMENT if self._is_aligned_after else 0
         blank = bytearray(data[:start])

@@ -145,7 +145,7 @@ def _parse_json(data: memoryview) -> Any:
     try:
         return json.loads(bytes(data))
     except (ValueError, RecursionError) as error:
-        raise WireError(f"it is no JSON: {error}") from None
+        raise WireError(f"it is not JSON: {error}") from None
 
 
 def _read_nodes(message: Any, many: bool) -> list[Transform]:
@@ -162,7 +162,7 @@ def _read_nodes(message: Any, many: bool) -> list[Transform]:
 def _read_node(node: Any) -> Transform:
     names = [_value(node, f"{end}_frame_id", "") for end in ("parent", "child")]
     if not all(isinstance(name, str) for name in names):
-        raise TypeError("the name of a frame is no string")
+        raise TypeError("the name of a frame is not a string")
     x, y, z = _numbers(_part(node, "translation"), "xyz", (0.0, 0.0, 0.0))
     qx, qy, qz, qw = _numbers(_part(node, "rotation"), "xyzw", (0.0, 0.0, 0.0, 1.0))
     return Transform(names[0], names[1], (x, y, z), (qx, qy, qz, qw))
@@ -181,7 +181,7 @@ def _part(node: Any, name: str) -> Any:
 def _numbers(node: Any, names: str, absent: tuple[float, ...]) -> list[float]:
     values = absent if node is None else [_value(node, name, 0.0) for name in names]
     if not all(isinstance(value, (int, float)) for value in values):
-        raise TypeError("a coordinate is no number")
+        raise TypeError("a coordinate is not a number")
     return [float(value) for value in values]
 
 

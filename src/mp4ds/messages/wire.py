@@ -247,7 +247,7 @@ class PrimitiveReader:
         self.align(size)
         end = self.offset + size * count
         if end > len(self._data):
-            raise WireError(f"it ends at byte {len(self._data)}, inside of its fields")
+            raise WireError(f"it ends at byte {len(self._data)}, in the middle of its fields")
         values = struct.unpack_from(f"{self._order}{count}{code}", self._data, self.offset)
         self.offset = end
         return values
@@ -260,7 +260,7 @@ class PrimitiveReader:
         """Read bytes as a view."""
         end = self.offset + size
         if end > len(self._data):
-            raise WireError(f"it ends at byte {len(self._data)} where a field needs {end}")
+            raise WireError(f"it ends at byte {len(self._data)}, but a field extends to byte {end}")
         view = self._data[self.offset : end]
         self.offset = end
         return view

@@ -24,7 +24,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from mp4ds.errors import OptionError, TargetError, WriteError
+from mp4ds.errors import OptionError, TargetError, WriteError, counted
 from mp4ds.files.outputs import as_write_error, is_mine, lock, sync, sync_folder, write_synced
 from mp4ds.files.urls import location
 from mp4ds.packing.job import TASK_NAME, Job, Task, tools
@@ -145,8 +145,7 @@ class Workplace:
             listed = ", ".join(sorted(strange)[:_NAMED]) + ", ..." * (len(strange) > _NAMED)
             raise TargetError(
                 self.folder,
-                f"holds {len(strange)} item{'s' * (len(strange) != 1)} that mp4ds did not "
-                f"make: {listed}",
+                f"holds {counted(len(strange), 'item')} that mp4ds did not make: {listed}",
                 "Check what they are; if you remove the folder, packing starts over.",
             )
 

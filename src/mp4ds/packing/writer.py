@@ -189,7 +189,7 @@ class StreamWriter:
         fields, wrap = seen.parts.fields, seen.wrap
         padding = None if wrap.padding is None else base64.b64encode(wrap.padding).decode()
         if exceeds_padding((padding, *(head.padding for head in self._heads.items))):
-            raise Refused("too much padding between rows, another for each image")
+            raise Refused("too much padding between rows, different in each image")
         header = Header(
             frame_id=seen.parts.frame_id,
             format=fields.format if isinstance(fields, CodedFields) else None,

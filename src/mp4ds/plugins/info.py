@@ -20,7 +20,7 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import MessageSplitter, fields_of
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import Matrix, effective
-from mp4ds.errors import Refused
+from mp4ds.errors import Refused, counted
 from mp4ds.files.urls import location
 from mp4ds.format.sidecars import names_dataset
 from mp4ds.messages.serializations import is_calibration, is_camera, kind_of
@@ -260,8 +260,8 @@ def _dataset_info(dataset: Dataset) -> Info:
         _add_stream(by_topic, stream)
     if dataset.manifest:
         result.notes += [
-            f"{item.topic}: {item.messages} messages stored verbatim, the first is number "
-            f"{item.first}: {item.reason}"
+            f"{item.topic}: {counted(item.messages, 'message')} stored verbatim, the first is "
+            f"number {item.first}: {item.reason}"
             for item in dataset.manifest.verbatim
         ]
         if dataset.manifest.about:

@@ -64,7 +64,7 @@ def obus(data: bytes | memoryview) -> Iterator[Obu]:
             return
         header = data[offset]
         if header & 0x81:
-            raise Refused("it is no AV1: reserved bits are set")
+            raise Refused("it is not AV1: reserved bits are set")
         if not header & 2:
             raise Refused("it has an AV1 unit that does not tell its size")
         start = offset

@@ -34,7 +34,7 @@ def packet_codec(message_format: str) -> str:
         # hardware encoders are called h264_nvenc, hevc_vaapi ...
         if name in found.names or name.partition("_")[0] in found.names:
             return codec
-    raise Refused(f"its codec {message_format[:40]!r} is none that a video here has")
+    raise Refused(f"its codec {message_format[:40]!r} is not one that becomes a video")
 
 
 # ---------------------------------------------------------------- packets

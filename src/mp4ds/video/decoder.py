@@ -259,7 +259,7 @@ class VideoDecoder:
         except (FFmpegError, OSError) as error:
             raise_if_scarce(error)
             raise VideoError(
-                "decode-failed", self._path, f"frame {index} cannot be sought: {error}"
+                "decode-failed", self._path, f"frame {index} cannot be reached: {error}"
             ) from None
 
     def _presentation_ticks(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

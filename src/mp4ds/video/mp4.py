@@ -187,7 +187,7 @@ def read_sample_entry(path: Path) -> SampleEntry:
             return parse_descriptions(file, box)
         except DamagedBoxError as error:
             raise VideoError(
-                "video-unreadable", path, f"has no track description: {error}"
+                "video-unreadable", path, f"has no usable track description: {error}"
             ) from None
 
 

@@ -172,7 +172,7 @@ def _check(configuration: bytes, *, lengths_at: int) -> None:
     if len(configuration) < lengths_at + 2 or configuration[0] != 1:
         raise Refused(_CUT_SHORT)
     if configuration[lengths_at] & 3 != 3:
-        raise Refused("its NAL units do not stand behind lengths of four bytes")
+        raise Refused("its NAL units do not have lengths of four bytes")
 
 
 def _sized(configuration: bytes, at: int, count: int) -> tuple[list[bytes], int]:

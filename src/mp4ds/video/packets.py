@@ -658,7 +658,7 @@ class StandAlonePackets(PacketReader):
             raise self._damage(error) from None
 
     def _damage(self, error: Refused) -> VideoError:
-        return VideoError("decode-failed", self._path, f"has a packet of which {error}")
+        return VideoError("decode-failed", self._path, f"has a damaged packet: {error}")
 
     def packet(self, index: int) -> bytes:
         """One packet; see `PacketReader.packet`."""

@@ -296,7 +296,7 @@ class VideoFile:
         except (FFmpegError, OSError) as error:
             raise_if_scarce(error)
             raise VideoError(
-                "decode-failed", self._path, f"frame {index} cannot be sought: {error}"
+                "decode-failed", self._path, f"frame {index} cannot be reached: {error}"
             ) from None
 
     def _next_at(self, tick: int, index: int) -> av.VideoFrame | None:

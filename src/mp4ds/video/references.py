@@ -260,7 +260,7 @@ class _Chained(ABC):
         """See `ReferenceParser.packet`."""
         is_key = self.is_key(data)
         if key and not is_key:
-            raise UnknownStructure("it is marked as a key frame and is none")
+            raise UnknownStructure("it is marked as a key frame but is not one")
         if not is_key and not self._begun:
             raise UnknownStructure("it comes before the first key frame")
         self._begun = True
@@ -283,7 +283,7 @@ class Vp9References(_Chained):
         for frame in split_superframe(data):
             head = int.from_bytes(frame[:2].tobytes().ljust(2, b"\0"), "big")
             if head >> 14 != 2:
-                raise UnknownStructure("it is no VP9: a frame does not begin with its marker")
+                raise UnknownStructure("it is not VP9: a frame does not begin with its marker")
             bits = head << 1 if head >> 12 & 3 == 3 else head  # profile 3 has a reserved bit more
             existing = bool(bits & 0x800)
             keys.append(not existing and not bits & 0x400)
@@ -305,7 +305,7 @@ class Ffv1References(_Chained):
         of its range, 0xFF00.
         """
         if len(data) < 2:
-            raise UnknownStructure("it is no FFV1: it is too short")
+            raise UnknownStructure("it is not FFV1: it is too short")
         return int.from_bytes(data[:2], "big") >= _FFV1_KEY
 
 

@@ -74,7 +74,7 @@ class Vp9Pictures:
         """Whether a frame is shown, and a key frame."""
         reader = BitReader(header)
         if reader.bits(2) != 2:
-            raise Refused("it is no VP9: a frame does not begin with its marker")
+            raise Refused("it is not VP9: a frame does not begin with its marker")
         profile = reader.bits(1) | reader.bits(1) << 1
         if profile == 3 and reader.flag():
             raise Refused("it is VP9 of an unknown profile")
@@ -90,7 +90,7 @@ class Vp9Pictures:
 
 def _key_frame_size(reader: BitReader, profile: int) -> tuple[int, int]:
     if reader.bits(24) != _SYNC_CODE:
-        raise Refused("it is no VP9: a key frame has no sync code")
+        raise Refused("it is not VP9: a key frame has no sync code")
     if profile >= 2:
         reader.flag()
     if reader.bits(3) != _RGB:

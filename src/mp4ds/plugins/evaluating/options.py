@@ -23,7 +23,7 @@ _DEFAULT_PRESETS = {
     **{name: (found.default_preset,) for name, found in HARDWARE.items()},
 }
 _MOST_CELLS = 10_000
-_CRF = re.compile(r"([0-9]{1,2})(?::([0-9]{1,2})(?::([0-9]{1,2}))?)?")
+_CRF = re.compile(r"([0-9]{1,4})(?::([0-9]{1,4})(?::([0-9]{1,4}))?)?")
 
 
 @dataclass(frozen=True, slots=True)

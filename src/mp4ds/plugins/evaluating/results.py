@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mp4ds.errors import counted
 from mp4ds.plugins.evaluating.clips import Clip, ClipFile
 from mp4ds.plugins.evaluating.options import ScoreGoal, Setting
 from mp4ds.video.codecs import recipe_for
@@ -121,7 +122,7 @@ class DataSet:
     @property
     def described(self) -> str:
         """A description in words."""
-        cameras = f"{self.streams} camera{'s' * (self.streams != 1)}"
+        cameras = counted(self.streams, "camera")
         hours = f"{self.hours:g} hour{'s' * (self.hours != 1)}"
         return f"{cameras} for {hours} at {self.rate:.2f} Hz"
 

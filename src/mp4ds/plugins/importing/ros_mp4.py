@@ -79,7 +79,7 @@ def import_ros_mp4(
     old = load_stream(described, video=_ANY)  # users may have renamed theirs
     if old.stamps != "record-float":
         raise OptionError(
-            f"{described} is not YAML file of the tool published with the paper: it is already "
+            f"{described} is not a YAML file of the tool published with the paper: it is already "
             "an mp4ds sidecar."
         )
     with (

@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 from mp4ds.dataset.collections import Paths, datasets_in, each
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.errors import Mp4dsError, OptionError, SourceError, TargetExistsError
+from mp4ds.errors import Mp4dsError, OptionError, SourceError, TargetExistsError, counted
 from mp4ds.files.outputs import (
     as_write_error,
     is_page,
@@ -198,7 +198,7 @@ def _page(title: str, facts: str, rows: Sequence[str]) -> str:
 
 
 def _facts(found: Sequence[Path], problems: Sequence[str]) -> str:
-    told = [f"{len(found)} dataset{'s' * (len(found) != 1)}"]
+    told = [counted(len(found), "dataset")]
     told += [f"not shown: {html.escape(problem)}" for problem in problems]
     return "<br>".join(told)
 

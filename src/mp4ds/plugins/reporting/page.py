@@ -16,6 +16,7 @@ import numpy as np
 from mp4ds._version import __version__
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.stream import Stream
+from mp4ds.errors import counted
 from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.plugins.reporting.cameras import ReportedCamera, axis_of, untimed
@@ -281,8 +282,8 @@ def _notes(dataset: Dataset) -> Iterable[str]:
         yield from manifest.about.lines
     for item in manifest.verbatim:
         yield (
-            f"{item.topic}: {item.messages} messages are stored verbatim in messages.mcap, the "
-            f"first is number {item.first}: {item.reason}."
+            f"{item.topic}: {counted(item.messages, 'message')} stored verbatim in messages.mcap, "
+            f"the first is number {item.first}: {item.reason}."
         )
     for loss in manifest.losses:
         yield f"Lost when packing: {loss.file}: {loss.problem}."
