@@ -1,6 +1,6 @@
 # mp4ds as a command:
 #   docker build --tag mp4ds .
-#   docker run --rm --user "$(id -u):$(id -g)" --volume "$PWD:/data" mp4ds pack drive.bag -o drive
+#   docker run --rm --user "$(id -u):$(id -g)" --volume "$PWD:/data" mp4ds pack drive.mcap -o drive
 # PyAV's wheel brings an ffmpeg with x264 and x265 (GPL): see docs/faq.md before you publish an image.
 FROM python:3.13-slim AS build
 # hadolint ignore=DL3008

@@ -7,8 +7,8 @@ work=${1:-quickstart}
 bash tools/install.sh
 mkdir -p "$work"
 export PATH="$PWD/${VENV:-.venv}/bin:$PATH"
-mp4ds demo "$work/demo.bag" --force
-mp4ds pack "$work/demo.bag" -o "$work/demo" --force
+mp4ds demo "$work/demo.mcap" --force
+mp4ds pack "$work/demo.mcap" -o "$work/demo" --force
 mp4ds validate "$work/demo" --deep
-mp4ds unpack "$work/demo" --to bag -o "$work/again.bag" --force
-python tools/compare.py "$work/demo.bag" "$work/again.bag"
+mp4ds unpack "$work/demo" --to mcap -o "$work/again.mcap" --force
+python tools/compare.py "$work/demo.mcap" "$work/again.mcap"

@@ -13,12 +13,12 @@ import numpy as np
 from rosbags.convert.converter import default_message
 from rosbags.typesys import Stores, get_typestore
 
-from mp4ds.bags.convert import ros1_channel
 from mp4ds.bags.formats import open_reader, open_writer
 from mp4ds.errors import Refused
 from mp4ds.messages.serializations import form_of
 from mp4ds.messages.wire import ImageFields, Slots
 from mp4ds.records import Channel, Message, Schema
+from sources import typestore
 
 ROS2 = get_typestore(Stores.ROS2_JAZZY)
 
@@ -181,6 +181,14 @@ def profiles(*depths: int, durability: str = "transient_local") -> str:
 def static_channel(*depths: int) -> Channel:
     """/tf_static in ROS 2: rosbag2 makes one channel of all its publishers."""
     return ros2_channel(1, "/tf_static", "tf2_msgs/msg/TFMessage", profiles(*depths))
+
+
+def ros1_channel(number: int, topic: str, kind: str, callerid: str) -> Channel:
+    """A channel of a bag, with the definition and md5sum of its type."""
+    package, name = kind.split("/")
+    definition, md5sum = typestore("ros1").generate_msgdef(f"{package}/msg/{name}", ros_version=1)
+    schema = Schema(kind, "ros1msg", definition.encode())
+    return Channel(number, topic, "ros1", schema, {"md5sum": md5sum, "callerid": callerid})
 
 
 def ros2_channel(number: int, topic: str, kind: str, qos: str = "") -> Channel:

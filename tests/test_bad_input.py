@@ -484,7 +484,7 @@ def test_a_target_that_may_not_be_written(
     name = {"below-a-file": "there/x", "no-parent": "none/x", "exists": "there"}.get(place, "link")
     target = tmp_path / name
     if command == "demo":
-        target = target.with_suffix(".bag")
+        target = target.with_suffix(".mcap")
         if place == "exists":
             target.write_text("mine")
         elif place == "dangling-link":
@@ -523,7 +523,7 @@ def test_a_folder_that_is_read_only(demo: Path, tmp_path: Path) -> None:
         for arguments in (
             ("pack", demo / "drive.bag", "-o", disk / "x"),
             ("unpack", demo / "drive", "--to", "mcap", "-o", disk / "x.mcap"),
-            ("demo", disk / "x.bag"),
+            *(("demo", disk / f"x{suffix}") for suffix in DEMOS),
         ):
             refused(call(*arguments), 2, str(disk / "x"), "Read-only file system")
 
@@ -711,11 +711,14 @@ UNPACK_TARGETS = {
 }
 
 
-@each("job", ["pack", "pack-lossy", "demo", *UNPACK_TARGETS])
+DEMOS = ("", ".bag", ".mcap")
+
+
+@each("job", ["pack", "pack-lossy", *(f"demo{suffix}" for suffix in DEMOS), *UNPACK_TARGETS])
 def test_a_disk_that_is_full_half_way(job: str, demo: Path, tmp_path: Path) -> None:
     with mounted(tmp_path / "disk", "size=512k") as disk, unchanged(demo):
-        if job == "demo":
-            result = call("demo", disk / "x.bag", "--seconds", 1)
+        if job.startswith("demo"):
+            result = call("demo", disk / job.replace("demo", "x"), "--seconds", 1)
         elif job == "pack":
             result = call("pack", demo / "drive.bag", "-o", disk / "x")
         elif job == "pack-lossy":
@@ -878,7 +881,7 @@ BAD_OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
         ("unpack", "DATASET", "--to", "images", "-o", "OUT", "-t", "/imu"),
         "/cam/image_raw",
     ),
-    "demo": (("demo", "OUT"), ".bag"),
+    "demo": (("demo", "OUT.db3"), ".mcap, .bag (ROS 1), or without a suffix"),
     "transcode-lossless": (("pack", "BAG", "-o", "OUT", "--transcode"), "--quality"),
     **{
         f"camera-info {value}": (("pack", "BAG", "-o", "OUT", "--camera-info", value), word)
@@ -1104,7 +1107,7 @@ def test_json_of_info_on_a_dataset(what: str, small_dataset: Path) -> None:
         (("unpack", "DATASET", "--to", "zip"), 2),
         (("validate", "none"), 2),
         (("info", "none.bag"), 2),
-        (("demo", "OUT"), 2),
+        (("demo", "OUT.db3"), 2),
     ],
 )
 def test_json_of_failure(

@@ -16,10 +16,11 @@ from rosbags.typesys.msg import normalize_msgtype
 
 from conftest import real
 from each import each
-from mp4ds.bags.convert import LATCHED_QOS, Converter, ros1_channel
+from mp4ds.bags.convert import LATCHED_QOS, Converter
 from mp4ds.bags.ros1 import Ros1Reader
 from mp4ds.errors import ConversionError, OptionError
 from mp4ds.records import Channel, Schema
+from player_scenes import ros1_channel
 from sources import INFO, image_cdr, image_ros1, scene, typestore
 
 HEADER = "std_msgs/msg/Header"

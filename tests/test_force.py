@@ -20,6 +20,7 @@ FOLDERS: dict[str, tuple[str, ...]] = {
     "rosbag2": ("unpack", "DATASET", "--to", "rosbag2", "--storage", "sqlite3"),
     "rosbag2 mcap": ("unpack", "DATASET", "--to", "rosbag2", "--storage", "mcap"),
     "images": ("unpack", "DATASET", "--to", "images"),
+    "demo": ("demo",),
     "tum": (
         "export",
         "tum",
@@ -30,7 +31,8 @@ FOLDERS: dict[str, tuple[str, ...]] = {
 FILES: dict[str, tuple[str, tuple[str, ...]]] = {
     "bag": ("out.bag", ("unpack", "DATASET", "--to", "bag")),
     "mcap": ("out.mcap", ("unpack", "DATASET", "--to", "mcap")),
-    "demo": ("out.bag", ("demo",)),
+    "demo": ("out.mcap", ("demo",)),
+    "demo bag": ("out.bag", ("demo",)),
     "png": ("out.png", ("frames", "DATASET", "--at", "#0")),
     "jpeg": ("out.jpg", ("frames", "DATASET", "--at", "#0")),
     "rerun": ("out.rrd", ("export", "rerun", "DATASET")),

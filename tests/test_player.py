@@ -18,7 +18,15 @@ from mp4ds.plugins.playing.pace import FollowedClock, Pace
 from mp4ds.plugins.playing.play import PlayOptions, open_player
 from mp4ds.plugins.playing.player import Player, PlaySummary
 from mp4ds.plugins.publishing.names import NodeNames
-from player_scenes import MS, START, Recorded, RecordingPublisher, make_drive, recorded
+from player_scenes import (
+    MS,
+    START,
+    Recorded,
+    RecordingPublisher,
+    make_drive,
+    recorded,
+    ros1_channel,
+)
 from waiting import WATCHDOG_S, until
 
 FIRST = START
@@ -235,7 +243,6 @@ def test_it_ends_when_the_receiving_side_is_shut_down(
 
 
 def test_a_recorded_clock_is_not_published_beside_ours(tmp_path: Path) -> None:
-    from mp4ds.bags.convert import ros1_channel
     from mp4ds.bags.formats import open_writer
     from mp4ds.records import Message
 

@@ -698,9 +698,9 @@ def test_the_page_on_frames_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     snippets = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     assert len(snippets) >= 7
     monkeypatch.chdir(tmp_path)
-    assert "mp4ds demo demo.bag\nmp4ds pack demo.bag -o demo\n" in page
-    demo("demo.bag")
-    mp4ds.pack("demo.bag", "demo")
+    assert "mp4ds demo demo.mcap\nmp4ds pack demo.mcap -o demo\n" in page
+    demo("demo.mcap")
+    mp4ds.pack("demo.mcap", "demo")
     shutil.copy("demo/right_image_raw.mp4", "clip.mp4")
     names: dict[str, Any] = {}
     printed = io.StringIO()

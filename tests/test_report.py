@@ -859,7 +859,7 @@ def test_the_scene_is_as_it_says(drive: Path) -> None:
 def test_the_commands_of_its_page(tmp_path: Path) -> None:
     page = (Path(__file__).parents[1] / "docs" / "report.md").read_text()
     lines = [
-        line.replace("demo demo.bag", "demo demo.bag --seconds 1.7")
+        line.replace("demo demo.mcap", "demo demo.mcap --seconds 1.7")
         for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
         for line in block.splitlines()
     ]

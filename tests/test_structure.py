@@ -73,6 +73,7 @@ def imports_of(path: Path) -> frozenset[str]:
 HOMES = {
     "rosbags": ("bags",),
     "mcap": ("bags",),
+    "mcap_ros2": ("plugins/demo.py",),
     "zstandard": ("bags",),
     "lz4": ("bags",),
     "sqlite3": ("bags",),

@@ -29,8 +29,8 @@ def main() -> None:
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        demo(folder / "demo.bag", seconds=6.0)
-        mp4ds.pack(folder / "demo.bag", folder / "demo")
+        demo(folder / "demo.mcap", seconds=6.0)
+        mp4ds.pack(folder / "demo.mcap", folder / "demo")
         report = mp4ds.report(folder / "demo").index
         options = mp4ds.EvaluateOptions(
             codecs=["svtav1", "x264"],
@@ -40,7 +40,7 @@ def main() -> None:
             topics=["/right/image_raw"],
             target="vmaf=97",
         )
-        mp4ds.evaluate(folder / "demo.bag", options, output=folder / "evaluation")
+        mp4ds.evaluate(folder / "demo.mcap", options, output=folder / "evaluation")
         (folder / "profile").mkdir()
         with chromium(folder / "profile", width=1280, height=1340) as tab:
             tab.open(f"{report.as_uri()}#t=2.5", ready=_READY)

@@ -1,4 +1,4 @@
-"""Converts channels and messages between ROS 1 and ROS 2; standard definitions of both."""
+"""Converts channels and messages between ROS 1 and ROS 2; standard definitions of ROS 2."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import denormalize_msgtype, normalize_msgtype
 from rosbags.typesys.store import Typestore
 
@@ -67,11 +67,11 @@ def _parts(types: Typesdict, name: str) -> list[tuple[int, str, bool]]:
 
 # ---------------------------------------------------------------- convert
 
-LATCHED_QOS = """\
+_QOS = """\
 - history: 1
-  depth: 1
+  depth: {depth}
   reliability: 1
-  durability: 1
+  durability: {durability}
   deadline:
     sec: 9223372036
     nsec: 854775807
@@ -83,7 +83,10 @@ LATCHED_QOS = """\
     sec: 9223372036
     nsec: 854775807
   avoid_ros_namespace_conventions: false"""
+LATCHED_QOS = _QOS.format(depth=1, durability=1)
 """Keep the last one, reliable, transient local: what ROS 1 calls latching."""
+DEFAULT_QOS = _QOS.format(depth=10, durability=2)
+"""Keep the last ten, reliable, volatile: the default of publishers in ROS 2."""
 
 _ROS1 = "ros1:"  # prefix of the keys that keep a ROS 1 connection header in ROS 2 metadata
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
@@ -372,33 +375,14 @@ def _seconds(value: Any) -> Iterator[int]:
 # ---------------------------------------------------------------- standard definitions
 
 
-def ros1_channel(channel_id: int, topic: str, type_name: str, callerid: str) -> Channel:
-    """A channel of a standard ROS 1 type, with its definition and md5sum.
-
-    Args:
-        channel_id: Unique in the recording.
-        topic: Topic name.
-        type_name: Such as ``sensor_msgs/Image``.
-        callerid: Name of the publishing node.
-    """
-    package, name = type_name.split("/")
-    definition, md5sum = _store().generate_msgdef(f"{package}/msg/{name}", ros_version=1)
-    return Channel(
-        channel_id,
-        topic,
-        "ros1",
-        Schema(type_name, "ros1msg", definition.encode()),
-        {"md5sum": md5sum, "callerid": callerid},
-    )
-
-
-def ros2_channel(channel_id: int, topic: str, type_name: str) -> Channel:
+def ros2_channel(channel_id: int, topic: str, type_name: str, qos: str = "") -> Channel:
     """A channel of a standard ROS 2 type, with its definition and type hash.
 
     Args:
         channel_id: Unique in the recording.
         topic: Topic name.
         type_name: Such as ``sensor_msgs/msg/Image``.
+        qos: Its profile, such as `LATCHED_QOS`; empty if not known.
     """
     store = _ros2_store()
     definition, _ = store.generate_msgdef(type_name, ros_version=2)
@@ -407,24 +391,10 @@ def ros2_channel(channel_id: int, topic: str, type_name: str) -> Channel:
         topic,
         "cdr",
         Schema(type_name, "ros2msg", definition.encode()),
-        {QOS_KEY: "", HASH_KEY: store.hash_rihs01(type_name)},
+        {QOS_KEY: qos, HASH_KEY: store.hash_rihs01(type_name)},
     )
-
-
-def latched(channel: Channel) -> Channel:
-    """The same ROS 2 channel, latched: late subscribers get the last message."""
-    return replace(channel, metadata={**channel.metadata, QOS_KEY: LATCHED_QOS})
 
 
 @lru_cache(maxsize=1)
 def _ros2_store() -> Typestore:
     return get_typestore(Stores.ROS2_HUMBLE)
-
-
-@lru_cache(maxsize=1)
-def _store() -> Typestore:
-    store = get_typestore(Stores.ROS1_NOETIC)
-    store.register(
-        get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
-    )
-    return store

@@ -218,7 +218,10 @@ def _print_speeds(path: str, as_json: bool) -> None:
 
 
 def demo(
-    output: Annotated[Path, typer.Argument(help="The .bag file to write.")] = Path("demo.bag"),
+    output: Annotated[
+        Path,
+        typer.Argument(help="What to write: .mcap, .bag (ROS 1), or no suffix for rosbag2."),
+    ] = Path("demo.mcap"),
     seconds: Annotated[
         float, typer.Option("--seconds", min=0.1, max=3600.0, help="Length of the recording.")
     ] = 3.0,

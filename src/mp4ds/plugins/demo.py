@@ -1,7 +1,7 @@
 """A small recording to try mp4ds with: a drive past coloured discs, seen by two cameras.
 
-Generated, so that the first command of the README needs only the package: a ROS 1 bag with a Bayer
-and an RGB camera, their calibrations, IMU and tf. The same on every machine.
+Generated, so that the first command of the README needs only the package: a ROS 2 recording with a
+Bayer and an RGB camera, their calibrations, IMU and transforms. The same on every machine.
 """
 
 from __future__ import annotations
@@ -9,19 +9,19 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from mcap_ros2.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
-from mp4ds.bags.convert import ros1_channel
-from mp4ds.bags.formats import open_writer, recording_names
+from mp4ds.bags.convert import DEFAULT_QOS, LATCHED_QOS, Converter, ros2_channel
+from mp4ds.bags.formats import open_reader, open_writer, recording_names
 from mp4ds.errors import OptionError
 from mp4ds.files.outputs import staged
-from mp4ds.messages.serializations import plain_message
-from mp4ds.messages.wire import CalibrationFields, Fields, ImageFields, Slots
 from mp4ds.records import Channel, Message
 
 START_NS = 1_712_647_128_027_473_200
@@ -31,8 +31,8 @@ IMU_HZ = 100
 TF_HZ = 20
 _NOISE = 2.0  # standard deviation, grey levels: like an indoor camera
 _DISCS = 12
-_IMAGE_TYPE = "sensor_msgs/Image"
-_INFO_TYPE = "sensor_msgs/CameraInfo"
+_KINDS = {".mcap": "mcap", "": "rosbag2", ".bag": "bag"}
+"""Suffix of the output -> format."""
 
 
 @dataclass(frozen=True)
@@ -43,77 +43,139 @@ class _Camera:
     offset: float  # metres beside the middle of the car
 
 
+@dataclass(frozen=True)
+class _Topic:
+    type_name: str
+    node: str
+    qos: str = DEFAULT_QOS
+
+
 _CAMERAS = (_Camera("left", "bayer_rggb8", 1, 0.1), _Camera("right", "rgb8", 3, -0.1))
+_TOPICS = {
+    "/tf_static": _Topic("tf2_msgs/msg/TFMessage", "/robot_state_publisher", LATCHED_QOS),
+    "/imu": _Topic("sensor_msgs/msg/Imu", "/imu_driver"),
+    "/tf": _Topic("tf2_msgs/msg/TFMessage", "/odometry"),
+    **{
+        f"/{camera.name}/{name}": _Topic(f"sensor_msgs/msg/{kind}", f"/{camera.name}_driver")
+        for camera in _CAMERAS
+        for name, kind in (("image_raw", "Image"), ("camera_info", "CameraInfo"))
+    },
+}
 
 
-def demo(output: Path | str = "demo.bag", *, seconds: float = 3.0, force: bool = False) -> int:
+def demo(output: Path | str = "demo.mcap", *, seconds: float = 3.0, force: bool = False) -> int:
     """Make the recording.
 
     Args:
-        output: The .bag file to make.
+        output: An .mcap file, a ROS 1 .bag, or, if the name has no suffix, a rosbag2 folder.
         seconds: Length of the recording, from 0.1 to 3600.
-        force: Replace an existing file.
+        force: Replace an existing recording.
 
     Returns:
         Number of messages.
 
     Raises:
-        OptionError: The file is not a .bag, or the length is out of bounds.
-        TargetError: The file cannot be written there.
+        OptionError: The name has another suffix, or the length is out of bounds.
+        TargetError: The recording cannot be written there.
     """
     if not 0.1 <= seconds <= 3600:  # not a number, too: older typers let it pass
         raise OptionError(f"A demo lasts from 0.1 to 3600 seconds, not {seconds:g}.")
     target = Path(os.path.abspath(output))  # noqa: PTH100 - keeps links, unlike resolve()
-    if target.suffix != ".bag":
-        raise OptionError(f"The demo is a ROS 1 bag, and {target.name!r} does not end in .bag.")
-    channels = _channels()
-    count = 0
-    with (
-        staged(target, force=force, owned=recording_names) as path,
-        open_writer(
-            path, "bag", name=target.name, profile="ros1", library="", storage=""
-        ) as writer,
-    ):
-        for channel in channels.values():
-            writer.add_channel(channel)
-        for time, topic, payload in sorted(_messages(seconds), key=lambda item: item[:2]):
-            writer.write(Message(channels[topic], time, time, 0, payload()))
-            count += 1
+    if target.suffix not in _KINDS:
+        raise OptionError(
+            f"The demo cannot be a {target.suffix} file. Name it .mcap, .bag (ROS 1), or "
+            "without a suffix for a rosbag2 folder."
+        )
+    kind = _KINDS[target.suffix]
+    with staged(target, force=force, owned=recording_names) as path:
+        if kind == "mcap":
+            return _record(path, seconds)
+        original = path.parent / "demo.mcap"  # goes when this temporary folder goes
+        count = _record(original, seconds)
+        _copy(original, path, kind, target.name)
     return count
 
 
-def _channels() -> dict[str, Channel]:
-    topics = {
-        "/imu": ("sensor_msgs/Imu", "/imu_driver"),
-        "/tf": ("tf2_msgs/TFMessage", "/odometry"),
-    }
-    for camera in _CAMERAS:
-        topics[f"/{camera.name}/image_raw"] = (_IMAGE_TYPE, f"/{camera.name}_driver")
-        topics[f"/{camera.name}/camera_info"] = (_INFO_TYPE, f"/{camera.name}_driver")
-    return {
-        topic: ros1_channel(number, topic, type_name, callerid)
-        for number, (topic, (type_name, callerid)) in enumerate(topics.items())
-    }
+class _Writer(Writer):
+    """Also writes the QoS and the type hash of topics, as ``ros2 bag record`` does."""
+
+    def declare(self, channel: Channel) -> Any:
+        """Add a topic; returns the schema that `write_message` takes."""
+        definition = channel.schema.data.decode() if channel.schema else ""
+        schema = self.register_msgdef(channel.type_name, definition)
+        self._channel_ids[channel.topic] = self._writer.register_channel(
+            channel.topic, channel.message_encoding, schema.id, dict(channel.metadata)
+        )
+        return schema
 
 
-def _messages(seconds: float) -> Iterator[tuple[int, str, Callable[[], bytes]]]:
+def _record(path: Path, seconds: float) -> int:
+    messages = sorted(_messages(seconds), key=lambda item: item[:2])
+    # rosbag2 does not compress, either
+    with path.open("wb") as file, _Writer(file, compression=CompressionType.NONE) as writer:
+        schemas = {
+            name: writer.declare(ros2_channel(number, name, topic.type_name, topic.qos))
+            for number, (name, topic) in enumerate(_TOPICS.items())
+        }
+        for time, topic, seq, make in messages:
+            writer.write_message(topic, schemas[topic], make(), time, time, seq)
+    return len(messages)
+
+
+def _copy(original: Path, path: Path, kind: str, name: str) -> None:
+    """Copy the MCAP file into a recording of another kind."""
+    converter = Converter("ros1" if kind == "bag" else None)
+    with (
+        open_reader(original) as reader,
+        open_writer(path, kind, name=name, profile="", library="", storage="mcap") as writer,
+    ):
+        channels = {}
+        for channel in reader.channels:
+            made = converter.channel(channel)
+            if kind == "bag":
+                callerid = {"callerid": _TOPICS[channel.topic].node}
+                made = replace(made, metadata={**made.metadata, **callerid})
+            channels[channel.id] = made
+            writer.add_channel(made)
+        for record in reader.records():
+            if isinstance(record, Message):
+                data = bytes(converter.payload(record.channel, record.data))
+                if kind == "bag" and not record.channel.topic.startswith("/tf"):
+                    data = struct.pack("<I", record.sequence) + data[4:]  # of the header
+                writer.write(replace(record, channel=channels[record.channel.id], data=data))
+
+
+# ---------------------------------------------------------------- messages
+
+_Made = tuple[int, str, int, Callable[[], dict[str, Any]]]
+"""Log time, topic, sequence number, and what makes the message."""
+
+
+def _messages(seconds: float) -> Iterator[_Made]:
     rng = np.random.default_rng(1)
+    yield START_NS, "/tf_static", 0, _mounts
     # images are made as they are written: only one is in memory at a time
-    for hertz, topic, make in ((IMU_HZ, "/imu", _imu), (TF_HZ, "/tf", _transform)):
+    for hertz, topic, make in ((IMU_HZ, "/imu", _imu), (TF_HZ, "/tf", _odometry)):
         for seq in range(max(1, int(seconds * hertz))):
             stamp = START_NS + seq * 10**9 // hertz
-            yield stamp + int(rng.integers(50_000, 400_000)), topic, partial(make, seq, stamp)
+            yield stamp + int(rng.integers(50_000, 400_000)), topic, seq, partial(make, stamp)
     for camera in _CAMERAS:
         for seq in range(max(1, int(seconds * CAMERA_HZ))):
             # a shutter that is sometimes a little late, and a driver that is later still
             stamp = START_NS + seq * 10**9 // CAMERA_HZ + int(rng.integers(0, 200_000))
             log_time = stamp + int(rng.integers(4_000_000, 9_000_000))
-            yield log_time, f"/{camera.name}/image_raw", partial(_image, camera, seq, stamp)
-            info = partial(_camera_info, camera, seq, stamp)
-            yield log_time + 20_000, f"/{camera.name}/camera_info", info
+            image = partial(_image, camera, seq, stamp)
+            yield log_time, f"/{camera.name}/image_raw", seq, image
+            info = partial(_camera_info, camera, stamp)
+            yield log_time + 20_000, f"/{camera.name}/camera_info", seq, info
 
 
-def _image(camera: _Camera, seq: int, stamp: int) -> bytes:
+def _header(stamp: int, frame_id: str) -> dict[str, Any]:
+    sec, nanosec = divmod(stamp, 10**9)
+    return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
+
+
+def _image(camera: _Camera, seq: int, stamp: int) -> dict[str, Any]:
     rgb = _view(camera, (stamp - START_NS) / 1e9)
     generator = np.random.default_rng((seq, camera.channels))
     noise = _NOISE * generator.standard_normal(rgb.shape, np.float32)
@@ -123,18 +185,15 @@ def _image(camera: _Camera, seq: int, stamp: int) -> bytes:
         for row, column, color in ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2)):  # rggb
             mosaic[row::2, column::2] = pixels[row::2, column::2, color]
         pixels = mosaic
-    fields = ImageFields(
-        encoding=camera.encoding,
-        width=WIDTH,
-        height=HEIGHT,
-        step=WIDTH * camera.channels,
-        is_bigendian=0,
-    )
-    return _ros1(_IMAGE_TYPE, f"{camera.name}_optical", fields, Slots(stamp, seq), pixels.tobytes())
-
-
-def _ros1(type_name: str, frame_id: str, fields: Fields, slots: Slots, body: bytes = b"") -> bytes:
-    return plain_message("ros1", type_name, frame_id, fields, slots, body)
+    return {
+        "header": _header(stamp, f"{camera.name}_optical"),
+        "height": HEIGHT,
+        "width": WIDTH,
+        "encoding": camera.encoding,
+        "is_bigendian": 0,
+        "step": WIDTH * camera.channels,
+        "data": pixels.tobytes(),
+    }
 
 
 def _view(camera: _Camera, time: float) -> NDArray[np.float32]:
@@ -159,41 +218,54 @@ def _view(camera: _Camera, time: float) -> NDArray[np.float32]:
     return picture
 
 
-def _camera_info(camera: _Camera, seq: int, stamp: int) -> bytes:
+def _camera_info(camera: _Camera, stamp: int) -> dict[str, Any]:
     fx, cx, cy = 300.0, WIDTH / 2, HEIGHT / 2
-    fields = CalibrationFields(
-        height=HEIGHT,
-        width=WIDTH,
-        distortion_model="plumb_bob",
-        d=(-0.31389, 0.088223, -0.000123, -0.001852, 0.0),
-        k=(fx, 0.0, cx, 0.0, fx, cy, 0.0, 0.0, 1.0),
-        r=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
-        p=(fx, 0.0, cx, -fx * camera.offset, 0.0, fx, cy, 0.0, 0.0, 0.0, 1.0, 0.0),
-    )
-    return _ros1(_INFO_TYPE, f"{camera.name}_optical", fields, Slots(stamp, seq))
+    return {
+        "header": _header(stamp, f"{camera.name}_optical"),
+        "height": HEIGHT,
+        "width": WIDTH,
+        "distortion_model": "plumb_bob",
+        "d": [-0.31389, 0.088223, -0.000123, -0.001852, 0.0],
+        "k": [fx, 0.0, cx, 0.0, fx, cy, 0.0, 0.0, 1.0],
+        "r": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        "p": [fx, 0.0, cx, -fx * camera.offset, 0.0, fx, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+    }
 
 
-def _header(seq: int, stamp: int, frame_id: str) -> bytes:
-    name = frame_id.encode()
-    return struct.pack(f"<IIII{len(name)}s", seq, *divmod(stamp, 10**9), len(name), name)
-
-
-def _imu(seq: int, stamp: int) -> bytes:
+def _imu(stamp: int) -> dict[str, Any]:
     time = (stamp - START_NS) / 1e9
-    orientation = (0.0, 0.0, 0.0, 1.0)
-    turn = (0.0, 0.0, 0.05 * float(np.sin(time)))
-    acceleration = (0.1 * float(np.cos(time)), 0.0, 9.81)
-    covariance = (0.01, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.01)
-    values = (*orientation, *covariance, *turn, *covariance, *acceleration, *covariance)
-    return _header(seq, stamp, "imu") + struct.pack("<37d", *values)
+    covariance = [0.01, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.01]
+    return {
+        "header": _header(stamp, "imu"),
+        "orientation": {"w": 1.0},
+        "orientation_covariance": covariance,
+        "angular_velocity": {"z": 0.05 * float(np.sin(time))},
+        "angular_velocity_covariance": covariance,
+        "linear_acceleration": {"x": 0.1 * float(np.cos(time)), "z": 9.81},
+        "linear_acceleration_covariance": covariance,
+    }
 
 
-def _transform(seq: int, stamp: int) -> bytes:
-    child = b"base_link"
-    position = (0.8 * (stamp - START_NS) / 1e9, 0.0, 0.0)
-    return (
-        struct.pack("<I", 1)
-        + _header(seq, stamp, "odom")
-        + struct.pack(f"<I{len(child)}s", len(child), child)
-        + struct.pack("<7d", *position, 0.0, 0.0, 0.0, 1.0)
-    )
+def _odometry(stamp: int) -> dict[str, Any]:
+    position = {"x": 0.8 * (stamp - START_NS) / 1e9}
+    return {"transforms": [_transform(stamp, "odom", "base_link", position, {"w": 1.0})]}
+
+
+def _mounts() -> dict[str, Any]:
+    forward = {"x": -0.5, "y": 0.5, "z": -0.5, "w": 0.5}  # an optical frame's z axis
+    mounts = [
+        (f"{camera.name}_optical", {"x": 0.3, "y": camera.offset, "z": 0.4}, forward)
+        for camera in _CAMERAS
+    ]
+    mounts.append(("imu", {}, {"w": 1.0}))
+    return {"transforms": [_transform(START_NS, "base_link", *mount) for mount in mounts]}
+
+
+def _transform(
+    stamp: int, parent: str, child: str, position: dict[str, float], rotation: dict[str, float]
+) -> dict[str, Any]:
+    return {
+        "header": _header(stamp, parent),
+        "child_frame_id": child,
+        "transform": {"translation": position, "rotation": rotation},
+    }

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.convert import latched, ros2_channel
+from mp4ds.bags.convert import LATCHED_QOS, ros2_channel
 from mp4ds.bags.protocols import Format
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.files.outputs import csv_cell
@@ -193,11 +193,11 @@ class ImagesReader:
         if scene.transforms:
             payload = transforms_message(self._start, scene.transforms)
             stamps = np.array([self._start], np.int64)
-            channel = latched(self._channel(_TF_STATIC, TRANSFORMS))
+            channel = self._channel(_TF_STATIC, TRANSFORMS, LATCHED_QOS)
             self._tracks.insert(0, _Track(channel, stamps, lambda _: payload))
 
-    def _channel(self, topic: str, type_name: str) -> Channel:
-        return ros2_channel(len(self._tracks), topic, type_name)
+    def _channel(self, topic: str, type_name: str, qos: str = "") -> Channel:
+        return ros2_channel(len(self._tracks), topic, type_name, qos)
 
     def _add_camera(self, camera: SceneCamera) -> None:
         is_jpeg = np.array([path.suffix.lower() in _JPEG for path in camera.files], bool)
