@@ -408,7 +408,7 @@ def test_tiles_are_played_where_no_proxies_are_wanted(packed_bag: Path, tmp_path
     (camera,) = summary.cameras
     assert (camera.plays, camera.note) == (
         "video",
-        "the coded picture does not show the image (layout mosaic8)",
+        "the video stores bayer_rggb8 and does not look like the image",
     )
     (facts,) = data_of(output)["cameras"]
     assert (

@@ -7,6 +7,7 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -58,6 +59,17 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
     with chromium(tmp_path_factory.mktemp("profile")) as tab:
         yield tab
+
+
+@contextmanager
+def window(browser: Tab, width: int, height: int) -> Iterator[None]:
+    """Another size of the window."""
+    size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+    browser.command("Emulation.setDeviceMetricsOverride", **size)
+    try:
+        yield
+    finally:
+        browser.command("Emulation.clearDeviceMetricsOverride")
 
 
 def show(browser: Tab, url: str) -> Tab:
@@ -475,9 +487,7 @@ def test_the_address_leads_to_a_time(wall: Tab) -> None:
 
 
 def test_names_and_numbers_are_whole_on_a_phone(browser: Tab, array: Path) -> None:
-    size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": False}
-    browser.command("Emulation.setDeviceMetricsOverride", **size)
-    try:
+    with window(browser, 390, 844):
         show(browser, (array / "index.html").as_uri())
         cut = browser.evaluate(
             "[...document.querySelectorAll('h1, h3, .camera .kind, .camera dd, .clock, .facts dd,"
@@ -490,8 +500,6 @@ def test_names_and_numbers_are_whole_on_a_phone(browser: Tab, array: Path) -> No
         stamp = browser.evaluate("mp4dsReport.player.cameras[0].values.stamp.clientHeight")
         assert stamp < 25  # on one line
         assert browser.evaluate("document.documentElement.scrollWidth") <= 390
-    finally:
-        browser.command("Emulation.clearDeviceMetricsOverride")
 
 
 def test_the_clock_waits_on_a_busy_machine(wall: Tab) -> None:
@@ -526,11 +534,54 @@ def test_the_clock_waits_on_a_busy_machine(wall: Tab) -> None:
 # ---------------------------------------------------------------- sizes, names and troubles
 
 
+@each("count", [1, 3, 8])
+def test_all_cameras_are_above_the_controls(count: int, browser: Tab, tmp_path: Path) -> None:
+    folder = pack_cameras(tmp_path, many_cameras(count, stampless=-1))
+    report(folder)
+    with window(browser, 1400, 900):
+        show(browser, (folder / "index.html").as_uri())
+        bottoms = browser.evaluate(
+            "[...document.querySelectorAll('.camera')].map(c => c.getBoundingClientRect().bottom)"
+        )
+        assert len(bottoms) == count
+        bar = browser.evaluate("document.querySelector('#transport').getBoundingClientRect().top")
+        assert max(bottoms) <= bar
+        assert browser.evaluate("document.querySelector('video').clientWidth") >= 180
+
+
+def test_the_controls_leave_room_on_a_phone(wall: Tab) -> None:
+    height = "document.querySelector('#transport').offsetHeight"
+    seen = "document.querySelector('#%s').offsetParent !== null"
+    with window(wall, 390, 844):
+        until(lambda: wall.evaluate(height) < 844 / 5)  # of fourteen cameras
+        for name, is_seen in {"play": True, "seconds": True, "speed": False}.items():
+            assert wall.evaluate(seen % name) == is_seen, name
+        wall.evaluate("document.querySelector('#options').click()")
+        for name in ("speed", "lead", "grid", "goto-time", "date"):
+            assert wall.evaluate(seen % name), name
+        assert wall.evaluate("document.documentElement.scrollWidth") <= 390
+    assert not wall.evaluate(seen % "options")
+
+
+@each("second", [0, 1e9])
+def test_the_cursor_hides_no_time(second: float, page: Tab) -> None:
+    """The line and its knob are below the labels, and whole at either end."""
+    page.evaluate(f"mp4dsReport.player.go({second}); mp4dsReport.settled()")
+    blue = page.evaluate(
+        "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => {"
+        " const c = document.querySelector('#timeline'), w = c.width, rows = [];"
+        " const data = c.getContext('2d').getImageData(0, 0, w, 26).data;"
+        " for (let y = 0; y < 26; y++) { let n = 0; for (let x = 0; x < w; x++) {"
+        " const [r, g, b, a] = data.slice(4 * (y * w + x), 4 * (y * w + x) + 4);"
+        " n += a > 200 && b > r + 100; } rows.push(n); } done(rows); })))"
+    )
+    assert sum(blue[:13]) == 0
+    assert max(blue) >= 9
+
+
 @pytest.mark.parametrize("width", [1280, 1920, 420])
 def test_the_page_fits_the_window(width: int, browser: Tab, drive: Path) -> None:
-    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
-    browser.command("Emulation.setDeviceMetricsOverride", **size)
-    try:
+    with window(browser, width, 900):
         show(browser, (drive / "index.html").as_uri())
         assert browser.evaluate("document.documentElement.scrollWidth") <= width
         assert browser.evaluate("document.querySelector('video').clientWidth") > 0.4 * width / 2
@@ -538,8 +589,6 @@ def test_the_page_fits_the_window(width: int, browser: Tab, drive: Path) -> None
             "(v => v.clientWidth / v.clientHeight)(document.querySelector('video'))"
         )
         assert ratio == pytest.approx(WIDTH / HEIGHT, rel=0.02)
-    finally:
-        browser.command("Emulation.clearDeviceMetricsOverride")
 
 
 def test_videos_of_10_bits_are_shown_as_they_are(browser: Tab, tmp_path: Path) -> None:

@@ -54,8 +54,9 @@ def print_evaluation(result: Evaluation) -> None:
             say(f"{item.why} for all cameras: {item.options} (score at least {item.score:.2f})")
         if not result.recommended:
             say("no setting reaches every camera's target")
-    known = f", {result.known} reused from an earlier run" if result.known else ""
-    say(f"{path_text(result.output)}/index.html: {counted(result.tried, 'setting')} tried{known}")
+    known = f", {result.known} of them in an earlier run" if result.known else ""
+    tried = counted(result.tried + result.known, "setting")
+    say(f"{path_text(result.output)}/index.html: {tried} tried{known}")
 
 
 def _print_camera(camera: CameraEvaluation) -> None:

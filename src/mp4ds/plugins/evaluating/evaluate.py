@@ -11,7 +11,6 @@ import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +98,7 @@ class CameraTrial:
         self._notes: list[str] = []
         self._done = 0
         self._total = len(grid.settings())
+        self.known = 0  # settings with results of an earlier run
 
     def run(self, origin: int) -> CameraEvaluation:
         """Try all settings.
@@ -124,6 +124,7 @@ class CameraTrial:
         ceiling = _measured(measured, None)["scores"]
         reachable = reachable_score(target, ceiling[target.metric].mean)
         cells = self._cells(place, {item: measured[item] for item in settings})
+        self.known = sum(not self._trials.is_new(place, cell.setting) for cell in cells)
         self._note(clip, reachable, cells)
         recommended = recommend([(cells, reachable)], target)
         rates = self._rates()
@@ -365,12 +366,13 @@ def evaluate(
                 trial = CameraTrial(camera, name, chosen, grid, trials, work, progress)
                 try:
                     result.cameras.append(trial.run(origin))
+                    result.known += trial.known
                 except Refused as reason:
                     result.left_out[camera.topic] = str(reason)
         _refuse_none(result)
         rated = [(camera.cells, camera.reachable) for camera in result.cameras]
         result.recommended = recommend(rated, chosen.wanted)
-        result = replace(result, tried=trials.tried, known=trials.known)
+        result.tried = sum(len(camera.cells) for camera in result.cameras) - result.known
         write_files(result, chosen)
     return result
 

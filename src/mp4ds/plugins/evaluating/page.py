@@ -7,7 +7,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
@@ -15,7 +15,13 @@ from typing import Any
 
 from mp4ds.files.outputs import csv_cell, write_synced
 from mp4ds.plugins.evaluating.options import EvaluateOptions
-from mp4ds.plugins.evaluating.results import CameraEvaluation, Cell, Evaluation, pareto, score_of
+from mp4ds.plugins.evaluating.results import (
+    CameraEvaluation,
+    Cell,
+    Evaluation,
+    pareto,
+    score_of,
+)
 from mp4ds.video.drawing import Dot, Line, Shape, Text, png_of, svg_of
 from mp4ds.video.scores import METRICS
 
@@ -161,15 +167,17 @@ def _level(up: _Axis, score: float, words: str, color: str) -> list[Shape]:
 
 _STYLE = """
 body { font: 14px/1.45 system-ui, sans-serif; color: #222; margin: 2em auto; max-width: 1340px;
-       padding: 0 1em; }
-table { border-collapse: collapse; margin: 1em 0; font-variant-numeric: tabular-nums; }
+       padding: 0 1em; overflow-wrap: anywhere; }
+.scroll { overflow-x: auto; margin: 1em 0; overflow-wrap: normal; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: 2px 9px; text-align: right; border-bottom: 1px solid #e4e4e4; }
 th { border-bottom: 1px solid #888; }
 td.word, th.word { text-align: left; }
 tr.chosen { background: #e7f4e4; }
 .plots, .pictures { display: flex; flex-wrap: wrap; gap: 12px; }
-figure { margin: 0; }
-figure img { display: block; image-rendering: pixelated; }
+figure { margin: 0; max-width: 100%; }
+figure img, figure svg { display: block; max-width: 100%; height: auto; }
+figure img { image-rendering: pixelated; }
 figcaption { font-size: 12px; }
 code { background: #f2f2f2; padding: 1px 4px; }
 .first { font-size: 16px; line-height: 1.8; }
@@ -195,6 +203,7 @@ def page(result: Evaluation) -> str:
     body = "\n".join([f"<h1>{title}</h1>", *_head(result), *_sections(result)])
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{title}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
     )
 
@@ -247,17 +256,20 @@ def _facts(camera: CameraEvaluation) -> str:
     )
 
 
-def _table(heads: Sequence[str], rows: Iterator[tuple[bool, Sequence[str]]], words: int) -> str:
+def _table(heads: Sequence[str], rows: Iterable[tuple[bool, Sequence[str]]], words: int) -> str:
+    """A table without the columns that are empty, such as scores that were not computed."""
+    rows = list(rows)
+    kept = [n for n in range(len(heads)) if any(values[n] for _, values in rows)]
+
     def cells(tag: str, values: Sequence[str]) -> str:
         return "".join(
-            f"<{tag}{' class=word' if number < words else ''}>{escape(value)}</{tag}>"
-            for number, value in enumerate(values)
+            f"<{tag}{' class=word' if n < words else ''}>{escape(values[n])}</{tag}>" for n in kept
         )
 
     lines = [f"<tr>{cells('th', heads)}</tr>"]
     for is_chosen, values in rows:
         lines.append(f"<tr{' class=chosen' if is_chosen else ''}>{cells('td', values)}</tr>")
-    return "<table>\n" + "\n".join(lines) + "\n</table>"
+    return '<div class="scroll"><table>\n' + "\n".join(lines) + "\n</table></div>"
 
 
 def _cells(camera: CameraEvaluation) -> str:

@@ -205,8 +205,8 @@ class Evaluation:
         versions: Of the software that made the videos and scores.
         recommended: The smallest and the fastest setting that reach the targets of all cameras,
             with their lowest score; empty if none.
-        tried: Settings tried in this run.
-        known: Settings with existing results.
+        tried: Cells measured in this run.
+        known: Cells measured in an earlier one.
     """
 
     source: Path

@@ -378,8 +378,11 @@ class Trials:
         self._engines = engines
         self._versions = versions
         self._threads = threads
-        self.tried = 0
-        self.known = 0
+        self._made: set[Path] = set()
+
+    def is_new(self, place: ClipPlace, setting: Setting) -> bool:
+        """Whether a setting was tried in this run, not in an earlier one."""
+        return self._result(place, setting) in self._made
 
     def run(
         self,
@@ -412,7 +415,6 @@ class Trials:
             job = self._work / f"{self._name(place, setting)}.job"
             write_synced(job, self._trial(place, setting).to_json())
             tasks[(str(job),)] = setting
-        self.known += len(found)
         on_done(len(found.keys() - {None}))
         engine = self._engines.engine(task_bytes(place.clip, settings, self._threads))
         with closing(engine.run(list(tasks), lambda *_: None)) as outcomes:
@@ -436,7 +438,7 @@ class Trials:
             )
         result = None if sentence else self._read(place, setting)
         if result is not None:
-            self.tried += 1
+            self._made.add(self._result(place, setting))
             return result
         if setting is None:
             raise ScoringError(sentence)

@@ -224,7 +224,7 @@ def why_not_seen(stream: Stream) -> str:
     """Why a stream's video does not look like its images; empty if it does."""
     if stream.sidecar.body == "packet" or stream.sidecar.layout.is_shown:
         return ""
-    return f"the coded picture does not show the image (layout {stream.sidecar.video.layout})"
+    return f"the video stores {stream.encoding} and does not look like the image"
 
 
 def proxy_size(image_size: tuple[int, int], width: int) -> tuple[int, int]:

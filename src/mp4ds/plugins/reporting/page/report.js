@@ -107,11 +107,29 @@ var mp4dsReport = (() => {
     arrange();
   }
 
-  /** Lay out the visible cameras in columns, and list the hidden ones. */
+  /** Use the columns in which the cameras are largest while all of them are above the controls. */
+  function fit(cameras) {
+    const grid = find("cameras"), {style} = grid, gap = 14, count = cameras.length;
+    const height = innerHeight - grid.offsetTop - find("transport").offsetHeight - 2 * gap;
+    const ratio = Math.min(...cameras.map(({facts}) => facts.width / facts.height));
+    const heightOf = ({panel, stage}) => [...panel.children].reduce((sum, child) => sum + (child === stage ? 0 : child.offsetHeight), 2);
+    // pictures that are smaller still show too little: the page scrolls instead
+    let best = {columns: count <= 1 ? 1 : count <= 4 ? 2 : count <= 9 ? 3 : 4, tall: "", width: 180};
+    for (let columns = 1; columns <= count; columns++) {
+      style.setProperty("--columns", String(columns));
+      const rows = Math.ceil(count / columns), tall = (height + gap) / rows - gap - Math.max(...cameras.map(heightOf));
+      const width = Math.min((grid.clientWidth + gap) / columns - gap, tall * ratio);
+      if (width > best.width) best = {columns, tall: `${tall}px`, width};
+    }
+    style.setProperty("--columns", String(best.columns));
+    style.setProperty("--tall", best.tall);
+  }
+
+  /** Lay out the visible cameras, and list the hidden ones. */
   function arrange() {
-    const hidden = player.cameras.filter(camera => camera.isHidden), count = player.cameras.length - hidden.length;
-    find("cameras").style.setProperty("--columns", String(count <= 1 ? 1 : count <= 4 ? 2 : count <= 9 ? 3 : 4));
-    for (const camera of player.cameras) camera.close.hidden = count <= 1;
+    const hidden = player.cameras.filter(camera => camera.isHidden), shown = player.cameras.filter(camera => !camera.isHidden);
+    for (const camera of player.cameras) camera.close.hidden = shown.length <= 1;
+    fit(shown);
     find("hidden").hidden = !hidden.length;
     find("hidden").replaceChildren("Hidden:", ...hidden.map(camera => {
       const dot = element("span", {class: "dot"}), show = element("button", {type: "button", title: "Show again"}, [dot, camera.facts.name]);
@@ -216,7 +234,8 @@ var mp4dsReport = (() => {
 
   function refresh() {
     const base = BigInt(data.base), seconds = player.time / 1e9;
-    find("clock").textContent = `${seconds.toFixed(6)} s   ${mp4dsTables.dateText(base + BigInt(Math.round(player.time)))}`;
+    find("seconds").textContent = `${seconds.toFixed(6)} s`;
+    find("date").textContent = mp4dsTables.dateText(base + BigInt(Math.round(player.time)));
     const play = find("play");
     play.classList.toggle("playing", player.isPlaying);
     play.setAttribute("aria-label", player.isPlaying ? "Pause" : "Play");
@@ -287,7 +306,10 @@ var mp4dsReport = (() => {
       event.preventDefault();
       action();
     });
-    addEventListener("resize", redraw);
+    find("options").addEventListener("click", event => {
+      event.currentTarget.setAttribute("aria-expanded", String(find("transport").classList.toggle("open")));
+    });
+    addEventListener("resize", arrange);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   }
 
@@ -345,6 +367,8 @@ var mp4dsReport = (() => {
     addPlots();
     player.listeners.push(refresh);
     player.go(timeOfAddress() ?? 0);
+    timeline.draw();  // the controls now have their height
+    arrange();
   }
 
   /** Receives the page's data; called by report/data.js. */

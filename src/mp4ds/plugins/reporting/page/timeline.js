@@ -35,7 +35,7 @@ var mp4dsTimeline = (() => {
 
     /** The lanes change only with the view; the time cursor moves over them. */
     draw() {
-      const {player, view} = this, lanes = player.cameras.length, row = lanes > 8 ? 5 : 8, top = 18;
+      const {player, view} = this, lanes = player.cameras.length, row = Math.max(3, Math.min(8, Math.floor(48 / lanes))), top = 26;
       const [context, width, height] = mp4dsPlots.prepare(this.canvas, top + lanes * row + 4), colours = mp4dsPlots.theme();
       const xOf = time => (time - view.from) / (view.to - view.from || 1) * width;
       const marks = mp4dsPlots.ticks(view.from / 1e9, view.to / 1e9, width / 110), digits = mp4dsPlots.digitsOf(marks);
@@ -46,13 +46,13 @@ var mp4dsTimeline = (() => {
         const x = xOf(mark * 1e9), text = mp4dsPlots.timeText(mark, digits);
         context.textAlign = x < 24 ? "left" : x > width - 24 ? "right" : "center";
         context.fillText(text, x, 7);
-        context.beginPath(); context.moveTo(x, top - 3); context.lineTo(x, height); context.stroke();
+        context.beginPath(); context.moveTo(x, top - 11); context.lineTo(x, height); context.stroke();
       }
       player.cameras.forEach((camera, lane) => { if (camera.position) this.lane(context, camera, top + lane * row, row - 2, width, colours); });
-      const x = xOf(player.time);
+      const x = Math.max(5, Math.min(width - 5, xOf(player.time)));  // whole at both ends
       context.fillStyle = colours.accent;
-      context.fillRect(x - 1, 0, 2, height);
-      context.beginPath(); context.arc(x, 5, 5, 0, 7); context.fill();
+      context.fillRect(x - 1, top - 7, 2, height - top + 7);
+      context.beginPath(); context.arc(x, top - 7, 5, 0, 7); context.fill();
     }
 
     lane(context, camera, y, height, width, colours) {
