@@ -173,6 +173,16 @@ def test_every_public_name_is_in_the_reference(site: Path) -> None:
         assert all(any(f"<code>{name}</code>" in page for page in pages) for name in fields), kind
 
 
+def test_the_reference_is_of_what_programs_use(site: Path) -> None:
+    """And of nothing that only the package itself uses."""
+    page = (site / "api" / "reading" / "index.html").read_text()
+    members = re.findall(r'<h3 id="mp4ds\.Dataset\.(\w+)"', page)
+    assert set(members) == {"topics", "channels", "profile", "messages", "sync", "close"}
+    for path in (site / "api").rglob("index.html"):
+        text = re.sub("<[^>]+>", "", path.read_text())
+        assert re.findall(r"(?<![\w.])_[A-Za-z]\w+", text) == [], path
+
+
 # ---------------------------------------------------------------- looks
 
 

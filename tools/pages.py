@@ -10,6 +10,7 @@ from __future__ import annotations
 import html
 import posixpath
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,14 @@ API = {
     "torch": ("PyTorch", ("torch.",)),
 }
 """Page -> its title, and where the names on it live; a name is on the first page that has it."""
+MEMBERS = {
+    "Dataset": ("topics", "messages", "sync", "channels", "profile", "close"),
+    "Stream": ("topic", "video_path", "columns"),
+    "TopicFrames": (),
+    "Video": ("video_path",),
+}
+"""Class -> what programs need of it, besides what it has of `Frames`; the rest is for the package
+itself."""
 _HIDDEN = ("repack",)  # another name of `pack`
 _COMMANDS = "docs/commands/"
 _API = "docs/api/"
@@ -104,12 +113,15 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
-    """Refuse a page that nobody would find."""
+    """Refuse a page that nobody would find, or that is listed twice."""
     missing = [file.src_uri for file in files.documentation_pages() if file.page is None]
     listed = {page.file.src_uri for page in nav.pages}
     missing += [file.src_uri for file in files.documentation_pages() if file.src_uri not in listed]
     if missing:
         raise PluginError(f"mkdocs.yml, nav: has no {', '.join(sorted(set(missing)))}")
+    places = Counter(page.file.src_uri for page in nav.pages)
+    if twice := [place for place, count in places.items() if count > 1]:
+        raise PluginError(f"mkdocs.yml, nav: has {', '.join(twice)} twice")
     return nav
 
 
@@ -245,8 +257,11 @@ def api_text(page: str, title: str) -> str:
         value = None if page == "torch" else getattr(mp4ds, name)
         is_options = isinstance(value, type) and issubclass(value, Options)
         parts.append(f"::: mp4ds.{'torch.' if page == 'torch' else ''}{name}")
-        if is_options:
-            parts.append("    options:\n      members: false\n      show_bases: false")
+        if is_options:  # its fields follow, as a table
+            hidden = ("members", "show_bases", "show_signature")
+            parts.append("    options:\n" + "\n".join(f"      {name}: false" for name in hidden))
+        elif name in MEMBERS:
+            parts.append(f"    options:\n      members: {list(MEMBERS[name]) or 'false'}")
         parts.append("")
         if is_options and value:
             parts += [_options_table(value), ""]

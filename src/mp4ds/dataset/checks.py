@@ -65,7 +65,10 @@ class Problem:
 
 
 def validate(
-    path: Path | str, *, deep: bool = False, progress: _Report | None = None
+    path: Path | str,
+    *,
+    deep: bool = False,
+    progress: Callable[[str, float | None], None] | None = None,
 ) -> list[Problem]:
     """Find all problems of a sidecar, a video with its sidecar, a dataset, or a folder of them.
 

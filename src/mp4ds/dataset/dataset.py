@@ -42,7 +42,6 @@ from mp4ds.times import Sync, synchronize
 
 _VIDEOS = (".mp4", ".m4v", ".mov")
 _RECORDINGS = (".bag", ".mcap", ".db3")
-_JPEG_QUALITY = 95
 _MOST_TOPICS = 4  # named in a repr
 
 
@@ -71,7 +70,7 @@ class Dataset:
         FormatError: A file breaks a rule of the format.
     """
 
-    def __init__(self, path: Path | str, *, jpeg_quality: int = _JPEG_QUALITY) -> None:
+    def __init__(self, path: Path | str, *, jpeg_quality: int = 95) -> None:
         self.path = location(path)
         if not self.path.exists():
             raise SourceNotFoundError(self.path)
@@ -106,7 +105,7 @@ class Dataset:
     def of(cls, folder: Path, manifest: Manifest, streams: Sequence[Stream]) -> Dataset:
         """A folder whose sidecars have already been read."""
         dataset = cls.__new__(cls)
-        dataset.path, dataset.manifest, dataset.jpeg_quality = folder, manifest, _JPEG_QUALITY
+        dataset.path, dataset.manifest, dataset.jpeg_quality = folder, manifest, 95
         dataset.streams, dataset.videos = list(streams), []
         return dataset
 

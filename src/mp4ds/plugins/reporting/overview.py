@@ -217,7 +217,7 @@ def _row(path: Path, told: Brief | None, number: int, place: Path, made: Path) -
             with suppress(ValueError, OverflowError, OSError):
                 moment = datetime.fromtimestamp(told.start // _NS, timezone.utc)
                 begun = f"{moment:%Y-%m-%d %H:%M:%S}"
-        cameras = "<br>".join(f"{html.escape(t)}: {n}" for t, n in told.frames.items())
+        cameras = "<br>".join(f"{html.escape(t)}: {n}" for t, n in sorted(told.frames.items()))
         cells = [
             begun,
             f"{told.seconds:.1f} s",
