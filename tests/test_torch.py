@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
@@ -553,6 +554,19 @@ def test_a_copy_has_no_open_videos(drives: list[Path]) -> None:
     again = pickle.loads(data)
     assert len(again._reader.cameras) == 0
     assert torch.equal(again[6][RIGHT], sample[RIGHT])
+
+
+def test_threads_that_share_a_dataset(drives: list[Path]) -> None:
+    """Also where each closes the video that another one reads."""
+    dataset = FrameDataset(drives[0], cache_files=1)
+    expected = [dataset[number] for number in range(8)]
+
+    def alike(seed: int) -> bool:
+        numbers = np.random.default_rng(seed).permutation(len(expected)).tolist()
+        return all(torch.equal(dataset[n][RIGHT], expected[n][RIGHT]) for n in numbers)
+
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(alike, range(8))) == [True] * 8
 
 
 def test_a_forked_child_opens_its_own(drives: list[Path]) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import index as as_integer
 from reprlib import repr as shortened
@@ -206,7 +208,8 @@ class Frames(ABC):
     """A sequence of frames, decoded on demand.
 
     ``len(frames)``, ``frames[i]``, ``frames[-1]``, ``frames[a:b]`` and iteration work as on a list.
-    Do not share it between threads or across a fork.
+    Threads that share it wait for each other; a process made by a fork opens the video itself. An
+    iterator belongs to one thread of one process.
 
     Options for returning frames other than as recorded:
 
@@ -471,18 +474,46 @@ class Frames(ABC):
 # ---------------------------------------------------------------- frames of one video
 
 
+@dataclass(slots=True)
+class _Opened:
+    """What a process has open of a video.
+
+    Attributes:
+        lock: Held while anything of it is used: two threads in one decoder crash.
+        reader: The decoder for frames by number.
+        view: The last view, with its key.
+        inherited: Iterators of another process, kept as they are: to free their decoders would
+            be to wait for threads that a fork does not copy.
+    """
+
+    lock: threading.RLock = field(default_factory=threading.RLock)
+    reader: FrameReader | None = None
+    view: tuple[str, View] | None = None
+    inherited: list[object] = field(default_factory=list)
+
+
 class DecodedFrames(Frames):
     """The frames of one video, all of one size and encoding. See `Frames`."""
 
     def __init__(self) -> None:
-        self._views: dict[str, View] = {}
-        self._reader: FrameReader | None = None
+        # What other processes opened stays in it, for the reason given above.
+        self._processes: dict[int, _Opened] = {}
+
+    @property
+    def _opened(self) -> _Opened:
+        process = os.getpid()
+        return self._processes.get(process) or self._processes.setdefault(process, _Opened())
 
     def close(self) -> None:
         """Close the video, if it is open."""
-        if self._reader is not None:
-            self._reader.close()
-            self._reader = None
+        opened = self._opened
+        with opened.lock:
+            if opened.reader is not None:
+                opened.reader.close()
+                opened.reader = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_processes": {}}
 
     # ------------------------------------------------------------ what makes them
 
@@ -525,23 +556,34 @@ class DecodedFrames(Frames):
 
         Yields:
             Views that are valid until the next one is requested. Nothing else may be read
-            meanwhile.
+            meanwhile, so the caller holds the lock.
 
         Raises:
             VideoError: One cannot be decoded.
         """
         if not len(indices):
             return iter(())
-        if self._reader is None:
-            self._reader = self._open_reader()
-        return self._reader.pictures_of(indices, scale, outs)
+        opened = self._opened
+        if opened.reader is None:
+            opened.reader = self._open_reader()
+        return opened.reader.pictures_of(indices, scale, outs)
 
     # ------------------------------------------------------------ by number
 
     def __iter__(self) -> Iterator[Frame]:
         view = self._view("native", None, None)
-        for index, picture in enumerate(self._pictures(view.scale)):
+        yield from self._one_by_one(enumerate(self._pictures(view.scale)), view)
+
+    def _one_by_one(self, pictures: Iterable[tuple[int, Picture]], view: View) -> Iterator[Frame]:
+        process = os.getpid()
+        for index, picture in pictures:
             yield self._frame(index, picture, view)
+            if os.getpid() != process:
+                self._opened.inherited.append(pictures)
+                raise RuntimeError(
+                    f"an iterator over {self.topic} that process {process} began cannot go on in "
+                    f"process {os.getpid()}, a fork of it: begin it again there"
+                )
 
     def get(
         self,
@@ -555,8 +597,9 @@ class DecodedFrames(Frames):
         numbers = numbers_of(self.topic, len(self), indices)
         view = self._view(format, resize, crop)
         found: dict[int, Frame] = {}
-        for number, picture in self.pictures_of(sorted(set(numbers)), view.scale):
-            found[number] = self._frame(number, picture, view)
+        with self._opened.lock:
+            for number, picture in self.pictures_of(sorted(set(numbers)), view.scale):
+                found[number] = self._frame(number, picture, view)
         given: set[int] = set()
         frames = []
         for number in numbers:
@@ -611,11 +654,12 @@ class DecodedFrames(Frames):
         for place, number in enumerate(numbers):
             places.setdefault(number, []).append(place)
         outs = {number: out[first] for number, (first, *_) in places.items()} if view.scale else {}
-        for number, picture in self.pictures_of(sorted(places), view.scale, outs):
-            first, *others = places[number]
-            self._give(number, picture, view, out[first])
-            for place in others:
-                np.copyto(out[place], out[first])
+        with self._opened.lock:
+            for number, picture in self.pictures_of(sorted(places), view.scale, outs):
+                first, *others = places[number]
+                self._give(number, picture, view, out[first])
+                for place in others:
+                    np.copyto(out[place], out[first])
 
     # ------------------------------------------------------------ by stamp
 
@@ -639,8 +683,7 @@ class DecodedFrames(Frames):
         runs = (run.tolist() for run in np.split(indices, falls) if len(run))
         with self._open_reader() as reader:  # a separate one: more may be read meanwhile
             for run in runs:
-                for index, picture in reader.pictures_of(run, view.scale):
-                    yield self._frame(index, picture, view)
+                yield from self._one_by_one(reader.pictures_of(run, view.scale), view)
 
     # ------------------------------------------------------------ how they are given
 
@@ -651,18 +694,20 @@ class DecodedFrames(Frames):
             OptionError: The format, crop or size is invalid, or not available for these frames.
         """
         key = repr((format, resize, crop))
-        view = self._views.get(key)
-        if view is None:
-            view = view_of(
-                self.topic,
-                self._known_encoding,
-                self.image_size,
-                format=format,
-                resize=resize,
-                crop=crop,
-                shows_colours=self._shows_colours,
-            )
-            self._views = {key: view}  # only the last one: each holds its own tables
+        opened = self._opened
+        last = opened.view  # no more than one: each holds its own tables
+        if last is not None and last[0] == key:
+            return last[1]
+        view = view_of(
+            self.topic,
+            self._known_encoding,
+            self.image_size,
+            format=format,
+            resize=resize,
+            crop=crop,
+            shows_colours=self._shows_colours,
+        )
+        opened.view = key, view
         return view
 
     def _give(self, number: int, picture: Picture, view: View, out: Pixels) -> None:
@@ -682,7 +727,8 @@ class DecodedFrames(Frames):
             data: Pixels = picture[0]
         else:
             data = np.empty(view.shape, view.dtype)
-            self._give(index, picture, view, data)
+            with self._opened.lock:
+                self._give(index, picture, view, data)
         return Frame(
             data=data,
             index=index,

@@ -146,7 +146,7 @@ _Size = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One way of returning the frames of a stream; not to be shared between threads.
+    """One way of returning the frames of a stream; one thread at a time may use it.
 
     Attributes:
         encoding: ROS image encoding of the result.

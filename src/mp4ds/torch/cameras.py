@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import gc
 import os
+import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
@@ -559,6 +561,14 @@ class OpenCamera:
         self.stream.close()
 
 
+@dataclass(slots=True)
+class _Cameras:
+    """The open cameras of one process by place, used by one thread at a time."""
+
+    lock: threading.RLock = field(default_factory=threading.RLock)
+    by_place: OrderedDict[str, OpenCamera] = field(default_factory=OrderedDict)
+
+
 class OpenCameras:
     """The open cameras of one process; the least recently used are closed.
 
@@ -576,50 +586,48 @@ class OpenCameras:
     def __init__(self, most: int, pictures: Pictures) -> None:
         self._most = most
         self._pictures = pictures
-        self._start()
+        # what a parent opened is kept as it is: closing or freeing its decoders could hang
+        self._processes: dict[int, _Cameras] = {}
         if most < 1:
             raise OptionError(f"cache_files is {most}, but must be at least 1.")
 
-    def _start(self) -> None:
-        self._process = os.getpid()
-        self._open: OrderedDict[str, OpenCamera] = OrderedDict()
-        self._inherited: list[OrderedDict[str, OpenCamera]] = []
+    @property
+    def _own(self) -> _Cameras:
+        process = os.getpid()
+        return self._processes.get(process) or self._processes.setdefault(process, _Cameras())
 
     def __len__(self) -> int:
-        return len(self._open)
+        return len(self._own.by_place)
 
-    def get(self, recording: Recording, camera: int) -> OpenCamera:
-        """A camera of a recording, opened if needed.
+    @contextmanager
+    def using(self, recording: Recording, camera: int) -> Iterator[OpenCamera]:
+        """A camera of a recording, opened if needed; other threads wait until it is left.
 
         Raises:
             FormatError: It breaks a rule of the format.
         """
-        if self._process != os.getpid():
-            # kept as it is: closing or freeing the parent's decoders could hang here
-            self._inherited.append(self._open)
-            self._open, self._process = OrderedDict(), os.getpid()
-        source = recording.sources[camera]
-        found = self._open.pop(source.place, None)
-        if found is None:
-            while len(self._open) >= self._most:
-                self._open.popitem(last=False)[1].close()
-            found = OpenCamera(source, self._pictures.views[camera], self._pictures)
-        self._open[source.place] = found
-        return found
+        own = self._own
+        with own.lock:
+            source = recording.sources[camera]
+            found = own.by_place.pop(source.place, None)
+            if found is None:
+                while len(own.by_place) >= self._most:
+                    own.by_place.popitem(last=False)[1].close()
+                found = OpenCamera(source, self._pictures.views[camera], self._pictures)
+            own.by_place[source.place] = found
+            yield found
 
     def close(self) -> None:
         """Close the cameras of this process."""
-        if self._process == os.getpid():
-            while self._open:
-                self._open.popitem()[1].close()
+        own = self._processes.get(os.getpid())
+        if own is not None:
+            with own.lock:
+                while own.by_place:
+                    own.by_place.popitem()[1].close()
 
     def __del__(self) -> None:
         # a decoder left to the garbage collector may be collected in a forked process
         self.close()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"_most": self._most, "_pictures": self._pictures}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._start()
+        return {**self.__dict__, "_processes": {}}

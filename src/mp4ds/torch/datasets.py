@@ -224,8 +224,9 @@ class SampleReader:
             SampleError: Its video cannot be read.
         """
         recording = self._collection.recordings[number]
-        with _named(recording.path, self._collection.topics[0]):
-            return self.cameras.get(recording, 0).key_frames
+        first = self._collection.topics[0]
+        with _named(recording.path, first), self.cameras.using(recording, 0) as camera:
+            return camera.key_frames
 
     def batch(self, samples: int, *, shared: bool) -> Batch:
         """A batch of that many samples; see `Batch`."""
@@ -255,8 +256,8 @@ class SampleReader:
         stamps: list[int] = []
         for camera_number, topic in enumerate(self._collection.topics):
             recording = self._collection.recordings[number]
-            with _named(recording.path, topic):
-                camera = self.cameras.get(recording, camera_number)
+            using = self.cameras.using(recording, camera_number)
+            with _named(recording.path, topic), using as camera:
                 frames, padded = self._offsets.frames(recording, camera_number, camera, rows)
                 whole = None if batch is None else batch.tensor_for(camera, camera_number)
                 if whole is None:

@@ -299,7 +299,7 @@ class Chains:
 class FrameAccess:
     """Random access to the frames of one mp4. A context manager.
 
-    Do not share it between threads or across a fork.
+    One thread at a time may use it, in the process that opened it.
 
     Args:
         path: The video.

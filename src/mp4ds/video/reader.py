@@ -37,7 +37,7 @@ class Seeking(Protocol):
 class FrameReader:
     """Gives frames by number; others are decoded only if necessary.
 
-    A context manager. Not to be shared between threads or over a fork.
+    A context manager. One thread at a time may use it, in the process that opened it.
 
     Args:
         open_access: Opens the decoder of single frames and their references.
