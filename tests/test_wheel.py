@@ -34,7 +34,7 @@ OWN_NAMES = {"xxhash": "python-xxhash"}
 
 
 def built(kind: str, source: Path, target: Path, **environment: str) -> Path:
-    """What hatchling makes of a source tree, without a network: an ``sdist`` or a ``wheel``."""
+    """What hatchling makes of a source tree offline: an ``sdist``, a ``wheel`` or ``editable``."""
     code = f"import hatchling.build as b, sys; print(b.build_{kind}(sys.argv[1]))"
     done = subprocess.run(
         [sys.executable, "-c", code, str(target)],
@@ -43,11 +43,14 @@ def built(kind: str, source: Path, target: Path, **environment: str) -> Path:
         text=True,
         timeout=WATCHDOG_S,
         check=False,
-        # the build imports hatch_build.py from the tree, and would leave it compiled there
         env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1", **environment},
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return target / done.stdout.split()[-1]
+
+
+def contents(folder: Path) -> set[str]:
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +107,10 @@ def test_the_pure_wheel_has_what_the_package_needs_and_no_more(pure: zipfile.Zip
 @pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
 def test_a_compiled_wheel_is_for_its_platform(unpacked: Path, tmp_path: Path) -> None:
     source = shutil.copytree(unpacked, tmp_path / "source")
-    path = built("wheel", source, tmp_path, MP4DS_PURE="0")
+    before = contents(source)
+    # PYTHONDONTWRITEBYTECODE as most have it, or rather have it not
+    path = built("wheel", source, tmp_path, MP4DS_PURE="0", PYTHONDONTWRITEBYTECODE="")
+    assert contents(source) == before  # nothing is compiled into the checkout
     with zipfile.ZipFile(path) as wheel:
         assert "mp4ds/video/_colour.so" in wheel.namelist()
         assert "mp4ds/video/colour.c" not in wheel.namelist()
@@ -122,6 +128,18 @@ def test_a_compiled_wheel_is_for_its_platform(unpacked: Path, tmp_path: Path) ->
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(str(tmp_path / "installed"))
+
+
+@pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
+def test_an_editable_install_is_compiled_where_it_runs(unpacked: Path, tmp_path: Path) -> None:
+    source = shutil.copytree(unpacked, tmp_path / "source")
+    before = contents(source)
+    with zipfile.ZipFile(built("editable", source, tmp_path, MP4DS_PURE="0")) as wheel:
+        assert not [name for name in wheel.namelist() if name.endswith(".so")]
+    made = contents(source) - before
+    assert made == {"src/mp4ds/video/_colour.so"}
+    with zipfile.ZipFile(built("wheel", source, tmp_path, MP4DS_PURE="1")) as wheel:
+        assert not [name for name in wheel.namelist() if name.endswith(".so")]
 
 
 def test_the_sdist_has_its_tests_and_no_rubbish(unpacked: Path) -> None:
