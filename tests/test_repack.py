@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,6 +22,7 @@ from mp4ds.packing.options import PackOptions
 from mp4ds.packing.pack import pack_each
 from mp4ds.plugins.info import info
 from mp4ds.records import Excerpt, Message
+from mp4ds.unpacking.unpack import UnpackOptions
 from round_trips import Compare, journey, own_target, unpacked
 from sources import PERIOD, SOURCES, START, TRAITS, odd_scene, scene, write_bag
 
@@ -147,9 +150,81 @@ def test_a_file_that_is_not_as_it_was_packed(recording: Path, tmp_path: Path) ->
     video = next((tmp_path / "whole").glob("*.mp4"))
     video.write_bytes(video.read_bytes() + b"\0\0\0\x08free")
     for options in (PackOptions(), PackOptions(window=4)):
-        with pytest.raises((SourceError, mp4ds.FormatError), match="SHA-256"):
+        with pytest.raises(mp4ds.FormatError, match=r"SHA-256|the manifest says"):
             mp4ds.pack(tmp_path / "whole", tmp_path / "again", options)
         assert not (tmp_path / "again").exists()
+
+
+def edit_sidecar(dataset: Path) -> Path:
+    """Change a frame_id as an editor would, without the line that tells of it."""
+    path = next(dataset.glob("*image_raw.yaml"))
+    lines = path.read_text().replace("frame_id: c", "frame_id: k", 1).splitlines(keepends=True)
+    path.write_text("".join(line for line in lines if not line.startswith("checksum: ")))
+    with mp4ds.open(dataset) as opened:  # which looks valid
+        assert opened.streams[0].sidecar.headers[0].frame_id.startswith("k")
+    return path
+
+
+def edit_messages(dataset: Path) -> Path:
+    """Change what no checksum inside of the file protects."""
+    path = dataset / "messages.mcap"
+    path.write_bytes(path.read_bytes().replace(b"mp4ds", b"mp4dz", 1))
+    return path
+
+
+def edit_video(dataset: Path) -> Path:
+    """The same."""
+    path = next(dataset.glob("*.mp4"))
+    path.write_bytes(path.read_bytes().replace(b"VideoHandler", b"VideoHandles", 1))
+    return path
+
+
+WAYS: dict[str, dict[str, Any]] = {
+    "copy": {},
+    "slice": {"start": 0.2},
+    "topics": {"exclude": ["/imu"]},
+    "encode": {"quality": "crf=30"},
+    "encode-slice": {"quality": "crf=30", "start": 0.2},
+    "encode-parts": {"quality": "crf=30", "window": 4},
+    "join": {"quality": "crf=30"},
+}
+
+
+@pytest.fixture(scope="module")
+def lossy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset whose frames have no digests; not to be changed."""
+    folder = tmp_path_factory.mktemp("lossy")
+    write_bag(folder / "drive.bag", scene("rgb8", frames=12))
+    mp4ds.pack(folder / "drive.bag", folder / "drive", PackOptions(quality="crf=30", codec="h264"))
+    return folder / "drive"
+
+
+@each("edit", [edit_sidecar, edit_messages, edit_video], ids=lambda one: one.__name__)
+@each("way", WAYS)
+def test_no_manifest_vouches_for_what_was_changed(
+    way: str, edit: Callable[[Path], Path], lossy: Path, tmp_path: Path
+) -> None:
+    changed = edit(Path(shutil.copytree(lossy, tmp_path / "changed")))
+    sources = [tmp_path / "changed", *([lossy] if way == "join" else [])]
+    options = PackOptions(codec="h264" if "quality" in WAYS[way] else None, **WAYS[way])
+    with pytest.raises(mp4ds.FormatError, match=r"--deep` lists what is damaged") as caught:
+        mp4ds.pack(sources, tmp_path / "again", options)
+    assert str(changed) in str(caught.value)
+    assert caught.value.code in ("size-mismatch", "hash-mismatch")
+    assert not (tmp_path / "again").exists()
+
+
+@each("options", [UnpackOptions(), UnpackOptions(start=0.2)], ids=["whole", "slice"])
+@each("to", ["bag", "images"])
+def test_a_changed_sidecar_is_not_unpacked(
+    to: str, options: UnpackOptions, lossy: Path, tmp_path: Path
+) -> None:
+    changed = edit_sidecar(Path(shutil.copytree(lossy, tmp_path / "changed")))
+    with pytest.raises(mp4ds.FormatError, match=f"{changed}.*manifest"):
+        mp4ds.unpack(tmp_path / "changed", to, tmp_path / "again", options)
+    with pytest.raises(mp4ds.FormatError, match=f"{changed}.*manifest"):
+        mp4ds.export(tmp_path / "changed", "kitti", tmp_path / "again")
+    assert not (tmp_path / "again").exists()
 
 
 def test_topics_that_were_left_out(recording: Path, tmp_path: Path) -> None:

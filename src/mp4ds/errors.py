@@ -35,7 +35,8 @@ from __future__ import annotations
 import errno
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -192,6 +193,16 @@ class FormatError(Mp4dsError, ValueError):
         self.place = str(place)
         self.problem = problem
         super().__init__(f"{path_text(place)}: {problem} [{code}].")
+
+
+@contextmanager
+def advising(remedy: str) -> Iterator[None]:
+    """Add to the error of a damaged dataset what the user can do."""
+    try:
+        yield
+    except FormatError as error:
+        error.args = (f"{error} {remedy}",)
+        raise
 
 
 class VersionError(FormatError):

@@ -23,10 +23,9 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import recorded_storage
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import ConversionError, FormatError, SourceError, SourceNotFoundError, VideoError
-from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location
 from mp4ds.format.fields import MESSAGES_NAME
-from mp4ds.format.manifest import FileEntry, Manifest, StreamEntry
+from mp4ds.format.manifest import Manifest, StreamEntry
 from mp4ds.format.models import References, StreamSidecar, VideoModel
 from mp4ds.format.sidecars import (
     MANIFEST_NAME,
@@ -35,6 +34,7 @@ from mp4ds.format.sidecars import (
     load_document,
     model_problems,
     schema_text,
+    verify_file,
 )
 from mp4ds.records import Message, Record
 from mp4ds.video.access import digest_video, packets_in_groups
@@ -188,7 +188,7 @@ def _validate_dataset(folder: Path, deep: bool, report: _Report) -> list[Problem
     if dataset is not None:
         problems += _check_messages(dataset, manifest)
     if deep:
-        problems += _check_hashes(folder, manifest, report)
+        problems += _check_files(folder, manifest, report, deep=True)
         frames = [len(stream) for stream in streams]
         for number, stream in enumerate(streams):
             part = _scaled(report, sum(frames[:number]), sum(frames), frames[number])
@@ -202,34 +202,28 @@ def _validate_dataset(folder: Path, deep: bool, report: _Report) -> list[Problem
     ]
 
 
-def _check_files(folder: Path, manifest: Manifest, report: _Report) -> Iterator[Problem]:
-    """Check that each listed file exists with its size; small ones also with their hash."""
+def _check_files(
+    folder: Path, manifest: Manifest, report: _Report, *, deep: bool = False
+) -> Iterator[Problem]:
+    """Check that each listed file exists with its size; small ones also with their hash.
+
+    Args:
+        folder: The dataset.
+        manifest: Its manifest.
+        report: See `validate`.
+        deep: Check the hash of the others.
+    """
     for entry in manifest.files:
         path = folder / entry.name
-        if not path.is_file():
-            yield Problem("file-missing", str(path), "is listed in the manifest but missing")
+        is_small = path.suffix == ".yaml"
+        if deep and is_small:
             continue
-        size = path.stat().st_size
-        if size != entry.size:
-            yield Problem(
-                "size-mismatch", str(path), f"has {size} bytes, but the manifest says {entry.size}"
-            )
-        elif path.suffix == ".yaml":
-            yield from _check_hash(path, entry, report)
-
-
-def _check_hashes(folder: Path, manifest: Manifest, report: _Report) -> Iterator[Problem]:
-    """Check the hash of each file whose size is right."""
-    for entry in manifest.files:
-        path = folder / entry.name
-        if path.suffix != ".yaml" and path.is_file() and path.stat().st_size == entry.size:
-            yield from _check_hash(path, entry, report)
-
-
-def _check_hash(path: Path, entry: FileEntry, report: _Report) -> Iterator[Problem]:
-    report(f"hashing {path.name}", None)
-    if digest_file(path)[1] != entry.sha256:
-        yield Problem("hash-mismatch", str(path), "does not match the SHA-256 in the manifest")
+        if deep or is_small:
+            report(f"hashing {entry.name}", None)
+        try:
+            verify_file(path, entry, hashed=deep or is_small)
+        except FormatError as error:
+            yield Problem(error.code, error.place, error.problem)
 
 
 def _check_listed(folder: Path, manifest: Manifest) -> Iterator[Problem]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import shlex
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import chain
@@ -36,7 +36,7 @@ from mp4ds.files.sources import HOW_TO_OPEN, is_folder, video_at
 from mp4ds.files.urls import location
 from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.format.manifest import Manifest
-from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, verify_file
 from mp4ds.records import Channel, Excerpt, Message, Record, Schema
 from mp4ds.times import Sync, synchronize
 
@@ -190,10 +190,26 @@ class Dataset:
         """Check messages.mcap against its SHA-256: not all of its contents have their own checksum.
 
         Raises:
-            FormatError: ``file-missing`` or ``hash-mismatch``.
+            FormatError: See `verify_file`.
         """
         if self.manifest:
             self._file.verify(self.manifest)
+
+    def verify_sidecars(self, selected: Callable[[str], bool] = lambda _: True) -> None:
+        """Check sidecars against their SHA-256: an edited one may look valid.
+
+        Args:
+            selected: Of which topics.
+
+        Raises:
+            FormatError: See `verify_file`.
+        """
+        if self.manifest is None:
+            return
+        for stream in self.streams:
+            info = stream.sidecar.camera_info
+            if selected(stream.topic) or (info and selected(info.channel.topic)):
+                verify_file(stream.path, self.manifest.file(stream.path.name))
 
     def other_records(self) -> Iterator[Record]:
         """The attachments and metadata records."""

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from mp4ds.bags.mcap import McapReader
 from mp4ds.errors import FormatError, SourceError
-from mp4ds.files.outputs import digest_file
-from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.format.manifest import Manifest
+from mp4ds.format.sidecars import verify_file
 from mp4ds.messages.wire import WireError
 from mp4ds.records import Channel, Excerpt, Message, MetadataRecord, Record, Schema
 
@@ -34,16 +33,11 @@ class MessagesFile:
         """Check it against its SHA-256: not all of its contents have their own checksum.
 
         Raises:
-            FormatError: ``file-missing`` or ``hash-mismatch``.
+            FormatError: See `verify_file`.
         """
         if self.path is None:
             return
-        self._check_there(self.path)
-        entry = next((item for item in manifest.files if item.name == MESSAGES_NAME), None)
-        if entry is None or digest_file(self.path)[1] != entry.sha256:
-            raise FormatError(
-                "hash-mismatch", self.path, "does not match the SHA-256 in the manifest"
-            )
+        verify_file(self.path, manifest.file(self.path.name))
 
     @staticmethod
     def _check_there(path: Path) -> None:

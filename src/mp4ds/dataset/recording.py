@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from mp4ds.bags.protocols import Format, first_of
 from mp4ds.dataset.dataset import Dataset
+from mp4ds.errors import advising
 from mp4ds.format.manifest import Manifest
-from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_manifest
 from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Record, Schema
 
 _BEST_JPEG = 100
@@ -36,7 +37,9 @@ class DatasetReader:
     """
 
     def __init__(self, path: Path) -> None:
-        self._dataset = Dataset(path, jpeg_quality=_BEST_JPEG)
+        with advising(COPY_AGAIN):
+            self._dataset = Dataset(path, jpeg_quality=_BEST_JPEG)
+            self._dataset.verify_sidecars()
         self.path = self._dataset.path
         self.manifest: Manifest = load_manifest(self.path / MANIFEST_NAME)
         self.profile = self.manifest.recording_profile
@@ -75,9 +78,10 @@ class DatasetReader:
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """See `BagReader.records`."""
         self._read = 0
-        for record in self._records(excerpt):
-            yield record
-            self._read += isinstance(record, Message)
+        with advising(COPY_AGAIN):
+            for record in self._records(excerpt):
+                yield record
+                self._read += isinstance(record, Message)
 
     def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         start, end = excerpt.start, excerpt.end

@@ -33,7 +33,7 @@ from mp4ds.format.manifest import (
     Verbatim,
 )
 from mp4ds.format.models import CameraInfo, ChannelModel, StreamSidecar, video_facts
-from mp4ds.format.sidecars import MANIFEST_NAME, dump_document
+from mp4ds.format.sidecars import MANIFEST_NAME, dump_document, verify_file
 from mp4ds.options import Slice
 from mp4ds.records import EVERYTHING, Channel, Excerpt, Message
 from mp4ds.times import PresentationClock
@@ -155,6 +155,7 @@ class _Part:
         self._selected = selected
         self._is_slice = span.start is not None or span.end is not None
         self._cuts = [self._cut(stream) for stream in dataset.streams]
+        self._copied: list[str] = []  # names of files copied as a whole
 
     def _cut(self, stream: Stream) -> _Cut:
         info, columns = stream.sidecar.camera_info, stream.camera_info_columns
@@ -197,6 +198,7 @@ class _Part:
     def write(self, about: About | None) -> Manifest:
         """Write all files, the manifest last."""
         dataset, folder, old = self._dataset, self._folder, self._old
+        dataset.verify_sidecars(self._selected)
         made = self._write_streams()
         self._write_messages(folder / MESSAGES_NAME)
         digests = {
@@ -205,6 +207,8 @@ class _Part:
         }
         for name in (MESSAGES_NAME, *(name for name, _ in made)):
             digests[name] = digest_file(folder / name)
+        for name in self._copied:
+            verify_file(dataset.path / name, old.file(name), found=digests[name])
         times = [in_span(one, self._span) for one in self._times.values()]
         times = [one for one in times if len(one)]
         left_out = [item.topic for item in dataset.channels if not self._selected(item.topic)]
@@ -289,7 +293,7 @@ class _Part:
         sidecar, video = stream.sidecar, stream.sidecar.video
         path = self._folder / stream.video_path.name
         if cut.has_all:
-            _copy(stream.video_path, path)
+            self._copy(path.name)
         else:
             frames = range(int(numbers[0]), int(numbers[-1]) + 1)
             cut_segment(stream.video_path, video.codec, frames, self._ticks(cut), path)
@@ -371,8 +375,7 @@ class _Part:
     def _write_messages(self, path: Path) -> None:
         dataset = self._dataset
         if not self._is_slice and all(self._selected(item.topic) for item in dataset.channels):
-            dataset.verify_messages()
-            _copy(dataset.path / MESSAGES_NAME, path)
+            self._copy(path.name)
             return
         in_videos: set[tuple[object, ...]] = set()
         for cut in self._cuts:
@@ -412,8 +415,8 @@ class _Part:
         found = cut.stream.camera_info_messages(channel, within(self._span))
         return (message for _, message in found)
 
-
-def _copy(source: Path, target: Path) -> None:
-    """Copy a file, which may be at a URL."""
-    with source.open("rb") as file, target.open("wb") as copy:
-        shutil.copyfileobj(file, copy, _BLOCK)
+    def _copy(self, name: str) -> None:
+        """Copy a whole file, which may be at a URL; the copy is compared with the manifest."""
+        with (self._dataset.path / name).open("rb") as file, (self._folder / name).open("wb") as to:
+            shutil.copyfileobj(file, to, _BLOCK)
+        self._copied.append(name)

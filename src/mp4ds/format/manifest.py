@@ -234,6 +234,10 @@ class Manifest(Model):
     files: list[FileEntry]
     tools: dict[str, str] = Field(default_factory=dict, description="Versions that packed it.")
 
+    def file(self, name: str) -> FileEntry | None:
+        """The entry of a file; None if it is not listed."""
+        return next((entry for entry in self.files if entry.name == name), None)
+
     @model_validator(mode="after")
     def _once(self) -> Manifest:
         for what, names in (

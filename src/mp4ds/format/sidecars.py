@@ -15,9 +15,10 @@ from pydantic import BaseModel, ValidationError
 
 from mp4ds import yamlio
 from mp4ds.errors import FormatError, SourceError, VersionError
+from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location
 from mp4ds.format.fields import FORMAT_VERSION, document_of, parse_version
-from mp4ds.format.manifest import About, Manifest
+from mp4ds.format.manifest import About, FileEntry, Manifest
 from mp4ds.format.models import StreamSidecar
 from mp4ds.times import encode_column
 
@@ -296,6 +297,43 @@ def load_manifest(path: Path) -> Manifest:
         FormatError: Any code of `load_document`, or ``model-invalid``.
     """
     return _model(Manifest, load_document(path), path)
+
+
+COPY_AGAIN = "`mp4ds validate --deep` lists what is damaged: copy it again from a good copy."
+"""What to do about a damaged dataset that is to be packed again."""
+
+
+def verify_file(
+    path: Path,
+    entry: FileEntry | None,
+    *,
+    found: tuple[int, str] | None = None,
+    hashed: bool = True,
+) -> None:
+    """Check a dataset's file against its manifest.
+
+    Args:
+        path: The file.
+        entry: What the manifest says of it; None: nothing.
+        found: Its size and SHA-256 where they are known; else it is read.
+        hashed: Whether to check more than its size.
+
+    Raises:
+        FormatError: ``file-missing``, ``size-mismatch``, ``hash-mismatch``, or
+            ``manifest-inconsistent`` if the manifest does not list it.
+    """
+    if entry is None:
+        raise FormatError(
+            "manifest-inconsistent", path.with_name(MANIFEST_NAME), f"does not list {path.name}"
+        )
+    if found is None and not path.is_file():
+        raise FormatError("file-missing", path, "is listed in the manifest but missing")
+    size = found[0] if found else path.stat().st_size
+    if size != entry.size:
+        problem = f"has {size} bytes, but the manifest says {entry.size}"
+        raise FormatError("size-mismatch", path, problem)
+    if hashed and (found or digest_file(path))[1] != entry.sha256:
+        raise FormatError("hash-mismatch", path, "does not match the SHA-256 in the manifest")
 
 
 def _model(model: type[_ModelT], document: dict[str, Any], path: Path) -> _ModelT:

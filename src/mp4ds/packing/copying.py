@@ -8,9 +8,9 @@ from pathlib import Path
 from mp4ds.dataset.checks import validate
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.slicing import copy_part, span_in
-from mp4ds.errors import FormatError
+from mp4ds.errors import FormatError, advising
 from mp4ds.files.outputs import staged
-from mp4ds.format.sidecars import load_about
+from mp4ds.format.sidecars import COPY_AGAIN, load_about
 from mp4ds.packing.job import dataset_at
 from mp4ds.packing.manifest import dataset_files, folder_size
 from mp4ds.packing.options import PackOptions, PackSummary, TopicSummary
@@ -46,6 +46,7 @@ def copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
     """
     about = load_about(options.about) if options.about is not None else None
     with (
+        advising(COPY_AGAIN),
         Dataset(path) as dataset,
         staged(target, force=options.force, owned=dataset_files, sources=[path]) as folder,
     ):
@@ -53,8 +54,14 @@ def copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
         selected.check(channel.topic for channel in dataset.channels)
         folder.mkdir()
         span = span_in(dataset, options.slice)
+        if options.slice or options.topics or options.exclude:  # whole files are checked as copied
+            dataset.verify_messages()
+        for stream in dataset.streams:
+            is_cut = options.slice and selected(stream.topic)
+            if is_cut and stream.sidecar.digests is None:  # nothing else shows that it is damaged
+                stream.verify_video()
         manifest = copy_part(dataset, folder, span=span, selected=selected, about=about)
-        if options.slice:  # whole files were checked against their SHA-256
+        if options.slice:
             for problem in validate(folder, deep=True):
                 raise FormatError(problem.code, dataset.path, f"is damaged: {problem}")
         with Dataset(folder) as made:

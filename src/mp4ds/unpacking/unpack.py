@@ -203,7 +203,8 @@ def unpack(
 ) -> UnpackSummary:
     """Write a dataset's recording.
 
-    Every message of a lossless stream is checked against its digest.
+    Every message of a lossless stream is checked against its digest, and each sidecar, and
+    messages.mcap unless a slice is taken, against the manifest.
 
     Args:
         dataset: A dataset, or one video with its sidecar; or its URL.
@@ -234,6 +235,7 @@ def unpack(
     with Dataset(dataset, jpeg_quality=chosen.jpeg_quality) as whole:
         given = location(output) if output else default_output(whole.path, to)
         target = Path(os.path.abspath(given))  # noqa: PTH100
+        whole.verify_sidecars(Selection(chosen.topics, chosen.exclude))
         if to != "images" and not chosen.slice:
             whole.verify_messages()
         with staged(target, force=chosen.force, owned=_owned(to), sources=[whole.path]) as path:

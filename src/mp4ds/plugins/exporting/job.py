@@ -428,6 +428,7 @@ class ExportedDataset:
         named = {options.poses, options.state, options.action}
         self._selected = selected
         self._named = named
+        dataset.verify_sidecars(self.chosen)
         streams = [stream for stream in dataset.streams if selected(stream.topic)]
         self.cameras = chosen_cameras(streams, options, self.ledger, self.notes)
 
