@@ -17,6 +17,7 @@ import mp4ds
 from coded_scenes import CODED
 from each import each, fresh
 from mp4ds import FormatError, Mp4dsError, SourceError, yamlio
+from mp4ds.unpacking.unpack import UnpackOptions
 from scenes import Scene
 from sources import SOURCES, load_tool, scene
 
@@ -234,6 +235,32 @@ def test_shallow_validation_finds_a_flipped_bit_of_the_sidecar(dataset: Path) ->
     assert codes(dataset, deep=False) == ["checksum-mismatch", "hash-mismatch"]
 
 
+def test_a_manifest_lists_no_other_file(dataset: Path) -> None:
+    (dataset / "notes.txt").write_text("windy")
+    entry = digest(dataset / "notes.txt")
+    changed(dataset / "dataset.yaml", lambda manifest: manifest["files"].append(entry))
+    assert codes(dataset) == ["manifest-inconsistent"]
+
+
+def test_a_slice_does_not_need_what_the_manifest_says_of_verbatim_messages(dataset: Path) -> None:
+    """A slice counts them itself; validate finds what is wrong with them."""
+    topic = mp4ds.open(dataset).topics[0]
+    for said, problem in (
+        (("/elsewhere", 1, 0), "names topic /elsewhere, which has no messages"),
+        ((topic, 1, 0), f"counts more messages of {topic} than messages.mcap holds"),
+        ((topic, 0, 999), f"begins at message 999 of {topic}, which has "),
+    ):
+        entry = {**dict(zip(("topic", "messages", "first"), said, strict=True)), "reason": "none"}
+        changed(dataset / "dataset.yaml", lambda it, entry=entry: it.update(verbatim=[entry]))  # type: ignore[misc]
+        (found,) = mp4ds.validate(dataset)
+        assert found.code == "manifest-inconsistent"
+        assert found.place.endswith("dataset.yaml at verbatim.0")
+        assert found.message.startswith(problem)
+    changed(dataset / "dataset.yaml", lambda it: it["verbatim"][0].update(topic="/elsewhere"))
+    mp4ds.unpack(dataset, "bag", dataset.parent / "part.bag", UnpackOptions(start=0.1))
+    assert (dataset.parent / "part.bag").is_file()
+
+
 # ---------------------------------------------------------------- coded pictures and packets
 
 CODED_KINDS = [
@@ -421,7 +448,7 @@ def swap(folder: Path, suffix: str) -> None:
 def test_a_manifest_that_lists_no_streams(dataset: Path) -> None:
     changed(dataset / "dataset.yaml", lambda manifest: manifest.update(streams=[]))
     for deep in (False, True):
-        assert codes(dataset, deep=deep) == ["message-count"]
+        assert codes(dataset, deep=deep) == ["manifest-inconsistent"]  # its files are of none
     assert "message-count" in refused(dataset)
 
 

@@ -114,6 +114,19 @@ def broken(good: Path) -> dict[str, DatasetCase]:
             ("file-unlisted", "manifest-inconsistent"),
             _unlisted(first["video"]),
         ),
+        "verbatim-topic": DatasetCase(
+            "messages stored verbatim of a topic that is not there",
+            ("manifest-inconsistent",),
+            setting(
+                "verbatim",
+                [{"topic": "/elsewhere", "messages": 1, "first": 0, "reason": "no reason"}],
+            ),
+        ),
+        "time-range": DatasetCase(
+            "another time of the last message",
+            ("manifest-inconsistent",),
+            setting("time_range.end", manifest["time_range"]["end"] + 1),
+        ),
         "messages-missing": DatasetCase(
             "a stream was taken away: its ordinals are a gap",
             ("messages-missing",),

@@ -25,7 +25,7 @@ from mp4ds.dataset.stream import Stream
 from mp4ds.errors import ConversionError, FormatError, SourceError, SourceNotFoundError, VideoError
 from mp4ds.files.urls import location
 from mp4ds.format.fields import MESSAGES_NAME
-from mp4ds.format.manifest import Manifest, StreamEntry
+from mp4ds.format.manifest import Manifest, StreamEntry, TimeRange
 from mp4ds.format.models import References, StreamSidecar, VideoModel
 from mp4ds.format.sidecars import (
     MANIFEST_NAME,
@@ -239,6 +239,10 @@ def _check_listed(folder: Path, manifest: Manifest) -> Iterator[Problem]:
         yield Problem(
             "manifest-inconsistent", str(folder / MANIFEST_NAME), f"does not list {MESSAGES_NAME}"
         )
+    own = {name for entry in manifest.streams for name in (entry.sidecar, entry.video)}
+    for name in sorted(listed - own - {MESSAGES_NAME}):
+        problem = f"lists {name}, which belongs to no stream"
+        yield Problem("manifest-inconsistent", str(folder / MANIFEST_NAME), problem)
     listed.add(MANIFEST_NAME)
     for path in sorted(folder.iterdir()):
         if path.name not in listed and path.suffix in (".mp4", ".yaml", ".mcap"):
@@ -343,11 +347,35 @@ def _check_messages(dataset: Dataset, manifest: Manifest) -> list[Problem]:
         if total != manifest.messages:
             problem = f"and the videos hold {total} messages, but the manifest says "
             return [Problem("message-count", place, f"{problem}{manifest.messages}")]
-        return list(_check_limits(dataset, manifest, (), place))
+        return [*_check_verbatim(dataset, manifest), *_check_limits(dataset, manifest, (), place)]
     except FormatError as error:
         return [Problem(error.code, error.place, error.problem)]
     except SourceError as error:
         return [Problem("messages-unreadable", place, str(error))]
+
+
+def _check_verbatim(dataset: Dataset, manifest: Manifest) -> Iterator[Problem]:
+    """Check that there are as many messages of each topic as are listed as stored verbatim."""
+    totals = Counter({item.topic: dataset.recorded_count(item.topic) for item in manifest.verbatim})
+    recorded = dict(totals)
+    for stream in dataset.streams:
+        totals[stream.topic] += len(stream)
+        info = stream.sidecar.camera_info
+        if info:
+            totals[info.channel.topic] += info.messages
+    for number, item in enumerate(manifest.verbatim):
+        recorded[item.topic] -= item.messages
+        problem = ""
+        if not totals[item.topic]:
+            problem = f"names topic {item.topic}, which has no messages"
+        elif recorded[item.topic] < 0:
+            problem = f"counts more messages of {item.topic} than {MESSAGES_NAME} holds"
+        elif item.first + item.messages > totals[item.topic]:
+            count = totals[item.topic]
+            problem = f"begins at message {item.first} of {item.topic}, which has {count}"
+        if problem:
+            place = f"{dataset.path / MANIFEST_NAME} at verbatim.{number}"
+            yield Problem("manifest-inconsistent", place, problem)
 
 
 def _check_recorded(dataset: Dataset, manifest: Manifest, report: _Report) -> list[Problem]:
@@ -355,29 +383,37 @@ def _check_recorded(dataset: Dataset, manifest: Manifest, report: _Report) -> li
     report(f"reading {MESSAGES_NAME}", 1.0)
     place = str(dataset.path / MESSAGES_NAME)
     try:
-        return list(_check_limits(dataset, manifest, _counted(dataset, place), place))
+        return list(_check_limits(dataset, manifest, _counted(dataset, manifest, place), place))
     except FormatError as error:
         return [Problem(error.code, error.place, error.problem)]
     except SourceError as error:
         return [Problem("messages-unreadable", place, str(error))]
 
 
-def _counted(dataset: Dataset, place: str) -> Iterator[Record]:
-    """All of messages.mcap, which must agree with its index.
+def _counted(dataset: Dataset, manifest: Manifest, place: str) -> Iterator[Record]:
+    """All of messages.mcap, which must agree with its index and the manifest.
 
     Raises:
-        FormatError: ``messages-unreadable``: a channel's number of messages differs.
+        FormatError: ``messages-unreadable``: a channel's number of messages differs;
+            ``manifest-inconsistent``: the times of the first and last message of all do.
     """
     counts = Counter[int]()
+    times = [message.log_time for stream in dataset.streams for message in _extremes(stream)]
     for record in dataset.recorded_records():
         if isinstance(record, Message):
             counts[record.channel.id] += 1
+            times = [min([record.log_time, *times]), max([record.log_time, *times])]
         yield record
     told = dataset.recorded_counts
     for key in counts.keys() | told.keys():
         if counts[key] != told.get(key, 0):
             problem = f"holds {counts[key]} messages of channel {key}, but its index lists "
             raise FormatError("messages-unreadable", place, f"{problem}{told.get(key, 0)}")
+    span, due = manifest.time_range, TimeRange(start=min(times), end=max(times)) if times else None
+    if span != due:
+        words = f"from {due.start} to {due.end}" if due else "absent, as there are no messages"
+        where = f"{dataset.path / MANIFEST_NAME} at time_range"
+        raise FormatError("manifest-inconsistent", where, f"must be {words}")
 
 
 def _check_limits(

@@ -186,6 +186,11 @@ class Dataset:
         """Number of messages in messages.mcap by channel id, from its index."""
         return self._file.counts
 
+    def recorded_count(self, topic: str) -> int:
+        """Number of a topic's messages in messages.mcap, from its index."""
+        channels, counts = self._file.channels, self._file.counts
+        return sum(counts.get(channel.id, 0) for channel in channels if channel.topic == topic)
+
     def verify_messages(self) -> None:
         """Check messages.mcap against its SHA-256: not all of its contents have their own checksum.
 

@@ -260,7 +260,7 @@ class _Part:
         found = []
         for topic in dict.fromkeys(item.topic for item in old.verbatim):
             reasons = [item.reason for item in old.verbatim if item.topic == topic]
-            times = np.sort(np.concatenate(self._times_of(topic)))
+            times = np.sort(np.concatenate([_NO_TIMES, *self._times_of(topic)]))
             recorded = self._dataset.recorded_times(topic)
             inside = in_span(recorded, self._span)
             if self._selected(topic) and len(inside):
