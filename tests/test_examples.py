@@ -126,7 +126,7 @@ def test_commands_of_a_page(page: str, demo_dataset: Path, tmp_path: Path) -> No
     for name in ("drive_0.mcap", "drive.mcap"):
         if f"mp4ds demo {name}" not in text:
             shutil.copy(demo_dataset.parent / "demo.mcap", tmp_path / name)
-    if not any(re.search(r"-o drive( |$)", line) for line in lines):
+    if not any(re.search(r"-o drive( |$)|pack drive[.]mcap$", line) for line in lines):
         shutil.copytree(demo_dataset, tmp_path / "drive")
     for line in lines:
         run("bash", "-c", line, cwd=tmp_path)
