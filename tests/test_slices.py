@@ -92,6 +92,27 @@ def test_of_odd_recordings(trait: str, tmp_path: Path, compare: Compare) -> None
         output = tmp_path / f"{name}.mcap"
         mp4ds.unpack(tmp_path / name, "mcap", output)
         assert compare(paths, output, start=start, end=end) == []
+    output = unpacked(tmp_path / "whole", "mcap", **span)
+    assert compare(paths, output, start=start, end=end) == []
+
+
+def test_equal_times_in_different_files(tmp_path: Path, compare: Compare) -> None:
+    """Unpacking a slice leaves out what packing it leaves out; what converts says what to do."""
+    made = odd_scene("encoding-change")
+    equal = [
+        replace(record, log_time=START + n // 6 * PERIOD) for n, record in enumerate(made.messages)
+    ]
+    paths = SOURCES["bag-lz4"](tmp_path, replace(made, messages=equal))
+    mp4ds.pack(paths, tmp_path / "whole")
+    with mp4ds.open(tmp_path / "whole") as opened:
+        assert not opened.is_in_time
+    span = {"start": str(START + PERIOD), "end": str(START + 3 * PERIOD)}
+    between = {"start": START + PERIOD, "end": START + 3 * PERIOD}
+    mp4ds.pack(tmp_path / "whole", tmp_path / "part", PackOptions(**span))
+    for output in (unpacked(tmp_path / "part", "bag"), unpacked(tmp_path / "whole", "bag", **span)):
+        assert compare(paths, output, **between) == []
+    with pytest.raises(OptionError, match=r"cannot be sliced: .* Pack the slice first"):
+        mp4ds.unpack(tmp_path / "whole", "images", options=UnpackOptions(**span))
 
 
 @each(

@@ -81,7 +81,10 @@ def sliced(dataset: Dataset, asked: Slice, folder: Path) -> Iterator[Dataset]:
     try:
         copy_part(dataset, path, span=span_in(dataset, asked))
     except Refused as reason:
-        raise OptionError(f"{dataset.path} cannot be sliced: {reason}.") from None
+        raise OptionError(
+            f"{dataset.path} cannot be sliced: {reason}. Pack the slice first (mp4ds pack with the "
+            "same times), and use that."
+        ) from None
     try:
         with Dataset(path, jpeg_quality=dataset.jpeg_quality) as opened:
             yield opened

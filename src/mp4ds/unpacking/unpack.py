@@ -15,10 +15,11 @@ from pathlib import Path
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.formats import open_writer, recording_names
 from mp4ds.bags.protocols import BagWriter
+from mp4ds.bags.slices import in_span
 from mp4ds.dataset.collections import Paths, datasets_in, each
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import recorded_storage
-from mp4ds.dataset.slicing import sliced
+from mp4ds.dataset.slicing import sliced, span_in
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import ConversionError, FormatError, OptionError, WriteError, interrupted
 from mp4ds.files.outputs import Owned, csv_cell, staged
@@ -39,7 +40,7 @@ from mp4ds.options import (
     topics,
 )
 from mp4ds.plan import FileNames, Selection
-from mp4ds.records import Attachment, Channel, Message, MetadataRecord
+from mp4ds.records import EVERYTHING, Attachment, Channel, Excerpt, Message, MetadataRecord
 from mp4ds.unpacking.pictures import Reduction, holds_files, image_files
 from mp4ds.unpacking.republish import KINDS, Republished, Republisher, check_kind
 
@@ -236,10 +237,16 @@ def unpack(
         given = location(output) if output else default_output(whole.path, to)
         target = Path(os.path.abspath(given))  # noqa: PTH100
         whole.verify_sidecars(Selection(chosen.topics, chosen.exclude))
-        if to != "images" and not chosen.slice:
+        # where log times do not tell the order, nothing can be cut out, only left out
+        is_filtered = bool(chosen.slice) and to != "images" and not whole.is_in_time
+        is_filtered = is_filtered and _converts_none(chosen)
+        if to != "images" and (is_filtered or not chosen.slice):
             whole.verify_messages()
         with staged(target, force=chosen.force, owned=_owned(to), sources=[whole.path]) as path:
             try:
+                if is_filtered:
+                    span = span_in(whole, chosen.slice)
+                    return _unpack_recording(whole, path, target, to, chosen, progress, span)
                 with sliced(whole, chosen.slice, path.parent) as opened:
                     if to == "images":
                         return _unpack_images(opened, path, target, chosen, progress)
@@ -374,6 +381,7 @@ def _unpack_recording(
     to: str,
     options: UnpackOptions,
     progress: Callable[[UnpackProgress], None] | None,
+    span: Excerpt = EVERYTHING,
 ) -> UnpackSummary:
     selected = Selection(options.topics, options.exclude)
     selected.check(channel.topic for channel in dataset.channels)
@@ -383,6 +391,8 @@ def _unpack_recording(
     republisher = _republisher(dataset, to, options, selected)
     summary = UnpackSummary(target)
     total = dataset.manifest.messages if dataset.manifest else 0
+    if span != EVERYTHING:
+        total = sum(len(in_span(times, span)) for times in dataset.times().values())
     storage = ""
     if to == "rosbag2":
         storage = options.storage or recorded_storage(dataset.recorded_records())
@@ -397,7 +407,8 @@ def _unpack_recording(
         topics = _Topics(writer, converter, selected, summary, may_skip=options.skip_unconvertible)
         topics.declare(dataset, republisher)
         done = found = 0
-        for record in dataset.records(republisher.sources if republisher else None):
+        records = dataset.records(republisher.sources if republisher else None)
+        for record in filter(span.has, records):
             if not isinstance(record, Message):
                 _write_other(writer, record, to, source)
                 continue
@@ -427,8 +438,7 @@ def _unpack_recording(
 def _republisher(
     dataset: Dataset, to: str, options: UnpackOptions, selected: Selection
 ) -> Republisher | None:
-    reduction = options.reduction
-    if options.images is None and reduction == Reduction():
+    if _converts_none(options):
         return None
     world = _WORLDS.get(to) or ("ros1" if dataset.profile == "ros1" else "ros2")
     return Republisher(
@@ -437,8 +447,13 @@ def _republisher(
         encoding="ros1" if world == "ros1" else "cdr",
         selected=selected,
         jpeg_quality=options.jpeg_quality,
-        reduction=reduction,
+        reduction=options.reduction,
     )
+
+
+def _converts_none(options: UnpackOptions) -> bool:
+    """Whether all images stay as recorded."""
+    return options.images is None and options.reduction == Reduction()
 
 
 class _Topics:
