@@ -16,7 +16,8 @@ from rosbags.typesys.msg import normalize_msgtype
 
 from conftest import real
 from each import each
-from mp4ds.bags.convert import LATCHED_QOS, Converter
+from mp4ds.bags.convert import Converter
+from mp4ds.bags.latched import LATCHED_QOS
 from mp4ds.bags.ros1 import Ros1Reader
 from mp4ds.errors import ConversionError, OptionError
 from mp4ds.records import Channel, Schema

@@ -9,9 +9,8 @@ import pytest
 
 import mp4ds
 from each import each
-from mp4ds.bags.convert import LATCHED_QOS
+from mp4ds.bags.latched import LATCHED_QOS, Kept, kept_depth
 from mp4ds.plugins.playing.play import PlayOptions, open_player
-from mp4ds.plugins.publishing.latching import Kept, kept_depth
 from mp4ds.plugins.publishing.ros2_writers import offered_qos
 from mp4ds.records import Channel
 from player_scenes import (

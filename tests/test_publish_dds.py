@@ -16,7 +16,8 @@ import pytest
 
 pytest.importorskip("cyclonedds")
 
-from mp4ds.bags.convert import LATCHED_QOS, Converter
+from mp4ds.bags.convert import Converter
+from mp4ds.bags.latched import LATCHED_QOS
 from mp4ds.bags.types import ros2_world
 from mp4ds.errors import ConversionError, OptionError, PublishError
 from mp4ds.plugins.publishing.dds import DdsPublisher

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 import fake_rclpy
-from mp4ds.bags.convert import LATCHED_QOS
+from mp4ds.bags.latched import LATCHED_QOS
 from mp4ds.errors import ConversionError, OptionError, PublishError, Refused
 from mp4ds.plugins.publishing.names import NodeNames
 from mp4ds.plugins.publishing.ros2 import RclpyPublisher

@@ -27,6 +27,7 @@ from sources import PERIOD, SOURCES, START, TRAITS, Scene, odd_scene, scene, wri
 FRAMES = 40
 FIRST, LAST = START + 17 * PERIOD + 5, START + 26 * PERIOD  # of what is taken, and after it
 SPAN = {"start": str(FIRST), "end": str(LAST)}
+ONLY: dict[str, Any] = {**SPAN, "latched": False}
 BETWEEN = {"start": FIRST, "end": LAST}
 
 
@@ -57,18 +58,18 @@ def test_what_is_taken(source: str, way: str, tmp_path: Path, compare: Compare) 
     paths = SOURCES[source](tmp_path, scene("rgb8", frames=FRAMES))
     dataset, whole = tmp_path / "dataset", tmp_path / "whole"
     if way == "one-pass":
-        mp4ds.pack(paths, dataset, PackOptions(**SPAN))
+        mp4ds.pack(paths, dataset, PackOptions(**ONLY))
     elif way == "parts":
-        mp4ds.pack(paths, dataset, PackOptions(**SPAN, window=4, jobs=2))
+        mp4ds.pack(paths, dataset, PackOptions(**ONLY, window=4, jobs=2))
     else:
         mp4ds.pack(paths, whole, PackOptions(codec="h264", gop=8))
     if way == "dataset":
-        mp4ds.pack(whole, dataset, PackOptions(**SPAN))
+        mp4ds.pack(whole, dataset, PackOptions(**ONLY))
         assert max(hidden(dataset)) > 0
     elif way == "dataset-anew":
-        mp4ds.pack(whole, dataset, PackOptions(**SPAN, codec="ffv1"))
+        mp4ds.pack(whole, dataset, PackOptions(**ONLY, codec="ffv1"))
     if way == "unpack":
-        output = unpacked(whole, own_target(source), **SPAN)
+        output = unpacked(whole, own_target(source), **ONLY)
     else:
         assert mp4ds.validate(dataset, deep=True) == []
         for item in manifest(dataset).sources:
@@ -241,7 +242,7 @@ def test_a_span_without_frames_keeps_the_rest(tmp_path: Path, compare: Compare) 
     ]
     write_bag(tmp_path / "drive.bag", replace(recorded, messages=kept))
     mp4ds.pack(tmp_path / "drive.bag", tmp_path / "whole")
-    mp4ds.pack(tmp_path / "whole", tmp_path / "part", PackOptions(**SPAN))
+    mp4ds.pack(tmp_path / "whole", tmp_path / "part", PackOptions(**ONLY))
     assert manifest(tmp_path / "part").streams == []
     assert mp4ds.validate(tmp_path / "part", deep=True) == []
     output = unpacked(tmp_path / "part", "bag")

@@ -198,11 +198,13 @@ class Slice:
         start: The first time included; None for the beginning.
         end: The time before which everything is included; None for no end.
         duration: Seconds from `start`, or before `end`; None if the others define the slice.
+        latched: Include the latched messages from before it.
     """
 
     start: str | float | None = None
     end: str | float | None = None
     duration: str | float | None = None
+    latched: bool = False
 
     def __bool__(self) -> bool:
         return (self.start, self.end, self.duration) != (None, None, None)
@@ -273,11 +275,12 @@ class SliceOptions(Options):
     start: str | float | None
     end: str | float | None
     duration: str | float | None
+    latched = False
 
     @property
     def slice(self) -> Slice:
         """The slice of the recording; false for all of it."""
-        return Slice(self.start, self.end, self.duration)
+        return Slice(self.start, self.end, self.duration, self.latched)
 
 
 # ---------------------------------------------------------------- options of several kinds
@@ -330,6 +333,15 @@ def end() -> Any:
 def duration() -> Any:
     """The option for the length of a slice."""
     return option("Length of the slice: seconds from `start`, or before `end`.", metavar="SECONDS")
+
+
+def latched() -> Any:
+    """The option for latched messages from before a slice."""
+    return option(
+        "Begin a slice with the latched messages from before it, such as those of /tf_static.",
+        True,
+        "--latched/--no-latched",
+    )
 
 
 def cluster() -> Any:

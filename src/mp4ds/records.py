@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from mp4ds.errors import counted
+
 QOS_KEY = "offered_qos_profiles"
 """Key of a ROS 2 channel's metadata with the recorded QoS profiles, a YAML text."""
 
@@ -222,3 +224,9 @@ class ChannelStats:
         return ChannelStats(
             self.count + other.count, min(self.start, other.start), max(self.end, other.end)
         )
+
+
+def latched_text(counts: Mapping[str, int]) -> str:
+    """How many latched messages come from before a slice, by topic, in words."""
+    messages = counted(sum(counts.values()), "latched message")
+    return f"{messages} from before the start: {', '.join(counts)}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import re
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -16,6 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import denormalize_msgtype, normalize_msgtype
 from rosbags.typesys.store import Typestore
 
+from mp4ds.bags.latched import LATCHED_QOS, is_latched
 from mp4ds.bags.types import (
     BUILTIN,
     HEADER,
@@ -66,27 +66,6 @@ def _parts(types: Typesdict, name: str) -> list[tuple[int, str, bool]]:
 
 
 # ---------------------------------------------------------------- convert
-
-_QOS = """\
-- history: 1
-  depth: {depth}
-  reliability: 1
-  durability: {durability}
-  deadline:
-    sec: 9223372036
-    nsec: 854775807
-  lifespan:
-    sec: 9223372036
-    nsec: 854775807
-  liveliness: 1
-  liveliness_lease_duration:
-    sec: 9223372036
-    nsec: 854775807
-  avoid_ros_namespace_conventions: false"""
-LATCHED_QOS = _QOS.format(depth=1, durability=1)
-"""Keep the last one, reliable, transient local: what ROS 1 calls latching."""
-DEFAULT_QOS = _QOS.format(depth=10, durability=2)
-"""Keep the last ten, reliable, volatile: the default of publishers in ROS 2."""
 
 _ROS1 = "ros1:"  # prefix of the keys that keep a ROS 1 connection header in ROS 2 metadata
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
@@ -317,15 +296,6 @@ def _ros2_channel(channel: Channel, plan: _Plan) -> Channel:
             encoded = base64.b64encode(channel.schema.data).decode()
             metadata[_ROS1 + "message_definition;base64"] = encoded
     return replace(channel, message_encoding="cdr", schema=plan.schema, metadata=metadata)
-
-
-def is_latched(channel: Channel) -> bool:
-    """Whether late subscribers get the last message: latching, or transient local."""
-    if channel.metadata.get("latching", "").lower() in ("1", "true"):
-        return True
-    qos = channel.metadata.get(QOS_KEY, "")
-    found = re.findall(r"durability[\"']?\s*:\s*[\"']?(\w+)", qos)
-    return bool(found) and set(found) <= {"1", "transient_local"}
 
 
 def _end(plan: _Plan, raw: memoryview, *, to_ros1: bool) -> int:

@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.bags.latched import begun_by, latched_before
 from mp4ds.bags.protocols import BagReader, Format, first_of
 from mp4ds.bags.salvage.losses import losses_of
 from mp4ds.errors import SourceError
 from mp4ds.options import Slice
 from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Loss, Message, Record, Schema
 
+_NO_TIMES = np.empty(0, np.int64)
+
 
 class SliceReader:
     """The messages of a recording logged within a time slice. See `BagReader`.
 
-    Attachments, metadata records, channels and definitions are those of the whole recording.
+    Attachments, metadata records, channels and definitions are those of the whole recording. If
+    requested, the latched messages from before the slice are the first of its messages.
 
     Args:
         reader: The recording, closed together with this reader.
         asked: The requested slice.
+        begin: The time from which it is counted, nanoseconds; None for the first message.
 
     Attributes:
         span: The slice, as times of the recording.
@@ -32,7 +39,7 @@ class SliceReader:
         SourceError: The recording is damaged, or without messages.
     """
 
-    def __init__(self, reader: BagReader, asked: Slice) -> None:
+    def __init__(self, reader: BagReader, asked: Slice, begin: int | None = None) -> None:
         self._reader = reader
         self.path, self.profile = reader.path, reader.profile
         self.library, self.files = reader.library, reader.files
@@ -43,7 +50,9 @@ class SliceReader:
         if not known:
             raise SourceError(reader.path, "has no messages to take a slice of")
         first, last = min(item.start for item in known), max(item.end for item in known)
+        first = max(first, begin or first)
         self.span = Excerpt(*asked.times(first, last, reader.path))
+        self._has_latched = asked.latched and self.span.start is not None
 
     @property
     def format(self) -> Format:
@@ -82,7 +91,30 @@ class SliceReader:
 
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """See `BagReader.records`."""
-        return self._reader.records(excerpt.within(self.span))
+        latched = [message for message in self._latched[0] if excerpt.has(message)]
+        return begun_by(latched, self._reader.records(excerpt.within(self.span)))
+
+    @cached_property
+    def _latched(self) -> tuple[Sequence[Message], Sequence[str]]:
+        if not self._has_latched:
+            return (), ()
+        times, before = self._reader.times(), Excerpt(end=self.span.start, others=False)
+        sent = [c for c in self.channels if len(in_span(times.get(c.id, _NO_TIMES), before))]
+
+        def read(topics: frozenset[str], _: int) -> Iterator[Record]:
+            return self._reader.records(replace(before, topics=topics))
+
+        return latched_before(sent, read)
+
+    @property
+    def latched(self) -> Mapping[str, int]:
+        """Number of latched messages from before the slice, by topic."""
+        return Counter(message.channel.topic for message in self._latched[0])
+
+    @property
+    def latched_left_out(self) -> Sequence[str]:
+        """Latched topics whose messages from before the slice are too large to be included."""
+        return self._latched[1]
 
     def stats(self) -> Mapping[int, ChannelStats]:
         """See `BagReader.stats`."""
@@ -99,7 +131,15 @@ class SliceReader:
 
     @cached_property
     def _times(self) -> Mapping[int, NDArray[np.int64]]:
-        found = {key: in_span(times, self.span) for key, times in self._reader.times().items()}
+        early: dict[int, list[int]] = {}
+        for message in self._latched[0]:
+            early.setdefault(message.channel.id, []).append(message.log_time)
+        found = {
+            key: np.concatenate(
+                [np.sort(np.array(early.get(key, ()), np.int64)), in_span(times, self.span)]
+            )
+            for key, times in self._reader.times().items()
+        }
         return {key: times for key, times in found.items() if len(times)}
 
     def first(self, channel: Channel) -> Message | None:

@@ -57,7 +57,15 @@ _PANELS = {
         *("start_offset", "until_sec", "until_nsec", "skip_empty", "topic", "at"),
         *("sheet", "every", "max_rate", "sync", "tolerance_ns", "camera_info", "salvage", "poses"),
         *("all", "all_topics", "all_services", "topic_types", "exclude_topic_types"),
-        *("hidden", "unpublished", "ignore_leaf", "max_duration", "max_size", "start_paused"),
+        *(
+            "hidden",
+            "latched",
+            "unpublished",
+            "ignore_leaf",
+            "max_duration",
+            "max_size",
+            "start_paused",
+        ),
         *("state", "action", "task", "cameras", "frames", "clips", "streams", "hours"),
     ),
     "How": (

@@ -21,6 +21,7 @@ import typer
 
 from mp4ds.errors import Mp4dsError, counted, path_text
 from mp4ds.options import iso_text
+from mp4ds.records import latched_text
 
 if TYPE_CHECKING:
     from mp4ds.dataset.checks import Problem
@@ -233,6 +234,7 @@ def print_pack(summary: PackSummary) -> None:
         say(f"not packed exactly: {what} ({count})")
     if summary.left_out:
         say(f"left out: {', '.join(summary.left_out)}")
+    _print_latched(summary)
     for loss in summary.losses[:_LOSSES_SHOWN]:
         say(f"lost: {_loss_text(loss)}")
     if len(summary.losses) > _LOSSES_SHOWN:
@@ -310,6 +312,16 @@ def print_unpack(summary: UnpackSummary, noun: str) -> None:
         say(f"not supported by this format: {what} ({count})")
     if summary.left_out:
         say(f"left out: {', '.join(summary.left_out)}")
+    _print_latched(summary)
+
+
+def _print_latched(summary: PackSummary | UnpackSummary) -> None:
+    """Print which latched messages from before the slice were included."""
+    if summary.latched:
+        say(latched_text(summary.latched))
+    if summary.latched_left_out:
+        topics = ", ".join(summary.latched_left_out)
+        say(f"left out, as too large: latched messages from before the start: {topics}")
 
 
 def print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> None:

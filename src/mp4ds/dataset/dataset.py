@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import shlex
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -373,6 +374,28 @@ class Dataset:
     def times(self) -> dict[int, NDArray[np.int64]]:
         """Sorted log times of every message, nanoseconds, by channel id; decodes no frame."""
         return log_times(self._groups, self._file.times())
+
+    @property
+    def slice_start(self) -> int | None:
+        """Where the slice begins that it holds, as a log time; None if it holds no slice.
+
+        Earlier messages are latched ones, which late subscribers would have got.
+        """
+        excerpts = [source.excerpt for source in self.manifest.sources] if self.manifest else []
+        starts = [item.start for item in excerpts if item and item.start is not None]
+        return min(starts) if starts and len(starts) == len(excerpts) else None
+
+    @cached_property
+    def latched_before(self) -> Mapping[str, int]:
+        """Number of latched messages from before the slice that it holds, by topic."""
+        found: Counter[str] = Counter()
+        begin = self.slice_start
+        if begin is None:
+            return found
+        times = self.times()
+        for channel in self.channels:
+            found[channel.topic] += int(np.searchsorted(times.get(channel.id, []), begin))
+        return +found
 
     def recorded_times(self, topic: str) -> NDArray[np.int64]:
         """Sorted log times, nanoseconds, of a topic's messages that are in messages.mcap."""

@@ -30,6 +30,7 @@ class DatasetReader:
 
     Attributes:
         manifest: Of the dataset.
+        slice_start: See `Dataset.slice_start`.
 
     Raises:
         FormatError: A file breaks a rule of the format.
@@ -44,6 +45,7 @@ class DatasetReader:
         self.manifest: Manifest = load_manifest(self.path / MANIFEST_NAME)
         self.profile = self.manifest.recording_profile
         self.library = self.manifest.library
+        self.slice_start = self._dataset.slice_start
         names = [MANIFEST_NAME, *(entry.name for entry in self.manifest.files)]
         self.files: Sequence[Path] = [self.path / name for name in names]
         self.skipped: Mapping[str, int] = {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.bags.latched import latched_before
 from mp4ds.bags.mcap_write import McapWriter
 from mp4ds.bags.protocols import write_record
 from mp4ds.bags.slices import in_span
@@ -56,17 +58,33 @@ def span_in(dataset: Dataset, asked: Slice) -> Excerpt:
     if not times:
         raise OptionError(f"{dataset.path} has no messages to take a slice of.")
     first, last = min(int(one[0]) for one in times), max(int(one[-1]) for one in times)
+    first = max(first, dataset.slice_start or first)
     return Excerpt(*asked.times(first, last, dataset.path))
 
 
+def latched_at(
+    dataset: Dataset, span: Excerpt, asked: Slice
+) -> tuple[Sequence[Message], Sequence[str]]:
+    """The latched messages from before a slice if requested, and the topics left out."""
+    start = span.start
+    if start is None or not asked.latched:
+        return (), ()
+    return latched_before(
+        dataset.channels, lambda topics, frames: dataset.before(start, topics, frames)
+    )
+
+
 @contextmanager
-def sliced(dataset: Dataset, asked: Slice, folder: Path) -> Iterator[Dataset]:
+def sliced(
+    dataset: Dataset, asked: Slice, folder: Path, latched: Sequence[Message] = ()
+) -> Iterator[Dataset]:
     """A temporary dataset of a slice; the dataset itself if no slice is given.
 
     Args:
         dataset: A folder made by `mp4ds pack`.
         asked: The slice.
         folder: Where to make it.
+        latched: Messages from before the slice that it has, too.
 
     Raises:
         OptionError: It is empty, or cannot be cut out.
@@ -79,7 +97,7 @@ def sliced(dataset: Dataset, asked: Slice, folder: Path) -> Iterator[Dataset]:
     path = folder / "slice" / dataset.path.name
     path.mkdir(parents=True)
     try:
-        copy_part(dataset, path, span=span_in(dataset, asked))
+        copy_part(dataset, path, span=span_in(dataset, asked), latched=latched)
     except Refused as reason:
         raise OptionError(
             f"{dataset.path} cannot be sliced: {reason}. Pack the slice first (mp4ds pack with the "
@@ -97,6 +115,7 @@ def copy_part(
     folder: Path,
     *,
     span: Excerpt = EVERYTHING,
+    latched: Sequence[Message] = (),
     selected: Callable[[str], bool] = lambda _: True,
     about: About | None = None,
 ) -> Manifest:
@@ -109,6 +128,7 @@ def copy_part(
         dataset: A folder made by `mp4ds pack`.
         folder: The folder to fill, empty.
         span: What to copy; its topics are ignored.
+        latched: The messages from before it that are copied, too.
         selected: Whether a topic is to be copied.
         about: Description of the recording; None to keep the dataset's.
 
@@ -120,7 +140,8 @@ def copy_part(
         FormatError: A file does not match its dataset.
         OSError: The disk could not be written.
     """
-    part = _Part(dataset, folder, span, selected)
+    latched = [message for message in latched if selected(message.channel.topic)]
+    part = _Part(dataset, folder, span, latched, selected)
     part.check()
     return part.write(about)
 
@@ -147,7 +168,12 @@ class _Cut:
 
 class _Part:
     def __init__(
-        self, dataset: Dataset, folder: Path, span: Excerpt, selected: Callable[[str], bool]
+        self,
+        dataset: Dataset,
+        folder: Path,
+        span: Excerpt,
+        latched: Sequence[Message],
+        selected: Callable[[str], bool],
     ) -> None:
         if dataset.manifest is None:
             raise Refused("it is a single video, not a dataset")
@@ -155,6 +181,8 @@ class _Part:
         self._dataset = dataset
         self._folder = folder
         self._span = span
+        self._latched = latched
+        self._early = Counter(message.channel.identity for message in latched)
         self._selected = selected
         self._is_slice = span.start is not None or span.end is not None
         self._cuts = [self._cut(stream) for stream in dataset.streams]
@@ -213,6 +241,7 @@ class _Part:
         for name in self._copied:
             verify_file(dataset.path / name, old.file(name), found=digests[name])
         times = [in_span(one, self._span) for one in self._times.values()]
+        times.append(np.sort(np.array([item.log_time for item in self._latched], np.int64)))
         times = [one for one in times if len(one)]
         left_out = [item.topic for item in dataset.channels if not self._selected(item.topic)]
         manifest = old.model_copy(
@@ -370,10 +399,12 @@ class _Part:
         return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items()}
 
     def _before(self, channel: ChannelModel) -> int:
-        """How many messages of a channel come before the span."""
+        """How many messages of a channel come before the span and are left out."""
         if self._span.start is None:
             return 0
-        return int(np.searchsorted(self._times[channel.to_record(0).identity], self._span.start))
+        identity = channel.to_record(0).identity
+        before = int(np.searchsorted(self._times[identity], self._span.start))
+        return before - self._early[identity]
 
     def _write_messages(self, path: Path) -> None:
         dataset = self._dataset
@@ -408,7 +439,8 @@ class _Part:
         )
         channels = {channel.identity: channel for channel in self._dataset.channels}
         orphans = [self._orphans(cut, channels) for cut in self._cuts if not len(cut.images)]
-        return heapq.merge(recorded, *orphans, key=lambda message: message.log_time)
+        found = heapq.merge(recorded, *orphans, key=lambda message: message.log_time)
+        return chain(self._latched, found)
 
     def _orphans(self, cut: _Cut, channels: dict[tuple[object, ...], Channel]) -> Iterator[Message]:
         info = cut.stream.sidecar.camera_info

@@ -23,7 +23,7 @@ from mp4ds.errors import (
 )
 from mp4ds.files.outputs import is_seen, move_into_place, sync
 from mp4ds.packing.engine import Engine, Outcome
-from mp4ds.packing.job import Job, Task, span_of
+from mp4ds.packing.job import Job, Task, span_of, with_latched
 from mp4ds.packing.join import Assembler
 from mp4ds.packing.manifest import (
     Origin,
@@ -266,9 +266,10 @@ class Coordinator:
                 run.job.check_sources(reader.files)
                 origin = Origin.of(reader.files, digests, run.job.about, span_of(reader))
                 write_manifest(part, reader, origin, run.job.options["quality"])
+                size = sum(source.size for source in run.job.sources)
+                summary = summarize(part, run.target, None if run.job.slice else size, origin)
+                summary = with_latched(summary, reader)
             sync(folder)
-            size = sum(source.size for source in run.job.sources)
-            summary = summarize(part, run.target, None if run.job.slice else size, origin)
             move_into_place(
                 folder, run.target, run.place.replaced, force=run.force, owned=dataset_files
             )

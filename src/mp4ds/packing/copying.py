@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mp4ds.dataset.checks import validate
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.slicing import copy_part, span_in
+from mp4ds.dataset.slicing import copy_part, latched_at, span_in
 from mp4ds.errors import FormatError, advising
 from mp4ds.files.outputs import staged
 from mp4ds.format.sidecars import COPY_AGAIN, load_about
@@ -60,12 +60,16 @@ def copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
             is_cut = options.slice and selected(stream.topic)
             if is_cut and stream.sidecar.digests is None:  # nothing else shows that it is damaged
                 stream.verify_video()
-        manifest = copy_part(dataset, folder, span=span, selected=selected, about=about)
+        latched, too_large = latched_at(dataset, span, options.slice)
+        manifest = copy_part(
+            dataset, folder, span=span, latched=latched, selected=selected, about=about
+        )
         if options.slice:
             for problem in validate(folder, deep=True):
                 raise FormatError(problem.code, dataset.path, f"is damaged: {problem}")
         with Dataset(folder) as made:
             topics = _topics(made)
+            early = dict(made.latched_before) if options.slice else {}
         return PackSummary(
             dataset=target,
             topics=topics,
@@ -75,6 +79,8 @@ def copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
             left_out=[item.topic for item in dataset.channels if not selected(item.topic)],
             skipped={},
             is_copy=True,
+            latched=early,
+            latched_left_out=[topic for topic in too_large if selected(topic)],
         )
 
 

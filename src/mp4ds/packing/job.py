@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from mp4ds.format.manifest import About
 from mp4ds.format.sidecars import MANIFEST_NAME, load_about
 from mp4ds.options import WHOLE, Slice
 from mp4ds.packing.manifest import dump_kept, load_kept
-from mp4ds.packing.options import ImageFolder, PackOptions
+from mp4ds.packing.options import ImageFolder, PackOptions, PackSummary
 from mp4ds.packing.packer import Exact, PartSettings
 from mp4ds.packing.survey import Survey
 from mp4ds.packing.tracks import StreamSettings
@@ -35,7 +35,18 @@ TASK_NAME = r"source-[0-9]{1,9}|whole-[0-9]{1,9}|[0-9]{5,9}-[0-9]{1,9}|all"
 _MOST_THREADS = 4096
 _OUTCOME_OPTIONS = (
     *("topics", "exclude", "quality", "codec", "preset", "transcode", "camera_info"),
-    *("gop", "window", "salvage", "images", "purpose", "about", "start", "end", "duration"),
+    *(
+        "gop",
+        "window",
+        "salvage",
+        "images",
+        "purpose",
+        "about",
+        "start",
+        "end",
+        "duration",
+        "latched",
+    ),
 )
 
 
@@ -214,7 +225,7 @@ class Job:
     @property
     def slice(self) -> Slice:
         """The slice of the recording to pack; false for all."""
-        return Slice(*(self.options[name] for name in ("start", "end", "duration")))
+        return Slice(*(self.options[name] for name in ("start", "end", "duration", "latched")))
 
     def digests(
         self, reader: BagReader, digest_of: Callable[[int], tuple[int, str]]
@@ -310,7 +321,7 @@ def open_recording(
     if not asked:
         return reader
     try:
-        return SliceReader(reader, asked)
+        return SliceReader(reader, asked, getattr(reader, "slice_start", None))
     except BaseException:
         reader.__exit__()
         raise
@@ -392,6 +403,15 @@ def is_hashed(path: Path, asked: Slice) -> bool:
 def span_of(reader: BagReader) -> Excerpt:
     """The part of a recording that is read."""
     return reader.span if isinstance(reader, SliceReader) else EVERYTHING
+
+
+def with_latched(summary: PackSummary, reader: BagReader) -> PackSummary:
+    """The summary of what was read, with the latched messages from before a slice."""
+    if not isinstance(reader, SliceReader):
+        return summary
+    too_large = [topic for topic in reader.latched_left_out if topic not in summary.left_out]
+    packed = {topic: n for topic, n in reader.latched.items() if topic not in summary.left_out}
+    return replace(summary, latched=packed, latched_left_out=too_large)
 
 
 def digest_source(source: SourceState) -> Sequence[object]:

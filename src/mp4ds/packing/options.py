@@ -16,6 +16,7 @@ from mp4ds.options import (
     end,
     exclude,
     force,
+    latched,
     option,
     parse_size,
     start,
@@ -74,6 +75,7 @@ class PackOptions(SliceOptions):
     start: str | float | None = start()
     end: str | float | None = end()
     duration: str | float | None = duration()
+    latched: bool = latched()
     quality: str | None = option(
         "lossless, visual, crf=N, or a score to reach: vmaf=99.5, psnr=42, ssim=0.98; default: "
         "lossless, or the quality of a repacked dataset."
@@ -263,6 +265,8 @@ class PackSummary:
         larger: Why the dataset is larger than its source, if by more than 5 %.
         is_copy: Whether the videos of a dataset were copied; `raw_bytes` of topics are unknown.
         not_copied: Why a dataset's videos were re-encoded without being asked to.
+        latched: Latched messages from before the slice, by topic.
+        latched_left_out: Latched topics whose messages from before it are too large.
     """
 
     dataset: Path
@@ -276,3 +280,5 @@ class PackSummary:
     larger: str = ""
     is_copy: bool = False
     not_copied: str = ""
+    latched: dict[str, int] = field(default_factory=dict)
+    latched_left_out: list[str] = field(default_factory=list)

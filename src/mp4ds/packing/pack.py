@@ -46,6 +46,7 @@ from mp4ds.packing.job import (
     open_recording,
     outcome_options,
     span_of,
+    with_latched,
 )
 from mp4ds.packing.manifest import (
     Origin,
@@ -207,7 +208,7 @@ def pack_in_one_pass(
     origin = Origin.of(reader.files, digests, job.about, span_of(reader))
     write_manifest(part, reader, origin, job.options["quality"])
     progress(part, done=True)
-    return summarize(part, target, None if job.slice else total, origin)
+    return with_latched(summarize(part, target, None if job.slice else total, origin), reader)
 
 
 def _digest(reader: BagReader, number: int) -> tuple[int, str]:

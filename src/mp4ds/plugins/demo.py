@@ -18,8 +18,9 @@ import numpy as np
 from mcap_ros2.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
-from mp4ds.bags.convert import DEFAULT_QOS, LATCHED_QOS, Converter, ros2_channel
+from mp4ds.bags.convert import Converter, ros2_channel
 from mp4ds.bags.formats import open_reader, open_writer, recording_names
+from mp4ds.bags.latched import DEFAULT_QOS, LATCHED_QOS
 from mp4ds.errors import OptionError
 from mp4ds.files.outputs import staged
 from mp4ds.records import Channel, Message

@@ -30,7 +30,7 @@ from mp4ds.options import WHOLE, Slice
 from mp4ds.packing.calibrations import StampPairing, pair_camera_infos
 from mp4ds.packing.job import open_recording
 from mp4ds.packing.look import Looker
-from mp4ds.records import Channel, Message
+from mp4ds.records import Channel, Message, latched_text
 from mp4ds.times import intervals, lost_frames
 
 _T = TypeVar("_T")
@@ -264,6 +264,8 @@ def _dataset_info(dataset: Dataset) -> Info:
             f"number {item.first}: {item.reason}"
             for item in dataset.manifest.verbatim
         ]
+        if dataset.latched_before:
+            result.notes.append(latched_text(dataset.latched_before))
         if dataset.manifest.about:
             result.notes += dataset.manifest.about.lines
         if dataset.manifest.derived_from:

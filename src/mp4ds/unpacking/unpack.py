@@ -14,12 +14,13 @@ from pathlib import Path
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.formats import open_writer, recording_names
+from mp4ds.bags.latched import begun_by
 from mp4ds.bags.protocols import BagWriter
 from mp4ds.bags.slices import in_span
 from mp4ds.dataset.collections import Paths, datasets_in, each
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import recorded_storage
-from mp4ds.dataset.slicing import sliced, span_in
+from mp4ds.dataset.slicing import latched_at, sliced, span_in
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import ConversionError, FormatError, OptionError, WriteError, interrupted
 from mp4ds.files.outputs import Owned, csv_cell, staged
@@ -33,6 +34,7 @@ from mp4ds.options import (
     exclude,
     force,
     jpeg_quality,
+    latched,
     max_rate,
     option,
     resize,
@@ -69,6 +71,7 @@ class UnpackOptions(SliceOptions):
     start: str | float | None = start()
     end: str | float | None = end()
     duration: str | float | None = duration()
+    latched: bool = latched()
     skip_unconvertible: bool = option(
         "Leave out, and count, what the output format cannot hold.", False
     )
@@ -108,6 +111,8 @@ class UnpackSummary:
         unconvertible: Topics with messages left out because the target cannot hold them:
             reason -> how many.
         thinned: Topics with messages left out because fewer were requested -> how many.
+        latched: Latched messages from before the slice, by topic.
+        latched_left_out: Latched topics whose messages from before it are too large.
     """
 
     output: Path
@@ -119,6 +124,8 @@ class UnpackSummary:
     as_recorded: dict[str, dict[str, int]] = field(default_factory=dict)
     thinned: dict[str, int] = field(default_factory=dict)
     unconvertible: dict[str, dict[str, int]] = field(default_factory=dict)
+    latched: dict[str, int] = field(default_factory=dict)
+    latched_left_out: list[str] = field(default_factory=list)
 
 
 # ---------------------------------------------------------------- images
@@ -244,13 +251,25 @@ def unpack(
             whole.verify_messages()
         with staged(target, force=chosen.force, owned=_owned(to), sources=[whole.path]) as path:
             try:
-                if is_filtered:
-                    span = span_in(whole, chosen.slice)
-                    return _unpack_recording(whole, path, target, to, chosen, progress, span)
-                with sliced(whole, chosen.slice, path.parent) as opened:
-                    if to == "images":
+                if to == "images":
+                    with sliced(whole, chosen.slice, path.parent) as opened:
                         return _unpack_images(opened, path, target, chosen, progress)
-                    return _unpack_recording(opened, path, target, to, chosen, progress)
+                span = span_in(whole, chosen.slice)
+                latched, too_large = latched_at(whole, span, chosen.slice)
+                unpack_recording = partial(
+                    _unpack_recording, path=path, target=target, to=to, options=chosen
+                )
+                if is_filtered:
+                    summary = unpack_recording(whole, progress=progress, span=span, latched=latched)
+                else:
+                    with sliced(whole, chosen.slice, path.parent, latched) as opened:
+                        summary = unpack_recording(opened, progress=progress)
+                selected = Selection(chosen.topics, chosen.exclude)
+                summary.latched.update(
+                    Counter(item.channel.topic for item in latched if selected(item.channel.topic))
+                )
+                summary.latched_left_out.extend(filter(selected, too_large))
+                return summary
             except OSError as error:
                 if error.errno is None:
                     raise
@@ -382,6 +401,7 @@ def _unpack_recording(
     options: UnpackOptions,
     progress: Callable[[UnpackProgress], None] | None,
     span: Excerpt = EVERYTHING,
+    latched: Sequence[Message] = (),
 ) -> UnpackSummary:
     selected = Selection(options.topics, options.exclude)
     selected.check(channel.topic for channel in dataset.channels)
@@ -392,7 +412,8 @@ def _unpack_recording(
     summary = UnpackSummary(target)
     total = dataset.manifest.messages if dataset.manifest else 0
     if span != EVERYTHING:
-        total = sum(len(in_span(times, span)) for times in dataset.times().values())
+        total = len(latched)
+        total += sum(len(in_span(times, span)) for times in dataset.times().values())
     storage = ""
     if to == "rosbag2":
         storage = options.storage or recorded_storage(dataset.recorded_records())
@@ -408,7 +429,7 @@ def _unpack_recording(
         topics.declare(dataset, republisher)
         done = found = 0
         records = dataset.records(republisher.sources if republisher else None)
-        for record in filter(span.has, records):
+        for record in begun_by(latched, filter(span.has, records)):
             if not isinstance(record, Message):
                 _write_other(writer, record, to, source)
                 continue

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.convert import LATCHED_QOS, ros2_channel
+from mp4ds.bags.convert import ros2_channel
+from mp4ds.bags.latched import LATCHED_QOS
 from mp4ds.bags.protocols import Format
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.files.outputs import csv_cell

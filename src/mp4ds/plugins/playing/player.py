@@ -511,9 +511,8 @@ class Player:
         if self._has_looped and self._options.delays_loops:
             self._wait(self._options.delay_s, "waiting")
         self._has_looped = False
-        if time_ns > self._timeline.start_ns:
-            for due in self._timeline.latched(time_ns):
-                self._send(due, time_ns)
+        for due in self._timeline.latched(time_ns):
+            self._send(due, time_ns)
 
     def _read_from(self, time_ns: int) -> None:
         if self._playback is not None:

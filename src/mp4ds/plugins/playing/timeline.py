@@ -15,14 +15,14 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from mp4ds.bags.convert import Converter, is_latched
+from mp4ds.bags.convert import Converter
+from mp4ds.bags.latched import Kept, has_late, kept_depth
 from mp4ds.bags.types import HeaderStamps
 from mp4ds.dataset.channels import Ahead
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import DecodedColumns, everything
 from mp4ds.errors import ConversionError, OptionError
 from mp4ds.plan import Selection
-from mp4ds.plugins.publishing.latching import Kept, kept_depth
 from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.records import Channel, Message
 from mp4ds.unpacking.pictures import Reduction
@@ -551,7 +551,9 @@ class _Part:
         times = [times for key, times in self._dataset.times().items() if key in ids and len(times)]
         if not times:
             return None
-        return min(int(item[0]) for item in times), max(int(item[-1]) for item in times)
+        first, last = min(int(item[0]) for item in times), max(int(item[-1]) for item in times)
+        begin = self._dataset.slice_start  # latched messages from before it are sent at first
+        return (first if begin is None else min(max(first, begin), last)), last
 
     @property
     def published(self) -> list[Channel]:
@@ -599,7 +601,7 @@ class _Part:
     def latched(self, time_ns: int) -> Iterator[Due]:
         """The latched messages of each channel at a time."""
         channels = [item for item in self._dataset.channels if item.topic in self._topics]
-        kept = {item.id: Kept[Message](item) for item in filter(is_latched, channels)}
+        kept = {item.id: Kept[Message](item) for item in filter(has_late, channels)}
         topics = {item.topic for item in channels if item.id in kept}
         most = max((kept_depth(item) for item in channels if item.id in kept), default=1)
         for message in self._dataset.before(time_ns, topics, most) if topics else ():

@@ -21,9 +21,8 @@ from http.client import HTTPException, parse_headers
 from typing import Any
 from urllib.parse import urlsplit
 
-from mp4ds.bags.convert import is_latched
+from mp4ds.bags.latched import Kept, has_late
 from mp4ds.errors import ConversionError, OptionError, PublishError
-from mp4ds.plugins.publishing.latching import Kept
 from mp4ds.plugins.publishing.publisher import Controls
 from mp4ds.records import Channel, Schema
 
@@ -612,7 +611,7 @@ class _Outlet:
     def __init__(self, channel: Channel, announced: Any) -> None:
         self.channel = channel  # a reference, so that its id() stays unique
         self.announced = announced
-        self.kept = Kept[tuple[bytes, int]](channel) if is_latched(channel) else None
+        self.kept = Kept[tuple[bytes, int]](channel) if has_late(channel) else None
 
 
 class _Listener:

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from mp4ds.bags.convert import Converter
+from mp4ds.bags.latched import is_ros1
 from mp4ds.errors import ConversionError, OptionError, PublishError
-from mp4ds.plugins.publishing.latching import is_ros1
 from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import Controls
 from mp4ds.records import Channel

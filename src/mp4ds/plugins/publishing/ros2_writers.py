@@ -11,9 +11,9 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import yaml
 
+from mp4ds.bags.latched import PLAYER_DEPTH, kept_depth
 from mp4ds.bags.rosbag2_metadata import native_qos
 from mp4ds.errors import ConversionError, OptionError
-from mp4ds.plugins.publishing.latching import PLAYER_DEPTH, kept_depth
 from mp4ds.plugins.publishing.publisher import Controls
 from mp4ds.records import QOS_KEY, Channel
 

@@ -1,16 +1,39 @@
-"""The messages of a latched channel that late subscribers get."""
+"""The messages of latched channels that late subscribers get."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
-from mp4ds.bags.convert import LATCHED_QOS
 from mp4ds.bags.rosbag2_metadata import native_qos
 from mp4ds.errors import Refused
+from mp4ds.messages.serializations import is_camera
 from mp4ds.messages.transforms import transform_parser
 from mp4ds.messages.wire import WireError
-from mp4ds.records import QOS_KEY, Channel
+from mp4ds.records import QOS_KEY, Channel, Message, Record
+
+_QOS = """\
+- history: 1
+  depth: {depth}
+  reliability: 1
+  durability: {durability}
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  lifespan:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: 1
+  liveliness_lease_duration:
+    sec: 9223372036
+    nsec: 854775807
+  avoid_ros_namespace_conventions: false"""
+LATCHED_QOS = _QOS.format(depth=1, durability=1)
+"""Keep the last one, reliable, transient local: what ROS 1 calls latching."""
+DEFAULT_QOS = _QOS.format(depth=10, durability=2)
+"""Keep the last ten, reliable, volatile: the default of publishers in ROS 2."""
 
 PLAYER_DEPTH = 10
 """rosbag2's history depth: recordings seldom know the depth of their publishers."""
@@ -19,8 +42,26 @@ TF_STATIC_DEPTH = 100
 """History depth of tf2's listeners for /tf_static."""
 
 MOST = 1000
+
+MOST_BYTES = 2**28
+"""Of the latched messages from before a slice."""
+
 _TF_STATIC = "tf_static"
 _Item = TypeVar("_Item")
+
+
+def is_latched(channel: Channel) -> bool:
+    """Whether late subscribers get the last message: latching, or transient local."""
+    if is_ros1(channel):
+        return True
+    qos = channel.metadata.get(QOS_KEY, "")
+    found = re.findall(r"durability[\"']?\s*:\s*[\"']?(\w+)", qos)
+    return bool(found) and set(found) <= {"1", "transient_local"}
+
+
+def has_late(channel: Channel) -> bool:
+    """Whether late subscribers get earlier messages: /tf_static counts as latched in any case."""
+    return is_latched(channel) or _is_tf_static(channel)
 
 
 def kept_depth(channel: Channel) -> int:
@@ -61,12 +102,16 @@ class Kept(Generic[_Item]):
 
     Args:
         channel: The channel, as recorded.
+
+    Attributes:
+        size: Bytes of the kept messages.
     """
 
     def __init__(self, channel: Channel) -> None:
         self._depth = kept_depth(channel)
         self._children = None if is_ros1(channel) else _parser(channel)
         self._kept: list[tuple[bytes | memoryview, frozenset[str] | None, _Item]] = []
+        self.size = 0
 
     def __iter__(self) -> Iterator[_Item]:
         return (item for _, _, item in self._kept)
@@ -83,6 +128,7 @@ class Kept(Generic[_Item]):
         if self._children:
             kept = _uncovered(kept)
         self._kept = kept[-(MOST if self._children else self._depth) :]
+        self.size = sum(len(row[0]) for row in self._kept)
 
 
 _Row = tuple["bytes | memoryview", "frozenset[str] | None", _Item]
@@ -102,7 +148,7 @@ def _uncovered(rows: list[_Row[_Item]]) -> list[_Row[_Item]]:
 
 def _parser(channel: Channel) -> Callable[[bytes | memoryview], frozenset[str] | None] | None:
     """A function that returns the child frames of a /tf_static message; None for other channels."""
-    if channel.topic.rpartition("/")[2] != _TF_STATIC:
+    if not _is_tf_static(channel):
         return None
     try:
         parse = transform_parser(channel)
@@ -116,3 +162,61 @@ def _parser(channel: Channel) -> Callable[[bytes | memoryview], frozenset[str] |
             return None  # kept in any case
 
     return children
+
+
+def _is_tf_static(channel: Channel) -> bool:
+    return channel.topic.rpartition("/")[2] == _TF_STATIC
+
+
+def begun_by(latched: Sequence[Message], records: Iterable[Record]) -> Iterator[Record]:
+    """Records with latched messages before the first message.
+
+    What is not a message comes first: it may tell about those that follow.
+    """
+    for record in records:
+        if latched and isinstance(record, Message):
+            yield from latched
+            latched = ()
+        yield record
+    yield from latched
+
+
+Read = Callable[[frozenset[str], int], Iterable[Record]]
+"""Yields the earlier messages of some topics, of each video at least so many of the last."""
+
+
+def latched_before(
+    channels: Sequence[Channel], read: Read
+) -> tuple[Sequence[Message], Sequence[str]]:
+    """The latched messages from before a slice, in recorded order.
+
+    Images are never among them.
+
+    Args:
+        channels: Those of the recording.
+        read: Reads what was recorded before the slice.
+
+    Returns:
+        The messages, and the topics left out since the messages are too large.
+    """
+    own = {item.id: item for item in channels if has_late(item) and not is_camera(item)}
+    if not own:
+        return (), ()
+    kept = {key: Kept[tuple[int, Message]](channel) for key, channel in own.items()}
+    topics = frozenset(channel.topic for channel in own.values())
+    left_out: dict[str, None] = {}
+    size = 0
+    for number, message in enumerate(read(topics, max(map(kept_depth, own.values())))):
+        if not isinstance(message, Message) or message.channel.id not in kept:
+            continue
+        data = bytes(message.data)  # a view would keep a whole chunk
+        one = kept[message.channel.id]
+        size -= one.size
+        one.add(data, (number, replace(message, data=data)))
+        size += one.size
+        while size > MOST_BYTES:
+            largest = max(kept, key=lambda key: kept[key].size)
+            size -= kept.pop(largest).size
+            left_out[own[largest].topic] = None
+    found = sorted((pair for one in kept.values() for pair in one), key=lambda pair: pair[0])
+    return [message for _, message in found], [*left_out]
