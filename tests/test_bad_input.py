@@ -963,7 +963,6 @@ def test_a_preset_that_is_wrong(codec: str, small_bag: Path, tmp_path: Path) -> 
     "arguments",
     [
         ("pack",),
-        ("pack", "BAG"),
         ("pack", "BAG", "-o", "OUT", "--gop", "0"),
         ("pack", "BAG", "-o", "OUT", "--gop", "many"),
         ("pack", "BAG", "-o", "OUT", "--jobs", "0"),
