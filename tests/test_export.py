@@ -40,6 +40,7 @@ from export_scenes import (
     stamps_of,
 )
 from mp4ds.format.models import Calibration
+from mp4ds.options import seconds_text
 from mp4ds.plugins.exporting.colmap import PoseTrack, model_of
 from mp4ds.plugins.exporting.euroc import distortion
 from mp4ds.plugins.exporting.job import ExportJob
@@ -50,7 +51,6 @@ from mp4ds.plugins.exporting.motion import (
     quaternion_of,
     rotation_matrix,
 )
-from mp4ds.plugins.exporting.tum import seconds
 from mp4ds.times import nearest
 from scenes import PERIOD, Record, Scene, scene
 from waiting import WATCHDOG_S
@@ -179,7 +179,7 @@ def test_tum(dataset: Path, tmp_path: Path) -> None:
     ],
 )
 def test_seconds_keep_every_digit(time: int, text: str) -> None:
-    assert seconds(time) == text
+    assert seconds_text(time) == text
 
 
 # ---------------------------------------------------------------- KITTI

@@ -184,22 +184,41 @@ class FormatError(Mp4dsError, ValueError):
 
     Args:
         code: A problem code of spec/registry.md.
-        place: File, with key or frame where known.
+        place: File, with key where known.
         problem: What is wrong, without a full stop.
+        frame: Number of the frame that it is wrong with, if it is one.
+        name: What the frame is called, with its topic and times where they are known.
     """
 
-    def __init__(self, code: str, place: Path | str, problem: str) -> None:
+    def __init__(
+        self,
+        code: str,
+        place: Path | str,
+        problem: str,
+        *,
+        frame: int | None = None,
+        name: str = "",
+    ) -> None:
         self.code = code
         self.place = str(place)
+        self.frame = frame
+        self.name = name
+        self.what = problem
+        if name:
+            problem = f"{name}: {problem}"
+        elif frame is not None:
+            problem = f"frame {frame} {problem}"
         self.problem = problem
-        super().__init__(f"{path_text(place)}: {problem} [{code}].")
+        super().__init__(f"{path_text(place)}: {self.problem} [{code}].")
 
 
 @contextmanager
 def advising(remedy: str) -> Iterator[None]:
-    """Add to the error of a damaged dataset what the user can do."""
+    """Add to the error of a damaged dataset what the user can do; a newer version is no damage."""
     try:
         yield
+    except VersionError:
+        raise
     except FormatError as error:
         error.args = (f"{error} {remedy}",)
         raise

@@ -190,6 +190,12 @@ def iso_text(time_ns: int) -> str:
     return f"{moment:%Y-%m-%dT%H:%M:%S}{fraction}Z"
 
 
+def seconds_text(time_ns: int) -> str:
+    """Nanoseconds as seconds, with all digits."""
+    sign, (whole, part) = "-" if time_ns < 0 else "", divmod(abs(time_ns), _NS)
+    return f"{sign}{whole}.{part:09d}"
+
+
 @dataclass(frozen=True, slots=True)
 class Slice:
     """A time slice, as users write it. False if empty.

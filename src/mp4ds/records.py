@@ -181,9 +181,12 @@ class Loss:
         size: Its bytes, some of which may have been read anyway; None if unknown.
         problem: What is wrong, a phrase.
         messages: How many are lost, None if unknown. If only the total of several places is known,
-        the largest of them has it. topics: Topics known to have lost messages. start: Log time of
-        the last message read before it, ns; None if unknown. end: Log time of the first
-        message read after it, ns; None if unknown.
+            the largest of them has it.
+        topics: Topics known to have lost messages.
+        start: Log time of the last message read before it, ns; None if unknown.
+        end: Log time of the first message read after it, ns; None if unknown.
+        frames: Numbers of the first and the last frame that are lost of a dataset's video; `start`
+            and `end` are the log times of these two.
     """
 
     file: str
@@ -194,6 +197,7 @@ class Loss:
     topics: tuple[str, ...] = ()
     start: int | None = None
     end: int | None = None
+    frames: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from unicodedata import east_asian_width
 import typer
 
 from mp4ds.errors import Mp4dsError, counted, path_text
-from mp4ds.options import iso_text
+from mp4ds.options import iso_text, seconds_text
 from mp4ds.records import latched_text
 
 if TYPE_CHECKING:
@@ -235,11 +235,7 @@ def print_pack(summary: PackSummary) -> None:
     if summary.left_out:
         say(f"left out: {', '.join(summary.left_out)}")
     _print_latched(summary)
-    for loss in summary.losses[:_LOSSES_SHOWN]:
-        say(f"lost: {_loss_text(loss)}")
-    if len(summary.losses) > _LOSSES_SHOWN:
-        more = counted(len(summary.losses) - _LOSSES_SHOWN, "more place")
-        say(f"lost: {more}, listed in dataset.yaml")
+    _print_losses(summary.losses, "listed in dataset.yaml")
     if not any(topic.files for topic in summary.topics):
         say("no topic became a video: all messages are stored unchanged in messages.mcap")
     if summary.not_copied:
@@ -264,12 +260,25 @@ def _change(summary: PackSummary) -> str:
     return f" ({ratio:.2f} times smaller)" if ratio >= 1 else f" ({1 / ratio:.2f} times as large)"
 
 
+def _print_losses(losses: Sequence[Loss], where: str) -> None:
+    for loss in losses[:_LOSSES_SHOWN]:
+        say(f"lost: {_loss_text(loss)}")
+    if len(losses) > _LOSSES_SHOWN:
+        say(f"lost: {counted(len(losses) - _LOSSES_SHOWN, 'more place')}, {where}")
+
+
 def _loss_text(loss: Loss) -> str:
     place = f" at byte {loss.offset}" if loss.offset is not None else ""
     size = f", {size_text(loss.size)}" if loss.size is not None else ""
     messages = f"; {counted(loss.messages, 'message')}" if loss.messages is not None else ""
     topics = f" of {', '.join(loss.topics)}" if loss.topics else ""
-    return f"{loss.file}{place}{size}: {loss.problem}{messages}{topics}"
+    if loss.frames is None:
+        return f"{loss.file}{place}{size}: {loss.problem}{messages}{topics}"
+    first, last = loss.frames
+    frames = f"frame {first}" if first == last else f"frames {first} to {last}"
+    times = dict.fromkeys(seconds_text(time) for time in (loss.start, loss.end) if time is not None)
+    logged = f", log time {' to '.join(times)}" if times else ""
+    return f"{loss.file}: {frames}{topics}{logged}: {loss.problem}"
 
 
 def _pack_row(topic: TopicSummary) -> list[str]:
@@ -313,6 +322,9 @@ def print_unpack(summary: UnpackSummary, noun: str) -> None:
     if summary.left_out:
         say(f"left out: {', '.join(summary.left_out)}")
     _print_latched(summary)
+    for note in summary.notes:
+        say(note)
+    _print_losses(summary.losses, "listed with --json")
 
 
 def _print_latched(summary: PackSummary | UnpackSummary) -> None:

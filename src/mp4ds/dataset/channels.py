@@ -86,12 +86,14 @@ class ChannelPart:
         key: Which they are.
         source: Makes them.
         decode_columns: Decodes their columns.
+        count: How many there are.
         stream: Whose images they are; None for calibrations.
     """
 
     key: PartKey
     source: MessageSource
     decode_columns: Callable[[], DecodedColumns]
+    count: int
     stream: Stream | None = None
 
     @property
@@ -134,14 +136,14 @@ class ChannelGroup:
         return [(message for _, message in part) for part in self._read(reading)]
 
     def merged(
-        self, reading: Reading, recorded: Iterator[Message], place: str
+        self, reading: Reading, recorded: Iterator[Message], place: str | None
     ) -> Iterator[Message]:
         """All its messages, in the channel's order.
 
         Args:
             reading: How those in videos are read.
             recorded: Those of messages.mcap, which fill the remaining ordinals.
-            place: The dataset, for errors.
+            place: The dataset, for errors; None if some may be missing.
 
         Raises:
             FormatError: ``messages-missing``.
@@ -153,6 +155,8 @@ class ChannelGroup:
             while given < before:
                 verbatim = next(recorded, None)
                 if verbatim is None:
+                    if place is None:
+                        break
                     raise FormatError(
                         "messages-missing",
                         place,
@@ -232,12 +236,14 @@ def channel_groups(streams: Sequence[Stream], recorded: Sequence[Channel]) -> li
     first_id = 1 + max((channel.id for channel in recorded), default=0)
     for stream in streams:
         key = PartKey(stream.path)
-        images = ChannelPart(key, stream.messages, partial(_columns_of, stream), stream)
-        sources = [(stream.sidecar.channel, images)]
+        columns = partial(_columns_of, stream)
+        images = ChannelPart(key, stream.messages, columns, len(stream), stream)
+        sources = [] if stream.is_lost else [(stream.sidecar.channel, images)]
         info = stream.sidecar.camera_info
         if info and info.messages:
             key = PartKey(stream.path, is_calibration=True)
-            part = ChannelPart(key, stream.camera_info_messages, partial(_info_columns_of, stream))
+            columns = partial(_info_columns_of, stream)
+            part = ChannelPart(key, stream.camera_info_messages, columns, info.messages)
             sources.append((info.channel, part))
         for model, part in sources:
             identity = model.to_record(0).identity

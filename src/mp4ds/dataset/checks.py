@@ -21,6 +21,7 @@ from mp4ds.bags.formats import limits_of
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import recorded_storage
+from mp4ds.dataset.salvage import damages_of
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import ConversionError, FormatError, SourceError, SourceNotFoundError, VideoError
 from mp4ds.files.urls import location
@@ -59,6 +60,11 @@ class Problem:
     code: str
     place: str
     message: str
+
+    @classmethod
+    def of(cls, error: FormatError) -> Problem:
+        """The problem that an error tells of."""
+        return cls(error.code, error.place, error.problem)
 
     def __str__(self) -> str:
         return f"{self.place}: {self.message} [{self.code}]"
@@ -135,7 +141,7 @@ def _read(path: Path, kind: str, model: type[_Model]) -> tuple[_Model | None, li
     try:
         document = load_document(path)
     except FormatError as error:
-        return None, [Problem(error.code, error.place, error.problem)]
+        return None, [Problem.of(error)]
     if document["kind"] != kind:
         return None, [Problem("kind-unknown", str(path), f"is not a {kind}")]
     if problem := cut_short(document):
@@ -275,7 +281,7 @@ def _check_stream(stream: Stream) -> list[Problem]:
         with stream.open_video(sequential=True) as decoder:
             problems += _check_count(stream, decoder.coded_frames)
     except FormatError as error:
-        problems.append(Problem(error.code, error.place, error.problem))
+        problems.append(Problem.of(error))
     return problems
 
 
@@ -299,7 +305,7 @@ def _check_deep(stream: Stream, report: _Report) -> list[Problem]:
                 return problems
         problems += _check_frames(stream, report)
     except FormatError as error:
-        problems.append(Problem(error.code, error.place, error.problem))
+        problems.append(Problem.of(error))
     return problems
 
 
@@ -322,18 +328,18 @@ def _check_video_file(stream: Stream, *, deep: bool) -> Iterator[Problem]:
     if not stream.video_path.is_file():
         return  # reported when it is opened
     for error in wrong_facts(stream.video_path, stream.sidecar.video, deep=deep):
-        yield Problem(error.code, error.place, error.problem)
+        yield Problem.of(error)
 
 
 def _check_frames(stream: Stream, report: _Report) -> Iterator[Problem]:
     """Check that every frame decodes and that its message matches its digest, if any."""
-    for number, make in enumerate(stream.makers()):
+
+    def tell(number: int) -> None:
         if number % _TELL_EVERY == 0:
             report(f"decoding {stream.video_path.name}", number / len(stream))
-        try:
-            make()
-        except FormatError as error:
-            yield Problem(error.code, error.place, error.problem)
+
+    for damage in damages_of(stream, tell):
+        yield Problem.of(damage.error)
 
 
 def _check_messages(dataset: Dataset, manifest: Manifest) -> list[Problem]:
@@ -349,9 +355,7 @@ def _check_messages(dataset: Dataset, manifest: Manifest) -> list[Problem]:
             return [Problem("message-count", place, f"{problem}{manifest.messages}")]
         return [*_check_verbatim(dataset, manifest), *_check_limits(dataset, manifest, (), place)]
     except FormatError as error:
-        return [Problem(error.code, error.place, error.problem)]
-    except SourceError as error:
-        return [Problem("messages-unreadable", place, str(error))]
+        return [Problem.of(error)]
 
 
 def _check_verbatim(dataset: Dataset, manifest: Manifest) -> Iterator[Problem]:
@@ -385,9 +389,7 @@ def _check_recorded(dataset: Dataset, manifest: Manifest, report: _Report) -> li
     try:
         return list(_check_limits(dataset, manifest, _counted(dataset, manifest, place), place))
     except FormatError as error:
-        return [Problem(error.code, error.place, error.problem)]
-    except SourceError as error:
-        return [Problem("messages-unreadable", place, str(error))]
+        return [Problem.of(error)]
 
 
 def _counted(dataset: Dataset, manifest: Manifest, place: str) -> Iterator[Record]:

@@ -27,17 +27,18 @@ from mp4ds.dataset.channels import (
     when_asked,
 )
 from mp4ds.dataset.frames import Frames, missing, seconds_of
-from mp4ds.dataset.messages import MessagesFile, RecordedMessage, as_recorded
+from mp4ds.dataset.messages import MessagesFile, RecordedMessage, SalvagedMessages, as_recorded
 from mp4ds.dataset.rebuild import Choice, everything, last_of, within
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic_frames import TopicFrames
 from mp4ds.dataset.video import Video
-from mp4ds.errors import OptionError, SourceError, SourceNotFoundError, counted
+from mp4ds.errors import FormatError, OptionError, SourceError, SourceNotFoundError, counted
 from mp4ds.files.sources import HOW_TO_OPEN, is_folder, video_at
 from mp4ds.files.urls import location
 from mp4ds.format.fields import MESSAGES_NAME
-from mp4ds.format.manifest import Manifest
+from mp4ds.format.manifest import Manifest, StreamEntry
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, verify_file
+from mp4ds.plan import calibration_topics
 from mp4ds.records import Channel, Excerpt, Message, Record, Schema
 from mp4ds.times import Sync, synchronize
 
@@ -60,10 +61,14 @@ class Dataset:
         streams: Its streams.
         videos: Third-party videos without a sidecar; see `mp4ds.open`.
         jpeg_quality: Quality of the JPEG files in messages of transcoded streams.
+        unread: What is wrong with files that cannot be read, and that have nothing that is wanted.
+        is_salvaged: Whether messages may be missing; see `mp4ds.dataset.salvage`.
 
     Args:
         path: The folder, a manifest, a sidecar, or a video next to its sidecar; or its URL.
         jpeg_quality: Quality of the JPEG files in messages of transcoded streams, 1 to 100.
+        selected: Whether a topic is wanted: damage of files that only have others is no error.
+            None: all are.
 
     Raises:
         SourceNotFoundError: The path does not exist.
@@ -71,7 +76,15 @@ class Dataset:
         FormatError: A file breaks a rule of the format.
     """
 
-    def __init__(self, path: Path | str, *, jpeg_quality: int = 95) -> None:
+    is_salvaged = False
+
+    def __init__(
+        self,
+        path: Path | str,
+        *,
+        jpeg_quality: int = 95,
+        selected: Callable[[str], bool] | None = None,
+    ) -> None:
         self.path = location(path)
         if not self.path.exists():
             raise SourceNotFoundError(self.path)
@@ -92,22 +105,75 @@ class Dataset:
                 problem = f"is a folder of {counted(len(inside), 'dataset')}, not a dataset"
                 remedy = f"Open one of them, such as {inside[0].parent}."
             raise SourceError(self.path, problem, remedy)
+        self.streams: list[Stream] = []
+        self.videos: list[Video] = []
+        self.unread: list[str] = []
+        self._selected = selected
         if self.path.is_dir():
             self.manifest = load_manifest(self.path / MANIFEST_NAME)
-            sidecars = [self.path / entry.sidecar for entry in self.manifest.streams]
+            for entry in self.manifest.streams:
+                self._open_stream(entry)
         else:
-            sidecars = [self.path.with_suffix(".yaml") if self.path.suffix == ".mp4" else self.path]
-        self.streams: list[Stream] = [
-            Stream(sidecar, jpeg_quality=jpeg_quality) for sidecar in sidecars
-        ]
-        self.videos: list[Video] = []
+            is_video = self.path.suffix == ".mp4"
+            sidecar = self.path.with_suffix(".yaml") if is_video else self.path
+            self.streams.append(Stream(sidecar, jpeg_quality=jpeg_quality))
+        self._file = MessagesFile(self.path / MESSAGES_NAME if self.manifest else None)
+        if selected is not None:
+            try:
+                self._file.check_index()
+            except FormatError as error:
+                self._do_without_messages(error)
+
+    def _open_stream(self, entry: StreamEntry) -> None:
+        path, wanted = self.path / entry.sidecar, self._selected
+        topics = [entry.topic, *calibration_topics(entry.topic)]
+        try:
+            stream = Stream(path, jpeg_quality=self.jpeg_quality)
+            topics = stream.topics
+            if wanted is not None and not any(map(wanted, topics)):
+                stream.check_size()
+            self.streams.append(stream)
+        except FormatError as error:
+            if wanted is None or any(map(wanted, topics)):
+                raise
+            self.unread.append(str(error))
+
+    def _do_without_messages(self, error: FormatError) -> None:
+        """Go on without messages.mcap, which is damaged.
+
+        Raises:
+            FormatError: It has, or may have, messages that are wanted.
+        """
+        path, wanted = self._file.path, self._selected
+        if path is None or wanted is None:
+            raise error
+        try:
+            file = SalvagedMessages(path)
+        except FormatError:
+            raise error from None
+        there = [channel.topic for channel in file.channels if file.counts.get(channel.id)]
+        lost = [loss for loss in file.losses if loss.messages != 0]
+        if any(map(wanted, there)) or any(
+            not loss.topics or any(map(wanted, loss.topics)) for loss in lost
+        ):
+            raise error
+        self.unread.append(str(error))
+        self._file = MessagesFile(None)
 
     @classmethod
-    def of(cls, folder: Path, manifest: Manifest, streams: Sequence[Stream]) -> Dataset:
-        """A folder whose sidecars have already been read."""
+    def of(
+        cls,
+        folder: Path,
+        manifest: Manifest,
+        streams: Sequence[Stream],
+        file: MessagesFile | None = None,
+    ) -> Dataset:
+        """A folder whose sidecars, and perhaps its messages.mcap, have already been read."""
         dataset = cls.__new__(cls)
         dataset.path, dataset.manifest, dataset.jpeg_quality = folder, manifest, 95
-        dataset.streams, dataset.videos = list(streams), []
+        dataset.streams, dataset.videos, dataset.unread = list(streams), [], []
+        dataset._selected = None
+        dataset._file = file or MessagesFile(folder / MESSAGES_NAME)
         return dataset
 
     if not TYPE_CHECKING:  # else every name would pass for known
@@ -173,9 +239,11 @@ class Dataset:
         """All channels of the recording."""
         return [*self._verbatim_channels, *(group.channel for group in self._groups)]
 
-    @cached_property
-    def _file(self) -> MessagesFile:
-        return MessagesFile(self.path / MESSAGES_NAME if self.manifest else None)
+    @property
+    def all_topics(self) -> list[str]:
+        """The topics of all channels, and of the images whose sidecars are in `unread`."""
+        listed = [entry.topic for entry in self.manifest.streams] if self.manifest else []
+        return list(dict.fromkeys([*(channel.topic for channel in self.channels), *listed]))
 
     @property
     def unused_schemas(self) -> Sequence[Schema]:
@@ -196,10 +264,13 @@ class Dataset:
         """Check messages.mcap against its SHA-256: not all of its contents have their own checksum.
 
         Raises:
-            FormatError: See `verify_file`.
+            FormatError: See `verify_file`; and it has messages that are wanted.
         """
-        if self.manifest:
-            self._file.verify(self.manifest)
+        if self.manifest and not self.is_salvaged and self._file.path:
+            try:
+                self._file.verify(self.manifest)
+            except FormatError as error:
+                self._do_without_messages(error)
 
     def verify_sidecars(self, selected: Callable[[str], bool] = lambda _: True) -> None:
         """Check sidecars against their SHA-256: an edited one may look valid.
@@ -397,6 +468,14 @@ class Dataset:
             found[channel.topic] += int(np.searchsorted(times.get(channel.id, []), begin))
         return +found
 
+    def counts(self) -> dict[int, int]:
+        """Number of messages by channel id; decodes nothing."""
+        found = dict(self._file.counts)
+        for group in self._groups:
+            recorded = sum(found.pop(key, 0) for key in group.recorded_ids)
+            found[group.channel.id] = recorded + sum(part.count for part in group.parts)
+        return found
+
     def recorded_times(self, topic: str) -> NDArray[np.int64]:
         """Sorted log times, nanoseconds, of a topic's messages that are in messages.mcap."""
         times = self._file.times()
@@ -441,7 +520,7 @@ class Dataset:
         recorded = reading.ahead(group.found_in(self.recorded_records()))
         if self.manifest is None:  # a pair on its own has only its own messages
             return chain(group.messages(reading), recorded)
-        return group.merged(reading, recorded, str(self.path))
+        return group.merged(reading, recorded, None if self.is_salvaged else str(self.path))
 
     def close(self) -> None:
         """Close all videos."""
@@ -467,6 +546,8 @@ class _VideoDataset(Dataset):
         self.manifest = None
         self.streams = []
         self.videos = [Video(path, track)]
+        self.unread = []
+        self._file = MessagesFile(None)
 
     @property
     def profile(self) -> str:

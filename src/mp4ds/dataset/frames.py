@@ -6,7 +6,7 @@ import os
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import index as as_integer
@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.dataset.views import Crop, Resize, View, check_outputs, output, view_of
-from mp4ds.errors import FrameNotFoundError, Mp4dsError, OptionError
+from mp4ds.errors import FormatError, FrameNotFoundError, Mp4dsError, OptionError
 from mp4ds.format.models import Calibration
 from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.depth import metres_of
 from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
+from mp4ds.options import seconds_text
 from mp4ds.times import nanoseconds
 from mp4ds.video.pixels import Scale
 from mp4ds.video.reader import FrameReader
@@ -297,6 +298,38 @@ class Frames(ABC):
     def close(self) -> None:
         """Close any open videos."""
 
+    # ------------------------------------------------------------ damage
+
+    def name_of(self, first: int, last: int | None = None) -> str:
+        """What errors call a frame, or several in a row: by number, topic and times.
+
+        Args:
+            first: 0 <= first < frames.
+            last: The last one; None for one frame.
+        """
+        ends = [first] if last in (None, first) else [first, last]
+        frames = f"frame{'s' * (len(ends) - 1)} {' to '.join(map(str, ends))}"
+        stamps, times = (
+            " to ".join(seconds_text(int(column[index])) for index in ends)
+            for column in (self.stamps, self.log_times)
+        )
+        return f"{frames} of {self.topic} (stamp {stamps}, log time {times})"
+
+    @contextmanager
+    def naming_frames(self) -> Iterator[None]:
+        """Give errors that have the number of a frame its topic and times."""
+        try:
+            yield
+        except FormatError as error:
+            if error.frame is None or error.name:
+                raise
+            raise self.named(error, error.frame) from None
+
+    def named(self, error: FormatError, first: int, last: int | None = None) -> FormatError:
+        """An error of a frame, or of several in a row, with their topic and times."""
+        name = self.name_of(first, last)
+        return type(error)(error.code, error.place, error.what, frame=first, name=name)
+
     # ------------------------------------------------------------ by number
 
     @overload
@@ -562,11 +595,12 @@ class DecodedFrames(Frames):
             VideoError: One cannot be decoded.
         """
         if not len(indices):
-            return iter(())
+            return
         opened = self._opened
         if opened.reader is None:
             opened.reader = self._open_reader()
-        return opened.reader.pictures_of(indices, scale, outs)
+        with self.naming_frames():
+            yield from opened.reader.pictures_of(indices, scale, outs)
 
     # ------------------------------------------------------------ by number
 

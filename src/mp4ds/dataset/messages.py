@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.mcap import McapReader
+from mp4ds.bags.protocols import Format, times_of
+from mp4ds.bags.rosbag2_metadata import RECORD
+from mp4ds.bags.salvage.mcap import McapSalvage
 from mp4ds.errors import FormatError, SourceError
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import verify_file
 from mp4ds.messages.wire import WireError
-from mp4ds.records import Channel, Excerpt, Message, MetadataRecord, Record, Schema
+from mp4ds.records import Channel, Excerpt, Loss, Message, MetadataRecord, Record, Schema
+
+_Item = TypeVar("_Item")
 
 
 class MessagesFile:
@@ -49,13 +55,14 @@ class MessagesFile:
         """The reader; keeps no file open between passes.
 
         Raises:
-            FormatError: ``file-missing``; ``messages-unreadable`` if it does not list them all.
-            SourceError: It is damaged, or not an MCAP file.
+            FormatError: ``file-missing``, or ``messages-unreadable``: it is damaged, or does not
+                list all its messages.
         """
         if self.path is None:
             return None
         self._check_there(self.path)
-        reader = McapReader(self.path)
+        with _damage_told():
+            reader = McapReader(self.path)
         if not reader.has_whole_index:
             raise FormatError(
                 "messages-unreadable",
@@ -64,10 +71,23 @@ class MessagesFile:
             )
         return reader
 
+    def check_index(self) -> None:
+        """Open it.
+
+        Raises:
+            FormatError: ``file-missing`` or ``messages-unreadable``.
+        """
+        _ = self._reader
+
     @property
     def channels(self) -> Sequence[Channel]:
         """Its channels."""
         return self._reader.channels if self._reader else ()
+
+    @property
+    def profile(self) -> str:
+        """MCAP profile of the recording."""
+        return self._reader.profile if self._reader else ""
 
     @property
     def unused_schemas(self) -> Sequence[Schema]:
@@ -82,20 +102,101 @@ class MessagesFile:
 
     def times(self) -> Mapping[int, NDArray[np.int64]]:
         """Sorted log times, nanoseconds, by channel id."""
-        return self._reader.times() if self._reader else {}
+        with _damage_told():
+            return self._reader.times() if self._reader else {}
 
     def in_file_order(self) -> Iterator[Record]:
         """All its records, in file order."""
-        return self._reader.as_it_stands() if self._reader else iter(())
+        return _intact(self._reader.as_it_stands() if self._reader else ())
 
     def others(self) -> Iterator[Record]:
         """The attachments and metadata records in it."""
-        return self._reader.records(Excerpt(start=0, end=0)) if self._reader else iter(())
+        return _intact(self._reader.records(Excerpt(start=0, end=0)) if self._reader else ())
 
     def in_time(self, excerpt: Excerpt) -> Iterator[Message]:
         """The messages of an excerpt, by log time."""
         records = self._reader.records(replace(excerpt, others=False)) if self._reader else ()
+        return (record for record in _intact(records) if isinstance(record, Message))
+
+
+@contextmanager
+def _damage_told() -> Iterator[None]:
+    """Turn the error of a damaged recording into that of a damaged dataset."""
+    try:
+        yield
+    except SourceError as error:
+        raise FormatError("messages-unreadable", error.path, error.problem) from None
+
+
+def _intact(items: Iterable[_Item]) -> Iterator[_Item]:
+    with _damage_told():
+        yield from items
+
+
+class SalvagedMessages(MessagesFile):
+    """What can be read of a damaged messages.mcap; it is read once when this is made.
+
+    Args:
+        path: The file.
+
+    Attributes:
+        losses: What is lost of it.
+
+    Raises:
+        FormatError: ``file-missing`` or ``messages-unreadable``: nothing of it can be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._check_there(path)
+        with _damage_told():
+            self._salvage = McapSalvage(path)
+            self._times = times_of(self._salvage.records())
+        self.losses: Sequence[Loss] = self._salvage.losses
+
+    @property
+    def channels(self) -> Sequence[Channel]:
+        """Its channels, as far as they are known."""
+        return self._salvage.channels
+
+    @property
+    def profile(self) -> str:
+        """MCAP profile of the recording; empty if unknown."""
+        return self._salvage.profile
+
+    @property
+    def unused_schemas(self) -> Sequence[Schema]:
+        """Definitions that no channel refers to."""
+        return self._salvage.unused_schemas
+
+    @cached_property
+    def counts(self) -> Mapping[int, int]:
+        """Number of messages that can be read, by channel id."""
+        return {key: len(times) for key, times in self._times.items()}
+
+    def times(self) -> Mapping[int, NDArray[np.int64]]:
+        """Sorted log times of the messages that can be read, nanoseconds, by channel id."""
+        return self._times
+
+    def in_file_order(self) -> Iterator[Record]:
+        """All that can be read."""
+        return self._salvage.records()
+
+    def others(self) -> Iterator[Record]:
+        """The attachments and metadata records."""
+        return self._salvage.records(Excerpt(start=0, end=0))
+
+    def in_time(self, excerpt: Excerpt) -> Iterator[Message]:
+        """The messages of an excerpt."""
+        records = self._salvage.records(replace(excerpt, others=False))
         return (record for record in records if isinstance(record, Message))
+
+
+def recorded_format(file: MessagesFile) -> Format:
+    """The likely format of the recording that a messages.mcap is of."""
+    if any(isinstance(item, MetadataRecord) and item.name == RECORD for item in file.others()):
+        return "rosbag2"
+    return "bag" if file.profile == "ros1" else "mcap"
 
 
 def recorded_storage(records: Iterable[Record]) -> str:
@@ -107,7 +208,7 @@ def recorded_storage(records: Iterable[Record]) -> str:
     for record in records:
         if isinstance(record, Message):
             break
-        if isinstance(record, MetadataRecord) and record.name == "mp4ds:rosbag2":
+        if isinstance(record, MetadataRecord) and record.name == RECORD:
             return "sqlite3" if record.metadata.get("storage") == "sqlite3" else "mcap"
     return "mcap"
 

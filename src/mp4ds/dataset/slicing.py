@@ -7,7 +7,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -54,29 +54,37 @@ def span_in(dataset: Dataset, asked: Slice) -> Excerpt:
     """
     if not asked:
         return EVERYTHING
-    times = [one for one in dataset.times().values() if len(one)]
-    if not times:
+    if dataset.manifest is not None:
+        told = dataset.manifest.time_range
+        span = (told.start, told.end) if told else None
+    else:
+        times = [one for one in dataset.times().values() if len(one)]
+        span = (min(int(one[0]) for one in times), max(int(one[-1]) for one in times))
+    if span is None:
         raise OptionError(f"{dataset.path} has no messages to take a slice of.")
-    first, last = min(int(one[0]) for one in times), max(int(one[-1]) for one in times)
+    first, last = span
     first = max(first, dataset.slice_start or first)
     return Excerpt(*asked.times(first, last, dataset.path))
 
 
 def latched_at(
-    dataset: Dataset, span: Excerpt, asked: Slice
+    dataset: Dataset, span: Excerpt, asked: Slice, selected: Callable[[str], bool]
 ) -> tuple[Sequence[Message], Sequence[str]]:
-    """The latched messages from before a slice if requested, and the topics left out."""
+    """Latched messages from before a slice if requested, on selected topics, and those left out."""
     start = span.start
     if start is None or not asked.latched:
         return (), ()
-    return latched_before(
-        dataset.channels, lambda topics, frames: dataset.before(start, topics, frames)
-    )
+    channels = [channel for channel in dataset.channels if selected(channel.topic)]
+    return latched_before(channels, lambda topics, frames: dataset.before(start, topics, frames))
 
 
 @contextmanager
 def sliced(
-    dataset: Dataset, asked: Slice, folder: Path, latched: Sequence[Message] = ()
+    dataset: Dataset,
+    asked: Slice,
+    folder: Path,
+    selected: Callable[[str], bool],
+    latched: Sequence[Message] = (),
 ) -> Iterator[Dataset]:
     """A temporary dataset of a slice; the dataset itself if no slice is given.
 
@@ -84,6 +92,7 @@ def sliced(
         dataset: A folder made by `mp4ds pack`.
         asked: The slice.
         folder: Where to make it.
+        selected: Whether a topic has to be in it; those that share a stream with it are, too.
         latched: Messages from before the slice that it has, too.
 
     Raises:
@@ -97,7 +106,9 @@ def sliced(
     path = folder / "slice" / dataset.path.name
     path.mkdir(parents=True)
     try:
-        copy_part(dataset, path, span=span_in(dataset, asked), latched=latched)
+        kept = _with_shared(dataset, selected).__contains__
+        span = span_in(dataset, asked)
+        copy_part(dataset, path, span=span, latched=latched, selected=kept)
     except Refused as reason:
         raise OptionError(
             f"{dataset.path} cannot be sliced: {reason}. Pack the slice first (mp4ds pack with the "
@@ -108,6 +119,15 @@ def sliced(
             yield opened
     finally:
         shutil.rmtree(path.parent, ignore_errors=True)
+
+
+def _with_shared(dataset: Dataset, selected: Callable[[str], bool]) -> set[str]:
+    """The selected topics, and those that share a stream with them."""
+    kept = {channel.topic for channel in dataset.channels if selected(channel.topic)}
+    shared = [set(stream.topics) for stream in dataset.streams]
+    while more := [own for own in shared if own & kept and not own <= kept]:
+        kept.update(*more)
+    return kept
 
 
 def copy_part(
@@ -432,11 +452,8 @@ class _Part:
 
         Includes the calibrations of streams without frames in the span.
         """
-        recorded = (
-            message
-            for message in self._dataset.recorded_messages(self._span)
-            if self._selected(message.channel.topic)
-        )
+        topics = {item.topic for item in self._dataset.channels if self._selected(item.topic)}
+        recorded = self._dataset.recorded_messages(replace(self._span, topics=frozenset(topics)))
         channels = {channel.identity: channel for channel in self._dataset.channels}
         orphans = [self._orphans(cut, channels) for cut in self._cuts if not len(cut.images)]
         found = heapq.merge(recorded, *orphans, key=lambda message: message.log_time)

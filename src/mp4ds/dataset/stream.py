@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from mp4ds.dataset.rebuild import (
     template_of,
     unbroken,
 )
-from mp4ds.errors import FormatError, OptionError, Refused
+from mp4ds.errors import FormatError, OptionError, Refused, VideoError
 from mp4ds.files.outputs import digest_file
 from mp4ds.format.fields import decode_base64
 from mp4ds.format.models import Calibration, StreamSidecar
@@ -116,7 +116,7 @@ class MessageRebuilder:
             picture: Of the frame, decoded.
 
         Raises:
-            FormatError: ``digest-mismatch``, naming topic and frame.
+            FormatError: ``digest-mismatch``, with the frame's number.
         """
         if self._sidecar.body == "pixels":
             return self._verified(index, self._with_pixels(index, picture))
@@ -144,7 +144,7 @@ class MessageRebuilder:
             packet: As stored in the video.
 
         Raises:
-            FormatError: ``digest-mismatch`` or ``decode-failed``, naming topic and frame.
+            FormatError: ``digest-mismatch`` or ``decode-failed``, with the frame's number.
         """
         framing = self._sidecar.headers[int(self.columns.variant[index])].framing
         try:
@@ -198,8 +198,7 @@ class MessageRebuilder:
         raise self._failure("digest-mismatch", index, f"differs from what was recorded{remark}")
 
     def _failure(self, code: str, index: int, problem: str) -> FormatError:
-        topic = self._sidecar.channel.topic
-        return FormatError(code, self._place, f"message {index} of topic {topic} {problem}")
+        return FormatError(code, self._place, problem, frame=index)
 
     def _decode_digests(self) -> list[int] | None:
         if self._sidecar.digests is None:
@@ -271,6 +270,10 @@ def _inflated(text: str, most: int) -> bytes:
 class Stream(DecodedFrames):
     """One camera topic (of one geometry), as a sequence of frames. See `Frames`.
 
+    Attributes:
+        sound: Which frames are read of a damaged video: those that `damages` does not name, shape
+            (frames,). None: all, and damage is an error.
+
     Args:
         path: The sidecar; the video is next to it.
         sidecar: Its contents, if already read.
@@ -289,6 +292,7 @@ class Stream(DecodedFrames):
     ) -> None:
         super().__init__()
         self.path = path
+        self.sound: NDArray[np.bool_] | None = None
         self._jpeg_quality = jpeg_quality
         self.sidecar = sidecar or load_stream(path)
 
@@ -296,6 +300,12 @@ class Stream(DecodedFrames):
     def topic(self) -> str:
         """Topic of the images."""
         return self.sidecar.channel.topic
+
+    @property
+    def topics(self) -> list[str]:
+        """Topic of the images, and that of the calibrations if there are any."""
+        info = self.sidecar.camera_info
+        return [self.topic, *([info.channel.topic] if info and info.messages else [])]
 
     @cached_property
     def video_path(self) -> Path:
@@ -305,6 +315,16 @@ class Stream(DecodedFrames):
     @cached_property
     def columns(self) -> DecodedColumns:
         """One value per frame: its times, and what fills its message; checked on first use."""
+        self.check_size()
+        count, variants = self.sidecar.frames, len(self.sidecar.headers)
+        return decode_columns(self.sidecar.columns, count, variants, str(self.path))
+
+    def check_size(self) -> None:
+        """Refuse a video that is missing, or too short for so many frames.
+
+        Raises:
+            FormatError: ``file-missing`` or ``frame-count``.
+        """
         try:
             size = self.video_path.stat().st_size
         except OSError as error:
@@ -315,8 +335,6 @@ class Stream(DecodedFrames):
             raise FormatError(
                 "frame-count", self.path, f"declares {self.sidecar.frames} frames in {size} bytes"
             )
-        count, variants = self.sidecar.frames, len(self.sidecar.headers)
-        return decode_columns(self.sidecar.columns, count, variants, str(self.path))
 
     @cached_property
     def rebuilder(self) -> MessageRebuilder:
@@ -387,7 +405,8 @@ class Stream(DecodedFrames):
         Raises:
             VideoError: The video cannot be read, or does not match the sidecar.
         """
-        return VideoDecoder(self.video_path, **self._promises, sequential=sequential)
+        is_sound = self.sound is None
+        return VideoDecoder(self.video_path, **self._promises, sequential=sequential and is_sound)
 
     @property
     def _promises(self) -> dict[str, Any]:
@@ -415,7 +434,8 @@ class Stream(DecodedFrames):
 
     def _pictures(self, scale: Scale | None) -> Iterator[Picture]:
         with self.open_video(sequential=True) as decoder:
-            yield from decoder.pictures(scale)
+            for _, picture in self.pictures_in_order(decoder, scale=scale):
+                yield picture
 
     @property
     def _shows_colours(self) -> bool:
@@ -487,18 +507,26 @@ class Stream(DecodedFrames):
         rebuilder = self.rebuilder
         if self.sidecar.body == "packet":
             video = self.sidecar.video
-            with PacketReader(
-                self.video_path,
-                codec=video.codec,
-                frames=self.sidecar.frames,
-                coded_size=(video.width, video.height),
-            ) as reader:
-                for index in unbroken(choice(self.columns), reader.key_numbers):
-                    yield index, partial(rebuilder.packet_payload, index, reader.packet(index))
+            with (
+                self.naming_frames(),
+                PacketReader(
+                    self.video_path,
+                    codec=video.codec,
+                    frames=self.sidecar.frames,
+                    coded_size=(video.width, video.height),
+                ) as reader,
+            ):
+                for index in self.sound_of(unbroken(choice(self.columns), reader.key_numbers)):
+                    packet = reader.packet(index)
+                    yield index, partial(self._made, rebuilder.packet_payload, index, packet)
             return
         with self.open_video(sequential=True) as decoder:
             for index, picture in self.pictures_in_order(decoder, choice):
-                yield index, partial(rebuilder.payload, index, picture)
+                yield index, partial(self._made, rebuilder.payload, index, picture)
+
+    def _made(self, make: Callable[..., bytes | bytearray], *given: Any) -> bytes | bytearray:
+        with self.naming_frames():
+            return make(*given)
 
     def pictures_in_order(
         self, decoder: VideoDecoder, choice: Choice = everything, scale: Scale | None = None
@@ -516,26 +544,114 @@ class Stream(DecodedFrames):
         Raises:
             VideoError: See `VideoDecoder.pictures`.
         """
-        if choice is everything:
-            yield from enumerate(decoder.pictures(scale))
+        with self.naming_frames():
+            if self.sound is not None:
+                wanted = self.sound_of(choice(self.columns))
+                yield from map(self._found, decoder.decodable_pictures(wanted, scale))
+            elif choice is everything:
+                yield from enumerate(decoder.pictures(scale))
+            else:
+                yield from decoder.pictures_at(choice(self.columns), scale)
+
+    def _found(self, numbered: tuple[int, Picture | None]) -> tuple[int, Picture]:
+        """A picture that could be decoded, with its number.
+
+        Raises:
+            VideoError: ``decode-failed``: it could not.
+        """
+        index, picture = numbered
+        if picture is None:
+            raise VideoError("decode-failed", self.video_path, "cannot be decoded", frame=index)
+        return index, picture
+
+    # ------------------------------------------------------------ damage
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether none of its frames can be read."""
+        return self.sound is not None and not self.sound.any()
+
+    def sound_of(self, indices: Iterable[int]) -> Iterator[int]:
+        """Those of some frames that can be read."""
+        return (index for index in indices if self.sound is None or self.sound[index])
+
+    def count(self, is_wanted: NDArray[np.bool_] | None = None) -> int:
+        """How many frames can be read.
+
+        Args:
+            is_wanted: Count only these, shape (frames,); None: all.
+        """
+        marks = [mark for mark in (is_wanted, self.sound) if mark is not None]
+        return int(np.logical_and.reduce(marks).sum()) if marks else len(self)
+
+    def damages(self, report: Callable[[int], None] = lambda _: None) -> Iterator[FormatError]:
+        """What is wrong with the frames: all are decoded, rebuilt and compared.
+
+        Args:
+            report: Called with the number of each frame.
+
+        Yields:
+            An error with the number of each frame that cannot be read, in order; one without a
+            number, the last, if none can.
+        """
+        start, is_careful = 0, False
+        while start < len(self):
+            try:
+                for index, make in self._makers_from(start, is_careful):
+                    report(index)
+                    try:
+                        make()
+                    except FormatError as error:
+                        yield error
+                    start = index + 1
+                return
+            except FormatError as error:
+                if error.frame is None and (is_careful or start in (0, len(self))):
+                    yield error
+                    return
+                if is_careful and error.frame is not None:
+                    yield error
+                    start = max(start, error.frame) + 1
+                is_careful = True
+
+    def _makers_from(
+        self, start: int, is_careful: bool
+    ) -> Iterator[tuple[int, Callable[[], bytes | bytearray]]]:
+        """Number of each message from one on, and what makes it.
+
+        Args:
+            start: Number of the first one; 0 unless careful.
+            is_careful: Go on after a picture that cannot be decoded.
+        """
+        if not is_careful:
+            yield from self.numbered_makers()
+        elif self.sidecar.body == "packet":
+            yield from self.numbered_makers(lambda _: iter(range(start, len(self))))
         else:
-            yield from decoder.pictures_at(choice(self.columns), scale)
+            with self.open_video(sequential=False) as decoder:
+                found = decoder.decodable_pictures(range(start, len(self)))
+                for index, picture in found:
+                    yield index, partial(self._made, self._payload, index, picture)
+
+    def _payload(self, index: int, picture: Picture | None) -> bytes | bytearray:
+        return self.rebuilder.payload(*self._found((index, picture)))
 
     def verify_video(self) -> None:
         """Check the video against its SHA-256, for when no message digest would reveal damage.
 
+        Not if it is known to be damaged.
+
         Raises:
             FormatError: ``file-missing`` or ``hash-mismatch``.
         """
+        if self.sound is not None:
+            return
         video = self.sidecar.video
         if not self.video_path.is_file():
             raise FormatError("file-missing", self.video_path, "does not exist")
         if video.sha256 is not None and digest_file(self.video_path)[1] != video.sha256:
-            raise FormatError(
-                "hash-mismatch",
-                self.video_path,
-                "does not match the SHA-256 in its sidecar",
-            )
+            problem = f"with the frames of {self.topic}, does not match the SHA-256 in its sidecar"
+            raise FormatError("hash-mismatch", self.video_path, problem)
 
     def camera_info_messages(
         self, channel: Channel, choice: Choice = everything

@@ -15,6 +15,7 @@ from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, Parts
 from mp4ds.packing.journal import Journal
 from mp4ds.packing.look import CameraMessage
 from mp4ds.packing.options import TopicSummary
+from mp4ds.plan import INFO_NAMES, TRANSPORTS
 from mp4ds.records import Channel, Message
 
 INFO_WINDOW = 50
@@ -29,8 +30,6 @@ _MIN_COMMON = 3
 _MIN_SHARE = 0.8
 _LISTED = 20
 
-_INFO_NAMES = ("camera_info", "calibration")  # those of ROS and of Foxglove
-_TRANSPORTS = frozenset({"compressed", "compressedDepth", "ffmpeg", "foxglove"})
 # the topics of one camera, as sensor_msgs/CameraInfo.msg and image_proc name them
 _VIEWS = frozenset(
     {
@@ -158,9 +157,9 @@ def pair_camera_infos(
             beside.setdefault(namespace, []).append((rank, image))
     infos = _by_topic(filter(is_calibration, channels))
     found = [
-        ((_INFO_NAMES.index(_leaf(topic)), rank, *_preference(image, sizes or {})), own[0], image)
+        ((INFO_NAMES.index(_leaf(topic)), rank, *_preference(image, sizes or {})), own[0], image)
         for topic, own in infos.items()
-        if len(own) == 1 and _leaf(topic) in _INFO_NAMES
+        if len(own) == 1 and _leaf(topic) in INFO_NAMES
         for rank, image in beside.get(_namespace_of_images(topic), [])
     ]
     taken = set(pairs.values())
@@ -206,7 +205,7 @@ def _namespace_of_images(topic: str) -> str:
 
 def _base(image: Channel) -> str:
     """The base topic of a transport; the topic itself for a plain one."""
-    if _is_coded(image) and _leaf(image.topic) in _TRANSPORTS and _parent(image.topic):
+    if _is_coded(image) and _leaf(image.topic) in TRANSPORTS and _parent(image.topic):
         return _parent(image.topic)
     return image.topic.strip("/")
 

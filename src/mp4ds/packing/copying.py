@@ -60,7 +60,7 @@ def copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
             is_cut = options.slice and selected(stream.topic)
             if is_cut and stream.sidecar.digests is None:  # nothing else shows that it is damaged
                 stream.verify_video()
-        latched, too_large = latched_at(dataset, span, options.slice)
+        latched, too_large = latched_at(dataset, span, options.slice, selected)
         manifest = copy_part(
             dataset, folder, span=span, latched=latched, selected=selected, about=about
         )
@@ -80,7 +80,7 @@ def copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
             skipped={},
             is_copy=True,
             latched=early,
-            latched_left_out=[topic for topic in too_large if selected(topic)],
+            latched_left_out=list(too_large),
         )
 
 

@@ -438,7 +438,7 @@ def _packets_of(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[
     with StandAlonePackets(stream.video_path, codec=codec, frames=len(stream)) as packets:
         fields = VideoFields(codec, image.encoding, image.width, image.height, packets.pixel_format)
         wanted = choice(stream.columns)
-        for index in unbroken(wanted, packets.key_numbers, from_key=True):
+        for index in stream.sound_of(unbroken(wanted, packets.key_numbers, from_key=True)):
             is_key = bool(packets.keyframes[index])
             yield index, Given(fields, packets.packet(index), is_key=is_key)
 
@@ -501,7 +501,7 @@ def _from_pictures(
                 yield index, make.give(make.resizing.pixels(stream, picture))
             return
         packets = None
-        for index, found in decoder.decodable_pictures(choice(columns), scale):
+        for index, found in decoder.decodable_pictures(stream.sound_of(choice(columns)), scale):
             if found is not None:
                 make = makers[columns.variant[index]]
                 yield index, make.give(make.resizing.pixels(stream, found))

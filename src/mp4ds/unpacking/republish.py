@@ -313,16 +313,15 @@ class Republisher:
                 if is_kept is None:
                     raise Refused(f"they are already {_ALREADY[kind]}")
             except Refused as reason:
-                count = len(stream) if is_kept is None else int(is_kept.sum())
-                self._keep(topic, str(reason), count)
+                self._keep(topic, str(reason), stream.count(is_kept))
         if is_kept is not None and _refers(stream):
-            self._keep(topic, _REFERS, len(stream))
+            self._keep(topic, _REFERS, stream.count())
             is_kept = None
         return self._thinned(_Plan(stream, "", None, is_kept, None, False))
 
     def _thinned(self, plan: _Plan) -> _Plan:
         if plan.is_kept is not None:
-            self._leave_out(plan.stream.topic, int((~plan.is_kept).sum()))
+            self._leave_out(plan.stream.topic, plan.stream.count(~plan.is_kept))
         return plan
 
     def _leave_out(self, topic: str, count: int) -> None:
@@ -447,7 +446,7 @@ class Republisher:
             if slots.seq is not None and not types.has_seq:
                 self._omitted[types.no_seq] += 1
             yield ordinal, message_at(columns, index, made or recorded, payload)
-        due = len(stream) if plan.is_kept is None else int(plan.is_kept.sum())
+        due = stream.count(plan.is_kept)
         if choice is everything and count != due:
             problem = f"has {count} frames or more, not {due}"
             raise FormatError("frame-count", stream.video_path, problem)

@@ -7,7 +7,8 @@ import io
 import os
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,16 +17,26 @@ from mp4ds.bags.convert import Converter
 from mp4ds.bags.formats import open_writer, recording_names
 from mp4ds.bags.latched import begun_by
 from mp4ds.bags.protocols import BagWriter
+from mp4ds.bags.salvage.losses import bounded
 from mp4ds.bags.slices import in_span
 from mp4ds.dataset.collections import Paths, datasets_in, each
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import recorded_storage
+from mp4ds.dataset.salvage import examine, open_damaged
 from mp4ds.dataset.slicing import latched_at, sliced, span_in
 from mp4ds.dataset.stream import Stream
-from mp4ds.errors import ConversionError, FormatError, OptionError, WriteError, interrupted
+from mp4ds.errors import (
+    ConversionError,
+    FormatError,
+    OptionError,
+    WriteError,
+    advising,
+    interrupted,
+)
 from mp4ds.files.outputs import Owned, csv_cell, staged
 from mp4ds.files.uploads import uploaded
 from mp4ds.files.urls import RemotePath, location, remote
+from mp4ds.format.sidecars import MANIFEST_NAME
 from mp4ds.options import (
     SliceOptions,
     duration,
@@ -42,7 +53,15 @@ from mp4ds.options import (
     topics,
 )
 from mp4ds.plan import FileNames, Selection
-from mp4ds.records import EVERYTHING, Attachment, Channel, Excerpt, Message, MetadataRecord
+from mp4ds.records import (
+    EVERYTHING,
+    Attachment,
+    Channel,
+    Excerpt,
+    Loss,
+    Message,
+    MetadataRecord,
+)
 from mp4ds.unpacking.pictures import Reduction, holds_files, image_files
 from mp4ds.unpacking.republish import KINDS, Republished, Republisher, check_kind
 
@@ -75,6 +94,7 @@ class UnpackOptions(SliceOptions):
     skip_unconvertible: bool = option(
         "Leave out, and count, what the output format cannot hold.", False
     )
+    salvage: bool = option("Restore what can be read of a damaged dataset.", False)
     force: bool = force()
 
     @property
@@ -85,6 +105,11 @@ class UnpackOptions(SliceOptions):
             OptionError: The size, number or rate is not valid.
         """
         return Reduction(self.resize, self.every, self.max_rate)
+
+    @property
+    def selected(self) -> Selection:
+        """Which topics."""
+        return Selection(self.topics, self.exclude)
 
 
 @dataclass(frozen=True)
@@ -113,6 +138,8 @@ class UnpackSummary:
         thinned: Topics with messages left out because fewer were requested -> how many.
         latched: Latched messages from before the slice, by topic.
         latched_left_out: Latched topics whose messages from before it are too large.
+        losses: What could not be read, if a damaged dataset is salvaged.
+        notes: Other deviations from the recording.
     """
 
     output: Path
@@ -126,6 +153,8 @@ class UnpackSummary:
     unconvertible: dict[str, dict[str, int]] = field(default_factory=dict)
     latched: dict[str, int] = field(default_factory=dict)
     latched_left_out: list[str] = field(default_factory=list)
+    losses: list[Loss] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 # ---------------------------------------------------------------- images
@@ -212,7 +241,8 @@ def unpack(
     """Write a dataset's recording.
 
     Every message of a lossless stream is checked against its digest, and each sidecar, and
-    messages.mcap unless a slice is taken, against the manifest.
+    messages.mcap unless a slice is taken, against the manifest. Damage is an error, unless only
+    topics that are left out have it, or `salvage` asks for what can be read.
 
     Args:
         dataset: A dataset, or one video with its sidecar; or its URL.
@@ -234,46 +264,100 @@ def unpack(
         RemoteError: A store or web server fails.
     """
     chosen = options or UnpackOptions()
-    if to is None:
-        to = _own_format(dataset)
-    _check(to, chosen)
-    store = remote(location(output)) if output else None
-    if store:
-        return _unpack_to_store(dataset, to, store, chosen, progress)
-    with Dataset(dataset, jpeg_quality=chosen.jpeg_quality) as whole:
+    with nullcontext() if chosen.salvage else advising("`salvage` restores what can be read."):
+        if to is None:
+            to = _own_format(dataset, chosen)
+        _check(to, chosen)
+        if output and (store := remote(location(output))):
+            return _unpack_to_store(dataset, to, store, chosen, progress)
+        return _unpack_here(dataset, to, output, chosen, progress)
+
+
+def _unpack_here(
+    dataset: Path | str,
+    to: str,
+    output: Path | str | None,
+    chosen: UnpackOptions,
+    progress: Callable[[UnpackProgress], None] | None,
+) -> UnpackSummary:
+    with ExitStack() as stack:
+        whole, losses = _opened(dataset, chosen)
+        stack.enter_context(whole)
         given = location(output) if output else default_output(whole.path, to)
         target = Path(os.path.abspath(given))  # noqa: PTH100
-        whole.verify_sidecars(Selection(chosen.topics, chosen.exclude))
-        # where log times do not tell the order, nothing can be cut out, only left out
-        is_filtered = bool(chosen.slice) and to != "images" and not whole.is_in_time
-        is_filtered = is_filtered and _converts_none(chosen)
-        if to != "images" and (is_filtered or not chosen.slice):
-            whole.verify_messages()
-        with staged(target, force=chosen.force, owned=_owned(to), sources=[whole.path]) as path:
-            try:
-                if to == "images":
-                    with sliced(whole, chosen.slice, path.parent) as opened:
-                        return _unpack_images(opened, path, target, chosen, progress)
+        path = stack.enter_context(
+            staged(target, force=chosen.force, owned=_owned(to), sources=[whole.path])
+        )
+        try:
+            for stream in whole.streams if chosen.salvage else ():
+                if chosen.selected(stream.topic):
+                    losses += examine(stream)
+            if not chosen.salvage:
+                whole.verify_sidecars(chosen.selected)
+            # where log times do not tell the order, nothing can be cut out, only left out
+            is_filtered = bool(chosen.slice) and to != "images" and not whole.is_in_time
+            is_filtered = is_filtered and _converts_none(chosen)
+            if to != "images" and (is_filtered or not chosen.slice):
+                whole.verify_messages()
+            summary = UnpackSummary(target, losses=losses)
+            summary.left_out.extend(_left_out(whole, chosen.selected, to))
+            span = EVERYTHING
+            latched: Sequence[Message] = ()
+            if chosen.slice and to != "images":
                 span = span_in(whole, chosen.slice)
-                latched, too_large = latched_at(whole, span, chosen.slice)
-                unpack_recording = partial(
-                    _unpack_recording, path=path, target=target, to=to, options=chosen
-                )
-                if is_filtered:
-                    summary = unpack_recording(whole, progress=progress, span=span, latched=latched)
-                else:
-                    with sliced(whole, chosen.slice, path.parent, latched) as opened:
-                        summary = unpack_recording(opened, progress=progress)
-                selected = Selection(chosen.topics, chosen.exclude)
-                summary.latched.update(
-                    Counter(item.channel.topic for item in latched if selected(item.channel.topic))
-                )
-                summary.latched_left_out.extend(filter(selected, too_large))
-                return summary
-            except OSError as error:
-                if error.errno is None:
-                    raise
-                raise WriteError(target, error) from error
+                latched, too_large = latched_at(whole, span, chosen.slice, chosen.selected)
+                summary.latched.update(Counter(item.channel.topic for item in latched))
+                summary.latched_left_out.extend(too_large)
+            if is_filtered:
+                _unpack_recording(whole, path, to, chosen, summary, progress, span, latched)
+            else:
+                with sliced(whole, chosen.slice, path.parent, chosen.selected, latched) as opened:
+                    if to == "images":
+                        _unpack_images(opened, path, chosen, summary, progress)
+                    else:
+                        _unpack_recording(opened, path, to, chosen, summary, progress)
+            summary.notes.extend(_notes(whole, chosen.selected))
+            summary.losses[:] = bounded(summary.losses)
+            return summary
+        except OSError as error:
+            if error.errno is None:
+                raise
+            raise WriteError(target, error) from error
+
+
+def _opened(dataset: Path | str, options: UnpackOptions) -> tuple[Dataset, list[Loss]]:
+    """The dataset, and what is lost of it by files that cannot be read."""
+    if options.salvage:
+        return open_damaged(dataset, selected=options.selected, jpeg_quality=options.jpeg_quality)
+    opened = Dataset(dataset, jpeg_quality=options.jpeg_quality, selected=options.selected)
+    return opened, []
+
+
+def _left_out(dataset: Dataset, selected: Selection, to: str) -> list[str]:
+    """Topics of a dataset that are left out.
+
+    Raises:
+        OptionError: A pattern matches no topic.
+    """
+    if to == "images":
+        others = {item.topic for item in dataset.channels} - set(dataset.topics)
+        pictured = [topic for topic in dataset.all_topics if topic not in others]
+        selected.check(pictured)
+        return sorted({*others, *(topic for topic in pictured if not selected(topic))})
+    selected.check(dataset.all_topics)
+    return [topic for topic in dataset.all_topics if not selected(topic)]
+
+
+def _notes(dataset: Dataset, selected: Selection) -> Iterator[str]:
+    """What else the output does not have of the recording."""
+    for problem in dataset.unread:
+        yield f"not read, since only topics that are left out are in it: {problem}"
+    for stream in dataset.streams:
+        if stream.sidecar.digests is None and selected(stream.topic):
+            yield (
+                f"{stream.topic}: its pixels differ from those recorded: it was packed with "
+                f"quality {stream.sidecar.profile}"
+            )
 
 
 def unpack_each(
@@ -302,7 +386,7 @@ def unpack_each(
     """
     outputs: dict[Path, Path | None] = {}
     for dataset in datasets_in(datasets):
-        kind = to or _own_format(dataset)
+        kind = to or _own_format(dataset, options or UnpackOptions())
         stem = dataset.name if dataset.is_dir() else dataset.stem
         outputs[dataset] = location(folder) / f"{stem}{_SUFFIXES[kind]}" if folder else None
     named = [output for output in outputs.values() if output is not None]
@@ -331,8 +415,9 @@ def _unpack_one(
     return unpack(dataset, to, output, options)
 
 
-def _own_format(dataset: Path | str) -> str:
-    with Dataset(dataset) as opened:
+def _own_format(dataset: Path | str, options: UnpackOptions) -> str:
+    opened, _ = _opened(dataset, options)
+    with opened:
         return opened.manifest.format if opened.manifest else "mcap"
 
 
@@ -355,6 +440,10 @@ def _check(to: str, options: UnpackOptions) -> None:
     if options.images and to == "images":
         raise OptionError("`images` is for recordings; with `to` images, use `image_format`.")
     check_kind(options.images, options.reduction)
+    if options.salvage and options.slice:
+        raise OptionError(
+            "`salvage` restores a whole dataset: pack what it restores, and unpack a slice of that."
+        )
 
 
 def default_output(dataset: Path, to: str) -> Path:
@@ -376,7 +465,7 @@ def _unpack_to_store(
     """Unpack on this machine, then upload."""
 
     def make(local: Path) -> UnpackSummary:
-        return unpack(dataset, to, local, replace(options, force=True), progress=progress)
+        return _unpack_here(dataset, to, local, replace(options, force=True), progress)
 
     summary = uploaded(
         target,
@@ -396,39 +485,38 @@ def _owned(to: str) -> Owned:
 def _unpack_recording(
     dataset: Dataset,
     path: Path,
-    target: Path,
     to: str,
     options: UnpackOptions,
+    summary: UnpackSummary,
     progress: Callable[[UnpackProgress], None] | None,
     span: Excerpt = EVERYTHING,
     latched: Sequence[Message] = (),
-) -> UnpackSummary:
-    selected = Selection(options.topics, options.exclude)
-    selected.check(channel.topic for channel in dataset.channels)
+) -> None:
+    selected = options.selected
     # a recording is restored to its own format unchanged, whatever its serializations
     source = dataset.manifest.format if dataset.manifest else ""
     converter = Converter(None if source == to else _WORLDS.get(to))
     republisher = _republisher(dataset, to, options, selected)
-    summary = UnpackSummary(target)
-    total = dataset.manifest.messages if dataset.manifest else 0
-    if span != EVERYTHING:
-        total = len(latched)
-        total += sum(len(in_span(times, span)) for times in dataset.times().values())
     storage = ""
     if to == "rosbag2":
         storage = options.storage or recorded_storage(dataset.recorded_records())
     with open_writer(
         path,
         to,
-        name=target.name,
+        name=summary.output.name,
         profile=dataset.profile,
         library=dataset.manifest.library if dataset.manifest else "",
         storage=storage,
     ) as writer:
         topics = _Topics(writer, converter, selected, summary, may_skip=options.skip_unconvertible)
         topics.declare(dataset, republisher)
+        wanted = {item.topic for item in dataset.channels if selected(item.topic)}
+        total = _total(dataset, wanted)
+        if span != EVERYTHING:
+            total = len(latched) + _count_in(dataset, wanted, span)
         done = found = 0
-        records = dataset.records(republisher.sources if republisher else None)
+        sources = republisher.sources if republisher else None
+        records = dataset.records(sources, topics=wanted)
         for record in begun_by(latched, filter(span.has, records)):
             if not isinstance(record, Message):
                 _write_other(writer, record, to, source)
@@ -440,12 +528,11 @@ def _unpack_recording(
                     progress(UnpackProgress(done, total))
         if republisher:
             found += sum(republisher.thinned.values())
-        if dataset.manifest and found != total:
-            raise FormatError(
-                "message-count",
-                dataset.path,
-                f"holds {found} messages, but its manifest says {total}",
-            )
+        if dataset.is_salvaged:
+            summary.losses.extend(_unaccounted(total - found, summary.losses))
+        elif found != total:
+            problem = f"holds {found} messages, but should hold {total}"
+            raise FormatError("message-count", dataset.path, problem)
     omitted = Counter(writer.omitted) + Counter(converter.omitted)
     if republisher:
         omitted += Counter(republisher.omitted)
@@ -453,7 +540,29 @@ def _unpack_recording(
         summary.as_recorded.update(republisher.as_recorded)
         summary.thinned.update(republisher.thinned)
     summary.omitted.update(omitted)
-    return summary
+
+
+def _total(dataset: Dataset, topics: Collection[str]) -> int:
+    """How many messages there should be of some topics."""
+    counts = dataset.counts()
+    is_whole = all(item.topic in topics for item in dataset.channels) and not dataset.unread
+    if dataset.manifest and is_whole and dataset.manifest.messages:
+        return dataset.manifest.messages
+    return sum(counts.get(item.id, 0) for item in dataset.channels if item.topic in topics)
+
+
+def _count_in(dataset: Dataset, topics: Collection[str], span: Excerpt) -> int:
+    """How many messages of some topics there are in a span."""
+    wanted = {item.id for item in dataset.channels if item.topic in topics}
+    return sum(len(in_span(one, span)) for key, one in dataset.times().items() if key in wanted)
+
+
+def _unaccounted(missing: int, losses: Sequence[Loss]) -> Iterator[Loss]:
+    """The loss of messages that are missing by the manifest, and of which nothing else tells."""
+    missing -= sum(loss.messages or 0 for loss in losses)
+    if missing > 0:
+        problem = f"counts {missing} more messages, of which nothing else is known"
+        yield Loss(MANIFEST_NAME, None, None, problem, missing)
 
 
 def _republisher(
@@ -505,12 +614,9 @@ class _Topics:
             ConversionError: The target cannot hold some of them; names all.
         """
         for channel in dataset.channels:
-            topic = channel.topic
-            if self._selected(topic):
-                if republisher is None or not republisher.empties(channel):
-                    self._try_to_add(channel)
-            elif topic not in self._summary.left_out:
-                self._summary.left_out.append(topic)
+            is_emptied = republisher is not None and republisher.empties(channel)
+            if self._selected(channel.topic) and not is_emptied:
+                self._try_to_add(channel)
         if self._refused and not self._may_skip:
             topics = {item.id: item.topic for item in dataset.channels}
             raise _refusal({topics[number]: why for number, why in self._refused.items()})
@@ -597,16 +703,14 @@ def _write_other(
 def _unpack_images(
     dataset: Dataset,
     path: Path,
-    target: Path,
     options: UnpackOptions,
+    summary: UnpackSummary,
     progress: Callable[[UnpackProgress], None] | None,
-) -> UnpackSummary:
-    selected = Selection(options.topics, options.exclude)
-    selected.check(dataset.topics)
-    summary = UnpackSummary(target)
+) -> None:
+    selected = options.selected
     path.mkdir()
     names = FileNames()
-    streams = [stream for stream in dataset.streams if selected(stream.topic)]
+    streams = [item for item in dataset.streams if selected(item.topic) and not item.is_lost]
     reduction = options.reduction
     counts = [_given(stream, reduction, summary) for stream in streams]
     total, done = sum(counts), 0
@@ -626,17 +730,11 @@ def _unpack_images(
             if progress:
                 progress(UnpackProgress(done, total))
         summary.messages[stream.topic] = summary.messages.get(stream.topic, 0) + count
-    others = {channel.topic for channel in dataset.channels} - set(summary.messages)
-    summary.left_out.extend(sorted(others))
-    return summary
 
 
 def _given(stream: Stream, reduction: Reduction, summary: UnpackSummary) -> int:
     """How many frames of a stream are kept; reports those left out."""
-    count = len(stream)
-    if reduction.leaves_out:
-        count = int(reduction.kept(stream.columns).sum())
-        if count < len(stream):
-            thinned = summary.thinned.get(stream.topic, 0) + len(stream) - count
-            summary.thinned[stream.topic] = thinned
+    count = stream.count(reduction.kept(stream.columns))
+    if thinned := stream.count() - count:
+        summary.thinned[stream.topic] = summary.thinned.get(stream.topic, 0) + thinned
     return count

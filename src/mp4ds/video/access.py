@@ -15,7 +15,7 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
-from mp4ds.errors import FormatError, Refused, VideoError
+from mp4ds.errors import FormatError, Refused, VideoError, reason_of
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import expect
 from mp4ds.messages.arrangements import Picture
@@ -430,7 +430,7 @@ class FrameAccess:
         except FFmpegError as error:
             raise_if_scarce(error)
             self._context = self._session = None
-            raise self._damage(due, f"cannot be decoded: {error}") from None
+            raise self._damage(due, f"cannot be decoded: {reason_of(error)}") from None
         raise self._damage(due, "was not found")
 
     def _group(self, wanted: list[int]) -> Group:
@@ -440,7 +440,7 @@ class FrameAccess:
             raise self._unfit(error) from None
 
     def _damage(self, due: Mapping[int, int], what: str) -> VideoError:
-        return VideoError("decode-failed", self._path, f"frame {min(due.values())} {what}")
+        return VideoError("decode-failed", self._path, what, frame=min(due.values()))
 
     def _decoded(self, chain: list[int]) -> Iterator[av.VideoFrame]:
         session = self._session
@@ -467,9 +467,8 @@ class FrameAccess:
             return self._chains.cut(group, piece, packet)
         except Refused as error:
             number = int(self._numbers[piece.sample])
-            raise VideoError(
-                "decode-failed", self._path, f"frame {number} is damaged: {error}"
-            ) from None
+            problem = f"is damaged: {error}"
+            raise VideoError("decode-failed", self._path, problem, frame=number) from None
 
     def _begin(self, group: Group) -> None:
         if self._context is None:
@@ -508,7 +507,7 @@ class FrameAccess:
         packet = self._file.read(size)
         if len(packet) != size:
             number = int(self._numbers[sample])
-            raise VideoError("decode-failed", self._path, f"ends before frame {number}")
+            raise VideoError("decode-failed", self._path, "is cut off", frame=number)
         return packet
 
     def close(self) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from av.error import FFmpegError, InvalidDataError
 from numpy.typing import NDArray
 
-from mp4ds.errors import Refused, VideoError
+from mp4ds.errors import Refused, VideoError, reason_of
 from mp4ds.messages.arrangements import Picture
 from mp4ds.video.media import Media, raise_if_scarce
 from mp4ds.video.pixels import PictureMaker, Scale
@@ -173,7 +173,7 @@ class VideoDecoder:
         for frame in self._decoded(0):
             if number == self._frames:
                 raise VideoError("frame-count", self._path, f"has more than {self._frames} frames")
-            yield self._maker.make(frame, scale=scale)
+            yield self._maker.make(frame, number, scale)
             number += 1
         if number != self._frames:
             raise VideoError(
@@ -198,18 +198,20 @@ class VideoDecoder:
         """
         for index, frame in self._chosen(indices, self._decoded):
             if frame is None:
-                raise VideoError("decode-failed", self._path, f"frame {index} was not found")
-            yield index, self._maker.make(frame, scale=scale)
+                raise VideoError("decode-failed", self._path, "was not found", frame=index)
+            yield index, self._maker.make(frame, index, scale)
 
     def decodable_pictures(
         self, indices: Iterable[int], scale: Scale | None = None
     ) -> Iterator[tuple[int, Picture | None]]:
-        """Like `pictures_at`, for third-party streams: None for a picture that cannot be decoded.
+        """Like `pictures_at`, but None for a picture that cannot be decoded.
 
-        Where a packet was lost before it was recorded, those that refer to it cannot be decoded.
+        That is how third-party streams are read, of which a packet may have been lost before it was
+        recorded, and damaged videos. For the latter decode on one core: with several, an error may
+        take the picture before it along.
         """
         for index, frame in self._chosen(indices, lambda _: self._decodable()):
-            yield index, None if frame is None else self._maker.make(frame, scale=scale)
+            yield index, None if frame is None else self._maker.make(frame, index, scale)
 
     def _chosen(
         self, indices: Iterable[int], decode: Callable[[int], Iterator[av.VideoFrame]]
@@ -250,17 +252,16 @@ class VideoDecoder:
             if frame.pts is not None and frame.pts >= tick:
                 if frame.pts > tick:
                     break
-                return self._maker.make(frame, scale=scale)
-        raise VideoError("decode-failed", self._path, f"frame {index} was not found")
+                return self._maker.make(frame, index, scale)
+        raise VideoError("decode-failed", self._path, "was not found", frame=index)
 
     def _seek(self, tick: int, index: int) -> None:
         try:
             self._container.seek(tick, stream=self._stream)
         except (FFmpegError, OSError) as error:
             raise_if_scarce(error)
-            raise VideoError(
-                "decode-failed", self._path, f"frame {index} cannot be reached: {error}"
-            ) from None
+            problem = f"cannot be reached: {reason_of(error)}"
+            raise VideoError("decode-failed", self._path, problem, frame=index) from None
 
     def _presentation_ticks(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
         if self._ticks is None:
@@ -286,9 +287,8 @@ class VideoDecoder:
                 number += 1
         except (FFmpegError, OSError) as error:
             raise_if_scarce(error)
-            raise VideoError(
-                "decode-failed", self._path, f"frame {number} cannot be decoded: {error}"
-            ) from None
+            problem = f"cannot be decoded: {reason_of(error)}"
+            raise VideoError("decode-failed", self._path, problem, frame=number) from None
 
     def _frames_from_here(self) -> Iterator[av.VideoFrame]:
         if self._jpeg is None:
@@ -306,8 +306,7 @@ class VideoDecoder:
                     continue
                 yield from (frame for frame in frames if not frame.is_corrupt)
         except (FFmpegError, OSError) as error:
-            raise_if_scarce(error)
-            raise VideoError("decode-failed", self._path, f"cannot be read: {error}") from None
+            raise_if_scarce(error)  # what comes after that is not there
 
     def close(self) -> None:
         """Close the file."""

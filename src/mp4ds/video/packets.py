@@ -307,7 +307,7 @@ class PacketReader:
         self._file.seek(self._places[self.hidden + index])
         packet = self._file.read(size)
         if len(packet) != size:
-            raise VideoError("decode-failed", self._path, f"ends before frame {index}")
+            raise VideoError("decode-failed", self._path, "is cut off", frame=index)
         return packet
 
     def packets(self) -> Iterator[bytes]:

@@ -442,7 +442,7 @@ class PictureMaker:
     def make(
         self,
         frame: av.VideoFrame,
-        number: int | None = None,
+        number: int,
         scale: Scale | None = None,
         out: NDArray[np.uint8] | None = None,
     ) -> Picture:
@@ -458,17 +458,16 @@ class PictureMaker:
             VideoError: ``decode-failed``: the decoder found damage; ``geometry-mismatch`` or
                 ``codec-mismatch``: the frame is not what was promised.
         """
-        name = "a frame" if number is None else f"frame {number}"
         if frame.is_corrupt:
             raise_if_scarce()
-            raise VideoError("decode-failed", self._path, f"has {name} that is marked as corrupt")
+            raise VideoError("decode-failed", self._path, "is marked as corrupt", frame=number)
         if (frame.width, frame.height) != self.coded_size:
             width, height = self.coded_size
             raise VideoError(
                 "geometry-mismatch",
                 self._path,
-                f"has {name} of {frame.width}x{frame.height} pixels among others of "
-                f"{width}x{height}",
+                f"has {frame.width}x{frame.height} pixels, others have {width}x{height}",
+                frame=number,
             )
         if scale is not None:
             return (self._converter.scale(frame, scale, out),)

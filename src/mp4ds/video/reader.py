@@ -11,7 +11,7 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
-from mp4ds.errors import Refused, VideoError
+from mp4ds.errors import Refused, VideoError, reason_of
 from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.coded import UnknownStructure
 from mp4ds.messages.encodings import MAX_SIDE, Pixels
@@ -271,7 +271,7 @@ class VideoFile:
             self._seek(group, index)
             frame = self._next_at(tick, index)
         if frame is None:
-            raise VideoError("decode-failed", self._path, f"frame {index} was not found")
+            raise VideoError("decode-failed", self._path, "was not found", frame=index)
         picture = self._maker.make(frame, index, scale)
         self._last = index
         return picture
@@ -295,9 +295,8 @@ class VideoFile:
                 self._frames = container.decode(self._stream)
         except (FFmpegError, OSError) as error:
             raise_if_scarce(error)
-            raise VideoError(
-                "decode-failed", self._path, f"frame {index} cannot be reached: {error}"
-            ) from None
+            problem = f"cannot be reached: {reason_of(error)}"
+            raise VideoError("decode-failed", self._path, problem, frame=index) from None
 
     def _next_at(self, tick: int, index: int) -> av.VideoFrame | None:
         try:
@@ -306,9 +305,8 @@ class VideoFile:
                     return frame if frame.pts == tick else None
         except (FFmpegError, OSError) as error:
             raise_if_scarce(error)
-            raise VideoError(
-                "decode-failed", self._path, f"frame {index} cannot be decoded: {error}"
-            ) from None
+            problem = f"cannot be decoded: {reason_of(error)}"
+            raise VideoError("decode-failed", self._path, problem, frame=index) from None
         return None
 
     def close(self) -> None:

@@ -13,8 +13,9 @@ from pathlib import Path
 from mp4ds._version import __version__
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.salvage import HOW_TO_SALVAGE
 from mp4ds.dataset.slicing import sliced
-from mp4ds.errors import OptionError
+from mp4ds.errors import OptionError, advising
 from mp4ds.files.outputs import begins_with, listed_names, staged
 from mp4ds.files.urls import location, remote
 from mp4ds.format.fields import document_of
@@ -89,8 +90,8 @@ def export(
         raise OptionError(
             f"{FORMATS[to]} needs {_LIBRARIES[to]} ({error}). Install it: pip install 'mp4ds[{to}]'"
         ) from None
-    with ExitStack() as stack:
-        opened = [stack.enter_context(Dataset(path)) for path in paths]
+    with ExitStack() as stack, advising(HOW_TO_SALVAGE):
+        opened = [stack.enter_context(Dataset(path, selected=chosen.uses)) for path in paths]
         path = stack.enter_context(
             staged(
                 target,
@@ -100,7 +101,7 @@ def export(
             )
         )
         opened = [
-            stack.enter_context(sliced(one, chosen.slice, path.parent / str(number)))
+            stack.enter_context(sliced(one, chosen.slice, path.parent / str(number), chosen.uses))
             for number, one in enumerate(opened)
         ]
         if to == "lerobot":  # whose videos are in colour

@@ -107,6 +107,19 @@ class ExportOptions(SliceOptions):
         """
         return Reduction(self.resize, self.every, self.max_rate)
 
+    @property
+    def selected(self) -> Selection:
+        """Which topics are selected by globs."""
+        return Selection(self.topics, self.exclude)
+
+    def chosen(self, topic: str) -> bool:
+        """Whether a topic was selected, by a glob or by name."""
+        return self.selected(topic) or topic in (self.poses, self.state, self.action)
+
+    def uses(self, topic: str) -> bool:
+        """Whether messages of a topic may be read: static transforms always are."""
+        return self.chosen(topic) or topic.endswith("tf_static")
+
 
 @dataclass(frozen=True)
 class ExportSummary:
@@ -148,11 +161,11 @@ class Ledger:
 
     def __init__(self, dataset: Dataset) -> None:
         self._totals: Counter[str] = Counter()
-        times = dataset.times()
+        counts = dataset.counts()
         self._channels: dict[str, Channel] = {}
         for channel in dataset.channels:
             self._channels[channel.topic] = channel
-            self._totals[channel.topic] += len(times.get(channel.id, ()))
+            self._totals[channel.topic] += counts.get(channel.id, 0)
         self.held: dict[str, int] = {}
         self.left_out: dict[str, dict[str, int]] = {}
 
@@ -414,6 +427,7 @@ class ExportedDataset:
     Attributes:
         dataset: The dataset.
         ledger: Counts its messages.
+        chosen: Whether a topic was selected.
         cameras: Its selected streams.
         notes: Deviations from the recording.
     """
@@ -422,19 +436,12 @@ class ExportedDataset:
         dataset.verify_messages()
         self.dataset = dataset
         self.ledger = Ledger(dataset)
-        self.notes: list[str] = []
-        selected = Selection(options.topics, options.exclude)
-        selected.check(channel.topic for channel in dataset.channels)
-        named = {options.poses, options.state, options.action}
-        self._selected = selected
-        self._named = named
+        self.notes = [f"not read, and not selected: {problem}" for problem in dataset.unread]
+        options.selected.check(dataset.all_topics)
+        self.chosen = options.chosen
         dataset.verify_sidecars(self.chosen)
-        streams = [stream for stream in dataset.streams if selected(stream.topic)]
+        streams = [stream for stream in dataset.streams if options.selected(stream.topic)]
         self.cameras = chosen_cameras(streams, options, self.ledger, self.notes)
-
-    def chosen(self, topic: str) -> bool:
-        """Whether a topic was selected, by a glob or by name."""
-        return self._selected(topic) or topic in self._named
 
 
 @dataclass

@@ -7,9 +7,9 @@ from collections.abc import Iterable
 import numpy as np
 
 from mp4ds.dataset.views import lens_of
+from mp4ds.options import seconds_text
 from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob, hold_calibration, that_png_holds
 from mp4ds.plugins.exporting.motion import StaticTree, static_transforms
-from mp4ds.plugins.exporting.tum import seconds
 
 _MOST_CAMERAS = 100  # two digits
 _IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
@@ -34,7 +34,7 @@ def write(job: ExportJob) -> None:
         (job.path / "calib_cam_to_cam.txt").write_text("\n".join([*lines, ""]), encoding="utf-8")
     if cameras:
         times = cameras[0].times
-        text = "".join(f"{seconds(time)}\n" for time in (times - times[:1]).tolist())
+        text = "".join(f"{seconds_text(time)}\n" for time in (times - times[:1]).tolist())
         (job.path / "times.txt").write_text(text, encoding="utf-8")
     if len({len(camera) for camera in cameras}) > 1:
         job.note(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from mp4ds.options import seconds_text
 from mp4ds.plugins.exporting.job import (
     ExportedCamera,
     ExportJob,
@@ -14,14 +15,7 @@ from mp4ds.plugins.exporting.job import (
 from mp4ds.plugins.exporting.motion import Poses, Row, imu_rows, in_order, topics_of
 from mp4ds.video.images import encoding_as
 
-_NS = 10**9
 _IMU = "sensor_msgs/Imu"
-
-
-def seconds(time: int) -> str:
-    """Nanoseconds as seconds, with all digits."""
-    sign, (whole, part) = "-" if time < 0 else "", divmod(abs(time), _NS)
-    return f"{sign}{whole}.{part:09d}"
 
 
 def is_depth(camera: ExportedCamera) -> bool:
@@ -58,14 +52,14 @@ def write(job: ExportJob) -> None:
 
 
 def _write_images(job: ExportJob, kind: str, camera: ExportedCamera) -> None:
-    names = [f"{kind}/{seconds(time)}.png" for time in camera.times.tolist()]
+    names = [f"{kind}/{seconds_text(time)}.png" for time in camera.times.tolist()]
     job.write_png_files(camera, kind, names)
     heads = ["color images" if kind == "rgb" else "depth maps", f"file: {camera.topic}"]
     if kind == "depth":
         unit = "as recorded, in ROS one millimetre (depth factor 1000, not TUM's 5000)"
         heads.append(f"unit: {unit}")
         job.note(f"{camera.topic}: depths are in units {unit}")
-    rows = zip(map(seconds, camera.times.tolist()), names, strict=True)
+    rows = zip(map(seconds_text, camera.times.tolist()), names, strict=True)
     _write_list(job.path / f"{kind}.txt", [*heads, "timestamp filename"], map(" ".join, rows))
 
 
@@ -76,7 +70,7 @@ def _write_rows(job: ExportJob, name: str, topic: str, head: str, rows: Iterable
         nonlocal count
         for time, values in in_order(rows):
             count += 1
-            yield " ".join([seconds(time), *map(repr, map(float, values))])
+            yield " ".join([seconds_text(time), *map(repr, map(float, values))])
 
     _write_list(job.path / name, [f"file: {topic}", head], lines())
     job.places[name] = topic

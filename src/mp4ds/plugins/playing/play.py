@@ -10,7 +10,8 @@ from pathlib import Path
 
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.errors import OptionError
+from mp4ds.dataset.salvage import HOW_TO_SALVAGE
+from mp4ds.errors import OptionError, advising
 from mp4ds.options import (
     Options,
     argument,
@@ -190,21 +191,23 @@ def open_player(
     chosen = replace(chosen, names=chosen.names.in_world(world))
     places = datasets_in(datasets)
     with ExitStack() as stack:
+        stack.enter_context(advising(HOW_TO_SALVAGE))
+        leads = chosen.clock is not None or bool(chosen.clock_topics) or chosen.clock_topics_all
+        wanted = Wanted(
+            chosen.topics,
+            chosen.exclude,
+            regex=chosen.regex,
+            exclude_regex=chosen.exclude_regex,
+            without=frozenset({_CLOCK} if leads or chosen.follow_clock else ()),
+        )
         opened = [
-            stack.enter_context(Dataset(place, jpeg_quality=chosen.jpeg_quality))
+            stack.enter_context(Dataset(place, jpeg_quality=chosen.jpeg_quality, selected=wanted))
             for place in places
         ]
-        leads = chosen.clock is not None or bool(chosen.clock_topics) or chosen.clock_topics_all
         timeline = Timeline(
             opened,
             world=world,
-            wanted=Wanted(
-                chosen.topics,
-                chosen.exclude,
-                regex=chosen.regex,
-                exclude_regex=chosen.exclude_regex,
-                without=frozenset({_CLOCK} if leads or chosen.follow_clock else ()),
-            ),
+            wanted=wanted,
             names=Names(chosen.remap, chosen.prefix, chosen.names),
             kind=KINDS[chosen.publish_as] if chosen.publish_as else None,
             reduction=Reduction(chosen.resize, chosen.every, chosen.max_rate),

@@ -378,7 +378,7 @@ class Timeline:
         jpeg_quality: int = 95,
         read_ahead: int = 8,
     ) -> None:
-        topics = [channel.topic for dataset in datasets for channel in dataset.channels]
+        topics = [topic for dataset in datasets for topic in dataset.all_topics]
         wanted.check(topics)
         names.check(topic for topic in topics if wanted(topic))
         self._read_ahead = read_ahead

@@ -1,0 +1,270 @@
+"""What can be read of a damaged dataset, and what is lost of it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.messages import MessagesFile, SalvagedMessages, recorded_format
+from mp4ds.dataset.stream import Stream
+from mp4ds.errors import FormatError, SourceError, SourceNotFoundError, VersionError
+from mp4ds.files.outputs import digest_file
+from mp4ds.files.urls import location, remote
+from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME
+from mp4ds.format.manifest import Manifest, StreamEntry
+from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.plan import calibration_topics
+from mp4ds.records import Loss
+
+_FORMAT = re.compile(rb"^format: (bag|rosbag2|mcap)\r?$", re.MULTILINE)
+_ALTERED = "does not match its SHA-256"
+
+
+class Damage:
+    """Frames of a stream, one after another, that cannot be read for the same reason.
+
+    Args:
+        stream: The stream.
+        error: Of the first of them; without a number if none can be read.
+    """
+
+    def __init__(self, stream: Stream, error: FormatError) -> None:
+        self._stream = stream
+        self._error = error
+        self.last = error.frame
+
+    def takes(self, error: FormatError) -> bool:
+        """Whether an error says the same of the next frame, which then belongs to it."""
+        if self.last is None or error.frame != self.last + 1 or error.code != self._error.code:
+            return False
+        self.last = error.frame
+        return True
+
+    @property
+    def error(self) -> FormatError:
+        """The error that names them all, by number, topic and times."""
+        if self._error.frame is None:
+            return self._error
+        return self._stream.named(self._error, self._error.frame, self.last)
+
+    @property
+    def frames(self) -> tuple[int, int]:
+        """Numbers of the first and the last of them."""
+        if self._error.frame is None or self.last is None:
+            return 0, len(self._stream) - 1
+        return self._error.frame, self.last
+
+    @property
+    def loss(self) -> Loss:
+        """What is lost by it."""
+        first, last = self.frames
+        times = self._stream.log_times
+        return Loss(
+            self._stream.video_path.name,
+            None,
+            None,
+            self._error.what,
+            last - first + 1,
+            (self._stream.topic,),
+            int(times[first]),
+            int(times[last]),
+            (first, last),
+        )
+
+
+def damages_of(stream: Stream, report: Callable[[int], None] = lambda _: None) -> Iterator[Damage]:
+    """What cannot be read of a stream: every frame is decoded, rebuilt and compared.
+
+    Args:
+        stream: The stream.
+        report: Called with the number of each frame.
+    """
+    found: Damage | None = None
+    for error in stream.damages(report):
+        if found and found.takes(error):
+            continue
+        if found:
+            yield found
+        found = Damage(stream, error)
+    if found:
+        yield found
+
+
+HOW_TO_SALVAGE = (
+    "`mp4ds validate --deep` names the frames, and `mp4ds unpack --salvage` restores what can be "
+    "read."
+)
+"""What to do about a damaged dataset."""
+
+
+# ---------------------------------------------------------------- opening
+
+
+def open_damaged(
+    path: Path | str, *, selected: Callable[[str], bool], jpeg_quality: int
+) -> tuple[Dataset, list[Loss]]:
+    """A dataset, some files of which cannot be read. What can be read of its videos: see `examine`.
+
+    Args:
+        path: See `Dataset`.
+        selected: Whether a topic is wanted; damage to others is not reported.
+        jpeg_quality: See `Dataset`.
+
+    Returns:
+        The dataset, and what is lost by such files and of messages.mcap.
+
+    Raises:
+        SourceNotFoundError: The path does not exist.
+        SourceError: It is at a URL.
+        FormatError: Nothing of it can be read, or a newer version wrote it.
+    """
+    place = location(path)
+    if remote(place):
+        raise SourceError(place, "cannot be salvaged from a remote location", "Download it first.")
+    if not place.exists():
+        raise SourceNotFoundError(place)
+    folder = place.parent if place.name == MANIFEST_NAME else place
+    if folder.is_dir():
+        opening = _Opening(folder, selected, jpeg_quality)
+        return opening.dataset(), opening.losses
+    dataset = Dataset(folder, jpeg_quality=jpeg_quality)
+    dataset.is_salvaged = True
+    return dataset, []
+
+
+def examine(stream: Stream) -> list[Loss]:
+    """Find the frames of a stream that can be read; from then on it only reads these.
+
+    If the video matches its SHA-256, nothing is decoded.
+
+    Returns:
+        What is lost of the others.
+    """
+    count, video = len(stream), stream.sidecar.video
+    try:
+        _ = stream.rebuilder
+    except FormatError as error:
+        stream.sound = np.zeros(count, np.bool_)
+        name, topics = stream.video_path.name, (stream.topic,)
+        return [Loss(name, None, None, error.what, count, topics, frames=(0, count - 1))]
+    if video.sha256 is not None and digest_file(stream.video_path)[1] == video.sha256:
+        return []
+    sound = np.ones(count, np.bool_)
+    losses = []
+    for damage in damages_of(stream):
+        first, last = damage.frames
+        sound[first : last + 1] = False
+        losses.append(damage.loss)
+    if stream.sidecar.digests is None and sound.any() and video.sha256 is not None:
+        problem = f"{_ALTERED}, and frames of a lossy video have no digests: some may be altered"
+        losses.append(Loss(stream.video_path.name, None, None, problem, 0, (stream.topic,)))
+    stream.sound = sound
+    return losses
+
+
+class _Opening:
+    """The files of a damaged folder.
+
+    Attributes:
+        losses: What is lost by files that cannot be read at all, and of messages.mcap.
+    """
+
+    def __init__(self, folder: Path, selected: Callable[[str], bool], jpeg_quality: int) -> None:
+        self._folder = folder
+        self._selected = selected
+        self._jpeg_quality = jpeg_quality
+        self.losses: list[Loss] = []
+
+    def dataset(self) -> Dataset:
+        """The dataset."""
+        manifest: Manifest | None = None
+        try:
+            manifest = load_manifest(self._folder / MANIFEST_NAME)
+        except VersionError:
+            raise
+        except FormatError as error:
+            problem = f"{error.problem}; the other files tell what the dataset holds"
+            self.losses.append(Loss(MANIFEST_NAME, None, None, problem, 0))
+        if manifest is not None:
+            entries = {entry.sidecar: entry for entry in manifest.streams}
+            streams = [self._stream(name, entry) for name, entry in entries.items()]
+        else:
+            names = sorted(path.name for path in self._folder.glob("*.yaml"))
+            streams = [self._stream(name, None) for name in names if name != MANIFEST_NAME]
+        file = self._messages(manifest)
+        there = [stream for stream in streams if stream is not None]
+        if not there and file.path is None:
+            raise FormatError("file-missing", self._folder, "has no file that can be read")
+        manifest = manifest or self._rebuilt(there, file)
+        dataset = Dataset.of(self._folder, manifest, there, file)
+        dataset.jpeg_quality, dataset.is_salvaged = self._jpeg_quality, True
+        return dataset
+
+    def _stream(self, name: str, entry: StreamEntry | None) -> Stream | None:
+        try:
+            return Stream(self._folder / name, jpeg_quality=self._jpeg_quality)
+        except VersionError:
+            raise
+        except FormatError as error:
+            if entry is None:
+                self.losses.append(Loss(name, None, None, error.problem))
+            elif self._selected(entry.topic):
+                frames, topics = entry.frames, (entry.topic,)
+                self.losses.append(Loss(name, None, None, error.problem, frames, topics))
+            elif any(map(self._selected, calibration_topics(entry.topic))):
+                problem = f"{error.problem}; it may have had calibrations"
+                self.losses.append(Loss(name, None, None, problem))
+            return None
+
+    def _messages(self, manifest: Manifest | None) -> MessagesFile:
+        path = self._folder / MESSAGES_NAME
+        file = MessagesFile(path)
+        try:
+            if manifest is not None:
+                file.verify(manifest)
+                return file
+        except FormatError:
+            pass  # it is read below as far as possible
+        try:
+            salvaged = SalvagedMessages(path)
+        except FormatError as error:
+            self.losses.append(Loss(MESSAGES_NAME, None, None, error.problem))
+            return MessagesFile(None)
+        losses = list(salvaged.losses)
+        if not losses and manifest is not None:
+            problem = f"{_ALTERED}, although all its records can be read: some may be altered"
+            losses.append(Loss(MESSAGES_NAME, None, None, problem, 0))
+        self.losses += [
+            loss for loss in losses if not loss.topics or any(map(self._selected, loss.topics))
+        ]
+        return salvaged
+
+    def _rebuilt(self, streams: list[Stream], file: MessagesFile) -> Manifest:
+        """What the manifest said, as far as the other files tell."""
+        path = self._folder / MANIFEST_NAME
+        found = _FORMAT.search(path.read_bytes()) if path.is_file() else None
+        told: Any = found[1].decode() if found else recorded_format(file)
+        return Manifest(
+            mp4ds=FORMAT_VERSION,
+            kind="dataset",
+            profile=streams[0].sidecar.profile if streams else "lossless",
+            format=told,
+            recording_profile=file.profile,
+            sources=[],
+            messages=0,
+            streams=[
+                StreamEntry(
+                    topic=stream.topic,
+                    sidecar=stream.path.name,
+                    video=stream.sidecar.video.file,
+                    frames=len(stream),
+                )
+                for stream in streams
+            ],
+            files=[],
+        )
