@@ -57,7 +57,7 @@ from mp4ds.plugins.evaluating.results import (
     reachable_score,
     recommend,
 )
-from mp4ds.unpacking.unpack import UnpackOptions
+from mp4ds.unpacking.options import UnpackOptions
 from mp4ds.video.planes import PacketSizes, packet_sizes
 from mp4ds.video.scores import ScoreSummary, largest_crf
 from scenes import PERIOD, TRAITS, Scene, odd_scene

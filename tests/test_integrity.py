@@ -17,7 +17,7 @@ import mp4ds
 from coded_scenes import CODED
 from each import each, fresh
 from mp4ds import FormatError, Mp4dsError, SourceError, yamlio
-from mp4ds.unpacking.unpack import UnpackOptions
+from mp4ds.unpacking.options import UnpackOptions
 from scenes import Scene
 from sources import SOURCES, load_tool, scene
 
@@ -749,5 +749,5 @@ def test_jpeg_of_sixteen_bits_is_refused_in_a_sentence(tmp_path: Path) -> None:
     sources = SOURCES["mcap-ros2-none"](tmp_path / "source", scene("mono16"))
     mp4ds.pack(sources, tmp_path / "dataset")
     options = mp4ds.UnpackOptions(image_format="jpeg")
-    with pytest.raises(mp4ds.OptionError, match="mono16"):
+    with pytest.raises(mp4ds.ConversionError, match=r"topic .*mono16 images, but PNG can"):
         mp4ds.unpack(tmp_path / "dataset", "images", tmp_path / "images", options)

@@ -20,7 +20,7 @@ from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.info import info
 from mp4ds.plugins.playing.play import PlayOptions, open_player
 from mp4ds.records import Excerpt, Message, Record
-from mp4ds.unpacking.unpack import UnpackOptions
+from mp4ds.unpacking.options import UnpackOptions
 from player_scenes import (
     MS,
     START,

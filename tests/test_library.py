@@ -23,7 +23,7 @@ from coded_scenes import CODED
 from definitions import PICTURES
 from each import each
 from mp4ds.packing.options import PackOptions
-from mp4ds.unpacking.unpack import UnpackOptions
+from mp4ds.unpacking.options import UnpackOptions
 from pictures import CAREFUL, pixels
 from sources import (
     COMMON,

@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 import mp4ds
 from coded_scenes import CODED
 from each import each
-from mp4ds.dataset.frames import StampIndex
+from mp4ds.dataset.stamps import StampIndex
 from mp4ds.dataset.views import Placement
 from mp4ds.format.models import Calibration, Roi
 from mp4ds.messages.encodings import ENCODINGS as KNOWN
 from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.demo import demo
-from mp4ds.unpacking.unpack import UnpackOptions
+from mp4ds.unpacking.options import UnpackOptions
 from mp4ds.video.images import Renderer
 from pictures import YUV, picture, pixels
 from republished import psnr

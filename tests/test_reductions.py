@@ -28,9 +28,9 @@ from mp4ds.errors import FormatError, OptionError
 from mp4ds.format.sidecars import MANIFEST_NAME
 from mp4ds.packing.options import PackOptions
 from mp4ds.records import Message
+from mp4ds.unpacking.options import UnpackOptions
 from mp4ds.unpacking.pictures import Reduction, at_most, times_of
 from mp4ds.unpacking.republish import Republisher
-from mp4ds.unpacking.unpack import UnpackOptions
 from pictures import picture, pixels
 from republished import CAMERAS, Read, file_picture, psnr, read
 from scenes import Record, Scene, odd_scene, scene

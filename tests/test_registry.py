@@ -361,8 +361,11 @@ OF_READING = {
     *("a message of this type needs a template", "contradicts the fields beside it"),
     *("a blank message has data", "a blank message has a timestamp or data"),
     *("it has no pixels", "* has no plain form"),
+    "it is a packet of a video, which cannot be decoded on its own",
+    *("it is no image of a known format", "its picture is damaged, or cut short"),
+    "its PNG has 16 bits, of which Pillow would read only 8",
 }
-"""Refusals of what a sidecar, a video or mp4ds itself says, which no message meets when packed."""
+"""Refusals of what a sidecar, a video, a stored message or mp4ds itself says; not when packed."""
 
 
 def blanked(text: str) -> str:

@@ -20,7 +20,7 @@ from mp4ds.packing.options import PackOptions
 from mp4ds.packing.pack import pack_each, pack_share
 from mp4ds.plugins.exporting.export import export
 from mp4ds.plugins.exporting.job import ExportOptions
-from mp4ds.unpacking.unpack import UnpackOptions
+from mp4ds.unpacking.options import UnpackOptions
 from round_trips import TARGETS, Compare, output_of, own_target
 from sources import PERIOD, SOURCES, START, TRAITS, Scene, odd_scene, scene, write_bag
 

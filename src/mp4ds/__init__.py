@@ -73,7 +73,8 @@ if TYPE_CHECKING:
     from mp4ds.plugins.recording.record import RecordOptions, RecordSummary, record
     from mp4ds.plugins.reporting.report import ReportOptions, ReportSummary, report
     from mp4ds.times import Sync
-    from mp4ds.unpacking.unpack import UnpackOptions, UnpackSummary, unpack
+    from mp4ds.unpacking.options import UnpackOptions, UnpackSummary
+    from mp4ds.unpacking.unpack import unpack
 
 _HOMES = {
     "dataset.checks": (
@@ -116,11 +117,8 @@ _HOMES = {
     "plugins.recording.record": ("RecordOptions", "RecordSummary", "record"),
     "plugins.reporting.report": ("ReportOptions", "ReportSummary", "report"),
     "times": ("Sync",),
-    "unpacking.unpack": (
-        "UnpackOptions",
-        "UnpackSummary",
-        "unpack",
-    ),
+    "unpacking.options": ("UnpackOptions", "UnpackSummary"),
+    "unpacking.unpack": ("unpack",),
 }
 
 __all__ = [

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from mp4ds.plugins.info import Info, ReadingSpeed, TopicInfo
     from mp4ds.plugins.reporting.overview import Brief
     from mp4ds.records import Loss
-    from mp4ds.unpacking.unpack import UnpackSummary
+    from mp4ds.unpacking.options import UnpackSummary
 
 _LOSSES_SHOWN = 20
 _quiet = False

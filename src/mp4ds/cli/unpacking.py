@@ -16,8 +16,9 @@ from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import counted, path_text
 from mp4ds.plugins.exporting.export import export as run_export
 from mp4ds.plugins.exporting.job import ExportOptions, ExportSummary
-from mp4ds.unpacking.unpack import UnpackOptions, UnpackProgress, unpack_each
+from mp4ds.unpacking.options import UnpackOptions, UnpackProgress
 from mp4ds.unpacking.unpack import unpack as run
+from mp4ds.unpacking.unpack import unpack_each
 
 
 @takes(UnpackOptions)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import heapq
 import shlex
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import chain
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ from mp4ds.dataset.messages import MessagesFile, RecordedMessage, SalvagedMessag
 from mp4ds.dataset.rebuild import Choice, everything, last_of, within
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic_frames import TopicFrames
+from mp4ds.dataset.verbatim import VerbatimFrames, verbatim_frames
 from mp4ds.dataset.video import Video
 from mp4ds.errors import FormatError, OptionError, SourceError, SourceNotFoundError, counted
 from mp4ds.files.sources import HOW_TO_OPEN, is_folder, video_at
@@ -38,6 +39,7 @@ from mp4ds.files.urls import location
 from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.format.manifest import Manifest, StreamEntry
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, verify_file
+from mp4ds.messages.serializations import is_camera
 from mp4ds.plan import calibration_topics
 from mp4ds.records import Channel, Excerpt, Message, Record, Schema
 from mp4ds.times import Sync, synchronize
@@ -52,8 +54,9 @@ class Dataset:
 
     ``dataset["/topic"]`` returns a topic's frames, ``"/topic" in dataset`` tells whether it has
     any, and iteration yields all streams. If a topic changes its size or encoding and so has
-    several streams, ``dataset["/topic"]`` is a `TopicFrames`: the frames of all of them in recorded
-    order. Each stream can also be looked up by its file name without extension.
+    several streams, or has images that are stored verbatim, ``dataset["/topic"]`` is a
+    `TopicFrames`: all its frames in recorded order. Each stream can also be looked up by its file
+    name without extension.
 
     Attributes:
         path: The folder, or the video or sidecar.
@@ -69,6 +72,7 @@ class Dataset:
         jpeg_quality: Quality of the JPEG files in messages of transcoded streams, 1 to 100.
         selected: Whether a topic is wanted: damage of files that only have others is no error.
             None: all are.
+        among: The only topics that can be wanted; None if that is not known.
 
     Raises:
         SourceNotFoundError: The path does not exist.
@@ -84,6 +88,7 @@ class Dataset:
         *,
         jpeg_quality: int = 95,
         selected: Callable[[str], bool] | None = None,
+        among: Collection[str] | None = None,
     ) -> None:
         self.path = location(path)
         if not self.path.exists():
@@ -122,7 +127,7 @@ class Dataset:
             try:
                 self._file.check_index()
             except FormatError as error:
-                self._do_without_messages(error)
+                self._do_without_messages(error, among)
 
     def _open_stream(self, entry: StreamEntry) -> None:
         path, wanted = self.path / entry.sidecar, self._selected
@@ -138,27 +143,42 @@ class Dataset:
                 raise
             self.unread.append(str(error))
 
-    def _do_without_messages(self, error: FormatError) -> None:
+    def _do_without_messages(
+        self, error: FormatError, among: Collection[str] | None = None
+    ) -> None:
         """Go on without messages.mcap, which is damaged.
 
         Raises:
             FormatError: It has, or may have, messages that are wanted.
         """
-        path, wanted = self._file.path, self._selected
-        if path is None or wanted is None:
+        wanted = self._selected
+        if wanted is None:
             raise error
-        try:
-            file = SalvagedMessages(path)
-        except FormatError:
-            raise error from None
-        there = [channel.topic for channel in file.channels if file.counts.get(channel.id)]
-        lost = [loss for loss in file.losses if loss.messages != 0]
-        if any(map(wanted, there)) or any(
-            not loss.topics or any(map(wanted, loss.topics)) for loss in lost
-        ):
+        is_known = among is not None and self._are_in_videos(filter(wanted, among))
+        if not is_known and self._may_hold(wanted):
             raise error
         self.unread.append(str(error))
         self._file = MessagesFile(None)
+
+    def _are_in_videos(self, topics: Iterable[str]) -> bool:
+        """Whether all messages of some topics are in videos or their sidecars."""
+        verbatim = {entry.topic for entry in self.manifest.verbatim} if self.manifest else set()
+        known = {topic for stream in self.streams for topic in stream.topics}
+        return known - verbatim >= set(topics)
+
+    def _may_hold(self, wanted: Callable[[str], bool]) -> bool:
+        """Whether messages.mcap, which is damaged, has, or may have, wanted messages."""
+        if self._file.path is None:
+            return False
+        try:
+            file = SalvagedMessages(self._file.path)
+        except FormatError:
+            return True
+        there = [channel.topic for channel in file.channels if file.counts.get(channel.id)]
+        lost = [loss.topics for loss in file.losses if loss.messages != 0]
+        return any(map(wanted, there)) or any(
+            not topics or any(map(wanted, topics)) for topics in lost
+        )
 
     @classmethod
     def of(
@@ -199,27 +219,85 @@ class Dataset:
 
     @property
     def topics(self) -> list[str]:
-        """Topics with frames."""
+        """Topics with frames in videos."""
         return list(dict.fromkeys(stream.topic for stream in self._all))
 
     @cached_property
-    def _by_name(self) -> dict[str, Frames]:
-        """The frames of each topic, and the streams by file name."""
-        found: dict[str, Frames] = {one.path.stem: one for one in self._all}
-        found |= {video.topic: video for video in self.videos}
-        for topic in dict.fromkeys(stream.topic for stream in self.streams):
-            streams = [stream for stream in self.streams if stream.topic == topic]
-            found[topic] = TopicFrames(streams) if len(streams) > 1 else streams[0]
-        return found
+    def _looked_up(self) -> dict[str, Frames | None]:
+        return {}
+
+    def _frames_of(self, name: str) -> Frames | None:
+        """The frames of a topic, or of the stream with a file name; None if there are none."""
+        if name not in self._looked_up:
+            parts: list[Stream | VerbatimFrames] = [
+                stream for stream in self.streams if stream.topic == name and not stream.is_lost
+            ]
+            parts += self.verbatim(name)[0]
+            named = (one for one in self._all if name in (one.path.stem, one.topic))
+            found = TopicFrames(parts) if len(parts) > 1 else next(chain(parts, named), None)
+            self._looked_up[name] = found
+        return self._looked_up[name]
+
+    def verbatim(self, topic: str) -> tuple[list[VerbatimFrames], Counter[str]]:
+        """A topic's frames that are stored verbatim in messages.mcap; they are read once.
+
+        Returns:
+            Those of each size and encoding, and how many messages have no picture, by reason.
+
+        Raises:
+            FormatError: messages.mcap is damaged.
+        """
+        if topic not in self._verbatim:
+            frames: list[VerbatimFrames] = []
+            without = Counter[str]()
+            for channel in self._verbatim_cameras(topic):
+                found, others = self._verbatim_of(channel)
+                frames += found
+                without += others
+            self._verbatim[topic] = frames, without
+        return self._verbatim[topic]
+
+    @cached_property
+    def _verbatim(self) -> dict[str, tuple[list[VerbatimFrames], Counter[str]]]:
+        return {}
+
+    def _verbatim_cameras(self, topic: str) -> list[Channel]:
+        """The channels of a topic with images in messages.mcap, which need not be opened."""
+        listed = self.manifest.verbatim if self.manifest else []
+        if not any(entry.topic == topic for entry in listed):
+            return []
+        return [item for item in self.channels if item.topic == topic and is_camera(item)]
+
+    def _verbatim_of(self, channel: Channel) -> tuple[list[VerbatimFrames], Counter[str]]:
+        group = next((item for item in self._groups if item.channel.id == channel.id), None)
+        ids = group.recorded_ids if group else {channel.id}
+
+        def recorded(excerpt: Excerpt) -> Iterator[Message]:
+            return (item for item in self._file.in_time(excerpt) if item.channel.id in ids)
+
+        messages = recorded(Excerpt(topics=frozenset([channel.topic]), others=False))
+        numbers: Iterable[int] = count()
+        if group is not None:
+            taken, times = group.places, self._file.times()
+            own = [times[key] for key in ids if key in times]
+            numbers = np.setdiff1d(np.arange(len(taken) + sum(map(len, own))), taken).tolist()
+            if not group.is_in_time(own):
+                messages = group.found_in(self.recorded_records())
+        numbered = zip(numbers, messages, strict=False)
+        with_info = (item for item in self.streams if item.topic == channel.topic)
+        calibrated = next((item for item in with_info if item.calibrations), None)
+        path = self._file.path or self.path
+        return verbatim_frames(path, channel, numbered, recorded, calibrated)
 
     def __getitem__(self, topic: str) -> Frames:
-        if topic not in self._by_name:
+        found = self._frames_of(topic)
+        if found is None:
             known = ", ".join(self.topics) or "none"
             raise KeyError(f"{self.path} has no stream {topic!r}; there are: {known}")
-        return self._by_name[topic]
+        return found
 
     def __contains__(self, topic: object) -> bool:
-        return topic in self._by_name
+        return isinstance(topic, str) and self._frames_of(topic) is not None
 
     def __iter__(self) -> Iterator[Stream | Video]:
         return iter(self._all)
@@ -240,10 +318,22 @@ class Dataset:
         return [*self._verbatim_channels, *(group.channel for group in self._groups)]
 
     @property
+    def listed_topics(self) -> list[str]:
+        """Topics of the streams that the manifest lists, even if a sidecar is in `unread`."""
+        return [entry.topic for entry in self.manifest.streams] if self.manifest else []
+
+    @property
     def all_topics(self) -> list[str]:
-        """The topics of all channels, and of the images whose sidecars are in `unread`."""
-        listed = [entry.topic for entry in self.manifest.streams] if self.manifest else []
-        return list(dict.fromkeys([*(channel.topic for channel in self.channels), *listed]))
+        """The topics of all channels, and the `listed_topics`."""
+        topics = (channel.topic for channel in self.channels)
+        return list(dict.fromkeys([*topics, *self.listed_topics]))
+
+    @property
+    def camera_topics(self) -> list[str]:
+        """Topics with images, in videos or stored verbatim."""
+        listed = self.manifest.verbatim if self.manifest else []
+        verbatim = [entry.topic for entry in listed if self._verbatim_cameras(entry.topic)]
+        return list(dict.fromkeys([*self.topics, *verbatim]))
 
     @property
     def unused_schemas(self) -> Sequence[Schema]:

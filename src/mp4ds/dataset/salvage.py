@@ -16,8 +16,9 @@ from mp4ds.errors import FormatError, SourceError, SourceNotFoundError, VersionE
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location, remote
 from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME
-from mp4ds.format.manifest import Manifest, StreamEntry
+from mp4ds.format.manifest import Manifest, StreamEntry, Verbatim
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.messages.serializations import is_camera
 from mp4ds.plan import calibration_topics
 from mp4ds.records import Loss
 
@@ -265,6 +266,11 @@ class _Opening:
                     frames=len(stream),
                 )
                 for stream in streams
+            ],
+            verbatim=[
+                Verbatim(topic=item.topic, messages=number, first=0, reason="not known")
+                for item in file.channels
+                if is_camera(item) and (number := file.counts.get(item.id, 0))
             ],
             files=[],
         )

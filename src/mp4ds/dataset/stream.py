@@ -301,6 +301,16 @@ class Stream(DecodedFrames):
         """Topic of the images."""
         return self.sidecar.channel.topic
 
+    @cached_property
+    def channel(self) -> Channel:
+        """The channel of the images; its id has no meaning."""
+        return self.sidecar.channel.to_record(0)
+
+    @property
+    def ordinals(self) -> NDArray[np.int64]:
+        """Numbers among the messages of the channel, shape (frames,)."""
+        return self.columns.ordinal
+
     @property
     def topics(self) -> list[str]:
         """Topic of the images, and that of the calibrations if there are any."""
@@ -388,12 +398,16 @@ class Stream(DecodedFrames):
         Args:
             index: 0 <= index < frames.
         """
+        return self.calibration_at(int(self.log_times[index]))
+
+    def calibration_at(self, log_time: int) -> Calibration | None:
+        """The calibration that applied at a log time, nanoseconds. See `intrinsics_at`."""
         if not self.calibrations:
             return None
         columns = self.camera_info_columns
         if columns is None:
             return self.calibrations[0]
-        place = np.searchsorted(columns.log_time, self.log_times[index], side="right")
+        place = np.searchsorted(columns.log_time, log_time, side="right")
         return self.calibrations[int(columns.variant[max(int(place) - 1, 0)])]
 
     def open_video(self, *, sequential: bool) -> VideoDecoder:
@@ -456,7 +470,8 @@ class Stream(DecodedFrames):
             )
         return depth.metres_of(pixels, prefix)
 
-    def _frame_id(self, index: int) -> str:
+    def frame_id(self, index: int) -> str:
+        """The coordinate frame of a frame's header; empty if unknown."""
         return self.sidecar.headers[int(self.columns.variant[index])].frame_id
 
     def messages(
@@ -506,16 +521,7 @@ class Stream(DecodedFrames):
         """
         rebuilder = self.rebuilder
         if self.sidecar.body == "packet":
-            video = self.sidecar.video
-            with (
-                self.naming_frames(),
-                PacketReader(
-                    self.video_path,
-                    codec=video.codec,
-                    frames=self.sidecar.frames,
-                    coded_size=(video.width, video.height),
-                ) as reader,
-            ):
+            with self.naming_frames(), self._open_packets() as reader:
                 for index in self.sound_of(unbroken(choice(self.columns), reader.key_numbers)):
                     packet = reader.packet(index)
                     yield index, partial(self._made, rebuilder.packet_payload, index, packet)
@@ -523,6 +529,15 @@ class Stream(DecodedFrames):
         with self.open_video(sequential=True) as decoder:
             for index, picture in self.pictures_in_order(decoder, choice):
                 yield index, partial(self._made, rebuilder.payload, index, picture)
+
+    def _open_packets(self) -> PacketReader:
+        video = self.sidecar.video
+        return PacketReader(
+            self.video_path,
+            codec=video.codec,
+            frames=self.sidecar.frames,
+            coded_size=(video.width, video.height),
+        )
 
     def _made(self, make: Callable[..., bytes | bytearray], *given: Any) -> bytes | bytearray:
         with self.naming_frames():
@@ -594,47 +609,61 @@ class Stream(DecodedFrames):
             An error with the number of each frame that cannot be read, in order; one without a
             number, the last, if none can.
         """
-        start, is_careful = 0, False
-        while start < len(self):
-            try:
-                for index, make in self._makers_from(start, is_careful):
-                    report(index)
-                    try:
-                        make()
-                    except FormatError as error:
-                        yield error
-                    start = index + 1
-                return
-            except FormatError as error:
-                if error.frame is None and (is_careful or start in (0, len(self))):
+        try:
+            for index, make in self._makers_of_all():
+                report(index)
+                try:
+                    self._made(make)
+                except FormatError as error:
                     yield error
-                    return
-                if is_careful and error.frame is not None:
-                    yield error
-                    start = max(start, error.frame) + 1
-                is_careful = True
+        except FormatError as error:
+            yield error
 
-    def _makers_from(
-        self, start: int, is_careful: bool
-    ) -> Iterator[tuple[int, Callable[[], bytes | bytearray]]]:
-        """Number of each message from one on, and what makes it.
+    def _makers_of_all(self) -> Iterator[tuple[int, Callable[[], bytes | bytearray]]]:
+        """Number of each message and what makes it, even after one that cannot be read."""
+        rebuilder = self.rebuilder
+        if self.sidecar.body == "packet":
+            with self._open_packets() as reader:
+                for index in range(len(self)):
+                    yield index, partial(self._of_packet, reader, index)
+            return
+        for index, picture in self.decodable_pictures():
+            yield (
+                index,
+                partial(lambda *found: rebuilder.payload(*self._found(found)), index, picture),
+            )
+
+    def _of_packet(self, reader: PacketReader, index: int) -> bytes | bytearray:
+        return self.rebuilder.packet_payload(index, reader.packet(index))
+
+    def decodable_pictures(
+        self, choice: Choice = everything, scale: Scale | None = None
+    ) -> Iterator[tuple[int, Picture | None]]:
+        """Like `pictures_in_order`, but None for a picture that cannot be decoded.
 
         Args:
-            start: Number of the first one; 0 unless careful.
-            is_careful: Go on after a picture that cannot be decoded.
-        """
-        if not is_careful:
-            yield from self.numbered_makers()
-        elif self.sidecar.body == "packet":
-            yield from self.numbered_makers(lambda _: iter(range(start, len(self))))
-        else:
-            with self.open_video(sequential=False) as decoder:
-                found = decoder.decodable_pictures(range(start, len(self)))
-                for index, picture in found:
-                    yield index, partial(self._made, self._payload, index, picture)
+            choice: Which are wanted; asked twice.
+            scale: See `PictureMaker.make`.
 
-    def _payload(self, index: int, picture: Picture | None) -> bytes | bytearray:
-        return self.rebuilder.payload(*self._found((index, picture)))
+        Raises:
+            VideoError: None of them can be read.
+        """
+        done = -1
+        with self.naming_frames():
+            if self.sound is None:
+                try:
+                    with self.open_video(sequential=True) as decoder:
+                        for index, picture in decoder.pictures_at(choice(self.columns), scale):
+                            yield index, picture
+                            done = index
+                    return
+                except VideoError as error:
+                    if error.frame is None:
+                        raise
+            # from there on on one core; see the decoder
+            with self.open_video(sequential=False) as decoder:
+                rest = (index for index in self.sound_of(choice(self.columns)) if index > done)
+                yield from decoder.decodable_pictures(rest, scale)
 
     def verify_video(self) -> None:
         """Check the video against its SHA-256, for when no message digest would reveal damage.

@@ -100,5 +100,6 @@ class Video(DecodedFrames):
     def _write_pixels(self, picture: Picture, out: Pixels) -> None:
         np.copyto(out, picture[0])
 
-    def _frame_id(self, index: int) -> str:
+    def frame_id(self, index: int) -> str:
+        """The coordinate frame of a frame's header; empty if unknown."""
         return ""

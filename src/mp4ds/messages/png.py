@@ -409,6 +409,16 @@ def check_whole(data: bytes | memoryview) -> None:
         raise Refused("its PNG holds no image data")
 
 
+def pixels_of(data: bytes | memoryview) -> Pixels:
+    """The pixels of a PNG, whether or not it could be rebuilt. See `decode`.
+
+    Raises:
+        Refused: It is incomplete, or of an unsupported kind.
+    """
+    parts = _split(data)
+    return _to_pixels(unfilter(_inflate(parts), parts.info.pixel_bytes), parts.info)
+
+
 def decode(data: bytes | memoryview, hint: PngRecipe | None = None) -> tuple[Pixels, PngRecipe]:
     """Unpack a PNG that can be rebuilt byte for byte, which is verified.
 

@@ -7,12 +7,13 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.rebuild import Choice, DecodedColumns, everything, form_for, marked, unbroken
+from mp4ds.dataset.frames import Frames as AnyFrames
+from mp4ds.dataset.rebuild import Choice, DecodedColumns, everything, form_for, unbroken
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import size_after, view_of
 from mp4ds.errors import OptionError, Refused
@@ -35,6 +36,13 @@ from mp4ds.video.packets import PacketReader, StandAlonePackets
 from mp4ds.video.pixels import Scale
 
 _NS = 1_000_000_000
+
+
+class FrameTimes(NamedTuple):
+    """Times of frames, nanoseconds, int64, shape (frames,). See `DecodedColumns`."""
+
+    stamp: NDArray[np.int64]
+    log_time: NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,28 +76,24 @@ class Reduction:
         ):
             raise OptionError(f"`max_rate` {rate!r} is not a rate: use Hz, such as 10.")
 
-    def size_of(self, stream: Stream) -> tuple[int, int] | None:
-        """New width and height for a stream's images; None if unchanged.
+    def size_of(self, frames: AnyFrames) -> tuple[int, int] | None:
+        """New width and height for images of one size; None if unchanged.
 
         Raises:
             OptionError: They are too large for an image.
         """
         if self.resize is None:
             return None
-        size = size_after(stream.topic, stream.image_size, self.resize)
-        return size if size != stream.image_size else None
-
-    def choice_of(self, stream: Stream, choice: Choice = everything) -> Choice:
-        """Restrict the wanted frames of a stream to those that are kept."""
-        return marked(self.kept(stream.columns), choice) if self.leaves_out else choice
+        size = size_after(frames.topic, frames.image_size, self.resize)
+        return size if size != frames.image_size else None
 
     @property
     def leaves_out(self) -> bool:
         """Whether there may be fewer images."""
         return self.every > 1 or self.max_rate is not None
 
-    def kept(self, columns: DecodedColumns) -> NDArray[np.bool_]:
-        """Which frames of a stream are kept, shape (frames,)."""
+    def kept(self, columns: DecodedColumns | FrameTimes) -> NDArray[np.bool_]:
+        """Which frames are kept, shape (frames,)."""
         is_kept = np.zeros(len(columns.stamp), np.bool_)
         is_kept[:: self.every] = True
         if self.max_rate is not None:
@@ -112,7 +116,7 @@ def _check_size(resize: Any) -> None:
         )
 
 
-def times_of(columns: DecodedColumns) -> NDArray[np.int64]:
+def times_of(columns: DecodedColumns | FrameTimes) -> NDArray[np.int64]:
     """When the frames were taken, nanoseconds: by their stamps, or by their log times.
 
     The latter if most stamps do not increase, as with cameras that leave them zero.
@@ -261,6 +265,13 @@ class Resizing:
         return self.resize(stream.rebuilder.pixels(picture))
 
 
+def resizing_of(frames: AnyFrames, size: tuple[int, int] | None) -> Resizing:
+    """How to resize the pixels of frames of one size and encoding. See `resizer`."""
+    if isinstance(frames, Stream):
+        return resizer(frames.sidecar, frames.encoding, size)
+    return _resizing(frames.topic, frames.encoding, frames.image_size, size, shows_colours=False)
+
+
 def resizer(sidecar: StreamSidecar, encoding: str, size: tuple[int, int] | None) -> Resizing:
     """How to resize pixels of a stream.
 
@@ -271,18 +282,32 @@ def resizer(sidecar: StreamSidecar, encoding: str, size: tuple[int, int] | None)
         encoding: Of the pixels.
         size: Width and height to make; None to keep them.
     """
+    image, topic = sidecar.image, sidecar.channel.topic
+    shows_colours = sidecar.shows_colours and encoding == image.encoding
+    own = image.width, image.height
+    return _resizing(topic, encoding, own, size, shows_colours=shows_colours)
+
+
+def _resizing(
+    topic: str,
+    encoding: str,
+    own: tuple[int, int],
+    size: tuple[int, int] | None,
+    *,
+    shows_colours: bool,
+) -> Resizing:
     if size is None:
         return Resizing(lambda pixels: pixels, encoding, None)
     known = ENCODINGS[encoding]
     is_plain = not known.mosaic and known.rows == 1 and known.even == (1, 1)
     view = view_of(
-        sidecar.channel.topic,
+        topic,
         known,
-        (sidecar.image.width, sidecar.image.height),
+        own,
         format="native" if is_plain else "rgb",
         resize=size,
         crop=None,
-        shows_colours=sidecar.shows_colours and encoding == sidecar.image.encoding,
+        shows_colours=shows_colours,
     )
 
     def resize(pixels: Pixels) -> Pixels:
@@ -494,20 +519,29 @@ def _from_pictures(
     if verify:
         _verify(stream)
     columns, scale = stream.columns, makers[0].resizing.scale
-    with stream.open_video(sequential=True) as decoder, ExitStack() as files:
-        if stream.sidecar.body != "packet":
-            for index, picture in stream.pictures_in_order(decoder, choice, scale):
+    with ExitStack() as files:
+        packets = None
+        for index, picture in pictures_of(stream, choice, scale):
+            if picture is not None:
                 make = makers[columns.variant[index]]
                 yield index, make.give(make.resizing.pixels(stream, picture))
-            return
-        packets = None
-        for index, found in decoder.decodable_pictures(stream.sound_of(choice(columns)), scale):
-            if found is not None:
-                make = makers[columns.variant[index]]
-                yield index, make.give(make.resizing.pixels(stream, found))
                 continue
             packets = packets or files.enter_context(_packets(stream))
             yield index, Undecoded(stream.rebuilder.packet_payload(index, packets.packet(index)))
+
+
+def pictures_of(
+    stream: Stream, choice: Choice, scale: Scale | None
+) -> Iterator[tuple[int, Picture | None]]:
+    """Pictures of a stream; None for a packet that cannot be decoded.
+
+    Such packets refer to others that were lost before they were recorded.
+    """
+    if stream.sidecar.body == "packet":
+        yield from stream.decodable_pictures(choice, scale)
+        return
+    with stream.open_video(sequential=True) as decoder:
+        yield from stream.pictures_in_order(decoder, choice, scale)
 
 
 def _packets(stream: Stream) -> PacketReader:
@@ -520,32 +554,3 @@ def _verify(stream: Stream) -> None:
     if stream.sidecar.video.sha256 is None and stream.sidecar.digests is not None:
         for make in stream.makers():
             make()
-
-
-def image_files(
-    stream: Stream, kind: str, reduction: Reduction, *, jpeg_quality: int
-) -> Iterator[tuple[int, bytes | memoryview]]:
-    """The images of a stream as files, each with its number.
-
-    JPEG files are kept as recorded if JPEG is wanted; all others are made from the stream's frames.
-
-    Args:
-        stream: The stream.
-        kind: ``png`` or ``jpeg``.
-        reduction: How to reduce them.
-        jpeg_quality: Of new JPEG files, 1 to 100.
-
-    Raises:
-        OptionError: The files cannot hold the images.
-        FormatError: The stream is damaged.
-    """
-    choice = reduction.choice_of(stream)
-    size = reduction.size_of(stream)
-    if kind == "jpeg" and size is None and holds_files(stream.sidecar, kind):
-        yield from files_of(stream, choice)
-        return
-    resizing = resizer(stream.sidecar, stream.sidecar.image.encoding, size)
-    file = ImageFile(resizing.encoding, kind, quality=jpeg_quality)
-    with stream.open_video(sequential=True) as decoder:
-        for index, picture in stream.pictures_in_order(decoder, choice, resizing.scale):
-            yield index, file.encode(resizing.pixels(stream, picture))

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 import shlex
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -24,7 +22,6 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import recorded_storage
 from mp4ds.dataset.salvage import examine, open_damaged
 from mp4ds.dataset.slicing import latched_at, sliced, span_in
-from mp4ds.dataset.stream import Stream
 from mp4ds.errors import (
     ConversionError,
     FormatError,
@@ -33,25 +30,10 @@ from mp4ds.errors import (
     advising,
     interrupted,
 )
-from mp4ds.files.outputs import Owned, csv_cell, staged
+from mp4ds.files.outputs import Owned, staged
 from mp4ds.files.uploads import uploaded
 from mp4ds.files.urls import RemotePath, location, remote
-from mp4ds.format.sidecars import MANIFEST_NAME
-from mp4ds.options import (
-    SliceOptions,
-    duration,
-    end,
-    every,
-    exclude,
-    force,
-    jpeg_quality,
-    latched,
-    max_rate,
-    option,
-    resize,
-    start,
-    topics,
-)
+from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
 from mp4ds.plan import FileNames, Selection
 from mp4ds.records import (
     EVERYTHING,
@@ -62,167 +44,10 @@ from mp4ds.records import (
     Message,
     MetadataRecord,
 )
-from mp4ds.unpacking.pictures import Reduction, holds_files, image_files
-from mp4ds.unpacking.republish import KINDS, Republished, Republisher, check_kind
-
-
-@dataclass(frozen=True)
-class UnpackOptions(SliceOptions):
-    """How to unpack."""
-
-    storage: str | None = option(
-        "Storage of rosbag2: sqlite3 or mcap; default: as recorded, else mcap."
-    )
-    image_format: str | None = option(
-        "png (exact) or jpeg, for `to` images; default: JPEG files as recorded, others as png."
-    )
-    images: str | None = option(
-        "Convert all cameras to raw, jpeg, png, compressed-video or ffmpeg messages; "
-        "default: as recorded.",
-        metavar="KIND",
-    )
-    jpeg_quality: int = jpeg_quality()
-    resize: float | tuple[int, int] | None = resize()
-    every: int = every()
-    max_rate: float | None = max_rate()
-    topics: Sequence[str] = topics()
-    exclude: Sequence[str] = exclude()
-    start: str | float | None = start()
-    end: str | float | None = end()
-    duration: str | float | None = duration()
-    latched: bool = latched()
-    skip_unconvertible: bool = option(
-        "Leave out, and count, what the output format cannot hold.", False
-    )
-    salvage: bool = option("Restore what can be read of a damaged dataset.", False)
-    force: bool = force()
-
-    @property
-    def reduction(self) -> Reduction:
-        """How to reduce images.
-
-        Raises:
-            OptionError: The size, number or rate is not valid.
-        """
-        return Reduction(self.resize, self.every, self.max_rate)
-
-    @property
-    def selected(self) -> Selection:
-        """Which topics."""
-        return Selection(self.topics, self.exclude)
-
-
-@dataclass(frozen=True)
-class UnpackProgress:
-    """Progress of an unpack: messages written, and their total (0: unknown)."""
-
-    messages: int
-    messages_total: int
-
-
-@dataclass(frozen=True)
-class UnpackSummary:
-    """The result of an unpack.
-
-    Attributes:
-        output: The recording or folder made.
-        messages: Messages written, by topic.
-        converted: Types converted between ROS 1 and ROS 2, by topic.
-        omitted: What the target cannot hold and was left out: a phrase -> how many.
-        left_out: Topics left out on request.
-        republished: The results for topics whose images are converted.
-        as_recorded: If a conversion was requested, the camera topics with messages that stay as
-            recorded: reason -> how many.
-        unconvertible: Topics with messages left out because the target cannot hold them:
-            reason -> how many.
-        thinned: Topics with messages left out because fewer were requested -> how many.
-        latched: Latched messages from before the slice, by topic.
-        latched_left_out: Latched topics whose messages from before it are too large.
-        losses: What could not be read, if a damaged dataset is salvaged.
-        notes: Other deviations from the recording.
-    """
-
-    output: Path
-    messages: dict[str, int] = field(default_factory=dict)
-    converted: list[str] = field(default_factory=list)
-    omitted: dict[str, int] = field(default_factory=dict)
-    left_out: list[str] = field(default_factory=list)
-    republished: dict[str, Republished] = field(default_factory=dict)
-    as_recorded: dict[str, dict[str, int]] = field(default_factory=dict)
-    thinned: dict[str, int] = field(default_factory=dict)
-    unconvertible: dict[str, dict[str, int]] = field(default_factory=dict)
-    latched: dict[str, int] = field(default_factory=dict)
-    latched_left_out: list[str] = field(default_factory=list)
-    losses: list[Loss] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-
-# ---------------------------------------------------------------- images
-
-_STAMPS_NAME = "stamps.csv"
-_HEAD = ["file", "stamp_ns", "log_time_ns", "frame_id"]
-
-
-def write_images(
-    stream: Stream,
-    folder: Path,
-    *,
-    image_format: str | None,
-    jpeg_quality: int,
-    reduction: Reduction,
-) -> Iterator[None]:
-    """Write one file per frame, named by its number, and stamps.csv with their times.
-
-    Args:
-        stream: The stream.
-        folder: Where to write; empty.
-        image_format: ``png`` or ``jpeg``; None for JPEG files as they were recorded, else PNG.
-        jpeg_quality: Of new JPEG files, 1 to 100.
-        reduction: How to reduce them.
-
-    Yields:
-        After each file.
-    """
-    columns, headers = stream.columns, stream.sidecar.headers
-    if image_format is None:
-        keeps = reduction.size_of(stream) is None and holds_files(stream.sidecar, "jpeg")
-        image_format = "jpeg" if keeps else "png"
-    suffix = "jpg" if image_format == "jpeg" else "png"
-    digits = len(str(len(stream) - 1))
-    with (folder / _STAMPS_NAME).open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow(_HEAD)
-        files = image_files(stream, image_format, reduction, jpeg_quality=jpeg_quality)
-        for index, data in files:
-            name = f"{index:0{digits}d}.{suffix}"
-            (folder / name).write_bytes(data)
-            frame_id = csv_cell(headers[int(columns.variant[index])].frame_id)
-            rows.writerow([name, int(columns.stamp[index]), int(columns.log_time[index]), frame_id])
-            yield
-
-
-def image_names(folder: Path) -> set[str] | None:
-    """Names of the files of image folders, by their stamps.csv; None if there is none."""
-    if not folder.is_dir():
-        return None
-    names: set[str] = set()
-    for place in folder.iterdir():
-        if place.is_dir():
-            names.update(f"{place.name}/{name}" for name in _names_in(place / _STAMPS_NAME))
-    return names or None
-
-
-def _names_in(stamps: Path) -> set[str]:
-    try:
-        rows = csv.reader(io.StringIO(stamps.read_bytes().decode(), newline=""))
-        if next(rows, None) != _HEAD:
-            return set()
-        return {stamps.name, *(row[0] for row in rows if row)}
-    except (OSError, ValueError, csv.Error):
-        return set()
-
-
-# ---------------------------------------------------------------- unpack
+from mp4ds.unpacking.image_folders import TopicImages, image_names, topic_images
+from mp4ds.unpacking.options import UnpackOptions, UnpackProgress, UnpackSummary
+from mp4ds.unpacking.pictures import Reduction
+from mp4ds.unpacking.republish import KINDS, Republisher, check_kind
 
 TARGETS = ("bag", "rosbag2", "mcap", "images")
 _SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
@@ -281,7 +106,7 @@ def _unpack_here(
     progress: Callable[[UnpackProgress], None] | None,
 ) -> UnpackSummary:
     with ExitStack() as stack:
-        whole, losses = _opened(dataset, chosen)
+        whole, losses = _opened(dataset, chosen, to)
         stack.enter_context(whole)
         given = location(output) if output else default_output(whole.path, to)
         target = Path(os.path.abspath(given))  # noqa: PTH100
@@ -297,7 +122,8 @@ def _unpack_here(
             # where log times do not tell the order, nothing can be cut out, only left out
             is_filtered = bool(chosen.slice) and to != "images" and not whole.is_in_time
             is_filtered = is_filtered and _converts_none(chosen)
-            if to != "images" and (is_filtered or not chosen.slice):
+            needs_messages = to != "images" or _needs_messages(whole, chosen.selected)
+            if needs_messages and (is_filtered or not chosen.slice):
                 whole.verify_messages()
             summary = UnpackSummary(target, losses=losses)
             summary.left_out.extend(_left_out(whole, chosen.selected, to))
@@ -325,12 +151,41 @@ def _unpack_here(
             raise WriteError(target, error) from error
 
 
-def _opened(dataset: Path | str, options: UnpackOptions) -> tuple[Dataset, list[Loss]]:
+def _opened(
+    dataset: Path | str, options: UnpackOptions, to: str = ""
+) -> tuple[Dataset, list[Loss]]:
     """The dataset, and what is lost of it by files that cannot be read."""
+    selected = options.selected
     if options.salvage:
-        return open_damaged(dataset, selected=options.selected, jpeg_quality=options.jpeg_quality)
-    opened = Dataset(dataset, jpeg_quality=options.jpeg_quality, selected=options.selected)
+        return open_damaged(dataset, selected=selected, jpeg_quality=options.jpeg_quality)
+    among = _with_images(dataset) if to == "images" else None
+    opened = Dataset(
+        dataset,
+        jpeg_quality=options.jpeg_quality,
+        selected=lambda topic: selected(topic) and (among is None or topic in among),
+        among=selected.names if among is None else among,
+    )
     return opened, []
+
+
+def _with_images(dataset: Path | str) -> set[str] | None:
+    """Topics that have images by the manifest; None if there is none that can be read."""
+    path = location(dataset)
+    path = (path.parent if path.name == MANIFEST_NAME else path) / MANIFEST_NAME
+    if not path.exists():
+        return None
+    try:
+        manifest = load_manifest(path)
+    except FormatError:  # reported when the dataset is opened
+        return None
+    topics = {entry.topic for entry in manifest.streams}
+    return topics | {entry.topic for entry in manifest.verbatim}
+
+
+def _needs_messages(dataset: Dataset, selected: Selection) -> bool:
+    """Whether images of selected topics are stored verbatim."""
+    manifest = dataset.manifest
+    return any(selected(item.topic) for item in manifest.verbatim) if manifest else False
 
 
 def _left_out(dataset: Dataset, selected: Selection, to: str) -> list[str]:
@@ -340,9 +195,9 @@ def _left_out(dataset: Dataset, selected: Selection, to: str) -> list[str]:
         OptionError: A pattern matches no topic.
     """
     if to == "images":
-        others = {item.topic for item in dataset.channels} - set(dataset.topics)
-        pictured = [topic for topic in dataset.all_topics if topic not in others]
+        pictured = dict.fromkeys([*dataset.listed_topics, *dataset.camera_topics])
         selected.check(pictured)
+        others = set(dataset.all_topics) - pictured.keys()
         return sorted({*others, *(topic for topic in pictured if not selected(topic))})
     selected.check(dataset.all_topics)
     return [topic for topic in dataset.all_topics if not selected(topic)]
@@ -707,34 +562,39 @@ def _unpack_images(
     summary: UnpackSummary,
     progress: Callable[[UnpackProgress], None] | None,
 ) -> None:
-    selected = options.selected
-    path.mkdir()
-    names = FileNames()
-    streams = [item for item in dataset.streams if selected(item.topic) and not item.is_lost]
-    reduction = options.reduction
-    counts = [_given(stream, reduction, summary) for stream in streams]
-    total, done = sum(counts), 0
-    for stream, count in zip(streams, counts, strict=True):
-        stream.verify_video()
-        stem, _ = names.name_for(stream.topic)
-        folder = path / stem
-        folder.mkdir()
-        for _ in write_images(
-            stream,
-            folder,
+    found: list[TopicImages] = []
+    refused: dict[str, str] = {}
+    for topic in filter(options.selected, dataset.camera_topics):
+        images = topic_images(
+            dataset,
+            topic,
             image_format=options.image_format,
             jpeg_quality=options.jpeg_quality,
-            reduction=reduction,
-        ):
-            done += 1
-            if progress:
-                progress(UnpackProgress(done, total))
-        summary.messages[stream.topic] = summary.messages.get(stream.topic, 0) + count
+            reduction=options.reduction,
+        )
+        without = dataset.verbatim(topic)[1]
+        if images is not None:
+            found.append(images)
+            if images.refused:
+                refused[topic] = "; ".join(images.refused)
+            if images.thinned:
+                summary.thinned[topic] = images.thinned
+        if without:
+            summary.unconvertible[topic] = {f"no picture: {why}": n for why, n in without.items()}
+    if refused and not options.skip_unconvertible:
+        raise _refusal(refused)
+    path.mkdir()
+    names, total, done = FileNames(), sum(images.count for images in found), 0
 
+    def tell() -> None:
+        nonlocal done
+        done += 1
+        if progress:
+            progress(UnpackProgress(done, total))
 
-def _given(stream: Stream, reduction: Reduction, summary: UnpackSummary) -> int:
-    """How many frames of a stream are kept; reports those left out."""
-    count = stream.count(reduction.kept(stream.columns))
-    if thinned := stream.count() - count:
-        summary.thinned[stream.topic] = summary.thinned.get(stream.topic, 0) + thinned
-    return count
+    for images in found:
+        if images.count:
+            stem, _ = names.name_for(images.topic)
+            summary.messages[images.topic] = images.write(path / stem, tell)
+        for reason, count in images.refused.items():
+            summary.unconvertible.setdefault(images.topic, {})[reason] = count

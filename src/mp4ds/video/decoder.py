@@ -7,6 +7,7 @@ import io
 import os
 import struct
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext, suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -210,13 +211,23 @@ class VideoDecoder:
         recorded, and damaged videos. For the latter decode on one core: with several, an error may
         take the picture before it along.
         """
-        for index, frame in self._chosen(indices, lambda _: self._decodable()):
+        for index, frame in self._chosen(indices, lambda _: self._decodable(), is_strict=False):
             yield index, None if frame is None else self._maker.make(frame, index, scale)
 
     def _chosen(
-        self, indices: Iterable[int], decode: Callable[[int], Iterator[av.VideoFrame]]
+        self,
+        indices: Iterable[int],
+        decode: Callable[[int], Iterator[av.VideoFrame]],
+        *,
+        is_strict: bool = True,
     ) -> Iterator[tuple[int, av.VideoFrame | None]]:
-        """The frames with some numbers; None for one that the decoder does not output."""
+        """The frames with some numbers; None for one that the decoder does not output.
+
+        Args:
+            indices: The numbers.
+            decode: Decodes from the key frame with a number on.
+            is_strict: Whether it is an error if a key frame cannot be sought.
+        """
         ticks, keys = self._presentation_ticks(), self._key_numbers
         in_flight = min(os.cpu_count() or 1, _MOST_THREADS) + 1
         frames: Iterator[av.VideoFrame] = iter(())
@@ -226,7 +237,8 @@ class VideoDecoder:
             at = int(np.searchsorted(keys, index, side="right"))
             key = int(keys[at - 1]) if at else 0
             if key > due + in_flight:  # the decoder has begun the frames up to there
-                self._seek(int(ticks[index]), index)
+                with nullcontext() if is_strict else suppress(VideoError):
+                    self._seek(int(ticks[index]), index)
                 frames, frame = decode(key), None
             tick = int(ticks[index])
             while frame is None or frame.pts is None or frame.pts < tick:

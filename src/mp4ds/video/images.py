@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import re
+import struct
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,8 +18,10 @@ from av.error import FFmpegError
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from numpy.typing import NDArray
 
-from mp4ds.errors import OptionError, SourceError
+from mp4ds.errors import OptionError, Refused, SourceError
+from mp4ds.messages import png
 from mp4ds.messages.arrangements import CHROMA_SHIFTS
+from mp4ds.messages.coded import check_size
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Encoding, Pixels
 from mp4ds.messages.layouts import Layout, bind
 from mp4ds.video.pixels import PictureConverter, plain_frame, scaling
@@ -140,6 +144,45 @@ def read_image(path: Path) -> tuple[str, Pixels]:
         raise SourceError(path, f"cannot be read as an image: {reason}") from None
     encoding, pixels = found
     return encoding, np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
+
+
+def coded_pixels(data: bytes | memoryview) -> tuple[str, Pixels]:
+    """The pixels of an image file in a message.
+
+    Returns:
+        The ROS encoding, and pixels of shape (H, W) or (H, W, C), native byte order.
+
+    Raises:
+        Refused: It cannot be decoded.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    is_png = bytes(data[:8]) == png.SIGNATURE
+    if is_png:
+        with suppress(Refused):  # of a kind that Pillow may read
+            pixels = png.pixels_of(data)
+            channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+            return png.PNG_ENCODINGS[pixels.itemsize, channels], pixels
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data), formats=STILL_FORMATS) as image:
+                check_size(*image.size)
+                if is_png and data[24] > 8:
+                    raise Refused("its PNG has 16 bits, of which Pillow would read only 8")
+                is_grey = image.mode in _GREY
+                return ("mono8" if is_grey else "rgb8"), np.asarray(
+                    image.convert("L" if is_grey else "RGB")
+                )
+    except Refused:
+        raise
+    except UnidentifiedImageError:
+        raise Refused("it is no image of a known format") from None
+    except (
+        OSError, ValueError, SyntaxError, EOFError, LookupError, struct.error,
+        Image.DecompressionBombError,
+    ):  # fmt: skip
+        raise Refused("its picture is damaged, or cut short") from None
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -284,11 +327,11 @@ class ImageFile:
         self._jpeg = image_format == "jpeg"
         if known.dtype not in ("u1", "u2") or known.general.startswith("stack"):
             raise OptionError(
-                f"{image_format} cannot hold {encoding} images: it supports no signed, float or "
-                "two-channel samples. Unpack to a recording."
+                f"{image_format.upper()} cannot hold {encoding} images: it supports no signed, "
+                "float or two-channel samples."
             )
         if self._jpeg and known.bytes_per_sample == 2:
-            raise OptionError(f"JPEG cannot hold {encoding} images; use png")
+            raise OptionError(f"JPEG cannot hold {encoding} images, but PNG can.")
         if not 1 <= quality <= 100:
             raise OptionError(f"JPEG quality is {quality}: use 1 to 100")
         self._quality = quality

@@ -1,0 +1,224 @@
+"""Dataset -> folders of image files, one per topic, with their times."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.frames import Frames
+from mp4ds.dataset.rebuild import marked
+from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.topic_frames import Part, TopicFrames
+from mp4ds.dataset.verbatim import VerbatimFrames
+from mp4ds.errors import OptionError
+from mp4ds.files.outputs import csv_cell
+from mp4ds.unpacking.pictures import (
+    FrameTimes,
+    Reduction,
+    Resizing,
+    files_of,
+    holds_files,
+    pictures_of,
+    resizing_of,
+)
+from mp4ds.video.images import ImageFile
+
+_STAMPS_NAME = "stamps.csv"
+_HEAD = ["file", "stamp_ns", "log_time_ns", "frame_id"]
+_SUFFIXES = {"jpeg": "jpg", "png": "png"}
+_NOT_DECODED = "its picture cannot be decoded"
+
+
+@dataclass(frozen=True)
+class _Files:
+    """How frames of one size and encoding become files.
+
+    Attributes:
+        part: The frames.
+        numbers: Their numbers in the topic, shape (frames,).
+        is_kept: Which are written, shape (frames,).
+        kind: ``png`` or ``jpeg``.
+        resizing: How their pixels are resized.
+        file: Encodes them; None if their files are written as recorded.
+    """
+
+    part: Part
+    numbers: NDArray[np.int64]
+    is_kept: NDArray[np.bool_]
+    kind: str
+    resizing: Resizing
+    file: ImageFile | None
+
+    def all(self) -> Iterator[tuple[int, bytes | memoryview | None]]:
+        """The files, each with its frame's number in the part; None: it has no picture."""
+        if isinstance(self.part, VerbatimFrames):
+            return self._verbatim(self.part)
+        self.part.verify_video()
+        if self.file is None:
+            return files_of(self.part, marked(self.is_kept))
+        return self._encoded(self.part, self.file)
+
+    def _encoded(self, stream: Stream, file: ImageFile) -> Iterator[tuple[int, bytes | None]]:
+        for index, picture in pictures_of(stream, marked(self.is_kept), self.resizing.scale):
+            made = None
+            if picture is not None:
+                made = file.encode(self.resizing.pixels(stream, picture))
+            yield index, made
+
+    def _verbatim(self, part: VerbatimFrames) -> Iterator[tuple[int, bytes | memoryview | None]]:
+        for index, shown in part.all_shown():
+            if not self.is_kept[index]:
+                continue
+            if self.file is None:
+                yield index, shown.file
+            else:
+                yield index, self.file.encode(self.resizing.resize(shown.pixels))
+
+
+@dataclass(frozen=True)
+class TopicImages:
+    """The images of a topic, about to be written.
+
+    Attributes:
+        topic: The topic.
+        frames: Its frames.
+        thinned: How many of them are left out because fewer were requested.
+        refused: How many cannot be written, by reason.
+    """
+
+    topic: str
+    frames: Frames
+    thinned: int
+    refused: Counter[str]
+    _files: Sequence[_Files]
+
+    @property
+    def count(self) -> int:
+        """How many are written, unless some cannot be decoded."""
+        return sum(_readable(files.part, files.is_kept) for files in self._files)
+
+    def write(self, folder: Path, on_file: Callable[[], None]) -> int:
+        """Write one file per frame, named by its number in the topic, and stamps.csv.
+
+        Args:
+            folder: To make.
+            on_file: Called after each file.
+
+        Returns:
+            How many were written; the others are added to `refused`.
+
+        Raises:
+            FormatError: The dataset is damaged.
+        """
+        folder.mkdir()
+        digits = len(str(len(self.frames) - 1))
+        rows: dict[int, list[str | int]] = {}
+        for files in self._files:
+            part = files.part
+            for index, data in files.all():
+                if data is None:
+                    self.refused[_NOT_DECODED] += 1
+                    continue
+                number = int(files.numbers[index])
+                name = f"{number:0{digits}d}.{_SUFFIXES[files.kind]}"
+                (folder / name).write_bytes(data)
+                stamp, log_time = int(part.stamps[index]), int(part.log_times[index])
+                rows[number] = [name, stamp, log_time, csv_cell(part.frame_id(index))]
+                on_file()
+        with (folder / _STAMPS_NAME).open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([_HEAD, *(rows[number] for number in sorted(rows))])
+        return len(rows)
+
+
+def topic_images(
+    dataset: Dataset,
+    topic: str,
+    *,
+    image_format: str | None,
+    jpeg_quality: int,
+    reduction: Reduction,
+) -> TopicImages | None:
+    """The images of a topic, in videos and verbatim, as they are to be written.
+
+    Args:
+        dataset: The dataset.
+        topic: One of its topics.
+        image_format: ``png`` or ``jpeg``; None for JPEG files as they were recorded, else PNG.
+        jpeg_quality: Of new JPEG files, 1 to 100.
+        reduction: How to reduce them; the frames of a topic are counted together.
+
+    Returns:
+        None if the topic has no frames.
+
+    Raises:
+        OptionError: The size is too large.
+        FormatError: The dataset is damaged.
+    """
+    if topic not in dataset:
+        return None
+    frames = dataset[topic]
+    parts: list[Part] = []
+    if isinstance(frames, TopicFrames):
+        parts = frames.parts
+    elif isinstance(frames, Stream | VerbatimFrames):
+        parts = [frames]
+    is_kept = reduction.kept(FrameTimes(frames.stamps, frames.log_times))
+    refused, thinned = Counter[str](), 0
+    made = []
+    for place, part in enumerate(parts):
+        numbers = np.arange(len(part))
+        if isinstance(frames, TopicFrames):
+            numbers = frames.numbers_of(place)
+        kept = is_kept[numbers]
+        thinned += _readable(part, ~kept)
+        size = reduction.size_of(part)
+        keeps_files = size is None and _holds_jpeg(part) and image_format != "png"
+        kind = "jpeg" if keeps_files else image_format or "png"
+        resizing = resizing_of(part, size)
+        try:
+            file = None
+            if not keeps_files:
+                file = ImageFile(resizing.encoding, kind, quality=jpeg_quality)
+            made.append(_Files(part, numbers, kept, kind, resizing, file))
+        except OptionError as error:
+            refused[str(error).rstrip(".")] += _readable(part, kept)
+    return TopicImages(topic, frames, thinned, refused, made)
+
+
+def _holds_jpeg(part: Part) -> bool:
+    if isinstance(part, Stream):
+        return holds_files(part.sidecar, "jpeg")
+    return part.are_jpeg_files
+
+
+def _readable(part: Part, is_wanted: NDArray[np.bool_]) -> int:
+    return part.count(is_wanted) if isinstance(part, Stream) else int(is_wanted.sum())
+
+
+def image_names(folder: Path) -> set[str] | None:
+    """Names of the files of image folders, by their stamps.csv; None if there is none."""
+    if not folder.is_dir():
+        return None
+    names: set[str] = set()
+    for place in folder.iterdir():
+        if place.is_dir():
+            names.update(f"{place.name}/{name}" for name in _names_in(place / _STAMPS_NAME))
+    return names or None
+
+
+def _names_in(stamps: Path) -> set[str]:
+    try:
+        rows = csv.reader(io.StringIO(stamps.read_bytes().decode(), newline=""))
+        if next(rows, None) != _HEAD:
+            return set()
+        return {stamps.name, *(row[0] for row in rows if row)}
+    except (OSError, ValueError, csv.Error):
+        return set()
