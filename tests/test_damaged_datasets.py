@@ -178,7 +178,7 @@ def check_salvage(dataset: Path, original: Path, out: Path) -> Sequence[Loss]:
         for loss in summary.losses:
             if loss.topics == (topic,) and loss.frames:
                 first, last = loss.frames
-                assert (loss.start, loss.end) in ((times[first], times[last]), (None, None))
+                assert (loss.start, loss.end) == (times[first], times[last])
                 named += times[first : last + 1]
             elif loss.topics == (topic,):
                 named += times[: loss.messages]
@@ -397,8 +397,8 @@ def test_what_an_export_or_a_player_does_not_need(
 def test_errors_of_other_commands_say_where_the_damage_is(dataset: Path, tmp_path: Path) -> None:
     flip(file_of(dataset, "left.mp4"), 0.3)
     words = (
-        r"left_image_raw\.mp4: .* frames of /left/image_raw, does not match .*`mp4ds validate "
-        "--deep` names the frames, and `mp4ds unpack --salvage` restores"
+        r"left_image_raw\.mp4: does not match .*; it has frames of /left/image_raw .*`mp4ds "
+        "validate --deep` finds all damage, and `mp4ds unpack --salvage` restores"
     )
     with pytest.raises(FormatError, match=words):
         mp4ds.export(dataset, "kitti", tmp_path / "export")
@@ -415,3 +415,38 @@ def test_errors_of_other_commands_say_where_the_damage_is(dataset: Path, tmp_pat
     frames = mp4ds.open(dataset)["/left/image_raw"]
     with pytest.raises(FormatError, match=words):
         frames.get(range(FRAMES))
+
+
+def test_messages_that_are_not_needed_may_be_missing(dataset: Path, tmp_path: Path) -> None:
+    """Where topics are named, the manifest and the sidecars tell that none is in messages.mcap."""
+    (dataset / "messages.mcap").unlink()
+    named = UnpackOptions(topics=["/left/image_raw", "/left/camera_info"])
+    summary = mp4ds.unpack(dataset, "bag", tmp_path / "named.bag", named)
+    assert summary.messages == {"/left/image_raw": FRAMES, "/left/camera_info": FRAMES}
+    with pytest.raises(FormatError, match=r"messages\.mcap: does not exist"):
+        mp4ds.unpack(dataset, "bag", tmp_path / "glob.bag", UnpackOptions(topics=["/left/*"]))
+
+
+def test_how_many_are_lost_is_told_once(dataset: Path, tmp_path: Path) -> None:
+    (dataset / "messages.mcap").unlink()
+    summary = mp4ds.unpack(dataset, "bag", tmp_path / "out.bag", SALVAGE)
+    (loss,) = summary.losses
+    assert loss.file == "messages.mcap"
+    assert loss.messages == 12 * FRAMES - sum(summary.messages.values())
+
+
+def test_an_edited_sidecar_is_not_claimed_to_be_exact(dataset: Path, tmp_path: Path) -> None:
+    """Its images have digests, its calibrations have none."""
+    path = file_of(dataset, "left.yaml")
+    text = path.read_text()
+    edited = re.sub(r"(distortion_model: )\w+", r"\1equidistant", text)
+    assert edited != text
+    path.write_text(edited[: edited.rindex("checksum:")])
+    with pytest.raises(FormatError, match=r"left_image_raw\.yaml: .* `salvage` restores"):
+        mp4ds.unpack(dataset, "bag", tmp_path / "no.bag")
+    summary = mp4ds.unpack(dataset, "bag", tmp_path / "out.bag", SALVAGE)
+    (loss,) = summary.losses
+    assert (loss.file, loss.messages) == (path.name, 0)
+    assert "calibrations, may be altered" in loss.problem
+    left = {"/left/image_raw": FRAMES, "/left/camera_info": FRAMES}
+    assert left.items() <= summary.messages.items()

@@ -270,7 +270,9 @@ def _print_losses(losses: Sequence[Loss], where: str) -> None:
 def _loss_text(loss: Loss) -> str:
     place = f" at byte {loss.offset}" if loss.offset is not None else ""
     size = f", {size_text(loss.size)}" if loss.size is not None else ""
-    messages = f"; {counted(loss.messages, 'message')}" if loss.messages is not None else ""
+    messages = ""
+    if loss.messages is not None:
+        messages = f"; {counted(loss.messages, 'message') if loss.messages else 'no messages'}"
     topics = f" of {', '.join(loss.topics)}" if loss.topics else ""
     if loss.frames is None:
         return f"{loss.file}{place}{size}: {loss.problem}{messages}{topics}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,8 @@ from mp4ds.errors import FormatError, SourceError, SourceNotFoundError, VersionE
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location, remote
 from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME
-from mp4ds.format.manifest import Manifest, StreamEntry, Verbatim
-from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.format.manifest import FileEntry, Manifest, StreamEntry, Verbatim
+from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, verify_file
 from mp4ds.messages.serializations import is_camera
 from mp4ds.plan import calibration_topics
 from mp4ds.records import Loss
@@ -97,7 +97,7 @@ def damages_of(stream: Stream, report: Callable[[int], None] = lambda _: None) -
 
 
 HOW_TO_SALVAGE = (
-    "`mp4ds validate --deep` names the frames, and `mp4ds unpack --salvage` restores what can be "
+    "`mp4ds validate --deep` finds all damage, and `mp4ds unpack --salvage` restores what can be "
     "read."
 )
 """What to do about a damaged dataset."""
@@ -151,8 +151,8 @@ def examine(stream: Stream) -> list[Loss]:
         _ = stream.rebuilder
     except FormatError as error:
         stream.sound = np.zeros(count, np.bool_)
-        name, topics = stream.video_path.name, (stream.topic,)
-        return [Loss(name, None, None, error.what, count, topics, frames=(0, count - 1))]
+        name, topics, ends = stream.video_path.name, (stream.topic,), (0, count - 1)
+        return [Loss(name, None, None, error.what, count, topics, *_span(stream), ends)]
     if video.sha256 is not None and digest_file(stream.video_path)[1] == video.sha256:
         return []
     sound = np.ones(count, np.bool_)
@@ -166,6 +166,22 @@ def examine(stream: Stream) -> list[Loss]:
         losses.append(Loss(stream.video_path.name, None, None, problem, 0, (stream.topic,)))
     stream.sound = sound
     return losses
+
+
+def _span(stream: Stream) -> tuple[int | None, int | None]:
+    """Log times of the first and the last frame of a stream whose video is missing or too short.
+
+    The digests show that there were as many frames as the sidecar says: each takes its space there.
+    """
+    sidecar = stream.sidecar
+    try:
+        if sidecar.digests is None:
+            return None, None
+        sidecar.digests.decode(sidecar.frames)
+        times = sidecar.columns.log_time.decode(sidecar.frames)
+    except ValueError:
+        return None, None
+    return int(times[0]), int(times[-1])
 
 
 class _Opening:
@@ -193,10 +209,10 @@ class _Opening:
             self.losses.append(Loss(MANIFEST_NAME, None, None, problem, 0))
         if manifest is not None:
             entries = {entry.sidecar: entry for entry in manifest.streams}
-            streams = [self._stream(name, entry) for name, entry in entries.items()]
+            streams = [self._stream(name, entry, manifest) for name, entry in entries.items()]
         else:
             names = sorted(path.name for path in self._folder.glob("*.yaml"))
-            streams = [self._stream(name, None) for name in names if name != MANIFEST_NAME]
+            streams = [self._stream(name, None, None) for name in names if name != MANIFEST_NAME]
         file = self._messages(manifest)
         there = [stream for stream in streams if stream is not None]
         if not there and file.path is None:
@@ -206,9 +222,23 @@ class _Opening:
         dataset.jpeg_quality, dataset.is_salvaged = self._jpeg_quality, True
         return dataset
 
-    def _stream(self, name: str, entry: StreamEntry | None) -> Stream | None:
+    def _compare(self, path: Path, entry: FileEntry | None, topics: Sequence[str]) -> None:
+        """Note that a sidecar that can be read is not the one that was packed."""
         try:
-            return Stream(self._folder / name, jpeg_quality=self._jpeg_quality)
+            verify_file(path, entry)
+        except FormatError as error:
+            problem = f"{error.problem}: what has no digests, such as calibrations, may be altered"
+            self.losses.append(Loss(path.name, None, None, problem, 0, tuple(topics)))
+
+    def _stream(
+        self, name: str, entry: StreamEntry | None, manifest: Manifest | None
+    ) -> Stream | None:
+        path = self._folder / name
+        try:
+            stream = Stream(path, jpeg_quality=self._jpeg_quality)
+            if manifest is not None and any(map(self._selected, stream.topics)):
+                self._compare(path, manifest.file(name), stream.topics)
+            return stream
         except VersionError:
             raise
         except FormatError as error:

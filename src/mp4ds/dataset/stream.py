@@ -679,7 +679,7 @@ class Stream(DecodedFrames):
         if not self.video_path.is_file():
             raise FormatError("file-missing", self.video_path, "does not exist")
         if video.sha256 is not None and digest_file(self.video_path)[1] != video.sha256:
-            problem = f"with the frames of {self.topic}, does not match the SHA-256 in its sidecar"
+            problem = f"does not match the SHA-256 in its sidecar; it has frames of {self.topic}"
             raise FormatError("hash-mismatch", self.video_path, problem)
 
     def camera_info_messages(

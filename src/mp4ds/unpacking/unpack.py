@@ -206,7 +206,7 @@ def _left_out(dataset: Dataset, selected: Selection, to: str) -> list[str]:
 def _notes(dataset: Dataset, selected: Selection) -> Iterator[str]:
     """What else the output does not have of the recording."""
     for problem in dataset.unread:
-        yield f"not read, since only topics that are left out are in it: {problem}"
+        yield f"damaged, but not needed for the selected topics: {problem}"
     for stream in dataset.streams:
         if stream.sidecar.digests is None and selected(stream.topic):
             yield (
@@ -384,7 +384,7 @@ def _unpack_recording(
         if republisher:
             found += sum(republisher.thinned.values())
         if dataset.is_salvaged:
-            summary.losses.extend(_unaccounted(total - found, summary.losses))
+            _account_for(total - found, summary.losses)
         elif found != total:
             problem = f"holds {found} messages, but should hold {total}"
             raise FormatError("message-count", dataset.path, problem)
@@ -412,12 +412,22 @@ def _count_in(dataset: Dataset, topics: Collection[str], span: Excerpt) -> int:
     return sum(len(in_span(one, span)) for key, one in dataset.times().items() if key in wanted)
 
 
-def _unaccounted(missing: int, losses: Sequence[Loss]) -> Iterator[Loss]:
-    """The loss of messages that are missing by the manifest, and of which nothing else tells."""
+def _account_for(missing: int, losses: list[Loss]) -> None:
+    """Add how many messages are lost to a loss that does not say it, or as one of its own.
+
+    Args:
+        missing: How many the manifest counts that were not restored.
+        losses: What is known to be lost.
+    """
     missing -= sum(loss.messages or 0 for loss in losses)
-    if missing > 0:
-        problem = f"counts {missing} more messages, of which nothing else is known"
-        yield Loss(MANIFEST_NAME, None, None, problem, missing)
+    if missing <= 0:
+        return
+    for place, loss in enumerate(losses):
+        if loss.messages is None:
+            losses[place] = replace(loss, messages=missing)
+            return
+    problem = "more messages are counted in it, such as calibrations in a sidecar that is lost"
+    losses.append(Loss(MANIFEST_NAME, None, None, problem, missing))
 
 
 def _republisher(

@@ -436,7 +436,10 @@ class ExportedDataset:
         dataset.verify_messages()
         self.dataset = dataset
         self.ledger = Ledger(dataset)
-        self.notes = [f"not read, and not selected: {problem}" for problem in dataset.unread]
+        self.notes = [
+            f"damaged, but not needed for the selected topics: {problem}"
+            for problem in dataset.unread
+        ]
         options.selected.check(dataset.all_topics)
         self.chosen = options.chosen
         dataset.verify_sidecars(self.chosen)
