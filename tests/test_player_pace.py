@@ -79,7 +79,7 @@ def test_the_time_of_day_of_a_recorded_time(monkeypatch: pytest.MonkeyPatch) -> 
     hand = Hand(monkeypatch)
     clock = Pace(10.0, steady=lambda: round(hand.now * NS))
     clock.jump(START)
-    clock.run()
+    clock.resume()
     hand.now += 2
     for seconds, told in ((20, 0), (0, -2), (35, 1.5)):
         assert clock.wall_of(START + seconds * NS) == hand.time_ns() + told * NS

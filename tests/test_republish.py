@@ -1125,7 +1125,7 @@ def test_the_command_line(packed: Pack, tmp_path: Path) -> None:
     now = "/cam/image_raw/compressed_png, sensor_msgs/msg/CompressedImage"
     assert f"/cam/image_raw/compressed: written as {now}" in done.stdout
     assert "(the name /cam/image_raw/compressed is taken)" in done.stdout
-    assert "/cam/image_raw/compressed: 1 messages as recorded: stored verbatim" in done.stdout
+    assert "/cam/image_raw/compressed: 1 message as recorded: stored verbatim" in done.stdout
     done = command(*arguments, "--json", "-o", tmp_path / "b.mcap")
     told = json.loads(done.stdout)
     assert told["republished"]["/cam/image_raw/compressed"]["topic"].endswith("compressed_png")

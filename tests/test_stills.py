@@ -212,7 +212,7 @@ def test_a_sheet_of_more_than_there_is(drive: Path, tmp_path: Path) -> None:
 
 def test_a_sheet_that_is_too_large(drive: Path, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="exceeds"):
-        frames(drive, tmp_path / "a.png", StillOptions(topic=COLOUR, sheet=(20, 1), resize=20.0))
+        frames(drive, tmp_path / "a.png", StillOptions(topic=COLOUR, sheet=(80, 1), resize=16.0))
 
 
 @each("text", ["5", "0x4", "5x", "x4", "5x4x3", "-1x3", "1000x1"])
