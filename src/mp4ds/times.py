@@ -226,7 +226,8 @@ def nearest(times: Integers, wanted: Integers) -> Integers:
     is_later = np.abs(differences(times[after], wanted)) < np.abs(
         differences(wanted, times[before])
     )
-    return np.searchsorted(times, times[np.where(is_later, after, before)])
+    found: Integers = np.searchsorted(times, times[np.where(is_later, after, before)])
+    return found
 
 
 def intervals(times: Integers) -> Floats:
@@ -419,4 +420,5 @@ def _nearest_first(gaps: NDArray[np.uint64], may_go: NDArray[np.bool_]) -> NDArr
 def _run_lengths(waits: NDArray[np.bool_]) -> Integers:
     """Distance of each from the last one before it that does not wait."""
     places = np.arange(len(waits))
-    return places - np.maximum.accumulate(np.where(waits, 0, places))
+    lengths: Integers = places - np.maximum.accumulate(np.where(waits, 0, places))
+    return lengths

@@ -210,7 +210,7 @@ class _Part:
 
     def _cut(self, stream: Stream) -> _Cut:
         info, columns = stream.sidecar.camera_info, stream.camera_info_columns
-        infos = np.empty(0, np.int64)
+        infos: Integers = np.empty(0, np.int64)
         if info and columns and self._selected(info.channel.topic):
             infos = self._numbers(columns)
         has_images = self._selected(stream.topic)

@@ -143,7 +143,8 @@ class TopicFrames(Frames):
             log_times = np.concatenate([part.log_times for part in own])[order]
             times.append(np.maximum.accumulate(log_times))
         order = np.argsort(np.concatenate(times), kind="stable")
-        return np.concatenate(owners)[order].astype(np.int64, copy=False)
+        found: Integers = np.concatenate(owners)[order].astype(np.int64, copy=False)
+        return found
 
     @cached_property
     def _numbers(self) -> Integers:

@@ -439,7 +439,7 @@ class RemotePath(Place):
         """The store's tag of the content, which changes with it; may be empty."""
         return self._facts.tag if self._facts else ""
 
-    def exists(self) -> bool:
+    def exists(self, *, follow_symlinks: bool = True) -> bool:
         """Whether anything exists.
 
         Raises:
@@ -448,11 +448,11 @@ class RemotePath(Place):
         """
         return self._facts is not None
 
-    def is_dir(self) -> bool:
+    def is_dir(self, *, follow_symlinks: bool = True) -> bool:
         """Whether it is a folder; on a web server, one of a recording or dataset."""
         return self._facts is not None and self._facts.is_folder
 
-    def is_file(self) -> bool:
+    def is_file(self, *, follow_symlinks: bool = True) -> bool:
         """Whether it is a file."""
         return self._facts is not None and not self._facts.is_folder
 

@@ -104,7 +104,7 @@ def _read_numbers(nibbles: NDArray[np.uint8]) -> _Numbers:
     groups = int(lengths.max())
     if groups > _MAX_GROUPS:
         raise Refused("its RVL codes a number beyond 32 bits")
-    numbers = (nibbles[starts] & 7).astype(np.int64)
+    numbers: _Numbers = (nibbles[starts] & 7).astype(np.int64)
     longer = np.arange(len(numbers))
     for group in range(1, groups):
         longer = longer[lengths[longer] > group]
@@ -160,7 +160,8 @@ def _ranges(starts: _Numbers, lengths: _Numbers) -> _Numbers:
     """All places of the runs, in order."""
     total = int(lengths.sum())
     shifts = starts - (np.cumsum(lengths) - lengths)
-    return np.repeat(shifts, lengths) + np.arange(total)
+    places: _Numbers = np.repeat(shifts, lengths) + np.arange(total)
+    return places
 
 
 # ---------------------------------------------------------------- depth

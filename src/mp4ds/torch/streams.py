@@ -75,7 +75,7 @@ def mixed(
         skip: How many to skip at the beginning, without reading them; what the buffer holds by then
             is read when it is yielded.
     """
-    kept: list[tuple[_T, Any]] = []
+    kept: list[Any] = []  # items, each with what was read of it
     for item in items:
         entry = (item, _UNREAD if skip > 0 else read(item))
         if len(kept) < size:

@@ -156,7 +156,7 @@ def calibration_source(
             raise
         raise Refused("calibrations of this type cannot be adapted to another size") from None
     stamps = columns.stamp
-    is_wanted = np.ones(len(stamps), np.bool_)
+    is_wanted: NDArray[np.bool_] = np.ones(len(stamps), np.bool_)
     if is_kept is not None:
         frames = stream.stamps
         is_wanted = ~np.isin(stamps, frames) | np.isin(stamps, frames[is_kept])

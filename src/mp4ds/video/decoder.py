@@ -141,7 +141,7 @@ class VideoDecoder:
             full_range=full_range,
         )
         self._jpeg = JpegDecoder(coded_size) if codec == "mjpeg" else None
-        self._ticks: np.ndarray[tuple[int], np.dtype[np.int64]] | None = None
+        self._ticks: NDArray[np.int64] | None = None
         self._media = Media(path)
         self._container = self._media.container
         try:
@@ -275,7 +275,7 @@ class VideoDecoder:
             problem = f"cannot be reached: {reason_of(error)}"
             raise VideoError("decode-failed", self._path, problem, frame=index) from None
 
-    def _presentation_ticks(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    def _presentation_ticks(self) -> NDArray[np.int64]:
         if self._ticks is None:
             # without B-frames the index's decoding times are the presentation times
             ticks = [entry.timestamp for entry in self._stream.index_entries][self._media.hidden :]
@@ -287,7 +287,7 @@ class VideoDecoder:
         return self._ticks
 
     @cached_property
-    def _key_numbers(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    def _key_numbers(self) -> NDArray[np.int64]:
         keys = [entry.is_keyframe for entry in self._stream.index_entries]
         return np.flatnonzero(keys[self._media.hidden :])
 

@@ -478,7 +478,7 @@ def _parse_track(movie: _Movie, track: Box, file_size: int) -> SampleTable:
     places = _places(movie, tables, sizes, file_size)
     decoding, presentation = _times(movie, tables, len(sizes))
     edit = _edit(movie, track, timescale)
-    order = np.arange(len(sizes), dtype=np.int64)
+    order: Integers = np.arange(len(sizes), dtype=np.int64)
     if edit:
         order = _shown(presentation, edit, order)
         shift = edit.delay - int(presentation[order].min())

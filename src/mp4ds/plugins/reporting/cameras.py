@@ -551,6 +551,9 @@ class ReportedCamera:
         if info is None:
             return {"calibrations": [], "calibration_topic": "", "calibrations_more": 0}
         columns = self.stream.camera_info_columns
+        changes: NDArray[np.integer[Any]]
+        frames: NDArray[np.integer[Any]]
+        variants: NDArray[np.integer[Any]]
         if columns is None:
             changes, frames = np.arange(len(info.calibrations)), np.zeros(1, np.int64)
             variants = changes

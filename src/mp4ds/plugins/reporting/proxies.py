@@ -178,7 +178,8 @@ def _colour_table() -> Bytes:
     channels = [
         np.interp(np.arange(256), places, channel) for channel in zip(*_COLOURS, strict=True)
     ]
-    return np.rint(np.stack(channels, axis=1)).astype(np.uint8)
+    table: Bytes = np.rint(np.stack(channels, axis=1)).astype(np.uint8)
+    return table
 
 
 # ---------------------------------------------------------------- proxies
@@ -284,7 +285,7 @@ def make_proxy(
         threads=min(os.cpu_count() or 1, _MOST_THREADS),
         rate=(len(times) - 1) * _MICROSECONDS / span if span else None,
     )
-    picture = np.zeros((size[1], size[0], 3), np.uint8)
+    picture: Bytes = np.zeros((size[1], size[0], 3), np.uint8)
     try:
         for number, pixels in pictures_in_order(stream):
             if pixels is not None:  # otherwise the previous one stays
