@@ -22,7 +22,7 @@ from mp4ds.packing.manifest import dump_kept, load_kept
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.pack import pack_share
 from mp4ds.packing.workplace import Workplace
-from mp4ds.video.codecs import HARDWARE, lossless_codecs, recipe_for, remade
+from mp4ds.video.codecs import lossless_codecs, recipe_for, remade
 from sources import SOURCES, scene
 from test_bad_input import call, refused, tree
 
@@ -268,7 +268,7 @@ def test_every_recipe_is_made_again() -> None:
             for preset in (None, *(["veryfast", "slow"] if codec != "ffv1" else [])):
                 recipe = recipe_for(pixel_format, lossless=True, codec=codec, preset=preset)
                 assert remade(pixel_format, json.loads(json.dumps(asdict(recipe)))) == recipe
-    for codec in (None, "av1", "av1-10bit", "h264", "h265", *HARDWARE):
+    for codec in (None, "av1", "av1-10bit", "h264", "h265"):
         for crf in (1, 20, 40):
             for varied in (False, True):
                 preset = "4" if codec in ("av1", "av1-10bit") else None

@@ -602,7 +602,7 @@ def decodes_to(clip: Clip, given: Sequence[bytes], wanted: bytes) -> bool:
 
 
 def test_av1_headers_and_tiles_apart() -> None:
-    """As encoders in hardware send them. Where a header ends is tried."""
+    """As encoders of graphics cards send them. Where a header ends is tried."""
     clip = encoded(RECIPES["svt-10-low-delay"])
     packets = [packet.data for packet in clip.packets[:5]]
     whole = shown(clip, [(data, number) for number, data in enumerate(packets)])

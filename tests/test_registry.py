@@ -21,7 +21,7 @@ from mp4ds.messages.protobuf import TYPES as FOXGLOVE_TYPES
 from mp4ds.messages.ros import LAYOUTS as ROS_TYPES
 from mp4ds.messages.serializations import WIRES
 from mp4ds.plan import VISUAL_TABLE
-from mp4ds.video.codecs import HARDWARE, codecs_to_try, lossless_codecs, recipe_for
+from mp4ds.video.codecs import codecs_to_try, lossless_codecs, recipe_for
 from mp4ds.video.coded_messages import PACKET_CODECS, packet_codec
 
 ROOT = Path(__file__).parents[1]
@@ -329,22 +329,6 @@ def test_the_registry_has_every_lossless_coding() -> None:
         for name in row.formats
     }
     assert coded | lossy == set(PIXEL_FORMATS)
-
-
-def test_the_registry_lists_exactly_the_hardware() -> None:
-    rows = tables(registry("Codecs"))[2]
-    assert [quoted(row[0]) for row in rows] == [[name] for name in HARDWARE]
-    for name, codec, encoder, options, scale, crfs, presets in rows:
-        found = HARDWARE[quoted(name)[0]]
-        assert (quoted(codec), encoder) == ([found.codec], found.encoder)
-        assert dict(option.split("=") for option in quoted(options)) == found.given
-        option, _, formula = scale.partition(" = ")
-        first, _, step = formula.removesuffix("N").strip().rpartition("- ")
-        assert (quoted(option), int(first or 0)) == ([found.scale], found.first)
-        assert int(step or 1) * (-1 if first else 1) == found.step
-        assert crfs == f"1 to {found.most}"
-        assert presets.replace("*", "").split() == list(found.presets)
-        assert re.findall(r"(\w+)\*", presets) == [found.default_preset][: len(found.presets)]
 
 
 # ---------------------------------------------------------------- reasons for verbatim storage

@@ -17,7 +17,6 @@
     ├── RecordError (OSError)          1  a live recording could not be written, what came is kept
     ├── PartsFailedError               1  parts of a pack failed, the others are kept
     ├── EncoderRefusedError            1  pictures that an encoder does not support
-    ├── HardwareError                  1  a hardware encoder that is missing or failed
     ├── OutOfReachError                1  a score that a stream cannot reach
     ├── SegmentsDifferError            1  videos that cannot be joined
     ├── ScoringError                   1  an ffmpeg with libvmaf that is missing or failed
@@ -384,21 +383,6 @@ class SegmentsDifferError(Mp4dsError):
             f"{path_text(other)}: cannot be joined to {path_text(first)}: they differ in "
             f"{differences}. Encode both with the same options, or keep them as two streams."
         )
-
-
-class HardwareError(Mp4dsError):
-    """A hardware encoder cannot be used here.
-
-    Args:
-        name: As given to ``--codec``.
-        problem: What was tried, and why it failed, without a full stop.
-        remedy: What the user can do, without a full stop.
-        instead: The codec that needs no hardware.
-    """
-
-    def __init__(self, name: str, problem: str, remedy: str, instead: str) -> None:
-        self.name = name
-        super().__init__(f"`codec` {name}: {problem}. {remedy}; `codec` {instead} needs no device.")
 
 
 class EncoderRefusedError(Mp4dsError):

@@ -81,10 +81,9 @@ class PackOptions(SliceOptions):
         "lossless, or the quality of a repacked dataset."
     )
     codec: str | None = option(
-        "h264, h265, ffv1 (lossless), av1, av1-10bit (lossy); on a GPU av1-nvenc, h264-nvenc, "
-        "h265-nvenc, ...-vaapi or ...-videotoolbox; default: chosen by trial."
+        "h264, h265, ffv1 (lossless), av1, av1-10bit (lossy); default: chosen by trial."
     )
-    preset: str | None = option("Encoder preset, such as 6, veryfast or p4.")
+    preset: str | None = option("Encoder preset, such as 6 or veryfast.")
     transcode: bool = option("Re-encode JPEG images at `quality` instead of copying them.", False)
     camera_info: Sequence[str] = option(
         "Pair a camera topic with its camera_info, if neither names nor stamps do.",

@@ -63,7 +63,6 @@ from mp4ds.packing.workplace import Workplace
 from mp4ds.plan import LOSSLESS, parse_quality
 from mp4ds.registry import plugin
 from mp4ds.video.codecs import check_codec
-from mp4ds.video.encoder import check_hardware
 
 if TYPE_CHECKING:
     from mp4ds.packing.engine import Engine
@@ -460,7 +459,6 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
 
     Raises:
         OptionError: They contradict each other.
-        HardwareError: The requested encoder is not available on this machine.
         ScoringError: VMAF is requested, but cannot be computed.
     """
     images = options.images.absolute() if options.images else None
@@ -480,10 +478,7 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
         options.preset,
         lossless=quality.lossless,
         crf=quality.crf,
-        varied=quality.target is not None,
     )
-    if not (options.cluster or options.join):  # otherwise others encode, or have encoded
-        check_hardware(codec)
     if quality.target and quality.target.metric == "vmaf" and not options.join:
         from mp4ds.video.libvmaf import find_ffmpeg
 

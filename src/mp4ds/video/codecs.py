@@ -5,7 +5,7 @@ To add a codec, add an entry to `CODECS`, and to the tables of encodings below i
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from itertools import product
@@ -83,96 +83,6 @@ def part_of(place: str) -> Any:
 
 # ---------------------------------------------------------------- encoders
 
-CHROMA_PLACE = "chroma_sample_location"
-"""Option that tags the chroma location; of these encoders, those of VAAPI use it."""
-
-_LAMBDA = 118  # FF_QP2LAMBDA, the unit of ffmpeg's -q:v
-
-
-@dataclass(frozen=True, slots=True)
-class HardwareEncoder:
-    """A hardware encoder.
-
-    Attributes:
-        codec: What a reader must support.
-        encoder: ffmpeg's name.
-        needs: What it needs on the machine, in words.
-        given: Options for every stream.
-        scale: Its option for quality.
-        first: The value of that option for a crf of 0.
-        step: How much it changes per unit of crf.
-        most: The largest crf; the smallest is 1, since 0 leaves the choice to most of them.
-        presets: That it has.
-        default_preset: One of them, or empty.
-        device: Kind of device whose memory must hold the pictures; empty: ordinary memory.
-    """
-
-    codec: str
-    encoder: str
-    needs: str
-    given: Mapping[str, str]
-    scale: str
-    most: int
-    first: int = 0
-    step: int = 1
-    presets: tuple[str, ...] = ()
-    default_preset: str = ""
-    device: str = ""
-
-    def options(self, crf: int) -> dict[str, str]:
-        """The options for a quality."""
-        return {**self.given, self.scale: str(self.first + crf * self.step)}
-
-
-# all without B-frames, so that frames are coded in the order shown, and without a bit rate
-_NVIDIA = "an NVIDIA GPU that encodes {}, with its driver"
-_NVENC = MappingProxyType({"rc": "vbr", "b": "0", "bf": "0", "no-scenecut": "1"})
-_NVENC_PRESETS = tuple(f"p{number}" for number in range(1, 8))
-_RENDERS = "a GPU that encodes {} by VAAPI, its driver, and access to /dev/dri"
-_VAAPI = MappingProxyType({"rc_mode": "CQP", "bf": "0"})
-_VAAPI_CENTRED = MappingProxyType({**_VAAPI, CHROMA_PLACE: "center"})
-_APPLE = "a Mac with Apple silicon"
-_TOOLBOX = MappingProxyType({"bf": "0", "flags": "+qscale+cgop"})
-# its scale is from 1 to 100, and more is better: -q:v 100 - 2 * crf
-_TOOLBOX_SCALE: Any = MappingProxyType(
-    {"scale": "global_quality", "first": 100 * _LAMBDA, "step": -2 * _LAMBDA, "most": 49}
-)
-
-
-def _nvenc(codec: str, encoder: str, most: int, **given: str) -> HardwareEncoder:
-    return HardwareEncoder(
-        codec, encoder, _NVIDIA.format(codec), {**_NVENC, **given}, "cq", most,
-        presets=_NVENC_PRESETS, default_preset="p4",
-    )  # fmt: skip
-
-
-HARDWARE: Mapping[str, HardwareEncoder] = MappingProxyType(
-    {
-        "h264-nvenc": _nvenc("h264", "h264_nvenc", 51, profile="high"),
-        "h265-nvenc": _nvenc("h265", "hevc_nvenc", 51),
-        "av1-nvenc": _nvenc("av1", "av1_nvenc", 63),
-        "h264-vaapi": HardwareEncoder(
-            "h264", "h264_vaapi", _RENDERS.format("h264"), _VAAPI_CENTRED, "qp", 51, device="vaapi"
-        ),
-        "h265-vaapi": HardwareEncoder(
-            "h265", "hevc_vaapi", _RENDERS.format("h265"), _VAAPI_CENTRED, "qp", 51, device="vaapi"
-        ),
-        # 0 to 255, of which other AV1 encoders make 63 steps
-        "av1-vaapi": HardwareEncoder(
-            "av1", "av1_vaapi", _RENDERS.format("av1"), _VAAPI, "global_quality", 63,
-            step=4, device="vaapi",
-        ),
-        "h264-videotoolbox": HardwareEncoder(
-            "h264", "h264_videotoolbox", _APPLE, {**_TOOLBOX, "profile": "high"}, **_TOOLBOX_SCALE
-        ),
-        "h265-videotoolbox": HardwareEncoder(
-            "h265", "hevc_videotoolbox", _APPLE, _TOOLBOX, **_TOOLBOX_SCALE
-        ),
-    }
-)  # fmt: skip
-"""Name of ``--codec`` -> encoder."""
-
-
 # maximum distance of key frames, chosen by cost (spec/notes.md)
 LOSSLESS_GOP, LOSSY_GOP = 10, 30
 ARCHIVE_GOP, LOSSY_TRAINING_GOP = 120, 15
@@ -196,7 +106,6 @@ class Recipe:
         options: Options of the encoder.
         matrix: Matrix coefficients to tag, by ffmpeg's name: bt709, gbr or smpte170m.
         full_range: Whether to tag the samples as using their full range.
-        hardware: Its name in `HARDWARE`, or empty for a software encoder.
     """
 
     codec: str
@@ -206,7 +115,6 @@ class Recipe:
     options: Mapping[str, str] = field(default_factory=dict)
     matrix: str = "bt709"
     full_range: bool = True
-    hardware: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -345,17 +253,13 @@ _DEFAULT_LOSSY = "av1"
 _PRESETS: Mapping[str, Sequence[str]] = {
     "ffv1": (),
     **{name: found.presets for name, found in _LOSSY.items()},
-    **{name: found.presets for name, found in HARDWARE.items()},
 }
 
 AV1 = ("av1", "av1-10bit")
 """The names of SVT-AV1's two forms."""
 
-MAX_CRF = {
-    **{name: found.most for name, found in _LOSSY.items()},
-    **{name: found.most for name, found in HARDWARE.items()},
-}
-"""The largest crf of each lossy codec, and of each hardware encoder."""
+MAX_CRF = {name: found.most for name, found in _LOSSY.items()}
+"""The largest crf of each lossy codec."""
 
 LEAST_CRF = {found.coding.codec or name: found.least for name, found in _LOSSY.items()}
 """The smallest crf chosen automatically for each codec."""
@@ -382,7 +286,6 @@ def check_codec(
     *,
     lossless: bool,
     crf: int | None = None,
-    varied: bool = False,
 ) -> str | None:
     """Refuse a codec that cannot encode any stream of a profile, or options it does not have.
 
@@ -391,7 +294,6 @@ def check_codec(
         preset: The encoder's preset, or None for the default.
         lossless: Whether every sample must be restored exactly.
         crf: Constant rate factor, where there is one.
-        varied: Whether videos with several crf will be joined into one.
 
     Returns:
         The codec by its `codec_name`.
@@ -400,15 +302,7 @@ def check_codec(
         OptionError: Names those that can.
     """
     codec = codec and codec_name(codec)
-    software = {name for codings in _LOSSLESS.values() for name in codings} if lossless else _LOSSY
-    able = software if lossless else {*software, *HARDWARE}
-    if varied and codec is not None and codec in HARDWARE:
-        raise OptionError(
-            f"`codec` {codec} works with `quality` visual or crf=N. Reaching a score means "
-            "joining segments with different crf into one video, which the headers written by "
-            f"hardware encoders may not allow: use `codec` {HARDWARE[codec].codec}, or find a crf "
-            "with `mp4ds evaluate`."
-        )
+    able = {name for codings in _LOSSLESS.values() for name in codings} if lossless else _LOSSY
     if codec is not None and codec not in able:
         known = ", ".join(sorted(able))
         if codec not in _PRESETS:
@@ -428,7 +322,7 @@ def check_codec(
 
 
 def _check_crf(codec: str, preset: str | None, crf: int) -> None:
-    least = 1 if codec in HARDWARE else 0
+    least = 0
     if codec in AV1:  # ffmpeg takes 0 for none
         is_fast = preset is not None and int(preset) >= _AV1_FAST
         least = LEAST_CRF["av1"] if is_fast else 1
@@ -455,8 +349,8 @@ def recipe_for(
     Args:
         pixel_format: Of the pictures, as a layout gives them.
         lossless: Whether every sample must be restored exactly.
-        codec: ``h264``, ``h265``, ``av1``, ``av1-10bit``, ``ffv1``, a name among `HARDWARE`, or
-            None for the default.
+        codec: ``h264``, ``h265``, ``av1``, ``av1-10bit``, ``ffv1``, or None for the
+            default.
         crf: Constant rate factor of a lossy recipe.
         preset: The encoder's preset, or None for the default; encoders without ignore it.
         varied: Whether videos with several crf will be joined into one.
@@ -509,7 +403,6 @@ def recipe_for(
         # a camera's own YUV is kept, and tagged as what ROS and OpenCV take it for
         matrix="smpte170m" if is_yuv else "gbr" if is_rgb else "bt709",
         full_range=not is_yuv,
-        hardware=name if name in HARDWARE else "",
     )
 
 
@@ -525,23 +418,19 @@ def remade(pixel_format: str, values: Mapping[str, Any]) -> Recipe:
     """
     lossless = bool(values["lossless"])
     preset, crf = (values["options"].get(name) for name in ("preset", "crf"))
-    for name in _LOSSLESS[pixel_format] if lossless else (*_LOSSY, *HARDWARE):
+    for name in _LOSSLESS[pixel_format] if lossless else _LOSSY:
         fast = (False, True) if lossless and _LOSSLESS[pixel_format][name].fast else (False,)
         varied = (False,) if lossless else (False, True)
         known = preset if preset in _PRESETS[name] else None
-        if name in HARDWARE:
-            crfs: Iterable[int | None] = range(1, MAX_CRF[name] + 1)
-        else:
-            crfs = [None if crf is None else int(crf)]
-        for choice in product(crfs, {known, None}, varied, fast):
+        for choice in product({known, None}, varied, fast):
             recipe = recipe_for(
                 pixel_format,
                 lossless=lossless,
                 codec=name,
-                crf=choice[0],
-                preset=choice[1],
-                varied=choice[2],
-                fast=choice[3],
+                crf=None if crf is None else int(crf),
+                preset=choice[0],
+                varied=choice[1],
+                fast=choice[2],
             )
             if asdict(recipe) == values:
                 return recipe
@@ -550,13 +439,8 @@ def remade(pixel_format: str, values: Mapping[str, Any]) -> Recipe:
 
 def _lossy(name: str, crf: int | None) -> tuple[_Coding, dict[str, str]]:
     """How pictures are coded at a crf, and all options but the preset."""
-    if name in HARDWARE:
-        device = HARDWARE[name]
-        options = device.options(crf or 1)
-        preset, codec = device.default_preset, device.codec
-        return _Coding(device.encoder, "yuv420p", options, preset, codec=codec), options
     if name not in _LOSSY:
-        known = ", ".join((*_LOSSY, *HARDWARE))
+        known = ", ".join(_LOSSY)
         raise OptionError(f"codec {name} is lossless only; use one of {known}")
     coding = _LOSSY[name].coding
     return coding, {**coding.options, "crf": str(crf)}
@@ -567,6 +451,5 @@ def _sited_left(options: Mapping[str, str]) -> dict[str, str]:
     parts = {
         key: ":".join(part for part in value.split(":") if part != _CENTRED)
         for key, value in options.items()
-        if key != CHROMA_PLACE
     }
     return {key: value for key, value in parts.items() if value}

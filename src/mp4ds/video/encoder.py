@@ -10,14 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import av
-import av.logging
-from av.codec.hwaccel import HWAccel
 from av.error import FFmpegError
 
-from mp4ds.errors import EncoderRefusedError, HardwareError
+from mp4ds.errors import EncoderRefusedError
 from mp4ds.messages.arrangements import Picture
 from mp4ds.times import TIMESCALE
-from mp4ds.video.codecs import HARDWARE, Recipe
+from mp4ds.video.codecs import Recipe
 from mp4ds.video.media import new_mp4, raise_if_scarce
 from mp4ds.video.pixels import PictureConverter, picture_to_frame
 
@@ -85,7 +83,6 @@ class VideoEncoder:
 
     Raises:
         EncoderRefusedError: The codec does not take such pictures.
-        HardwareError: It is one of a device that is not there, or fails.
     """
 
     def __init__(
@@ -120,8 +117,6 @@ class VideoEncoder:
         except (FFmpegError, ValueError) as error:
             self._container.close()
             raise_if_scarce(error)
-            if recipe.hardware:
-                refuse_if_unusable(recipe.hardware, self.width, self.height)
             raise EncoderRefusedError(
                 f"{recipe.encoder} does not take pictures of {width}x{height}"
             ) from None
@@ -129,12 +124,10 @@ class VideoEncoder:
     def _open_stream(self, threads: int, rate: float | None) -> None:
         # the rate gives the last frame its duration: one of no ticks would be cut off
         hint = min(max(rate or _USUAL_RATE, _LOWEST_RATE), _HIGHEST_RATE)
-        device = device_for(self.recipe.hardware)
         stream: Any = self._container.add_stream(
             self.recipe.encoder,
             rate=Fraction(hint).limit_denominator(1000),
             options=dict(self.options),
-            **({"hwaccel": device} if device else {}),
         )
         stream.time_base = _TIME_BASE
         context = stream.codec_context
@@ -151,7 +144,6 @@ class VideoEncoder:
 
         Raises:
             OSError: It cannot be written.
-            HardwareError: A device failed.
         """
         frame = picture_to_frame(
             picture,
@@ -177,12 +169,7 @@ class VideoEncoder:
             packets: Sequence[Any] = self._stream.encode(frame)
         except FFmpegError as error:
             raise_if_scarce(error)
-            if not self.recipe.hardware:
-                raise
-            raise hardware_error(
-                self.recipe.hardware,
-                f"{self.recipe.encoder} failed at frame {self.frames}: {error}",
-            ) from None
+            raise
         return packets
 
     def close(self) -> None:
@@ -190,7 +177,6 @@ class VideoEncoder:
 
         Raises:
             OSError: It cannot be written.
-            HardwareError: A device failed.
         """
         try:
             self._mux(self._encoded(None))
@@ -247,7 +233,7 @@ def open_encoder(context: Any, recipe: Recipe, width: int, height: int, *, threa
         # and to give wrong pictures up to 32
         raise ValueError("too narrow")
     context.width, context.height = width, height
-    context.pix_fmt = surface_format(recipe.hardware) or recipe.pixel_format
+    context.pix_fmt = recipe.pixel_format
     context.thread_count = threads
     context.colorspace = _MATRICES[recipe.matrix]
     context.color_primaries = _BT709
@@ -273,119 +259,3 @@ def tool_versions() -> Mapping[str, str]:
         "av": av.__version__,
         "libavcodec": ".".join(map(str, av.library_versions["libavcodec"])),
     }
-
-
-# ---------------------------------------------------------------- hardware
-
-_USUAL_SIZE = (640, 480)  # which every device takes
-_UPLOADS_SINCE = 18  # PyAV that brings pictures to a device on its own
-
-
-def hardware_error(codec: str, problem: str, remedy: str = "") -> HardwareError:
-    """The error to raise if the hardware of a codec cannot be used; see `HardwareError`."""
-    found = HARDWARE[codec]
-    return HardwareError(codec, problem, remedy or f"It needs {found.needs}", found.codec)
-
-
-def check_hardware(codec: str | None) -> None:
-    """Open an encoder briefly, if it is a hardware one, to see that it works.
-
-    Args:
-        codec: As given to ``--codec``.
-
-    Raises:
-        HardwareError: It cannot be used here; says why, and what to do.
-    """
-    if codec is not None and codec in HARDWARE:
-        _open_once(codec, *_USUAL_SIZE)
-
-
-def refuse_if_unusable(codec: str, width: int, height: int) -> None:
-    """Distinguish a failing device from one that does not support a picture size.
-
-    Call it after a hardware encoder could not be opened.
-
-    Args:
-        codec: As given to ``--codec``.
-        width: Columns of the pictures.
-        height: Rows of the pictures.
-
-    Raises:
-        HardwareError: It is the device.
-    """
-    check_hardware(codec)
-    try:
-        _open_once(codec, width, height)
-    except HardwareError:
-        return
-    raise hardware_error(
-        codec,
-        "the device refused an encoder, but accepted one a moment later: too many were open "
-        "at once",
-        "Use fewer `jobs`",
-    )
-
-
-def device_for(codec: str) -> HWAccel | None:
-    """The device that must hold an encoder's pictures; PyAV uploads them.
-
-    Args:
-        codec: As given to ``--codec``.
-    """
-    kind = HARDWARE[codec].device if codec in HARDWARE else ""
-    return HWAccel(kind) if kind else None
-
-
-def surface_format(codec: str) -> str:
-    """The pixel format of pictures on an encoder's device; empty: no upload is needed.
-
-    Args:
-        codec: As given to ``--codec``.
-    """
-    return "nv12" if codec in HARDWARE and HARDWARE[codec].device else ""
-
-
-def _open_once(codec: str, width: int, height: int) -> None:
-    found = HARDWARE[codec]
-    if found.encoder not in av.codecs_available:
-        raise hardware_error(
-            codec,
-            f"PyAV {av.__version__} was built without {found.encoder}",
-            f"It needs {found.needs}, and a PyAV whose FFmpeg has {found.encoder}",
-        )
-    if found.device and int(av.__version__.split(".")[0]) < _UPLOADS_SINCE:
-        raise hardware_error(
-            codec,
-            f"PyAV {av.__version__} cannot upload pictures to {found.encoder}",
-            f"Install PyAV {_UPLOADS_SINCE} with an FFmpeg that has it",
-        )
-    with _told() as lines:
-        try:
-            context: Any = av.CodecContext.create(found.encoder, "w", device_for(codec))
-            context.width, context.height = width, height
-            context.pix_fmt = surface_format(codec) or "yuv420p"
-            context.time_base = Fraction(1, 30)
-            context.options = found.options(min(20, found.most))
-            context.open()
-        except (FFmpegError, ValueError, NotImplementedError) as error:
-            reason = error
-        else:
-            return
-    why = "; ".join(dict.fromkeys(lines)) or getattr(reason, "strerror", None) or str(reason)
-    raise hardware_error(codec, f"{found.encoder} could not be opened: {why}")
-
-
-@contextmanager
-def _told() -> Iterator[list[str]]:
-    """What ffmpeg says of its errors in here, without full stops."""
-    lines: list[str] = []
-    level, skips = av.logging.get_level(), av.logging.get_skip_repeated()
-    av.logging.set_level(av.logging.ERROR)
-    av.logging.set_skip_repeated(False)
-    try:
-        with av.logging.Capture() as logs:
-            yield lines
-            lines += (message.strip().rstrip(".") for _, _, message in logs if message.strip())
-    finally:
-        av.logging.set_skip_repeated(skips)
-        av.logging.set_level(level)

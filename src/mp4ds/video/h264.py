@@ -100,7 +100,7 @@ def parse_sps(unit: bytes) -> Sps:
     if reader.flag():
         try:
             reorder = _vui_reorder(reader)
-        except Refused:  # encoders in hardware cut it short
+        except Refused:  # encoders of graphics cards cut it short
             reorder = None
     return Sps(
         number, width, height, planes, frames_only, frame_num_bits, poc_type, poc_bits, reorder

@@ -84,9 +84,6 @@ _X265_FRAMES, _X265_FRAME_AHEAD, _X265_THREAD = 55.0, 4.6, 12.5  # bytes of a pi
 _X265_WORKER = 6 * _MB  # of a worker, of which there is one for each processor
 _X265_HIGH = 1.4  # times as much with more than 8 bits
 
-# not measured: a driver's own, and 32 pictures where a device has no memory but the machine's
-_HARDWARE, _HARDWARE_PIXEL = 400 * _MB, 64.0  # bytes of a pixel
-
 _FFV1_SAMPLE, _FFV1_BIT = 12.0, 2.3  # bytes of a sample, and more for each of its bits
 
 
@@ -108,9 +105,7 @@ def encoder_bytes(recipe: Recipe, width: int, height: int, threads: int) -> int:
     pixels = width * height
     bordered = (width + _BORDER) * (height + _BORDER)
     needed: float
-    if recipe.hardware:
-        needed = _HARDWARE + _HARDWARE_PIXEL * pixels
-    elif recipe.encoder == "libsvtav1":
+    if recipe.encoder == "libsvtav1":
         needed = _svt_bytes(recipe, pixels, bordered, threads)
     elif recipe.encoder == "libx265":
         needed = _x265_bytes(recipe, bordered, threads)

@@ -55,7 +55,6 @@ from mp4ds.plugins.evaluating.results import (
 )
 from mp4ds.plugins.evaluating.trials import ClipPlace, Engines, Failure, Found, Trials, versions_of
 from mp4ds.video.codecs import MAX_CRF
-from mp4ds.video.encoder import check_hardware
 from mp4ds.video.libvmaf import VMAF_MODEL, Ffmpeg, find_ffmpeg
 from mp4ds.video.scores import largest_crf
 
@@ -336,7 +335,6 @@ def evaluate(
     Raises:
         SourceError: The source cannot be read, or has no camera that could be tried.
         OptionError: An option is wrong.
-        HardwareError: A requested encoder is not available on this machine.
         TargetError: The folder cannot be used.
         ScoringError: The target is a VMAF score but libvmaf is missing; or no setting could be
             tried.
@@ -347,9 +345,6 @@ def evaluate(
     chosen = options or EvaluateOptions()
     check_options(chosen)
     grid = grid_of(chosen)
-    if not chosen.cluster:  # else others encode
-        for codec in grid.presets:
-            check_hardware(codec)
     engines = Engines(chosen, len(grid.settings()) + 1)
     versions = versions_of(_ffmpeg(chosen.wanted))
     with open_source(source, fps=chosen.fps) as found:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from mp4ds.errors import OptionError
 from mp4ds.options import Options, cluster, option, parse_words
 from mp4ds.plan import visual_setting
-from mp4ds.video.codecs import AV1, HARDWARE, LOSSY_GOP, MAX_CRF, check_codec, codec_name
+from mp4ds.video.codecs import AV1, LOSSY_GOP, MAX_CRF, check_codec, codec_name
 from mp4ds.video.scores import METRICS
 
 ENCODER_NAMES = {"svtav1": "av1", "x264": "h264", "x265": "h265"}
@@ -20,7 +20,6 @@ _DEFAULT_PRESETS = {
     **dict.fromkeys(AV1, ("6", "8")),
     "h264": ("medium",),
     "h265": ("medium",),
-    **{name: (found.default_preset,) for name, found in HARDWARE.items()},
 }
 _MOST_CELLS = 10_000
 _CRF = re.compile(r"([0-9]{1,4})(?::([0-9]{1,4})(?::([0-9]{1,4}))?)?")
@@ -31,8 +30,7 @@ class Setting:
     """How to encode a clip, in the terms of ``mp4ds pack``.
 
     Attributes:
-        codec: ``av1``, ``av1-10bit``, ``h264``, ``h265``, or an encoder of the hardware, such as
-            ``h264-nvenc``.
+        codec: ``av1``, ``av1-10bit``, ``h264`` or ``h265``.
         preset: Of its encoder; empty if it has none.
         crf: Constant rate factor.
         gop: Most frames between key frames.
@@ -190,7 +188,7 @@ def _codec(name: str) -> str:
     codec = codec_name(ENCODER_NAMES.get(name, name))
     if codec not in MAX_CRF:
         names = [f"{encoder} ({codec})" for encoder, codec in ENCODER_NAMES.items()]
-        known = ", ".join([*names, AV1[1], *HARDWARE])
+        known = ", ".join([*names, AV1[1]])
         raise OptionError(f"`codecs` {name!r} is not one of {known}.")
     return codec
 
