@@ -1,7 +1,7 @@
 """Run a reader over the cases of the suite, and compare what it says with what is expected.
 
     python conformance/run.py -- COMMAND {file}
-    python conformance/run.py --validator -- mp4ds conformance-dump {file}
+    python conformance/run.py --validator -- python tools/conformance_dump.py {file}
     python conformance/run.py --only datasets -- python conformance/reader.py {file}
 
 COMMAND prints JSON (README.md says what). Keys that it leaves out are not compared, and are listed

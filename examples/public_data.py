@@ -2,7 +2,7 @@
 
 python examples/public_data.py KIND SOURCE OUT [--rate HZ] [--frames N] [--crf A:B:STEP]
 
-KIND is euroc, kitti, tum (folders as they are downloaded), images (any folder, with --rate), or
+KIND is euroc, tum (folders as they are downloaded), images (any folder, with --rate), or
 mcap (a recording, such as one of nuScenes). docs/public-data.md says where to get each. OUT gets
 two datasets (lossless, visual), an evaluation of encoder settings with VMAF where that is
 installed, a report, and an export; a table is printed.
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import mp4ds
 
-EXPORTS = {"euroc": "euroc", "kitti": "kitti", "tum": "tum", "images": "euroc", "mcap": "euroc"}
+EXPORTS = {"euroc": "euroc", "tum": "tum", "images": "euroc", "mcap": "euroc"}
 """Kind -> the format that it is exported to: its own, where it has one."""
 
 

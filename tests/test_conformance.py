@@ -26,13 +26,13 @@ from mp4ds.format.fields import FORMAT_VERSION, Body
 from mp4ds.format.models import VIDEO_CODECS
 from mp4ds.messages.layouts import LAYOUTS
 from mp4ds.messages.serializations import WIRES
-from mp4ds.plugins.conformance import conformance_dump
 from mp4ds.video.planes import RawPicture, raw_pictures
 from sources import load_tool
 from waiting import WATCHDOG_S
 
 SUITE = Path(__file__).parents[1] / "conformance"
 CASES = SUITE / "cases"
+DUMP = SUITE.parent / "tools" / "conformance_dump.py"
 LISTED: dict[str, Any] = json.loads((CASES / "cases.json").read_text())
 NOT_READ = "values,messages,version-0"
 """Parts that the second reader does not claim; README.md says the same."""
@@ -220,21 +220,21 @@ def test_the_runner_takes_a_place_within_the_expected_one(
 
 def test_the_command_prints_what_is_expected() -> None:
     dataset = CASES / "datasets" / "before-1970"
-    done = run(sys.executable, "-m", "mp4ds", "conformance-dump", dataset)
+    done = run(sys.executable, DUMP, dataset)
     assert done.returncode == 0, done.stderr
     assert done.stdout == (dataset / "expected.json").read_text()
 
 
 def test_the_command_prints_problems() -> None:
     broken = CASES / "sidecars" / "invalid" / "column-short.yaml"
-    done = run(sys.executable, "-m", "mp4ds", "conformance-dump", broken)
+    done = run(sys.executable, DUMP, broken)
     assert done.returncode == 1
     place = {"file": broken.name, "at": "columns.stamp", "code": "column-invalid"}
     assert json.loads(done.stdout) == {"problems": [place]}
 
 
 def test_the_command_refuses_what_is_no_dataset(tmp_path: Path) -> None:
-    done = run(sys.executable, "-m", "mp4ds", "conformance-dump", tmp_path)
+    done = run(sys.executable, DUMP, tmp_path)
     assert done.returncode == 2
     assert "is not a dataset" in done.stderr
     assert "Traceback" not in done.stderr
@@ -375,8 +375,9 @@ def test_a_stream_that_does_not_decode_is_told_without_planes(
         yield from itertools.islice(raw_pictures(path, is_gray=False), 1)
         raise VideoError("decode-failed", path, "frame 1 cannot be decoded")
 
-    monkeypatch.setattr("mp4ds.plugins.conformance.raw_pictures", fail)
-    found = conformance_dump(CASES / "sidecars" / "valid" / "packets.yaml")
+    module = load_tool("conformance_dump")
+    monkeypatch.setattr(module, "raw_pictures", fail)
+    found = module.conformance_dump(CASES / "sidecars" / "valid" / "packets.yaml")
     (stream,) = found["streams"]
     assert stream["planes"] is None
     assert len(stream["payloads"]) == stream["frames"]

@@ -35,7 +35,6 @@ FILES: dict[str, tuple[str, tuple[str, ...]]] = {
     "demo bag": ("out.bag", ("demo",)),
     "png": ("out.png", ("frames", "DATASET", "--at", "#0")),
     "jpeg": ("out.jpg", ("frames", "DATASET", "--at", "#0")),
-    "rerun": ("out.rrd", ("export", "rerun", "DATASET")),
 }
 
 

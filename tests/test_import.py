@@ -235,13 +235,6 @@ def test_finer_times_are_rounded_and_counted() -> None:
     assert rounded == {scene.ROUNDED: 2}
 
 
-def test_dates_are_exact() -> None:
-    read = scene.of_date(Counter())
-    # date --utc -d '2011-09-26 13:02:25' +%s
-    assert read("2011-09-26 13:02:25.964389445") == 1317042145_964389445
-    assert read("1970-01-01 00:00:00") == 0
-
-
 @each("text", ["", "x", "-1", "nan", "inf", "1e99", "0x10", "1_000", "2147483648"])
 def test_what_is_no_time_is_refused(text: str) -> None:
     with pytest.raises(scene.Refused):
@@ -688,86 +681,6 @@ def test_quaternions_turn_as_their_matrices_do() -> None:
             quaternion(bad)
 
 
-# ---------------------------------------------------------------- KITTI
-
-
-def test_kitti_odometry(tmp_path: Path) -> None:
-    root = tmp_path / "00"
-    lines = ["0.000000e+00", "1.037359e-01", "2.073430e-01"]
-    root.mkdir()
-    (root / "times.txt").write_text("\n".join(lines) + "\n")
-    (root / "calib.txt").write_text(
-        "P0: 7e+02 0 6e+02 0 0 7e+02 1.8e+02 0 0 0 1 0\n"
-        "P1: 7e+02 0 6e+02 -3.5e+02 0 7e+02 1.8e+02 0 0 0 1 0\n"
-        "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n"
-    )
-    for camera in (0, 1):
-        for number in range(3):
-            save(root / f"image_{camera}" / f"{number:06}.png", image(number + camera))
-    found = imported(root, tmp_path)
-    for camera in (0, 1):
-        rows = found[f"/image_{camera}/image_raw"]
-        assert [time for time, _ in rows] == [0, 103_735_900, 207_343_000]
-        for number, (_, message) in enumerate(rows):
-            assert np.array_equal(pixels_of(message), image(number + camera))
-    info = found["/image_1/camera_info"][2][1]
-    assert list(info.p) == [700, 0, 600, -350, 0, 700, 180, 0, 0, 0, 1, 0]
-    assert list(info.k) == [700, 0, 600, 0, 700, 180, 0, 0, 1]
-    ((_, tree),) = found["/tf_static"]
-    (item,) = tree.transforms
-    assert (item.header.frame_id, item.child_frame_id) == ("image_0", "image_1")
-    assert item.transform.translation.x == pytest.approx(0.5)  # to the right of the first
-    assert item.transform.rotation.w == 1
-    calibrations = (root / "calib.txt").read_text().replace("P1: 7e+02", "P1: 0")
-    (root / "calib.txt").write_text(calibrations)
-    done = run("import", "images", root, "-o", tmp_path / "other")
-    refused(done, ": its calibration gives no pose for image_1: the translation is not finite.")
-
-
-@pytest.mark.parametrize("rectified", [True, False])
-def test_kitti_raw(rectified: bool, tmp_path: Path) -> None:
-    drive = tmp_path / "2011_09_26" / "2011_09_26_drive_0001"
-    sizes = ("5.0e+01 4.0e+01", "3.2e+01 2.4e+01")
-    (drive / "oxts").mkdir(parents=True)
-    (drive / "oxts" / "dataformat.txt").write_text("lat\n")
-    lines = ["calib_time: 09-Jan-2012 13:57:47"]
-    for camera, shift in (("00", 0), ("01", -350)):
-        (drive / f"image_{camera}").mkdir()
-        stamps = [f"2011-09-26 13:02:25.96438944{number}" for number in range(2)]
-        (drive / f"image_{camera}" / "timestamps.txt").write_text("\n".join(stamps) + "\n")
-        for number in range(2):
-            save(drive / f"image_{camera}" / "data" / f"{number:010}.png", image(number, 3))
-        lines += [
-            f"S_{camera}: {sizes[0] if rectified else sizes[1]}",
-            f"K_{camera}: 9 0 5 0 9 4 0 0 1",
-            f"D_{camera}: -0.3 0.2 0.001 0.002 -0.07",
-            f"R_{camera}: 0 -1 0 1 0 0 0 0 1",
-            f"T_{camera}: 1 2 3",
-            f"S_rect_{camera}: {sizes[1] if rectified else sizes[0]}",
-            f"R_rect_{camera}: 1 0 0 0 1 0 0 0 1",
-            f"P_rect_{camera}: 7e+02 0 6e+02 {shift} 0 7e+02 1.8e+02 0 0 0 1 0",
-        ]
-    (drive.parent / "calib_cam_to_cam.txt").write_text("\n".join(lines) + "\n")
-    found = imported(drive, tmp_path)
-    rows = found["/image_01/image_raw"]
-    assert [time for time, _ in rows] == [1317042145_964389440, 1317042145_964389441]
-    assert np.array_equal(pixels_of(rows[1][1], channels=3), image(1, 3))
-    info = found["/image_01/camera_info"][0][1]
-    assert list(info.p) == [700, 0, 600, -350, 0, 700, 180, 0, 0, 0, 1, 0]
-    assert list(info.d) == ([0] * 5 if rectified else [-0.3, 0.2, 0.001, 0.002, -0.07])
-    assert info.k[0] == (700 if rectified else 9)
-    ((_, tree),) = found["/tf_static"]
-    (item,) = tree.transforms
-    place, turn = item.transform.translation, item.transform.rotation
-    # where the origin of the second camera is seen from the first: -R^T T
-    due = [0.5, 0, 0] if rectified else [-2, 1, -3]
-    assert [place.x, place.y, place.z] == pytest.approx(due)
-    half = 0.5**0.5
-    assert [turn.z, turn.w] == pytest.approx([0, 1] if rectified else [-half, half])
-    summary = mp4ds.pack(drive, tmp_path / "ds2", folder())
-    assert summary.skipped == {"files of oxts, which is not a camera": 1}
-
-
 # ---------------------------------------------------------------- TUM
 
 
@@ -868,7 +781,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], list[str], str]] = {
         "cannot identify image file",
     ),
     "other-layout": (lambda root: None, ["--layout", "tum"], "does not have the layout tum"),
-    "no-layout": (lambda root: None, ["--layout", "x"], "euroc, kitti, tum, plain"),
+    "no-layout": (lambda root: None, ["--layout", "x"], "euroc, tum, plain"),
     "stamps": (lambda root: None, ["--stamps", "x"], "--stamps is for plain folders"),
     "frame-id": (lambda root: None, ["--frame-id", "x"], "--frame-id is for plain folders"),
     "own-calibration": (lambda root: None, ["--calibration", "x"], "has its own"),

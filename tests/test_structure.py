@@ -92,7 +92,6 @@ HOMES = {
     "cyclonedds": ("plugins/publishing", "plugins/recording"),
     "foxglove": ("plugins/publishing",),
     "pyarrow": ("plugins/exporting",),
-    "rerun": ("plugins/exporting",),
     "yaml": ("yamlio.py", "bags", "plugins/publishing"),
     "pydantic": ("format", "dataset/checks.py"),
     "jsonschema": ("dataset/checks.py",),

@@ -22,6 +22,7 @@ from typing import Any
 import xxhash
 
 from conformance_broken import broken
+from conformance_dump import as_json, conformance_dump
 from conformance_files import REFUSED_BY_READERS, VALID, Document, part_of
 from conformance_invalid import INVALID
 from conformance_recordings import RECORDINGS, ROOT, chosen_layouts, recording_of
@@ -31,7 +32,6 @@ from mp4ds.format.fields import FORMAT_VERSION
 from mp4ds.format.sidecars import MANIFEST_NAME
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.pack import pack
-from mp4ds.plugins.conformance import as_json, conformance_dump
 
 CASES = ROOT / "conformance" / "cases"
 LIST = "cases.json"

@@ -5,7 +5,7 @@ The public API, and nothing else::
     mp4ds.pack("drive.mcap", "drive")            recording -> dataset
     mp4ds.unpack("drive", "bag", "again.bag")   dataset -> recording
     mp4ds.import_ros_mp4("a.mp4", "a.yaml", "a")   converts a pair made by the paper's tool
-    mp4ds.export("drive", "euroc", "for_slam")  EuRoC, TUM, KITTI, COLMAP, Rerun, LeRobot
+    mp4ds.export("drive", "euroc", "for_slam")  EuRoC, TUM, COLMAP, LeRobot
     mp4ds.evaluate("drive.mcap").recommended     encoder settings, tried on clips
     mp4ds.report("drive")                       a page with its cameras, timing and calibrations
     mp4ds.play("drive")                         publishes to ROS 1, ROS 2 or Foxglove

@@ -60,10 +60,6 @@ COMMANDS = {
         "inspect",
         "Make a small test recording: two cameras (Bayer and RGB), calibrations, IMU, tf.",
     ),
-    "conformance-dump": (
-        "inspect",
-        "Dump a file's contents as JSON, to check other readers against (conformance/README.md).",
-    ),
 }
 """Commands -> their module, and what they do."""
 

@@ -1,4 +1,4 @@
-"""``mp4ds info``, ``validate``, ``demo`` and ``conformance-dump``; calibrations as Python code."""
+"""``mp4ds info``, ``validate`` and ``demo``; calibrations as Python code."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from mp4ds.cli.output import (
     print_overview,
     print_speeds,
     print_validation,
-    printed,
     say,
 )
 from mp4ds.cli.process import told_errors
@@ -237,23 +236,6 @@ def demo(
         print_json({"output": output, "messages": messages})
     else:
         say(f"{path_text(output)}: {counted(messages, 'message')}")
-
-
-def conformance_dump(
-    path: Annotated[str, typer.Argument(metavar="FILE", help="A sidecar or a dataset.")],
-) -> None:
-    """Dump a file's contents as JSON, to check other readers against (conformance/README.md).
-
-    If the file has problems, prints only those and exits with 1.
-    """
-    from mp4ds.plugins.conformance import as_json
-    from mp4ds.plugins.conformance import conformance_dump as run
-
-    with told_errors(as_json=True), progress_of("validating", as_json=False) as report:
-        found = run(path, progress=report)
-    with printed():
-        print(as_json(found))
-    raise typer.Exit(1 if found["problems"] else 0)
 
 
 # ---------------------------------------------------------------- calibrations

@@ -111,7 +111,7 @@ def images(
 ) -> None:
     """Make a dataset from a folder of timestamped images.
 
-    EuRoC, KITTI and TUM RGB-D folders are imported with all their cameras. Lossless by default. To
+    EuRoC and TUM RGB-D folders are imported with all their cameras. Lossless by default. To
     resume a long import that was interrupted, run the same command again.
     """
     from mp4ds.packing.pack import pack as run

@@ -72,7 +72,7 @@ def export(
     options: Callable[[], ExportOptions],
     to: Annotated[
         str,
-        typer.Argument(metavar="FORMAT", help="euroc, tum, kitti, colmap, rerun or lerobot."),
+        typer.Argument(metavar="FORMAT", help="euroc, tum, colmap or lerobot."),
     ],
     datasets: Annotated[
         list[str],
@@ -81,10 +81,7 @@ def export(
         ),
     ],
     output: Annotated[
-        Path,
-        typer.Option(
-            "--output", "-o", metavar="OUT", help="Folder to create; for rerun an .rrd file."
-        ),
+        Path, typer.Option("--output", "-o", metavar="OUT", help="Folder to create.")
     ],
     as_json: JsonFlag = False,
 ) -> None:

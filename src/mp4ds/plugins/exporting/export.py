@@ -16,7 +16,7 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.salvage import HOW_TO_SALVAGE
 from mp4ds.dataset.slicing import sliced
 from mp4ds.errors import OptionError, advising
-from mp4ds.files.outputs import begins_with, listed_names, staged
+from mp4ds.files.outputs import listed_names, staged
 from mp4ds.files.urls import location, remote
 from mp4ds.format.fields import document_of
 from mp4ds.plugins.exporting.job import ExportedDataset, ExportJob, ExportOptions, ExportSummary
@@ -27,16 +27,13 @@ NOTE_NAME = "mp4ds_export.json"
 FORMATS = {
     "euroc": "EuRoC",
     "tum": "TUM",
-    "kitti": "KITTI",
     "colmap": "COLMAP",
-    "rerun": "Rerun",
     "lerobot": "LeRobot",
 }
 """Formats, each written by the module of that name -> display name."""
 
-_LIBRARIES = {"rerun": "rerun-sdk", "lerobot": "pyarrow"}
+_LIBRARIES = {"lerobot": "pyarrow"}
 _SEVERAL = ("lerobot",)  # formats that hold several datasets
-_FILES = {"rerun": ".rrd"}
 _OPTIONS_OF = {
     "poses": ("euroc", "tum", "colmap"),
     "fps": ("lerobot",),
@@ -61,8 +58,8 @@ def export(
     Args:
         datasets: A dataset, or one video with its sidecar, or its URL; for lerobot also several,
             each of which becomes an episode.
-        to: ``euroc``, ``tum``, ``kitti``, ``colmap``, ``rerun`` or ``lerobot``.
-        output: The folder to make; for rerun the file.
+        to: ``euroc``, ``tum``, ``colmap`` or ``lerobot``.
+        output: The folder to make.
         options: How.
         progress: Called now and then with a phrase, and the share of frames done if known.
 
@@ -96,7 +93,7 @@ def export(
             staged(
                 target,
                 force=chosen.force,
-                owned=_rerun_names if to in _FILES else _export_names,
+                owned=_export_names,
                 sources=[dataset.path for dataset in opened],
             )
         )
@@ -178,7 +175,3 @@ def _first_reason(summary: ExportSummary) -> str:
 
 def _export_names(path: Path) -> set[str] | None:
     return listed_names(path, NOTE_NAME)
-
-
-def _rerun_names(path: Path) -> set[str] | None:
-    return {""} if begins_with(path, b"RRF") else None

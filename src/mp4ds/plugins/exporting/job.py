@@ -247,12 +247,6 @@ class ExportedCamera:
             return self.stream.image_size
         return width, height
 
-    @property
-    def is_as_recorded(self) -> bool:
-        """Whether all frames are exported as recorded and in order."""
-        is_whole = np.array_equal(self.numbers, np.arange(len(self.stream)))
-        return self.view.is_plain and is_whole
-
     @cached_property
     def calibration(self) -> Calibration | None:
         """The calibration of the exported images at the first frame; None if unknown."""

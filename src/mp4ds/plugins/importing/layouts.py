@@ -17,10 +17,8 @@ from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.packing.options import ImageFolder
 from mp4ds.plugins.importing.benchmarks import (
     find_euroc,
-    find_kitti,
     find_tum,
     is_euroc,
-    is_kitti,
     is_tum,
 )
 from mp4ds.plugins.importing.reader import ImagesReader
@@ -321,7 +319,6 @@ class FolderLayout:
 
 LAYOUTS: Mapping[str, FolderLayout] = {
     "euroc": FolderLayout(is_euroc, find_euroc, is_calibrated=True),
-    "kitti": FolderLayout(is_kitti, find_kitti, is_calibrated=True),
     "tum": FolderLayout(is_tum, find_tum, is_calibrated=False),
     "plain": FolderLayout(lambda folder: True, find_plain, is_calibrated=False),
 }

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from calendar import timegm
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime
 from fractions import Fraction
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -31,7 +29,6 @@ ROUNDED = "times finer than a nanosecond, which were rounded"
 
 _CERTAIN_DIGITS = 16  # of nanoseconds since 1970; counts of seconds or images have fewer
 _NUMBER = re.compile(r"\+?([0-9]{1,40})(?:(\.[0-9]{0,40})?([eE][-+]?[0-9]{1,2})?)?")
-_DATE = re.compile(r"([0-9]{4}-[0-9]{2}-[0-9]{2}[ T][0-9]{2}:[0-9]{2}:[0-9]{2})(\.[0-9]{1,40})?")
 
 
 def is_number(text: str) -> bool:
@@ -67,23 +64,6 @@ def of_unit(unit: str, found: Counter[str]) -> Callable[[str], int]:
         if not _NUMBER.fullmatch(text):
             raise Refused(f"{text!r} is not a time in {unit}")
         return _checked(Fraction(text) * scale, text, found)
-
-    return read
-
-
-def of_date(found: Counter[str]) -> Callable[[str], int]:
-    """A parser for ``2011-09-26 13:02:25.964389445``, taken as UTC. See `of_unit`."""
-
-    def read(text: str) -> int:
-        match = _DATE.fullmatch(text.strip())
-        try:
-            whole = datetime.fromisoformat(match[1]) if match else None
-        except ValueError:
-            whole = None
-        if match is None or whole is None:
-            raise Refused(f"{text!r} is not a date and time")
-        seconds = timegm(whole.timetuple()) + Fraction(f"0{match[2] or ''}")
-        return _checked(seconds * UNITS["s"], text, found)
 
     return read
 

@@ -1,15 +1,18 @@
-"""The contents of a file in the form used to compare readers.
+"""Prints what mp4ds reads from a file, in the form used to compare readers.
 
-conformance/README.md says what each key means. 64-bit integers are strings, since JSON parsers keep
-only 53 bits of a number.
+    python tools/conformance_dump.py A_SIDECAR_OR_DATASET
+
+The exit code is 1 if the file has problems. conformance/README.md says what each key means. 64-bit
+integers are strings, since JSON parsers keep only 53 bits of a number.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +24,7 @@ from mp4ds.dataset.checks import Problem, validate
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import DecodedColumns
 from mp4ds.dataset.stream import Stream
-from mp4ds.errors import SourceError, VideoError
+from mp4ds.errors import Mp4dsError, SourceError, VideoError
 from mp4ds.files.urls import location
 from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.format.manifest import Manifest
@@ -38,9 +41,7 @@ def as_json(values: Values) -> str:
     return json.dumps(values, indent=1)
 
 
-def conformance_dump(
-    path: Path | str, *, progress: Callable[[str, float | None], None] | None = None
-) -> dict[str, Any]:
+def conformance_dump(path: Path | str) -> dict[str, Any]:
     """The contents of a sidecar with its video, or of a dataset, as JSON values.
 
     Every frame is decoded and every message rebuilt, one frame at a time; the result has a few
@@ -48,7 +49,6 @@ def conformance_dump(
 
     Args:
         path: A sidecar, its video, a dataset or its manifest; or a URL.
-        progress: Called with a phrase before each costly step.
 
     Returns:
         ``problems``, and if there are none, everything listed in conformance/README.md.
@@ -64,7 +64,7 @@ def conformance_dump(
         raise SourceError(
             path, f"is not a dataset: there is no {MANIFEST_NAME} in it", "Give one dataset."
         )
-    problems = [_problem(problem) for problem in validate(path, deep=True, progress=progress)]
+    problems = [_problem(problem) for problem in validate(path, deep=True)]
     if problems:
         return {"problems": sorted(problems, key=lambda item: tuple(item.values()))}
     with Dataset(path) as dataset:
@@ -273,3 +273,18 @@ def _messages(dataset: Dataset) -> Values:
         "attachments": kinds[Attachment],
         "metadata": kinds[MetadataRecord],
     }
+
+
+def main() -> int:
+    """Print what a file holds."""
+    try:
+        found = conformance_dump(sys.argv[1])
+    except (IndexError, Mp4dsError) as error:
+        print(error if isinstance(error, Mp4dsError) else __doc__, file=sys.stderr)
+        return 2
+    print(as_json(found))
+    return 1 if found["problems"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,1 +1,0 @@
-complete --command mp4ds --no-files --arguments "(env _MP4DS_COMPLETE=complete_fish _TYPER_COMPLETE_FISH_ACTION=get-args _TYPER_COMPLETE_ARGS=(commandline -cp) mp4ds)" --condition "env _MP4DS_COMPLETE=complete_fish _TYPER_COMPLETE_FISH_ACTION=is-args _TYPER_COMPLETE_ARGS=(commandline -cp) mp4ds"
