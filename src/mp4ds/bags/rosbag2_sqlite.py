@@ -103,12 +103,13 @@ class Tables:
 
 
 @contextmanager
-def open_tables(path: Path, shown: Path) -> Iterator[Tables]:
+def open_tables(path: Path, shown: Path, *, damaged: bool = False) -> Iterator[Tables]:
     """Open a file for reading only.
 
     Args:
         path: The database.
         shown: Its name in errors, where it is a decompressed copy.
+        damaged: Read a file that was cut short, too, up to where it ends.
 
     Raises:
         SourceError: It cannot be read; also for errors within the block.
@@ -126,6 +127,8 @@ def open_tables(path: Path, shown: Path) -> Iterator[Tables]:
         size = path.stat().st_size + beside
         tables = Tables(connection, size, shown)
         connection.execute("PRAGMA trusted_schema = OFF")
+        if damaged:  # otherwise sqlite3 opens no file of fewer pages than its header says
+            connection.execute("PRAGMA writable_schema = ON")
         if sys.version_info >= (3, 11):
             most = min(max(size, _LEAST_LENGTH), 2**31 - 1)
             connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, most)
@@ -173,6 +176,7 @@ class SqliteReader:
         shown: Its name in errors and tables, where it is a decompressed copy.
         message_decompress: Makes the payload of a message from what the file holds; raises
             `DamageError` for what it cannot read.
+        damaged: Read a file that was cut short, too.
 
     Attributes:
         tables: Content of the small tables by ``db3:<file>:<column>``, verbatim.
@@ -188,8 +192,10 @@ class SqliteReader:
         *,
         shown: Path | None = None,
         message_decompress: Callable[[bytes], bytes] | None = None,
+        damaged: bool = False,
     ) -> None:
         self.path = path
+        self._damaged = damaged
         self._shown = shown or path
         self._decompress = message_decompress
         self._rows_read = 0
@@ -208,7 +214,7 @@ class SqliteReader:
 
     def _opened(self) -> AbstractContextManager[Tables]:
         """Its tables, for one pass."""
-        return open_tables(self.path, self._shown)
+        return open_tables(self.path, self._shown, damaged=self._damaged)
 
     def _columns(self, tables: Tables, table: str) -> list[str]:
         columns = tables.columns(table)
