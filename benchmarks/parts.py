@@ -1,8 +1,7 @@
-"""What packing in parts costs, gains and takes: time by workers, memory by length and by cameras.
+"""What packing in parts costs, gains and takes: time by workers, memory by length.
 
     python benchmarks/parts.py workers [--frames N] [--window N] [--jobs N ...]
     python benchmarks/parts.py length [--gigabytes SHORT LONG]
-    python benchmarks/parts.py cameras [--cameras N] [--frames N] [--memory SIZE] [--quality Q]
 
 ``workers`` packs one recording in one pass and in parts by 1 to N processes, and tells for each the
 time on the clock, the CPU time of all, and that of the coordinator alone. The tasks' recorded times
@@ -11,9 +10,8 @@ joining after, which are done by one process: what the division allows, given ma
 slow each other down.
 
 ``length`` packs a short and a long recording of the same camera and compares the peaks of resident
-memory, of all processes together. ``cameras`` packs a few seconds of many 5 MP cameras within a
-bound of memory. Both ask the system for what is resident every 20 ms: shared pages are counted in
-every process that has them, so the sums are above what is taken.
+memory, of all processes together. It asks the system for what is resident every 20 ms: shared pages
+are counted in every process that has them, so the sums are above what is taken.
 """
 
 from __future__ import annotations
@@ -58,11 +56,6 @@ def main() -> None:
     workers.add_argument("--jobs", type=int, nargs="+", default=[1, 2])
     length = commands.add_parser("length")
     length.add_argument("--gigabytes", type=float, nargs=2, default=(1.0, 8.0))
-    cameras = commands.add_parser("cameras")
-    cameras.add_argument("--cameras", type=int, default=11)
-    cameras.add_argument("--frames", type=int, default=20)
-    cameras.add_argument("--memory", default="3G")
-    cameras.add_argument("--quality", default="visual")
     child = commands.add_parser("child")
     child.add_argument("arguments")
     options = parser.parse_args()
@@ -73,10 +66,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="mp4ds-benchmark-") as folder:
         if options.command == "workers":
             compare_workers(Path(folder), options)
-        elif options.command == "length":
-            compare_lengths(Path(folder), options)
         else:
-            measure_cameras(Path(folder), options)
+            compare_lengths(Path(folder), options)
 
 
 # ---------------------------------------------------------------- recordings
@@ -249,27 +240,6 @@ def compare_lengths(folder: Path, options: argparse.Namespace) -> None:
         ("recording", "frames", "tasks", "clock s", "peak of all, MB", "of the largest task"), rows
     )
     print(f"\nlong / short: {peaks[1] / peaks[0]:.3f}")
-
-
-def measure_cameras(folder: Path, options: argparse.Namespace) -> None:
-    """Peak memory of many large cameras within a bound."""
-    from mp4ds.options import parse_size
-
-    source = folder / "drive.bag"
-    size = write_recording(
-        source, cameras=options.cameras, frames=options.frames, width=2448, height=2048
-    )
-    bound = parse_size(options.memory)
-    done = run_pack(source, folder / "dataset", memory=bound, quality=options.quality)
-    parts = [task for task in done["tasks"] if not task["name"].startswith("source")]
-    wall = done["marks"]["end"] - done["marks"]["begin"]
-    print(f"- recording: {options.cameras} cameras of 2448x2048, {options.frames} frames each")
-    print(f"- {size / 1e9:.2f} GB, --quality {options.quality} --memory {options.memory}")
-    print(f"- parts: {len(parts)}; {wall:.0f} s on the clock")
-    verdict = "within the bound" if done["peak"] <= bound else "ABOVE THE BOUND"
-    print(
-        f"- peak of all processes: {done['peak'] / 2**20:.0f} MiB of {bound / 2**20:.0f}: {verdict}"
-    )
 
 
 def _remove(folder: Path) -> None:

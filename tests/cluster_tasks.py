@@ -14,7 +14,6 @@ import time
 from pathlib import Path
 
 from mp4ds.errors import SourceError
-from waiting import until
 
 SECONDS = 0.3
 
@@ -47,23 +46,6 @@ def die(folder: str, name: str) -> None:
     if name == "deadly":
         os.kill(os.getpid(), signal.SIGKILL)
     write(folder, name)
-
-
-def crowd(folder: str, name: str) -> None:
-    """Note how many there are at the same time in one process, once as many came as are wanted."""
-    here, met = Path(folder, f"{name}.here-{os.getpid()}"), Path(folder, "met")
-    here.touch()
-
-    def count() -> int:
-        return len(list(Path(folder).glob(f"*.here-{os.getpid()}")))
-
-    wanted = int(Path(folder, "wanted").read_text())
-    until(lambda: met.exists() or count() >= wanted)
-    met.touch()
-    time.sleep(SECONDS)
-    Path(folder, name).write_text(str(count()))
-    time.sleep(SECONDS)
-    here.unlink()
 
 
 class Large:

@@ -29,8 +29,6 @@ from mp4ds.plugins import cluster as access
 from mp4ds.plugins.cluster import ClusterEngine, Connection
 from waiting import WATCHDOG_S, until
 
-MIB = 2**20
-
 
 @pytest.fixture(autouse=True)
 def _settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,7 +76,7 @@ def started(folder: Path) -> list[Path]:
 
 def test_all_tasks_run(cluster: RealCluster, tmp_path: Path) -> None:
     names = numbered(12)
-    engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.write, cluster.address)
     assert not errors(run(engine, tasks_in(tmp_path, *names)))
     assert results(tmp_path) == {name: cluster_tasks.result(name) for name in names}
     assert len({path.suffix for path in started(tmp_path)}) == 2  # processes: both worked
@@ -86,12 +84,12 @@ def test_all_tasks_run(cluster: RealCluster, tmp_path: Path) -> None:
 
 
 def test_no_tasks_need_no_cluster() -> None:
-    engine = ClusterEngine(cluster_tasks.write, "tcp://127.0.0.1:1", task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.write, "tcp://127.0.0.1:1")
     assert run(engine, []) == {}
 
 
 def test_outcomes_come_as_tasks_end(cluster: RealCluster, tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.write, cluster.address)
     with closing(engine.run(tasks_in(tmp_path, *numbered(50)), lambda *_: None)) as outcomes:
         next(outcomes)
         assert len(results(tmp_path)) < 50
@@ -99,7 +97,7 @@ def test_outcomes_come_as_tasks_end(cluster: RealCluster, tmp_path: Path) -> Non
 
 def test_errors_of_tasks_are_told_and_not_tried_again(cluster: RealCluster, tmp_path: Path) -> None:
     names = ["source", "disk", "odd", "silent", "memory", "fine"]
-    engine = ClusterEngine(cluster_tasks.fail, cluster.address, task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.fail, cluster.address)
     found = errors(run(engine, tasks_in(tmp_path, *names)))
     for name, kind, sentence in [
         ("source", "SourceError", "drive.bag: is damaged. Copy it again."),
@@ -118,7 +116,7 @@ def test_errors_of_tasks_are_told_and_not_tried_again(cluster: RealCluster, tmp_
 
 def test_a_function_that_the_cluster_lacks(tmp_path: Path) -> None:
     with RealCluster(tmp_path / "dask", workers=1, path=tmp_path) as cluster:
-        engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+        engine = ClusterEngine(cluster_tasks.write, cluster.address)
         found = errors(run(engine, tasks_in(tmp_path, "a", "b")))
     assert {kind for kind, _ in found.values()} == {"Failed"}
     for _, sentence in found.values():
@@ -129,7 +127,7 @@ def test_a_function_that_the_cluster_lacks(tmp_path: Path) -> None:
 def test_closing_drops_what_waits_and_leaves_the_cluster(
     cluster: RealCluster, tmp_path: Path
 ) -> None:
-    engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.write, cluster.address)
     outcomes = engine.run(tasks_in(tmp_path, *numbered(50)), lambda *_: None)
     with closing(outcomes):
         assert next(outcomes).error is None
@@ -145,27 +143,8 @@ def test_closing_drops_what_waits_and_leaves_the_cluster(
 # ---------------------------------------------------------------- memory
 
 
-def test_workers_run_as_many_tasks_as_their_memory_holds(tmp_path: Path) -> None:
-    names = numbered(8)
-    limits = ("--nthreads", "4", "--memory-limit", "1GiB")
-    with RealCluster(tmp_path / "dask", workers=1, arguments=limits) as cluster:
-        for task_bytes, expected in [(400 * MIB, {2}), (MIB, {3, 4})]:
-            folder = tmp_path / str(task_bytes)
-            folder.mkdir()
-            (folder / "wanted").write_text(str(min(expected)))
-            engine = ClusterEngine(cluster_tasks.crowd, cluster.address, task_bytes=task_bytes)
-            assert not errors(run(engine, tasks_in(folder, *names)))
-            assert max(int((folder / name).read_text()) for name in names) in expected
-        engine = ClusterEngine(cluster_tasks.crowd, cluster.address, task_bytes=2048 * MIB)
-        found = errors(run(engine, tasks_in(tmp_path, "large")))
-    kind, sentence = found["large"]
-    assert kind == "OptionError"
-    assert "it has 1024 MiB of memory, and a task takes up to 2048 MiB" in sentence
-    assert not (tmp_path / "large").exists()
-
-
 def test_a_task_leaves_no_memory_behind(cluster: RealCluster, tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.leave_large, cluster.address, task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.leave_large, cluster.address)
     assert not errors(run(engine, tasks_in(tmp_path, *numbered(4))))
     assert len(list(tmp_path.glob("*.freed"))) == 4
 
@@ -176,7 +155,7 @@ def test_a_task_leaves_no_memory_behind(cluster: RealCluster, tmp_path: Path) ->
 def test_tasks_of_a_killed_worker_run_on_another(tmp_path: Path) -> None:
     names = numbered(8)
     with RealCluster(tmp_path / "dask") as cluster:
-        engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+        engine = ClusterEngine(cluster_tasks.write, cluster.address)
         outcomes = engine.run(tasks_in(tmp_path, *names), lambda *_: None)
         done = [next(outcomes)]
         victim = cluster.workers[0]
@@ -204,20 +183,19 @@ def test_a_task_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
     }
     # more workers than it kills: on a loaded machine a nanny may not bring one back
     with RealCluster(tmp_path / "dask", workers=4, arguments=WITH_NANNY, config=config) as cluster:
-        engine = ClusterEngine(cluster_tasks.die, cluster.address, task_bytes=300 * MIB)
+        engine = ClusterEngine(cluster_tasks.die, cluster.address)
         found = errors(run(engine, tasks_in(tmp_path, "deadly", *numbered(6))))
     assert set(found) == {"deadly"}
     kind, sentence = found["deadly"]
     assert kind == "Killed"
     assert sentence.startswith("2 workers died on it, perhaps for lack of memory")
-    assert "300 MiB" in sentence
 
 
 @pytest.mark.slow
 def test_a_lost_scheduler_is_an_error_and_the_next_one_goes_on(tmp_path: Path) -> None:
     names = numbered(8)
     with RealCluster(tmp_path / "dask") as cluster:
-        engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+        engine = ClusterEngine(cluster_tasks.write, cluster.address)
         outcomes = engine.run(tasks_in(tmp_path, *names), lambda *_: None)
         next(outcomes)
         cluster.scheduler.kill()
@@ -226,7 +204,7 @@ def test_a_lost_scheduler_is_an_error_and_the_next_one_goes_on(tmp_path: Path) -
     kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("0??")}
     assert 0 < len(kept) < len(names)
     with RealCluster(tmp_path / "dask-2", workers=1) as cluster:
-        engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+        engine = ClusterEngine(cluster_tasks.write, cluster.address)
         assert not errors(run(engine, tasks_in(tmp_path, *names)))
     assert results(tmp_path).keys() >= set(names)
     assert all((tmp_path / name).stat().st_mtime_ns == kept[name] for name in kept)
@@ -235,7 +213,7 @@ def test_a_lost_scheduler_is_an_error_and_the_next_one_goes_on(tmp_path: Path) -
 def test_a_broken_connection_is_made_again(cluster: RealCluster, tmp_path: Path) -> None:
     names = numbered(8)
     with Relay(cluster.address) as relay:
-        engine = ClusterEngine(cluster_tasks.write, relay.address, task_bytes=MIB)
+        engine = ClusterEngine(cluster_tasks.write, relay.address)
         outcomes = engine.run(tasks_in(tmp_path, *names), lambda *_: None)
         done = [next(outcomes)]
         relay.break_connections()
@@ -250,14 +228,14 @@ def test_a_cluster_without_workers_is_given_up(tmp_path: Path) -> None:
         RealCluster(tmp_path / "dask", workers=0) as cluster,
         dask.config.set({"mp4ds.worker-timeout": "1 s"}),
     ):
-        engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+        engine = ClusterEngine(cluster_tasks.write, cluster.address)
         with pytest.raises(ClusterError, match="has had no worker for 1 s"):
             run(engine, tasks_in(tmp_path, "a"))
 
 
 def test_workers_may_come_late(tmp_path: Path) -> None:
     with RealCluster(tmp_path / "dask", workers=0) as cluster:
-        engine = ClusterEngine(cluster_tasks.write, cluster.address, task_bytes=MIB)
+        engine = ClusterEngine(cluster_tasks.write, cluster.address)
         timer = threading.Timer(1, cluster.add_worker)
         timer.start()
         assert not errors(run(engine, tasks_in(tmp_path, "a")))
@@ -270,7 +248,7 @@ def test_a_scheduler_that_was_lost_between_two_runs(tmp_path: Path) -> None:
         RealCluster(tmp_path / "dask", workers=1) as cluster,
         Connection(cluster.address, 1) as connection,
     ):
-        engine = ClusterEngine(cluster_tasks.write, connection, task_bytes=MIB)
+        engine = ClusterEngine(cluster_tasks.write, connection)
         assert not errors(run(engine, tasks_in(tmp_path, "a")))
         cluster.scheduler.kill()
         with pytest.raises(ClusterError, match="run the same command again to resume"):
@@ -288,7 +266,7 @@ def test_time_between_two_runs_is_no_waiting(tmp_path: Path) -> None:
         watch._empty_since = time.monotonic() - 60
         timer = threading.Timer(1, cluster.add_worker)
         timer.start()
-        engine = ClusterEngine(cluster_tasks.write, connection, task_bytes=MIB)
+        engine = ClusterEngine(cluster_tasks.write, connection)
         assert not errors(run(engine, tasks_in(tmp_path, "a")))
         timer.join()
 
@@ -305,7 +283,7 @@ def test_time_between_two_runs_is_no_waiting(tmp_path: Path) -> None:
 )
 def test_other_addresses_are_refused(address: str) -> None:
     with pytest.raises(OptionError, match=r"tcp://HOST:PORT .* slurm, pbs,"):
-        ClusterEngine(cluster_tasks.write, address, task_bytes=MIB)
+        ClusterEngine(cluster_tasks.write, address)
 
 
 @each(
@@ -319,7 +297,7 @@ def test_a_missing_package_is_named(
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(OptionError, match=rf"needs {package}.*pip install 'mp4ds\[cluster\]'"):
-        ClusterEngine(cluster_tasks.write, address, task_bytes=MIB)
+        ClusterEngine(cluster_tasks.write, address)
 
 
 @pytest.fixture
@@ -330,7 +308,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "tcp://no-such-host.invalid:8786"])
 def test_nobody_at_the_address(address: str, tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.write, address, task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.write, address)
     with pytest.raises(ClusterError, match="no Dask scheduler can be reached"):
         run(engine, tasks_in(tmp_path, "a"))
 
@@ -359,7 +337,7 @@ def test_another_server_at_the_address(says: bytes, problem: str, tmp_path: Path
         thread = threading.Thread(target=serve, args=(server,))
         thread.start()
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        engine = ClusterEngine(cluster_tasks.write, address, task_bytes=MIB)
+        engine = ClusterEngine(cluster_tasks.write, address)
         with pytest.raises(ClusterError, match=problem):
             run(engine, tasks_in(tmp_path, "a"))
         thread.join()
@@ -368,7 +346,7 @@ def test_another_server_at_the_address(says: bytes, problem: str, tmp_path: Path
 
 
 def test_tls_needs_certificates(tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.write, "tls://127.0.0.1:1", task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.write, "tls://127.0.0.1:1")
     with pytest.raises(OptionError, match="needs certificates"):
         run(engine, tasks_in(tmp_path, "a"))
 
@@ -382,7 +360,7 @@ def is_alive(pid: int) -> bool:
 
 
 def test_a_cluster_on_this_machine(tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.write, "local", task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.write, "local")
     assert not errors(run(engine, tasks_in(tmp_path, *numbered(4))))
     workers = {int(path.suffix.removeprefix(".by-")) for path in started(tmp_path)}
     assert os.getpid() not in workers
@@ -482,7 +460,7 @@ def batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Batch]:
 
 
 def test_jobs_of_a_batch_system_run_the_tasks(batch: Batch, tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.write, "slurm", task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.write, "slurm")
     with dask.config.set({"mp4ds.jobs": 2}):
         assert not errors(run(engine, tasks_in(tmp_path, *numbered(8))))
     assert len(batch.numbers("jobs")) == 2
@@ -490,7 +468,7 @@ def test_jobs_of_a_batch_system_run_the_tasks(batch: Batch, tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_there_are_not_more_jobs_than_tasks(batch: Batch, tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.write, "slurm", task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.write, "slurm")
     assert not errors(run(engine, tasks_in(tmp_path, "a")))
     assert len(batch.numbers("jobs")) == 1
 
@@ -501,7 +479,7 @@ def test_runs_of_one_connection_share_its_jobs(batch: Batch, tmp_path: Path) -> 
         assert batch.numbers("jobs") == []
         for folder, names in [("a", numbered(3)), ("b", numbered(2))]:
             (tmp_path / folder).mkdir()
-            engine = ClusterEngine(cluster_tasks.write, connection, task_bytes=MIB)
+            engine = ClusterEngine(cluster_tasks.write, connection)
             assert not errors(run(engine, tasks_in(tmp_path / folder, *names)))
         assert len(batch.numbers("jobs")) == 2
         assert batch.numbers("cancelled") == []
@@ -512,7 +490,7 @@ def test_a_job_that_ended_is_submitted_again(
     batch: Batch, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(access, "_LOOK_SECONDS", 0.5)
-    engine = ClusterEngine(cluster_tasks.write, "slurm", task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.write, "slurm")
     with dask.config.set({"mp4ds.jobs": 1}):
         outcomes = engine.run(tasks_in(tmp_path, *numbered(6)), lambda *_: None)
         done = [next(outcomes)]
@@ -525,7 +503,7 @@ def test_a_job_that_ended_is_submitted_again(
 
 def test_what_the_batch_system_refuses_is_told(batch: Batch, tmp_path: Path) -> None:
     (batch.folder / "refuse").touch()
-    engine = ClusterEngine(cluster_tasks.write, "slurm", task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.write, "slurm")
     with pytest.raises(ClusterError, match=r"could not be submitted.*invalid partition specified"):
         run(engine, tasks_in(tmp_path, "a", "b"))
 
@@ -540,14 +518,14 @@ def test_a_batch_system_that_is_not_there(system: str, tmp_path: Path) -> None:
         "scheduler-options": {"host": "127.0.0.1", "dashboard_address": ":0"},
     }
     named = {f"jobqueue.{system}.{name}": value for name, value in settings.items()}
-    engine = ClusterEngine(cluster_tasks.write, system, task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.write, system)
     with dask.config.set(named), pytest.raises(ClusterError, match="could not be submitted"):
         run(engine, tasks_in(tmp_path, "a"))
 
 
 @each("system", access.BATCH_SYSTEMS)
 def test_a_batch_system_that_is_not_set_up(system: str, tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.write, system, task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.write, system)
     with pytest.raises(OptionError, match=rf"`cluster` {system}: .*jobqueue.yaml"):
         run(engine, tasks_in(tmp_path, "a"))
 
@@ -560,6 +538,6 @@ def test_a_batch_system_that_is_not_set_up(system: str, tmp_path: Path) -> None:
 def test_settings_are_checked(
     name: str, value: object, variable: str, batch: Batch, tmp_path: Path
 ) -> None:
-    engine = ClusterEngine(cluster_tasks.write, "slurm", task_bytes=MIB)
+    engine = ClusterEngine(cluster_tasks.write, "slurm")
     with dask.config.set({name: value}), pytest.raises(OptionError, match=variable):
         run(engine, tasks_in(tmp_path, "a"))

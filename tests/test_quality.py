@@ -27,7 +27,7 @@ from mp4ds.packing.target import CrfControl, window_frames
 from mp4ds.plan import QualityTarget, parse_quality
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.info import info
-from mp4ds.video.libvmaf import find_ffmpeg, vmaf_bytes
+from mp4ds.video.libvmaf import find_ffmpeg
 from mp4ds.video.scores import largest_crf, vmaf_scores
 from round_trips import unpacked
 from scenes import Record, Scene, instant, scene, together
@@ -394,25 +394,6 @@ def test_vmaf_of_a_scene_at_rest(tmp_path: Path) -> None:
     found = quality_of(tmp_path / "dataset")
     assert (found.windows, found.limited) == (1, 1)
     assert 96 < found.mean < 98
-
-
-@needs_vmaf
-@pytest.mark.parametrize("threads", [1, 2])
-def test_the_memory_of_vmaf_is_not_underestimated(threads: int) -> None:
-    """Of a process of its own, which tells the most that its children took."""
-    code = f"""if True:
-        import resource
-        import numpy as np
-        from mp4ds.video.libvmaf import find_ffmpeg
-        from mp4ds.video.scores import vmaf_scores
-        luma = np.random.default_rng(0).integers(0, 255, (480, 640), np.uint8)
-        grey = np.full((240, 320), 128, np.uint8)
-        frames = [(np.roll(luma, n), grey, grey) for n in range(6)]
-        vmaf_scores(frames, frames, ffmpeg=find_ffmpeg(), threads={threads})
-        print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024)
-    """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert 0 < int(done.stdout) < vmaf_bytes(640, 480, threads)
 
 
 def test_without_libvmaf_it_is_said_how_to_get_it(

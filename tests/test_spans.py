@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mp4ds.packing.planning import cut_times, group_topics, share, spans_of
+from mp4ds.packing.planning import cut_times, share, spans_of
 
 TIMES = st.lists(
     st.lists(st.integers(-(2**62), 2**62) | st.integers(0, 50), min_size=1, max_size=80),
@@ -50,17 +50,6 @@ def test_another_camera_is_cut_where_the_busiest_rests() -> None:
 def test_a_clock_that_jumps_makes_no_endless_row_of_windows() -> None:
     times = np.concatenate([np.arange(0, 600, 10), 1_700_000_000 * 10**9 + np.arange(0, 600, 10)])
     assert len(cut_times([times], 30)) == 3
-
-
-@given(
-    st.dictionaries(st.text(min_size=1), st.integers(0, 1000), max_size=12), st.integers(1, 2000)
-)
-def test_groups_hold_every_topic_once_within_the_budget(costs: dict[str, int], budget: int) -> None:
-    groups = group_topics(costs, budget)
-    assert sorted(topic for group in groups for topic in group) == sorted(costs)
-    assert groups
-    for group in groups:
-        assert len(group) < 2 or sum(costs[topic] for topic in group) <= budget
 
 
 @given(st.integers(1, 20), st.integers(0, 50))

@@ -15,10 +15,7 @@ from coded_scenes import CODED
 from each import each, fresh
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from in_parts import InlineEngine, facts, leftovers
-from mp4ds.errors import OptionError
 from mp4ds.packing.options import PackOptions
-from mp4ds.packing.planning import TASK_BYTES
-from mp4ds.plugins.demo import demo
 from pictures import ENCODINGS, picture
 from round_trips import Compare, own_target, unpacked
 from scenes import Scene
@@ -29,8 +26,6 @@ INDEXED = [
     *("bag-none", "bag-lz4", "bag-bz2", "mcap-ros1-zstd", "mcap-ros2-lz4", "mcap-ros2-none"),
     *("rosbag2-mcap-v9", "rosbag2-mcap-split"),
 ]
-ONE_ENCODER = TASK_BYTES + 40 * 2**20
-"""Bytes that hold the encoder of either of the demo's cameras, not both."""
 
 
 @fresh
@@ -139,34 +134,6 @@ def test_a_lossy_profile(
             for n, frame in enumerate(stream)
         ]
     assert max(error) < 12
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("groups", [1, 2])
-def test_groups_of_cameras_and_one_without_images(
-    groups: int, tmp_path: Path, compare: Compare, engine: InlineEngine
-) -> None:
-    """Where the memory does not hold all encoders at once, cameras are packed apart."""
-    demo(tmp_path / "drive.bag", seconds=3)
-    memory = {1: None, 2: ONE_ENCODER}[groups]
-    mp4ds.pack(tmp_path / "drive.bag", tmp_path / "whole")
-    options = PackOptions(window=15, memory=memory)
-    mp4ds.pack(tmp_path / "drive.bag", tmp_path / "dataset", options)
-    parts = {name.partition("-")[2] for name in engine.ran if not name.startswith("source")}
-    assert parts == {str(number) for number in range(groups)}
-    assert facts(tmp_path / "dataset") == facts(tmp_path / "whole")
-    assert compare([tmp_path / "drive.bag"], unpacked(tmp_path, "bag")) == []
-
-
-def test_memory_for_less_than_one_encoder_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.undo()  # the engine is to be the usual one
-    demo(tmp_path / "drive.bag", seconds=3)
-    with pytest.raises(OptionError, match=r"`memory` of 50 MiB is too little: encoding"):
-        mp4ds.pack(
-            tmp_path / "drive.bag", tmp_path / "d", PackOptions(window=15, memory=50 * 2**20)
-        )
 
 
 def test_channels_that_cannot_be_told_apart(

@@ -108,7 +108,7 @@ _PANELS = {
         ),
     ),
     "Long jobs": (
-        *("jobs", "memory", "window", "cluster", "shard", "join", "keep_going", "restart"),
+        *("jobs", "window", "cluster", "shard", "join", "keep_going", "restart"),
         "threads",
     ),
 }

@@ -103,7 +103,6 @@ class Job:
         options: Those that determine the result.
         threads: Of each encoder.
         workers: Streams that a task encodes in parallel.
-        task_bytes: Memory of the largest task.
         survey: What all tasks agree on.
         tasks: In the order of their time.
         work: By topic, its messages and the cost of one, in any unit.
@@ -117,7 +116,6 @@ class Job:
     options: dict[str, Any]
     threads: int
     workers: int
-    task_bytes: int
     survey: Survey
     tasks: list[Task]
     work: dict[str, tuple[int, float]]
@@ -133,7 +131,6 @@ class Job:
             "options": self.options,
             "threads": self.threads,
             "workers": self.workers,
-            "task_bytes": self.task_bytes,
             "survey": self.survey.to_values(),
             "tasks": [asdict(task) for task in self.tasks],
             "work": self.work,
@@ -176,7 +173,7 @@ class Job:
             ValueError: Says what.
         """
         names = {task.name for task in self.tasks}
-        numbers = (self.threads, self.workers, self.task_bytes)
+        numbers = (self.threads, self.workers)
         if len(names) != len(self.tasks):
             raise ValueError("two tasks with the same name")
         paths = [*self.paths, *(source.path for source in self.sources)]
@@ -185,7 +182,7 @@ class Job:
         if any(not 0 <= (task.source or 0) < len(self.sources) for task in self.tasks):
             raise ValueError("a task of a file that is not in the recording")
         if not all(isinstance(number, int) and number > 0 for number in numbers):
-            raise ValueError("not a number of threads or bytes")
+            raise ValueError("not a number of threads")
         if max(self.threads, self.workers) > _MOST_THREADS:
             raise ValueError("too many threads")
         if set(self.options) != set(_OUTCOME_OPTIONS):

@@ -18,7 +18,6 @@ from mp4ds.options import (
     force,
     latched,
     option,
-    parse_size,
     start,
     topics,
 )
@@ -109,12 +108,11 @@ class PackOptions(SliceOptions):
         most=10_000_000,
     )
     jobs: int | None = option(
-        "Parallel processes; default: one per core.", None, "-j", least=1, most=1024
-    )
-    memory: int | None = option(
-        "Memory limit, such as 8G; default: half of the machine's memory.",
-        metavar="SIZE",
-        parse=parse_size,
+        "Parallel processes; default: one per core. Each holds the encoders of all cameras.",
+        None,
+        "-j",
+        least=1,
+        most=1024,
     )
     cluster: str | None = cluster()
     join: bool = option("Join the parts packed with --shard into the dataset.", False)

@@ -593,17 +593,13 @@ def _engine(runs: Sequence[PackRun], options: PackOptions) -> Engine:
     if options.cluster:
         from mp4ds.packing.work import run_task
 
-        engine: Engine = plugin("cluster")(run_task, options.cluster, task_bytes=_task_bytes(runs))
+        engine: Engine = plugin("cluster")(run_task, options.cluster)
         return engine
     from mp4ds.packing.engine import ProcessEngine
     from mp4ds.packing.work import command
 
     means = Resources.of(options)
     return ProcessEngine(command, min((means.slots(run.job) for run in runs), default=1))
-
-
-def _task_bytes(runs: Sequence[PackRun]) -> int:
-    return max((run.job.task_bytes for run in runs), default=0)
 
 
 def _paths(sources: Sequence[Path | str] | Path | str) -> list[Path]:

@@ -6,7 +6,6 @@ import asyncio
 import importlib
 import logging
 import queue
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -24,9 +23,6 @@ if TYPE_CHECKING:
     from dask_jobqueue import JobQueueCluster
     from distributed import Client, Future, LocalCluster
 
-_PATIENCE_SECONDS = 3.0
-_MIB = 2**20
-
 
 class TaskFailedError(Exception):
     """A task's error, as strings: the error itself may not survive pickling.
@@ -42,77 +38,19 @@ class TaskFailedError(Exception):
         super().__init__(kind, sentence)
 
 
-class Room:
-    """The memory of a worker, shared among its tasks.
-
-    Args:
-        size: Bytes.
-    """
-
-    def __init__(self, size: int) -> None:
-        self.size = size
-        self._taken = 0
-        self._changed = threading.Condition()
-
-    @contextmanager
-    def taken(self, count: int) -> Iterator[bool]:
-        """Reserve some of it.
-
-        Args:
-            count: Bytes.
-
-        Yields:
-            Whether it became free within a few seconds.
-        """
-        with self._changed:
-            has_room = self._changed.wait_for(
-                lambda: self._taken + count <= self.size, _PATIENCE_SECONDS
-            )
-            self._taken += count * has_room
-        try:
-            yield has_room
-        finally:
-            with self._changed:
-                self._taken -= count * has_room
-                self._changed.notify_all()
-
-
-def attempt(task: tuple[str, ...], *, function: Callable[..., None], task_bytes: int) -> None:
+def attempt(task: tuple[str, ...], *, function: Callable[..., None]) -> None:
     """Run a task in a thread of this worker.
-
-    If other tasks hold the worker's memory, it goes back to the scheduler, which reassigns it: a
-    task that waited here would block a thread, and would run even if no longer wanted.
 
     Args:
         task: The function's string arguments.
         function: What to call.
-        task_bytes: Memory that it takes.
 
     Raises:
-        TaskFailedError: It failed, or this worker is too small.
-        Reschedule: There is not enough memory now.
+        TaskFailedError: It failed.
     """
-    from distributed import Reschedule, get_worker
+    from distributed import get_worker
 
-    worker = get_worker()
-    limit: int | None = worker.memory_manager.memory_limit
-    if not limit:
-        return _call(function, task, worker.address)
-    if limit < task_bytes:
-        raise TaskFailedError(
-            "OptionError",
-            f"on worker {worker.address}: it has {limit // _MIB} MiB of memory, and a task takes "
-            f"up to {-(-task_bytes // _MIB)} MiB. Start workers with a larger --memory-limit.",
-        )
-    # Kept on the worker, since all its packs share its memory.
-    room: Room = vars(worker).setdefault("mp4ds_room", Room(limit))
-    with room.taken(task_bytes) as has_room:
-        if not has_room:
-            raise Reschedule
-        return _call(function, task, worker.address)
-
-
-def _call(function: Callable[..., None], task: tuple[str, ...], where: str) -> None:
+    where = get_worker().address
     try:
         function(*task)
     except MemoryError:
@@ -570,20 +508,16 @@ class ClusterEngine:
             batch system, as dask-jobqueue is configured, which are ended after the last task;
             ``local`` for workers on this machine. Or a connection, shared by several engines and
             runs.
-        task_bytes: Memory of a task; a worker runs as many in parallel as fit into its memory.
 
     Raises:
         OptionError: The address is none of these, or a package is missing.
     """
 
-    def __init__(
-        self, function: Callable[..., None], address: str | Connection, *, task_bytes: int
-    ) -> None:
+    def __init__(self, function: Callable[..., None], address: str | Connection) -> None:
         if isinstance(address, str):
             check_address(address)
         self._function = function
         self._address = address
-        self._task_bytes = task_bytes
 
     def run(
         self,
@@ -619,7 +553,6 @@ class ClusterEngine:
                 attempt,
                 list(some),
                 function=self._function,
-                task_bytes=self._task_bytes,
                 key=f"mp4ds-{self._function.__name__}",
                 pure=False,  # another run of the same tasks shares nothing with this one
             )
@@ -662,8 +595,8 @@ class ClusterEngine:
             return Outcome(task, (error.kind, error.sentence))
         if type(error).__name__ == "KilledWorker":
             said = (
-                f"{error.allowed_failures + 1} workers died on it, perhaps for lack of memory: it "
-                f"takes up to {-(-self._task_bytes // _MIB)} MiB. See their logs."
+                f"{error.allowed_failures + 1} workers died on it, perhaps for lack of memory. See "
+                "their logs."
             )
             return Outcome(task, ("Killed", said))
         lines = str(error.__cause__ or error).strip().splitlines() or [""]

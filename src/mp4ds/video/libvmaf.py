@@ -32,21 +32,6 @@ _MISSING = (
 )
 
 
-_BASE_BYTES = 60_000_000  # 58 were seen on a busy machine
-_PIXEL_BYTES, _THREAD_BYTES = 30, 55  # for each pixel; libvmaf holds pictures of floats
-
-
-def vmaf_bytes(width: int, height: int, threads: int) -> int:
-    """Upper estimate of the memory of a process that computes VMAF.
-
-    Args:
-        width: Columns of a frame.
-        height: Rows of a frame.
-        threads: Of libvmaf.
-    """
-    return _BASE_BYTES + width * height * (_PIXEL_BYTES + _THREAD_BYTES * threads)
-
-
 @dataclass(frozen=True)
 class Ffmpeg:
     """An ffmpeg that has libvmaf.

@@ -28,10 +28,9 @@ from mp4ds.plugins.evaluating.results import Cell
 from mp4ds.video.codecs import Recipe, recipe_for
 from mp4ds.video.encoder import VideoEncoder, tool_versions
 from mp4ds.video.images import png_file
-from mp4ds.video.libvmaf import Ffmpeg, find_ffmpeg, vmaf_bytes
+from mp4ds.video.libvmaf import Ffmpeg, find_ffmpeg
 from mp4ds.video.planes import PLANES_FORMAT, Planes, decoded_planes, packet_sizes, rgb_of
 from mp4ds.video.scores import Scorer, Scores, ScoreSummary
-from mp4ds.video.trial import encoder_bytes
 
 REFUSED = "refused"
 """Key of a result that says why the encoder refused the frames."""
@@ -92,20 +91,6 @@ def run_task(job: str) -> None:
     for outcome in ProcessEngine(command, 1).run([(job,)], lambda *_: None):
         if outcome.error is not None:
             raise Mp4dsError(outcome.error[1])
-
-
-def task_bytes(clip: Clip, settings: Sequence[Setting | None], threads: int) -> int:
-    """Upper estimate of the memory of the largest of some trials.
-
-    Args:
-        clip: What they encode.
-        settings: How.
-        threads: Of the encoder and of libvmaf.
-    """
-    size = clip.width, clip.height
-    encoders = [encoder_bytes(_recipe(clip, item), *size, threads) for item in settings if item]
-    # not all of an encoder's memory is released before frames are scored
-    return _PROCESS_BYTES + max(encoders, default=0) + vmaf_bytes(*size, threads)
 
 
 def versions_of(ffmpeg: Ffmpeg | None) -> dict[str, str]:
@@ -292,17 +277,13 @@ class Engines:
 
             self._connection = self._stack.enter_context(Connection(options.cluster, most))
 
-    def engine(self, task_bytes: int) -> Engine:
-        """An engine for trials.
-
-        Args:
-            task_bytes: Memory of the largest one.
-        """
+    def engine(self) -> Engine:
+        """An engine for trials."""
         if self._connection is None:
             return ProcessEngine(command, self._jobs)
         from mp4ds.plugins.cluster import ClusterEngine
 
-        return ClusterEngine(run_task, self._connection, task_bytes=task_bytes)
+        return ClusterEngine(run_task, self._connection)
 
     def __enter__(self) -> Engines:
         return self
@@ -416,7 +397,7 @@ class Trials:
             write_synced(job, self._trial(place, setting).to_json())
             tasks[(str(job),)] = setting
         on_done(len(found.keys() - {None}))
-        engine = self._engines.engine(task_bytes(place.clip, settings, self._threads))
+        engine = self._engines.engine()
         with closing(engine.run(list(tasks), lambda *_: None)) as outcomes:
             for outcome in outcomes:
                 setting = tasks[outcome.task]
