@@ -165,16 +165,23 @@ class Side:
             yield
 
 
+def alone_in_ros2(monkeypatch: pytest.MonkeyPatch) -> int:
+    """Keep ROS 2 to loopback, in a domain where no other test is, which is returned."""
+    domain = next(_DOMAINS)
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    for name in ("ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
+        monkeypatch.delenv(name, raising=False)
+    return domain
+
+
 @contextmanager
 def dds_side(monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
     """Cyclone DDS on loopback, in a domain where no other test is."""
     pytest.importorskip("cyclonedds")
     from mp4ds.plugins.publishing.dds import DdsPublisher
 
-    domain = next(_DOMAINS)
-    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
-    for name in ("ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
-        monkeypatch.delenv(name, raising=False)
+    domain = alone_in_ros2(monkeypatch)
     process = subprocess.Popen(
         [sys.executable, str(Path(__file__).with_name("dds_peer.py")), str(domain)],
         stdin=subprocess.PIPE,

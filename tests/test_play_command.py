@@ -20,11 +20,12 @@ import mp4ds
 from each import each
 from mp4ds.plugins.playing.play import PlayOptions, open_player
 from player_scenes import RecordingPublisher, make_drive, recorded
+from ros2_sides import alone_in_ros2
 from test_bad_input import call
 from waiting import WATCHDOG_S
 
 WAIT_S = WATCHDOG_S
-pytest.importorskip("foxglove")
+pytest.importorskip("cyclonedds")
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +39,9 @@ def command(*arguments: str | Path) -> list[str]:
     return [sys.executable, "-m", "mp4ds", "play", *map(str, arguments)]
 
 
-FOXGLOVE = ("--foxglove", "--port", "0")
+@pytest.fixture(autouse=True)
+def _ros2(monkeypatch: pytest.MonkeyPatch) -> None:
+    alone_in_ros2(monkeypatch)
 
 
 def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -108,16 +111,16 @@ def terminal(*arguments: str | Path) -> Iterator[Terminal]:
 
 
 def test_plays_and_tells(drive: Path) -> None:
-    done = run(drive, *FOXGLOVE, "-r", "5", "--json")
+    done = run(drive, "--ros2", "-r", "5", "--json")
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     assert result["messages"] == {"/tf": 40, "/tf_static": 2, "/camera/image_raw": 20}
     assert not result["stopped"]
-    assert re.search(r"publishing to ws://127.0.0.1:\d+", done.stderr)
+    assert re.search(r"publishing to ROS 2, domain \d+", done.stderr)
 
 
 def test_keys(drive: Path) -> None:
-    with terminal(drive, *FOXGLOVE, "--pause", "--topics", "/camera/*") as shown:
+    with terminal(drive, "--ros2", "--pause", "--topics", "/camera/*") as shown:
         shown.until("1x paused · 0 messages")
         shown.press(b"\x1b[C")
         shown.until("1 messages")
@@ -138,7 +141,7 @@ def test_keys(drive: Path) -> None:
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_signals(drive: Path, number: signal.Signals, code: int) -> None:
     """Ctrl-C ends with 0, as `ros2 bag play` does."""
-    with terminal(drive, *FOXGLOVE, "-r", "0.2") as shown:
+    with terminal(drive, "--ros2", "-r", "0.2") as shown:
         shown.until(r"0\.2x playing · [1-9]")
         os.kill(shown.process.pid, number)
         assert shown.end() == code
@@ -151,28 +154,26 @@ def test_signals(drive: Path, number: signal.Signals, code: int) -> None:
     [
         (["{}", "--ros1", "--ros2"], 2, "--ros1 contradicts --ros2"),
         (["{}", "--ros2", "-s", "3"], 2, "to start later, use --start-offset"),
-        (["{}", "--foxglove", "--log-level", "loud"], 2, "--log-level 'loud'"),
-        (["{}", "--foxglove", "--publish-service-requests"], 2, "services are not called"),
-        (["{}", "--foxglove", "--wait-for-all-acked", "5"], 2, "needs --ros2"),
-        (["{}", "--foxglove", "--queue", "5"], 2, "needs --ros1"),
-        (["{}", "--foxglove", "--rate-control-topic", "/a"], 2, "needs --ros1"),
-        (["{}", "--foxglove", "--topics"], 2, "--topics requires an argument"),
+        (["{}", "--ros2", "--log-level", "loud"], 2, "--log-level 'loud'"),
+        (["{}", "--ros2", "--publish-service-requests"], 2, "services are not called"),
+        (["{}", "--ros1", "--wait-for-all-acked", "5"], 2, "needs --ros2"),
+        (["{}", "--ros2", "--queue", "5"], 2, "needs --ros1"),
+        (["{}", "--ros2", "--rate-control-topic", "/a"], 2, "needs --ros1"),
+        (["{}", "--ros2", "--topics"], 2, "--topics requires an argument"),
         (
-            ["{}", "--foxglove", "--ros-args", "-r", "__node:=a/b"],
+            ["{}", "--ros2", "--ros-args", "-r", "__node:=a/b"],
             2,
             "'a/b' is not a valid node name",
         ),
-        (["{}", "--foxglove", "--rate", "0"], 2, "--rate 0 is not greater than 0"),
-        (["{}", "--foxglove", "--topics", "/none"], 2, "matches no topic"),
-        (["{}", "--foxglove", "--qos-profile-overrides-path", "x"], 2, "needs --ros2"),
-        (["{}", "--foxglove", "--resize", "big"], 2, "--resize 'big' is not a size"),
-        (["{}/none", "--foxglove"], 2, "none"),
-        (["{}", "--foxglove", "--lock-step", "/odom"], 2, "--foxglove"),
-        (["{}", "--foxglove", "--follow-clock"], 2, "--foxglove"),
+        (["{}", "--ros2", "--rate", "0"], 2, "--rate 0 is not greater than 0"),
+        (["{}", "--ros2", "--topics", "/none"], 2, "matches no topic"),
+        (["{}", "--ros1", "--qos-profile-overrides-path", "x"], 2, "needs --ros2"),
+        (["{}", "--ros2", "--resize", "big"], 2, "--resize 'big' is not a size"),
+        (["{}/none", "--ros2"], 2, "none"),
     ],
 )
 def test_errors_are_sentences(drive: Path, arguments: list[str], code: int, words: str) -> None:
-    done = call("play", *(argument.format(drive) for argument in arguments), "--port", "0")
+    done = call("play", *(argument.format(drive) for argument in arguments))
     assert done.code == code, done.err
     assert words in done.err
     assert "Traceback" not in done.err

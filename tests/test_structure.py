@@ -90,7 +90,6 @@ HOMES = {
     "rospy": ("plugins/publishing",),
     "rclpy": ("plugins/publishing", "plugins/recording"),
     "cyclonedds": ("plugins/publishing", "plugins/recording"),
-    "foxglove": ("plugins/publishing",),
     "pyarrow": ("plugins/exporting",),
     "yaml": ("yamlio.py", "bags", "plugins/publishing"),
     "pydantic": ("format", "dataset/checks.py"),

@@ -27,13 +27,14 @@ import typer
 
 from each import each
 from mp4ds.cli import app_for, play_words, record_words
+from ros2_sides import alone_in_ros2
 from test_examples import ROOT
 from waiting import WATCHDOG_S
 
 DOCS = ROOT / "docs"
 PAGES = sorted((DOCS / "tutorials").glob("*.md"))
 OTHERS = [DOCS / "exporting.md", DOCS / "hub.md"]
-NEEDS = {"--foxglove": "foxglove", "mp4ds.torch": "torch"}
+NEEDS = {"--ros2": "cyclonedds", "mp4ds.torch": "torch"}
 """What a line needs beside the package -> the module of it; the page is skipped without."""
 
 # a demonstration as long as these tests can afford
@@ -127,6 +128,7 @@ def assert_printed(said: str, printed: str) -> None:
 @each("page", [*PAGES, *OTHERS], ids=lambda page: page.stem, one_in=3)
 def test_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    alone_in_ros2(monkeypatch)
     blocks = blocks_of(page)
     for text, module in NEEDS.items():
         if any(text in block.text for block in blocks) and find_spec(module) is None:

@@ -8,7 +8,7 @@ The public API, and nothing else::
     mp4ds.export("drive", "euroc", "for_slam")  EuRoC, TUM, COLMAP, LeRobot
     mp4ds.evaluate("drive.mcap").recommended     encoder settings, tried on clips
     mp4ds.report("drive")                       a page with its cameras, timing and calibrations
-    mp4ds.play("drive")                         publishes to ROS 1, ROS 2 or Foxglove
+    mp4ds.play("drive")                         publishes to ROS 1 or ROS 2
     mp4ds.record(["/imu", "/cam*/*"], "drive")  a live robot -> dataset
     mp4ds.validate("drive", deep=True)          every problem, or an empty list
     mp4ds.open("drive")["/camera/image_raw"][7].data

@@ -33,7 +33,7 @@ COMMANDS = {
     ),
     "play": (
         "play",
-        "Play back datasets, publishing to ROS 1, ROS 2 or Foxglove.",
+        "Play back datasets, publishing to ROS 1 or ROS 2.",
     ),
     "record": (
         "record",

@@ -91,22 +91,7 @@ _PANELS = {
             "custom_data",
         ),
     ),
-    "Where": (
-        *(
-            "output",
-            "to",
-            "ros1",
-            "ros2",
-            "foxglove",
-            "force",
-            "remap",
-            "prefix",
-            "host",
-            "port",
-            "origins",
-            "serve",
-        ),
-    ),
+    "Where": (*("output", "to", "ros1", "ros2", "force", "remap", "prefix", "port", "serve"),),
     "Long jobs": (
         *("jobs", "window", "cluster", "shard", "join", "keep_going", "restart"),
         "threads",

@@ -159,9 +159,6 @@ def play(
     ros2: Annotated[
         bool, typer.Option("--ros2", help="Publish to ROS 2, with rclpy or else Cyclone DDS.")
     ] = False,
-    foxglove: Annotated[
-        bool, typer.Option("--foxglove", help="Serve to Foxglove, over a WebSocket.")
-    ] = False,
     clock: Annotated[
         bool,
         typer.Option(
@@ -194,7 +191,7 @@ def play(
     ] = True,
     as_json: JsonFlag = False,
 ) -> None:
-    """Play back datasets, publishing to ROS 1, ROS 2 or Foxglove.
+    """Play back datasets, publishing to ROS 1 or ROS 2.
 
     Keys: space pauses or resumes, right and left publish the next or previous message, up and down
     play faster or slower.
@@ -213,7 +210,7 @@ def play(
                 f"`storage` {storage!r} is not {' or '.join(STORAGES)}. With --ros2, -s means "
                 "--storage; to start later, use --start-offset."
             )
-        kinds = {"ros1": ros1, "ros2": ros2, "foxglove": foxglove}
+        kinds = {"ros1": ros1, "ros2": ros2}
         chosen = [name for name, on in kinds.items() if on]
         if len(chosen) > 1:
             raise OptionError(f"--{chosen[0]} contradicts --{chosen[1]}.")

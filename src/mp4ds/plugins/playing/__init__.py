@@ -1,1 +1,1 @@
-"""Plays datasets back, to ROS 1, ROS 2 or Foxglove."""
+"""Plays datasets back, to ROS 1 or ROS 2."""

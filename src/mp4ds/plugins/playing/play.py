@@ -1,4 +1,4 @@
-"""Play datasets back to ROS 1, ROS 2 or Foxglove, at the recorded times."""
+"""Play datasets back to ROS 1 or ROS 2, at the recorded times."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mp4ds.options import (
 from mp4ds.plugins.playing.player import Player, PlayerOptions, PlayProgress, PlaySummary
 from mp4ds.plugins.playing.timeline import Names, Timeline, Wanted
 from mp4ds.plugins.publishing.names import PLAIN, NodeNames
-from mp4ds.plugins.publishing.publisher import WORLDS, Publisher, open_publisher, sourced
+from mp4ds.plugins.publishing.publisher import Publisher, open_publisher, sourced
 from mp4ds.unpacking.pictures import Reduction
 
 KINDS = {"raw": "raw", "compressed": "jpeg", "ffmpeg": "ffmpeg"}
@@ -40,7 +40,7 @@ _CLOCK = "/clock"
 class PlayOptions(Options):
     """How to play datasets back."""
 
-    to: str | None = option("ros1, ros2 or foxglove; default: the ROS that is sourced.")
+    to: str | None = option("ros1 or ros2; default: the ROS that is sourced.")
     rate: float = option("Playback rate; 2 is twice as fast.", 1.0, "-r")
     start_offset: float = option(
         "Start this many seconds into the recording.", 0.0, "--start-offset", "--start", "-s"
@@ -128,16 +128,6 @@ class PlayOptions(Options):
     lock_step: str = option(
         "Publish the next frame only after a message on this topic.", "", metavar="TOPIC"
     )
-    host: str = option("Address to listen on (Foxglove).", "127.0.0.1")
-    port: int = option(
-        "Port to listen on (Foxglove); 0 picks a free one.", 8765, least=0, most=65535
-    )
-    origins: Sequence[str] = option(
-        "Also let this web site connect, such as http://robot:8080 (Foxglove).",
-        (),
-        "--allow-origin",
-        metavar="URL",
-    )
     names: NodeNames = argument("Name, namespace and remappings of the ROS node.", PLAIN)
 
 
@@ -187,7 +177,7 @@ def open_player(
     chosen = options or PlayOptions()
     _check(chosen)
     kind = chosen.to or ("" if publisher else sourced())
-    world = publisher.world if publisher else WORLDS.get(kind)
+    world = publisher.world if publisher else kind
     chosen = replace(chosen, names=chosen.names.in_world(world))
     places = datasets_in(datasets)
     with ExitStack() as stack:
@@ -240,10 +230,6 @@ def _opened(kind: str, chosen: PlayOptions, timeline: Timeline) -> Publisher:
         qos_overrides=chosen.qos_overrides,
         parting_s=None if patience is None else patience / 1000 or math.inf,
         queue_size=chosen.queue,
-        host=chosen.host,
-        origins=chosen.origins,
-        port=chosen.port,
-        span=(timeline.start_ns, timeline.end_ns),
         is_paced=not chosen.immediate,
     )
 

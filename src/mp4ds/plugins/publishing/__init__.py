@@ -1,1 +1,1 @@
-"""Publishers for ROS 1, ROS 2 and Foxglove. Only this package and `recording` import them."""
+"""Publishers for ROS 1 and ROS 2. Only this package and `recording` import them."""

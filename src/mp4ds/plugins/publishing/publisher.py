@@ -1,9 +1,9 @@
-"""What ROS 1, ROS 2 and Foxglove publishers have in common, and how to open one."""
+"""What ROS 1 and ROS 2 publishers have in common, and how to open one."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Protocol
@@ -14,7 +14,7 @@ from mp4ds.records import Channel
 
 
 class Controls(Protocol):
-    """Remote controls of a player, for services, a web page or keys; called from any thread."""
+    """Remote controls of a player, for services or keys; called from any thread."""
 
     @property
     def is_paused(self) -> bool:
@@ -74,7 +74,7 @@ class Publisher(Protocol):
     """Publishes messages. A context manager; used by one thread.
 
     Attributes:
-        world: What messages are to be converted to: ``ros1``, ``ros2``; None: as recorded.
+        world: What messages are to be converted to: ``ros1`` or ``ros2``; None: as recorded.
     """
 
     world: str | None
@@ -152,18 +152,17 @@ class Publisher(Protocol):
 
 # ---------------------------------------------------------------- opening
 
-WORLDS: Mapping[str, str | None] = {"ros1": "ros1", "ros2": "ros2", "foxglove": None}
-"""Kinds of publishers -> what messages are converted to; None: as recorded."""
+WORLDS = ("ros1", "ros2")
+"""What can be published to."""
 
 _PATIENCE_S = 2.0
 
 
-def sourced(command: str = "play", others: str = " or `foxglove`") -> str:
+def sourced(command: str = "play") -> str:
     """Which ROS is sourced: ``ros1`` or ``ros2``.
 
     Args:
         command: The command, for the error.
-        others: Other choices than ROS, for the error.
 
     Raises:
         PublishError: Neither is.
@@ -177,7 +176,7 @@ def sourced(command: str = "play", others: str = " or `foxglove`") -> str:
     raise PublishError(
         command,
         "no ROS is sourced: source its setup file, or choose `ros1`, `ros2` (works without ROS "
-        f"after pip install 'mp4ds[dds]'){others}",
+        "after pip install 'mp4ds[dds]')",
     )
 
 
@@ -188,10 +187,6 @@ def open_publisher(
     qos_overrides: Path | None = None,
     parting_s: float | None = None,
     queue_size: int = 0,
-    host: str = "127.0.0.1",
-    port: int = 8765,
-    origins: Sequence[str] = (),
-    span: tuple[int, int] | None = None,
     is_paced: bool = True,
 ) -> Publisher:
     """Open a publisher.
@@ -203,16 +198,12 @@ def open_publisher(
         parting_s: How long to wait at the end for acknowledgements (ROS 2); None for 3 s.
         queue_size: Messages that may wait for each subscriber of a topic (ROS 1); 0 for any
             number, up to `MAX_BYTES`.
-        host: Address to listen on (Foxglove).
-        port: Port to listen on (Foxglove).
-        origins: Web sites that may connect (Foxglove).
-        span: Log times of the first and the last message, nanoseconds.
         is_paced: Whether messages are published at their times; if not, the ROS 1 publisher waits
             for slow subscribers.
 
     Raises:
         OptionError: There is no such kind, or the file of QoS profiles is not valid.
-        PublishError: Something is missing: a library, a master, a free port.
+        PublishError: Something is missing: a library or a master.
     """
     if kind not in WORLDS:
         raise OptionError(f"cannot publish to {kind!r}. Use {', '.join(WORLDS)}.")
@@ -224,10 +215,6 @@ def open_publisher(
         # limited by bytes, as a hundred small messages last for a moment only
         wait_s = 0.0 if is_paced else _PATIENCE_S
         return RospyPublisher(names=names, queue_size=queue_size, wait_s=wait_s)
-    if kind == "foxglove":
-        from mp4ds.plugins.publishing.foxglove import FoxglovePublisher
-
-        return FoxglovePublisher(host=host, port=port, origins=origins, span=span)
     from mp4ds.plugins.publishing.ros2_writers import load_overrides
 
     overrides = load_overrides(qos_overrides) if qos_overrides is not None else {}

@@ -260,7 +260,7 @@ def open_recorder(
     is_all = chosen.all or chosen.all_topics or chosen.all_services
     if not (topics or is_all or chosen.regex or chosen.topic_types):
         raise OptionError("Name topics, or give `all`, `regex` or `topic_types`.")
-    kind = source.profile if source else chosen.to or sourced("record", "")
+    kind = source.profile if source else chosen.to or sourced("record")
     names = chosen.names.in_world(kind)
     wanted = Wanted(
         topics,
