@@ -401,7 +401,7 @@ def test_errors_of_other_commands_say_where_the_damage_is(dataset: Path, tmp_pat
         "validate --deep` finds all damage, and `mp4ds unpack --salvage` restores"
     )
     with pytest.raises(FormatError, match=words):
-        mp4ds.export(dataset, "kitti", tmp_path / "export")
+        mp4ds.export(dataset, "euroc", tmp_path / "export")
     words = r"frame (\d) of /left/image_raw \(stamp \d+\.\d{9}, log time \d+\.\d{9}\): "
     play = mp4ds.PlayOptions(immediate=True)
     publisher = RecordingPublisher(world="ros1")

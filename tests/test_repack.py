@@ -223,7 +223,7 @@ def test_a_changed_sidecar_is_not_unpacked(
     with pytest.raises(mp4ds.FormatError, match=f"{changed}.*manifest"):
         mp4ds.unpack(tmp_path / "changed", to, tmp_path / "again", options)
     with pytest.raises(mp4ds.FormatError, match=f"{changed}.*manifest"):
-        mp4ds.export(tmp_path / "changed", "kitti", tmp_path / "again")
+        mp4ds.export(tmp_path / "changed", "euroc", tmp_path / "again")
     assert not (tmp_path / "again").exists()
 
 
