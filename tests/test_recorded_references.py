@@ -461,7 +461,7 @@ def test_damage_is_told_as_such(packed: Path, tmp_path: Path) -> None:
     assert "references-invalid" not in codes
     with (
         closing(Stream(path)) as stream,
-        pytest.raises(FormatError, match=r"frame 17 is damaged") as raised,
+        pytest.raises(FormatError, match=r"frame 17 of /cam/image_raw .*: is damaged") as raised,
     ):
         stream.get([17])
     assert raised.value.code == "decode-failed"

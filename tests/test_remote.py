@@ -315,7 +315,7 @@ def test_a_slice_fetches_what_is_in_it(
     start, end = int(times[30]), int(times[36])
     folder = tmp_path / "there" if name == "dataset" else large
     with web_server(folder) as web:
-        span = PackOptions(start=str(start), end=str(end))
+        span = PackOptions(start=str(start), end=str(end), latched=False)
         mp4ds.pack(f"{web.url}/{name}", tmp_path / "slice", span)
         names = ["image_raw.mp4"] if name == "dataset" else [name]
         fetched = sum(covered(web.fetched(ending)) for ending in names)

@@ -78,8 +78,8 @@ def test_one_of_a_kind_is_singular(tmp_path: Path) -> None:
     assert "not supported by this format: attachments (2)\n" in done.out
 
 
-def test_progress_without_a_total(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of one video, nobody has counted the messages."""
+def test_progress_of_a_single_video(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its frames are its messages."""
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.setattr(progress, "_LINE_PAUSE", 0)
     err = io.StringIO()
@@ -90,7 +90,7 @@ def test_progress_without_a_total(dataset: Path, monkeypatch: pytest.MonkeyPatch
         pytest.raises(SystemExit),
     ):
         app_for()(list(map(str, words)))
-    assert re.search(r"unpacking: \d+ messages", err.getvalue())
+    assert re.search(r"unpacking: \d+ of \d+ messages", err.getvalue())
     assert "?" not in err.getvalue()
 
 

@@ -18,7 +18,6 @@ import pytest
 import mp4ds
 from mp4ds.cli import app_for
 from mp4ds.cli.progress import progress_of
-from ros2_sides import alone_in_ros2
 from scenes import Scene
 from sources import scene, write_mcap
 
@@ -88,7 +87,6 @@ COMMANDS = {
     "frames": "frames DATASET -t TOPIC --at #1 -o OUT.png",
     "evaluate": "evaluate RECORDING -o OUT --codecs x264 --frames 4 --crf 30 --presets ultrafast "
     "--target psnr_y=20 --jobs 1",
-    "play": "play DATASET --ros2 --rate 100 --disable-keyboard-controls",
 }
 
 
@@ -102,9 +100,6 @@ COMMANDS = {
 def test_topics_steer_no_terminal(
     name: str, recording: Path, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if name == "play":
-        pytest.importorskip("cyclonedds")
-        alone_in_ros2(monkeypatch)
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.setenv("COLUMNS", "200")
     places = {"RECORDING": recording, "DATASET": dataset, "TOPIC": TITLE}
