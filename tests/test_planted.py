@@ -163,6 +163,12 @@ def _recipe(values: Any) -> dict[str, Any]:
     return recipe
 
 
+def _key(values: Any) -> dict[str, Any]:
+    (decisions,) = values["survey"]["decisions"].values()
+    key: dict[str, Any] = decisions[0]["key"]
+    return key
+
+
 PLANTED: dict[str, Callable[[Any], object]] = {
     "absolute": _set("tasks", 1, "name", "/VICTIM"),
     "above": _set("tasks", 1, "name", "../../victim"),
@@ -178,6 +184,8 @@ PLANTED: dict[str, Callable[[Any], object]] = {
     "threads": _set("threads", 10**9),
     "options": lambda values: values["options"].pop("salvage"),
     "work": _set("work", {"/cam": "x"}),
+    "key": lambda values: _key(values).update(encoding=[]),
+    "size": lambda values: _key(values).update(width="7"),
     "source": lambda values: values["sources"][0].update(path=[]),
     "nothing": lambda values: values.clear() or values.update(x=1),
 }

@@ -82,12 +82,16 @@ class Survey:
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> Survey:
-        """The survey that `to_values` was called on."""
+        """The survey that `to_values` was called on.
+
+        Raises:
+            ValueError: No survey has such values; nor where another error is raised.
+        """
         return cls(
             {
                 int(channel): [
                     Decision(
-                        StreamKey(**item["key"]),
+                        _key_of(item["key"]),
                         [plan_from_values(plan) for plan in item["plans"]],
                         item["refusal"],
                     )
@@ -97,6 +101,14 @@ class Survey:
             },
             {int(info): image for info, image in values["pairs"].items()},
         )
+
+
+def _key_of(values: Mapping[str, Any]) -> StreamKey:
+    for name, value in values.items():
+        is_number = name in ("width", "height", "step", "is_bigendian")
+        if not isinstance(value, int if is_number else str):
+            raise ValueError(f"{name} {value!r} of a stream's images")
+    return StreamKey(**values)
 
 
 def rate_of(reader: BagReader, channel: Channel) -> float | None:
