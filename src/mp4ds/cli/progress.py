@@ -442,7 +442,7 @@ class ProgressWriter(Protocol):
     """Tells of a job in lines."""
 
     def take(self, state: PackProgress) -> None:
-        """Take what is told, and tell it if it is time to."""
+        """Take a report, and show it if one is due."""
 
     def tick(self) -> None:
         """Tell what is due though nothing is heard."""
