@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+import gc
 import json
+import os
 import random
 import signal
 import subprocess
@@ -11,7 +13,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,19 @@ LOOPBACK = (
     "</Discovery></Domain></CycloneDDS>"
 )
 STORE = get_typestore(Stores.ROS2_JAZZY)
-# each once in a process: publishers of an earlier test live until the garbage collector finds them
-_DOMAINS = cycle(random.SystemRandom().sample(range(200), 200))
+
+
+def _domains() -> Iterator[int]:
+    """Domains of this process of pytest, none of which another one draws, in any order."""
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:])
+    own = range(worker, 200, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
+    while True:
+        # publishers of an earlier test live until the garbage collector finds them
+        gc.collect()
+        yield from random.SystemRandom().sample(own, len(own))
+
+
+_DOMAINS = _domains()
 KINDS = (
     "std_msgs/msg/Header",
     "std_msgs/msg/String",
