@@ -30,7 +30,7 @@ from fuzz_records import (
 from fuzz_rules import BrokenRuleError, check_dataset, check_recording
 from in_parts import InlineEngine
 from mp4ds import Mp4dsError
-from mp4ds.packing.manifest import PartRecord
+from mp4ds.packing.manifest import PartFacts
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.workplace import Workplace
 from scenes import Scene
@@ -237,7 +237,7 @@ def _check_work(folder: Path, out: Path, rng: random.Random, *, source: Path) ->
         if job is not None:
             [place.is_done(task) for task in job.tasks]
     with suppress(Mp4dsError):
-        PartRecord.load(place.parts / "00000-0")
+        PartFacts.load(place.parts / "00000-0")
     if rng.random() < 0.25:
         _pack(source, out / "drive", InlineEngine())
         if problems := mp4ds.validate(out / "drive", deep=True):

@@ -18,6 +18,7 @@ from coded_scenes import CODED
 from damage import Key, all_messages, pieces_of
 from each import each, fresh
 from mp4ds import FormatError, OptionError, SourceError, UnpackOptions
+from mp4ds.errors import VideoError
 from mp4ds.plugins.playing.play import open_player
 from mp4ds.records import Loss
 from player_scenes import RecordingPublisher
@@ -55,6 +56,18 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def dataset(packed: tuple[Path, Path], tmp_path: Path) -> Path:
     """The dataset, to be damaged."""
     return Path(shutil.copytree(packed[1], tmp_path / "dataset"))
+
+
+def test_an_error_of_a_frame_beyond_the_sidecar(packed: tuple[Path, Path]) -> None:
+    """A damaged video may seem to have more frames than were recorded."""
+    with mp4ds.open(packed[1]) as opened:
+        stream = opened.streams[0]
+        path = stream.video_path
+        with (
+            pytest.raises(VideoError, match=f"frame {FRAMES} was not found"),
+            stream.naming_frames(),
+        ):
+            raise VideoError("decode-failed", path, "was not found", frame=len(stream))
 
 
 def file_of(dataset: Path, name: str) -> Path:

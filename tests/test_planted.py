@@ -157,9 +157,14 @@ def _set(*path: object) -> Callable[[Any], None]:
     return change
 
 
-def _recipe(values: Any) -> dict[str, Any]:
+def _plan(values: Any) -> dict[str, Any]:
     (decisions,) = values["survey"]["decisions"].values()
-    recipe: dict[str, Any] = decisions[0]["plans"][0]["recipe"]
+    plan: dict[str, Any] = decisions[0]["plans"][0]
+    return plan
+
+
+def _recipe(values: Any) -> dict[str, Any]:
+    recipe: dict[str, Any] = _plan(values)["recipe"]
     return recipe
 
 
@@ -181,6 +186,7 @@ PLANTED: dict[str, Callable[[Any], object]] = {
     "stats": lambda values: _recipe(values)["options"].update(stats="VICTIM"),
     "encoder": lambda values: _recipe(values).update(encoder="rawvideo"),
     "lossy": lambda values: _recipe(values)["options"].update(qp="30"),
+    "profile": lambda values: _plan(values).update(profile={}),
     "threads": _set("threads", 10**9),
     "options": lambda values: values["options"].pop("salvage"),
     "work": _set("work", {"/cam": "x"}),

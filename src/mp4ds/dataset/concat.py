@@ -36,10 +36,10 @@ from mp4ds.format.manifest import (
     FileEntry,
     LossEntry,
     Manifest,
-    StaticTransform,
     StreamEntry,
     TimeRange,
     Verbatim,
+    static_transforms,
 )
 from mp4ds.format.models import (
     ChannelModel,
@@ -70,7 +70,7 @@ def concat(
     selected: Callable[[str], bool] = lambda _: True,
     changes: dict[str, Any] | None = None,
     report: Callable[[str], None] = lambda _: None,
-) -> Manifest:
+) -> tuple[Manifest, list[StreamSidecar]]:
     """Make one dataset of several that follow one another, or a copy of one or of a part of it.
 
     All that is read is checked: whole files against their manifest, what is cut out of a file
@@ -89,7 +89,7 @@ def concat(
         report: Called with the name of each file when it is begun, perhaps in another thread.
 
     Returns:
-        The new manifest, already written.
+        The new manifest and sidecars, already written.
 
     Raises:
         Refused: It cannot be copied; says why. Nothing was written.
@@ -300,7 +300,7 @@ class _Concat:
                     next_id += 1
                 self._channels[number, channel.id] = same
 
-    def write(self, changes: dict[str, Any]) -> Manifest:
+    def write(self, changes: dict[str, Any]) -> tuple[Manifest, list[StreamSidecar]]:
         """Write all files, the manifest last."""
         parts = self._parts
         for part in parts:
@@ -355,7 +355,7 @@ class _Concat:
             }
         )
         (self._folder / MANIFEST_NAME).write_bytes(dump_document(manifest))
-        return manifest
+        return manifest, [sidecar for _, sidecar in made]
 
     def _verbatim(self) -> list[Verbatim]:
         """Camera messages in messages.mcap, by topic and reason."""
@@ -445,19 +445,6 @@ class _Concat:
                     yield message.of_channel(self._channels[number, message.channel.id])
 
         return heapq.merge(*map(messages, chains), key=_time_of)
-
-
-def static_transforms(
-    sidecars: Iterable[StreamSidecar], known: Iterable[Transform]
-) -> list[StaticTransform]:
-    """The transforms between the coordinate frames of all images and calibrations."""
-    frame_ids: set[str] = set()
-    for sidecar in sidecars:
-        frame_ids.update(header.frame_id for header in sidecar.headers)
-        if sidecar.camera_info:
-            frame_ids.update(item.frame_id for item in sidecar.camera_info.calibrations)
-    found = TransformCollector(known).between(frame_ids)
-    return list(map(StaticTransform.from_record, found))
 
 
 def _identity_of(channel: ChannelModel) -> _Identity:

@@ -239,7 +239,8 @@ class Frames(ABC):
         try:
             yield
         except FormatError as error:
-            if error.frame is None or error.name:
+            # a damaged video may have more frames than its sidecar
+            if error.frame is None or error.name or error.frame >= len(self.stamps):
                 raise
             raise self.named(error, error.frame) from None
 

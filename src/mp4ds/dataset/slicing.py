@@ -142,4 +142,7 @@ def copy_part(
         "sources": [source.within(span) for source in old.sources],
         "derived_from": [*old.derived_from, earlier],
     }
-    return concat([dataset], folder, span=span, latched=latched, selected=selected, changes=changes)
+    manifest, _ = concat(
+        [dataset], folder, span=span, latched=latched, selected=selected, changes=changes
+    )
+    return manifest

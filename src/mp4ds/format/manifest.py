@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, model_validator
 
 from mp4ds import records
 from mp4ds.format.fields import Count, FileName, Model, Profile, Sha256, Size, Time, Version
-from mp4ds.messages.transforms import MAX_TRANSFORMS, Transform
+from mp4ds.format.models import StreamSidecar
+from mp4ds.messages.transforms import MAX_TRANSFORMS, Transform, TransformCollector
 from mp4ds.records import MAX_LOSSES, MAX_LOST_TOPICS, Loss
 
 
@@ -249,3 +251,16 @@ class Manifest(Model):
             if twice:
                 raise ValueError(f"{what} {twice[0]} is listed twice")
         return self
+
+
+def static_transforms(
+    sidecars: Iterable[StreamSidecar], known: Iterable[Transform]
+) -> list[StaticTransform]:
+    """The transforms between the coordinate frames of all images and calibrations."""
+    frame_ids: set[str] = set()
+    for sidecar in sidecars:
+        frame_ids.update(header.frame_id for header in sidecar.headers)
+        if sidecar.camera_info:
+            frame_ids.update(item.frame_id for item in sidecar.camera_info.calibrations)
+    found = TransformCollector(known).between(frame_ids)
+    return list(map(StaticTransform.from_record, found))

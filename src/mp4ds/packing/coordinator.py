@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from mp4ds.bags.protocols import BagReader
+from mp4ds.dataset.concat import concat
+from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import (
     FormatError,
     OptionError,
@@ -22,23 +27,27 @@ from mp4ds.errors import (
     path_text,
 )
 from mp4ds.files.outputs import is_seen, move_into_place, sync
+from mp4ds.format.manifest import Manifest
+from mp4ds.format.models import StreamSidecar
+from mp4ds.format.sidecars import MANIFEST_NAME, dump_document
 from mp4ds.packing.engine import Engine, Outcome
 from mp4ds.packing.job import Job, Task, span_of, with_latched
-from mp4ds.packing.join import Assembler
 from mp4ds.packing.manifest import (
+    RECORD_NAME,
     Origin,
+    PartFacts,
     PartRecord,
+    PartStream,
     dataset_files,
     folder_size,
     read_record,
     summarize,
-    write_manifest,
 )
-from mp4ds.packing.options import PackProgress, PackSummary
+from mp4ds.packing.options import PackProgress, PackSummary, TopicSummary
 from mp4ds.packing.pack import PackRun
 from mp4ds.packing.planning import share
 from mp4ds.packing.workplace import Workplace
-from mp4ds.plan import Selection
+from mp4ds.plan import FileNames, Selection
 
 _REPORT_SECONDS = 0.1
 
@@ -260,15 +269,7 @@ class Coordinator:
         try:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
-            part = self._join(run, folder, progress)
-            with run.job.open() as reader:
-                digests = run.job.digests(reader, partial(_digest, run.place))
-                run.job.check_sources(reader.files)
-                origin = Origin.of(reader.files, digests, run.job.about, span_of(reader))
-                write_manifest(part, reader, origin, run.job.options["quality"])
-                size = sum(source.size for source in run.job.sources)
-                summary = summarize(part, run.target, None if run.job.slice else size, origin)
-                summary = with_latched(summary, reader)
+            summary = self._join(run, folder, progress)
             sync(folder)
             move_into_place(
                 folder, run.target, run.place.replaced, force=run.force, owned=dataset_files
@@ -286,24 +287,120 @@ class Coordinator:
         return summary
 
     @staticmethod
-    def _join(run: PackRun, folder: Path, progress: JobProgress) -> PartRecord:
-        job, parts = run.job, run.place.parts
-        tasks = [task for task in job.tasks if task.source is None]
-        if tasks[0].whole:
-            part = PartRecord.load(parts / tasks[0].name)
-            with job.open() as reader:
-                part.check_counts(reader.channels)
-            for name in part.files:
-                _link(part.folder / name, folder / name)
-            part.folder = folder
-            return part
+    def _join(run: PackRun, folder: Path, progress: JobProgress) -> PackSummary:
+        job = run.job
+        places = [run.place.parts / task.name for task in job.tasks if task.source is None]
+        facts = list(map(PartFacts.load, places))
         selected = Selection(job.options["topics"], job.options["exclude"])
-        with job.open() as reader:
-            assembler = Assembler(reader, selected, folder, threads=_JOINED_AT_ONCE)
-            for task in tasks:
-                chain = task.name if task.solo else task.name.partition("-")[2]
-                assembler.add(PartRecord.load(parts / task.name), chain)
-            return assembler.finish(lambda name: progress.report("joining", name, now=True))
+        with ExitStack() as stack:
+            reader = stack.enter_context(job.open())
+            with _forgetting_damaged(places):
+                parts = [stack.enter_context(Dataset(place)) for place in places]
+                manifests = [part.manifest for part in parts if part.manifest]
+                _check_counts(reader, parts, facts, selected)
+                digests = job.digests(reader, partial(_digest, run.place))
+                job.check_sources(reader.files)
+                origin = Origin.of(reader.files, digests, job.about, span_of(reader))
+                losses = [item.to_record() for one in manifests for item in one.losses]
+                left_out = [topic for one in manifests for topic in one.topics_left_out]
+                changes = origin.fields(reader, losses, left_out)
+                if job.is_single:
+                    for name in facts[0].files:
+                        _link(places[0] / name, folder / name)
+                    manifest = manifests[0].model_copy(update=changes)
+                    (folder / MANIFEST_NAME).unlink()
+                    (folder / MANIFEST_NAME).write_bytes(dump_document(manifest))
+                    sidecars = [stream.sidecar for stream in parts[0].streams]
+                else:
+                    manifest, sidecars = concat(
+                        parts,
+                        folder,
+                        changes=changes,
+                        report=lambda name: progress.report("joining", name, now=True),
+                    )
+            whole = _joined(folder, manifest, sidecars, facts)
+            whole.losses, whole.left_out = losses, dict.fromkeys(left_out)
+            size = sum(source.size for source in job.sources)
+            summary = summarize(whole, run.target, None if job.slice else size, origin)
+            return with_latched(summary, reader)
+
+
+@contextmanager
+def _forgetting_damaged(places: Sequence[Path]) -> Iterator[None]:
+    """Where parts cannot be joined, see to it that damaged ones are made again.
+
+    Raises:
+        FormatError: Names a damaged file.
+    """
+    try:
+        yield
+    except FormatError as error:
+        for place in places:
+            if str(error.place).startswith(f"{place}{os.sep}"):
+                (place / RECORD_NAME).unlink(missing_ok=True)
+                raise FormatError(
+                    "checksum-mismatch",
+                    error.place,
+                    "was damaged after it was written; run the same command again to redo this "
+                    "part",
+                ) from None
+        raise
+
+
+def _check_counts(
+    reader: BagReader,
+    parts: Sequence[Dataset],
+    facts: Sequence[PartFacts],
+    selected: Selection,
+) -> None:
+    """Refuse parts that together lack messages.
+
+    Raises:
+        FormatError: The facts of a part are not those of its dataset.
+        SourceError: The recording's index is wrong.
+    """
+    found = Counter[str]()
+    for part, told in zip(parts, facts, strict=True):
+        own = Counter[str]()
+        counts = part.counts()
+        for channel in part.channels:
+            own[channel.topic] += counts.get(channel.id, 0)
+        if +own != +Counter({topic.topic: topic.messages for topic in told.topics}):
+            (part.path / RECORD_NAME).unlink()
+            raise FormatError("file-missing", part.path, "was damaged after it was made")
+        found += own
+    due = Counter[str]()
+    for channel in reader.channels:
+        if selected(channel.topic) and channel.id in reader.stats():
+            due[channel.topic] += reader.stats()[channel.id].count
+    for topic, count in due.items():
+        if found[topic] != count:
+            raise SourceError(
+                reader.path,
+                f"is damaged: its index lists {count} messages on {topic}, but {found[topic]} were "
+                "found",
+            )
+
+
+def _joined(
+    folder: Path, manifest: Manifest, sidecars: Sequence[StreamSidecar], facts: Sequence[PartFacts]
+) -> PartRecord:
+    """What became of each topic in all parts together."""
+    topics: dict[str, TopicSummary] = {}
+    skipped: dict[str, int] = {}
+    for part in facts:
+        skipped |= part.skipped
+        for topic in part.topics:
+            if topic.topic in topics:
+                topics[topic.topic].extend(topic, topics[topic.topic].messages)
+            else:
+                topics[topic.topic] = topic
+    names = FileNames()
+    streams = [
+        PartStream(Path(entry.sidecar).stem, sidecar, names.name_for(entry.topic)[1])
+        for entry, sidecar in zip(manifest.streams, sidecars, strict=True)
+    ]
+    return PartRecord(folder, topics, streams, skipped=skipped)
 
 
 def _link(path: Path, new: Path) -> None:

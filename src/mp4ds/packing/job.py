@@ -285,7 +285,6 @@ class Job:
             camera_info=tuple(options["camera_info"]),
             workers=self.workers,
             compression="zstd" if task.whole else "lz4",  # that is read once, in the joining
-            is_whole=task.whole,
             exact=exact,
         )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import stat
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -25,10 +24,10 @@ from mp4ds.format.manifest import (
     LossEntry,
     Manifest,
     Source,
-    StaticTransform,
     StreamEntry,
     TimeRange,
     Verbatim,
+    static_transforms,
 )
 from mp4ds.format.models import ChannelModel, StreamSidecar
 from mp4ds.format.sidecars import (
@@ -36,11 +35,10 @@ from mp4ds.format.sidecars import (
     MANIFEST_NAME,
     dump_document,
     load_manifest,
-    load_stream,
     verify_file,
 )
 from mp4ds.messages.png import zlib_build
-from mp4ds.messages.transforms import Transform, TransformCollector
+from mp4ds.messages.transforms import Transform
 from mp4ds.packing.options import PackSummary, TopicSummary
 from mp4ds.plan import LOSSLESS
 from mp4ds.records import EVERYTHING, Channel, Excerpt, Loss
@@ -102,9 +100,7 @@ class PartRecord:
 
     Attributes:
         folder: Where the files are.
-        files: Names of the saved files.
         topics: What became of each topic, in the order of the recording.
-        counts: Messages read by channel id.
         streams: In the order in which they began.
         span: Log times of the first and last message, ns; None without messages.
         left_out: Topics left out on request.
@@ -115,14 +111,12 @@ class PartRecord:
 
     folder: Path
     topics: dict[str, TopicSummary] = field(default_factory=dict)
-    counts: dict[int, int] = field(default_factory=dict)
     streams: list[PartStream] = field(default_factory=list)
     span: tuple[int, int] | None = None
     left_out: dict[str, None] = field(default_factory=dict)
     skipped: dict[str, int] = field(default_factory=dict)
     transforms: list[Transform] = field(default_factory=list)
     losses: list[Loss] = field(default_factory=list)
-    files: list[str] = field(default_factory=list)
 
     @property
     def messages_path(self) -> Path:
@@ -142,109 +136,43 @@ class PartRecord:
             self.span = (min(start, time), max(end, time))
 
     def save(self) -> None:
-        """Write the record, which completes the part."""
+        """Write what the manifest does not tell, which completes the part."""
         record = {
             "topics": [asdict(topic) for topic in self.topics.values()],
-            "counts": {str(key): count for key, count in self.counts.items()},
-            "streams": [stream.stem for stream in self.streams],
-            "span": self.span,
-            "left_out": list(self.left_out),
             "skipped": self.skipped,
-            "transforms": [asdict(transform) for transform in self.transforms],
-            "losses": [asdict(loss) for loss in self.losses],
-            "files": {
-                path.name: path.stat().st_size
-                for path in sorted(self.folder.iterdir())
-                if path.name != RECORD_NAME
-            },
+            "files": {path.name: path.stat().st_size for path in sorted(self.folder.iterdir())},
         }
         write_synced(self.folder / RECORD_NAME, dump_kept(record))
 
-    def forget(self) -> None:
-        """Mark it incomplete, so that it is made again."""
-        (self.folder / RECORD_NAME).unlink(missing_ok=True)
-
-    @classmethod
-    def load(cls, folder: Path) -> PartRecord:
-        """Read what `save` wrote.
-
-        Raises:
-            FormatError: It is missing or damaged.
-        """
-        record = read_record(folder)
-        if record is None:
-            raise _damaged(folder)
-        try:
-            return cls._of(folder, of_types(_Record, record))
-        except ValueError as error:
-            (folder / RECORD_NAME).unlink(missing_ok=True)  # to be made again
-            if isinstance(error, FormatError):
-                raise
-            raise _damaged(folder) from None
-
-    @classmethod
-    def _of(cls, folder: Path, record: _Record) -> PartRecord:
-        if not record.files.keys() >= {f"{stem}.yaml" for stem in record.streams}:
-            raise ValueError("a stream without a file")
-        sidecars = [load_stream(folder / f"{stem}.yaml") for stem in record.streams]
-        names = {MESSAGES_NAME, *(f"{stem}.yaml" for stem in record.streams)}
-        if record.files.keys() != names | {sidecar.video.file for sidecar in sidecars}:
-            raise ValueError("a file of no stream")
-        part = cls(
-            folder=folder,
-            topics={topic.topic: topic for topic in record.topics},
-            counts=record.counts,
-            streams=[PartStream(*pair) for pair in zip(record.streams, sidecars, strict=True)],
-            span=record.span,
-            left_out=dict.fromkeys(record.left_out),
-            skipped=record.skipped,
-            transforms=record.transforms,
-            losses=record.losses,
-            files=list(record.files),
-        )
-        if part.span:  # values that no manifest accepts are damage, too, and the part is made again
-            TimeRange(start=part.span[0], end=part.span[1])
-        for loss in part.losses:
-            LossEntry.from_record(loss)
-        for transform in part.transforms:
-            StaticTransform.from_record(transform)
-        return part
-
-    def check_counts(self, channels: Iterable[Channel]) -> None:
-        """Refuse a record whose counts by topic and by channel differ.
-
-        Args:
-            channels: All of the recording.
-
-        Raises:
-            FormatError: They differ; the part is made again.
-        """
-        found: Counter[str] = Counter()
-        for channel in channels:
-            found[channel.topic] += self.counts.get(channel.id, 0)
-        told = {name: topic.messages for name, topic in self.topics.items() if topic.messages}
-        if told != {name: count for name, count in found.items() if count}:
-            self.forget()
-            raise _damaged(self.folder)
-
 
 @dataclass(frozen=True, slots=True)
-class _Record:
-    """The contents of a part's record."""
+class PartFacts:
+    """What the manifest of a part does not tell.
+
+    Attributes:
+        topics: What became of each topic, in the order of the recording.
+        skipped: What the source holds and no dataset can: a phrase -> how many.
+        files: Size of each file.
+    """
 
     topics: list[TopicSummary]
-    counts: dict[int, int]
-    streams: list[str]
-    span: tuple[int, int] | None
-    left_out: list[str]
     skipped: dict[str, int]
-    transforms: list[Transform]
-    losses: list[Loss]
     files: dict[str, int]
 
+    @classmethod
+    def load(cls, folder: Path) -> PartFacts:
+        """Read what `PartRecord.save` wrote.
 
-def _damaged(folder: Path) -> FormatError:
-    return FormatError("file-missing", folder, "disappeared or was damaged after it was made")
+        Raises:
+            FormatError: It is missing or damaged; the part is made again.
+        """
+        try:
+            return of_types(cls, read_record(folder) or {})
+        except ValueError:
+            (folder / RECORD_NAME).unlink(missing_ok=True)
+            raise FormatError(
+                "file-missing", folder, "disappeared or was damaged after it was made"
+            ) from None
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
@@ -353,6 +281,27 @@ class Origin:
             about = told[0]
         return replace(origin, sources=[it.within(span) for it in origin.sources], about=about)
 
+    def fields(
+        self, recording: Recorded, losses: Iterable[Loss], left_out: Iterable[str]
+    ) -> dict[str, Any]:
+        """The fields of a manifest that tell where a dataset came from.
+
+        Args:
+            recording: What was read.
+            losses: What could not be read of it.
+            left_out: Topics that were left out on request.
+        """
+        return {
+            "about": self.about,
+            "format": recording.format,
+            "recording_profile": recording.profile,
+            "library": recording.library,
+            "sources": self.sources,
+            "derived_from": self.derived_from,
+            "losses": list(map(LossEntry.from_record, bounded([*self.losses, *losses]))),
+            "topics_left_out": list(dict.fromkeys([*self.left_out, *left_out])),
+        }
+
     def _add_dataset(self, manifest: Manifest, path: Path, sha256: str) -> None:
         self.sources.extend(manifest.sources)
         self.derived_from.extend(manifest.derived_from)
@@ -416,16 +365,8 @@ def write_manifest(part: PartRecord, recording: Recorded, origin: Origin, profil
     manifest = Manifest(
         mp4ds=FORMAT_VERSION,
         kind="dataset",
-        about=origin.about,
         profile=profile,
-        format=recording.format,
-        recording_profile=recording.profile,
-        library=recording.library,
-        sources=origin.sources,
-        derived_from=origin.derived_from,
         messages=sum(topic.messages for topic in part.topics.values()),
-        losses=list(map(LossEntry.from_record, bounded([*origin.losses, *part.losses]))),
-        topics_left_out=list(dict.fromkeys([*origin.left_out, *part.left_out])),
         time_range=TimeRange(start=part.span[0], end=part.span[1]) if part.span else None,
         streams=[
             StreamEntry(
@@ -436,7 +377,7 @@ def write_manifest(part: PartRecord, recording: Recorded, origin: Origin, profil
             )
             for stream in part.streams
         ],
-        transforms=_static_transforms(part),
+        transforms=static_transforms([stream.sidecar for stream in part.streams], part.transforms),
         verbatim=[
             Verbatim(topic=topic.topic, messages=count, first=first, reason=reason)
             for topic in part.topics.values()
@@ -447,19 +388,9 @@ def write_manifest(part: PartRecord, recording: Recorded, origin: Origin, profil
             for name, (size, sha256) in sorted(digests.items())
         ],
         tools={"mp4ds": __version__, **tool_versions(), "zlib": zlib_build()},
+        **origin.fields(recording, part.losses, part.left_out),
     )
     (part.folder / MANIFEST_NAME).write_bytes(dump_document(manifest))
-
-
-def _static_transforms(part: PartRecord) -> list[StaticTransform]:
-    """The transforms between the coordinate frames of all images and calibrations."""
-    frame_ids: set[str] = set()
-    for stream in part.streams:
-        frame_ids.update(header.frame_id for header in stream.sidecar.headers)
-        if stream.sidecar.camera_info:
-            frame_ids.update(item.frame_id for item in stream.sidecar.camera_info.calibrations)
-    collector = TransformCollector(part.transforms)
-    return [StaticTransform.from_record(item) for item in collector.between(frame_ids)]
 
 
 def summarize(

@@ -291,7 +291,6 @@ class PartSettings:
         camera_info: Pairs of topics given by the user, ``IMAGE=INFO``.
         workers: Streams to encode in parallel.
         compression: Of messages.mcap.
-        is_whole: Whether there are no other parts.
         exact: Streams made lossless because they cannot reach the score, and why.
     """
 
@@ -302,7 +301,6 @@ class PartSettings:
     camera_info: tuple[str, ...] = ()
     workers: int = 1
     compression: str = "zstd"
-    is_whole: bool = True
     exact: Exact = field(default_factory=dict)
 
 
@@ -349,6 +347,7 @@ class Packer:
         self._progress = progress
         self._transforms = TransformCollector()
         self._part = PartRecord(folder)
+        self._noted: set[int] = set()  # channels that the journal has
         survey = settings.survey
         self._calibrations = Calibrations(
             [channel for channel in reader.channels if settings.selected(channel.topic)],
@@ -387,7 +386,7 @@ class Packer:
             ) as self._verbatim:
                 self._read()
                 part.streams = self._cameras.finish()
-                if self._settings.is_whole:
+                if self._settings.excerpt.others:
                     declare_rest(part, self._reader, self._settings.selected, self._verbatim)
         except BaseException:
             self._cameras.abandon()
@@ -420,9 +419,9 @@ class Packer:
         if not self._settings.selected(channel.topic):
             part.left_out[channel.topic] = None
             return
-        if self._journal is not None and channel.id not in part.counts:
+        if self._journal is not None and channel.id not in self._noted:
+            self._noted.add(channel.id)
             self._journal.channel(channel)
-        part.counts[channel.id] = part.counts.get(channel.id, 0) + 1
         topic = part.topic(channel)
         topic.messages += 1
         topic.raw_bytes += len(record.data)

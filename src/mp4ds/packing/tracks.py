@@ -586,7 +586,11 @@ def plan_from_values(values: Mapping[str, Any]) -> TrackPlan:
     Raises:
         ValueError: It is not valid, or not one that this version makes.
     """
-    common = {name: values[name] for name in ("profile", "exact", "note")}
+    types = {"profile": str, "exact": bool, "note": str}
+    common = {name: values[name] for name in types}
+    for name, kind in types.items():
+        if not isinstance(common[name], kind):
+            raise ValueError(f"{common[name]!r} as the {name} of a video")
     if "recipe" not in values:
         return PacketPlan(**common)
     parameters = Parameters.from_values(values["parameters"])

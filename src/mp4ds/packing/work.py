@@ -24,7 +24,7 @@ from mp4ds.files.outputs import write_synced
 from mp4ds.files.sources import unchanged
 from mp4ds.packing.engine import give_back
 from mp4ds.packing.job import Job, Task, digest_source
-from mp4ds.packing.manifest import RECORD_NAME, PartRecord, dump_kept
+from mp4ds.packing.manifest import RECORD_NAME, Origin, PartRecord, dump_kept, write_manifest
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
 from mp4ds.packing.workplace import Workplace
 
@@ -87,11 +87,14 @@ class Tasks:
         def make(exact: Exact) -> PartRecord:
             for path in into.iterdir():
                 path.unlink()
-            return Packer(self._open(job), into, job.settings(task, exact), report).run()
+            return Packer(reader, into, job.settings(task, exact), report).run()
+
+        reader = self._open(job)
 
         part = until_in_reach(make)
         if progress is not None:
             progress(told(part))
+        write_manifest(part, reader, Origin(), job.options["quality"])
         part.save()
 
     def _open(self, job: Job) -> BagReader:

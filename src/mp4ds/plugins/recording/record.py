@@ -631,7 +631,7 @@ class _Split:
     def _run(self) -> None:
         try:
             part = self._packer.run()
-            if self._is_spare and not part.counts:
+            if self._is_spare and not part.span:
                 for path in (part.messages_path, self._journal.path):
                     path.unlink()
                 with suppress(OSError):  # somebody else put a file there
