@@ -126,7 +126,7 @@ class _Part:
 
     def _cut(self, stream: Stream) -> Cut:
         info, columns = stream.sidecar.camera_info, stream.camera_info_columns
-        infos = _NO_TIMES
+        infos: Integers = _NO_TIMES
         if info and columns and self.selected(info.channel.topic):
             infos = self._numbers(columns)
         images = self._numbers(stream.columns) if self.selected(stream.topic) else _NO_TIMES

@@ -174,9 +174,9 @@ def topic_images(
     refused, thinned = Counter[str](), 0
     made = []
     for place, part in enumerate(parts):
-        numbers = np.arange(len(part))
-        if isinstance(frames, TopicFrames):
-            numbers = frames.numbers_of(place)
+        numbers = (
+            frames.numbers_of(place) if isinstance(frames, TopicFrames) else np.arange(len(part))
+        )
         kept = is_kept[numbers]
         thinned += _readable(part, ~kept)
         size = reduction.size_of(part)
