@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import signal
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
@@ -11,7 +12,6 @@ from pathlib import Path
 import pytest
 
 import mp4ds
-from each import LONGEST
 from mp4ds.packing.options import PackOptions
 from mp4ds.video.encoder import ordinary_scheduling
 from sources import SOURCES, load_tool, scene
@@ -38,19 +38,29 @@ def real(name: str) -> Path:
     return path
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
-    """Let one case of a test be chosen that goes through many."""
-    parser.addoption("--case", default="", help="of tests over each row of a table: part of a name")
-
-
 def pytest_make_parametrize_id(val: object, argname: str) -> str | None:
-    """Name a case by its argument where the value is too long for a name."""
-    return argname if isinstance(val, (str, bytes)) and len(val) > LONGEST else None
+    """Name a case by its argument where the value is no name: bytes, or long text."""
+    is_name = not isinstance(val, bytes) and len(str(val)) <= 40 and str(val).isprintable()
+    return argname if isinstance(val, (str, bytes)) and not is_name else None
 
 
+def _number(item: pytest.Item, count: int) -> int:
+    """Number of a case among so many, of which another one comes first in each row of a matrix."""
+    axes = [mark.args[0] for mark in item.iter_markers("parametrize")]
+    names = [re.split(r"\W", axis)[0] if isinstance(axis, str) else axis[0] for axis in axes]
+    places = [item.callspec.indices[name] for name in names]  # type: ignore[attr-defined]
+    return sum(place + place // count for place in places) % count
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that keep to times: they run apart, one process for each network."""
+    """Mark the cases that `one_in` leaves out, and the tests that keep to times.
+
+    Those run apart, one process for each network.
+    """
     for item in items:
+        if (one_in := item.get_closest_marker("one_in")) and _number(item, *one_in.args):
+            item.add_marker(pytest.mark.slow)
         network = NETWORKS.get(item.path.stem)
         needs_master = "roscore" in getattr(item, "fixturenames", ())
         if needs_master and network != "ros1":

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from each import each
 from mp4ds.errors import VideoError
 from mp4ds.messages.coded import UnknownStructure
 from mp4ds.video.access import FrameAccess
@@ -74,7 +73,8 @@ def patterns(count: int) -> Iterator[list[int]]:
 
 
 # JPEG files are given as libjpeg decodes them, and not as PyAV does: see test_republish.py
-@each("name", [name for name in RECIPES if name not in (*ALIKE, "mjpeg")], one_in=4)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("name", [name for name in RECIPES if name not in (*ALIKE, "mjpeg")])
 def test_it_is_the_same_frame(name: str, tmp_path: Path) -> None:
     recipe = RECIPES[name]
     path = written(tmp_path, recipe)
@@ -112,7 +112,7 @@ def read_last(path: Path, recipe: Recipe) -> None:
         list(access.pictures_of([FRAMES - 1]))
 
 
-@each("name", REFUSED)
+@pytest.mark.parametrize("name", REFUSED)
 def test_unknown_structures_are_refused(name: str, tmp_path: Path) -> None:
     path = written(tmp_path, REFUSED[name])
     with pytest.raises(UnknownStructure):

@@ -27,7 +27,6 @@ import pytest
 import mp4ds
 from coded_scenes import CODED
 from conftest import real
-from each import each, fresh
 from mp4ds.cli import app_for
 from mp4ds.plugins import demo as demo_of
 from scenes import ENCODINGS, IMAGE, START, Record, Scene, image_cdr, image_ros1, picture
@@ -127,13 +126,13 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@fresh
+@pytest.fixture
 def small_bag(tmp_path: Path) -> Path:
     write_bag(tmp_path / "drive.bag", scene("mono8", frames=4))
     return tmp_path / "drive.bag"
 
 
-@fresh
+@pytest.fixture
 def small_dataset(packed_bag: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(packed_bag, tmp_path / "dataset"))
 
@@ -283,7 +282,7 @@ BAD_SOURCES: dict[str, tuple[Callable[[Path], Path], str]] = {
 }
 
 
-@each("name", BAD_SOURCES)
+@pytest.mark.parametrize("name", BAD_SOURCES)
 def test_a_source_that_cannot_be_read(name: str, tmp_path: Path) -> None:
     make, word = BAD_SOURCES[name]
     path = make(tmp_path)
@@ -291,7 +290,7 @@ def test_a_source_that_cannot_be_read(name: str, tmp_path: Path) -> None:
         refused(call("pack", path, "-o", tmp_path / "dataset"), 2, word)
 
 
-@each("name", [n for n in BAD_SOURCES if not n.startswith("damaged")])
+@pytest.mark.parametrize("name", [n for n in BAD_SOURCES if not n.startswith("damaged")])
 def test_info_on_a_source_that_cannot_be_read(name: str, tmp_path: Path) -> None:
     make, word = BAD_SOURCES[name]
     path = make(tmp_path)
@@ -307,7 +306,7 @@ def test_the_real_command_says_the_same(name: str, tmp_path: Path) -> None:
         refused(run("pack", path, "-o", tmp_path / "dataset"), 2, word)
 
 
-@each(
+@pytest.mark.parametrize(
     ("name", "word"),
     [
         ("truncated.bag", "rosbag reindex"),
@@ -374,8 +373,8 @@ EMPTY = Scene([], {"/cam/image_raw": IMAGE, "/chatter": "std_msgs/msg/String"})
 NO_IMAGES = only(scene("mono8"), "/imu", "/tf", "/cam/camera_info")
 
 
-@each("kind", ["bag", "mcap", "rosbag2"])
-@each("content", ["no-messages", "no-channels", "no-images"])
+@pytest.mark.parametrize("kind", ["bag", "mcap", "rosbag2"])
+@pytest.mark.parametrize("content", ["no-messages", "no-channels", "no-images"])
 def test_nothing_for_a_video(content: str, kind: str, tmp_path: Path, compare: Compare) -> None:
     made = {"no-messages": EMPTY, "no-channels": Scene([]), "no-images": NO_IMAGES}[content]
     name = {"bag": "bag-none", "mcap": "mcap-ros2-zstd", "rosbag2": "rosbag2-sqlite3-v9"}[kind]
@@ -447,7 +446,7 @@ def test_topics_that_map_to_one_file_name(kind: str, tmp_path: Path, compare: Co
     assert packed.out.count("stored as") >= 2
 
 
-@each(
+@pytest.mark.parametrize(
     "topics",
     [("/../x", "/..", "..", "/."), ("", "/"), ("/dataset", "/messages", "/con"), ("/ä", "/相机"),
      ("/a\nb", "/\x1b[31mred", "/[bold]", "/a[/b]"), ("/" + "x" * 300, "/" + "x" * 299 + "y")],
@@ -474,8 +473,8 @@ def test_a_terminal_that_cannot_show_a_topic(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- targets that may not be written
 
 
-@each("command", ["pack", "unpack", "demo"])
-@each("place", ["below-a-file", "no-parent", "exists", "dangling-link"])
+@pytest.mark.parametrize("command", ["pack", "unpack", "demo"])
+@pytest.mark.parametrize("place", ["below-a-file", "no-parent", "exists", "dangling-link"])
 def test_a_target_that_may_not_be_written(
     place: str, command: str, small_bag: Path, small_dataset: Path, tmp_path: Path
 ) -> None:
@@ -569,7 +568,7 @@ def test_pack_replaces_an_empty_folder_with_force_only(small_bag: Path, tmp_path
     assert mp4ds.validate(tmp_path / "empty") == []
 
 
-@each("what", ["folder", "file", "rosbag2", "link"])
+@pytest.mark.parametrize("what", ["folder", "file", "rosbag2", "link"])
 def test_pack_never_replaces_what_it_did_not_make(
     what: str, small_bag: Path, tmp_path: Path
 ) -> None:
@@ -589,7 +588,7 @@ def test_pack_never_replaces_what_it_did_not_make(
         refused(result, 2, str(target), "--force does not replace")
 
 
-@each("to", ["bag", "mcap", "rosbag2", "images"])
+@pytest.mark.parametrize("to", ["bag", "mcap", "rosbag2", "images"])
 def test_unpack_replaces_its_own_output_with_force_only(
     to: str, small_dataset: Path, tmp_path: Path
 ) -> None:
@@ -606,8 +605,8 @@ def test_unpack_replaces_its_own_output_with_force_only(
     assert len(list(tmp_path.iterdir())) == 2
 
 
-@each("to", ["bag", "mcap", "rosbag2", "images"])
-@each("what", ["folder", "dataset"])
+@pytest.mark.parametrize("to", ["bag", "mcap", "rosbag2", "images"])
+@pytest.mark.parametrize("what", ["folder", "dataset"])
 def test_unpack_never_replaces_a_folder_it_did_not_make(
     what: str, to: str, small_dataset: Path, tmp_path: Path
 ) -> None:
@@ -639,8 +638,8 @@ def test_what_is_replaced_stays_until_the_new_one_is_whole(
 # ---------------------------------------------------------------- a target that is the source
 
 
-@each("force", [False, True])
-@each("kind", ["bag", "rosbag2"])
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("kind", ["bag", "rosbag2"])
 def test_packing_onto_the_source(kind: str, force: bool, tmp_path: Path) -> None:
     name = {"bag": "bag-none", "rosbag2": "rosbag2-sqlite3-v9"}[kind]
     source = SOURCES[name](tmp_path, scene("mono8", frames=3))[0]
@@ -669,8 +668,8 @@ def test_packing_onto_a_dataset_that_holds_the_source(
         refused(call("pack", source, "-o", small_dataset, "--force"), 2, str(small_dataset))
 
 
-@each("name", ["messages.mcap", "cam_image_raw.mp4", "dataset.yaml", "new.mcap"])
-@each("to", ["bag", "mcap"])
+@pytest.mark.parametrize("name", ["messages.mcap", "cam_image_raw.mp4", "dataset.yaml", "new.mcap"])
+@pytest.mark.parametrize("to", ["bag", "mcap"])
 def test_unpacking_into_the_dataset(
     to: str, name: str, small_dataset: Path, tmp_path: Path
 ) -> None:
@@ -714,7 +713,9 @@ UNPACK_TARGETS = {
 DEMOS = ("", ".bag", ".mcap")
 
 
-@each("job", ["pack", "pack-lossy", *(f"demo{suffix}" for suffix in DEMOS), *UNPACK_TARGETS])
+@pytest.mark.parametrize(
+    "job", ["pack", "pack-lossy", *(f"demo{suffix}" for suffix in DEMOS), *UNPACK_TARGETS]
+)
 def test_a_disk_that_is_full_half_way(job: str, demo: Path, tmp_path: Path) -> None:
     with mounted(tmp_path / "disk", "size=512k") as disk, unchanged(demo):
         if job.startswith("demo"):
@@ -749,8 +750,9 @@ def test_a_full_disk_leaves_what_was_there(demo: Path, small_dataset: Path, tmp_
 CODED_KINDS = ["jpeg-444", "png-16-bit-cv2", "depth-32FC1-rvl", "video-h264", "video-vp9"]
 
 
-@each("to", ["dataset", "mcap"], one_in=6)
-@each("kind", CODED_KINDS)
+@pytest.mark.one_in(6)
+@pytest.mark.parametrize("to", ["dataset", "mcap"])
+@pytest.mark.parametrize("kind", CODED_KINDS)
 def test_a_disk_that_is_full_of_coded_pictures(kind: str, to: str, tmp_path: Path) -> None:
     recorded = CODED[kind](frames=24, width=320, height=240)
     (source,) = SOURCES["bag-none"](tmp_path, recorded)
@@ -930,7 +932,7 @@ BAD_OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
 }
 
 
-@each("name", BAD_OPTIONS)
+@pytest.mark.parametrize("name", BAD_OPTIONS)
 def test_an_option_that_is_wrong(
     name: str, small_bag: Path, small_dataset: Path, tmp_path: Path
 ) -> None:
@@ -959,7 +961,7 @@ def test_a_preset_that_is_wrong(codec: str, small_bag: Path, tmp_path: Path) -> 
         refused(run("pack", small_bag, "-o", tmp_path / "x", *options), 2, "'quick'")
 
 
-@each(
+@pytest.mark.parametrize(
     "arguments",
     [
         ("pack",),
@@ -987,7 +989,7 @@ def test_a_command_line_that_cannot_be_understood(
         assert "Error" in result.err
 
 
-@each("seconds", ["0", "3601", "nan", "inf"])
+@pytest.mark.parametrize("seconds", ["0", "3601", "nan", "inf"])
 def test_a_demo_of_no_length(seconds: str, tmp_path: Path) -> None:
     with unchanged(tmp_path):
         result = call("demo", tmp_path / "out.bag", "--seconds", seconds)
@@ -1010,8 +1012,8 @@ NO_DATASETS: dict[str, Callable[[Path], Path]] = {
 }
 
 
-@each("command", ["unpack", "validate"])
-@each("name", NO_DATASETS)
+@pytest.mark.parametrize("command", ["unpack", "validate"])
+@pytest.mark.parametrize("name", NO_DATASETS)
 def test_what_is_no_dataset(name: str, command: str, tmp_path: Path) -> None:
     path = NO_DATASETS[name](tmp_path)
     options = ("--to", "mcap", "-o", tmp_path / "out.mcap") if command == "unpack" else ()
@@ -1060,7 +1062,7 @@ def parsed(result: Result) -> Any:
     return json.loads(result.out, parse_constant=refuse)
 
 
-@each("command", ["pack", "unpack", "images", "validate", "info", "demo"])
+@pytest.mark.parametrize("command", ["pack", "unpack", "images", "validate", "info", "demo"])
 def test_json_of_success(
     command: str, small_bag: Path, small_dataset: Path, tmp_path: Path
 ) -> None:
@@ -1096,7 +1098,7 @@ def test_json_of_info_on_a_dataset(what: str, small_dataset: Path) -> None:
     assert topics["/cam/image_raw"]["messages"] == 8
 
 
-@each(
+@pytest.mark.parametrize(
     ("arguments", "code"),
     [
         (("pack", "none.bag", "-o", "OUT"), 2),

@@ -15,7 +15,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
 
 from conftest import real
-from each import each
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.latched import LATCHED_QOS
 from mp4ds.bags.ros1 import Ros1Reader
@@ -75,7 +74,8 @@ def values(item: Any) -> Any:
     return struct.pack("<d", item) if isinstance(item, float) else item
 
 
-@each("name", REAL_BAGS, one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("name", REAL_BAGS)
 def test_real_bags_to_ros2_and_back(name: str) -> None:
     to_ros2, to_ros1 = Converter("ros2"), Converter("ros1")
     known: dict[int, tuple[Channel, Any, Any]] = {}
@@ -177,7 +177,7 @@ def test_an_identity_that_does_not_fit_is_not_believed() -> None:
         assert made.metadata == {"md5sum": "992ce8a1687cec8c8bd883ec73ca41d1"}
 
 
-@each(
+@pytest.mark.parametrize(
     ("qos", "latching"),
     [
         (LATCHED_QOS, "1"),
@@ -353,7 +353,7 @@ def test_large_payloads_are_not_deserialised() -> None:
     assert bytes(converter.payload(float32, nan))[4:] == nan
 
 
-@each(
+@pytest.mark.parametrize(
     ("encoding", "schema", "target", "problem"),
     [
         ("protobuf", Schema("foxglove.RawImage", "protobuf", b""), "ros1", "messages are protobuf"),

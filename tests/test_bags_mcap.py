@@ -18,7 +18,6 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import IndexType, Writer
 
 from conftest import real
-from each import each
 from mp4ds.bags import protocols
 from mp4ds.bags.mcap import McapReader
 from mp4ds.bags.mcap_records import DamageError, unzstd
@@ -136,7 +135,7 @@ def check_index(reader: McapReader, got: list[Message]) -> None:
         assert (first and fields(first)) == (expected and fields(expected))
 
 
-@each("name", REAL_FILES)
+@pytest.mark.parametrize("name", REAL_FILES)
 def test_real_recordings(name: str) -> None:
     check_against_library(real(name))
 
@@ -187,8 +186,8 @@ def scene() -> list[Record]:
     ]
 
 
-@each("compression", ["zstd", "lz4", "none"])
-@each("chunk_size", [1, 4096, 10**7])
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+@pytest.mark.parametrize("chunk_size", [1, 4096, 10**7])
 def test_round_trip(tmp_path: Path, compression: str, chunk_size: int) -> None:
     path = tmp_path / "a.mcap"
     written = write_all(path, scene(), compression=compression, chunk_size=chunk_size)
@@ -361,7 +360,7 @@ def test_compressed_payloads(tmp_path: Path) -> None:
         list(McapReader(path, message_decompress=unzstd).records())
 
 
-@each(
+@pytest.mark.parametrize(
     ("data", "problem"),
     [
         (zstandard.compress(b"abc")[:-1], "damaged"),
@@ -513,7 +512,7 @@ DAMAGED: dict[str, tuple[bytes, str]] = {
 }
 
 
-@each("name", DAMAGED)
+@pytest.mark.parametrize("name", DAMAGED)
 def test_damage_has_a_sentence(tmp_path: Path, name: str) -> None:
     data, problem = DAMAGED[name]
     path = tmp_path / "a.mcap"

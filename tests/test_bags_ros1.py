@@ -16,7 +16,6 @@ import pytest
 from rosbags.rosbag1 import Reader
 
 from conftest import DATA, real
-from each import each
 from mp4ds.bags import ros1
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.ros1 import Ros1Reader
@@ -211,7 +210,7 @@ def refuse(path: Path, problem: str) -> None:
     assert problem in str(caught.value)
 
 
-@each("name", REAL_BAGS)
+@pytest.mark.parametrize("name", REAL_BAGS)
 def test_real_bags(name: str, tmp_path: Path) -> None:
     path = real(name)
     with Ros1Reader(path) as reader:
@@ -454,7 +453,7 @@ def test_a_time_that_ros_does_not_have_is_refused(tmp_path: Path) -> None:
         assert [loss.messages for loss in reader.losses] == [1]
 
 
-@each(
+@pytest.mark.parametrize(
     "name", ["header_only_dummy_600chunks", "lfs_pointer", "truncated", "unindexed", "zero_bytes"]
 )
 def test_real_damage(name: str) -> None:
@@ -488,7 +487,8 @@ def test_damage_has_a_sentence(tmp_path: Path) -> None:
     refuse(path, "the index points to another message")
 
 
-@each("compression", COMPRESSIONS, one_in=3)
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_a_bag_cut_short_or_changed_anywhere(tmp_path: Path, compression: str) -> None:
     chunks = [[(0, 5 * n + c, os.urandom(20)) for n in range(5)] for c in range(2)]
     path = make_bag(tmp_path / "a.bag", [plain()], chunks, compression=compression)
@@ -539,7 +539,7 @@ def test_what_a_bag_cannot_hold_is_counted(tmp_path: Path) -> None:
         assert rows(reader) == [(0, START, b"a"), (0, START, b"b"), (0, START, b"c")]
 
 
-@each("time", [0, 1, 10**9, 2**32 * 10**9 - 1])
+@pytest.mark.parametrize("time", [0, 1, 10**9, 2**32 * 10**9 - 1])
 def test_the_times_that_a_bag_can_hold(tmp_path: Path, time: int) -> None:
     with Ros1Writer(tmp_path / "a.bag") as writer:
         writer.add_channel(STRING)

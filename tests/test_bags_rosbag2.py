@@ -18,7 +18,6 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader as RosbagsReader
 
 from conftest import real
-from each import each
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.rosbag2 import Rosbag2Reader
 from mp4ds.bags.rosbag2_metadata import RECORD, TABLES_RECORD, native_qos, parse_bag_info
@@ -106,7 +105,7 @@ def check_index(reader: Rosbag2Reader, got: list[Message]) -> None:
     assert all(m.channel in reader.channels for m in got)
 
 
-@each("name", FOLDERS)
+@pytest.mark.parametrize("name", FOLDERS)
 def test_real_recordings(name: str) -> None:
     path = real(name)
     reader, records = read(path)
@@ -128,8 +127,8 @@ def test_real_recordings(name: str) -> None:
     check_index(reader, got)
 
 
-@each("name", FOLDERS)
-@each("storage", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("name", FOLDERS)
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
 def test_real_recordings_round_trip(name: str, storage: str, tmp_path: Path) -> None:
     reader, records = read(real(name))
     target = tmp_path / "out"
@@ -273,8 +272,8 @@ def source_record(version: int, **more: Any) -> MetadataRecord:
     return MetadataRecord(RECORD, {"metadata.yaml": text, "storage": "sqlite3", "files": ""})
 
 
-@each("storage", ["sqlite3", "mcap"])
-@each("version", [None, *range(2, 10)])
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("version", [None, *range(2, 10)])
 def test_round_trip(tmp_path: Path, storage: str, version: int | None) -> None:
     folder = tmp_path / "made"
     qos = NEW_QOS if version == 9 else "" if version and version < 4 else OLD_QOS
@@ -519,8 +518,8 @@ def compress_files(folder: Path, spelling: str = "FILE") -> None:
     edit(folder, change)
 
 
-@each("storage", ["sqlite3", "mcap"])
-@each("spelling", ["file", "FILE"])
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("spelling", ["file", "FILE"])
 def test_compressed_files(tmp_path: Path, storage: str, spelling: str) -> None:
     folder = split(tmp_path, storage, [scene()[:25], scene()[25:]])
     compress_files(folder, spelling)
@@ -653,7 +652,7 @@ METADATA_FAULTS: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-@each("name", METADATA_FAULTS)
+@pytest.mark.parametrize("name", METADATA_FAULTS)
 def test_metadata_that_cannot_be_followed(tmp_path: Path, name: str) -> None:
     change, problem = METADATA_FAULTS[name]
     write(tmp_path / "a", "sqlite3", scene())
@@ -662,7 +661,7 @@ def test_metadata_that_cannot_be_followed(tmp_path: Path, name: str) -> None:
         Rosbag2Reader(tmp_path / "a")
 
 
-@each(
+@pytest.mark.parametrize(
     ("text", "problem"),
     [
         (b"", "is empty"),
@@ -759,7 +758,7 @@ DATABASE_FAULTS = {
 }
 
 
-@each("name", DATABASE_FAULTS)
+@pytest.mark.parametrize("name", DATABASE_FAULTS)
 def test_a_database_that_cannot_be_read(tmp_path: Path, name: str) -> None:
     statements, problem = DATABASE_FAULTS[name]
     path = database(tmp_path / "a.db3", *statements)

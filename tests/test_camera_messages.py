@@ -22,7 +22,6 @@ from rosbags.highlevel import AnyReader
 import mp4ds
 from coded_scenes import CODED, ODD, VERBATIM
 from definitions import PICTURES
-from each import each
 from encoders import cv, pillow
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from pictures import BAYER, CONTENTS, ENCODINGS, picture, pixels
@@ -72,7 +71,8 @@ EVEN |= {("full", "32FC1")}
 """Where the two are of about one size, so that either may be taken."""
 
 
-@each(("content", "encoding", "source", "shape"), share(RAW, 6), one_in=3)
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize(("content", "encoding", "source", "shape"), share(RAW, 6))
 def test_raw_images(
     content: str, encoding: str, source: str, shape: str, tmp_path: Path, compare: Compare
 ) -> None:
@@ -109,8 +109,8 @@ LATER = {
 }
 
 
-@each("name", LATER)
-@each("source", ["bag-none", "mcap-ros2-lz4"])
+@pytest.mark.parametrize("name", LATER)
+@pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-lz4"])
 def test_images_that_do_not_fit_what_the_first_were_like(
     name: str, source: str, tmp_path: Path, compare: Compare
 ) -> None:
@@ -162,7 +162,10 @@ EVEN_PNG |= {"png-called-jpeg"}
 STREAMS = {"jpeg-mixed-sizes": 2, "video-h264-resized": 2}
 
 
-@each(("name", "source"), share([(name, s) for name in CODED for s in CODED_SOURCES], 6), one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize(
+    ("name", "source"), share([(name, s) for name in CODED for s in CODED_SOURCES], 6)
+)
 def test_coded_pictures(name: str, source: str, tmp_path: Path, compare: Compare) -> None:
     recorded = CODED[name]()
     topic = image_topic(recorded)
@@ -189,7 +192,7 @@ def body_of(name: str) -> str:
     return "packet"
 
 
-@each("codec", ["h264", "h265", "av1", "vp9"])
+@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "vp9"])
 def test_the_odd_ones_are_those_that_are_stored_verbatim(codec: str, tmp_path: Path) -> None:
     recorded = CODED[f"video-{codec}-mid-gop"]()
     done = journey(tmp_path, SOURCES["mcap-ros2-none"], recorded, "mcap")
@@ -248,7 +251,8 @@ FILES: dict[str, Rewrite] = {
 }
 
 
-@each("name", FILES, one_in=4)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("name", FILES)
 def test_files_of_many_encoders(name: str, tmp_path: Path, compare: Compare) -> None:
     recorded = with_data(CODED["jpeg-format-plain"](), FILES[name])
     done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag")
@@ -269,7 +273,8 @@ FOXGLOVE_EXPECTED: Mapping[str, tuple[int, int]] = {
 FOXGLOVE_CASES = [(name, source) for name in FOXGLOVE for source in FOXGLOVE_SOURCES]
 
 
-@each(("name", "source"), share(FOXGLOVE_CASES, len(FOXGLOVE_SOURCES)), one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize(("name", "source"), share(FOXGLOVE_CASES, len(FOXGLOVE_SOURCES)))
 def test_foxglove_messages(name: str, source: str, tmp_path: Path, compare: Compare) -> None:
     done = journey(tmp_path, FOXGLOVE_SOURCES[source], FOXGLOVE[name](), "mcap")
     assert compare(done.sources, done.output) == []
@@ -338,10 +343,10 @@ QUALITIES: dict[str, dict[str, Any]] = {
 }
 
 
-@each(
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize(
     ("quality", "encoding"),
     share([(quality, name) for name in ENCODINGS for quality in QUALITIES], len(QUALITIES)),
-    one_in=4,
 )
 def test_raw_images_in_a_lossy_profile(
     quality: str, encoding: str, tmp_path: Path, compare: Compare
@@ -364,8 +369,9 @@ def test_raw_images_in_a_lossy_profile(
         assert compare(done.sources, done.output) == []
 
 
-@each("quality", QUALITIES, one_in=3)
-@each("size", [(16, 16), (34, 18), (48, 32), (48, 200), (62, 62), (64, 16)])
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("size", [(16, 16), (34, 18), (48, 32), (48, 200), (62, 62), (64, 16)])
 def test_narrow_images_in_a_lossy_profile(
     size: tuple[int, int], quality: str, tmp_path: Path, compare: Compare
 ) -> None:
@@ -409,10 +415,10 @@ LEAST = {
 """dB, of a lossy video and a JPEG file of quality 95; 33 for others, whose colours are halved."""
 
 
-@each(
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize(
     ("name", "quality"),
     share([(name, quality) for name in TRANSCODED for quality in QUALITIES], len(QUALITIES)),
-    one_in=2,
 )
 def test_jpeg_files_that_are_transcoded(
     name: str, quality: str, tmp_path: Path, compare: Compare
@@ -434,7 +440,7 @@ def test_jpeg_files_that_are_transcoded(
     assert LEAST.get(name, 33) <= least_psnr(done, topic) < 90
 
 
-@each("quality", QUALITIES)
+@pytest.mark.parametrize("quality", QUALITIES)
 def test_jpeg_packets_that_are_transcoded(quality: str, tmp_path: Path, compare: Compare) -> None:
     recorded = CODED["ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"](width=96, height=64)
     topic = image_topic(recorded)
@@ -459,7 +465,7 @@ OTHERS = [
 ]
 
 
-@each(
+@pytest.mark.parametrize(
     ("name", "quality"),
     share([(name, quality) for name in OTHERS for quality in QUALITIES], 2 * len(QUALITIES)),
 )
@@ -474,7 +480,7 @@ def test_what_else_is_coded_stays_exact_in_every_profile(
     assert done.frames(image_topic(recorded)) == EXPECTED[name]
 
 
-@each("quality", QUALITIES)
+@pytest.mark.parametrize("quality", QUALITIES)
 def test_jpeg_files_are_kept_unless_asked(quality: str, tmp_path: Path, compare: Compare) -> None:
     recorded = CODED["jpeg-rgb"]()
     done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", **QUALITIES[quality])
@@ -533,7 +539,7 @@ def test_a_robot_with_many_cameras(source: str, tmp_path: Path, compare: Compare
         assert all(stream.sidecar.camera_info for stream in dataset.streams)
 
 
-@each(("frames", "are_files"), [(1, True), (6, False)])
+@pytest.mark.parametrize(("frames", "are_files"), [(1, True), (6, False)])
 def test_a_few_small_files_stay_files(
     frames: int, are_files: bool, tmp_path: Path, compare: Compare
 ) -> None:

@@ -22,7 +22,6 @@ from distributed import Security
 
 import cluster_tasks
 from clusters import WITH_NANNY, RealCluster, Relay
-from each import each
 from mp4ds.errors import ClusterError, OptionError
 from mp4ds.packing.engine import Engine, Outcome
 from mp4ds.plugins import cluster as access
@@ -274,7 +273,7 @@ def test_time_between_two_runs_is_no_waiting(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- ways to a cluster
 
 
-@each(
+@pytest.mark.parametrize(
     "address",
     [
         *("", "slrum", "127.0.0.1:8786", "tcp://127.0.0.1", "tcp://:8786", "tcp://host:99999"),
@@ -286,7 +285,7 @@ def test_other_addresses_are_refused(address: str) -> None:
         ClusterEngine(cluster_tasks.write, address)
 
 
-@each(
+@pytest.mark.parametrize(
     ("address", "module", "package"),
     [("tcp://127.0.0.1:1", "distributed", "distributed"), ("local", "distributed", "distributed")]
     + [("local", "cryptography", "cryptography")]
@@ -314,7 +313,7 @@ def test_nobody_at_the_address(address: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("impatient")
-@each(
+@pytest.mark.parametrize(
     ("says", "problem"),
     [
         (b"", "no Dask scheduler can be reached"),
@@ -508,7 +507,7 @@ def test_what_the_batch_system_refuses_is_told(batch: Batch, tmp_path: Path) -> 
         run(engine, tasks_in(tmp_path, "a", "b"))
 
 
-@each("system", access.BATCH_SYSTEMS)
+@pytest.mark.parametrize("system", access.BATCH_SYSTEMS)
 def test_a_batch_system_that_is_not_there(system: str, tmp_path: Path) -> None:
     settings = {
         "cores": 1,
@@ -523,7 +522,7 @@ def test_a_batch_system_that_is_not_there(system: str, tmp_path: Path) -> None:
         run(engine, tasks_in(tmp_path, "a"))
 
 
-@each("system", access.BATCH_SYSTEMS)
+@pytest.mark.parametrize("system", access.BATCH_SYSTEMS)
 def test_a_batch_system_that_is_not_set_up(system: str, tmp_path: Path) -> None:
     engine = ClusterEngine(cluster_tasks.write, system)
     with pytest.raises(OptionError, match=rf"`cluster` {system}: .*jobqueue.yaml"):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coded_tools import ENCODINGS, encode, refusal
-from each import each
 from mp4ds.video.nal import (
     MAX_UNITS,
     MAX_ZEROS,
@@ -32,7 +32,7 @@ def prefixed(units: list[bytes]) -> bytes:
     return b"".join(len(unit).to_bytes(4, "big") + unit for unit in units)
 
 
-@each(
+@pytest.mark.parametrize(
     ("data", "framing"),
     [
         ("00000001 6705", "4"),
@@ -73,7 +73,7 @@ def test_any_bytes_come_back_or_are_refused(data: bytes) -> None:
         assert join(*split(data)) == data
 
 
-@each(
+@pytest.mark.parametrize(
     ("data", "reason"),
     [
         (b"", "start code"),
@@ -104,18 +104,20 @@ NO_FRAMINGS = (
 )
 
 
-@each("framing", NO_FRAMINGS)
+@pytest.mark.parametrize("framing", NO_FRAMINGS)
 def test_what_is_no_framing(framing: str) -> None:
     assert refusal(join, [b"\x65"], framing)
 
 
-@each("packet", ["00", "00000000", "0000000265", "0000000165 0000", "ffffffff65", "00000001"])
+@pytest.mark.parametrize(
+    "packet", ["00", "00000000", "0000000265", "0000000165 0000", "ffffffff65", "00000001"]
+)
 def test_lengths_that_do_not_add_up(packet: str) -> None:
     assert "length" in refusal(split_length_prefixed, bytes.fromhex(packet))
     assert refusal(split_length_prefixed, b"\0\0\0\1e" * (MAX_UNITS + 1))
 
 
-@each("name", [name for name in ENCODINGS if name.startswith("h26")])
+@pytest.mark.parametrize("name", [name for name in ENCODINGS if name.startswith("h26")])
 def test_packets_of_encoders(name: str) -> None:
     for packet in encode(ENCODINGS[name], frames=4):
         units, framing = split(packet.data)

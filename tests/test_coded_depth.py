@@ -11,7 +11,6 @@ from rosbags.rosbag1 import Reader
 
 from coded_tools import mutations, refusal
 from conftest import real
-from each import each
 from mp4ds.messages import depth, png
 from mp4ds.messages.depth import encode_rvl
 
@@ -40,8 +39,8 @@ def rebuilt(image: depth.DepthImage) -> bytes:
     return image.header + png.rebuild(image.pixels, image.recipe)
 
 
-@each("header", [name for name in HEADERS if HEADERS[name]])
-@each("coding", ["png", "rvl"])
+@pytest.mark.parametrize("header", [name for name in HEADERS if HEADERS[name]])
+@pytest.mark.parametrize("coding", ["png", "rvl"])
 def test_comes_back(header: str, coding: str) -> None:
     hint = None
     for frame in range(3):
@@ -63,7 +62,7 @@ def test_a_png_without_the_header() -> None:
     assert rebuilt(image) == png_of(room())
 
 
-@each(
+@pytest.mark.parametrize(
     ("data", "reason"),
     [
         (b"", "not RVL"),

@@ -14,7 +14,6 @@ from rosbags.rosbag1 import Reader
 
 from coded_tools import decodes, jpeg, mutations, refusal, scene
 from conftest import real
-from each import each
 from mp4ds.messages.jpeg import parse
 
 PICTURE = next(scene(1))
@@ -52,7 +51,7 @@ KINDS: dict[str, tuple[bytes, dict[str, Any]]] = {
 }
 
 
-@each("kind", KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_headers_are_read(kind: str) -> None:
     data, expected = KINDS[kind]
     info = parse(memoryview(data))
@@ -63,7 +62,7 @@ def test_headers_are_read(kind: str) -> None:
     assert decodes("mjpeg", [data]) == 1
 
 
-@each("sampling", ["411", "420", "422", "440", "444"])
+@pytest.mark.parametrize("sampling", ["411", "420", "422", "440", "444"])
 def test_sampling_of_opencv(sampling: str) -> None:
     factor = getattr(cv2, f"IMWRITE_JPEG_SAMPLING_FACTOR_{sampling}")
     data = cv2.imencode(".jpg", PICTURE, [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, factor])[1].tobytes()
@@ -76,7 +75,7 @@ def test_sampling_of_opencv(sampling: str) -> None:
 FACTORS = [across << 4 | down for across in range(1, 5) for down in range(1, 5)]
 
 
-@each("luma", FACTORS)
+@pytest.mark.parametrize("luma", FACTORS)
 def test_every_sampling_taken_is_one_that_decodes(luma: int) -> None:
     taken = 0
     for chroma in FACTORS:
@@ -106,7 +105,7 @@ def test_fill_bytes_before_markers() -> None:
     assert parse(BASE[:-2] + b"\xff\xff" + BASE[-2:]).trailing == 0
 
 
-@each(
+@pytest.mark.parametrize(
     ("data", "reason"),
     [
         (b"", "not a JPEG"),
@@ -149,7 +148,7 @@ def test_cmyk_is_refused() -> None:
     assert "4 colour components" in refusal(parse, data)
 
 
-@each("kind", ["420", "progressive", "exif", "restarts"])
+@pytest.mark.parametrize("kind", ["420", "progressive", "exif", "restarts"])
 def test_every_cut_is_refused(kind: str) -> None:
     data = KINDS[kind][0]
     for length in range(len(data)):

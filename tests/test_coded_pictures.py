@@ -22,7 +22,6 @@ from coded_tools import (
     superframe,
 )
 from conftest import real
-from each import each
 from mp4ds.errors import Refused
 from mp4ds.messages.coded import REORDERED, NoPicture
 from mp4ds.video import av1, h264, h265, nal, vp9
@@ -47,8 +46,8 @@ def without(codec: str, body: bytes, *kinds: int) -> bytes:
     return nal.join_plain([u for u in units if UNITS[codec].unit_type(u) not in kinds])
 
 
-@each("name", IN_ORDER)
-@each(("width", "height"), [(64, 48), (66, 50), (322, 178)])
+@pytest.mark.parametrize("name", IN_ORDER)
+@pytest.mark.parametrize(("width", "height"), [(64, 48), (66, 50), (322, 178)])
 def test_streams_in_order(name: str, width: int, height: int) -> None:
     encoding = ENCODINGS[name]
     packets = encode(encoding, frames=11, width=width, height=height)
@@ -135,7 +134,7 @@ def packets_of(path: Path, codec: str) -> tuple[list[Packet], tuple[int, int]]:
         return packets, (context.width, context.height)
 
 
-@each("name", REAL)
+@pytest.mark.parametrize("name", REAL)
 def test_real_videos(name: str) -> None:
     """Refused exactly from the first picture that is out of order."""
     packets, size = packets_of(real(f"video/{name}"), REAL[name])
@@ -154,7 +153,7 @@ def test_real_videos(name: str) -> None:
 # ---------------------------------------------------------------- beginnings and gaps
 
 
-@each("name", VIDEO)
+@pytest.mark.parametrize("name", VIDEO)
 def test_a_video_begins_with_a_key_frame(name: str) -> None:
     packets = encode(ENCODINGS[name])
     parser = PictureParser(ENCODINGS[name].codec)
@@ -164,7 +163,7 @@ def test_a_video_begins_with_a_key_frame(name: str) -> None:
     assert parser.parse(packets[keys[1]].data).keyframe
 
 
-@each("name", VIDEO)
+@pytest.mark.parametrize("name", VIDEO)
 def test_after_a_gap_the_next_key_frame_is_awaited(name: str) -> None:
     codec = ENCODINGS[name].codec
     packets = encode(ENCODINGS[name])
@@ -197,8 +196,8 @@ def test_parameters_sent_apart(codec: str) -> None:
     assert parser.parse(body).keyframe
 
 
-@each("codec", ["h264", "h265"])
-@each("kind", [0, 1, 2])
+@pytest.mark.parametrize("codec", ["h264", "h265"])
+@pytest.mark.parametrize("kind", [0, 1, 2])
 def test_each_kind_of_parameters_is_needed(codec: str, kind: int) -> None:
     kinds = (7, 8, 8) if codec == "h264" else (32, 33, 34)
     body = encode(ENCODINGS[codec], frames=1)[0].data
@@ -292,7 +291,7 @@ def test_delimiters_are_a_framing() -> None:
     assert PictureParser("av1").parse(bare).framing == ""
 
 
-@each(
+@pytest.mark.parametrize(
     ("body", "reason"),
     [
         (UNIT + av1.DELIMITER, "temporal delimiter inside"),
@@ -343,7 +342,7 @@ def test_a_key_frame_without_its_header() -> None:
 # ---------------------------------------------------------------- VP9
 
 
-@each(
+@pytest.mark.parametrize(
     ("change", "reason"),
     [
         (lambda body: b"", "empty"),
@@ -362,7 +361,7 @@ def test_what_is_no_vp9(change: Callable[[bytes], bytes], reason: str) -> None:
     assert refused
 
 
-@each("name", ["vp9", "vp9-rgb", "av1", "h264", "h265"])
+@pytest.mark.parametrize("name", ["vp9", "vp9-rgb", "av1", "h264", "h265"])
 def test_damage_is_refused_or_read(name: str) -> None:
     packets = encode(ENCODINGS[name], frames=2)
     for packet in packets:
@@ -372,7 +371,7 @@ def test_damage_is_refused_or_read(name: str) -> None:
             refusal(parser.parse, damaged)  # and raises nothing else
 
 
-@each("name", ["h264-hrd", "h264-matrix", "h264-10bit", "h265-gray12"])
+@pytest.mark.parametrize("name", ["h264-hrd", "h264-matrix", "h264-10bit", "h265-gray12"])
 def test_every_cut_of_parameters_is_refused_or_read(name: str) -> None:
     codec = ENCODINGS[name].codec
     units = nal.split(encode(ENCODINGS[name], frames=1)[0].data)[0]

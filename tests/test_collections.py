@@ -17,7 +17,6 @@ from pathlib import Path
 import pytest
 
 import mp4ds
-from each import each as each_case
 from mp4ds.dataset import collections
 from mp4ds.dataset.collections import datasets_in, each
 from mp4ds.errors import (
@@ -58,7 +57,7 @@ def run(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
 # ---------------------------------------------------------------- which
 
 
-@each_case(
+@pytest.mark.parametrize(
     ("paths", "names"),
     [
         (".", ["a", "b", "deep/c"]),
@@ -109,7 +108,7 @@ def dying(number: int) -> int:
     return number
 
 
-@each_case("jobs", [1, 3])
+@pytest.mark.parametrize("jobs", [1, 3])
 def test_items_in_their_order(jobs: int) -> None:
     found = list(each(squared, range(6), jobs))
     assert [(item, made[0]) for item, made in found] == [(n, n * n) for n in range(6)]

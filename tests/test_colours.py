@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from each import each
 from mp4ds.video import colour
 from mp4ds.video.colour import BITS, MATRICES, factors, rgb, samples
 from mp4ds.video.pixels import PictureConverter, Scale
@@ -49,7 +48,7 @@ def as_numpy(monkeypatch: pytest.MonkeyPatch, *arguments: Any, **options: Any) -
         return rgb(*arguments, **options)
 
 
-@each("pixel_format", ["yuv420p", "yuv420p10le"])
+@pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv420p10le"])
 def test_compiled_or_not(pixel_format: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if colour._compiled() is None:
         pytest.skip("it was not compiled here")

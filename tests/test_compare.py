@@ -21,7 +21,6 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
-from each import each
 from sources import (
     ENCODINGS,
     IMAGE,
@@ -99,7 +98,7 @@ def one(differences: list[str], pattern: str) -> None:
 # ---------------------------------------------------------------- equal
 
 
-@each("name", SOURCES)
+@pytest.mark.parametrize("name", SOURCES)
 def test_source_is_valid_and_equals_itself(name: str, written: Any) -> None:
     paths = written(name)
     report = witness.examine(paths, paths)
@@ -113,14 +112,14 @@ def test_source_is_valid_and_equals_itself(name: str, written: Any) -> None:
             assert sum(1 for _ in reader.messages()) == 64
 
 
-@each(("a", "b"), EQUAL)
+@pytest.mark.parametrize(("a", "b"), EQUAL)
 def test_equal_across_compression_and_format(a: str, b: str, written: Any) -> None:
     report = witness.examine(written(a), written(b))
     assert report.differences == []
     assert all(row.equal == row.a == row.b for row in report.rows.values())
 
 
-@each("encoding", ENCODINGS)
+@pytest.mark.parametrize("encoding", ENCODINGS)
 def test_scene_is_deterministic(encoding: str) -> None:
     images = [m for m in scene(encoding).messages if m.msgtype == IMAGE]
     again = [m for m in scene(encoding).messages if m.msgtype == IMAGE]
@@ -134,7 +133,7 @@ def test_scene_is_deterministic(encoding: str) -> None:
     assert used == 0xFFFF
 
 
-@each("trait", TRAITS)
+@pytest.mark.parametrize("trait", TRAITS)
 def test_trait_can_be_written(trait: str, tmp_path: Path) -> None:
     what = odd_scene(trait)
     write_bag(tmp_path / "a.bag", what)
@@ -240,8 +239,8 @@ MESSAGE_CHANGES: dict[str, tuple[Callable[[Scene], Scene], str]] = {
 }  # fmt: skip
 
 
-@each("kind", WRITERS)
-@each("change", MESSAGE_CHANGES)
+@pytest.mark.parametrize("kind", WRITERS)
+@pytest.mark.parametrize("change", MESSAGE_CHANGES)
 def test_changed_message_is_seen(change: str, kind: str, tmp_path: Path) -> None:
     what = scene("rgb8")
     alter, pattern = MESSAGE_CHANGES[change]
@@ -301,7 +300,7 @@ BAG_CHANGES = {
 }  # fmt: skip
 
 
-@each("change", BAG_CHANGES)
+@pytest.mark.parametrize("change", BAG_CHANGES)
 def test_changed_bag_is_seen(change: str, tmp_path: Path) -> None:
     old, new, pattern = BAG_CHANGES[change]
     write_bag(tmp_path / "a.bag", scene("mono8"))
@@ -328,7 +327,7 @@ SQLITE_CHANGES = {
 }  # fmt: skip
 
 
-@each("change", SQLITE_CHANGES)
+@pytest.mark.parametrize("change", SQLITE_CHANGES)
 def test_changed_sqlite_is_seen(change: str, tmp_path: Path) -> None:
     statement, pattern = SQLITE_CHANGES[change]
     write_rosbag2(tmp_path / "a", scene("mono8", frames=3))
@@ -347,7 +346,7 @@ YAML_CHANGES = {
 }  # fmt: skip
 
 
-@each("change", YAML_CHANGES)
+@pytest.mark.parametrize("change", YAML_CHANGES)
 def test_changed_metadata_yaml_is_seen(change: str, tmp_path: Path) -> None:
     old, new, pattern = YAML_CHANGES[change]
     write_rosbag2(tmp_path / "a", scene("mono8", frames=3), "mcap")
@@ -424,7 +423,7 @@ MCAP_CHANGES: dict[str, tuple[type, Callable[[Any], bool], dict[str, Any] | None
 }  # fmt: skip
 
 
-@each("change", MCAP_CHANGES)
+@pytest.mark.parametrize("change", MCAP_CHANGES)
 def test_changed_mcap_is_seen(change: str, tmp_path: Path) -> None:
     kind, wanted, changes, pattern = MCAP_CHANGES[change]
     a, b = tmp_path / "a.mcap", tmp_path / "b.mcap"

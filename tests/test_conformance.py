@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 
 import mp4ds
-from each import each
 from mp4ds import yamlio
 from mp4ds.errors import FormatError, VideoError
 from mp4ds.format.fields import FORMAT_VERSION, Body
@@ -71,7 +70,7 @@ def streams() -> Iterator[Case]:
 # ---------------------------------------------------------------- readers
 
 
-@each("case", LISTED["cases"], ids=ids)
+@pytest.mark.parametrize("case", LISTED["cases"], ids=ids)
 def test_mp4ds_reads_what_is_expected(case: Case) -> None:
     found = load_tool("conformance").dump(CASES / case["path"])
     assert found == (expected(case) if "expected" in case else {"problems": case["problems"]})
@@ -163,7 +162,7 @@ def test_the_runner_lets_right_answers_pass(tmp_path: Path) -> None:
     assert "not shown: streams.planes" in done.stdout
 
 
-@each(
+@pytest.mark.parametrize(
     "change",
     [
         "found['streams'][0]['columns']['stamp'][1] = '0'",
@@ -201,7 +200,7 @@ def test_the_runner_sees_a_problem_too_many(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout
 
 
-@each(
+@pytest.mark.parametrize(
     ("at", "passes"),
     [("columns.stamp", True), ("columns.stamp.values", True), (None, True), ("columns", False)],
 )
@@ -297,7 +296,7 @@ def integers(value: Any) -> Iterator[int]:
         yield value
 
 
-@each("path", sorted(CASES.rglob("*.json")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(CASES.rglob("*.json")), ids=lambda path: path.stem)
 def test_the_json_can_be_read_in_any_language(path: Path) -> None:
     def refuse(name: str) -> None:
         raise AssertionError(f"{name} is no JSON")

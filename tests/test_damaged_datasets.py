@@ -16,7 +16,6 @@ import pytest
 import mp4ds
 from coded_scenes import CODED
 from damage import Key, all_messages, pieces_of
-from each import each, fresh
 from mp4ds import FormatError, OptionError, SourceError, UnpackOptions
 from mp4ds.errors import VideoError
 from mp4ds.plugins.playing.play import open_player
@@ -52,7 +51,7 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return path, folder / "dataset"
 
 
-@fresh
+@pytest.fixture
 def dataset(packed: tuple[Path, Path], tmp_path: Path) -> Path:
     """The dataset, to be damaged."""
     return Path(shutil.copytree(packed[1], tmp_path / "dataset"))
@@ -118,7 +117,7 @@ DAMAGES: dict[str, Callable[[Path], None]] = {
 }
 
 
-@each("damage", DAMAGES)
+@pytest.mark.parametrize("damage", DAMAGES)
 def test_a_camera_that_is_left_out_may_be_damaged(
     damage: str, dataset: Path, packed: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -143,7 +142,7 @@ def test_calibrations_of_a_damaged_sidecar_may_be_wanted(dataset: Path, tmp_path
         mp4ds.unpack(dataset, "bag", tmp_path / "x.bag", UnpackOptions(exclude=["/left/image_raw"]))
 
 
-@each("place", [0.2, 0.4, 0.9, 0.999])
+@pytest.mark.parametrize("place", [0.2, 0.4, 0.9, 0.999])
 def test_messages_that_are_left_out_may_be_damaged(
     place: float, dataset: Path, packed: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -203,7 +202,8 @@ def check_salvage(dataset: Path, original: Path, out: Path) -> Sequence[Loss]:
 PARTS = ["left.mp4", "right.mp4", "front.mp4", "left.yaml", "messages.mcap", "dataset.yaml"]
 
 
-@each("name", PARTS, one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("name", PARTS)
 def test_flipped_bits(name: str, dataset: Path, packed: tuple[Path, Path], tmp_path: Path) -> None:
     original, _ = packed
     path = file_of(dataset, name)
@@ -239,7 +239,7 @@ WORSE: dict[str, Callable[[Path], None]] = DAMAGES | {
 }
 
 
-@each("damage", WORSE)
+@pytest.mark.parametrize("damage", WORSE)
 def test_what_is_there_comes_back(
     damage: str, dataset: Path, packed: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -310,7 +310,7 @@ def test_images_of_a_damaged_video(
     assert len(rows) == 1 + FRAMES - len(lost)
 
 
-@each("kind", ["raw", "jpeg", "compressed-video"])
+@pytest.mark.parametrize("kind", ["raw", "jpeg", "compressed-video"])
 def test_converted_images_of_a_damaged_video(kind: str, dataset: Path, tmp_path: Path) -> None:
     flip(file_of(dataset, "left.mp4"), 0.3)
     options = replace(SALVAGE, images=kind, topics=["/left/*", "/front/*"])
@@ -385,7 +385,7 @@ def test_on_the_command_line(dataset: Path, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- other commands
 
 
-@each("damage", [*DAMAGES, "messages"])
+@pytest.mark.parametrize("damage", [*DAMAGES, "messages"])
 def test_what_an_export_or_a_player_does_not_need(
     damage: str, dataset: Path, packed: tuple[Path, Path], tmp_path: Path
 ) -> None:

@@ -9,7 +9,6 @@ from collections.abc import Callable
 
 import pytest
 
-from each import each
 from mp4ds.packing.engine import Workers
 from waiting import WATCHDOG_S, until
 
@@ -31,7 +30,7 @@ def threads() -> int:
     return threading.active_count()
 
 
-@each("count", COUNTS)
+@pytest.mark.parametrize("count", COUNTS)
 def test_jobs_of_a_key_run_in_order_and_all_run(count: int) -> None:
     done: dict[int, list[int]] = defaultdict(list)
     before = threads()

@@ -25,7 +25,6 @@ from PIL import Image
 import mp4ds
 from chromium import chromium
 from coded_scenes import CODED, VERBATIM
-from each import each
 from mp4ds.cli.evaluate import print_evaluation
 from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, TargetError
 from mp4ds.messages.encodings import ENCODINGS as ENCODING_TABLE
@@ -88,7 +87,7 @@ def recording(folder: Path, encoding: str = "rgb8", source: str = "bag-none", **
 # ---------------------------------------------------------------- options
 
 
-@each(
+@pytest.mark.parametrize(
     ("texts", "values"),
     [
         (["18"], (18,)),
@@ -102,7 +101,7 @@ def test_crfs(texts: list[str], values: tuple[int, ...]) -> None:
     assert parse_crfs(texts) == values
 
 
-@each("text", ["", "a", "16:", "25:16", "0", "64", "16:25:0", "-3", "16-25"])
+@pytest.mark.parametrize("text", ["", "a", "16:", "25:16", "0", "64", "16:25:0", "-3", "16-25"])
 def test_no_crfs(text: str) -> None:
     with pytest.raises(OptionError, match="`crf`"):
         parse_crfs([text])
@@ -132,7 +131,7 @@ def test_a_codec_has_only_its_crfs() -> None:
     assert max(item.crf for item in settings if item.codec == "h264") == 51
 
 
-@each(
+@pytest.mark.parametrize(
     ("changed", "said"),
     [
         ({"codecs": ["vp9"]}, "`codecs` 'vp9'"),
@@ -179,7 +178,7 @@ def test_clips_of_a_time() -> None:
             chosen(times, origin, replace(given, start=start))
 
 
-@each("rate", [0.7, 2, 5, 7.5, 10])
+@pytest.mark.parametrize("rate", [0.7, 2, 5, 7.5, 10])
 def test_clips_of_fewer_frames_a_second(rate: float) -> None:
     times = at_hertz(10, 200)
     found = chosen_at_rate(times, rate, 12)
@@ -193,8 +192,8 @@ def test_clips_of_fewer_frames_a_second(rate: float) -> None:
 # ---------------------------------------------------------------- search, recommendation
 
 
-@each("largest", [51, 63])
-@each("curve", [1.0, 2.0, 0.3])
+@pytest.mark.parametrize("largest", [51, 63])
+@pytest.mark.parametrize("curve", [1.0, 2.0, 0.3])
 def test_the_search_finds_the_largest_crf(largest: int, curve: float) -> None:
     def score(crf: int) -> float:
         return float(100 - 40 * (crf / largest) ** curve)
@@ -302,7 +301,8 @@ KINDS: dict[str, Callable[[Path, Path], Path]] = {
 }
 
 
-@each("kind", KINDS, one_in=4)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("kind", KINDS)
 def test_what_was_made_of_a_recording(kind: str, tmp_path: Path) -> None:
     source = KINDS[kind](tmp_path, recording(tmp_path))
     found = evaluate(source, replace(QUICK, fps=1e9 / PERIOD), output=tmp_path / "out")
@@ -314,7 +314,8 @@ def test_what_was_made_of_a_recording(kind: str, tmp_path: Path) -> None:
     assert 25 < camera.cells[0].scores["psnr_y"].mean < 60
 
 
-@each("source", ["bag-split", "rosbag2-sqlite3-v9", "mcap-unindexed"], one_in=3)
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("source", ["bag-split", "rosbag2-sqlite3-v9", "mcap-unindexed"])
 def test_recordings(source: str, tmp_path: Path) -> None:
     path = recording(tmp_path, "bayer_grbg8", source)
     (camera,) = evaluate(path, QUICK, output=tmp_path / "out").cameras
@@ -322,8 +323,9 @@ def test_recordings(source: str, tmp_path: Path) -> None:
     assert camera.raw_bytes == 96 * 64
 
 
-@each(
-    "encoding", ["mono8", "bgr8", "bayer_rggb8", "yuv422", "yuv422_yuy2", "nv12", "8UC3"], one_in=2
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize(
+    "encoding", ["mono8", "bgr8", "bayer_rggb8", "yuv422", "yuv422_yuy2", "nv12", "8UC3"]
 )
 def test_the_videos_are_those_of_a_pack(encoding: str, tmp_path: Path) -> None:
     """To the byte of their packets: a recommendation can be packed with."""
@@ -354,7 +356,7 @@ def test_the_videos_are_those_of_a_pack_by_codec(codec: str, tmp_path: Path) -> 
     assert packet_sizes(tmp_path / "drive" / "cam_image_raw.mp4").total == tried.size
 
 
-@each("encoding", ["16UC1", "mono16", "32FC1", "rgba8"])
+@pytest.mark.parametrize("encoding", ["16UC1", "mono16", "32FC1", "rgba8"])
 def test_cameras_that_are_no_light_are_left_out(encoding: str, tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=f"{TOPIC} has {encoding} images"):
         evaluate(recording(tmp_path, encoding), QUICK, output=tmp_path / "out")
@@ -416,7 +418,7 @@ def clips_of(path: Path, folder: Path) -> tuple[dict[str, Clip | str], dict[str,
         return found, source.left_out
 
 
-@each("encoding", ENCODINGS)
+@pytest.mark.parametrize("encoding", ENCODINGS)
 def test_every_encoding_is_tried_or_told(encoding: str, tmp_path: Path) -> None:
     ((_, found),) = clips_of(recording(tmp_path, encoding), tmp_path)[0].items()
     if isinstance(found, str):
@@ -430,7 +432,7 @@ def test_every_encoding_is_tried_or_told(encoding: str, tmp_path: Path) -> None:
     assert len({plane.tobytes() for plane, _, _ in frames}) == 10
 
 
-@each("name", CODED)
+@pytest.mark.parametrize("name", CODED)
 def test_every_coded_image_is_tried_or_told(name: str, tmp_path: Path) -> None:
     write_bag(tmp_path / "drive.bag", CODED[name]())
     clips, left_out = clips_of(tmp_path / "drive.bag", tmp_path)
@@ -447,7 +449,7 @@ def test_every_coded_image_is_tried_or_told(name: str, tmp_path: Path) -> None:
         assert made[0].frames + made[0].other_frames == 10
 
 
-@each("trait", TRAITS)
+@pytest.mark.parametrize("trait", TRAITS)
 def test_every_oddity_is_tried_or_told(trait: str, tmp_path: Path) -> None:
     write_bag(tmp_path / "drive.bag", odd_scene(trait))
     ((_, found),) = clips_of(tmp_path / "drive.bag", tmp_path)[0].items()
@@ -791,7 +793,7 @@ def test_scores_that_were_not_computed_take_no_columns(
 
 
 @pytest.mark.browser
-@each("width", [1400, 390])
+@pytest.mark.parametrize("width", [1400, 390])
 def test_the_page_fits_the_window(width: int, whole: Evaluation, tmp_path: Path) -> None:
     with chromium(tmp_path, width=1400, height=900) as tab:
         size = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": True}

@@ -14,7 +14,6 @@ import pytest
 import typer
 
 import mp4ds
-from each import each
 from mp4ds.cli import COMMANDS, app_for
 from mp4ds.plugins.demo import demo
 from sources import SOURCES, scene
@@ -63,7 +62,8 @@ def test_other_topics(tmp_path: Path) -> None:
     assert "/cam/image_raw" not in out
 
 
-@each("kind", ["euroc", "tum", "images", "mcap"], one_in=3)
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("kind", ["euroc", "tum", "images", "mcap"])
 def test_public_data(kind: str, demo_dataset: Path, tmp_path: Path) -> None:
     """The demonstration in the layout of each public data set."""
     source = tmp_path / "source"
@@ -109,7 +109,7 @@ def test_quickstart_over_what_it_left(tmp_path: Path) -> None:
     test_quickstart(tmp_path)
 
 
-@each("page", ["README.md", "docs/commands.md", "docs/conversions.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/commands.md", "docs/conversions.md"])
 def test_commands_of_a_page(page: str, demo_dataset: Path, tmp_path: Path) -> None:
     """Each mp4ds line of its shell blocks, on the demo under the names that the page has."""
     text = (ROOT / page).read_text()
@@ -139,13 +139,13 @@ def test_readme_python(demo_dataset: Path, tmp_path: Path) -> None:
     run(sys.executable, "-c", code, cwd=tmp_path)
 
 
-@each("name", COMMANDS)
+@pytest.mark.parametrize("name", COMMANDS)
 def test_the_list_of_commands_says_what_each_says_of_itself(name: str) -> None:
     group: Any = typer.main.get_command(app_for(name))
     assert (group.commands[name].help or "").splitlines()[0] == COMMANDS[name][1]
 
 
-@each(
+@pytest.mark.parametrize(
     "command",
     [
         *(

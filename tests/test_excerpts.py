@@ -19,7 +19,6 @@ from mcap.writer import IndexType, Writer
 from rosbags.rosbag1 import Reader as BagReader
 
 from conftest import real
-from each import each
 from mp4ds.bags import protocols
 from mp4ds.bags.formats import MultiReader, open_reader, open_sources
 from mp4ds.bags.mcap import McapReader
@@ -155,8 +154,9 @@ def test_stats_of_two_parts() -> None:
 # ---------------------------------------------------------------- all kinds of sources
 
 
-@each("name", SOURCES, one_in=2)
-@each("seed", [0, 1])
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("name", SOURCES)
+@pytest.mark.parametrize("seed", [0, 1])
 def test_parts_of_every_source(name: str, seed: int, tmp_path: Path) -> None:
     paths = SOURCES[name](tmp_path, scene("mono8", frames=24))
     with open_sources(paths) as reader:
@@ -171,7 +171,7 @@ def test_parts_of_every_source(name: str, seed: int, tmp_path: Path) -> None:
     assert sorted(rows(apart), key=repr) == sorted(rows(whole), key=repr)
 
 
-@each("name", SOURCES)
+@pytest.mark.parametrize("name", SOURCES)
 def test_spans_without_messages(name: str, tmp_path: Path) -> None:
     paths = SOURCES[name](tmp_path, scene("mono8", frames=4))
     with open_sources(paths) as reader:
@@ -196,7 +196,8 @@ def test_spans_without_messages(name: str, tmp_path: Path) -> None:
         assert list(reader.records(Excerpt(topics=frozenset({"/none"}), others=False))) == []
 
 
-@each("name", REAL_BAGS, one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("name", REAL_BAGS)
 def test_parts_of_real_bags(name: str) -> None:
     with open_reader(real(name)) as reader:
         assert reader.is_indexed
@@ -283,7 +284,7 @@ CHUNKED = [
 ]  # fmt: skip
 
 
-@each("name", CHUNKED)
+@pytest.mark.parametrize("name", CHUNKED)
 def test_chunks_outside_of_a_span_are_not_read(name: str, tmp_path: Path) -> None:
     span = Excerpt(START + 20 * PERIOD, START + 26 * PERIOD)
     paths = SOURCES[name](tmp_path, scene("mono8", frames=60))
@@ -474,8 +475,9 @@ ARRANGED: dict[str, list[tuple[str, int]]] = {
 }
 
 
-@each("name", ARRANGED, one_in=2)
-@each("hold", [None, 3900])
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("name", ARRANGED)
+@pytest.mark.parametrize("hold", [None, 3900])
 def test_chunks_in_any_order(
     name: str, hold: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -565,7 +567,7 @@ LIES: dict[str, tuple[int, Callable[..., None], bool]] = {
 }
 
 
-@each("name", LIES)
+@pytest.mark.parametrize("name", LIES)
 def test_an_index_that_lies_loses_nothing_in_silence(name: str, tmp_path: Path) -> None:
     """Either it is not used, or what is lost is told."""
     opcode, change, is_used = LIES[name]
@@ -655,7 +657,7 @@ def changed_database(folder: Path, *statements: str) -> Path:
     return path
 
 
-@each(
+@pytest.mark.parametrize(
     ("statements", "indexed"),
     [
         ([], True),
@@ -686,7 +688,7 @@ REBUILT = (
 )
 
 
-@each("value", ["NULL", "'text'", "x'ff'", "-5", "1e300", "-1e300"])
+@pytest.mark.parametrize("value", ["NULL", "'text'", "x'ff'", "-5", "1e300", "-1e300"])
 def test_what_is_no_time_is_refused_by_some_span(value: str, tmp_path: Path) -> None:
     path = changed_database(
         tmp_path, *REBUILT, f"UPDATE messages SET timestamp = {value} WHERE id = 50"
@@ -785,7 +787,8 @@ def vars_of(message: Any) -> dict[str, Any]:
     return {name: getattr(message, name) for name in message.__dataclass_fields__}
 
 
-@each("kind", ["bag", "mcap", "rosbag2-sqlite3", "rosbag2-mcap"], one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("kind", ["bag", "mcap", "rosbag2-sqlite3", "rosbag2-mcap"])
 def test_recordings_side_by_side(kind: str, tmp_path: Path) -> None:
     paths = side_by_side(kind, tmp_path)
     for order in (paths, paths[::-1]):

@@ -21,7 +21,6 @@ import yaml
 from PIL import Image
 
 import mp4ds
-from each import each
 from export_scenes import (
     COLOUR,
     DEPTH,
@@ -169,7 +168,7 @@ def test_tum(dataset: Path, tmp_path: Path) -> None:
     assert acceleration[:, 3] == pytest.approx([9.81] * 4 * FRAMES)
 
 
-@each(
+@pytest.mark.parametrize(
     ("time", "text"),
     [
         (1_700_000_000_000_000_007, "1700000000.000000007"),
@@ -261,7 +260,9 @@ def projected(point: np.ndarray[Any, Any], d: list[float], fisheye: bool = False
     return [float(value) + 0.5 for value in where.ravel()]
 
 
-@each("model", ["plumb_bob", "Brown Conrady", "rational_polynomial", "equidistant", ""])
+@pytest.mark.parametrize(
+    "model", ["plumb_bob", "Brown Conrady", "rational_polynomial", "equidistant", ""]
+)
 def test_pycolmap_distorts_as_opencv(model: str, tmp_path: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     made = with_lens(model, rectified=True)
@@ -318,7 +319,7 @@ def lens(model: str, d: list[float]) -> Calibration:
     )
 
 
-@each(
+@pytest.mark.parametrize(
     ("model", "d", "colmap", "euroc"),
     [
         ("plumb_bob", [0.0] * 5, ("PINHOLE", []), "radial-tangential"),
@@ -382,7 +383,7 @@ def with_lens(model: str, *, rectified: bool) -> Scene:
     return Scene([changed(message) for message in MADE.messages])
 
 
-@each("model", LENSES)
+@pytest.mark.parametrize("model", LENSES)
 def test_calibrations_are_imported_again(model: str, tmp_path: Path) -> None:
     made = with_lens(model, rectified=model != "Brown Conrady")
     source = pack_drive(tmp_path, Scene([m for m in made.messages if m.topic.startswith("/front")]))
@@ -398,7 +399,7 @@ def test_calibrations_are_imported_again(model: str, tmp_path: Path) -> None:
     assert found.p == pytest.approx([FX, 0, CX, 0, 0, FX, CY, 0, 0, 0, 1, 0])
 
 
-@each("to", IMPORTED)
+@pytest.mark.parametrize("to", IMPORTED)
 def test_import_takes_what_export_wrote(to: str, dataset: Path, tmp_path: Path) -> None:
     export(dataset, to, tmp_path / "out", poses=ODOMETRY)
     images = mp4ds.PackOptions(images=mp4ds.ImageFolder())
@@ -785,7 +786,7 @@ def test_the_command(dataset: Path, tmp_path: Path) -> None:
     assert not (out / "rgb").exists()
 
 
-@each(
+@pytest.mark.parametrize(
     ("to", "options", "words"),
     [
         ("nuscenes", {}, "format 'nuscenes' is not known"),

@@ -25,7 +25,6 @@ from typing import Any
 import pytest
 
 import mp4ds
-from each import each, fresh
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.errors import Mp4dsError, PartsFailedError, SourceError, TargetError, WriteError
 from mp4ds.packing.options import PackOptions
@@ -58,12 +57,12 @@ def recorded(folder: Path, kind: str = "bag-none") -> Path:
     return path
 
 
-@fresh
+@pytest.fixture
 def source(tmp_path: Path) -> Path:
     return recorded(tmp_path)
 
 
-@fresh
+@pytest.fixture
 def expected(source: Path, tmp_path: Path) -> dict[str, Any]:
     return undisturbed(source, tmp_path)
 
@@ -209,8 +208,10 @@ def test_a_disk_that_is_full_at_any_moment(
     assert REACHED[limit] <= reached
 
 
-@each("name", ["job.json", "part.json", "messages.mcap", "cam_image_raw.yaml", "dataset.yaml"])
-@each("code", [errno.ENOSPC, errno.EIO, errno.EROFS], ids=errno.errorcode.get)
+@pytest.mark.parametrize(
+    "name", ["job.json", "part.json", "messages.mcap", "cam_image_raw.yaml", "dataset.yaml"]
+)
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EROFS], ids=errno.errorcode.get)
 def test_a_file_that_the_disk_refuses(
     code: int,
     name: str,
@@ -300,7 +301,7 @@ class _BadSector(io.FileIO):
         return super().readall()
 
 
-@each("kind", ["bag-none", "bag-bz2", "mcap-ros2-zstd", "mcap-ros2-none"])
+@pytest.mark.parametrize("kind", ["bag-none", "bag-bz2", "mcap-ros2-zstd", "mcap-ros2-none"])
 def test_a_bad_sector(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compare: Compare
 ) -> None:
@@ -345,8 +346,8 @@ CHANGES: dict[str, Callable[[Path], object]] = {
 }
 
 
-@each("change", CHANGES)
-@each("kind", KINDS)
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_source_that_changes_while_it_is_packed(
     kind: str, change: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -440,7 +441,8 @@ def test_a_process_that_finds_its_source_gone(
     assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == [PARTS[1]]
 
 
-@each(
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize(
     ("harm", "sentence"),
     [
         ("raise MemoryError", "out of memory; try fewer `jobs`"),
@@ -449,7 +451,6 @@ def test_a_process_that_finds_its_source_gone(
         ("os.abort()", "its process was killed by SIGABRT"),
         ("raise ArithmeticError('odd')", "its process exited with code 1: ArithmeticError: odd"),
     ],
-    one_in=2,
 )
 def test_a_task_that_ends_its_process(
     harm: str,
@@ -498,7 +499,7 @@ def test_a_work_folder_that_is_removed_meanwhile(
     assert ran == ["source-0", *PARTS]
 
 
-@each(
+@pytest.mark.parametrize(
     ("gone", "again"),
     [
         (".", ["source-0", *PARTS]),

@@ -15,7 +15,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mp4ds
 from definitions import PACKET
-from each import each
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import Choice, DecodedColumns, everything
 from mp4ds.packing.options import PackOptions
@@ -130,8 +129,8 @@ def check(found: Sequence[Read], name: str, *, ros1: bool) -> None:
                 assert psnr(image[2:-2, 2:-2], expected[2:-2, 2:-2]) > 18
 
 
-@each("to", ["rosbag2", "bag"])
-@each("name", CASES)
+@pytest.mark.parametrize("to", ["rosbag2", "bag"])
+@pytest.mark.parametrize("name", CASES)
 def test_a_subscriber_sees_the_images(packed: Callable[[str], Packed], name: str, to: str) -> None:
     made = packed(name)
     summary, messages = made.unpack(to, "ffmpeg")
@@ -186,7 +185,7 @@ def test_the_messages_are_those_of_a_public_library(
     assert {message.metadata["digest"] for message in found} == {digest}
 
 
-@each(
+@pytest.mark.parametrize(
     ("first", "skipped", "expected"),
     [
         (8, (), range(6, FRAMES)),

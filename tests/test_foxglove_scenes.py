@@ -13,7 +13,6 @@ from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoder
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoder
 
 from definitions import CODED_VIDEO, RAW_IMAGE
-from each import each
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from foxglove_wire import SERIALIZATIONS, as_bytes, message_class
 from pictures import picture, pixels
@@ -60,8 +59,10 @@ def same(given: Any, found: Any) -> bool:
     return np.array_equal(np.asarray(given, float), np.asarray(found, float))
 
 
-@each("name", SCENES)
-@each("source", [s for s in FOXGLOVE_SOURCES if s.startswith(("mcap-protobuf", "mcap-foxglove"))])
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "source", [s for s in FOXGLOVE_SOURCES if s.startswith(("mcap-protobuf", "mcap-foxglove"))]
+)
 def test_protobuf_and_ros2(source: str, name: str, tmp_path: Path) -> None:
     for record, schema, _, decoded in written(tmp_path, source, name):
         kind = record.msgtype.rpartition("/")[2]
@@ -95,7 +96,7 @@ def test_protobuf_fields_stand_where_they_should(tmp_path: Path) -> None:
                 assert standard.FromString(data).data == packet
 
 
-@each("name", FOXGLOVE)
+@pytest.mark.parametrize("name", FOXGLOVE)
 def test_every_scene_is_the_same_in_every_serialization(name: str) -> None:
     made = FOXGLOVE[name](frames=3, width=32, height=16)
     for record in made.messages:

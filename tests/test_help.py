@@ -8,7 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from each import each
+import pytest
+
 from mp4ds.cli import COMMANDS
 from waiting import WATCHDOG_S
 
@@ -27,7 +28,9 @@ def run(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-@each("command", [name for name in COMMANDS if name != "import"] + ["import images"])
+@pytest.mark.parametrize(
+    "command", [name for name in COMMANDS if name != "import"] + ["import images"]
+)
 def test_options_stand_by_what_they_are_about(command: str, tmp_path: Path) -> None:
     done = run(*command.split(), "--help", folder=tmp_path)
     assert done.returncode == 0
@@ -64,7 +67,7 @@ def test_where_errors_come_from(tmp_path: Path) -> None:
     assert "Traceback" in run("-v", "info", "nothing", folder=tmp_path).stderr
 
 
-@each(
+@pytest.mark.parametrize(
     ("words", "number", "expected"),
     [("mp4ds rep", 1, {"repack", "report"}), ("mp4ds pack --dura", 2, {"--duration"})],
 )

@@ -25,7 +25,6 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
-from each import each, fresh
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from jail import Jail, Outcome
 from mp4ds import Mp4dsError, VersionError, yamlio
@@ -69,7 +68,7 @@ def jail() -> Iterator[Jail]:
         yield opened
 
 
-@fresh
+@pytest.fixture
 def pair(packed_bag: Path, tmp_path: Path) -> Path:
     """A video with its sidecar, without the rest of their dataset."""
     for suffix in (".mp4", ".yaml"):
@@ -77,7 +76,7 @@ def pair(packed_bag: Path, tmp_path: Path) -> Path:
     return tmp_path / f"{STEM}.yaml"
 
 
-@fresh
+@pytest.fixture
 def dataset(packed_bag: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(packed_bag, tmp_path / "dataset"))
 
@@ -206,14 +205,16 @@ def test_the_good_ones_are_accepted(pair: Path, dataset: Path, jail: Jail) -> No
 # ---------------------------------------------------------------- names of files
 
 
-@each("name", NAMES)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_video_outside_of_the_folder_is_refused(name: str, pair: Path, jail: Jail) -> None:
     changed(pair, put("video", "file", value=NAMES[name]))
     refused(jail, pair, *BAD_DOCUMENT)
 
 
-@each("name", ["parent", "absolute", "empty", "dot", "line-feed", "fullwidth-dots"])
-@each("key", ["sidecar", "video", "files"])
+@pytest.mark.parametrize(
+    "name", ["parent", "absolute", "empty", "dot", "line-feed", "fullwidth-dots"]
+)
+@pytest.mark.parametrize("key", ["sidecar", "video", "files"])
 def test_a_manifest_names_plain_files_only(key: str, name: str, dataset: Path, jail: Jail) -> None:
     place = ("files", 0, "name") if key == "files" else ("streams", 0, key)
     changed(dataset / "dataset.yaml", put(*place, value=NAMES[name]))
@@ -249,8 +250,8 @@ def test_a_sidecar_that_is_another_file(name: str, dataset: Path, jail: Jail) ->
 # ---------------------------------------------------------------- links and special files
 
 
-@each("inside", [True, False], ids=["inside", "outside"])
-@each("suffix", [".mp4", ".yaml"])
+@pytest.mark.parametrize("inside", [True, False], ids=["inside", "outside"])
+@pytest.mark.parametrize("suffix", [".mp4", ".yaml"])
 def test_links_are_followed(
     suffix: str, inside: bool, dataset: Path, tmp_path: Path, jail: Jail
 ) -> None:
@@ -274,8 +275,8 @@ def test_links_in_a_circle(suffix: str, pair: Path, jail: Jail) -> None:
         refused(jail, pair, "file-missing")
 
 
-@each("kind", ["zero", "fifo", "folder"])
-@each("name", [f"{STEM}.yaml", f"{STEM}.mp4", "messages.mcap", "dataset.yaml"])
+@pytest.mark.parametrize("kind", ["zero", "fifo", "folder"])
+@pytest.mark.parametrize("name", [f"{STEM}.yaml", f"{STEM}.mp4", "messages.mcap", "dataset.yaml"])
 def test_what_is_no_regular_file(name: str, kind: str, dataset: Path, jail: Jail) -> None:
     path = dataset / name
     path.unlink()
@@ -329,8 +330,8 @@ TEXTS: dict[str, bytes] = {
 }
 
 
-@each("name", TEXTS)
-@each("to", ["sidecar", "manifest"])
+@pytest.mark.parametrize("name", TEXTS)
+@pytest.mark.parametrize("to", ["sidecar", "manifest"])
 def test_yaml_beyond_the_subset(to: str, name: str, dataset: Path, jail: Jail) -> None:
     path = dataset / (f"{STEM}.yaml" if to == "sidecar" else "dataset.yaml")
     head = b'mp4ds: "1.1"\nkind: stream\n' if TEXTS[name].startswith(b"a:") else b""
@@ -361,13 +362,13 @@ VALUES: dict[str, bytes] = {
 }
 
 
-@each("name", VALUES)
+@pytest.mark.parametrize("name", VALUES)
 def test_what_is_no_integer(name: str, pair: Path, jail: Jail) -> None:
     edited(pair, b"frames: 8", b"frames: " + VALUES[name])
     refused(jail, pair, *BAD_DOCUMENT)
 
 
-@each("value", [b".nan", b".inf", b"-.inf", b"nan", b'"0.0"', b"true", b"[]"])
+@pytest.mark.parametrize("value", [b".nan", b".inf", b"-.inf", b"nan", b'"0.0"', b"true", b"[]"])
 def test_a_calibration_has_finite_numbers(value: bytes, pair: Path, jail: Jail) -> None:
     edited(pair, b"0.0,", value + b",")
     refused(jail, pair, *BAD_DOCUMENT)
@@ -398,7 +399,7 @@ def test_many_headers(pair: Path, jail: Jail) -> None:
 # ---------------------------------------------------------------- versions
 
 
-@each("version", ["2.0", "2.7", "10.0", "99999999999.0"])
+@pytest.mark.parametrize("version", ["2.0", "2.7", "10.0", "99999999999.0"])
 def test_a_newer_major_version_is_refused(version: str, pair: Path, jail: Jail) -> None:
     changed(pair, put("mp4ds", value=version))
     text = refused(jail, pair, "version-unsupported")
@@ -408,7 +409,7 @@ def test_a_newer_major_version_is_refused(version: str, pair: Path, jail: Jail) 
         mp4ds.open(pair)
 
 
-@each(
+@pytest.mark.parametrize(
     "version",
     [b"1", b"1.0", b'"1"', b'"1.0.0"', b'"01.0"', b'"0.9"', b'"1.0 "', b'"-1.0"', b'"1.\xd9\xa1"',
      b"null", b"[1]", b"{}", b"true", b'"' + b"9" * 5000 + b'.0"'],
@@ -465,7 +466,7 @@ def test_unknown_keys_of_this_version_are_refused(pair: Path, jail: Jail) -> Non
     refused(jail, pair, *BAD_DOCUMENT)
 
 
-@each("kind", [b"dataset", b"torrent", b"5", b"null", b"[]", b"{}", b"true"])
+@pytest.mark.parametrize("kind", [b"dataset", b"torrent", b"5", b"null", b"[]", b"{}", b"true"])
 def test_another_kind(kind: bytes, pair: Path, jail: Jail) -> None:
     edited(pair, b"kind: stream", b"kind: " + kind)
     refused(jail, pair, "kind-unknown", "model-invalid")
@@ -481,7 +482,7 @@ img_timestamp: [1.5, 2.5]
 """
 
 
-@each(
+@pytest.mark.parametrize(
     ("old", "new"),
     [
         ("[1.5, 2.5]", '["1/0"]'),
@@ -547,7 +548,7 @@ GEOMETRY: dict[str, tuple[Change, set[str]]] = {
 }
 
 
-@each("name", GEOMETRY)
+@pytest.mark.parametrize("name", GEOMETRY)
 def test_sizes_that_ask_for_memory(name: str, pair: Path, jail: Jail) -> None:
     change, codes = GEOMETRY[name]
     changed(pair, change)
@@ -605,7 +606,7 @@ RESIDUALS: dict[str, str] = {
 }
 
 
-@each("name", RESIDUALS)
+@pytest.mark.parametrize("name", RESIDUALS)
 def test_columns_that_do_not_decode(name: str, pair: Path, jail: Jail) -> None:
     changed(pair, put("columns", "stamp", "values", value=RESIDUALS[name]))
     text = refused(jail, pair, "column-invalid", "yaml-invalid")
@@ -687,7 +688,7 @@ COLUMN_CHANGES: dict[str, tuple[Change, set[str]]] = {
 }
 
 
-@each("name", COLUMN_CHANGES)
+@pytest.mark.parametrize("name", COLUMN_CHANGES)
 def test_a_sidecar_that_contradicts_itself_or_its_video(name: str, pair: Path, jail: Jail) -> None:
     change, codes = COLUMN_CHANGES[name]
     changed(pair, change)
@@ -784,7 +785,7 @@ OTHER_VIDEOS: dict[str, tuple[Callable[[Path], None], set[str]]] = {
 }
 
 
-@each("name", OTHER_VIDEOS)
+@pytest.mark.parametrize("name", OTHER_VIDEOS)
 def test_another_video(name: str, pair: Path, jail: Jail) -> None:
     make, codes = OTHER_VIDEOS[name]
     path = pair.with_suffix(".mp4")
@@ -795,7 +796,7 @@ def test_another_video(name: str, pair: Path, jail: Jail) -> None:
     refused(jail, pair, *codes)
 
 
-@each("size", [(32, 48), (128, 48), (64, 96), (4096, 4096)])
+@pytest.mark.parametrize("size", [(32, 48), (128, 48), (64, 96), (4096, 4096)])
 def test_a_video_that_changes_its_size_half_way(
     size: tuple[int, int], pair: Path, jail: Jail
 ) -> None:
@@ -838,7 +839,7 @@ def test_a_playlist_of_other_files(pair: Path, jail: Jail) -> None:
     refused(jail, pair, "video-unreadable")
 
 
-@each("form", ["hls", "sdp", "concat", "dash"])
+@pytest.mark.parametrize("form", ["hls", "sdp", "concat", "dash"])
 def test_nothing_is_fetched_from_a_network(form: str, pair: Path, jail: Jail) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(0.05)
@@ -858,7 +859,7 @@ def test_nothing_is_fetched_from_a_network(form: str, pair: Path, jail: Jail) ->
             server.accept()
 
 
-@each("folder", ["a:b", "run-12:00:00", "http:", "pipe:0", "100%d", "-x", "é è"])
+@pytest.mark.parametrize("folder", ["a:b", "run-12:00:00", "http:", "pipe:0", "100%d", "-x", "é è"])
 def test_a_folder_whose_name_looks_like_something_else(
     folder: str, packed_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -916,7 +917,7 @@ def copied(sidecar: Path, folder: Path) -> Path:
     return folder / sidecar.name
 
 
-@each("kind", KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_the_good_ones_of_every_kind_are_accepted(
     kind: str, pairs: Callable[[str], Path], tmp_path: Path, jail: Jail
 ) -> None:
@@ -1222,7 +1223,8 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
 }
 
 
-@each("name", FORGED, one_in=6)
+@pytest.mark.one_in(6)
+@pytest.mark.parametrize("name", FORGED)
 def test_a_forged_sidecar_of_coded_pictures(
     name: str, pairs: Callable[[str], Path], tmp_path: Path, jail: Jail
 ) -> None:
@@ -1248,7 +1250,7 @@ MANIFESTS: dict[str, tuple[Change, set[str]]] = {
 }
 
 
-@each("name", MANIFESTS)
+@pytest.mark.parametrize("name", MANIFESTS)
 def test_a_hostile_manifest(name: str, dataset: Path, jail: Jail) -> None:
     change, codes = MANIFESTS[name]
     changed(dataset / "dataset.yaml", change)
@@ -1338,8 +1340,9 @@ def _read_all(path: Path) -> None:
             _ = stream[-1].intrinsics
 
 
-@each("seed", range(3), one_in=3)
-@each("name", [f"{STEM}.yaml", "dataset.yaml"])
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", [f"{STEM}.yaml", "dataset.yaml"])
 def test_no_change_of_a_value_raises_anything_foreign(name: str, seed: int, dataset: Path) -> None:
     path, rng = dataset / name, random.Random(seed)
     document, found = load(path), []

@@ -13,7 +13,6 @@ import pytest
 import yaml
 
 import mp4ds
-from each import each
 from hub_server import REPOSITORY, Hub, hub_server
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.reporting.card import card
@@ -148,7 +147,7 @@ def test_a_card_has_what_was_told(tmp_path: Path) -> None:
     assert "| 6 | 0.2 |" in row
 
 
-@each(
+@pytest.mark.parametrize(
     ("licenses", "expected"),
     [
         (["CC-BY-4.0", "CC-BY-4.0"], {"license": "cc-by-4.0"}),

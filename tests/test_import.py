@@ -30,7 +30,6 @@ from typer.testing import CliRunner
 
 import mp4ds
 from conftest import real
-from each import each
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.cli import app_for
 from mp4ds.errors import SourceError
@@ -155,7 +154,7 @@ EXACT: dict[str, tuple[Callable[[Path], Any], str, Pixels]] = {
 }
 
 
-@each("name", EXACT)
+@pytest.mark.parametrize("name", EXACT)
 def test_files_are_read_to_the_bit(name: str, tmp_path: Path) -> None:
     write, encoding, expected = EXACT[name]
     write(tmp_path / name)
@@ -209,7 +208,7 @@ def test_what_cannot_be_had_as_it_is_is_refused(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- times
 
 
-@each(
+@pytest.mark.parametrize(
     "text",
     [
         "1305031102.175304",
@@ -235,7 +234,9 @@ def test_finer_times_are_rounded_and_counted() -> None:
     assert rounded == {scene.ROUNDED: 2}
 
 
-@each("text", ["", "x", "-1", "nan", "inf", "1e99", "0x10", "1_000", "2147483648"])
+@pytest.mark.parametrize(
+    "text", ["", "x", "-1", "nan", "inf", "1e99", "0x10", "1_000", "2147483648"]
+)
 def test_what_is_no_time_is_refused(text: str) -> None:
     with pytest.raises(scene.Refused):
         scene.of_unit("s", Counter())(text)
@@ -278,7 +279,7 @@ CASES: dict[str, tuple[list[str], str | None, dict[str, str], list[int]]] = {
 }  # fmt: skip
 
 
-@each("case", CASES)
+@pytest.mark.parametrize("case", CASES)
 def test_times_of_plain_folders(case: str, tmp_path: Path) -> None:
     names, listed, options, expected = CASES[case]
     pictures = plain(tmp_path / "images", names)
@@ -295,7 +296,7 @@ def test_times_of_plain_folders(case: str, tmp_path: Path) -> None:
             assert np.array_equal(frame.data, pixels)
 
 
-@each(
+@pytest.mark.parametrize(
     ("names", "cameras"),
     [
         (("color_{}.jpg", "depth_{}.png"), ["/color/image_raw/compressed", "/depth/image_raw"]),
@@ -317,7 +318,7 @@ def test_a_rate_is_that_of_each_camera(
     assert found == {topic: [0, 33333333, 66666667] for topic in cameras}
 
 
-@each(
+@pytest.mark.parametrize(
     "names",
     [
         ["a.png", "b.png", "c.png"],
@@ -337,7 +338,7 @@ def test_a_rate_is_that_of_one_camera(names: list[str], tmp_path: Path) -> None:
         assert len(set(np.concatenate(list(reader.times().values())).tolist())) == len(names)
 
 
-@each(
+@pytest.mark.parametrize(
     ("names", "options", "words"),
     [
         (["color_1.png", "color_2.png", "depth_1.png", "depth_3.png"], [], "their numbers differ"),
@@ -485,7 +486,7 @@ def test_an_import_goes_on_unless_the_images_have_changed(
     assert leftovers(tmp_path) == []
 
 
-@each(
+@pytest.mark.parametrize(
     ("model", "values", "name", "due"),
     [
         ("plumb_bob", [1, 2, 3, 4], "plumb_bob", [1, 2, 3, 4, 0]),
@@ -790,7 +791,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], list[str], str]] = {
 }
 
 
-@each("case", BAD)
+@pytest.mark.parametrize("case", BAD)
 def test_bad_folders_are_refused_in_a_sentence(case: str, tmp_path: Path) -> None:
     spoiled, options, words = BAD[case]
     root = euroc(tmp_path)
@@ -853,7 +854,7 @@ PLAIN_BAD: dict[str, tuple[list[str], dict[str, str], list[str], str]] = {
 }
 
 
-@each("case", PLAIN_BAD)
+@pytest.mark.parametrize("case", PLAIN_BAD)
 def test_bad_plain_folders_are_refused(
     case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

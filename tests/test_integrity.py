@@ -15,7 +15,6 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
-from each import each, fresh
 from mp4ds import FormatError, Mp4dsError, SourceError, yamlio
 from mp4ds.unpacking.options import UnpackOptions
 from scenes import Scene
@@ -59,13 +58,13 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[li
     return make
 
 
-@fresh
+@pytest.fixture
 def dataset(packed: Callable[[str], tuple[list[Path], Path]], tmp_path: Path) -> Path:
     """A dataset of a bag, to be damaged."""
     return Path(shutil.copytree(packed("bag-none")[1], tmp_path / "dataset"))
 
 
-@fresh
+@pytest.fixture
 def two_cameras(tmp_path: Path) -> Path:
     """A dataset of two streams, to be damaged."""
     left = scene("mono8", with_info=False).messages
@@ -157,8 +156,9 @@ def found_in(folder: Path, name: str) -> str:
     return ""
 
 
-@each("name", FILES, one_in=2)
-@each("source", TARGETS)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("source", TARGETS)
 def test_a_flipped_bit_is_found(
     source: str,
     name: str,
@@ -202,7 +202,7 @@ def test_flipped_bits_of_metadata_are_found(
     assert wrong == []
 
 
-@each("text", [b"Lavf", b"VideoHandler", b"moov", b"mdat", b"ftyp", b"stsz"])
+@pytest.mark.parametrize("text", [b"Lavf", b"VideoHandler", b"moov", b"mdat", b"ftyp", b"stsz"])
 def test_flipped_bits_of_the_container_are_found(text: bytes, dataset: Path) -> None:
     path = dataset / f"{STEM}.mp4"
     data = bytearray(path.read_bytes())
@@ -299,8 +299,9 @@ def unsealed(document: Document) -> None:
     del document["video"]["size"], document["video"]["sha256"]
 
 
-@each("suffix", [".mp4", ".yaml"], one_in=4)
-@each("kind", CODED_KINDS)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("suffix", [".mp4", ".yaml"])
+@pytest.mark.parametrize("kind", CODED_KINDS)
 def test_a_flipped_bit_of_coded_pictures_is_found(
     kind: str, suffix: str, coded: MakeCoded, tmp_path: Path
 ) -> None:
@@ -324,7 +325,8 @@ def coded_data(video: bytes) -> tuple[int, int]:
     return start + 4, start - 4 + int.from_bytes(video[start - 4 : start], "big")
 
 
-@each("kind", CODED_KINDS, one_in=3)
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("kind", CODED_KINDS)
 def test_digests_tell_of_each_coded_byte(kind: str, coded: MakeCoded, tmp_path: Path) -> None:
     """Although sidecar and manifest agree with the damaged video."""
     folder, video = copied(coded(kind)[1], tmp_path)
@@ -344,8 +346,9 @@ def test_digests_tell_of_each_coded_byte(kind: str, coded: MakeCoded, tmp_path: 
         assert any(f"[{code}]" in refused(folder) for code in found)
 
 
-@each("length", [0, 1, 40, 0.3, 0.9, -1], one_in=3)
-@each("kind", CODED_KINDS)
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("length", [0, 1, 40, 0.3, 0.9, -1])
+@pytest.mark.parametrize("kind", CODED_KINDS)
 def test_a_video_of_coded_pictures_that_was_cut_short(
     kind: str, length: float, coded: MakeCoded, tmp_path: Path
 ) -> None:
@@ -364,7 +367,8 @@ def test_a_video_of_coded_pictures_that_was_cut_short(
         refused(folder)
 
 
-@each(
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize(
     ("kind", "key", "value"),
     [
         ("depth-16UC1-png", "prefix", "00" * 12),
@@ -381,7 +385,6 @@ def test_a_video_of_coded_pictures_that_was_cut_short(
         ("video-av1", "framing", ""),
         ("ffmpeg-libx264", "framing", "+1"),
     ],
-    one_in=2,
 )
 def test_a_recipe_that_was_changed(
     kind: str, key: str, value: Any, coded: MakeCoded, tmp_path: Path
@@ -473,7 +476,7 @@ def test_swapped_sidecars_whose_manifest_was_made_to_agree(two_cameras: Path) ->
     assert codes(two_cameras) == ["manifest-inconsistent"]
 
 
-@each("length", [0, 1, 40, 0.3, 0.9, -1])
+@pytest.mark.parametrize("length", [0, 1, 40, 0.3, 0.9, -1])
 def test_a_video_that_was_cut_short(length: float, dataset: Path) -> None:
     path = dataset / f"{STEM}.mp4"
     data = path.read_bytes()
@@ -486,7 +489,7 @@ def test_a_video_that_was_cut_short(length: float, dataset: Path) -> None:
         refused(dataset)
 
 
-@each("length", [0, 1, 40, 0.3, 0.9, -1])
+@pytest.mark.parametrize("length", [0, 1, 40, 0.3, 0.9, -1])
 def test_messages_that_were_cut_short(length: float, dataset: Path) -> None:
     path = dataset / "messages.mcap"
     data = path.read_bytes()

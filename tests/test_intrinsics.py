@@ -23,7 +23,6 @@ from typer.testing import CliRunner
 
 import mp4ds
 from conftest import real
-from each import each
 from foxglove_scenes import FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.cli import app_for
 from mp4ds.dataset.views import effective
@@ -105,7 +104,7 @@ def check_focused(camera: CameraCalibrations, made: Scene) -> None:
         assert (item.binning, item.roi, item.k_effective, item.p_effective) == (None,) * 4
 
 
-@each("source", SOME_SOURCES)
+@pytest.mark.parametrize("source", SOME_SOURCES)
 def test_recordings_of_every_kind(source: str, tmp_path: Path) -> None:
     made = focused(scene("mono8"))
     path = SOURCES[source](tmp_path, made)[0]
@@ -117,7 +116,7 @@ def test_recordings_of_every_kind(source: str, tmp_path: Path) -> None:
     check_focused(camera, made)
 
 
-@each("source", FOXGLOVE_SOURCES)
+@pytest.mark.parametrize("source", FOXGLOVE_SOURCES)
 def test_recordings_of_foxglove(source: str, tmp_path: Path) -> None:
     made = focused(foxglove_scene(partial(scene, "mono8"), frames=8, width=64, height=48))
     camera = camera_of(intrinsics(FOXGLOVE_SOURCES[source](tmp_path, made)[0]))
@@ -305,7 +304,7 @@ def test_effective_matrices_of_image_geometry() -> None:
     ]  # fmt: skip
 
 
-@each(
+@pytest.mark.parametrize(
     ("binning", "roi", "same"),
     [
         ((0, 0), (0, 0, 0, 0), True),
@@ -458,7 +457,7 @@ def test_errors_are_those_of_info(options: list[str], tmp_path: Path) -> None:
 # ---------------------------------------------------------------- real recordings
 
 
-@each(
+@pytest.mark.parametrize(
     "name",
     [
         "bags/fiducials_aruco_marker_raspicam.bag",

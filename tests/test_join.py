@@ -21,7 +21,6 @@ import pytest
 from coded_tools import ENCODINGS, IN_ORDER, hide, jpeg, superframe
 from coded_tools import encode as encode_packets
 from coded_tools import scene as packet_scene
-from each import each
 from mp4ds.errors import Mp4dsError, SegmentsDifferError, VideoError
 from mp4ds.times import MAX_GAP_NS, NS_PER_TICK
 from mp4ds.video.codecs import Recipe, recipe_for
@@ -151,7 +150,7 @@ LEFT_OUT = {"h264": {"btrt"}, "h265": {"btrt"}, "av1": {"sdtp"}, "ffv1": set()}
 
 Kind = tuple[str, str, bool]
 Joined = Callable[[Kind], tuple[Path, list[Path], dict[str, Any]]]
-every_kind = each("kind", KINDS, ids=IDS, one_in=2)
+every_kind = pytest.mark.parametrize("kind", KINDS, ids=IDS)
 
 
 @pytest.fixture(scope="module")
@@ -172,6 +171,7 @@ def joined(elsewhere: Path, tmp_path_factory: pytest.TempPathFactory) -> Joined:
     return make
 
 
+@pytest.mark.one_in(2)
 @every_kind
 def test_pictures_are_those_of_the_segments(kind: Kind, joined: Joined) -> None:
     target, segments, told = joined(kind)
@@ -192,6 +192,7 @@ def test_pictures_are_those_of_the_segments(kind: Kind, joined: Joined) -> None:
             assert same(planes if len(planes) > 1 else planes[0], expected[number]), number
 
 
+@pytest.mark.one_in(2)
 @every_kind
 def test_the_file_is_as_one_encoder_writes_it(kind: Kind, joined: Joined, tmp_path: Path) -> None:
     target, segments, _ = joined(kind)
@@ -211,6 +212,7 @@ def test_the_file_is_as_one_encoder_writes_it(kind: Kind, joined: Joined, tmp_pa
     assert keys == expected
 
 
+@pytest.mark.one_in(2)
 @every_kind
 def test_one_segment_is_the_file_itself(kind: Kind, joined: Joined, tmp_path: Path) -> None:
     segment = joined(kind)[1][0]
@@ -222,7 +224,7 @@ def test_one_segment_is_the_file_itself(kind: Kind, joined: Joined, tmp_path: Pa
         assert target.read_bytes() == segment.read_bytes()
 
 
-@each("picture_format", [f for codec, f in LOSSLESS if codec == "ffv1"])
+@pytest.mark.parametrize("picture_format", [f for codec, f in LOSSLESS if codec == "ffv1"])
 def test_parts_that_end_at_key_frames_give_the_uncut_file(
     picture_format: str, tmp_path: Path
 ) -> None:
@@ -249,6 +251,7 @@ def ffmpeg_says(path: Path) -> tuple[int, str]:
     return done.returncode, done.stderr.decode()
 
 
+@pytest.mark.one_in(2)
 @every_kind
 def test_ffmpeg_reads_it_without_a_word(kind: Kind, joined: Joined) -> None:
     target, segments, told = joined(kind)
@@ -266,6 +269,7 @@ def test_ffmpeg_reads_it_without_a_word(kind: Kind, joined: Joined) -> None:
     assert times == [number * STEP for number in range(TOTAL)]
 
 
+@pytest.mark.one_in(2)
 @every_kind
 def test_pyav_seeks_across_the_seams(kind: Kind, joined: Joined) -> None:
     target, _, _ = joined(kind)
@@ -281,8 +285,9 @@ def test_pyav_seeks_across_the_seams(kind: Kind, joined: Joined) -> None:
             assert times == list(range(times[0], TOTAL * STEP, STEP))
 
 
-@each("kind", KINDS, ids=IDS, one_in=8)
-@each("size", [(640, 360), (1920, 1200)])
+@pytest.mark.one_in(8)
+@pytest.mark.parametrize("kind", KINDS, ids=IDS)
+@pytest.mark.parametrize("size", [(640, 360), (1920, 1200)])
 def test_what_a_track_says_does_not_hang_on_threads(
     kind: tuple[str, str, bool], size: tuple[int, int], tmp_path: Path
 ) -> None:
@@ -316,7 +321,7 @@ def cut_at_keys(bodies: Sequence[tuple[bytes, bool]]) -> list[list[bytes]]:
     return parts
 
 
-@each("name", IN_ORDER)
+@pytest.mark.parametrize("name", IN_ORDER)
 def test_copied_packets_give_the_uncut_file(name: str, tmp_path: Path) -> None:
     codec = ENCODINGS[name].codec
     bodies = bodies_of(name)
@@ -392,7 +397,7 @@ def test_times_with_gaps(tmp_path: Path) -> None:
     assert (tmp_path / "joined.mp4").read_bytes() == (tmp_path / "uncut.mp4").read_bytes()
 
 
-@each("rate", [0.5, 10.0, 30.0, 120.0, None])
+@pytest.mark.parametrize("rate", [0.5, 10.0, 30.0, 120.0, None])
 def test_the_last_frame_lasts_as_the_rate_says(rate: float | None, tmp_path: Path) -> None:
     bodies = [jpeg(picture) for picture in packet_scene(6)]
 
@@ -446,7 +451,7 @@ DIFFERENCES: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
 }  # fmt: skip
 
 
-@each("name", DIFFERENCES)
+@pytest.mark.parametrize("name", DIFFERENCES)
 def test_videos_that_cannot_be_one(name: str, tmp_path: Path) -> None:
     first, other, problem = DIFFERENCES[name]
     segments = [small(tmp_path / "a.mp4", **first), small(tmp_path / "b.mp4", **other)]
@@ -561,8 +566,8 @@ def empty_index(data: bytes) -> bytes:
     return data[:at] + bytes(4) + data[at + 4 :]
 
 
-@each("place", [0, 1])
-@each("fault", FAULTS)
+@pytest.mark.parametrize("place", [0, 1])
+@pytest.mark.parametrize("fault", FAULTS)
 def test_a_segment_that_cannot_be_read(fault: str, place: int, tmp_path: Path) -> None:
     segments = [small(tmp_path / "a.mp4"), small(tmp_path / "b.mp4")]
     segments[place].write_bytes(FAULTS[fault](segments[place].read_bytes()))
@@ -702,7 +707,7 @@ except OSError as error:
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="the system limits no files")
-@each("short", [1, 700, 5_000, 300_000, 2_000_000])
+@pytest.mark.parametrize("short", [1, 700, 5_000, 300_000, 2_000_000])
 def test_a_disk_that_is_full(short: int, tmp_path: Path) -> None:
     """In the packets, in the index at the end, and in its last byte."""
     segment = large(tmp_path / "a.mp4", 20, 100_000)
@@ -758,7 +763,8 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.browser
-@each("name", [*PLAYED_IDS, *(f"packets-{name}" for name in PACKETS_PLAYED)], one_in=6)
+@pytest.mark.one_in(6)
+@pytest.mark.parametrize("name", [*PLAYED_IDS, *(f"packets-{name}" for name in PACKETS_PLAYED)])
 def test_a_browser_plays_across_the_seams(name: str, seen: dict[str, Any]) -> None:
     path, result = seen[name]
     assert result is not None, "the browser did not come to this video in time"

@@ -16,7 +16,6 @@ from typing import Any
 
 import pytest
 
-from each import each, fresh
 from mp4ds.cli.keyboard import Keyboard, Keys
 from mp4ds.cli.play import player_keys
 from waiting import until
@@ -93,7 +92,7 @@ class Terminal:
         return not self.attributes[3] & (termios.ICANON | termios.ECHO)
 
 
-@fresh
+@pytest.fixture
 def terminal() -> Iterator[Terminal]:
     hand, fd = os.openpty()
     yield Terminal(hand, fd)
@@ -128,7 +127,7 @@ IGNORED = {
 }
 
 
-@each("name", KEYS)
+@pytest.mark.parametrize("name", KEYS)
 def test_each_key(name: str, terminal: Terminal) -> None:
     typed, call, rate = KEYS[name]
     controls = RecordedControls()
@@ -139,7 +138,7 @@ def test_each_key(name: str, terminal: Terminal) -> None:
     assert controls.rate == rate
 
 
-@each("name", KEYS)
+@pytest.mark.parametrize("name", KEYS)
 def test_a_key_that_comes_byte_by_byte(name: str, terminal: Terminal) -> None:
     typed, call, _ = KEYS[name]
     controls = RecordedControls()
@@ -152,7 +151,7 @@ def test_a_key_that_comes_byte_by_byte(name: str, terminal: Terminal) -> None:
     assert controls.calls == [call]
 
 
-@each("name", IGNORED)
+@pytest.mark.parametrize("name", IGNORED)
 def test_other_keys_are_ignored(name: str, terminal: Terminal) -> None:
     controls = RecordedControls()
     with Keyboard(player_keys(controls), fd=terminal.fd):
@@ -185,7 +184,7 @@ def test_faster_and_slower_cancel(terminal: Terminal) -> None:
     assert controls.rate == pytest.approx(1, abs=1e-8)
 
 
-@each("size", range(1, 6))
+@pytest.mark.parametrize("size", range(1, 6))
 def test_keys_wherever_they_are_cut(size: int) -> None:
     typed = b" " + ESC + b"[C" + ESC + b"[1;2A" + ESC + b"s" + ESC + ESC + b"OB" + b"\xc3\xa9b"
     keys = Keys()
@@ -357,7 +356,7 @@ class Session:
         self._shell.stderr.close()
 
 
-@fresh
+@pytest.fixture
 def session(terminal: Terminal) -> Iterator[Session]:
     made = Session(terminal)
     yield made
@@ -366,7 +365,7 @@ def session(terminal: Terminal) -> Iterator[Session]:
     made.close()
 
 
-@each("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT])
 def test_the_terminal_is_as_it_was_after_a_signal(
     number: signal.Signals, terminal: Terminal, session: Session
 ) -> None:

@@ -9,7 +9,6 @@ import pytest
 from typer.testing import CliRunner
 
 import mp4ds
-from each import each
 from mp4ds.bags import latched
 from mp4ds.bags.formats import open_reader, open_writer
 from mp4ds.bags.slices import SliceReader
@@ -76,8 +75,8 @@ def sliced(way: str, source: Path, folder: Path, **options: Any) -> tuple[Any, P
     return summary, output
 
 
-@each("way", WAYS)
-@each("kind", TOPICS)
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("kind", TOPICS)
 def test_it_begins_with_them(way: str, kind: str, tmp_path: Path) -> None:
     source = made(kind, tmp_path)
     summary, output = sliced(way, source, tmp_path)
@@ -96,7 +95,7 @@ def test_it_begins_with_them(way: str, kind: str, tmp_path: Path) -> None:
     assert [note for note in info(dataset).notes if words in note]
 
 
-@each("way", WAYS)
+@pytest.mark.parametrize("way", WAYS)
 def test_without_them(way: str, tmp_path: Path) -> None:
     source = made("bag", tmp_path)
     summary, output = sliced(way, source, tmp_path, latched=False)

@@ -12,7 +12,6 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from each import each
 from mp4ds.errors import OptionError
 from mp4ds.messages.arrangements import CHROMA_SHIFTS
 from mp4ds.messages.encodings import (
@@ -71,43 +70,45 @@ def through(layout: Layout, pixels: np.ndarray, out: np.ndarray | None = None) -
 # ---------------------------------------------------------------- exact layouts
 
 
-@each("kind", KINDS, one_in=2)
-@each(("name", "layout"), GENERAL)
-def test_the_general_layout_gives_all_pixels_back(name: str, layout: str, kind: str) -> None:
-    encoding = ENCODINGS[name]
-    general = bind(layout, encoding)
-    assert general == layout_for(encoding, lossless=True)
-    for width, height in {rounded(encoding, *size) for size in SIZES}:
-        pixels = values(encoding, kind, width, height)
-        for big in (False, True):
-            for pad in (0, 1, 6):
-                view = as_message(pixels, encoding, pad=pad, is_bigendian=big)
-                assert general.refuses(view) is None
-                assert bits_of(through(general, view)) == bits_of(pixels)
-                target = np.ndarray(
-                    view.shape, view.dtype, bytearray(len(view) * view.strides[0]),
-                    strides=view.strides,
-                )  # fmt: skip
-                assert bits_of(through(general, view, target)) == bits_of(pixels)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize(("name", "layout"), GENERAL)
+def test_the_general_layout_gives_all_pixels_back(name: str, layout: str) -> None:
+    for kind in KINDS:
+        encoding = ENCODINGS[name]
+        general = bind(layout, encoding)
+        assert general == layout_for(encoding, lossless=True)
+        for width, height in {rounded(encoding, *size) for size in SIZES}:
+            pixels = values(encoding, kind, width, height)
+            for big in (False, True):
+                for pad in (0, 1, 6):
+                    view = as_message(pixels, encoding, pad=pad, is_bigendian=big)
+                    assert general.refuses(view) is None
+                    assert bits_of(through(general, view)) == bits_of(pixels)
+                    target = np.ndarray(
+                        view.shape, view.dtype, bytearray(len(view) * view.strides[0]),
+                        strides=view.strides,
+                    )  # fmt: skip
+                    assert bits_of(through(general, view, target)) == bits_of(pixels)
 
 
-@each("seed", range(4), one_in=2)
-@each(("name", "layout"), WITH_PARAMETERS)
-def test_a_fitted_layout_gives_the_samples_back(name: str, layout: str, seed: int) -> None:
-    encoding = ENCODINGS[name]
-    for width, height in SIZES:
-        pixels = suited(layout, encoding, width, height, seed)
-        fitted = fit(layout, encoding, [pixels])
-        if fitted is None:
-            assert width * height < 600, "not even of many samples"
-            continue
-        assert bind(layout, encoding, fitted.parameters) is not fitted
-        for big in (False, True):
-            view = as_message(pixels, encoding, pad=3, is_bigendian=big)
-            assert fitted.refuses(view) is None
-            assert bits_of(through(fitted, view)) == bits_of(pixels)
-            out = np.empty(pixels.shape, pixels.dtype.newbyteorder(">" if big else "<"))
-            assert bits_of(through(fitted, view, out)) == bits_of(pixels)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize(("name", "layout"), WITH_PARAMETERS)
+def test_a_fitted_layout_gives_the_samples_back(name: str, layout: str) -> None:
+    for seed in range(4):
+        encoding = ENCODINGS[name]
+        for width, height in SIZES:
+            pixels = suited(layout, encoding, width, height, seed)
+            fitted = fit(layout, encoding, [pixels])
+            if fitted is None:
+                assert width * height < 600, "not even of many samples"
+                continue
+            assert bind(layout, encoding, fitted.parameters) is not fitted
+            for big in (False, True):
+                view = as_message(pixels, encoding, pad=3, is_bigendian=big)
+                assert fitted.refuses(view) is None
+                assert bits_of(through(fitted, view)) == bits_of(pixels)
+                out = np.empty(pixels.shape, pixels.dtype.newbyteorder(">" if big else "<"))
+                assert bits_of(through(fitted, view, out)) == bits_of(pixels)
 
 
 def refused_or_returned(layout: Layout, pixels: np.ndarray) -> bool:
@@ -117,21 +118,21 @@ def refused_or_returned(layout: Layout, pixels: np.ndarray) -> bool:
     return refused != returned or (refused and layout.name.endswith("fold"))
 
 
-@each("kind", KINDS)
-@each(("name", "layout"), WITH_PARAMETERS)
-def test_what_is_not_refused_comes_back(name: str, layout: str, kind: str) -> None:
+@pytest.mark.parametrize(("name", "layout"), WITH_PARAMETERS)
+def test_what_is_not_refused_comes_back(name: str, layout: str) -> None:
     """And what does not come back is refused: for every kind of pixels, some changed."""
-    encoding = ENCODINGS[name]
-    for seed in range(4):
-        fitted = bound(layout, encoding, 16, 12, seed)
-        pixels = suited(layout, encoding, 16, 12, seed)
-        assert fitted.refuses(pixels) is None
-        other = values(encoding, kind, 16, 12, seed)
-        for y, x in ((0, 0), (11, 15), (5, 7)):
-            changed = pixels.copy()
-            changed[y, x] = other[y, x]
-            assert refused_or_returned(fitted, changed)
-        assert refused_or_returned(fitted, other)
+    for kind in KINDS:
+        encoding = ENCODINGS[name]
+        for seed in range(4):
+            fitted = bound(layout, encoding, 16, 12, seed)
+            pixels = suited(layout, encoding, 16, 12, seed)
+            assert fitted.refuses(pixels) is None
+            other = values(encoding, kind, 16, 12, seed)
+            for y, x in ((0, 0), (11, 15), (5, 7)):
+                changed = pixels.copy()
+                changed[y, x] = other[y, x]
+                assert refused_or_returned(fitted, changed)
+            assert refused_or_returned(fitted, other)
 
 
 @steady
@@ -166,7 +167,7 @@ def test_every_word_comes_back(dtype: str) -> None:
 # ---------------------------------------------------------------- what the spec says of each
 
 
-@each(("width", "height"), SIZES)
+@pytest.mark.parametrize(("width", "height"), SIZES)
 def test_tiles_are_where_the_spec_says(width: int, height: int) -> None:
     """spec/index.md, Layouts, mosaic8."""
     pixels = np.arange(width * height, dtype=np.uint16).reshape(height, width)
@@ -192,7 +193,7 @@ def test_signed_samples_keep_their_order() -> None:
     assert picture.ravel().tolist() == list(range(256))
 
 
-@each("word", [0x0000, 0x00FF, 0x0100, 0x01FF, 0x02FE, 0xFF00, 0xFFFF])
+@pytest.mark.parametrize("word", [0x0000, 0x00FF, 0x0100, 0x01FF, 0x02FE, 0xFF00, 0xFFFF])
 def test_low_bytes_are_folded(word: int) -> None:
     """A step of one never moves the low byte by more than one."""
     fold = bind("fold", ENCODINGS["mono16"], Parameters(bits=16, shift=0, low=8))
@@ -201,7 +202,7 @@ def test_low_bytes_are_folded(word: int) -> None:
     assert picture.tolist() == [[high], [255 - low if high % 2 else low]]
 
 
-@each(
+@pytest.mark.parametrize(
     ("bits", "shift", "low", "pixel_format"),
     [(12, 0, 3, "gray10le"), (12, 4, 4, "gray"), (14, 2, 5, "gray10le"), (10, 0, 2, "gray")],
 )
@@ -262,7 +263,7 @@ def test_channels_are_stacked() -> None:
     assert picture.tolist() == [[0, 2, 4], [6, 8, 10], [1, 3, 5], [7, 9, 11]]
 
 
-@each(
+@pytest.mark.parametrize(
     ("encoding", "order"),
     [
         *(("rgb16", "rgb"), ("bgr16", "bgr"), ("rgba16", "rgba"), ("bgra16", "bgra")),
@@ -291,7 +292,7 @@ PLANES = {
 }
 
 
-@each(
+@pytest.mark.parametrize(
     ("encoding", "same", "planes"),
     [
         ("yuv422", "yuv422", "yuv422"),
@@ -303,7 +304,7 @@ PLANES = {
         ("nv24", "nv24", "nv24"),
     ],
 )
-@each("pad", [0, 5])
+@pytest.mark.parametrize("pad", [0, 5])
 def test_yuv_becomes_planes(encoding: str, same: str, planes: str, pad: int) -> None:
     """By the FourCC codes UYVY, YUY2, NV12, NV21 and NV24."""
     known = ENCODINGS[encoding]
@@ -313,27 +314,27 @@ def test_yuv_becomes_planes(encoding: str, same: str, planes: str, pad: int) -> 
     assert (u.tolist(), v.tolist()) == PLANES[planes]
 
 
-@each("encoding", ["yuv422", "uyvy", "yuyv", "yuv422_yuy2", "nv24"])
-@each(("width", "height"), SIZES)
-def test_halved_chroma_stays_near(encoding: str, width: int, height: int) -> None:
-    known = ENCODINGS[encoding]
-    width, height = rounded(known, width, height)
-    layout = layout_for(known, lossless=False)
-    assert (layout.name, layout.is_exact) == ("halved420", False)
-    y, x = np.mgrid[:height, :width]
-    planes = [(n * 40 + 8 * y + 4 * (x // 2)).astype(np.uint8) for n in (1, 2, 3)]
-    if known.channels == 2:
-        planes[1:] = [plane[:, ::2] for plane in planes[1:]]
-    exact = bind(known.general, known)
-    pixels = np.empty(known.shape(width, height), np.uint8)
-    exact.to_pixels(tuple(planes), pixels)
-    found = exact.to_picture(through(layout, pixels))
-    assert np.array_equal(found[0], planes[0])
-    for original, chroma in zip(planes[1:], found[1:], strict=True):
-        assert np.abs(chroma.astype(int) - original).max() <= 4
-        flat = np.full_like(original, 77)
-        exact.to_pixels((planes[0], flat, flat), pixels)
-        assert np.array_equal(through(layout, pixels), pixels)
+@pytest.mark.parametrize("encoding", ["yuv422", "uyvy", "yuyv", "yuv422_yuy2", "nv24"])
+def test_halved_chroma_stays_near(encoding: str) -> None:
+    for width, height in SIZES:
+        known = ENCODINGS[encoding]
+        width, height = rounded(known, width, height)
+        layout = layout_for(known, lossless=False)
+        assert (layout.name, layout.is_exact) == ("halved420", False)
+        y, x = np.mgrid[:height, :width]
+        planes = [(n * 40 + 8 * y + 4 * (x // 2)).astype(np.uint8) for n in (1, 2, 3)]
+        if known.channels == 2:
+            planes[1:] = [plane[:, ::2] for plane in planes[1:]]
+        exact = bind(known.general, known)
+        pixels = np.empty(known.shape(width, height), np.uint8)
+        exact.to_pixels(tuple(planes), pixels)
+        found = exact.to_picture(through(layout, pixels))
+        assert np.array_equal(found[0], planes[0])
+        for original, chroma in zip(planes[1:], found[1:], strict=True):
+            assert np.abs(chroma.astype(int) - original).max() <= 4
+            flat = np.full_like(original, 77)
+            exact.to_pixels((planes[0], flat, flat), pixels)
+            assert np.array_equal(through(layout, pixels), pixels)
 
 
 def test_layouts_of_encodings() -> None:
@@ -374,7 +375,7 @@ def parameters_of(layout: str, encoding: str, *samples: Any) -> Parameters | Non
     return fitted.parameters if fitted else None
 
 
-@each(
+@pytest.mark.parametrize(
     ("encoding", "samples", "expected"),
     [
         ("mono16", [[0, 4095]], (12, 0)),
@@ -406,7 +407,7 @@ def test_bits_that_are_fitted(
     assert (found and (found.bits, found.shift)) == expected
 
 
-@each(("encoding", "bits", "shift", "bad"), [
+@pytest.mark.parametrize(("encoding", "bits", "shift", "bad"), [
     ("mono16", 12, 0, 4096),
     ("mono16", 10, 6, 0x8020),
     ("16SC1", 12, 0, 2048),
@@ -470,8 +471,8 @@ def test_a_palette_stands_below_the_numbers() -> None:
     assert listed[512:].tolist() == [0]
 
 
-@each("encoding", ["mono16", "16SC1", "32FC1"])
-@each("count", [2, 100, 257, 2000])
+@pytest.mark.parametrize("encoding", ["mono16", "16SC1", "32FC1"])
+@pytest.mark.parametrize("count", [2, 100, 257, 2000])
 def test_images_of_few_values_have_palettes(encoding: str, count: int) -> None:
     known = ENCODINGS[encoding]
     rng = np.random.default_rng(count)
@@ -502,7 +503,7 @@ def test_numbers_beyond_a_table_are_no_error(encoding: str) -> None:
     assert out.view(f"u{out.itemsize}").tolist() == [[5, 9, 9]]
 
 
-@each("name", ["gray_bits", "fold", "metres16", "metres_fold"])
+@pytest.mark.parametrize("name", ["gray_bits", "fold", "metres16", "metres_fold"])
 def test_any_picture_gives_some_pixels(name: str) -> None:
     encoding = ENCODINGS["32FC1" if name.startswith("metres") else "16SC1"]
     layout = bound(name, encoding)
@@ -515,9 +516,9 @@ def test_any_picture_gives_some_pixels(name: str) -> None:
 COUNTS = np.arange(1, 65536, dtype=np.float32).reshape(255, 257)
 
 
-@each("scale", SCALES)
-@each("hole", [0x00000000, 0x7FC00000, 0xFFC00000, 0x7F800000])
-@each("name", ["metres16", "metres_fold"])
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("hole", [0x00000000, 0x7FC00000, 0xFFC00000, 0x7F800000])
+@pytest.mark.parametrize("name", ["metres16", "metres_fold"])
 def test_all_millimetres_come_back(name: str, hole: int, scale: str) -> None:
     pixels = COUNTS * np.float32(0.001) if scale == "product" else COUNTS / np.float32(1000)
     pixels[::7, ::5] = np.array(hole, np.uint32).view(np.float32)
@@ -537,7 +538,9 @@ def test_the_usual_ways_to_metres_are_two() -> None:
     assert bits_of(COUNTS * np.float32(0.001)) != quotient
 
 
-@each("value", [0.0005, 1.00025, -1.0, 65.536, 1e30, np.inf, -np.inf, np.nan, -0.0, 1e-40])
+@pytest.mark.parametrize(
+    "value", [0.0005, 1.00025, -1.0, 65.536, 1e30, np.inf, -np.inf, np.nan, -0.0, 1e-40]
+)
 def test_other_floats_are_refused(value: float) -> None:
     floats = ENCODINGS["32FC1"]
     layout = bind("metres16", floats, Parameters(hole=0, scale="quotient"))
@@ -553,7 +556,7 @@ def test_two_marks_of_a_hole_are_one_too_many() -> None:
     assert fit("metres16", ENCODINGS["32FC1"], [pixels]) is None
 
 
-@each(
+@pytest.mark.parametrize(
     ("encoding", "layout", "parameters", "words"),
     [
         ("mono8", "gray16", {}, "does not carry mono8"),
@@ -617,17 +620,17 @@ def test_layouts_that_cannot_be(
         bind(layout, ENCODINGS[encoding], Parameters.from_values(parameters))
 
 
-@each(("name", "layout"), PAIRS)
-def test_parameters_are_plain_values(name: str, layout: str) -> None:
-    parameters = bound(layout, ENCODINGS[name]).parameters
-    plain = parameters.to_values()
-    assert Parameters.from_values(plain) == parameters
-    assert set(plain) == LAYOUTS[layout].parameters
-    assert all(isinstance(value, (int, str, list)) for value in plain.values())
-    assert (parameters == NO_PARAMETERS) == (not plain)
-    if plain:
-        with pytest.raises(ValueError, match="needs the parameters"):
-            bind(layout, ENCODINGS[name], replace(parameters, **{next(iter(plain)): None}))
+def test_parameters_are_plain_values() -> None:
+    for name, layout in PAIRS:
+        parameters = bound(layout, ENCODINGS[name]).parameters
+        plain = parameters.to_values()
+        assert Parameters.from_values(plain) == parameters
+        assert set(plain) == LAYOUTS[layout].parameters
+        assert all(isinstance(value, (int, str, list)) for value in plain.values())
+        assert (parameters == NO_PARAMETERS) == (not plain)
+        if plain:
+            with pytest.raises(ValueError, match="needs the parameters"):
+                bind(layout, ENCODINGS[name], replace(parameters, **{next(iter(plain)): None}))
 
 
 def test_unknown_parameters() -> None:
@@ -638,32 +641,34 @@ def test_unknown_parameters() -> None:
 # ---------------------------------------------------------------- views
 
 
-@each("name", ENCODINGS)
-@each("pad", [0, 1, 3, 8])
-@each("big", [False, True])
-def test_a_view_is_the_message_itself(name: str, pad: int, big: bool) -> None:
-    encoding = ENCODINGS[name]
-    width, height = rounded(encoding, 5, 3)
-    step = width * encoding.pixel_bytes + pad
-    count = encoding.size(step, height)
-    data = bytearray(np.random.default_rng(0).integers(0, 256, count, np.uint8).tobytes())
-    view = pixel_view(data, encoding, width=width, height=height, step=step, is_bigendian=big)
-    order, size = "big" if big else "little", encoding.bytes_per_sample
-    assert view.shape == encoding.shape(width, height)
-    assert len(view) * step == count
-    for y, x, c in np.ndindex(len(view), width, encoding.channels):
-        at = y * step + x * encoding.pixel_bytes + c * size
-        sample = view[y, x] if encoding.channels == 1 else view[y, x, c]
-        assert sample.astype(encoding.dtype).tobytes() == int.from_bytes(
-            data[at : at + size], order
-        ).to_bytes(size, "little")
-    before = bytes(data)
-    view[...] = 0
-    assert view.flags.writeable
-    for y in range(len(view)):  # the padding is not touched
-        start = y * step + width * encoding.pixel_bytes
-        assert data[start : start + pad] == before[start : start + pad]
-        assert not any(data[y * step : start])
+@pytest.mark.parametrize("name", ENCODINGS)
+def test_a_view_is_the_message_itself(name: str) -> None:
+    for pad in [0, 1, 3, 8]:
+        for big in [False, True]:
+            encoding = ENCODINGS[name]
+            width, height = rounded(encoding, 5, 3)
+            step = width * encoding.pixel_bytes + pad
+            count = encoding.size(step, height)
+            data = bytearray(np.random.default_rng(0).integers(0, 256, count, np.uint8).tobytes())
+            view = pixel_view(
+                data, encoding, width=width, height=height, step=step, is_bigendian=big
+            )
+            order, size = "big" if big else "little", encoding.bytes_per_sample
+            assert view.shape == encoding.shape(width, height)
+            assert len(view) * step == count
+            for y, x, c in np.ndindex(len(view), width, encoding.channels):
+                at = y * step + x * encoding.pixel_bytes + c * size
+                sample = view[y, x] if encoding.channels == 1 else view[y, x, c]
+                assert sample.astype(encoding.dtype).tobytes() == int.from_bytes(
+                    data[at : at + size], order
+                ).to_bytes(size, "little")
+            before = bytes(data)
+            view[...] = 0
+            assert view.flags.writeable
+            for y in range(len(view)):  # the padding is not touched
+                start = y * step + width * encoding.pixel_bytes
+                assert data[start : start + pad] == before[start : start + pad]
+                assert not any(data[y * step : start])
 
 
 def test_a_view_of_bytes_is_read_only_and_not_a_copy() -> None:
@@ -673,7 +678,7 @@ def test_a_view_of_bytes_is_read_only_and_not_a_copy() -> None:
     assert np.shares_memory(view, np.frombuffer(data, np.uint8))
 
 
-@each("name", ["mono8", "mono16", "rgb8", "bgra8", "16UC1", "nv12"])
+@pytest.mark.parametrize("name", ["mono8", "mono16", "rgb8", "bgra8", "16UC1", "nv12"])
 def test_plain_pictures_are_no_copies(name: str) -> None:
     encoding = ENCODINGS[name]
     pixels = as_message(values(encoding, "random", 6, 4), encoding, pad=4)
@@ -714,34 +719,34 @@ def test_padding(name: str, pad: int, last: bool, value: int | None) -> None:
 # ---------------------------------------------------------------- what has no layout
 
 
-@each("name", ENCODINGS)
-@each(("width", "height"), [(2, 2), (640, 480), (1920, 1080)])
-@each("pad", [0, 5, MAX_ROW_PADDING])
-def test_ordinary_images_have_one(name: str, width: int, height: int, pad: int) -> None:
-    encoding = ENCODINGS[name]
-    step = width * encoding.pixel_bytes + pad
-    size = encoding.size(step, height)
-    assert why_not(name, width=width, height=height, step=step, size=size) is None
+@pytest.mark.parametrize("name", ENCODINGS)
+def test_ordinary_images_have_one(name: str) -> None:
+    for width, height in [(2, 2), (640, 480), (1920, 1080)]:
+        for pad in [0, 5, MAX_ROW_PADDING]:
+            encoding = ENCODINGS[name]
+            step = width * encoding.pixel_bytes + pad
+            size = encoding.size(step, height)
+            assert why_not(name, width=width, height=height, step=step, size=size) is None
 
 
-@each("name", ENCODINGS)
-def test_the_largest_image_is_the_one_of_the_largest_picture(name: str) -> None:
-    encoding = ENCODINGS[name]
-    layout = layout_for(encoding, lossless=True)
-    across, down = (side // 64 for side in layout.picture_size(64, 64))
-    for width, height, fits in (
-        (MAX_SIDE // across, MAX_SIDE // down, True),
-        (MAX_SIDE // across + 2, 2, False),
-        (2, MAX_SIDE // down + 2, False),
-    ):
-        step = width * encoding.pixel_bytes
-        size = encoding.size(step, height)
-        reason = why_not(name, width=width, height=height, step=step, size=size)
-        assert (reason is None) == fits
-        assert fits or "beyond 16384" in str(reason)
+def test_the_largest_image_is_the_one_of_the_largest_picture() -> None:
+    for name in ENCODINGS:
+        encoding = ENCODINGS[name]
+        layout = layout_for(encoding, lossless=True)
+        across, down = (side // 64 for side in layout.picture_size(64, 64))
+        for width, height, fits in (
+            (MAX_SIDE // across, MAX_SIDE // down, True),
+            (MAX_SIDE // across + 2, 2, False),
+            (2, MAX_SIDE // down + 2, False),
+        ):
+            step = width * encoding.pixel_bytes
+            size = encoding.size(step, height)
+            reason = why_not(name, width=width, height=height, step=step, size=size)
+            assert (reason is None) == fits
+            assert fits or "beyond 16384" in str(reason)
 
 
-@each(
+@pytest.mark.parametrize(
     ("encoding", "width", "height", "step", "size", "words"),
     [
         *((name, 4, 4, 16, 64, f"no layout for encoding {name!r}") for name in (

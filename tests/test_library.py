@@ -21,7 +21,6 @@ from rosbags.highlevel import AnyReader
 import mp4ds
 from coded_scenes import CODED
 from definitions import PICTURES
-from each import each
 from mp4ds.packing.options import PackOptions
 from mp4ds.unpacking.options import UnpackOptions
 from pictures import CAREFUL, pixels
@@ -82,8 +81,9 @@ def colour(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene]:
 # ---------------------------------------------------------------- frames
 
 
-@each("encoding", COMMON, one_in=2)
-@each(
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("encoding", COMMON)
+@pytest.mark.parametrize(
     ("variant", "shape"),
     [
         ("bag-none", {}),
@@ -116,7 +116,7 @@ def test_frames_are_the_pixels_that_were_recorded(
                 assert frame.intrinsics.k[0] == pytest.approx(0.9 * values["width"])
 
 
-@each("encoding", COMMON)
+@pytest.mark.parametrize("encoding", COMMON)
 def test_frames_of_a_lossy_dataset_are_near(encoding: str, tmp_path: Path) -> None:
     source = scene(encoding, frames=4, noisy=False, width=96, height=64)
     with mp4ds.open(packed(tmp_path, source, quality="crf=10")) as dataset:
@@ -132,7 +132,8 @@ def test_frames_of_a_lossy_dataset_are_near(encoding: str, tmp_path: Path) -> No
 SHAPES: list[dict[str, Any]] = [{"width": 63, "height": 47}, {"pad": 3}, {"big_endian": True}]
 
 
-@each("encoding", [name for name in ENCODINGS if name not in COMMON], one_in=4)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("encoding", [name for name in ENCODINGS if name not in COMMON])
 def test_frames_of_every_other_encoding(encoding: str, tmp_path: Path) -> None:
     shape = SHAPES[ENCODINGS.index(encoding) % 3]
     source = scene(encoding, **shape)
@@ -170,7 +171,7 @@ PNG_ENCODINGS = {
 }
 
 
-@each("name", PNG_ENCODINGS)
+@pytest.mark.parametrize("name", PNG_ENCODINGS)
 def test_frames_of_png_files_are_their_pixels(name: str, tmp_path: Path) -> None:
     source = CODED[name](frames=6)
     with mp4ds.open(packed(tmp_path, source)) as dataset:
@@ -203,7 +204,7 @@ def test_frames_of_rvl_are_those_of_png(encoding: str, tmp_path: Path) -> None:
 JPEGS = ["jpeg-rgb", "jpeg-gray", "jpeg-444", "jpeg-422", "jpeg-progressive", "jpeg-restart"]
 
 
-@each("name", [*JPEGS, "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"])
+@pytest.mark.parametrize("name", [*JPEGS, "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"])
 def test_frames_of_jpeg_files(name: str, tmp_path: Path) -> None:
     source = CODED[name](frames=5)
     with mp4ds.open(packed(tmp_path, source)) as dataset:
@@ -233,7 +234,7 @@ PACKETS = [
 ]
 
 
-@each("name", PACKETS)
+@pytest.mark.parametrize("name", PACKETS)
 def test_frames_of_packets(name: str, tmp_path: Path) -> None:
     source = CODED[name](frames=12)
     codec = "h265" if "265" in name else name.split("-")[1]
@@ -274,7 +275,7 @@ def test_numbers_and_slices(colour: tuple[Path, Scene]) -> None:
         assert stream[np.int64(3)].index == 3  # type: ignore[call-overload]
 
 
-@each("number", [12, -13, 10**9, -(10**9), 2**70])
+@pytest.mark.parametrize("number", [12, -13, 10**9, -(10**9), 2**70])
 def test_numbers_out_of_range(number: int, colour: tuple[Path, Scene]) -> None:
     with mp4ds.open(colour[0]) as dataset:
         with pytest.raises(IndexError, match=f"no frame {number}: its 12 frames"):
@@ -322,11 +323,11 @@ def test_columns(colour: tuple[Path, Scene]) -> None:
 # ---------------------------------------------------------------- opening
 
 
-@each(
+@pytest.mark.parametrize(
     "place",
     [".", "dataset.yaml", "cam_image_raw.mp4", "cam_image_raw.yaml"],
 )
-@each("kind", [str, Path])
+@pytest.mark.parametrize("kind", [str, Path])
 def test_all_that_can_be_opened(
     place: str, kind: Callable[[Path], Any], colour: tuple[Path, Scene]
 ) -> None:
@@ -345,7 +346,7 @@ def test_relative_paths(colour: tuple[Path, Scene], monkeypatch: pytest.MonkeyPa
             assert len(dataset[TOPIC][:2]) == 2
 
 
-@each("topic", ["/imu", "/cam", "", "cam/image_raw", "/cam/camera_info"])
+@pytest.mark.parametrize("topic", ["/imu", "/cam", "", "cam/image_raw", "/cam/camera_info"])
 def test_a_wrong_topic_lists_the_right_ones(topic: str, colour: tuple[Path, Scene]) -> None:
     with mp4ds.open(colour[0]) as dataset, pytest.raises(KeyError, match="there are: /cam/image_r"):
         dataset[topic]
@@ -457,9 +458,9 @@ def recalibrated(first_new: int, *, frames: int = 8, delay: int = 90_000) -> Sce
     return source
 
 
-@each("first_new", [0, 3, 5])
-@each("delay", [90_000, 0, -1, 40_000_000])
-@each("variant", ["bag-none", "mcap-ros2-lz4"])
+@pytest.mark.parametrize("first_new", [0, 3, 5])
+@pytest.mark.parametrize("delay", [90_000, 0, -1, 40_000_000])
+@pytest.mark.parametrize("variant", ["bag-none", "mcap-ros2-lz4"])
 def test_the_calibration_that_held(
     first_new: int, delay: int, variant: str, tmp_path: Path
 ) -> None:
@@ -524,7 +525,7 @@ def test_a_topic_that_changes_its_size(variant: str, tmp_path: Path) -> None:
         assert np.array_equal(out, [expected[0], expected[1], expected[0]])
 
 
-@each("publishers", [1, 2])
+@pytest.mark.parametrize("publishers", [1, 2])
 def test_frames_of_a_topic_that_changes_come_as_recorded(publishers: int, tmp_path: Path) -> None:
     """In all ways of asking; of one publisher where the times do not tell the order."""
     messages = [
@@ -574,7 +575,7 @@ def test_frame_ids_that_change(tmp_path: Path) -> None:
         assert dataset["/odd/image"][3].frame_id == ""
 
 
-@each("trait", ["stamp-zero", "stamp-repeated", "stamp-backward", "log-equal"])
+@pytest.mark.parametrize("trait", ["stamp-zero", "stamp-repeated", "stamp-backward", "log-equal"])
 def test_frames_are_found_by_number_whatever_the_times(trait: str, tmp_path: Path) -> None:
     with mp4ds.open(packed(tmp_path, odd_scene(trait))) as dataset:
         stream = dataset["/odd/image"]

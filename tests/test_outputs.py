@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from each import each, fresh
 from mp4ds.errors import Mp4dsError, TargetError, TargetExistsError, WriteError
 from mp4ds.files.outputs import (
     PAGE_SIGN,
@@ -46,7 +45,7 @@ def read(path: Path) -> str:
     return (path if path.is_file() else path / "deep" / "part").read_text()
 
 
-@fresh
+@pytest.fixture
 def target(tmp_path: Path) -> Path:
     return tmp_path / "out"
 
@@ -55,12 +54,14 @@ def only(folder: Path, *names: str) -> bool:
     return sorted(path.name for path in folder.iterdir()) == sorted(names)
 
 
-@each("text", ["=1+1", "+1+1", "-A1", "@SUM(A1)", "\t=1", "\r=1", "\uff1d1", "=", "-1-1"])
+@pytest.mark.parametrize(
+    "text", ["=1+1", "+1+1", "-A1", "@SUM(A1)", "\t=1", "\r=1", "\uff1d1", "=", "-1-1"]
+)
 def test_a_formula_in_a_csv_file_is_text(text: str) -> None:
     assert csv_cell(text) == f"'{text}"
 
 
-@each("text", ["", "/cam=1", "cam", "-1", "+2.5", "'=1"])
+@pytest.mark.parametrize("text", ["", "/cam=1", "cam", "-1", "+2.5", "'=1"])
 def test_other_text_in_a_csv_file_is_kept(text: str) -> None:
     assert csv_cell(text) == text
 
@@ -76,9 +77,9 @@ def test_an_output_appears_at_the_end(kind: str, target: Path) -> None:
     assert only(target.parent, "out")
 
 
-@each("kind", ["file", "folder"])
-@each("old", [None, "file", "folder"])
-@each("error", [ValueError("x"), KeyboardInterrupt(), SystemExit(3)])
+@pytest.mark.parametrize("kind", ["file", "folder"])
+@pytest.mark.parametrize("old", [None, "file", "folder"])
+@pytest.mark.parametrize("error", [ValueError("x"), KeyboardInterrupt(), SystemExit(3)])
 def test_what_goes_wrong_leaves_nothing(
     kind: str, old: str | None, error: BaseException, target: Path
 ) -> None:
@@ -95,8 +96,8 @@ def test_what_goes_wrong_leaves_nothing(
     assert only(target.parent, *(["out"] if old else []))
 
 
-@each("kind", ["file", "folder"])
-@each("old", ["file", "folder"])
+@pytest.mark.parametrize("kind", ["file", "folder"])
+@pytest.mark.parametrize("old", ["file", "folder"])
 def test_force_replaces_what_may_be_replaced(kind: str, old: str, target: Path) -> None:
     make(target, old, "old")
     with staged(target, force=True, owned=anything) as path:
@@ -204,8 +205,8 @@ def test_the_folder_must_exist(target: Path) -> None:
         check_target(target / "deep", force=False, owned=anything)
 
 
-@each("source", ["out", "out/deep", "out/deep/part", ".", "link", "link/deep"])
-@each("force", [False, True])
+@pytest.mark.parametrize("source", ["out", "out/deep", "out/deep/part", ".", "link", "link/deep"])
+@pytest.mark.parametrize("force", [False, True])
 def test_an_output_never_overlaps_with_its_source(
     source: str, force: bool, target: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -241,14 +242,14 @@ def test_a_folder_that_may_not_be_written(target: Path, monkeypatch: pytest.Monk
         pytest.fail("nothing can be made there")
 
 
-@each("name", ["x" * 250, "\U0001f916" * 61 + ".bag", "a b", ".hidden", "-x"])
+@pytest.mark.parametrize("name", ["x" * 250, "\U0001f916" * 61 + ".bag", "a b", ".hidden", "-x"])
 def test_any_name_that_the_disk_takes(name: str, tmp_path: Path) -> None:
     with staged(tmp_path / name, force=False, owned=nothing) as path:
         make(path, "folder")
     assert only(tmp_path, name)
 
 
-@each("code", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.EROFS])
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.EROFS])
 def test_a_disk_that_refuses(code: int, target: Path) -> None:
     with (  # noqa: PT012 - the body is what is tested
         pytest.raises(WriteError, match="The partial output was removed") as caught,
@@ -429,7 +430,7 @@ def test_what_appeared_meanwhile_is_not_replaced(kind: str, target: Path) -> Non
     assert only(target.parent, "out")
 
 
-@each("size", [0, 1, 2**20, 2**20 + 17])
+@pytest.mark.parametrize("size", [0, 1, 2**20, 2**20 + 17])
 def test_digests(size: int, tmp_path: Path) -> None:
     data = os.urandom(size)
     (tmp_path / "x").write_bytes(data)

@@ -29,7 +29,6 @@ from coded_tools import (
     superframe,
 )
 from conftest import real
-from each import each, fresh
 from mp4ds.errors import Refused, VideoError
 from mp4ds.times import MAX_GAP_NS, NS_PER_TICK
 from mp4ds.video import av1, h264, h265, nal
@@ -92,7 +91,7 @@ def ffprobe(path: Path) -> Any:
     return json.loads(done.stdout)["streams"]
 
 
-@each("name", IN_ORDER)
+@pytest.mark.parametrize("name", IN_ORDER)
 def test_packets_come_back(name: str, tmp_path: Path) -> None:
     codec = ENCODINGS[name].codec
     packets = encode(ENCODINGS[name])
@@ -107,7 +106,7 @@ def test_packets_come_back(name: str, tmp_path: Path) -> None:
             assert reader.packet(index) == everything[index]
 
 
-@each("name", IN_ORDER)
+@pytest.mark.parametrize("name", IN_ORDER)
 def test_the_file_plays(name: str, tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     write(path, ENCODINGS[name].codec, [packet.data for packet in encode(ENCODINGS[name])])
@@ -120,8 +119,8 @@ def test_the_file_plays(name: str, tmp_path: Path) -> None:
     assert float(stream["duration"]) == pytest.approx(12 / 30, abs=1e-4)
 
 
-@each("name", ["h264", "h265", "av1", "vp9"])
-@each(("width", "height"), [(66, 50), (322, 178)])
+@pytest.mark.parametrize("name", ["h264", "h265", "av1", "vp9"])
+@pytest.mark.parametrize(("width", "height"), [(66, 50), (322, 178)])
 def test_sizes_that_are_cropped(name: str, width: int, height: int, tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     packets = encode(ENCODINGS[name], frames=3, width=width, height=height)
@@ -162,8 +161,8 @@ def reframed(codec: str, body: bytes, framing: str) -> bytes:
     return nal.join(units, " ".join([*lengths, "+2"] if framing == "6 3" else lengths))
 
 
-@each("framing", ["3", "4", "4 3", "6 3"])
-@each("name", ["h264", "h264-aud", "h264-slices", "h265", "h265-aud"])
+@pytest.mark.parametrize("framing", ["3", "4", "4 3", "6 3"])
+@pytest.mark.parametrize("name", ["h264", "h264-aud", "h264-slices", "h265", "h265-aud"])
 def test_start_codes(name: str, framing: str, tmp_path: Path) -> None:
     codec = ENCODINGS[name].codec
     bodies = [reframed(codec, packet.data, framing) for packet in encode(ENCODINGS[name])]
@@ -252,7 +251,7 @@ def test_parameters_that_were_sent_before(codec: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- refusals and faults
 
 
-@each("codec", ["h264", "h265", "av1", "vp9"])
+@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "vp9"])
 def test_a_first_picture_that_cannot_be_used(codec: str, tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     first, second = [packet.data for packet in encode(ENCODINGS[codec], frames=2, gop=9)]
@@ -323,14 +322,14 @@ def test_what_the_index_says_is_compared(
         writer.close()
 
 
-@fresh
+@pytest.fixture
 def video(tmp_path: Path) -> Path:
     path = tmp_path / "a.mp4"
     write(path, "mjpeg", [jpeg(picture) for picture in scene(5)])
     return path
 
 
-@each(
+@pytest.mark.parametrize(
     ("code", "options"),
     [
         ("codec-mismatch", {"codec": "h264"}),
@@ -421,7 +420,7 @@ def standing_alone(path: Path, codec: str) -> list[bytes]:
         return list(packets.packets())
 
 
-@each("name", IN_ORDER)
+@pytest.mark.parametrize("name", IN_ORDER)
 def test_packets_stand_alone(name: str, tmp_path: Path) -> None:
     codec, path = ENCODINGS[name].codec, tmp_path / "a.mp4"
     packets = encode(ENCODINGS[name])
@@ -506,7 +505,7 @@ REAL = {
 }
 
 
-@each("name", REAL)
+@pytest.mark.parametrize("name", REAL)
 def test_real_videos(name: str, tmp_path: Path) -> None:
     packets, size = packets_of(real(f"video/{name}"), REAL[name])
     bodies = [packet.data for packet in packets[:120]]

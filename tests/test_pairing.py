@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
 from conftest import real
-from each import each
 from mp4ds.bags.formats import open_reader
 from mp4ds.errors import OptionError
 from mp4ds.messages.serializations import form_of, is_calibration, wire_of
@@ -101,7 +100,7 @@ BY_NAME: list[tuple[list[str], dict[int, int]]] = [
 ]  # fmt: skip
 
 
-@each(("topics", "pairs"), BY_NAME)
+@pytest.mark.parametrize(("topics", "pairs"), BY_NAME)
 def test_calibrations_belong_to_the_image_beside_them(
     topics: list[str], pairs: dict[int, int]
 ) -> None:
@@ -109,8 +108,8 @@ def test_calibrations_belong_to_the_image_beside_them(
     assert pair_camera_infos(channels(*topics)[::-1]) == pairs
 
 
-@each("info", INFO)
-@each("image", [*RAW, *CODED])
+@pytest.mark.parametrize("info", INFO)
+@pytest.mark.parametrize("image", [*RAW, *CODED])
 def test_every_type_of_images_and_calibrations(image: str, info: str) -> None:
     transport = "/compressed" if image in CODED else ""
     pair = [channel(7, "/cam/image_raw" + transport, image), channel(3, "/cam/camera_info", info)]
@@ -187,7 +186,7 @@ def test_chosen_topics_with_equals_signs() -> None:
     assert choose_pairs(["/a=b=/x=y=z_info"], found) == {2: 0}
 
 
-@each(
+@pytest.mark.parametrize(
     ("choices", "sentence"),
     [
         (["/a"], "'/a' is not of the form IMAGE=INFO"),
@@ -326,7 +325,7 @@ def test_only_the_time_of_both_counts() -> None:
     assert apart.pair() == {}
 
 
-@each(
+@pytest.mark.parametrize(
     ("image_stamps", "info_stamps", "pairs"),
     [
         (STAMPS[:1], STAMPS[:1], True),
@@ -383,7 +382,7 @@ SIZES: list[tuple[Fields, tuple[int, int], bool]] = [
 ]
 
 
-@each(("calibration", "size", "pairs"), SIZES)
+@pytest.mark.parametrize(("calibration", "size", "pairs"), SIZES)
 def test_sizes_must_not_contradict(calibration: Fields, size: tuple[int, int], pairs: bool) -> None:
     found = Recording().add("/eye", STAMPS, raw(*size)).add("/eye_info", STAMPS, calibration)
     assert bool(found.pair()) == pairs
@@ -541,7 +540,7 @@ REAL: list[tuple[str, dict[str, str]]] = [
 ]
 
 
-@each(("name", "pairs"), REAL)
+@pytest.mark.parametrize(("name", "pairs"), REAL)
 def test_real_recordings_by_name(name: str, pairs: dict[str, str]) -> None:
     with open_reader(real(name)) as reader:
         topics = {own.id: own.topic for own in reader.channels}
@@ -549,7 +548,7 @@ def test_real_recordings_by_name(name: str, pairs: dict[str, str]) -> None:
     assert {topics[i]: topics[j] for i, j in found.items()} == pairs
 
 
-@each("name", [name for name, _ in REAL])
+@pytest.mark.parametrize("name", [name for name, _ in REAL])
 def test_real_recordings_by_stamp(name: str) -> None:
     """Zero stamps, no common stamps, no images: none of these may pair."""
     path = real(name)

@@ -11,7 +11,6 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
-from each import each
 from mp4ds.errors import OptionError
 from mp4ds.format.fields import FileName
 from mp4ds.plan import (
@@ -29,7 +28,7 @@ steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 # ---------------------------------------------------------------- quality
 
 
-@each(
+@pytest.mark.parametrize(
     ("text", "quality", "lossless"),
     [
         ("lossless", QualitySetting("lossless"), True),
@@ -47,7 +46,7 @@ def test_qualities(text: str, quality: QualitySetting, lossless: bool) -> None:
     assert str(quality) == text
 
 
-@each(
+@pytest.mark.parametrize(
     "text",
     ["", "Lossless", "lossless ", "crf", "crf=", "crf=64", "crf=-1", "crf=1.5", "crf=100", "22",
      "crf=\u0662", "crf=22\n", "vmaf=100", "vmaf=", "psnr=60", "ssim=1.0", "ssim=0",
@@ -58,7 +57,7 @@ def test_other_qualities_are_refused(text: str) -> None:
         parse_quality(text)
 
 
-@each(
+@pytest.mark.parametrize(
     ("rate", "setting"),
     [
         (None, (18, 7)), (0.1, (18, 7)), (2, (18, 7)), (3.5, (18, 7)), (3.6, (17, 7)),
@@ -78,7 +77,7 @@ def test_the_table_is_ordered_by_rate() -> None:
 # ---------------------------------------------------------------- selection
 
 
-@each(
+@pytest.mark.parametrize(
     ("topics", "exclude", "chosen"),
     [
         ([], [], ["/a/image", "/a/info", "/b", "c"]),

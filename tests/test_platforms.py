@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from each import each
+import pytest
 
 DATASET = Path(__file__).parent / "fixtures/v1.0"
 NO_UNIX = """
@@ -42,7 +42,7 @@ with mp4ds.open(dataset) as opened:
 }
 
 
-@each("way", READING)
+@pytest.mark.parametrize("way", READING)
 def test_reading_without_unix(way: str, tmp_path: Path) -> None:
     command = [sys.executable, "-c", NO_UNIX + READING[way], str(DATASET), str(tmp_path / "out")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

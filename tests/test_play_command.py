@@ -17,7 +17,6 @@ from pathlib import Path
 import pytest
 
 import mp4ds
-from each import each
 from mp4ds.plugins.playing.play import PlayOptions, open_player
 from player_scenes import RecordingPublisher, make_drive, recorded
 from ros2_sides import alone_in_ros2
@@ -149,7 +148,7 @@ def test_signals(drive: Path, number: signal.Signals, code: int) -> None:
         assert "Traceback" not in shown.text
 
 
-@each(
+@pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
         (["{}", "--ros1", "--ros2"], 2, "--ros1 contradicts --ros2"),
@@ -189,7 +188,7 @@ def test_nothing_sourced(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         pass
 
 
-@each(
+@pytest.mark.parametrize(
     ("version", "modules", "kind"),
     [
         ("1", [], "ros1"),

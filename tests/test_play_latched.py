@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 import mp4ds
-from each import each
 from mp4ds.bags.latched import LATCHED_QOS, Kept, kept_depth
 from mp4ds.plugins.playing.play import PlayOptions, open_player
 from mp4ds.plugins.publishing.ros2_writers import offered_qos
@@ -70,7 +69,7 @@ def test_a_message_of_tf_static_that_does_not_parse_is_kept() -> None:
     assert late(static_channel(1), b"\0\1\0\0", static_transform("imu"))[0] == b"\0\1\0\0"
 
 
-@each(
+@pytest.mark.parametrize(
     ("channel", "depth"),
     [
         (ros2_channel(1, "/map", STRING, profiles(1, 1, 1, 1)), 10),

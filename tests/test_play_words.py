@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import typer
 
-from each import each
 from mp4ds.cli import app_for
 from mp4ds.cli.play_words import known_words, spelled
 from mp4ds.errors import OptionError
@@ -25,7 +24,7 @@ def words(typed: str) -> str:
     return " ".join(spelled(typed.split(), VALUED.__contains__)[0])
 
 
-@each(
+@pytest.mark.parametrize(
     ("typed", "expected"),
     [
         ("bag --topics /a /b -r 2", "bag --topics /a --topics /b -r 2"),
@@ -63,7 +62,7 @@ def test_words_of_other_players(typed: str, expected: str, tmp_path: Path) -> No
     assert words(typed.format(folder=tmp_path)) == expected.format(folder=tmp_path)
 
 
-@each(
+@pytest.mark.parametrize(
     ("typed", "says"),
     [
         ("--publish-service-requests", "services are not called"),
@@ -82,7 +81,7 @@ def test_what_has_no_counterpart_is_told(typed: str, says: str) -> None:
         words(typed)
 
 
-@each(
+@pytest.mark.parametrize(
     ("typed", "names"),
     [
         ("", PLAIN),
@@ -105,7 +104,7 @@ def test_ros1_tells_parameters_of_any_text() -> None:
     assert node_arguments(words) == (["drive"], PLAIN)
 
 
-@each(
+@pytest.mark.parametrize(
     ("text", "node", "expected"),
     [
         ("/**:\n  ros__parameters:\n    use_sim_time: true\n", "", True),

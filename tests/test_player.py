@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 import mp4ds
-from each import each
 from mp4ds.errors import FormatError, OptionError
 from mp4ds.plugins.playing.pace import FollowedClock, Pace
 from mp4ds.plugins.playing.play import PlayOptions, open_player
@@ -126,7 +125,7 @@ def test_what_begins_at_the_beginning_has_nothing_twice(
     assert sum(item[0] == "/tf_static" for item in published(publisher)) == 2
 
 
-@each(
+@pytest.mark.parametrize(
     ("options", "topics"),
     [
         ({"topics": ["/tf*"]}, {"/tf", "/tf_static"}),
@@ -154,7 +153,7 @@ def test_topics(
     assert set(summary.messages) == topics
 
 
-@each(
+@pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"topics": ["/none"]}, "`topics` '/none' matches no topic"),

@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 import mp4ds
-from each import each
 from mp4ds.bags.formats import open_writer
 from mp4ds.errors import PublishError
 from mp4ds.plugins.playing import pace, timeline
@@ -61,7 +60,7 @@ class Hand:
         return round((1_900_000_000 + self.now) * NS)
 
 
-@each("hertz", [1.0, 40.0, 333.0])
+@pytest.mark.parametrize("hertz", [1.0, 40.0, 333.0])
 def test_ticks_are_as_many_as_asked_for(hertz: float, monkeypatch: pytest.MonkeyPatch) -> None:
     hand, ticks = Hand(monkeypatch), Ticks(hertz)
     count = 0
@@ -113,7 +112,7 @@ def test_the_clock_ticks_before_the_first_message(drive: Path) -> None:
     assert len({one.time_ns for one in publisher.clocks[: before[0]]}) == 1
 
 
-@each(
+@pytest.mark.parametrize(
     ("options", "topics"),
     [
         ({"clock_topics": ["/map"]}, ["/map"] * 2),
@@ -259,7 +258,7 @@ def test_empty_times_are_skipped(gap: Path) -> None:
     assert summary.slowed_s == 0
 
 
-@each(
+@pytest.mark.parametrize(
     ("options", "last"),
     [
         ({"until_nsec": START + 100 * MS}, 100),

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 import mp4ds
 from coded_scenes import CODED
 from definitions import PICTURES
-from each import each
 from mp4ds.packing.options import PackOptions
 from mp4ds.video.decoder import VideoDecoder
 from pictures import CAREFUL
@@ -229,7 +228,8 @@ def ffprobe(path: Path, *options: str) -> Any:
     return json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
 
 
-@each("name", CASES, one_in=4)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("name", CASES)
 def test_ffprobe_knows_all(name: str, datasets: dict[str, Path]) -> None:
     case, path = CASES[name], video_of(datasets[name])
     found = ffprobe(path, "-count_frames", "-show_streams", "-show_format")
@@ -249,7 +249,8 @@ def test_ffprobe_knows_all(name: str, datasets: dict[str, Path]) -> None:
     assert tags == [case.range, case.matrix, *others]
 
 
-@each("name", CASES, one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("name", CASES)
 def test_ffprobe_reads_the_times(name: str, datasets: dict[str, Path]) -> None:
     path = video_of(datasets[name])
     frames = ffprobe(path, "-show_entries", "frame=best_effort_timestamp,pict_type")["frames"]
@@ -288,7 +289,7 @@ def untile(picture: NDArray[Any]) -> NDArray[Any]:
     return mosaic
 
 
-@each("name", [name for name in CASES if CASES[name].raw])
+@pytest.mark.parametrize("name", [name for name in CASES if CASES[name].raw])
 def test_ffmpeg_has_the_pixels_of_a_lossless_video(name: str, datasets: dict[str, Path]) -> None:
     """Without mp4ds: by ffmpeg, and the words of the spec."""
     case, path = CASES[name], video_of(datasets[name])
@@ -306,7 +307,9 @@ def test_ffmpeg_has_the_pixels_of_a_lossless_video(name: str, datasets: dict[str
 DECODERS = {"h265": "hevc", "ffmpeg": "h264", "av1": "libdav1d"}
 
 
-@each("name", [name for name, case in CASES.items() if case.is_packets and not case.options])
+@pytest.mark.parametrize(
+    "name", [name for name, case in CASES.items() if case.is_packets and not case.options]
+)
 def test_ffmpeg_decodes_packets_as_if_they_had_just_been_recorded(
     name: str, datasets: dict[str, Path]
 ) -> None:
@@ -324,7 +327,7 @@ def test_ffmpeg_decodes_packets_as_if_they_had_just_been_recorded(
 SHOWN = [name for name, case in CASES.items() if case.codec != "ffv1" and not case.raw]
 
 
-@each("name", SHOWN)
+@pytest.mark.parametrize("name", SHOWN)
 def test_ffmpeg_shows_the_same_colours(name: str, datasets: dict[str, Path]) -> None:
     """Nearly, where it is told in which way to interpolate: its weights are not to a 32nd.
 
@@ -352,7 +355,7 @@ def blocks(picture: NDArray[Any]) -> NDArray[np.float64]:
 # ---------------------------------------------------------------- PyAV
 
 
-@each("name", CASES)
+@pytest.mark.parametrize("name", CASES)
 def test_pyav_plays_and_seeks(name: str, datasets: dict[str, Path]) -> None:
     ticks = expected_ticks(datasets[name])
     with av.open(str(video_of(datasets[name]))) as container:
@@ -565,7 +568,8 @@ def middle_times(dataset: Path) -> list[float]:
 
 
 @pytest.mark.browser
-@each("name", PLAYED, one_in=4)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("name", PLAYED)
 def test_a_browser_plays_it(name: str, played: dict[str, Any], datasets: dict[str, Path]) -> None:
     assert name in played, "the browser did not come to this video in time"
     result = played[name]
@@ -578,7 +582,7 @@ def test_a_browser_plays_it(name: str, played: dict[str, Any], datasets: dict[st
 
 
 @pytest.mark.browser
-@each("name", PLAYED)
+@pytest.mark.parametrize("name", PLAYED)
 def test_a_browser_shows_the_right_frames_in_the_right_colours(
     name: str, played: dict[str, Any], datasets: dict[str, Path]
 ) -> None:

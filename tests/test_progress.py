@@ -24,7 +24,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from each import each
 from mp4ds.cli.progress import (
     Events,
     Lines,
@@ -102,7 +101,7 @@ def paced(share: Callable[[float], float | None], seconds: int, **values: Any) -
     return job
 
 
-@each(("begin", "before"), [(0.0, 0), (0.8, 192)])
+@pytest.mark.parametrize(("begin", "before"), [(0.0, 0), (0.8, 192)])
 def test_the_time_left_is_by_what_this_run_did(begin: float, before: int) -> None:
     job = paced(lambda n: begin + n * (1 - begin) / 1000, 400, before=before)
     assert job.seconds_left == pytest.approx(600, abs=5)
@@ -114,7 +113,7 @@ def test_a_pace_that_changes_is_followed() -> None:
     assert job.seconds_left == pytest.approx(0.45 * 4000, rel=0.05)
 
 
-@each(
+@pytest.mark.parametrize(
     "state",
     [told(None, parts=0), told(0.5, phase="planning"), told(None, phase="planning", parts=0)],
     ids=["nothing-tells", "planning", "planning-unknown"],
@@ -359,7 +358,7 @@ def test_a_pack_does_not_fail_for_want_of_a_log() -> None:
     Lines(closed).write("one")
 
 
-@each(
+@pytest.mark.parametrize(
     ("seconds", "text"),
     [
         (0.0, "0 s"),
@@ -378,7 +377,9 @@ def test_durations(seconds: float, text: str) -> None:
     assert left_text(seconds) == (f"{text} left" if seconds else "")
 
 
-@each(("share", "text"), [(None, ""), (0, "0 %"), (0.29, "29 %"), (0.9999, "99 %"), (1, "100 %")])
+@pytest.mark.parametrize(
+    ("share", "text"), [(None, ""), (0, "0 %"), (0.29, "29 %"), (0.9999, "99 %"), (1, "100 %")]
+)
 def test_percents(share: float | None, text: str) -> None:
     assert percent_text(share) == text
 
@@ -536,7 +537,7 @@ class _Counting:
         self.calls.append(outcome)
 
 
-@each(
+@pytest.mark.parametrize(
     ("error", "outcome"),
     [
         (None, "done"),

@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 import mp4ds
-from each import each
 from mp4ds import errors
 from mp4ds.plugins.demo import demo
 
@@ -125,7 +124,7 @@ def test_every_error_is_public() -> None:
         assert name in str(errors.__doc__)  # the tree is drawn there
 
 
-@each(
+@pytest.mark.parametrize(
     ("name", "builtin", "code"),
     [
         ("SourceError", ValueError, 2),
@@ -194,7 +193,7 @@ def members(value: Any) -> list[tuple[str, Any]]:
     ]
 
 
-@each("name", [name for name in NAMES if name != "__version__"])
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "__version__"])
 def test_all_is_documented(name: str) -> None:
     value = getattr(mp4ds, name)
     text = inspect.getdoc(value)
@@ -212,7 +211,7 @@ def test_all_is_documented(name: str) -> None:
             assert known, f"{name}({parameter.name})"
 
 
-@each(
+@pytest.mark.parametrize(
     "name", ["evaluate", "export", "import_ros_mp4", "open", "pack", "play", "unpack", "validate"]
 )
 def test_the_functions_are_annotated(name: str) -> None:
@@ -245,7 +244,7 @@ def test_importing_is_cheap() -> None:
     assert [name for name in HEAVY if name in loaded] == []
 
 
-@each(
+@pytest.mark.parametrize(
     ("code", "absent"),
     [
         ("mp4ds.FormatError", ["numpy", "av", "pydantic"]),

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 import mp4ds
 from coded_scenes import CODED
 from definitions import IMAGE
-from each import each
 from in_parts import InlineEngine, leftovers
 from mp4ds import yamlio
 from mp4ds.errors import OptionError, ScoringError
@@ -157,7 +156,7 @@ def test_the_search_ends_after_a_few_encodings() -> None:
     assert (reached, tried) == (score(crf) >= 30.2, 2)
 
 
-@each("seed", range(8))
+@pytest.mark.parametrize("seed", range(8))
 def test_the_course_of_the_crf_keeps_mean_and_windows(seed: int) -> None:
     """Scenes of any difficulty: the mean is what is asked for, and no window far below it."""
     rng = np.random.default_rng(seed)
@@ -192,7 +191,7 @@ def test_the_course_of_the_crf_keeps_mean_and_windows(seed: int) -> None:
 CHANGING = [0.0, 0.0, 8.0, 8.0, 0.0, 0.0]
 
 
-@each("codec", ["h264", "h265", "av1", "av1-10bit"])
+@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "av1-10bit"])
 def test_every_window_has_the_score(codec: str, tmp_path: Path) -> None:
     """Windows of other difficulty have another crf, and one video."""
     preset = "12" if codec.startswith("av1") else "ultrafast"

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 import mp4ds
 from coded_scenes import CODED
-from each import each
 from mp4ds.dataset.stamps import StampIndex
 from mp4ds.dataset.views import Placement
 from mp4ds.format.models import Calibration, Roi
@@ -67,7 +66,8 @@ def same(one: NDArray[Any], other: NDArray[Any]) -> bool:
 # ---------------------------------------------------------------- by number
 
 
-@each("encoding", ENCODINGS, one_in=4)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("encoding", ENCODINGS)
 def test_frames_of_every_encoding(encoding: str, tmp_path: Path) -> None:
     source = scene(encoding, frames=FRAMES)
     expected = recorded(source)
@@ -85,7 +85,7 @@ def test_frames_of_every_encoding(encoding: str, tmp_path: Path) -> None:
         assert same(stream.read(ORDER, format="native"), np.stack([expected[i] for i in ORDER]))
 
 
-@each("name", ["jpeg-rgb", "png-16-bit-cv2-9", "depth-16UC1-rvl", "video-h264",
+@pytest.mark.parametrize("name", ["jpeg-rgb", "png-16-bit-cv2-9", "depth-16UC1-rvl", "video-h264",
                                   "video-h265", "video-av1", "video-vp9"])  # fmt: skip
 def test_frames_of_coded_messages(name: str, tmp_path: Path) -> None:
     with mp4ds.open(packed(tmp_path, CODED[name](frames=FRAMES))) as dataset:
@@ -98,8 +98,11 @@ def test_frames_of_coded_messages(name: str, tmp_path: Path) -> None:
         assert same(stream.read(order, format="native"), np.stack([every[i] for i in order]))
 
 
-@each(("quality", "codec"), [("visual", None), ("crf=30", None), ("crf=30", "av1-10bit")], one_in=3)
-@each("encoding", ["rgb8", "bgr8", "mono8", "bayer_grbg8", "nv12"])
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize(
+    ("quality", "codec"), [("visual", None), ("crf=30", None), ("crf=30", "av1-10bit")]
+)
+@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8", "bayer_grbg8", "nv12"])
 def test_frames_of_a_lossy_video_are_those_of_unpack(
     encoding: str, quality: str, codec: str | None, tmp_path: Path
 ) -> None:
@@ -134,7 +137,9 @@ def test_numbers_out_of_range(index: int, colour: mp4ds.Stream) -> None:
             ask([0, index])
 
 
-@each("indices", [["1"], [1.0], [None], np.array([0.5]), 3, np.array(3), np.array([True, False])])
+@pytest.mark.parametrize(
+    "indices", [["1"], [1.0], [None], np.array([0.5]), 3, np.array(3), np.array([True, False])]
+)
 def test_what_is_no_number(indices: Any, colour: mp4ds.Stream) -> None:
     for ask in (colour.get, colour.read):
         with pytest.raises(TypeError):
@@ -175,7 +180,7 @@ def test_into_an_array_of_ones_own(colour: mp4ds.Stream) -> None:
     assert np.array_equal(small, colour.read([2, 9, 2], resize=0.25))
 
 
-@each(
+@pytest.mark.parametrize(
     ("out", "problem"),
     [
         (
@@ -229,7 +234,7 @@ def distance(one: NDArray[Any], other: NDArray[Any]) -> float:
     return float(np.abs(one.astype(float) - other.astype(float)).mean() / np.iinfo(one.dtype).max)
 
 
-@each("encoding", LIGHT)
+@pytest.mark.parametrize("encoding", LIGHT)
 def test_formats_of_every_encoding(encoding: str, tmp_path: Path) -> None:
     source = scene(encoding, frames=2, width=64, height=48, noisy=False)
     bits = 8 * np.dtype(KNOWN[encoding].dtype).itemsize
@@ -260,7 +265,7 @@ def test_formats_of_every_encoding(encoding: str, tmp_path: Path) -> None:
             assert np.array_equal(stream.read([number])[0], rgb.data)
 
 
-@each("encoding", DATA)
+@pytest.mark.parametrize("encoding", DATA)
 def test_numbers_are_no_colours(encoding: str, tmp_path: Path) -> None:
     source = scene(encoding, frames=4)
     data = recorded(source)[0]
@@ -276,7 +281,7 @@ def test_numbers_are_no_colours(encoding: str, tmp_path: Path) -> None:
         assert frame.encoding == encoding
 
 
-@each("encoding", ["16UC1", "mono16", "32FC1"])
+@pytest.mark.parametrize("encoding", ["16UC1", "mono16", "32FC1"])
 def test_depths_in_metres(encoding: str, tmp_path: Path) -> None:
     source = scene(encoding, frames=3)
     expected = [data.astype(np.float64) for data in recorded(source)]
@@ -298,7 +303,7 @@ def test_colours_are_no_depths(colour: mp4ds.Stream) -> None:
         colour.read([0], format="depth_m")
 
 
-@each("name", ["BGR", "", "rgb8", None])
+@pytest.mark.parametrize("name", ["BGR", "", "rgb8", None])
 def test_no_such_format(name: Any, colour: mp4ds.Stream) -> None:
     with pytest.raises(mp4ds.OptionError, match="native, rgb, bgr, gray"):
         colour.get([0], format=name)
@@ -307,8 +312,8 @@ def test_no_such_format(name: Any, colour: mp4ds.Stream) -> None:
 # ---------------------------------------------------------------- sizes
 
 
-@each("size", [(16, 12), (32, 24), (40, 30), (7, 48), (64, 5)])
-@each("name", ["native", "rgb", "bgr", "gray"])
+@pytest.mark.parametrize("size", [(16, 12), (32, 24), (40, 30), (7, 48), (64, 5)])
+@pytest.mark.parametrize("name", ["native", "rgb", "bgr", "gray"])
 def test_smaller(size: tuple[int, int], name: str, colour: mp4ds.Stream) -> None:
     """By area, as OpenCV does it."""
     (whole,) = colour.read([3], format=name)
@@ -317,8 +322,8 @@ def test_smaller(size: tuple[int, int], name: str, colour: mp4ds.Stream) -> None
     assert np.abs(small.astype(int) - expected).max() <= 2
 
 
-@each("codec", ["h264", "av1", "lossless"])
-@each("size", [(64, 48), (63, 47)])
+@pytest.mark.parametrize("codec", ["h264", "av1", "lossless"])
+@pytest.mark.parametrize("size", [(64, 48), (63, 47)])
 def test_a_lossy_video_gives_sizes_at_once(
     codec: str, size: tuple[int, int], tmp_path: Path
 ) -> None:
@@ -376,7 +381,7 @@ def test_parts(colour: mp4ds.Stream) -> None:
     assert np.abs(small.astype(int) - expected).max() <= 2
 
 
-@each("encoding", [*(name for name in ENCODINGS if name.startswith("bayer"))])
+@pytest.mark.parametrize("encoding", [*(name for name in ENCODINGS if name.startswith("bayer"))])
 def test_a_part_of_a_mosaic_is_a_mosaic(encoding: str, tmp_path: Path) -> None:
     source = scene(encoding, frames=4)
     data = recorded(source)[0]
@@ -397,7 +402,7 @@ def test_a_part_of_a_mosaic_is_a_mosaic(encoding: str, tmp_path: Path) -> None:
         assert stream.read([0], resize=0.5).shape == (1, 24, 32, 3)
 
 
-@each("encoding", YUV)
+@pytest.mark.parametrize("encoding", YUV)
 def test_camera_yuv_is_not_cut(encoding: str, tmp_path: Path) -> None:
     with mp4ds.open(packed(tmp_path, scene(encoding, frames=4))) as dataset:
         stream = dataset[TOPIC]
@@ -410,8 +415,8 @@ def test_camera_yuv_is_not_cut(encoding: str, tmp_path: Path) -> None:
         assert np.array_equal(part, stream.read([0])[0][3:10, 1:10])
 
 
-@each(("width", "height"), [(1, 1), (1, 4), (5, 1), (2, 2), (3, 3), (63, 47)])
-@each("encoding", [name for name in ENCODINGS if name.startswith("bayer")])
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 4), (5, 1), (2, 2), (3, 3), (63, 47)])
+@pytest.mark.parametrize("encoding", [name for name in ENCODINGS if name.startswith("bayer")])
 def test_mosaics_of_odd_sizes(encoding: str, width: int, height: int) -> None:
     rng = np.random.default_rng(0)
     data = picture(encoding, frame=0, width=width, height=height, rng=rng)
@@ -423,7 +428,7 @@ def test_mosaics_of_odd_sizes(encoding: str, width: int, height: int) -> None:
         assert rgb[row, column, channel] == data[row, column]
 
 
-@each(
+@pytest.mark.parametrize(
     "options",
     [
         *({"resize": value} for value in (0, -1.0, float("nan"), float("inf"), True, "2", 1e9,
@@ -458,7 +463,7 @@ MISTAKES: dict[str, tuple[type[Exception], str]] = {
 }
 
 
-@each("code", MISTAKES)
+@pytest.mark.parametrize("code", MISTAKES)
 def test_what_to_write_instead(code: str, colour: mp4ds.Stream) -> None:
     kind, words = MISTAKES[code]
     with mp4ds.open(colour.path) as dataset, pytest.raises(kind, match=re.escape(words)):

@@ -14,7 +14,6 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
-from each import each
 from mp4ds.dataset.channels import when_asked
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import DecodedColumns, everything, marked, unbroken, within
@@ -71,7 +70,8 @@ def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # ---------------------------------------------------------------- from a time on
 
 
-@each("name", SCENES, one_in=3)
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("name", SCENES)
 def test_from_every_kind_of_place(name: str, tmp_path: Path) -> None:
     """What comes from a time on is what has come before, however it was stored."""
     source = "mcap-ros2-zstd" if name.startswith("cdr") else "bag-none"
@@ -139,8 +139,8 @@ def every(step: int) -> Callable[[DecodedColumns], Iterator[int]]:
     return lambda columns: iter(range(0, len(columns.log_time), step))
 
 
-@each("start", [None, 0])
-@each("trait", ["size-change", "encoding-change", "plain", "data-empty"])
+@pytest.mark.parametrize("start", [None, 0])
+@pytest.mark.parametrize("trait", ["size-change", "encoding-change", "plain", "data-empty"])
 def test_chosen_messages_keep_their_places(trait: str, start: int | None, tmp_path: Path) -> None:
     """A channel of which some messages are in messages.mcap."""
     with Dataset(packed(tmp_path, odd_scene(trait), "mcap-ros2-zstd")) as dataset:
@@ -199,7 +199,7 @@ def test_choices() -> None:
     assert list(marked(times != 9, every(3))(columns)) == [0, 3]
 
 
-@each(
+@pytest.mark.parametrize(
     ("indices", "from_key", "wanted"),
     [
         ([], True, []),
@@ -232,7 +232,8 @@ def test_chosen_packets(name: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- of a decoder
 
 
-@each("codec", ["h264", "h265", "av1", "ffv1"], one_in=4)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "ffv1"])
 def test_pictures_of_any_frames(codec: str, tmp_path: Path) -> None:
     options = {"quality": "visual"} if codec == "av1" else {}
     made = scene("mono8", frames=90, width=32, height=16)
@@ -347,8 +348,8 @@ class Threads:
         return iter(made.get, end)
 
 
-@each("start", [None, 0])
-@each("trait", ["size-change", "plain"])
+@pytest.mark.parametrize("start", [None, 0])
+@pytest.mark.parametrize("trait", ["size-change", "plain"])
 def test_sources_are_read_by_threads(trait: str, start: int | None, tmp_path: Path) -> None:
     with Dataset(packed(tmp_path, odd_scene(trait))) as dataset:
         ahead = Threads()

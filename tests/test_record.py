@@ -17,7 +17,6 @@ from typing import Any
 import pytest
 
 import mp4ds
-from each import each
 from mp4ds.bags.formats import open_sources
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, RecordError, SourceError, TargetExistsError
@@ -72,8 +71,8 @@ def reasons(summary: mp4ds.PackSummary, topic: str) -> dict[str, int]:
 # ---------------------------------------------------------------- what comes
 
 
-@each(
-    "source, encoding",
+@pytest.mark.parametrize(
+    ("source", "encoding"),
     [
         ("bag-none", "bayer_rggb8"),
         ("bag-none", "16UC1"),
@@ -118,8 +117,8 @@ def test_topics_that_are_wanted() -> None:
         Wanted(regex="(")
 
 
-@each(
-    "options, found",
+@pytest.mark.parametrize(
+    ("options", "found"),
     [
         ({}, "image imu event"),
         ({"all_topics": True}, "image imu"),
@@ -227,8 +226,8 @@ def test_nothing_to_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert again(tmp_path / "live", tmp_path).stat().st_size > 0
 
 
-@each(
-    "options, said",
+@pytest.mark.parametrize(
+    ("options", "said"),
     [
         ({"all": False}, "Name topics"),
         ({"quality": "vmaf=95"}, "several tries"),
@@ -355,7 +354,7 @@ def test_a_buffer_that_is_full(tmp_path: Path) -> None:
     assert intake.received == {message.channel.topic: 5}
 
 
-@each("field", ["log_time", "publish_time"])
+@pytest.mark.parametrize("field", ["log_time", "publish_time"])
 def test_times_that_no_recording_can_hold(
     field: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,7 +15,6 @@ from rosbags.convert.converter import default_message
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mp4ds
-from each import each
 from mp4ds.bags.formats import open_reader
 from mp4ds.bags.rosbag2_metadata import read_bag_info
 from mp4ds.errors import OptionError
@@ -413,7 +412,7 @@ def test_a_definition_that_is_announced(monkeypatch: pytest.MonkeyPatch) -> None
 CUSTOM = "my_msgs/msg/Part"
 
 
-@each("described", ["proven", "wrong", "unknown", "nobody"])
+@pytest.mark.parametrize("described", ["proven", "wrong", "unknown", "nobody"])
 def test_a_definition_that_a_node_describes(
     described: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

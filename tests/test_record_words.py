@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from each import each
 from mp4ds.cli.record_words import known_words, spelled
 from mp4ds.errors import OptionError
 from roscore import RECORD
@@ -32,8 +31,8 @@ JAZZY = {
 VALUED = {"-o", "--output", "-e", "--regex", "-x", "--exclude-regex", "-d", "-b", "--max-size"}
 
 
-@each(
-    "typed, meant",
+@pytest.mark.parametrize(
+    ("typed", "meant"),
     [
         ("-o drive -a", "-o drive -a"),
         ("-O drive.bag /a /b", "--output drive.bag /a /b"),

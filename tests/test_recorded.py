@@ -17,7 +17,6 @@ from rosbags.highlevel import AnyReader
 
 import mp4ds
 from conftest import real
-from each import each
 from foxglove_scenes import FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.bags.decoding import decoder_of
 from mp4ds.messages.wire import WireError
@@ -69,7 +68,8 @@ def check_value(own: Any, value: Any) -> None:
 # ---------------------------------------------------------------- all sources
 
 
-@each("variant", SOURCES, one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("variant", SOURCES)
 def test_messages_of_every_source(variant: str, tmp_path: Path) -> None:
     source = scene("mono8", frames=6)
     (tmp_path / "source").mkdir()
@@ -96,7 +96,7 @@ def test_messages_of_every_source(variant: str, tmp_path: Path) -> None:
                 assert not is_typed or name == record.msgtype.replace("/msg/", "/")
 
 
-@each("variant", FOXGLOVE_SOURCES)
+@pytest.mark.parametrize("variant", FOXGLOVE_SOURCES)
 def test_messages_of_foxglove(variant: str, tmp_path: Path) -> None:
     source = foxglove_scene(partial(scene, "rgb8"), frames=6, width=64, height=48)
     dataset = packed(tmp_path, FOXGLOVE_SOURCES[variant](tmp_path, source))
@@ -176,7 +176,7 @@ REAL = [
 ]
 
 
-@each("name", REAL)
+@pytest.mark.parametrize("name", REAL)
 def test_real_recordings(name: str, tmp_path: Path) -> None:
     """Every message decodes, to what rosbags itself makes of it."""
     path = real(f"bags/{name}.bag")
@@ -220,7 +220,7 @@ def channel(encoding: str, name: str = "", schema: bytes = b"", kind: str = "") 
     return Channel(0, "/odd", encoding, Schema(name, kind, schema) if name else None)
 
 
-@each(
+@pytest.mark.parametrize(
     ("odd", "problem"),
     [
         (channel("flatbuffer", "foxglove.Log", b"", "flatbuffer"), "their encoding is flatbuffer"),
@@ -257,7 +257,7 @@ def test_a_type_declared_inside_another_in_a_file_that_comes_before_its_imports(
     assert decode(memoryview(b"\x3a\x04\x0a\x02hi")).part.text == "hi"
 
 
-@each("encoding", ["ros1", "cdr", "json", "protobuf"])
+@pytest.mark.parametrize("encoding", ["ros1", "cdr", "json", "protobuf"])
 def test_any_bytes(encoding: str) -> None:
     """An object or a WireError, whatever the bytes are."""
     from foxglove_wire import SERIALIZATIONS

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import mp4ds
-from each import each
 from in_parts import InlineEngine
 from mp4ds import yamlio
 from mp4ds.dataset.stream import Stream
@@ -65,7 +64,8 @@ def chains_of(path: Path, codec: str, recorded: Structures | None) -> list[Piece
     return found
 
 
-@each("name", RECIPES, one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("name", RECIPES)
 def test_recorded_and_parsed_chains_are_the_same(name: str, tmp_path: Path) -> None:
     recipe = RECIPES[name]
     path = written(tmp_path, recipe)
@@ -114,7 +114,7 @@ def test_groups_that_were_not_asked_for_long_are_forgotten(
         assert kept == chains._kept <= 2 * most
 
 
-@each("name", REFUSED)
+@pytest.mark.parametrize("name", REFUSED)
 def test_unknown_structures_are_not_recorded(name: str, tmp_path: Path) -> None:
     path = written(tmp_path, REFUSED[name])
     assert digest_video(path, REFUSED[name].codec).structures is None
@@ -163,7 +163,9 @@ def test_a_packet(frames: list[CodedFrame], text: str) -> None:
     assert write_packet(frames) == text
 
 
-@each("frames", [[], [frame(shown=False)], [frame(), frame(1)], [frame(), frame(1, shown=False)]])
+@pytest.mark.parametrize(
+    "frames", [[], [frame(shown=False)], [frame(), frame(1)], [frame(), frame(1, shown=False)]]
+)
 def test_a_packet_shows_its_last_frame(frames: list[CodedFrame]) -> None:
     with pytest.raises(UnknownStructure):
         write_packet(frames)
@@ -173,7 +175,7 @@ def test_needs_are_counted_from_the_key_frame() -> None:
     assert read_structure("k 1+2+1,3 1 k+2,4") == [[()], [(0,), (0,), (2, 0)], [(3,)], [(), (4, 2)]]
 
 
-@each(
+@pytest.mark.parametrize(
     ("text", "problem"),
     [
         ("k 2", "packet 1 refers to 2 frames back, before the key frame"),
@@ -187,7 +189,7 @@ def test_structures_that_contradict_themselves(text: str, problem: str) -> None:
         read_structure(text)
 
 
-@each(
+@pytest.mark.parametrize(
     ("texts", "plain"),
     [(["k 1 1,2"], True), (["k"], True), (["k 1", "k 1 2"], False), (["k 1+2+1"], False),
      (["k 1 12"], False), (["k 1 k"], False)],
@@ -327,7 +329,7 @@ def test_without_them_all_is_the_same(packed: Path, tmp_path: Path) -> None:
             assert np.array_equal(two[number].data, every[number])
 
 
-@each(
+@pytest.mark.parametrize(
     "text",
     [
         *("", "1", "k  1", "k 1 ", " k", "k 0", "k 01", "k 1,", "k +1", "k -1", "k 1234567"),
@@ -342,7 +344,7 @@ def test_what_is_no_structure(text: str, packed: Path, tmp_path: Path) -> None:
         Stream(path)
 
 
-@each(
+@pytest.mark.parametrize(
     ("structures", "code"),
     [
         ([], "schema-invalid"),
@@ -383,7 +385,7 @@ MISFITS: dict[str, tuple[Change, str]] = {
 }
 
 
-@each("name", MISFITS)
+@pytest.mark.parametrize("name", MISFITS)
 def test_references_of_another_video(name: str, packed: Path, tmp_path: Path) -> None:
     change, problem = MISFITS[name]
     path = edited(packed, tmp_path, change)
@@ -427,7 +429,7 @@ LIES: dict[str, Change] = {
 }
 
 
-@each("name", LIES)
+@pytest.mark.parametrize("name", LIES)
 def test_lies_are_found_and_do_no_harm(name: str, packed: Path, tmp_path: Path) -> None:
     path = edited(packed, tmp_path, LIES[name])
     assert mp4ds.validate(path) == []

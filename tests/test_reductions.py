@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 import mp4ds
 from coded_scenes import CODED, MakeScene
 from definitions import COMPRESSED, IMAGE, INFO
-from each import each
 from foxglove_scenes import FOXGLOVE
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import DecodedColumns
@@ -101,13 +100,13 @@ def frames_of(made: Packed, resize: Any, topic: str | None = None) -> list[mp4ds
 # ---------------------------------------------------------------- smaller
 
 
-@each(
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize(
     ("name", "to", "resize"),
     [
         (name, TARGETS[number % 3], SIZES[number % len(SIZES)] if number % 2 else 0.5)
         for number, name in enumerate(RESIZED)
     ],
-    one_in=4,
 )
 def test_images_are_those_of_the_frames(
     packed: Callable[..., Packed], name: str, to: str, resize: Any
@@ -155,8 +154,8 @@ def check_raw(name: str, message: Read, image: NDArray[Any], frame: mp4ds.Frame)
         assert np.array_equal(np.isnan(image), frame.data == 0)
 
 
-@each("kind", ["raw", "jpeg", "png"])
-@each("name", ["raw-rgb8", "raw-bayer_rggb8", "jpeg-rgb", "video-h264"])
+@pytest.mark.parametrize("kind", ["raw", "jpeg", "png"])
+@pytest.mark.parametrize("name", ["raw-rgb8", "raw-bayer_rggb8", "jpeg-rgb", "video-h264"])
 def test_smaller_images_of_another_kind(
     packed: Callable[..., Packed], name: str, kind: str
 ) -> None:
@@ -196,8 +195,8 @@ def test_the_same_size_stays_as_recorded(packed: Callable[..., Packed], resize: 
         assert rows(made.unpack("mcap", None, resize=resize)[1]) == rows(plain)
 
 
-@each("name", ["raw-mono8", "jpeg-rgb", "video-h264"])
-@each("to", TARGETS)
+@pytest.mark.parametrize("name", ["raw-mono8", "jpeg-rgb", "video-h264"])
+@pytest.mark.parametrize("to", TARGETS)
 def test_calibrations_are_made_to_match(packed: Callable[..., Packed], name: str, to: str) -> None:
     made = packed(name)
     messages = made.unpack(to, None, resize=(40, 30))[1]
@@ -266,8 +265,9 @@ def test_what_no_video_holds_is_told(tmp_path: Path) -> None:
 AS_RECORDED = ["raw-mono8", "raw-padded", "jpeg-rgb", "png-rgba-cv2", "depth-32FC1-rvl"]
 
 
-@each("name", [*AS_RECORDED, "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"], one_in=2)
-@each("every", [2, 3, 100])
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("name", [*AS_RECORDED, "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"])
+@pytest.mark.parametrize("every", [2, 3, 100])
 def test_fewer_messages_are_as_recorded(
     packed: Callable[..., Packed], name: str, every: int
 ) -> None:
@@ -283,7 +283,7 @@ def test_fewer_messages_are_as_recorded(
     assert summary.republished == {}
 
 
-@each(("rate", "kept"), [(1000.0, 8), (30.0, 8), (15.0, 4), (10.0, 3), (0.1, 1)])
+@pytest.mark.parametrize(("rate", "kept"), [(1000.0, 8), (30.0, 8), (15.0, 4), (10.0, 3), (0.1, 1)])
 def test_a_rate(packed: Callable[..., Packed], rate: float, kept: int) -> None:
     """Of a camera of 30 Hz whose stamps jitter."""
     made = packed("raw-mono8")
@@ -437,8 +437,8 @@ def test_frames_named_like_formulas(tmp_path: Path) -> None:
     assert row["frame_id"] == "'=1+\u00fc"
 
 
-@each("image_format", ["png", "jpeg"])
-@each("name", ["raw-rgb8", "raw-bayer_rggb8", "jpeg-rgb", "video-h264"])
+@pytest.mark.parametrize("image_format", ["png", "jpeg"])
+@pytest.mark.parametrize("name", ["raw-rgb8", "raw-bayer_rggb8", "jpeg-rgb", "video-h264"])
 def test_folders_of_images(
     packed: Callable[..., Packed], name: str, image_format: str, tmp_path: Path
 ) -> None:
@@ -471,8 +471,8 @@ def camera(rate: float, frames: int = 600, jitter: int = 0, seed: int = 0) -> ND
     return times + rng.integers(-jitter, jitter + 1, frames)
 
 
-@each("jitter", [0, 1_000, 1_000_000, 7_000_000])
-@each("rate", [10.0, 15.0, 29.97, 30.0, 60.0])
+@pytest.mark.parametrize("jitter", [0, 1_000, 1_000_000, 7_000_000])
+@pytest.mark.parametrize("rate", [10.0, 15.0, 29.97, 30.0, 60.0])
 def test_a_camera_of_the_rate_loses_nothing(rate: float, jitter: int) -> None:
     for seed in range(20):
         times = camera(rate, jitter=round(min(jitter, 0.2e9 / rate)), seed=seed)
@@ -480,16 +480,16 @@ def test_a_camera_of_the_rate_loses_nothing(rate: float, jitter: int) -> None:
         assert at_most(2 * rate, times).all()
 
 
-@each("jitter", [0, 3_000_000])
-@each("part", [1, 2, 3, 4, 5, 7, 30])
+@pytest.mark.parametrize("jitter", [0, 3_000_000])
+@pytest.mark.parametrize("part", [1, 2, 3, 4, 5, 7, 30])
 def test_parts_of_a_rate(part: int, jitter: int) -> None:
     """Frames at equal distances, whatever the jitter."""
     kept = np.flatnonzero(at_most(30 / part, camera(30.0, jitter=jitter)))
     assert kept.tolist() == list(range(0, 600, part))
 
 
-@each("jitter", [0, 3_000_000])
-@each("rate", [1.0, 7.0, 12.5, 20.0, 24.0, 29.0])
+@pytest.mark.parametrize("jitter", [0, 3_000_000])
+@pytest.mark.parametrize("rate", [1.0, 7.0, 12.5, 20.0, 24.0, 29.0])
 def test_any_rate_holds_on_the_average(rate: float, jitter: int) -> None:
     times = camera(30.0, jitter=jitter)
     count = int(at_most(rate, times).sum())
@@ -506,7 +506,7 @@ def test_gaps_and_clocks_that_are_set_back() -> None:
     assert at_most(10.0, np.array([5])).tolist() == [True]
 
 
-@each("stamps", ["zero", "backward", "sound", "doubled"])
+@pytest.mark.parametrize("stamps", ["zero", "backward", "sound", "doubled"])
 def test_times_are_stamps_or_log_times(stamps: str) -> None:
     log = camera(30.0, 10)
     stamp = {
@@ -523,7 +523,7 @@ def test_times_are_stamps_or_log_times(stamps: str) -> None:
 # ---------------------------------------------------------------- options
 
 
-@each(
+@pytest.mark.parametrize(
     "options",
     [
         *({"resize": value} for value in (0, -1.0, float("nan"), float("inf"), True, "0.5", 1e9)),
@@ -541,8 +541,8 @@ def test_what_is_no_reduction(options: dict[str, Any]) -> None:
         Reduction(**options)
 
 
-@each("options", [{"resize": 0.5}, {"every": 2}, {"max_rate": 3.0}], ids=repr)
-@each("kind", ["compressed-video", "ffmpeg"])
+@pytest.mark.parametrize("options", [{"resize": 0.5}, {"every": 2}, {"max_rate": 3.0}], ids=repr)
+@pytest.mark.parametrize("kind", ["compressed-video", "ffmpeg"])
 def test_video_is_given_as_it_is(
     packed: Callable[..., Packed], kind: str, options: dict[str, Any]
 ) -> None:

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from coded_tools import mutations, refusal, scene
 from conftest import real
-from each import each
 from mp4ds.messages.coded import CodedFrame
 from mp4ds.video import av1
 from mp4ds.video.nal import parameter_units
@@ -274,7 +273,8 @@ def check(clip: Clip, numbers: Sequence[int]) -> int:
     return left_out
 
 
-@each("name", RECIPES, one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("name", RECIPES)
 def test_frames_decode_from_what_they_refer_to(name: str) -> None:
     recipe = RECIPES[name]
     clip = encoded(recipe)
@@ -287,7 +287,7 @@ def test_frames_decode_from_what_they_refer_to(name: str) -> None:
     assert flat or not hierarchical or left_out > 0
 
 
-@each("name", RECIPES)
+@pytest.mark.parametrize("name", RECIPES)
 def test_a_parser_may_begin_at_any_key_packet(name: str) -> None:
     clip = encoded(RECIPES[name])
     whole = parsed(clip)
@@ -300,7 +300,7 @@ def test_a_parser_may_begin_at_any_key_packet(name: str) -> None:
                 assert refusal(partial(parser.packet, packet.data, key=key))
 
 
-@each("name", REFUSED)
+@pytest.mark.parametrize("name", REFUSED)
 def test_what_reaches_across_key_packets_is_refused(name: str) -> None:
     clip = encoded(REFUSED[name])
     parser = ReferenceParser(clip.codec, clip.configuration)
@@ -311,7 +311,8 @@ def test_what_reaches_across_key_packets_is_refused(name: str) -> None:
     assert all(reasons[first:following])
 
 
-@each("name", FILES, one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("name", FILES)
 def test_real_videos(name: str) -> None:
     path: Path = real(f"video/{name}")
     clip = read(str(path), most=60)
@@ -376,7 +377,7 @@ def test_a_picture_of_several_slices() -> None:
     assert parser.packet(clip.packets[0].data, key=True)[0].references == ()
 
 
-@each(
+@pytest.mark.parametrize(
     ("name", "data", "reason"),
     [
         ("x264-slices", b"", "one picture"),
@@ -505,8 +506,8 @@ SEQUENCES: dict[str, tuple[bytes, dict[str, Any]]] = {
 }
 
 
-@each("name", SEQUENCES)
-@each("configured", [True, False])
+@pytest.mark.parametrize("name", SEQUENCES)
+@pytest.mark.parametrize("configured", [True, False])
 def test_av1_headers(name: str, configured: bool) -> None:
     """By the tables of the specification: frames fill slots and others name these."""
     head, told = SEQUENCES[name]
@@ -546,7 +547,7 @@ def test_av1_slots_chosen_by_order() -> None:
     assert short.references == (1, 2, 3, 4, 5, 6, 7, 8)
 
 
-@each(
+@pytest.mark.parametrize(
     ("head", "body", "reason"),
     [
         (sequence(points=(0x303,)), b"", "spatial layers"),
@@ -666,7 +667,9 @@ def test_av1_key_frames_shown_later() -> None:
 # ---------------------------------------------------------------- damage
 
 
-@each("name", ["svt-8", "x264-slices", "x265-b4-3-layers", "vp9", "ffv1", "mjpeg"])
+@pytest.mark.parametrize(
+    "name", ["svt-8", "x264-slices", "x265-b4-3-layers", "vp9", "ffv1", "mjpeg"]
+)
 def test_damage_is_refused_or_read(name: str) -> None:
     clip = encoded(RECIPES[name])
     for packet in clip.packets[:8]:
@@ -679,7 +682,7 @@ def test_damage_is_refused_or_read(name: str) -> None:
         refusal(ReferenceParser, clip.codec, data)
 
 
-@each("codec", ["h264", "h265", "av1", "vp9", "ffv1", "png"])
+@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "vp9", "ffv1", "png"])
 def test_noise_is_refused_or_read(codec: str) -> None:
     rng = random.Random(codec)
     for _ in range(500):

@@ -15,7 +15,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mp4ds
-from each import each
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.bags.formats import open_sources
 from mp4ds.cli import app_for
@@ -55,7 +54,7 @@ def covered(ranges: Sequence[tuple[int, int]]) -> int:
 # ---------------------------------------------------------------- names
 
 
-@each(
+@pytest.mark.parametrize(
     ("url", "shown", "name", "parent", "child"),
     [
         ("s3://b/k/drive.mcap", "s3://b/k/drive.mcap", "drive.mcap", "s3://b/k", "s3://b/k/a b"),
@@ -489,8 +488,8 @@ def test_a_server_without_ranges(name: str, tmp_path: Path) -> None:
         assert web.sent < 2**26  # what is under way when the connection is closed
 
 
-@each("name", ["drive.bag", "drive.mcap"])
-@each("after", [3, 8, 20])
+@pytest.mark.parametrize("name", ["drive.bag", "drive.mcap"])
+@pytest.mark.parametrize("after", [3, 8, 20])
 def test_a_network_that_fails_is_no_damage(
     name: str, after: int, large: Path, tmp_path: Path
 ) -> None:

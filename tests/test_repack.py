@@ -13,7 +13,6 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
-from each import each
 from mp4ds.errors import OptionError, SourceError, TargetExistsError
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import load_manifest
@@ -47,7 +46,8 @@ def images(dataset: Path) -> list[str]:
         return opened.topics
 
 
-@each("source", SOURCES, one_in=4)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("source", SOURCES)
 def test_what_was_exact_stays_so(source: str, tmp_path: Path, compare: Compare) -> None:
     first = tmp_path / "first"
     first.mkdir()
@@ -66,7 +66,8 @@ def test_what_was_exact_stays_so(source: str, tmp_path: Path, compare: Compare) 
         assert getattr(told, fact) == getattr(known, fact)
 
 
-@each("trait", TRAITS, one_in=4)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("trait", TRAITS)
 def test_odd_recordings(trait: str, tmp_path: Path, compare: Compare) -> None:
     first = tmp_path / "first"
     first.mkdir()
@@ -75,7 +76,8 @@ def test_odd_recordings(trait: str, tmp_path: Path, compare: Compare) -> None:
     assert compare(before.sources, unpacked(tmp_path, "bag")) == []
 
 
-@each("kind", CODED, one_in=6)
+@pytest.mark.one_in(6)
+@pytest.mark.parametrize("kind", CODED)
 def test_coded_images(kind: str, tmp_path: Path, compare: Compare) -> None:
     first = tmp_path / "first"
     first.mkdir()
@@ -199,8 +201,10 @@ def lossy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "drive"
 
 
-@each("edit", [edit_sidecar, edit_messages, edit_video], ids=lambda one: one.__name__)
-@each("way", WAYS)
+@pytest.mark.parametrize(
+    "edit", [edit_sidecar, edit_messages, edit_video], ids=lambda one: one.__name__
+)
+@pytest.mark.parametrize("way", WAYS)
 def test_no_manifest_vouches_for_what_was_changed(
     way: str, edit: Callable[[Path], Path], lossy: Path, tmp_path: Path
 ) -> None:
@@ -214,8 +218,10 @@ def test_no_manifest_vouches_for_what_was_changed(
     assert not (tmp_path / "again").exists()
 
 
-@each("options", [UnpackOptions(), UnpackOptions(start=0.2)], ids=["whole", "slice"])
-@each("to", ["bag", "images"])
+@pytest.mark.parametrize(
+    "options", [UnpackOptions(), UnpackOptions(start=0.2)], ids=["whole", "slice"]
+)
+@pytest.mark.parametrize("to", ["bag", "images"])
 def test_a_changed_sidecar_is_not_unpacked(
     to: str, options: UnpackOptions, lossy: Path, tmp_path: Path
 ) -> None:
@@ -286,7 +292,7 @@ def test_who_made_it(recording: Path, tmp_path: Path) -> None:
     assert manifest(tmp_path / "more").about == manifest(tmp_path / "whole").about
 
 
-@each(
+@pytest.mark.parametrize(
     ("text", "problem"),
     [
         ("author: me", "at author"),

@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 
 import mp4ds
 from coded_scenes import CODED
-from each import each, fresh
 from mp4ds.errors import OptionError, SourceError, TargetError, TargetExistsError
 from mp4ds.format.models import Calibration, Roi
 from mp4ds.plugins.info import info
@@ -72,7 +71,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return pack_cameras(tmp_path_factory.mktemp("report"), two_cameras())
 
 
-@fresh
+@pytest.fixture
 def copy(drive: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(drive, tmp_path / "drive"))
 
@@ -126,7 +125,7 @@ COLUMNS = {
 }
 
 
-@each("name", COLUMNS)
+@pytest.mark.parametrize("name", COLUMNS)
 def test_columns_come_back(name: str) -> None:
     values = COLUMNS[name]
     assert unpacked(pack_column(np.array(values, np.int64)), len(values)) == values
@@ -163,7 +162,9 @@ def test_figures_of_a_camera() -> None:
     assert (timing.delay_median_ms, timing.delay_least_ms, timing.delay_most_ms) == (4.5, 4.5, 4.5)
 
 
-@each(("stamps", "rate"), [([5], None), ([5, 5, 5], None), ([9, 8, 7], None), ([0, 10**9], 1.0)])
+@pytest.mark.parametrize(
+    ("stamps", "rate"), [([5], None), ([5, 5, 5], None), ([9, 8, 7], None), ([0, 10**9], 1.0)]
+)
 def test_figures_where_there_are_none(stamps: list[int], rate: float | None) -> None:
     column = np.array(stamps, np.int64)
     timing = timing_of(column, column, None)
@@ -240,7 +241,7 @@ LENSES = {
 }
 
 
-@each("name", LENSES)
+@pytest.mark.parametrize("name", LENSES)
 def test_the_grid_is_straight_without_distortion(name: str) -> None:
     """By OpenCV, which takes the distortion of each point away."""
     lens = LENSES[name]
@@ -266,7 +267,7 @@ def test_the_grid_of_rectified_images_is_that_of_p() -> None:
     assert all(len(set(line[0::2])) == 1 or len(set(line[1::2])) == 1 for line in overlay.lines)
 
 
-@each(
+@pytest.mark.parametrize(
     ("lens", "size", "problem"),
     [
         (calibration("plumb_bob", [], k=[0.0] * 9), (640, 480), "not calibrated"),
@@ -504,7 +505,7 @@ def test_no_code_of_the_page_makes_elements_of_text() -> None:
     assert not re.search(r"https?://", everything)
 
 
-@each("time_ns", [INT64.min, INT64.max, 0, -1])
+@pytest.mark.parametrize("time_ns", [INT64.min, INT64.max, 0, -1])
 def test_any_time_has_a_text(time_ns: int) -> None:
     assert "UTC" in utc_text(time_ns) or abs(time_ns) > 10**12
 
@@ -514,7 +515,7 @@ def test_any_time_has_a_text(time_ns: int) -> None:
 SOME = {*COMMON, "rgb16", "yuyv", "nv12", "8UC2", "32FC1", "64FC3", "bgra8", "bayer_gbrg16"}
 
 
-@each(
+@pytest.mark.parametrize(
     "encoding",
     [name if name in SOME else pytest.param(name, marks=pytest.mark.slow) for name in ENCODINGS],
 )
@@ -535,7 +536,7 @@ CODED_KINDS = [
 ]
 
 
-@each("kind", CODED_KINDS)
+@pytest.mark.parametrize("kind", CODED_KINDS)
 def test_coded_images_get_a_proxy(kind: str, tmp_path: Path) -> None:
     made = CODED[kind](frames=8, width=96, height=66)
     dataset = pack_cameras(tmp_path, made, quality="lossless")
@@ -561,7 +562,7 @@ def assert_proxy_shows(dataset: Path, width: int) -> None:
                     assert np.abs(found - blocks(look.picture(pixels))).mean() < 8
 
 
-@each(
+@pytest.mark.parametrize(
     ("image", "width", "size"),
     [
         ((1920, 1080), 640, (640, 360)),
@@ -607,7 +608,7 @@ def test_scores_are_plotted(copy: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
-@each(
+@pytest.mark.parametrize(
     ("value", "problem"),
     [
         ({"/nowhere": {"vmaf": []}}, "not one of"),
@@ -653,7 +654,7 @@ def test_a_topic_of_two_sizes_has_two_cameras(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- the server
 
 
-@fresh
+@pytest.fixture
 def server(tmp_path: Path) -> Iterator[ReportServer]:
     (tmp_path / "a b.mp4").write_bytes(bytes(range(256)) * 4)
     (tmp_path / "index.html").write_text("page")
@@ -680,7 +681,7 @@ def ask(
         connection.close()
 
 
-@each(
+@pytest.mark.parametrize(
     ("asked", "start", "end"),
     [
         ("bytes=0-", 0, 1024),
@@ -705,12 +706,14 @@ def test_ranges_that_are_not_there(server: ReportServer, asked: str) -> None:
     assert headers["Content-Range"] == "bytes */1024"
 
 
-@each("asked", ["bytes=-", "lines=1-2", "bytes=1-2,5-6", "bytes=a-b", "x" * 999])
+@pytest.mark.parametrize("asked", ["bytes=-", "lines=1-2", "bytes=1-2,5-6", "bytes=a-b", "x" * 999])
 def test_other_ranges_give_all(asked: str) -> None:
     assert byte_range(asked, 7) == (0, 7)
 
 
-@each("path", ["/", "/secret", "/../secret", "/d/../secret", "/%2e%2e/secret", "/d/", "/gone"])
+@pytest.mark.parametrize(
+    "path", ["/", "/secret", "/../secret", "/d/../secret", "/%2e%2e/secret", "/d/", "/gone"]
+)
 def test_nothing_else_is_served(server: ReportServer, path: str) -> None:
     status, _, body = ask(server, path)
     assert (status, body) == (404, b"")

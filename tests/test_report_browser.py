@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 import mp4ds
 from chromium import Tab, chromium
 from conftest import real
-from each import each
 from mp4ds.plugins.reporting.cameras import nearest_offsets, pack_column
 from mp4ds.plugins.reporting.page import as_script
 from mp4ds.plugins.reporting.proxies import Look
@@ -272,7 +271,8 @@ REAL = {
 }
 
 
-@each("name", REAL, one_in=3)
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("name", REAL)
 def test_every_frame_of_real_recordings(name: str, browser: Tab, tmp_path: Path) -> None:
     mp4ds.pack(real(name), tmp_path / "real")
     summary = report(tmp_path / "real")
@@ -534,7 +534,7 @@ def test_the_clock_waits_on_a_busy_machine(wall: Tab) -> None:
 # ---------------------------------------------------------------- sizes, names and troubles
 
 
-@each("count", [1, 3, 8])
+@pytest.mark.parametrize("count", [1, 3, 8])
 def test_all_cameras_are_above_the_controls(count: int, browser: Tab, tmp_path: Path) -> None:
     folder = pack_cameras(tmp_path, many_cameras(count, stampless=-1))
     report(folder)
@@ -563,7 +563,7 @@ def test_the_controls_leave_room_on_a_phone(wall: Tab) -> None:
     assert not wall.evaluate(seen % "options")
 
 
-@each("second", [0, 1e9])
+@pytest.mark.parametrize("second", [0, 1e9])
 def test_the_cursor_hides_no_time(second: float, page: Tab) -> None:
     """The line and its knob are below the labels, and whole at either end."""
     page.evaluate(f"mp4dsReport.player.go({second}); mp4dsReport.settled()")

@@ -25,7 +25,6 @@ import pytest
 import mp4ds
 from coded_scenes import CODED, MakeScene
 from definitions import CODED_VIDEO, COMPRESSED, IMAGE, PACKET
-from each import each
 from encoders import cv, nal_units
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.errors import ConversionError, FormatError, OptionError
@@ -300,14 +299,16 @@ def in_turn(*tables: Sequence[str]) -> list[Any]:
     return found
 
 
-@each(("name", "kind", "to"), in_turn([*FATES], KINDS, [*TARGETS]), one_in=12)
+@pytest.mark.one_in(12)
+@pytest.mark.parametrize(("name", "kind", "to"), in_turn([*FATES], KINDS, [*TARGETS]))
 def test_every_camera_as_every_kind(packed: Pack, name: str, kind: str, to: str) -> None:
     made = packed(name, SOURCE_OF[to])
     summary, messages = made.unpack(to, kind)
     check(made, summary, messages, name, kind, to, fate_of(FATES[name], name, kind, to))
 
 
-@each(("name", "kind", "to"), in_turn([*FOXGLOVE_FATES], KINDS, [*TARGETS]), one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize(("name", "kind", "to"), in_turn([*FOXGLOVE_FATES], KINDS, [*TARGETS]))
 def test_foxglove_cameras_as_every_kind(packed: Pack, name: str, kind: str, to: str) -> None:
     made = packed(name, "mcap-protobuf")
     fate = fate_of(FOXGLOVE_FATES[name], name, kind)
@@ -319,8 +320,9 @@ def test_foxglove_cameras_as_every_kind(packed: Pack, name: str, kind: str, to: 
     check(made, summary, messages, name, kind, to, fate)
 
 
-@each("kind", KINDS, one_in=2)
-@each("name", ["foxglove-raw-mono8", "foxglove-jpeg-rgb", "foxglove-video-h264"])
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["foxglove-raw-mono8", "foxglove-jpeg-rgb", "foxglove-video-h264"])
 def test_foxglove_cameras_of_ros2(packed: Pack, name: str, kind: str) -> None:
     made = packed(name, "mcap-foxglove-ros2")
     summary, messages = made.unpack("bag", kind)
@@ -387,9 +389,10 @@ ENCODINGS = [
 ]
 
 
-@each("target", ["bag", "mcap"], one_in=8)
-@each("kind", ["png", "jpeg"])
-@each("encoding", ENCODINGS)
+@pytest.mark.one_in(8)
+@pytest.mark.parametrize("target", ["bag", "mcap"])
+@pytest.mark.parametrize("kind", ["png", "jpeg"])
+@pytest.mark.parametrize("encoding", ENCODINGS)
 def test_files_of_every_encoding(encoding: str, kind: str, target: str, tmp_path: Path) -> None:
     """A subscriber is given what was recorded, or something that looks like it."""
     made = Packed(tmp_path, scene(encoding, noisy=False, frames=3), "mcap-ros2-none")
@@ -424,7 +427,8 @@ def test_files_of_every_encoding(encoding: str, kind: str, target: str, tmp_path
             assert psnr(file_picture(data), original) > 33
 
 
-@each(
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize(
     ("encoding", "kind", "ros1", "ros2"),
     [
         ("rgb8", "jpeg", "rgb8; jpeg compressed bgr8", None),
@@ -439,7 +443,6 @@ def test_files_of_every_encoding(encoding: str, kind: str, target: str, tmp_path
         ("yuv422", "jpeg", "rgb8; jpeg compressed bgr8", None),
         ("8UC3", "jpeg", "8UC3; jpeg compressed ", None),
     ],
-    one_in=2,
 )
 def test_formats_are_those_of_the_transport(
     encoding: str, kind: str, ros1: str, ros2: str | None, tmp_path: Path
@@ -450,8 +453,8 @@ def test_formats_are_those_of_the_transport(
         assert {message.value.format for message in found} == {told}
 
 
-@each("encoding", ["16UC1", "32FC1"])
-@each("codec", ["png", "rvl"])
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+@pytest.mark.parametrize("codec", ["png", "rvl"])
 def test_coded_depths_in_metres(packed: Pack, encoding: str, codec: str) -> None:
     name = f"depth-{encoding}-{codec}"
     made = packed(name, "mcap-ros2-zstd")
@@ -478,8 +481,8 @@ def test_quantised_depths_without_their_parameters(packed: Pack, tmp_path: Path)
             stream.read([0], format="depth_m")
 
 
-@each("quality", [5, 60, 95])
-@each("name", ["raw-bgr8", "raw-mono8"])
+@pytest.mark.parametrize("quality", [5, 60, 95])
+@pytest.mark.parametrize("name", ["raw-bgr8", "raw-mono8"])
 def test_jpeg_quality(packed: Pack, name: str, quality: int) -> None:
     """Files are as good as libjpeg's of that quality, with full chroma."""
     made = packed(name, "mcap-ros2-zstd")
@@ -516,8 +519,8 @@ def test_the_encoding_in_a_format_tells_a_mosaic(extension: str, tmp_path: Path)
 # ---------------------------------------------------------------- files stay as they are
 
 
-@each("to", ["bag", "mcap"])
-@each(
+@pytest.mark.parametrize("to", ["bag", "mcap"])
+@pytest.mark.parametrize(
     ("name", "source", "kind"),
     [
         ("foxglove-jpeg-progressive", "mcap-protobuf", "jpeg"),
@@ -566,7 +569,7 @@ JPEG_KINDS = [
 ]
 
 
-@each("name", JPEG_KINDS)
+@pytest.mark.parametrize("name", JPEG_KINDS)
 def test_jpeg_pixels_are_those_of_opencv(packed: Pack, name: str) -> None:
     """By number, in order, as raw messages and as PNG: what cv2.imdecode gives."""
     made = packed(name, "mcap-ros2-zstd")
@@ -636,8 +639,8 @@ def test_transcoded_jpeg_as_video(packed: Pack) -> None:
 # ---------------------------------------------------------------- video without decoding
 
 
-@each("codec", ["h264", "h265", "av1"])
-@each("encoding", ["rgb8", "bayer_rggb8"])
+@pytest.mark.parametrize("codec", ["h264", "h265", "av1"])
+@pytest.mark.parametrize("encoding", ["rgb8", "bayer_rggb8"])
 def test_lossy_video(encoding: str, codec: str, tmp_path: Path) -> None:
     options = PackOptions(quality="crf=18", codec=codec, gop=3)
     made = Packed(tmp_path, scene(encoding, noisy=False), "bag-none", options)
@@ -674,7 +677,7 @@ def check_stand_alone(codec: str, found: Sequence[Read]) -> None:
     assert all(map(np.array_equal, whole[keys[-1] :], tail))
 
 
-@each(
+@pytest.mark.parametrize(
     ("name", "codec"),
     [
         ("ffmpeg-libx264", "h264"),
@@ -866,8 +869,8 @@ CHANGES = [
 ]
 
 
-@each("source", ["bag-none", "mcap-ros1-zstd", "mcap-ros2-zstd"])
-@each(("name", "kind"), CHANGES)
+@pytest.mark.parametrize("source", ["bag-none", "mcap-ros1-zstd", "mcap-ros2-zstd"])
+@pytest.mark.parametrize(("name", "kind"), CHANGES)
 def test_channels_of_ros1(packed: Pack, name: str, kind: str, source: str) -> None:
     made = packed(name, source)
     for to in ("bag", "mcap") if source != "mcap-ros2-zstd" else ("bag",):
@@ -885,8 +888,8 @@ def test_channels_of_ros1(packed: Pack, name: str, kind: str, source: str) -> No
             assert [message.value.header.seq for message in found] == expected
 
 
-@each("source", ["bag-none", "mcap-ros2-zstd"])
-@each(("name", "kind"), CHANGES)
+@pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-zstd"])
+@pytest.mark.parametrize(("name", "kind"), CHANGES)
 def test_channels_of_ros2(packed: Pack, name: str, kind: str, source: str) -> None:
     made = packed(name, source)
     to = "rosbag2" if source == "bag-none" else "mcap"
@@ -992,7 +995,7 @@ def test_stamps_beyond_32_bits_have_no_place_in_ros(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- topics
 
 
-@each(
+@pytest.mark.parametrize(
     ("topic", "type_name", "kind", "expected"),
     [
         ("/cam/image_raw", "sensor_msgs/Image", "jpeg", "/cam/image_raw/compressed"),
@@ -1041,7 +1044,7 @@ def test_no_topic_is_taken_twice() -> None:
 # ---------------------------------------------------------------- options, errors, command line
 
 
-@each(
+@pytest.mark.parametrize(
     ("to", "options", "problem"),
     [
         ("mcap", {"images": "bmp"}, "`images` 'bmp' is not known. Use raw, jpeg, png, compressed"),
@@ -1059,7 +1062,8 @@ def test_options_that_contradict(
     assert not (tmp_path / "out").exists()
 
 
-@each(
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize(
     ("name", "kind"),
     [
         ("raw-mono8", "compressed-video"),
@@ -1070,9 +1074,8 @@ def test_options_that_contradict(
         ("depth-16UC1-png", "raw"),
         ("depth-16UC1-png", "png"),
     ],
-    one_in=2,
 )
-@each("with_sum", [True, False])
+@pytest.mark.parametrize("with_sum", [True, False])
 def test_a_damaged_video_is_refused(name: str, kind: str, with_sum: bool, tmp_path: Path) -> None:
     made = Packed(tmp_path, SCENES[name](), "mcap-ros2-zstd")
     (video,) = (tmp_path / "dataset").glob("*.mp4")
@@ -1094,8 +1097,8 @@ def without_sum(sidecar: Path) -> None:
     sidecar.write_text("".join(kept_), "utf-8")
 
 
-@each("frames", [5, 9])
-@each("kind", ["compressed-video", "jpeg"])
+@pytest.mark.parametrize("frames", [5, 9])
+@pytest.mark.parametrize("kind", ["compressed-video", "jpeg"])
 def test_a_video_of_other_frames_is_refused(
     packed: Pack, kind: str, frames: int, tmp_path: Path
 ) -> None:

@@ -16,7 +16,6 @@ from typing import Any
 import pytest
 
 import mp4ds
-from each import each, fresh
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.errors import (
     FormatError,
@@ -37,14 +36,14 @@ IN_PARTS = PackOptions(window=3, codec="h264")
 PARTS = [f"0000{number}-0" for number in range(4)]
 
 
-@fresh
+@pytest.fixture
 def source(tmp_path: Path) -> Path:
     (tmp_path / "source").mkdir()
     (path,) = SOURCES["bag-none"](tmp_path / "source", scene("bayer_rggb8", frames=12))
     return path
 
 
-@fresh
+@pytest.fixture
 def expected(source: Path, tmp_path: Path) -> dict[str, Any]:
     mp4ds.pack(source, tmp_path / "whole", PackOptions(codec="h264"))
     return facts(tmp_path / "whole")
@@ -123,7 +122,7 @@ def test_where_nothing_was_finished_nothing_is_left(
     assert leftovers(tmp_path) == []
 
 
-@each(
+@pytest.mark.parametrize(
     ("options", "sentence"),
     [
         ({"codec": "ffv1"}, r"different `codec`: 'h264', and now it is 'ffv1'.*`restart`"),
@@ -147,7 +146,7 @@ def test_other_options_are_refused(
     assert leftovers(tmp_path) == [".dataset.mp4ds-part"]
 
 
-@each("change", ["longer", "touched", "byte", "missing"])
+@pytest.mark.parametrize("change", ["longer", "touched", "byte", "missing"])
 def test_a_changed_source_is_refused(
     change: str, tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -185,7 +184,7 @@ def test_restart_begins_anew(
     assert facts(tmp_path / "dataset") == expected
 
 
-@each("damage", ["record", "video", "sidecar", "missing"])
+@pytest.mark.parametrize("damage", ["record", "video", "sidecar", "missing"])
 def test_a_part_that_is_not_whole_is_made_again(
     damage: str,
     tmp_path: Path,

@@ -17,7 +17,6 @@ import pytest
 import typer
 
 import mp4ds
-from each import each
 from mp4ds.cli import app_for
 from mp4ds.packing.journal import JOURNAL_NAME
 from mp4ds.plugins.recording.record import UNFINISHED
@@ -47,14 +46,14 @@ def done(command: Sequence[str], **options: Any) -> str:
 # ---------------------------------------------------------------- what the files say
 
 
-@each("package", [ROS1, ROS2], ids=lambda path: path.name)
+@pytest.mark.parametrize("package", [ROS1, ROS2], ids=lambda path: path.name)
 def test_versions(package: Path) -> None:
     found = ElementTree.parse(package / "package.xml")
     assert found.findtext("version") == mp4ds.__version__
     assert found.findtext("name") == "mp4ds"
 
 
-@each("kind", LAUNCHED)
+@pytest.mark.parametrize("kind", LAUNCHED)
 def test_the_page_has_every_argument(kind: str) -> None:
     page = (ROOT / "docs" / "ros.md").read_text()
     ros, command = kind.split()
@@ -75,7 +74,7 @@ def substituted(text: str, values: dict[str, str]) -> str:
     return re.sub(r"\$\(var (\w+)\)", lambda match: values[match[1]], text)
 
 
-@each("command", ["play", "record"])
+@pytest.mark.parametrize("command", ["play", "record"])
 def test_launch_files_of_ros2(command: str, tmp_path: Path) -> None:
     """With every condition met, their words are options of the command."""
     root = ElementTree.parse(LAUNCHED[f"ros2 {command}"]).getroot()

@@ -17,7 +17,6 @@ import mp4ds
 from coded_scenes import CODED
 from conftest import DATA, real
 from definitions import PICTURES
-from each import each
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from mp4ds.records import Message
 from round_trips import (
@@ -37,8 +36,9 @@ def has_streams(folder: Path) -> bool:
     return bool(list(folder.glob("*.mp4")))
 
 
-@each("source", SOURCES, one_in=2)
-@each("encoding", ["bayer_gbrg8", "mono16"])
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("source", SOURCES)
+@pytest.mark.parametrize("encoding", ["bayer_gbrg8", "mono16"])
 def test_every_source_returns_to_its_own_format(
     source: str, encoding: str, tmp_path: Path, compare: Compare
 ) -> None:
@@ -49,8 +49,9 @@ def test_every_source_returns_to_its_own_format(
     assert compare(sources, output) == []
 
 
-@each("encoding", COMMON, one_in=2)
-@each("source", ["bag-lz4", "rosbag2-sqlite3-v9", "mcap-ros2-zstd"])
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("encoding", COMMON)
+@pytest.mark.parametrize("source", ["bag-lz4", "rosbag2-sqlite3-v9", "mcap-ros2-zstd"])
 def test_every_encoding_is_a_video_and_returns(
     source: str, encoding: str, tmp_path: Path, compare: Compare
 ) -> None:
@@ -65,8 +66,8 @@ def test_every_encoding_is_a_video_and_returns(
 
 
 @pytest.mark.slow
-@each("encoding", COMMON, parts=6)
-@each("source", SOURCES)
+@pytest.mark.parametrize("encoding", COMMON)
+@pytest.mark.parametrize("source", SOURCES)
 def test_every_source_and_encoding(
     source: str, encoding: str, tmp_path: Path, compare: Compare
 ) -> None:
@@ -76,8 +77,9 @@ def test_every_source_and_encoding(
     assert compare(sources, output) == []
 
 
-@each("target", [*TARGETS][:4], one_in=2)
-@each(
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("target", [*TARGETS][:4])
+@pytest.mark.parametrize(
     "source",
     ["bag-none", "rosbag2-sqlite3-v4", "rosbag2-mcap-v9", "mcap-ros1-zstd", "mcap-ros2-lz4"],
 )
@@ -109,7 +111,8 @@ CROSSED = [
 ]
 
 
-@each(("camera", "source", "target"), CROSSED, one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize(("camera", "source", "target"), CROSSED)
 def test_from_any_ros_to_any_other(
     camera: str, source: str, target: str, tmp_path: Path, compare: Compare
 ) -> None:
@@ -123,8 +126,8 @@ def test_from_any_ros_to_any_other(
 FOXGLOVE_CAMERAS = ["raw-bgr8", "jpeg-rgb", "video-h264"]
 
 
-@each("camera", FOXGLOVE_CAMERAS)
-@each("target", [*TARGETS][:4])
+@pytest.mark.parametrize("camera", FOXGLOVE_CAMERAS)
+@pytest.mark.parametrize("target", [*TARGETS][:4])
 def test_foxglove_messages_of_ros_go_to_any_other(
     camera: str, target: str, tmp_path: Path, compare: Compare
 ) -> None:
@@ -134,8 +137,9 @@ def test_foxglove_messages_of_ros_go_to_any_other(
     assert done.frames("/camera/image") == (10, 10)
 
 
-@each("camera", [*FOXGLOVE_CAMERAS, "webp"], one_in=3)
-@each("target", [*TARGETS][:3])
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("camera", [*FOXGLOVE_CAMERAS, "webp"])
+@pytest.mark.parametrize("target", [*TARGETS][:3])
 def test_what_no_ros_can_hold_is_refused(
     target: str, camera: str, tmp_path: Path, compare: Compare
 ) -> None:
@@ -188,8 +192,8 @@ def test_what_ros_can_hold_of_the_rest(target: str, tmp_path: Path, compare: Com
     assert all("/cam/image_raw" not in line for line in compare(sources, output))
 
 
-@each("trait", TRAITS)
-@each("source", ["bag-none", "mcap-ros2-none"])
+@pytest.mark.parametrize("trait", TRAITS)
+@pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-none"])
 def test_odd_messages_return(trait: str, source: str, tmp_path: Path, compare: Compare) -> None:
     (tmp_path / "source").mkdir()
     sources = SOURCES[source](tmp_path / "source", odd_scene(trait))
@@ -214,7 +218,8 @@ REAL_FOLDERS = sorted(
 )
 
 
-@each("name", [*REAL, *REAL_FOLDERS] or ["bags"], one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("name", [*REAL, *REAL_FOLDERS] or ["bags"])
 def test_real_recordings_return(name: str, tmp_path: Path, compare: Compare) -> None:
     path = real(name)
     target = "rosbag2" if path.is_dir() or path.suffix == ".db3" else path.suffix[1:]

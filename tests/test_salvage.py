@@ -23,7 +23,6 @@ import zstandard
 
 from conftest import DATA, real
 from damage import INJURIES, Key, Piece, all_messages, pieces_of, sound_messages
-from each import each, fresh
 from mp4ds import SourceError
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.salvage.losses import LossLog, bounded
@@ -76,7 +75,7 @@ def plain(record: Record) -> Any:
 # ---------------------------------------------------------------- intact recordings
 
 
-@each("name", SOURCES)
+@pytest.mark.parametrize("name", SOURCES)
 def test_an_intact_recording_is_read_as_usual(name: str, tmp_path: Path) -> None:
     paths = SOURCES[name](tmp_path, scene("bayer_rggb8"))
     with open_sources(paths) as reader, open_sources(paths, salvage=True) as salvage:
@@ -103,7 +102,8 @@ REAL = [
 ]
 
 
-@each("name", REAL, one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("name", REAL)
 def test_a_real_intact_recording_is_read_as_usual(name: str) -> None:
     path = real(name)
     try:
@@ -198,7 +198,7 @@ def intact(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[by
 Intact = Callable[[str], tuple[bytes, list[Piece]]]
 
 
-@each("kind", KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_the_pieces_are_all_there_is(kind: str, intact: Intact) -> None:
     """What the other tests measure by."""
     data, pieces = intact(kind)
@@ -208,8 +208,9 @@ def test_the_pieces_are_all_there_is(kind: str, intact: Intact) -> None:
     assert Counter(key[:2] for key in all_messages(pieces)) == written
 
 
-@each("injury", INJURIES, one_in=2)
-@each("kind", KINDS)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("injury", INJURIES)
+@pytest.mark.parametrize("kind", KINDS)
 def test_what_is_not_damaged_comes_back(
     kind: str, injury: str, intact: Intact, tmp_path: Path
 ) -> None:
@@ -255,7 +256,7 @@ def covers(loss: Loss, piece: Piece) -> bool:
     return loss.offset < piece.end and piece.start < loss.offset + loss.size
 
 
-@each("kind", KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_several_damages(kind: str, intact: Intact, tmp_path: Path) -> None:
     data, pieces = intact(kind)
     path = tmp_path / f"drive.{kind.partition('-')[0]}"
@@ -270,7 +271,7 @@ def test_several_damages(kind: str, intact: Intact, tmp_path: Path) -> None:
         check_ranges(losses, len(damaged))
 
 
-@each("kind", KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_file_cut_anywhere(kind: str, intact: Intact, tmp_path: Path) -> None:
     """Up to a chunk or message that is whole everything is there, byte for byte."""
     data, pieces = intact(kind)
@@ -424,7 +425,7 @@ def test_losses_that_follow_each_other_are_one() -> None:
 # ---------------------------------------------------------------- the usual reader
 
 
-@each("name", SOURCES)
+@pytest.mark.parametrize("name", SOURCES)
 def test_the_usual_error_names_the_option(name: str, tmp_path: Path) -> None:
     paths = SOURCES[name](tmp_path, scene("mono8"))
     last = paths[-1]
@@ -440,7 +441,7 @@ def test_the_usual_error_names_the_option(name: str, tmp_path: Path) -> None:
     assert keys(records) or name.startswith("mcap") or "zstd" in name
 
 
-@each("kind", [kind for kind in KINDS if kind != "bag-none"])
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "bag-none"])
 def test_it_names_the_option_for_damage_in_the_middle(
     kind: str, intact: Intact, tmp_path: Path
 ) -> None:
@@ -569,7 +570,8 @@ def read_confined(path: Path) -> tuple[int, int, int]:
     return int(records), int(losses), int(peak) // 1024
 
 
-@each("name", LIES, one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("name", LIES)
 def test_a_length_that_lies_takes_no_memory(name: str, intact: Intact, tmp_path: Path) -> None:
     kind, change = LIES[name]
     data, pieces = intact(kind)
@@ -582,7 +584,8 @@ def test_a_length_that_lies_takes_no_memory(name: str, intact: Intact, tmp_path:
     assert peak < 200
 
 
-@each("kind", ["bag-none", "bag-bz2", "mcap-zstd", "mcap-none"], one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("kind", ["bag-none", "bag-bz2", "mcap-zstd", "mcap-none"])
 def test_a_long_gap_takes_no_memory(kind: str, intact: Intact, tmp_path: Path) -> None:
     """A chunk that claims to be as long as the zeros that follow, where the disk was full."""
     data, pieces = intact(kind)
@@ -616,8 +619,8 @@ def folder_of(path: Path, **options: Any) -> Path:
 STORAGES = ["sqlite3", "mcap"]
 
 
-@each("compression", [None, "file", "message"])
-@each("storage", STORAGES)
+@pytest.mark.parametrize("compression", [None, "file", "message"])
+@pytest.mark.parametrize("storage", STORAGES)
 def test_a_folder_without_metadata(storage: str, compression: str | None, tmp_path: Path) -> None:
     folder = folder_of(tmp_path, storage=storage, compression=compression, files=3)
     expected = keys(usual(folder))
@@ -631,7 +634,7 @@ def test_a_folder_without_metadata(storage: str, compression: str | None, tmp_pa
     assert times == sorted(times) or storage == "mcap"
 
 
-@each("text", [b"", b"\xff: [", b"a: [", b"[]", b"version: x"])
+@pytest.mark.parametrize("text", [b"", b"\xff: [", b"a: [", b"[]", b"version: x"])
 def test_a_folder_with_damaged_metadata(text: bytes, tmp_path: Path) -> None:
     folder = folder_of(tmp_path)
     expected = keys(usual(folder))
@@ -669,8 +672,8 @@ def test_a_storage_file_that_is_missing_is_a_loss(storage: str, tmp_path: Path) 
     assert gone.total() > 5
 
 
-@each("compression", [None, "file", "message"])
-@each("storage", STORAGES)
+@pytest.mark.parametrize("compression", [None, "file", "message"])
+@pytest.mark.parametrize("storage", STORAGES)
 def test_damaged_storage(storage: str, compression: str | None, tmp_path: Path) -> None:
     folder = folder_of(tmp_path, storage=storage, compression=compression)
     expected = keys(usual(folder))
@@ -754,8 +757,8 @@ def places_of(path: Path) -> tuple[list[Place], set[int], int]:
     return found, small, size
 
 
-@each("injury", ["flip", "burst", "zeros", "cut"])
-@each("frames", [16, 200])
+@pytest.mark.parametrize("injury", ["flip", "burst", "zeros", "cut"])
+@pytest.mark.parametrize("frames", [16, 200])
 def test_rows_of_undamaged_pages_come_back(frames: int, injury: str, tmp_path: Path) -> None:
     side = 64 if frames < 100 else 6
     write_rosbag2(tmp_path / "drive", scene("rgb8", frames=frames, width=side, height=side))
@@ -793,7 +796,7 @@ def copied(path: Path, folder: Path) -> Path:
     return folder / path.name
 
 
-@fresh
+@pytest.fixture
 def database(tmp_path: Path) -> Path:
     write_rosbag2(tmp_path / "drive", scene("mono8"))
     return Path(shutil.copy(next((tmp_path / "drive").glob("*.db3")), tmp_path / "run_0.db3"))
@@ -848,7 +851,7 @@ def test_what_a_write_ahead_log_committed_is_read(
     assert (len(rows) > len(scene("mono8").messages)) == (keep > 0.01)
 
 
-@each("size", [512, 1024, 8192, 65536])
+@pytest.mark.parametrize("size", [512, 1024, 8192, 65536])
 def test_other_sizes_of_pages(size: int, database: Path) -> None:
     with closing(sqlite3.connect(database, isolation_level=None)) as connection:
         connection.execute(f"PRAGMA page_size = {size}")

@@ -19,7 +19,6 @@ import pytest
 from coded_tools import ENCODINGS, IN_ORDER, scene
 from coded_tools import encode as encode_packets
 from conftest import DATA, real
-from each import each
 from mp4ds.errors import Refused, VideoError
 from mp4ds.times import MAX_GAP_NS, NS_PER_TICK
 from mp4ds.video.codecs import recipe_for
@@ -87,7 +86,7 @@ def written(path: Path, codec: str, picture_format: str, *, lossless: bool, fram
     return path
 
 
-@each(
+@pytest.mark.parametrize(
     ("codec", "picture_format", "lossless"),
     [(*pair, True) for pair in LOSSLESS]
     + [(codec, kind, False) for codec in LOSSY for kind in ("rgb24", "yuv420p")],
@@ -105,7 +104,7 @@ def test_what_is_encoded_here(
     assert table.configuration
 
 
-@each("name", IN_ORDER)
+@pytest.mark.parametrize("name", IN_ORDER)
 def test_packets_that_are_copied(name: str, tmp_path: Path) -> None:
     packets = [packet.data for packet in encode_packets(ENCODINGS[name])]
     write_packets(tmp_path / "a.mp4", ENCODINGS[name].codec, packets)
@@ -172,8 +171,8 @@ def muxed(
     return path
 
 
-@each("mux", MUXED)
-@each(
+@pytest.mark.parametrize("mux", MUXED)
+@pytest.mark.parametrize(
     ("name", "extension"),
     [
         (name, kind)
@@ -202,7 +201,7 @@ UNREADABLE = {
 FILES = sorted(path.name for path in (DATA / "video").glob("*.*"))
 
 
-@each("name", FILES or [pytest.param("", marks=pytest.mark.skip)])
+@pytest.mark.parametrize("name", FILES or [pytest.param("", marks=pytest.mark.skip)])
 def test_files_of_others(name: str) -> None:
     path = real(f"video/{name}")
     if name in UNREADABLE:
@@ -298,7 +297,7 @@ EDIT_LISTS: dict[str, tuple[bytes, int, int]] = {
 }
 
 
-@each("name", EDIT_LISTS)
+@pytest.mark.parametrize("name", EDIT_LISTS)
 def test_edit_lists(name: str, b_frames: bytes, tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     edits, first, hidden = EDIT_LISTS[name]
@@ -311,8 +310,8 @@ def test_edit_lists(name: str, b_frames: bytes, tmp_path: Path) -> None:
     assert len(table.order) == len(table.sizes) - hidden
 
 
-@each("first", [-9, -2, 7])
-@each("mux", ["plain", "seconds"])
+@pytest.mark.parametrize("first", [-9, -2, 7])
+@pytest.mark.parametrize("mux", ["plain", "seconds"])
 def test_videos_that_begin_at_another_time(mux: str, first: int, tmp_path: Path) -> None:
     table = check(muxed(tmp_path / "a.mp4", *B_FRAMES["h264-3"], mux=MUXED[mux], first=first))
     assert len(table.order) == 31 - len([n for n in range(9) if first + 2 * n + (n % 3 == 1) < 0])
@@ -508,7 +507,7 @@ UNINDEXED: dict[str, tuple[Change, str]] = {
 }  # fmt: skip
 
 
-@each("name", UNINDEXED)
+@pytest.mark.parametrize("name", UNINDEXED)
 def test_what_is_not_read(name: str, b_frames: bytes) -> None:
     change, reason = UNINDEXED[name]
     with pytest.raises(Refused, match=reason) as caught:
@@ -586,7 +585,7 @@ DAMAGES: dict[str, tuple[Change, str]] = {
 }  # fmt: skip
 
 
-@each("name", DAMAGES)
+@pytest.mark.parametrize("name", DAMAGES)
 def test_what_is_damaged(name: str, b_frames: bytes) -> None:
     change, problem = DAMAGES[name]
     with pytest.raises(VideoError, match=problem) as caught:
@@ -667,7 +666,8 @@ def is_sound(table: SampleTable, size: int) -> bool:
     )
 
 
-@each("seed", range(4), one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("seed", range(4))
 def test_damage_anywhere_in_the_index(seed: int, b_frames: bytes) -> None:
     rng = random.Random(seed)
     start = b_frames.index(b"moov") - 4

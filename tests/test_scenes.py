@@ -19,7 +19,6 @@ from PIL import Image
 import encoders
 from coded_scenes import CODED, ODD, VERBATIM
 from definitions import CODED_VIDEO, COMPRESSED, IMAGE, PACKET, definitions
-from each import each
 from pictures import COMMON, CONTENTS, ENCODINGS, YUV, picture, pixels, rows_of, sample_format
 from scenes import Record, Scene, instant, scene, typestore
 from sources import SOURCES
@@ -57,26 +56,33 @@ def test_there_is_every_encoding_once() -> None:
     assert ENCODINGS[: len(COMMON)] == COMMON
 
 
-@each("wire", ["ros1", "cdr"])
-@each("options", [{}, {"width": 31, "height": 15}, {"pad": 5}, {"big_endian": True, "pad": 8}])
-@each("encoding", ENCODINGS)
-def test_raw_images_hold_their_pictures(encoding: str, options: dict[str, Any], wire: str) -> None:
-    made = images(scene(encoding, frames=2, noisy=False, **{"width": 32, "height": 16} | options))
-    dtype, samples = sample_format(encoding)
-    for number, record in enumerate(made):
-        message = read(record, wire)
-        width, height = message.width, message.height
-        odd = "width" in options and encoding not in YUV
-        assert (width, height) == ((31, 15) if odd else (32, 16))
-        assert message.encoding == encoding
-        assert message.step == width * samples * dtype.itemsize + options.get("pad", 0)
-        assert len(message.data) == message.step * rows_of(encoding, height)
-        expected = picture(encoding, frame=number, width=width, height=height, rng=None)
-        assert expected.dtype == dtype
-        assert np.array_equal(pixels(vars(message)), expected, equal_nan=dtype.kind == "f")
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_raw_images_hold_their_pictures(encoding: str) -> None:
+    for wire in ["ros1", "cdr"]:
+        for options in [
+            {},
+            {"width": 31, "height": 15},
+            {"pad": 5},
+            {"big_endian": True, "pad": 8},
+        ]:
+            made = images(
+                scene(encoding, frames=2, noisy=False, **{"width": 32, "height": 16} | options)
+            )
+            dtype, samples = sample_format(encoding)
+            for number, record in enumerate(made):
+                message = read(record, wire)
+                width, height = message.width, message.height
+                odd = "width" in options and encoding not in YUV
+                assert (width, height) == ((31, 15) if odd else (32, 16))
+                assert message.encoding == encoding
+                assert message.step == width * samples * dtype.itemsize + options.get("pad", 0)
+                assert len(message.data) == message.step * rows_of(encoding, height)
+                expected = picture(encoding, frame=number, width=width, height=height, rng=None)
+                assert expected.dtype == dtype
+                assert np.array_equal(pixels(vars(message)), expected, equal_nan=dtype.kind == "f")
 
 
-@each("content", CONTENTS)
+@pytest.mark.parametrize("content", CONTENTS)
 def test_samples_hold_what_their_content_says(content: str) -> None:
     for encoding in CONTENTS[content]:
         rng = np.random.default_rng(0)
@@ -106,7 +112,7 @@ def test_samples_hold_what_their_content_says(content: str) -> None:
             assert np.isnan(made).any() != ("product" in content)
 
 
-@each("encoding", YUV)
+@pytest.mark.parametrize("encoding", YUV)
 def test_yuv_is_what_opencv_takes_it_for(encoding: str) -> None:
     codes = {"nv12": "NV12", "nv21": "NV21", "uyvy": "UYVY", "yuv422": "UYVY"}
     made = picture(encoding, frame=2, width=64, height=48, rng=None)
@@ -120,7 +126,7 @@ def test_yuv_is_what_opencv_takes_it_for(encoding: str) -> None:
     assert np.abs(rgb.astype(float) - expected).mean() < (1 if encoding == "nv24" else 6)
 
 
-@each("encoding", [name for name in ENCODINGS if name.startswith("bayer")])
+@pytest.mark.parametrize("encoding", [name for name in ENCODINGS if name.startswith("bayer")])
 def test_mosaics_have_the_colours_of_their_places(encoding: str) -> None:
     deep = encoding.endswith("16")
     mosaic = picture(encoding, frame=2, width=64, height=48, rng=None)
@@ -130,7 +136,7 @@ def test_mosaics_have_the_colours_of_their_places(encoding: str) -> None:
         assert np.array_equal(mosaic[part], rgb[part][..., "rgb".index(letter)])
 
 
-@each("made", ["rgb", "rgba", "rgb16", "rgba16"])
+@pytest.mark.parametrize("made", ["rgb", "rgba", "rgb16", "rgba16"])
 def test_bgr_is_rgb_backwards(made: str) -> None:
     name = made if "16" in made else f"{made}8"
     forth = picture(name, frame=2, width=16, height=12, rng=None)
@@ -142,7 +148,7 @@ def test_bgr_is_rgb_backwards(made: str) -> None:
 # ---------------------------------------------------------------- coded scenes
 
 
-@each("name", CODED)
+@pytest.mark.parametrize("name", CODED)
 def test_coded_messages_are_alike_in_both_worlds(name: str) -> None:
     made, again = CODED[name](frames=FRAMES), CODED[name](frames=FRAMES)
     kept = [record for record in images(made) if record.values["data"] or name in VERBATIM]
@@ -164,8 +170,8 @@ def test_coded_messages_are_alike_in_both_worlds(name: str) -> None:
     assert [r.payload("cdr") for r in made.messages] == [r.payload("cdr") for r in again.messages]
 
 
-@each("source", ["bag-none", "rosbag2-sqlite3-v9", "mcap-none-profile"])
-@each("name", ["jpeg-rgb", "video-h264", "ffmpeg-libx264"])
+@pytest.mark.parametrize("source", ["bag-none", "rosbag2-sqlite3-v9", "mcap-none-profile"])
+@pytest.mark.parametrize("name", ["jpeg-rgb", "video-h264", "ffmpeg-libx264"])
 def test_coded_scenes_can_be_written(name: str, source: str, tmp_path: Path) -> None:
     assert all(path.exists() for path in SOURCES[source](tmp_path, CODED[name](frames=3)))
 
@@ -181,7 +187,7 @@ def test_definitions_are_those_that_are_written(encoding: str) -> None:
 PICTURES = [name for name in CODED if name.startswith(("jpeg", "png")) and name not in VERBATIM]
 
 
-@each("name", PICTURES)
+@pytest.mark.parametrize("name", PICTURES)
 def test_coded_pictures_decode(name: str) -> None:
     grey = {"jpeg-gray", "jpeg-pillow-gray", "jpeg-format-mono8"}
     for number, data in enumerate(payloads(name, frames=FRAMES)):
@@ -264,7 +270,7 @@ def rvl_decoded(data: bytes, count: int) -> np.ndarray[Any, Any]:
     return np.array(values, np.uint16)
 
 
-@each("name", [name for name in CODED if name.startswith("depth")])
+@pytest.mark.parametrize("name", [name for name in CODED if name.startswith("depth")])
 def test_depth_returns(name: str) -> None:
     rng = np.random.default_rng(0)
     for number, record in enumerate(images(CODED[name](frames=FRAMES))):
@@ -313,7 +319,7 @@ def decoded(name: str) -> tuple[list[np.ndarray[Any, Any]], list[Record]]:
     return [frame.to_ndarray(format="rgb24") for frame in found], records
 
 
-@each("name", VIDEO_NAMES)
+@pytest.mark.parametrize("name", VIDEO_NAMES)
 def test_video_packets_decode(name: str) -> None:
     frames, records = decoded(name)
     broken = name.endswith(("mid-gop", "lost"))
@@ -381,7 +387,7 @@ def test_av1_with_and_without_delimiters() -> None:
         assert not without.startswith(b"\x12\0")
 
 
-@each("codec", ["h264", "h265", "av1", "vp9"])
+@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "vp9"])
 def test_packets_that_are_missing(codec: str) -> None:
     whole = payloads(f"video-{codec}")
     assert payloads(f"video-{codec}-mid-gop") == whole[2:]

@@ -21,7 +21,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from each import each
 from mp4ds.errors import ScoringError
 from mp4ds.video.libvmaf import VMAF_MODEL, Ffmpeg, find_ffmpeg
 from mp4ds.video.scores import MAX_PSNR, METRICS, Scorer, YuvFrame, psnr, ssim, summary_of
@@ -153,9 +152,9 @@ def vmaf_in(log: dict[str, Any]) -> NDArray[np.float64]:
 
 
 @needs_vmaf
-@each("bits", [8, 10])
-@each("crf", [15, 40])
-@each("size", [(320, 240), (480, 360)], ids=str)
+@pytest.mark.parametrize("bits", [8, 10])
+@pytest.mark.parametrize("crf", [15, 40])
+@pytest.mark.parametrize("size", [(320, 240), (480, 360)], ids=str)
 def test_vmaf_is_that_of_another_build(
     size: tuple[int, int], crf: int, bits: int, tmp_path: Path
 ) -> None:
@@ -176,8 +175,8 @@ def test_vmaf_is_that_of_another_build(
 
 
 @needs_vmaf
-@each("bits", [8, 10])
-@each("size", SIZES, ids=str)
+@pytest.mark.parametrize("bits", [8, 10])
+@pytest.mark.parametrize("size", SIZES, ids=str)
 def test_vmaf_is_that_of_the_same_build_on_files(
     size: tuple[int, int], bits: int, tmp_path: Path
 ) -> None:
@@ -196,8 +195,8 @@ def test_vmaf_is_that_of_the_same_build_on_files(
 
 
 @needs_vmaf
-@each("bits", [8, 10])
-@each("size", SIZES, ids=str)
+@pytest.mark.parametrize("bits", [8, 10])
+@pytest.mark.parametrize("size", SIZES, ids=str)
 def test_psnr_and_ssim_are_those_of_ffmpeg(
     size: tuple[int, int], bits: int, tmp_path: Path
 ) -> None:
@@ -308,7 +307,7 @@ def test_memory_is_that_of_a_few_frames() -> None:
 # ---------------------------------------------------------------- what goes wrong
 
 
-@each(
+@pytest.mark.parametrize(
     ("original", "made", "said"),
     [
         ([], [], "no frames"),
@@ -342,7 +341,7 @@ def program(folder: Path, script: str) -> str:
     return str(path)
 
 
-@each(
+@pytest.mark.parametrize(
     ("script", "said"),
     [
         ("import sys; sys.exit('first\\nthe last line')", "the last line"),

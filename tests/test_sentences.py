@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 import mp4ds
-from each import each, fresh
 from mp4ds.cli import app_for, progress
 from mp4ds.cli.output import Column, print_table
 from scenes import START, Record, Scene
@@ -23,7 +22,7 @@ from test_terminal import Screen
 VIDEO, SIDECAR = "cam_image_raw.mp4", "cam_image_raw.yaml"
 
 
-@fresh
+@pytest.fixture
 def dataset(packed_bag: Path, tmp_path: Path) -> Path:
     """A dataset that may be damaged."""
     shutil.copytree(packed_bag, tmp_path / "drive")
@@ -173,7 +172,7 @@ def test_a_pipe_gets_all_of_a_table(monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(line.endswith("rgb8") for line in lines)
 
 
-@each("columns", [40, 80, 120, 300])
+@pytest.mark.parametrize("columns", [40, 80, 120, 300])
 def test_a_table_fits_a_terminal(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
     heading, *lines = printed(monkeypatch, columns, 4)
     assert max(map(len, (heading, *lines))) <= max(columns, 56)  # what is never left out
@@ -239,7 +238,7 @@ CUT = {
 }
 
 
-@each("what", CUT)
+@pytest.mark.parametrize("what", CUT)
 def test_what_was_cut_short(what: str, dataset: Path) -> None:
     """By `validate`, which says so once, and by whatever reads it."""
     damage, name, words = CUT[what]
@@ -287,7 +286,7 @@ def test_a_recording_is_not_a_dataset(tmp_path: Path) -> None:
         )
 
 
-@each(
+@pytest.mark.parametrize(
     ("words", "said"),
     [
         ("pack IN -o OUT --gop 0", "Invalid value for '--gop': 0 is below 1"),

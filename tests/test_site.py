@@ -21,7 +21,6 @@ import typer
 
 import mp4ds
 from chromium import chromium
-from each import each
 from mp4ds.cli import app_for
 from waiting import WATCHDOG_S
 
@@ -126,7 +125,7 @@ def test_every_link_leads_somewhere(site: Path) -> None:
     assert problems_of(site, address("Documentation"), address("Repository")) == []
 
 
-@each(
+@pytest.mark.parametrize(
     ("html", "problem"),
     [
         ('<a href="#there">', "no such anchor"),
@@ -151,7 +150,7 @@ def commands() -> dict[str, Any]:
     return {**group.commands, **{f"import-{name}": one for name, one in below.items()}}
 
 
-@each("name", sorted(commands()))
+@pytest.mark.parametrize("name", sorted(commands()))
 def test_every_option_is_on_its_commands_page(name: str, site: Path) -> None:
     command = commands()[name]
     page = (site / "commands" / name / "index.html").read_text()
@@ -202,7 +201,7 @@ def served(site: Path) -> Iterator[str]:
 
 
 @pytest.mark.browser
-@each("width", [1400, 390])
+@pytest.mark.parametrize("width", [1400, 390])
 def test_no_page_is_wider_than_the_window(width: int, served: str, tmp_path: Path) -> None:
     """And none asks another server, or has an error."""
     with chromium(tmp_path, width=width, height=900) as tab:

@@ -11,7 +11,6 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
-from each import each
 from mp4ds.errors import FormatError, OptionError, SourceError
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import load_manifest
@@ -51,8 +50,9 @@ def hidden(dataset: Path) -> list[int]:
 # ---------------------------------------------------------------- of recordings and datasets
 
 
-@each("source", SOURCES, one_in=3)
-@each("way", ["one-pass", "parts", "dataset", "dataset-anew", "unpack"])
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("source", SOURCES)
+@pytest.mark.parametrize("way", ["one-pass", "parts", "dataset", "dataset-anew", "unpack"])
 def test_what_is_taken(source: str, way: str, tmp_path: Path, compare: Compare) -> None:
     """Of a recording in one pass and in parts, and of a dataset of it, copied and anew."""
     paths = SOURCES[source](tmp_path, scene("rgb8", frames=FRAMES))
@@ -81,7 +81,8 @@ def test_what_is_taken(source: str, way: str, tmp_path: Path, compare: Compare) 
     assert compare(paths, output) != []
 
 
-@each("trait", TRAITS, one_in=3)
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("trait", TRAITS)
 def test_of_odd_recordings(trait: str, tmp_path: Path, compare: Compare) -> None:
     """Also where log times do not tell the order of messages, and so nothing can be copied."""
     paths = SOURCES["mcap-ros1-zstd"](tmp_path, odd_scene(trait, frames=12))
@@ -116,7 +117,7 @@ def test_equal_times_in_different_files(tmp_path: Path, compare: Compare) -> Non
         mp4ds.unpack(tmp_path / "whole", "images", options=UnpackOptions(**span))
 
 
-@each(
+@pytest.mark.parametrize(
     "kind", ["video-h264", "video-h265", "video-av1", "ffmpeg-libx264", "jpeg-rgb", "png-rgb-cv2"]
 )
 def test_of_coded_messages(kind: str, tmp_path: Path, compare: Compare) -> None:
@@ -145,7 +146,7 @@ def visual(recording: Path) -> Path:
     return recording.parent / "visual"
 
 
-@each("lossy", ["av1", "h264", "h265"])
+@pytest.mark.parametrize("lossy", ["av1", "h264", "h265"])
 def test_no_pixel_of_a_lossy_video_changes(lossy: str, recording: Path, tmp_path: Path) -> None:
     mp4ds.pack(recording, tmp_path / "whole", PackOptions(quality="crf=30", codec=lossy, gop=8))
     mp4ds.pack(tmp_path / "whole", tmp_path / "part", PackOptions(**SPAN))
@@ -292,7 +293,7 @@ def test_one_slice_each(recording: Path, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- times
 
 
-@each(
+@pytest.mark.parametrize(
     ("asked", "start", "end"),
     [
         (Slice(), None, None),
@@ -314,7 +315,7 @@ def test_how_it_is_written(asked: Slice, start: int | None, end: int | None) -> 
     assert bool(asked) == (asked != Slice())
 
 
-@each(
+@pytest.mark.parametrize(
     ("asked", "message"),
     [
         (Slice("1", "2", "3"), "two of `start`, `end` and `duration`"),

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from each import each
 from mp4ds.times import (
     INT64_MAX,
     INT64_MIN,
@@ -113,12 +112,12 @@ def test_numpy_arrays_and_runs() -> None:
     assert encode_column([7]) == {"start": 7, "step": 0, "values": ""}
 
 
-@each("text", ["1 2", "1 2\n", " 1\n2 ", "1\n\n2", "1*1 2", "1 2*1", "01 2*01"])
+@pytest.mark.parametrize("text", ["1 2", "1 2\n", " 1\n2 ", "1\n\n2", "1*1 2", "1 2*1", "01 2*01"])
 def test_texts_of_three_values(text: str) -> None:
     assert decode_column(10, 0, text, 3).tolist() == [10, 11, 13]
 
 
-@each(
+@pytest.mark.parametrize(
     ("text", "count"),
     [
         *((text, 2) for text in ("x", "1.0", "1e3", "0x1", "+1", "1_0", "1,", "1\t", "1\r\n")),

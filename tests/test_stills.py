@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import mp4ds
-from each import each
 from mp4ds.errors import FrameNotFoundError, OptionError, TargetExistsError
 from mp4ds.options import time_of
 from mp4ds.plugins.reporting.proxies import Look
@@ -45,7 +44,7 @@ def read(path: Path) -> np.ndarray[Any, Any]:
 # ---------------------------------------------------------------- times
 
 
-@each(
+@pytest.mark.parametrize(
     ("text", "time"),
     [
         ("+0", START),
@@ -65,7 +64,7 @@ def test_times_as_they_are_written(text: str, time: int) -> None:
     assert time_of(text, START, "at") == time
 
 
-@each(
+@pytest.mark.parametrize(
     "text",
     ["", "now", "1e9", "+", "+1.0000000001", "-5", "2023-13-14T22:13:20", "1.5 s", "12:30", "٣"],
 )
@@ -120,7 +119,7 @@ def test_a_frame_of_a_topic_that_changes_its_size(tmp_path: Path) -> None:
 SOME = {*COMMON, "rgb16", "yuyv", "8UC2", "32FC1", "bgra8", "bayer_gbrg16"}
 
 
-@each(
+@pytest.mark.parametrize(
     "encoding",
     [name if name in SOME else pytest.param(name, marks=pytest.mark.slow) for name in ENCODINGS],
 )
@@ -144,7 +143,7 @@ def test_every_encoding_can_be_looked_at(encoding: str, tmp_path: Path) -> None:
     assert png.dtype == (np.uint16 if is_wide else np.uint8)
 
 
-@each("encoding", ["bayer_rggb8", "mono16", "16UC1", "rgb8"])
+@pytest.mark.parametrize("encoding", ["bayer_rggb8", "mono16", "16UC1", "rgb8"])
 def test_exact_samples(encoding: str, tmp_path: Path) -> None:
     dataset = pack_cameras(tmp_path, scene(encoding, frames=4), quality="lossless")
     frames(dataset, tmp_path / "out.png", StillOptions(at="#3", exact=True))
@@ -169,7 +168,7 @@ def test_another_size(drive: Path, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- sheets
 
 
-@each(
+@pytest.mark.parametrize(
     ("count", "wanted", "numbers"),
     [
         (3, 20, [0, 1, 2]),
@@ -215,7 +214,7 @@ def test_a_sheet_that_is_too_large(drive: Path, tmp_path: Path) -> None:
         frames(drive, tmp_path / "a.png", StillOptions(topic=COLOUR, sheet=(80, 1), resize=16.0))
 
 
-@each("text", ["5", "0x4", "5x", "x4", "5x4x3", "-1x3", "1000x1"])
+@pytest.mark.parametrize("text", ["5", "0x4", "5x", "x4", "5x4x3", "-1x3", "1000x1"])
 def test_what_is_no_sheet(text: str) -> None:
     with pytest.raises(OptionError, match="`sheet`"):
         parse_sheet(text)
@@ -224,7 +223,7 @@ def test_what_is_no_sheet(text: str) -> None:
 # ---------------------------------------------------------------- options and the command
 
 
-@each(
+@pytest.mark.parametrize(
     "options",
     [
         {},

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import xxhash
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 
 import stranger
 from coded_scenes import CODED
-from each import each
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from mp4ds.messages.encodings import ENCODINGS, Encoding
 from mp4ds.messages.layouts import LAYOUTS, fit
@@ -117,7 +117,8 @@ CASES: dict[str, Case] = {
 }
 
 
-@each("case", CASES, one_in=6)
+@pytest.mark.one_in(6)
+@pytest.mark.parametrize("case", CASES)
 def test_a_reader_that_knows_the_spec_alone_gives_every_message(case: str, tmp_path: Path) -> None:
     make, write = CASES[case]
     (source,) = write(tmp_path, make(frames=8, width=192, height=128))

@@ -17,7 +17,6 @@ from typing import Any
 import pydantic
 import pytest
 
-from each import each
 from mp4ds.format.fields import FORMAT_VERSION, document_of
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.models import StreamSidecar
@@ -49,12 +48,12 @@ def test_imports_keep_to_the_floors() -> None:
     assert re.search(r"\b[1-9]\d* kept, 0 broken", done.stdout)
 
 
-@each("path", MODULES, ids=lambda path: str(path.relative_to(SOURCE)))
-def test_modules_are_short(path: Path) -> None:
-    lines = len(path.read_text().splitlines())
-    name = str(path.relative_to(SOURCE))
-    assert lines <= MAX_LINES or name in LONGER, f"{name} has {lines} lines"
-    assert lines > MAX_LINES or name not in LONGER, f"{name} is no longer long: strike it"
+def test_modules_are_short() -> None:
+    for path in MODULES:
+        lines = len(path.read_text().splitlines())
+        name = str(path.relative_to(SOURCE))
+        assert lines <= MAX_LINES or name in LONGER, f"{name} has {lines} lines"
+        assert lines > MAX_LINES or name not in LONGER, f"{name} is no longer long: strike it"
 
 
 @cache  # each library looks into all modules
@@ -97,7 +96,7 @@ HOMES = {
 }
 
 
-@each("package", HOMES)
+@pytest.mark.parametrize("package", HOMES)
 def test_each_library_has_its_room(package: str) -> None:
     found = [path for path in MODULES if package in imports_of(path)]
     homes = [SOURCE / home for home in HOMES[package]]
@@ -106,17 +105,17 @@ def test_each_library_has_its_room(package: str) -> None:
     assert found, f"nobody imports {package}: strike it, and from pyproject.toml"
 
 
-@each("path", MODULES, ids=lambda path: str(path.relative_to(SOURCE)))
-def test_habits(path: Path) -> None:
+def test_habits() -> None:
     """No print outside of the command line, no assert on state, a docstring for each module."""
-    tree = ast.parse(path.read_text())
-    name = str(path.relative_to(SOURCE))
-    assert ast.get_docstring(tree), name
-    for node in ast.walk(tree):
-        assert not isinstance(node, ast.Assert), f"{name}:{node.lineno}"
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-            assert node.func.id != "print" or name.startswith("cli"), f"{name}:{node.lineno}"
-    assert not re.search(r"\b(TODO|FIXME|XXX)\b", path.read_text()), name
+    for path in MODULES:
+        tree = ast.parse(path.read_text())
+        name = str(path.relative_to(SOURCE))
+        assert ast.get_docstring(tree), name
+        for node in ast.walk(tree):
+            assert not isinstance(node, ast.Assert), f"{name}:{node.lineno}"
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                assert node.func.id != "print" or name.startswith("cli"), f"{name}:{node.lineno}"
+        assert not re.search(r"\b(TODO|FIXME|XXX)\b", path.read_text()), name
 
 
 def test_the_picture_of_the_code_names_every_room() -> None:
@@ -269,7 +268,7 @@ def anchors(path: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
-@each(
+@pytest.mark.parametrize(
     "path",
     [
         *sorted(ROOT.glob("*.md")),

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import mp4ds
-from each import each, fresh
 from mp4ds.times import match, synchronize
 from sources import (
     IMAGE,
@@ -162,7 +161,7 @@ def cameras(**stamps: Sequence[int]) -> Scene:
     return Scene(sorted(records, key=lambda record: record.log_time))
 
 
-@fresh
+@pytest.fixture
 def three(tmp_path: Path) -> Path:
     made = cameras(
         left=[0, 100, 200, 300, 400, 500],
@@ -210,7 +209,7 @@ def test_a_topic_that_changes_its_size_is_one_column(tmp_path: Path) -> None:
         )
 
 
-@each(
+@pytest.mark.parametrize(
     ("topics", "options", "problem"),
     [
         (["/none"], {"tolerance_ns": 1}, "no stream '/none'; there are: /left/image, /right"),

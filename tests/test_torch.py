@@ -34,7 +34,6 @@ torch = pytest.importorskip("torch")
 
 from torch.utils.data import DataLoader, default_collate  # noqa: E402
 
-from each import each  # noqa: E402
 from mp4ds.torch import FrameDataset, FrameStream, SampleError  # noqa: E402
 from mp4ds.torch.streams import mixed, window_count, window_starts  # noqa: E402
 from waiting import WATCHDOG_S  # noqa: E402
@@ -364,7 +363,7 @@ def test_nothing_matches(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- options
 
 
-@each(
+@pytest.mark.parametrize(
     ("options", "sentence"),
     [
         ({"topics": ["/up"]}, "has no stream '/up'; there are: /"),
@@ -455,7 +454,8 @@ def test_without_torch() -> None:
 WORKERS = [(0, None), (2, "fork"), (2, "spawn")]
 
 
-@each(
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize(
     "options",
     [
         {},
@@ -466,9 +466,8 @@ WORKERS = [(0, None), (2, "fork"), (2, "spawn")]
         {"format": "gray", "dtype": "float32"},
         {"format": {LEFT: "native", RIGHT: "gray"}, "topics": BOTH},
     ],
-    one_in=2,
 )
-@each("batch", [[0], [5, 6, 7], [3, 30, 3, 60, 1]])
+@pytest.mark.parametrize("batch", [[0], [5, 6, 7], [3, 30, 3, 60, 1]])
 def test_batches_are_collated_as_usual(
     drives: list[Path], options: dict[str, Any], batch: list[int]
 ) -> None:
@@ -665,7 +664,7 @@ def test_damage_is_named(damaged: Path, workers: int, method: str | None) -> Non
     assert isinstance(error, mp4ds.Mp4dsError)
 
 
-@each(
+@pytest.mark.parametrize(
     "error",
     [
         mp4ds.SourceError("drive", "is odd", "Fix it."),
@@ -885,8 +884,8 @@ def test_a_kept_sample_does_not_keep_others(drives: list[Path]) -> None:
         assert image.permute(1, 2, 0).is_contiguous()
 
 
-@each("length", [1, 4, 7, 100])
-@each("keys", [[0], [0, 1, 2, 3], [0, 6, 12, 18], [0, 5, 6, 20], []])
+@pytest.mark.parametrize("length", [1, 4, 7, 100])
+@pytest.mark.parametrize("keys", [[0], [0, 1, 2, 3], [0, 6, 12, 18], [0, 5, 6, 20], []])
 def test_windows_are_a_partition(drives: list[Path], length: int, keys: list[int]) -> None:
     for topics in ([LEFT], BOTH):
         collection = FrameDataset(drives[:2], topics=topics)._collection
@@ -948,7 +947,7 @@ def test_torchcodec_gives_the_same_frames(drives: list[Path]) -> None:
 
 
 @pytest.mark.usefixtures("torchcodec")
-@each("codec", ["h264", "h265", "av1", "av1-10bit"])
+@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "av1-10bit"])
 def test_torchcodec_gives_lossy_videos_their_contrast_or_nothing(
     codec: str, tmp_path: Path
 ) -> None:

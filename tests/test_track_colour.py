@@ -8,9 +8,9 @@ from typing import Any
 
 import av
 import numpy as np
+import pytest
 
 from conftest import real
-from each import each
 from mp4ds.dataset.video import Video
 from mp4ds.video.access import FrameAccess
 from mp4ds.video.mp4 import SampleEntry, TrackColour, read_sample_entry, track_colour
@@ -52,9 +52,9 @@ class Tagged:
         return tags(frame)
 
 
-@each("colour_range", [1, 2])
-@each("colour", [BT709, BT601])
-@each("name", NAMES)
+@pytest.mark.parametrize("colour_range", [1, 2])
+@pytest.mark.parametrize("colour", [BT709, BT601])
+@pytest.mark.parametrize("name", NAMES)
 def test_decoders_know_what_the_track_says(
     name: str, colour: tuple[int, int, int], colour_range: int, tmp_path: Path
 ) -> None:
@@ -103,7 +103,7 @@ def colr(kind: bytes, *numbers: int, flags: bytes = b"") -> tuple[str, bytes]:
     return "colr", kind + b"".join(number.to_bytes(2, "big") for number in numbers) + flags
 
 
-@each(
+@pytest.mark.parametrize(
     ("boxes", "expected"),
     [
         ([], None),

@@ -20,7 +20,6 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from conftest import real
-from each import each
 from mp4ds import yamlio
 from mp4ds.bags.formats import open_reader
 from mp4ds.format.manifest import StaticTransform
@@ -196,7 +195,7 @@ Transforms = st.builds(
 # ---------------------------------------------------------------- parsing
 
 
-@each("kind", MANY_KINDS)
+@pytest.mark.parametrize("kind", MANY_KINDS)
 def test_messages_of_several_transforms(kind: str) -> None:
     own, write = MANY_KINDS[kind]
     for items in (TREE, TREE[:1], []):
@@ -204,7 +203,7 @@ def test_messages_of_several_transforms(kind: str) -> None:
         assert parse_transforms(own, memoryview(write(items))) == items
 
 
-@each("kind", ONE_KINDS)
+@pytest.mark.parametrize("kind", ONE_KINDS)
 def test_messages_of_one_transform(kind: str) -> None:
     own, write = ONE_KINDS[kind]
     for item in TREE:
@@ -264,7 +263,7 @@ def len_of(file: Any) -> int:
     return len(file.SerializeToString())
 
 
-@each(
+@pytest.mark.parametrize(
     "own",
     [
         channel("ros1", "sensor_msgs/Image"),
@@ -302,7 +301,7 @@ def test_descriptors_that_are_not_whole() -> None:
             transform_parser(channel("protobuf", ONE, schema.SerializeToString()))
 
 
-@each(
+@pytest.mark.parametrize(
     "text",
     [
         "", "{", "[]", "7", "null", '"text"', '{"transforms": 7}', '{"transforms": [7]}',
@@ -322,7 +321,7 @@ def test_json_of_another_shape(text: str) -> None:
         parse_transforms(channel("json", MANY), text.encode("utf-8", "surrogatepass"))
 
 
-@each(
+@pytest.mark.parametrize(
     "fields",
     [
         {"parent_frame_id": 5},
@@ -369,7 +368,7 @@ def test_damaged_messages_end_in_a_wire_error(data: st.DataObject) -> None:
         assert all(isinstance(item, Transform) for item in found)
 
 
-@each("kind", [kind for kind in MANY_KINDS if kind[:3] in ("ros", "cdr")])
+@pytest.mark.parametrize("kind", [kind for kind in MANY_KINDS if kind[:3] in ("ros", "cdr")])
 def test_a_count_that_the_message_does_not_hold(kind: str) -> None:
     own, write = MANY_KINDS[kind]
     payload = bytearray(write(TREE))
@@ -389,7 +388,7 @@ def collected(items: Iterable[Transform], **options: Any) -> TransformCollector:
     return collector
 
 
-@each("kind", MANY_KINDS)
+@pytest.mark.parametrize("kind", MANY_KINDS)
 def test_a_collector_takes_every_kind(kind: str) -> None:
     own, write = MANY_KINDS[kind]
     collector = TransformCollector()
@@ -398,7 +397,7 @@ def test_a_collector_takes_every_kind(kind: str) -> None:
     assert collector.transforms == TREE
 
 
-@each(
+@pytest.mark.parametrize(
     ("topic", "taken"),
     [
         ("/tf_static", True),
@@ -427,7 +426,7 @@ def test_the_latest_of_each_child_holds() -> None:
     assert collector.transforms == [moved, elsewhere, *TREE[2:]]
 
 
-@each(
+@pytest.mark.parametrize(
     "item",
     [
         Transform("", "b", (0.0, 0.0, 0.0), TURN),
@@ -475,7 +474,7 @@ def test_the_number_of_children_is_bounded() -> None:
 # ---------------------------------------------------------------- between cameras
 
 
-@each(
+@pytest.mark.parametrize(
     ("frames", "children"),
     [
         (["left", "right \u00e4"], ["head", "left", "right \u00e4"]),
@@ -538,7 +537,7 @@ def test_a_manifest_holds_them_bit_for_bit() -> None:
     assert [tuple(item["rotation"]) for item in loaded] == [item.rotation for item in TREE]
 
 
-@each(
+@pytest.mark.parametrize(
     "change",
     [
         {"translation": [0.0, 0.0]},

@@ -12,7 +12,6 @@ import pytest
 from numpy.typing import NDArray
 
 import mp4ds
-from each import each
 from mp4ds.errors import EncoderRefusedError, OptionError
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE
 from mp4ds.messages.layouts import bind, fit
@@ -65,7 +64,8 @@ def video_size(path: Path, samples: Sequence[Pixels], encoding: str, choice: Cho
 # ---------------------------------------------------------------- estimates
 
 
-@each("encoding", ENCODINGS, one_in=3)
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("encoding", ENCODINGS)
 def test_the_estimate_is_near_the_truth(encoding: str, tmp_path: Path) -> None:
     samples = scene(encoding, 24)
     choice = chosen(samples[:6], encoding)
@@ -103,7 +103,8 @@ def test_an_encoder_that_refuses() -> None:
 # ---------------------------------------------------------------- choices
 
 
-@each("encoding", ENCODINGS, one_in=4)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("encoding", ENCODINGS)
 def test_some_layout_is_chosen_for_every_encoding(encoding: str) -> None:
     samples = scene(encoding)
     first, again = chosen(samples, encoding), chosen(samples, encoding)
@@ -206,23 +207,23 @@ def test_the_earlier_of_two_near_ones_is_taken() -> None:
     assert choice.bytes_per_frame <= NEAR * min(every)
 
 
-@each("codec", ["h264", "h265", "ffv1"])
-@each("encoding", ENCODINGS)
-def test_a_codec_that_was_asked_for(codec: str, encoding: str) -> None:
-    samples = scene(encoding)
-    able = {
-        name
-        for layout in ENCODINGS[encoding].exact
-        for fitted in [fit(layout, ENCODINGS[encoding], samples)]
-        if fitted is not None
-        for name in lossless_codecs(fitted.pixel_format)
-    }
-    assert "ffv1" in able
-    if codec in able:
-        assert chosen(samples, encoding, codec=codec).recipe.codec == codec
-        return
-    with pytest.raises(OptionError, match=f"codec {codec} has no lossless form for .*ffv1"):
-        chosen(samples, encoding, codec=codec)
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_a_codec_that_was_asked_for(encoding: str) -> None:
+    for codec in ["h264", "h265", "ffv1"]:
+        samples = scene(encoding)
+        able = {
+            name
+            for layout in ENCODINGS[encoding].exact
+            for fitted in [fit(layout, ENCODINGS[encoding], samples)]
+            if fitted is not None
+            for name in lossless_codecs(fitted.pixel_format)
+        }
+        assert "ffv1" in able
+        if codec in able:
+            assert chosen(samples, encoding, codec=codec).recipe.codec == codec
+            continue
+        with pytest.raises(OptionError, match=f"codec {codec} has no lossless form for .*ffv1"):
+            chosen(samples, encoding, codec=codec)
 
 
 def test_a_preset_that_was_asked_for() -> None:
@@ -248,7 +249,8 @@ def test_pictures_beyond_the_bounds_are_not_tried() -> None:
     assert chosen([ramp], "mono16", codec="ffv1").recipe.pixel_format == "gray16le"
 
 
-@each("encoding", ["mono8", "rgb8", "uyvy", "bayer_rggb8", "nv12"], one_in=3)
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("encoding", ["mono8", "rgb8", "uyvy", "bayer_rggb8", "nv12"])
 def test_large_images_are_tried_in_part(encoding: str) -> None:
     """The estimate is for the whole."""
     samples = scene(encoding, 3, width=1602, height=1202)
@@ -327,7 +329,8 @@ def test_an_archive_has_the_smallest() -> None:
     )
 
 
-@each("encoding", ENCODINGS, one_in=6)
+@pytest.mark.one_in(6)
+@pytest.mark.parametrize("encoding", ENCODINGS)
 def test_fast_forms_are_exact(
     encoding: str, tmp_path: Path, compare: Callable[..., list[str]]
 ) -> None:
@@ -338,7 +341,7 @@ def test_fast_forms_are_exact(
     assert compare(paths, unpacked(tmp_path, "mcap")) == []
 
 
-@each("form", ["libx264", "libx264rgb", "ffv1"])
+@pytest.mark.parametrize("form", ["libx264", "libx264rgb", "ffv1"])
 def test_the_recipes_of_fast_forms_are_made_again(form: str) -> None:
     pixel_format = "rgb24" if form == "libx264rgb" else "gray"
     codec = "ffv1" if form == "ffv1" else "h264"

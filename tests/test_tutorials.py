@@ -25,7 +25,6 @@ from typing import Any
 import pytest
 import typer
 
-from each import each
 from mp4ds.cli import app_for, play_words, record_words
 from ros2_sides import alone_in_ros2
 from test_examples import ROOT
@@ -125,7 +124,8 @@ def assert_printed(said: str, printed: str) -> None:
         assert any(due in found for found in lines), f"{line}\n\n{printed}"
 
 
-@each("page", [*PAGES, *OTHERS], ids=lambda page: page.stem, one_in=3)
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("page", [*PAGES, *OTHERS], ids=lambda page: page.stem)
 def test_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     alone_in_ros2(monkeypatch)
@@ -192,7 +192,7 @@ def invocations(text: str) -> Iterator[tuple[str, list[str]]]:
                 yield found[1], re.findall(r"(?<![\w-])--?[a-z][a-z0-9-]*", found[2])
 
 
-@each(
+@pytest.mark.parametrize(
     "page",
     [ROOT / "README.md", *sorted(DOCS.rglob("*.md")), *sorted((ROOT / "spec").glob("*.md"))],
     ids=lambda page: str(page.relative_to(ROOT)),

@@ -15,7 +15,6 @@ import pytest
 import xxhash
 
 import mp4ds
-from each import each
 from mp4ds.errors import RecordError
 from mp4ds.files.sources import JOURNAL_NAME
 from record_scenes import PlayedSource, recorded
@@ -124,7 +123,7 @@ def test_files_of_the_user(unfinished: Path) -> None:
 # ---------------------------------------------------------------- hostility
 
 
-@each(
+@pytest.mark.parametrize(
     "stem",
     [
         *("../../victim", "../victim", "/tmp/victim", "a/b", "..", "", ".hidden", "a\0b", "a\nb"),
@@ -151,7 +150,7 @@ def test_two_streams_of_one_name(unfinished: Path) -> None:
     assert_refused(unfinished, "journal.jsonl: is damaged")
 
 
-@each("name", [f"{VIDEO}.mp4", "messages.mcap", JOURNAL_NAME])
+@pytest.mark.parametrize("name", [f"{VIDEO}.mp4", "messages.mcap", JOURNAL_NAME])
 def test_files_that_are_links(name: str, unfinished: Path) -> None:
     path, other = unfinished / name, unfinished.with_name("other")
     path.rename(other)

@@ -18,7 +18,6 @@ from PIL import Image
 import mp4ds
 from coded_scenes import CODED
 from definitions import COMPRESSED, IMAGE
-from each import each
 from mp4ds import ConversionError, UnpackOptions
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.messages.depth import encode_rvl
@@ -136,7 +135,7 @@ def webp() -> bytes:
     return file.getvalue()
 
 
-@each("name", CODED_FILES)
+@pytest.mark.parametrize("name", CODED_FILES)
 def test_files_that_no_video_holds(name: str, tmp_path: Path) -> None:
     told, make, encoding = CODED_FILES[name]
     made = scene("mono8", frames=3, with_info=False)
@@ -161,7 +160,7 @@ def test_files_that_no_video_holds(name: str, tmp_path: Path) -> None:
         assert np.array_equal(found, expected)
 
 
-@each("name", ["jpeg-cmyk", "jpeg-cut-one", "garbage", "video-h264-mid-gop"])
+@pytest.mark.parametrize("name", ["jpeg-cmyk", "jpeg-cut-one", "garbage", "video-h264-mid-gop"])
 def test_what_has_no_picture_is_counted(name: str, tmp_path: Path) -> None:
     made = CODED[name](frames=5)
     dataset = packed(tmp_path, made)

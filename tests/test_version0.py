@@ -24,7 +24,6 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 import mp4ds
-from each import each
 from mp4ds.format.sidecars import migrate
 from mp4ds.plugins.info import info
 from mp4ds.times import decode_column
@@ -283,7 +282,7 @@ def camera(**changes: Any) -> Document:
     return broken(camera_info={key: value for key, value in content.items() if value is not ...})
 
 
-@each(
+@pytest.mark.parametrize(
     ("content", "word"),
     [
         (broken(camera_info=...), "camera_info"),
@@ -338,7 +337,7 @@ def test_broken_files_are_refused_in_a_sentence(
     assert [problem.code for problem in problems] == ["migration-failed"]
 
 
-@each(
+@pytest.mark.parametrize(
     "content",
     [camera(K=[0.0] * 8), camera(P=[0.0] * 9), camera(width=0), camera(width=10**6)],
 )

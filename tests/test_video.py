@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from coded_tools import jpeg
-from each import each
 from mp4ds.errors import EncoderRefusedError, OptionError, Refused, VideoError
 from mp4ds.messages.arrangements import CHROMA_SHIFTS
 from mp4ds.messages.encodings import ENCODINGS
@@ -153,7 +152,7 @@ def psnr(a: Pixels, b: Pixels) -> float:
 EVEN = {name: (1 << across, 1 << down) for name, (across, down) in CHROMA_SHIFTS.items()}
 
 
-@each(("codec", "picture_format"), LOSSLESS)
+@pytest.mark.parametrize(("codec", "picture_format"), LOSSLESS)
 def test_lossless_is_exact(codec: str, picture_format: str, tmp_path: Path) -> None:
     recipe = recipe_for(picture_format, lossless=True, codec=codec)
     assert recipe.lossless
@@ -180,7 +179,7 @@ def test_lossless_is_exact(codec: str, picture_format: str, tmp_path: Path) -> N
     assert codec == "h265" or all(min(size) < 4 for size in refused)
 
 
-@each("picture_format", FORMATS)
+@pytest.mark.parametrize("picture_format", FORMATS)
 def test_the_default_takes_every_size_from_four_on(picture_format: str, tmp_path: Path) -> None:
     recipe = recipe_for(picture_format, lossless=True)
     assert recipe.codec == lossless_codecs(picture_format)[0]
@@ -228,8 +227,10 @@ SCENES = {"gray": "mono8", "gray16le": "mono16", "rgb24": "rgb8", "bgr24": "bgr8
           "rgba": "rgba8", "bgra": "bgra8"}  # fmt: skip
 
 
-@each(("codec", "picture_format"), [pair for pair in LOSSLESS if pair[1] in SCENES])
-@each("threads", [1, 3])
+@pytest.mark.parametrize(
+    ("codec", "picture_format"), [pair for pair in LOSSLESS if pair[1] in SCENES]
+)
+@pytest.mark.parametrize("threads", [1, 3])
 def test_lossless_of_a_scene_with_threads(
     codec: str, picture_format: str, threads: int, tmp_path: Path
 ) -> None:
@@ -255,7 +256,8 @@ def images_for(name: str, layout: str, width: int, height: int) -> list[Pixels]:
     ]
 
 
-@each(("name", "layout_name"), PAIRS, one_in=4)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize(("name", "layout_name"), PAIRS)
 def test_every_layout_returns_through_every_codec(
     name: str, layout_name: str, tmp_path: Path
 ) -> None:
@@ -288,8 +290,8 @@ def test_every_layout_returns_through_every_codec(
 TAGS = ("color_range", "color_space", "color_transfer", "color_primaries")
 
 
-@each("codec", LOSSY)
-@each("picture_format", ["rgb24", "bgr24", "gray", "bayer_rggb8"])
+@pytest.mark.parametrize("codec", LOSSY)
+@pytest.mark.parametrize("picture_format", ["rgb24", "bgr24", "gray", "bayer_rggb8"])
 def test_lossy_files_are_tagged_as_bt709_full_range(
     codec: str, picture_format: str, tmp_path: Path
 ) -> None:
@@ -303,7 +305,8 @@ def test_lossy_files_are_tagged_as_bt709_full_range(
     assert found[0]["pix_fmt"] in (recipe.pixel_format, "yuvj420p")
 
 
-@each(("codec", "picture_format"), LOSSLESS, one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize(("codec", "picture_format"), LOSSLESS)
 def test_lossless_files_are_tagged_too(codec: str, picture_format: str, tmp_path: Path) -> None:
     recipe = recipe_for(picture_format, lossless=True, codec=codec)
     encode(tmp_path / "v.mp4", recipe, noise(picture_format, 64, 16, 3), picture_format)
@@ -317,8 +320,8 @@ def test_lossless_files_are_tagged_too(codec: str, picture_format: str, tmp_path
     assert [found.get(tag) for tag in TAGS] == [full, matrix, "bt709", "bt709"]
 
 
-@each("codec", LOSSY)
-@each("picture_format", ["rgb24", "bgr24"])
+@pytest.mark.parametrize("codec", LOSSY)
+@pytest.mark.parametrize("picture_format", ["rgb24", "bgr24"])
 def test_flat_colours_keep_their_value(codec: str, picture_format: str, tmp_path: Path) -> None:
     """A wrong matrix or range moves them by 10 to 40 levels."""
     colours = [(0, 0, 0), (255, 255, 255), (255, 0, 0), (0, 255, 0), (0, 0, 255),
@@ -344,8 +347,8 @@ def test_colours_are_rounded_to_the_nearest() -> None:
         assert abs(errors.mean()) < 0.06
 
 
-@each("codec", LOSSY)
-@each(("width", "height"), [(96, 66), (97, 65), (64, 64)])
+@pytest.mark.parametrize("codec", LOSSY)
+@pytest.mark.parametrize(("width", "height"), [(96, 66), (97, 65), (64, 64)])
 def test_a_coloured_scene_stays_near(codec: str, width: int, height: int, tmp_path: Path) -> None:
     y, x = np.mgrid[:height, :width]
     pictures = [
@@ -361,9 +364,10 @@ def test_a_coloured_scene_stays_near(codec: str, width: int, height: int, tmp_pa
         assert np.abs(bias).max() < 2
 
 
-@each("codec", LOSSY, one_in=4)
-@each("encoding", YUV)
-@each(("width", "height"), [(64, 48), (66, 47), (65, 47)])
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("codec", LOSSY)
+@pytest.mark.parametrize("encoding", YUV)
+@pytest.mark.parametrize(("width", "height"), [(64, 48), (66, 47), (65, 47)])
 def test_yuv_is_coded_as_it_is(
     codec: str, encoding: str, width: int, height: int, tmp_path: Path
 ) -> None:
@@ -402,7 +406,7 @@ def by_bt709(frame: av.VideoFrame) -> Pixels:
     return np.stack([r, g, b], axis=-1).clip(0, 255)
 
 
-@each("codec", LOSSY)
+@pytest.mark.parametrize("codec", LOSSY)
 def test_colours_are_not_shifted_against_the_grey(codec: str, tmp_path: Path) -> None:
     """A decoder that takes the chroma to be sited elsewhere moves hard edges of colour."""
     pictures = scene_pictures("rgb8", 96, 66, 3)
@@ -418,8 +422,8 @@ def test_colours_are_not_shifted_against_the_grey(codec: str, tmp_path: Path) ->
         assert psnr(original, pixels) > psnr(original, formula)  # it interpolates
 
 
-@each("codec", LOSSY)
-@each(("width", "height"), [(64, 48), (65, 47)])
+@pytest.mark.parametrize("codec", LOSSY)
+@pytest.mark.parametrize(("width", "height"), [(64, 48), (65, 47)])
 def test_grey_is_the_luma_itself(codec: str, width: int, height: int, tmp_path: Path) -> None:
     pictures = scene_pictures("mono8", width, height, 6)
     recipe = recipe_for("gray", lossless=False, codec=codec, crf=12)
@@ -439,9 +443,9 @@ def plane_samples(frame: av.VideoFrame, index: int) -> Pixels:
     return np.frombuffer(bytes(plane), dtype).reshape(plane.height, -1)[:, : plane.width]
 
 
-@each("codec", LOSSY)
-@each("encoding", BAYER)
-@each(("width", "height"), [(128, 96), (127, 95)])
+@pytest.mark.parametrize("codec", LOSSY)
+@pytest.mark.parametrize("encoding", BAYER)
+@pytest.mark.parametrize(("width", "height"), [(128, 96), (127, 95)])
 def test_a_demosaiced_video_gives_the_mosaic_back(
     codec: str, encoding: str, width: int, height: int, tmp_path: Path
 ) -> None:
@@ -466,8 +470,8 @@ def test_a_demosaiced_video_gives_the_mosaic_back(
 # ---------------------------------------------------------------- random access
 
 
-@each("gop", [1, 3, 60])
-@each("codec", ["h264 lossless", "ffv1 lossless", *LOSSY])
+@pytest.mark.parametrize("gop", [1, 3, 60])
+@pytest.mark.parametrize("codec", ["h264 lossless", "ffv1 lossless", *LOSSY])
 def test_any_frame_is_found(codec: str, gop: int, tmp_path: Path) -> None:
     """By its number, at whatever times the frames are shown."""
     name, _, lossless = codec.partition(" ")
@@ -489,7 +493,7 @@ def test_any_frame_is_found(codec: str, gop: int, tmp_path: Path) -> None:
         assert same(decoder.picture(5), decoded[5])
 
 
-@each("codec", [*LOSSY, "h264 lossless", "ffv1 lossless"])
+@pytest.mark.parametrize("codec", [*LOSSY, "h264 lossless", "ffv1 lossless"])
 def test_times_in_the_file_are_the_ticks(codec: str, tmp_path: Path) -> None:
     """Strictly increasing from 0, in the order of coding, the last with a duration."""
     name, _, lossless = codec.partition(" ")
@@ -521,7 +525,7 @@ def test_parameters_of_a_recipe_reach_svt_av1(threads: int, tmp_path: Path) -> N
     assert came_back == [False, True]
 
 
-@each("rate", [None, 0.0, 1e-9, 0.3, 29.97, 1e9])
+@pytest.mark.parametrize("rate", [None, 0.0, 1e-9, 0.3, 29.97, 1e9])
 def test_any_rate_and_a_single_frame(rate: float | None, tmp_path: Path) -> None:
     pixels = scene_pictures("mono8", 64, 48, 1)[0]
     for lossless, codec in ((True, "h264"), (True, "ffv1"), (False, "av1"), (False, "h265")):
@@ -567,7 +571,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
     return path, encode(path, recipe, pictures, "gray", gop=4), pictures
 
 
-@each(
+@pytest.mark.parametrize(
     ("change", "code"),
     [
         ({"codec": "av1"}, "codec-mismatch"),
@@ -642,7 +646,8 @@ def damage(raw: bytes, rng: random.Random) -> bytes:
     return bytes(damaged)
 
 
-@each("codec", ["h264 lossless", "ffv1 lossless", "av1", "h265"], one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("codec", ["h264 lossless", "ffv1 lossless", "av1", "h265"])
 def test_a_damaged_video_is_a_clear_error_at_worst(codec: str, tmp_path: Path) -> None:
     """That its samples are the right ones is for the digests to say."""
     name, _, lossless = codec.partition(" ")
@@ -663,7 +668,7 @@ def test_a_damaged_video_is_a_clear_error_at_worst(codec: str, tmp_path: Path) -
     assert unclear == []
 
 
-@each(
+@pytest.mark.parametrize(
     ("codec", "preset", "lossless"),
     [
         (None, None, True),
@@ -685,7 +690,7 @@ def test_codecs_and_presets_that_there_are(
     encode(tmp_path / "v.mp4", recipe, scene_pictures("mono8", 64, 48, 2), "gray")
 
 
-@each(
+@pytest.mark.parametrize(
     ("codec", "preset", "lossless"),
     [
         *((codec, None, True) for codec in ("vp9", "", "av1", "H264")),
@@ -702,7 +707,7 @@ def test_others_are_refused(codec: str | None, preset: str | None, lossless: boo
     assert repr(codec if preset is None else preset) in str(caught.value)
 
 
-@each(
+@pytest.mark.parametrize(
     ("codec", "preset", "crf"),
     [(None, None, 1), ("av1", "10", 1), ("av1", "12", 2), ("h264", None, 0), ("h265", None, 51)],
 )
@@ -718,7 +723,7 @@ def test_the_ends_of_crf_look_like_the_pictures(
         assert np.sqrt(np.mean(away**2)) < (3 if crf <= 2 else 60)
 
 
-@each(
+@pytest.mark.parametrize(
     ("codec", "preset", "crf"),
     [
         *((None, None, 0), (None, "11", 1), ("av1", "13", 1), ("av1", None, 64)),
@@ -732,7 +737,7 @@ def test_a_crf_that_a_codec_has_not_is_refused(
         check_codec(codec, preset, lossless=False, crf=crf)
 
 
-@each("picture_format", FORMATS)
+@pytest.mark.parametrize("picture_format", FORMATS)
 def test_an_unable_codec_names_those_that_can(picture_format: str) -> None:
     able = [codec for codec in CODECS if exists(codec, picture_format, lossless=True)]
     for codec in set(CODECS) - set(able):
@@ -770,8 +775,8 @@ def read_png(data: bytes) -> Pixels:
     return pixels[..., 0].copy() if count == 1 else pixels.copy()
 
 
-@each("kind", ["random", "extreme"])
-@each("encoding", KEPT)
+@pytest.mark.parametrize("kind", ["random", "extreme"])
+@pytest.mark.parametrize("encoding", KEPT)
 def test_a_png_keeps_every_sample(encoding: str, kind: str) -> None:
     known = ENCODINGS[encoding]
     file = ImageFile(encoding, "png")
@@ -785,8 +790,8 @@ def test_a_png_keeps_every_sample(encoding: str, kind: str) -> None:
             assert np.array_equal(found, pixels)
 
 
-@each("encoding", YUV)
-@each("image_format", ["png", "jpeg"])
+@pytest.mark.parametrize("encoding", YUV)
+@pytest.mark.parametrize("image_format", ["png", "jpeg"])
 def test_yuv_becomes_the_colours_that_ros_takes_it_for(encoding: str, image_format: str) -> None:
     """BT.601, limited range, as OpenCV converts it."""
     known = ENCODINGS[encoding]
@@ -808,7 +813,7 @@ def test_yuv_becomes_the_colours_that_ros_takes_it_for(encoding: str, image_form
         assert np.abs(shown - rgb).max() <= 3
 
 
-@each("encoding", [name for name in KEPT if ENCODINGS[name].dtype == "u1"])
+@pytest.mark.parametrize("encoding", [name for name in KEPT if ENCODINGS[name].dtype == "u1"])
 def test_a_jpeg_is_for_looking_at(encoding: str) -> None:
     pixels = scene_pictures(encoding, 64, 48, 1)[0]
     image = Image.open(io.BytesIO(ImageFile(encoding, "jpeg").encode(pixels)))
@@ -827,20 +832,24 @@ def test_a_jpeg_is_for_looking_at(encoding: str) -> None:
     )
 
 
-@each("encoding", [name for name in KEPT if ENCODINGS[name].bytes_per_sample == 2])
+@pytest.mark.parametrize(
+    "encoding", [name for name in KEPT if ENCODINGS[name].bytes_per_sample == 2]
+)
 def test_a_jpeg_cannot_hold_16_bits(encoding: str) -> None:
     with pytest.raises(OptionError, match=f"{encoding} images, but PNG can"):
         ImageFile(encoding, "jpeg")
 
 
-@each("encoding", NO_FILES)
-@each("image_format", ["png", "jpeg"])
-def test_images_have_no_signs_or_floats(encoding: str, image_format: str) -> None:
-    with pytest.raises(OptionError, match=f"{image_format.upper()} cannot hold {encoding} images"):
-        ImageFile(encoding, image_format)
+@pytest.mark.parametrize("encoding", NO_FILES)
+def test_images_have_no_signs_or_floats(encoding: str) -> None:
+    for image_format in ["png", "jpeg"]:
+        with pytest.raises(
+            OptionError, match=f"{image_format.upper()} cannot hold {encoding} images"
+        ):
+            ImageFile(encoding, image_format)
 
 
-@each("quality", [30, 50, 75, 90])
+@pytest.mark.parametrize("quality", [30, 50, 75, 90])
 def test_jpeg_quality_is_that_of_libjpeg(quality: int) -> None:
     """About: between it at a quality somewhat lower and one somewhat higher."""
     rng = np.random.default_rng(0)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 import mp4ds
 from conftest import real
-from each import each
 from pictures import CAREFUL, picture
 from sources import SOURCES, scene
 
@@ -83,7 +82,7 @@ def near(one: NDArray[Any], other: NDArray[Any]) -> bool:
     return int(np.abs(one.astype(int) - other).max()) <= 2
 
 
-@each("kind", KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_frames_of_every_kind(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "a walk.mp4"
     write_video(path, kind)
@@ -143,7 +142,8 @@ def test_names(suffix: str, tmp_path: Path) -> None:
 VIDEOS = ["sam2_02_cups", "var_fps_video", "h264_10bits", "lerobot_aloha_insertion_human_yuv444"]
 
 
-@each("name", VIDEOS, one_in=4)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("name", VIDEOS)
 def test_real_videos(name: str) -> None:
     path = real("video") / f"{name}.mp4"
     times, pixels = decoded(path)
@@ -205,7 +205,7 @@ def check_frame(data: NDArray[Any], track: int, index: int) -> None:
     assert np.abs(data - expected).mean() < 4  # of the next frame 10, of the other track 5
 
 
-@each("encoders", [["libx264", "libx264"], ["libx264", "mpeg4"]], ids="-".join)
+@pytest.mark.parametrize("encoders", [["libx264", "libx264"], ["libx264", "mpeg4"]], ids="-".join)
 @pytest.mark.parametrize("in_fragments", [False, True])
 def test_one_of_several_tracks(encoders: list[str], in_fragments: bool, tmp_path: Path) -> None:
     path = tmp_path / "clip.mp4"

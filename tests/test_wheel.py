@@ -22,7 +22,6 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import mp4ds
-from each import each
 from waiting import WATCHDOG_S
 
 ROOT = Path(__file__).parents[1]
@@ -255,8 +254,8 @@ def pinned() -> Iterator[Requirement]:
             yield Requirement(requirement)
 
 
-@each("python", ["3.10", "3.11", "3.12", "3.13", "3.14"])
-@each("system", ["linux x86_64", "linux aarch64", "darwin arm64"])
+@pytest.mark.parametrize("python", ["3.10", "3.11", "3.12", "3.13", "3.14"])
+@pytest.mark.parametrize("system", ["linux x86_64", "linux aarch64", "darwin arm64"])
 def test_the_lock_has_what_is_asked_for(python: str, system: str) -> None:
     platform, machine = system.split()
     environment = {"python_version": python, "python_full_version": f"{python}.9", "extra": ""}
@@ -278,7 +277,7 @@ def test_the_lock_has_what_is_asked_for(python: str, system: str) -> None:
             assert is_met, f"{text}: lock/ has {versions}; bash tools/lock.sh renews it"
 
 
-@each("name", ["Dockerfile", "Dockerfile.ros2"])
+@pytest.mark.parametrize("name", ["Dockerfile", "Dockerfile.ros2"])
 def test_images_are_made_of_what_is_sent_to_be_built(name: str) -> None:
     lines = (ROOT / ".dockerignore").read_text().splitlines()
     sent = [line[1:] for line in lines if line.startswith("!")]
@@ -295,7 +294,9 @@ def test_images_are_made_of_what_is_sent_to_be_built(name: str) -> None:
     assert {extra for found in extras for extra in found.split(",")} <= known
 
 
-@each("path", sorted((ROOT / ".github" / "workflows").glob("*.yml")), ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / ".github" / "workflows").glob("*.yml")), ids=lambda path: path.name
+)
 def test_workflows_run_what_is_there(path: Path) -> None:
     workflow = yaml.safe_load(path.read_text())
     for job in workflow["jobs"].values():

@@ -12,7 +12,6 @@ from mcap.writer import Writer
 
 import mp4ds
 from coded_scenes import CODED
-from each import each, fresh
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.packing.options import PackOptions
@@ -28,7 +27,7 @@ INDEXED = [
 ]
 
 
-@fresh
+@pytest.fixture
 def engine(monkeypatch: pytest.MonkeyPatch) -> InlineEngine:
     inline = InlineEngine()
     monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: inline)
@@ -59,7 +58,8 @@ def compare_packs(
     assert compare(paths, unpacked(folder, own_target(source))) == []
 
 
-@each("encoding", ENCODINGS, one_in=6)
+@pytest.mark.one_in(6)
+@pytest.mark.parametrize("encoding", ENCODINGS)
 def test_every_encoding(
     encoding: str, tmp_path: Path, compare: Compare, engine: InlineEngine
 ) -> None:
@@ -68,7 +68,8 @@ def test_every_encoding(
     compare_packs(tmp_path, source, recorded, compare, engine)
 
 
-@each("source", SOURCES, one_in=4)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("source", SOURCES)
 def test_every_source(source: str, tmp_path: Path, compare: Compare, engine: InlineEngine) -> None:
     recorded = scene("bayer_gbrg8", frames=10)
     (tmp_path / "source").mkdir()
@@ -79,8 +80,9 @@ def test_every_source(source: str, tmp_path: Path, compare: Compare, engine: Inl
     assert leftovers(tmp_path) == []
 
 
-@each("source", ["bag-none", "mcap-ros2-zstd"], one_in=10)
-@each("name", CODED)
+@pytest.mark.one_in(10)
+@pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-zstd"])
+@pytest.mark.parametrize("name", CODED)
 def test_coded_images(
     name: str, source: str, tmp_path: Path, compare: Compare, engine: InlineEngine
 ) -> None:
@@ -91,7 +93,8 @@ def test_coded_images(
     assert compare(paths, unpacked(tmp_path, own_target(source))) == []
 
 
-@each("trait", TRAITS, one_in=3)
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("trait", TRAITS)
 def test_odd_messages(trait: str, tmp_path: Path, compare: Compare, engine: InlineEngine) -> None:
     (tmp_path / "source").mkdir()
     paths = SOURCES["mcap-ros2-zstd"](tmp_path / "source", odd_scene(trait))
@@ -100,8 +103,9 @@ def test_odd_messages(trait: str, tmp_path: Path, compare: Compare, engine: Inli
     assert compare(paths, unpacked(tmp_path, "mcap")) == []
 
 
-@each("source", list(FOXGLOVE_SOURCES)[::2], one_in=3)
-@each("name", ["raw-rgb8", "raw-padded", "jpeg-cut-one", "video-h264-mid-gop"])
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("source", list(FOXGLOVE_SOURCES)[::2])
+@pytest.mark.parametrize("name", ["raw-rgb8", "raw-padded", "jpeg-cut-one", "video-h264-mid-gop"])
 def test_foxglove_messages(
     name: str, source: str, tmp_path: Path, compare: Compare, engine: InlineEngine
 ) -> None:
@@ -112,7 +116,7 @@ def test_foxglove_messages(
     assert compare(paths, unpacked(tmp_path, "mcap")) == []
 
 
-@each("codec", ["av1", "av1-10bit", "h264", "h265"])
+@pytest.mark.parametrize("codec", ["av1", "av1-10bit", "h264", "h265"])
 def test_a_lossy_profile(
     codec: str, tmp_path: Path, compare: Compare, engine: InlineEngine
 ) -> None:

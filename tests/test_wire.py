@@ -12,7 +12,6 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from each import each
 from mp4ds.messages.serializations import form_of, wire_of
 from mp4ds.messages.wire import (
     MAX_BLANK,
@@ -171,8 +170,8 @@ def test_noise_splits_or_is_refused_as_a_whole(name: str, noise: bytes) -> None:
             split(name, msgtype, payload)
 
 
-@each("padding", [b"\0", b"\x61"])
-@each("little", [True, False])
+@pytest.mark.parametrize("padding", [b"\0", b"\x61"])
+@pytest.mark.parametrize("little", [True, False])
 def test_garbage_in_the_padding_of_cdr_is_in_the_template(padding: bytes, little: bool) -> None:
     payload = image_cdr(
         width=3, height=2, encoding="mono8", data=b"abcdef", frame_id="ab",
@@ -216,7 +215,7 @@ def test_wires_by_encapsulation(encoding: str, start: bytes, name: str) -> None:
     assert wire_of(encoding, memoryview(start + b"rest")) == name
 
 
-@each(
+@pytest.mark.parametrize(
     ("encoding", "start"),
     [
         *(("cdr", bytes.fromhex(text)) for text in ("", "00", "000100", "00010003", "00070000")),
@@ -289,9 +288,9 @@ def exact(value: float) -> tuple[float, float]:
     return float(value), math.copysign(1, value)
 
 
-@each("name", NAMES)
-@each("field", ["d", "k", "r", "p"])
-@each("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("field", ["d", "k", "r", "p"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_values_that_yaml_cannot_hold_are_refused(name: str, field: str, value: float) -> None:
     size = {"d": 5, "k": 9, "r": 9, "p": 12}[field]
     payload = serialize(name, INFO, {field: [0.0] * (size - 1) + [value]})
@@ -393,8 +392,8 @@ def coded(name: str, msgtype: str, body: bytes, *, stamp: int = 0, seq: int = 0)
     return bytes(out)
 
 
-@each("name", NAMES)
-@each("msgtype", OTHERS)
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("msgtype", OTHERS)
 def test_coded_images_return_for_every_size(name: str, msgtype: str) -> None:
     made = form(name, msgtype)
     blanks = set()
@@ -412,8 +411,8 @@ def test_coded_images_return_for_every_size(name: str, msgtype: str) -> None:
     assert len(blanks) <= 4  # what follows the data is aligned by its size
 
 
-@each("name", NAMES)
-@each("msgtype", OTHERS)
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("msgtype", OTHERS)
 def test_values_without_bits_are_refused(name: str, msgtype: str) -> None:
     template = form(name, msgtype).template(split(name, msgtype, coded(name, msgtype, b"")).blank)
     template.around(Slots(0, 0, 0), 2**32 - 1)

@@ -19,7 +19,6 @@ from mcap.writer import Writer
 
 import mp4ds
 from conftest import real
-from each import each
 from foxglove_wire import SERIALIZATIONS, message_class
 from mp4ds.messages.protobuf import TYPES, ProtobufForm
 from mp4ds.messages.wire import (
@@ -121,26 +120,26 @@ def test_the_types_are_those_of_the_tables() -> None:
     assert sorted(TYPES) == sorted(f"foxglove.{kind}" for kind in ALL)
 
 
-@each("size", SIZES)
-@each("kind", BODIED)
-@each("source", SOURCES)
-def test_an_image_splits_and_returns(source: str, kind: str, size: int) -> None:
-    body, of = noise(size), form(source, kind)
-    for stamp in (*STAMPS, LAST):
-        message = payload(source, kind, stamp, body)
-        if not size:  # protobuf leaves out what is empty
-            assert refused(of, message) == "it has no data"
-            continue
-        parts = of.split(memoryview(message))
-        assert (parts.stamp, parts.seq, parts.pts) == (stamp, None, None)
-        assert parts.frame_id == VALUES[kind]["frame_id"]
-        assert parts.fields == FIELDS[kind]
-        assert parts.body == body
-        assert len(parts.blank) < 300
-        assert proven(of, message)
+@pytest.mark.parametrize("kind", BODIED)
+@pytest.mark.parametrize("source", SOURCES)
+def test_an_image_splits_and_returns(source: str, kind: str) -> None:
+    for size in SIZES:
+        body, of = noise(size), form(source, kind)
+        for stamp in (*STAMPS, LAST):
+            message = payload(source, kind, stamp, body)
+            if not size:  # protobuf leaves out what is empty
+                assert refused(of, message) == "it has no data"
+                continue
+            parts = of.split(memoryview(message))
+            assert (parts.stamp, parts.seq, parts.pts) == (stamp, None, None)
+            assert parts.frame_id == VALUES[kind]["frame_id"]
+            assert parts.fields == FIELDS[kind]
+            assert parts.body == body
+            assert len(parts.blank) < 300
+            assert proven(of, message)
 
 
-@each("source", SOURCES)
+@pytest.mark.parametrize("source", SOURCES)
 def test_a_calibration_splits_and_returns(source: str) -> None:
     of = form(source, "CameraCalibration")
     blanks = set()
@@ -156,8 +155,8 @@ def test_a_calibration_splits_and_returns(source: str) -> None:
     assert len(blanks) == 1
 
 
-@each("kind", BODIED)
-@each("source", SOURCES)
+@pytest.mark.parametrize("kind", BODIED)
+@pytest.mark.parametrize("source", SOURCES)
 def test_a_blank_filled_anew_is_what_the_library_writes(source: str, kind: str) -> None:
     of = form(source, kind)
     messages = (payload(source, kind, 5 * 10**9 + size, noise(size)) for size in SIZES[1:])
@@ -167,8 +166,8 @@ def test_a_blank_filled_anew_is_what_the_library_writes(source: str, kind: str) 
         assert rebuilt(of.template(blank), Slots(stamp), body) == payload(source, kind, stamp, body)
 
 
-@each("kind", ALL)
-@each("source", SOURCES)
+@pytest.mark.parametrize("kind", ALL)
+@pytest.mark.parametrize("source", SOURCES)
 def test_a_blank_is_a_blank_message(source: str, kind: str) -> None:
     of = form(source, kind)
     message = payload(source, kind, STAMPS[-1], b"something" * (kind in BODIED))
@@ -185,8 +184,8 @@ def test_a_blank_is_a_blank_message(source: str, kind: str) -> None:
         assert kind not in BODIED or read.data == b""
 
 
-@each("kind", ALL)
-@each("source", SOURCES)
+@pytest.mark.parametrize("kind", ALL)
+@pytest.mark.parametrize("source", SOURCES)
 def test_a_message_that_is_not_blank_makes_no_template(source: str, kind: str) -> None:
     of = form(source, kind)
     cases = [payload(source, kind, 7, b"x")]
@@ -205,8 +204,8 @@ def test_a_blank_is_not_large() -> None:
         of.template(blank + b"\xba\x3e\xff\xff\x03" + bytes(MAX_BLANK - 1))
 
 
-@each("kind", BODIED)
-@each("source", SOURCES)
+@pytest.mark.parametrize("kind", BODIED)
+@pytest.mark.parametrize("source", SOURCES)
 def test_bodies_are_views(source: str, kind: str) -> None:
     message = payload(source, kind, 1, noise(99))
     parts = form(source, kind).split(memoryview(message))
@@ -214,8 +213,8 @@ def test_bodies_are_views(source: str, kind: str) -> None:
     assert np.shares_memory(at, np.frombuffer(message, np.uint8))
 
 
-@each("kind", ALL)
-@each("source", SOURCES)
+@pytest.mark.parametrize("kind", ALL)
+@pytest.mark.parametrize("source", SOURCES)
 def test_every_cut_is_refused(source: str, kind: str) -> None:
     message = payload(source, kind, STAMPS[-1], b"something")
     if source == "protobuf-unknown-field":
@@ -232,12 +231,12 @@ def test_every_cut_is_refused(source: str, kind: str) -> None:
         assert parts.stamp == STAMPS[-1]
 
 
-@each("source", SOURCES)
+@pytest.mark.parametrize("source", SOURCES)
 def test_the_wire_has_the_name_that_sidecars_use(source: str) -> None:
     assert form(source, "RawImage").wire == SERIALIZATIONS[source].encoding
 
 
-@each("type_name", ["foxglove.PointCloud", "RawImage", "", "sensor_msgs/Image"])
+@pytest.mark.parametrize("type_name", ["foxglove.PointCloud", "RawImage", "", "sensor_msgs/Image"])
 def test_other_types_are_refused(type_name: str) -> None:
     with pytest.raises(WireError, match="is not modelled"):
         ProtobufForm(type_name, b"")
@@ -299,7 +298,7 @@ def test_protobuf_fields_in_any_order() -> None:
         assert rebuilt(of.template(parts.blank), Slots(1), b"p" * 300) == expected
 
 
-@each(
+@pytest.mark.parametrize(
     ("stamp", "content"),
     [
         (-1, b"\x08" + b"\xff" * 9 + b"\x01" + b"\x10" + varint(999_999_999)),
@@ -318,7 +317,7 @@ def test_protobuf_stamps_of_64_bits(stamp: int, content: bytes) -> None:
     assert proven(of, message)
 
 
-@each(
+@pytest.mark.parametrize(
     "content",
     [
         b"\x08" + varint(9_223_372_036) + b"\x10" + varint(854_775_808),
@@ -335,7 +334,7 @@ def test_protobuf_stamps_that_have_no_value(content: bytes) -> None:
     assert refused(form("protobuf", "CompressedImage"), block(1, content) + DATA)
 
 
-@each(
+@pytest.mark.parametrize(
     "message",
     [
         block(1, b"\x08\x05\x10\x00") + DATA,  # a zero that serializers leave out
@@ -351,7 +350,7 @@ def test_protobuf_that_is_not_as_serializers_write_it_is_not_proven(message: byt
     assert not proven(form("protobuf", "CompressedImage"), message)
 
 
-@each(
+@pytest.mark.parametrize(
     ("more", "frame_id"),
     [
         (b"\x22\x83\x00cam", "cam"),  # its length in two bytes
@@ -371,7 +370,7 @@ def test_protobuf_that_is_odd_elsewhere_is_proven(more: bytes, frame_id: str) ->
         assert of.split(memoryview(message)).frame_id == frame_id
 
 
-@each(
+@pytest.mark.parametrize(
     ("message", "reason"),
     [
         (DATA, "it has no timestamp"),
@@ -420,7 +419,7 @@ def image_schema() -> tuple[FileDescriptorSet, dict[str, FieldDescriptorProto]]:
     return described, {field.name: field for field in message.field}
 
 
-@each(
+@pytest.mark.parametrize(
     ("name", "change"),
     [
         ("timestamp", {"type": FieldDescriptorProto.TYPE_INT64}),
@@ -540,8 +539,9 @@ def mutations(draw: st.DrawFn, message: bytes) -> bytes:
     return bytes(found)
 
 
-@each("kind", ["RawImage", "CompressedVideo", "CameraCalibration"], one_in=4)
-@each("source", ["protobuf", "protobuf-renumbered"])
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("kind", ["RawImage", "CompressedVideo", "CameraCalibration"])
+@pytest.mark.parametrize("source", ["protobuf", "protobuf-renumbered"])
 @settings(steady, max_examples=400)
 @given(st.data())
 def test_mutated_messages_are_harmless(source: str, kind: str, data: st.DataObject) -> None:
@@ -561,14 +561,15 @@ def test_mutated_blanks_are_harmless(data: st.DataObject) -> None:
     assert isinstance(head + tail, bytes)
 
 
-@each("kind", ALL)
+@pytest.mark.parametrize("kind", ALL)
 @settings(steady, max_examples=200)
 @given(st.binary(max_size=200))
 def test_noise_is_harmless(kind: str, noise: bytes) -> None:
     harmless(form("protobuf", kind), noise)
 
 
-@each("kind", ["RawImage", "CameraCalibration"], one_in=2)
+@pytest.mark.one_in(2)
+@pytest.mark.parametrize("kind", ["RawImage", "CameraCalibration"])
 @settings(steady, max_examples=300)
 @given(st.data())
 def test_mutated_schemas_are_harmless(kind: str, data: st.DataObject) -> None:
@@ -591,8 +592,8 @@ MANY = {  # what is first, and repeated
 }
 
 
-@each("kind", ["RawImage", "CameraCalibration"])
-@each("case", MANY)
+@pytest.mark.parametrize("kind", ["RawImage", "CameraCalibration"])
+@pytest.mark.parametrize("case", MANY)
 def test_large_hostile_messages_take_little_work(case: str, kind: str) -> None:
     first, repeated = MANY[case]
     message = first + repeated * (LARGE // len(repeated))
@@ -617,7 +618,7 @@ def test_a_large_message_takes_no_copy() -> None:
 # ---------------------------------------------------------------- other serializations
 
 
-@each("encoding", ["json", "flatbuffer", "cbor"])
+@pytest.mark.parametrize("encoding", ["json", "flatbuffer", "cbor"])
 def test_other_serializations_are_kept_as_they_are(
     encoding: str, tmp_path: Path, compare: Compare
 ) -> None:

@@ -11,7 +11,6 @@ import yaml
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from each import each
 from mp4ds import yamlio
 from mp4ds.errors import FormatError
 
@@ -83,17 +82,22 @@ def load_back(document: dict[str, Any]) -> dict[str, Any]:
     return yamlio.load(yamlio.dump(document, comment="A comment."), "some.yaml")
 
 
-@each("text", NASTY)
-@each("place", ["value", "key", "item", "deep", "beside"])
-def test_nasty_strings_return_everywhere(text: str, place: str) -> None:
-    document: dict[str, Any] = {
-        "value": {"a": text, "b": 1},
-        "key": {text: text, "other": {text: 1}},
-        "item": {"a": [text, [text], {"b": text}]},
-        "deep": {"a": {"b": {"c": [{"values": text, "start": text}]}}},
-        "beside": {"a": {"values": "1 2\n3\n"}, "b": text, "values": text, "c": {"values": "4\n"}},
-    }[place]
-    assert same(load_back(document), document)
+@pytest.mark.parametrize("place", ["value", "key", "item", "deep", "beside"])
+def test_nasty_strings_return_everywhere(place: str) -> None:
+    for text in NASTY:
+        document: dict[str, Any] = {
+            "value": {"a": text, "b": 1},
+            "key": {text: text, "other": {text: 1}},
+            "item": {"a": [text, [text], {"b": text}]},
+            "deep": {"a": {"b": {"c": [{"values": text, "start": text}]}}},
+            "beside": {
+                "a": {"values": "1 2\n3\n"},
+                "b": text,
+                "values": text,
+                "c": {"values": "4\n"},
+            },
+        }[place]
+        assert same(load_back(document), document)
 
 
 @steady
@@ -148,7 +152,7 @@ def test_a_column_line_stands_in_no_other_block() -> None:
     assert [line.strip() for line in lines].count("values: |") == 1
 
 
-@each(
+@pytest.mark.parametrize(
     "document",
     [
         {"values": "mp4ds column 0\n", "text": "x\n  values: |\n    5\n"},
@@ -173,7 +177,7 @@ def test_layout_for_human_readers() -> None:
 # ---------------------------------------------------------------- reading
 
 
-@each(
+@pytest.mark.parametrize(
     ("text", "value"),
     [
         *((text, None) for text in ("", "null", "~")),
@@ -196,7 +200,7 @@ def test_plain_scalars(text: str, value: Any) -> None:
     assert same(load(f"a: {text}\n"), {"a": value})
 
 
-@each(
+@pytest.mark.parametrize(
     ("text", "words"),
     [
         ("a: &x 1\nb: *x\n", "anchors"),
@@ -273,14 +277,16 @@ def test_depth_just_allowed() -> None:
         load_back({"a": document})
 
 
-@each("header", ["values: |", "values: |-", "values: |+", "values: >", "values:"])
+@pytest.mark.parametrize(
+    "header", ["values: |", "values: |-", "values: |+", "values: >", "values:"]
+)
 def test_any_spelling_of_a_column_is_read(header: str) -> None:
     """Other writers choose other styles; the slicer must not make a difference."""
     text = f"c:\n  {header}\n    1 2\n    3\nd: 4\n"
     assert same(load(text), yaml.safe_load(text))
 
 
-@each(
+@pytest.mark.parametrize(
     "text",
     [
         "c:\n    values: |\n      1 2\n\n      3\nd: 4\n",  # a blank line inside
